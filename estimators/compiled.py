@@ -1,0 +1,253 @@
+"""A model as machine code, and the context in which a filter sees it.
+
+`compile_model` turns the plain functions of a `StateSpaceModel` into addresses, and checks on the way that they agree
+with the declaration: shapes, finiteness at the prior, and derivatives.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import numba
+import numpy as np
+
+from .context import (
+    F_signature,
+    H_signature,
+    Q_signature,
+    f_complex_signature,
+    f_signature,
+    h_complex_signature,
+    h_signature,
+)
+from .errors import ModelError
+from .jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step_f, complex_step_h
+from .jit import address, jit
+from .model import StateSpaceModel
+
+@dataclass(frozen=True)
+class CompiledModel:
+    """A model whose functions are machine code; `f`, `h[k]` and `Q` can be called from Python too."""
+
+    model: StateSpaceModel
+    f: Callable
+    h: tuple[Callable, ...]
+    Q: Callable
+    static: dict[str, Any] = field(repr=False)
+    keep_alive: tuple[Any, ...] = field(repr=False)
+
+
+def compile_model(model: StateSpaceModel) -> CompiledModel:
+    """Compile a model and check its functions against its declaration.
+
+    Raises:
+        ModelError: If a function cannot be compiled, fills the wrong shape, gives a value that is not finite at the
+            prior, or an analytic Jacobian disagrees with differences.
+    """
+    return _compile(model)
+
+
+@lru_cache(maxsize=32)
+def _compile(model: StateSpaceModel) -> CompiledModel:
+    kept: list[Any] = []
+
+    def code(function: Callable | None, signature: Any, what: str) -> int:
+        if function is None:
+            return 0
+        try:
+            dispatcher = jit(getattr(function, "py_func", function))
+            kept.append(dispatcher)
+            return address(dispatcher, signature)
+        except numba.core.errors.NumbaError as error:
+            raise ModelError(f"model {model.name}: {what} cannot be compiled: {_gist(error)}") from None
+
+    def complex_code(function: Callable, signature: Any) -> int:
+        """The same function over complex numbers, or 0 where it is not analytic (comparisons, abs, atan2)."""
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                dispatcher = jit(getattr(function, "py_func", function))
+                kept.append(dispatcher)
+                return address(dispatcher, signature)
+        except Exception as error:  # noqa: BLE001  Numba raises many kinds; each means the same here
+            del error
+            return 0
+
+    _probe(model)
+    f = code(model.f, f_signature, "f")
+    f_dispatcher = kept[-1]
+    F = code(model.F, F_signature, "F")
+    Q = code(model.Q, Q_signature, "Q")
+    Q_dispatcher = kept[-1] if model.Q else None
+    h, H, h_dispatchers = [], [], []
+    for sensor in model.sensors:
+        h.append(code(sensor.h, h_signature, f"h of sensor {sensor.name}"))
+        h_dispatchers.append(kept[-1])
+        H.append(code(sensor.H, H_signature, f"H of sensor {sensor.name}"))
+    f_complex = 0 if model.F else complex_code(model.f, f_complex_signature)
+    h_complex = [0 if sensor.H else complex_code(sensor.h, h_complex_signature) for sensor in model.sensors]
+
+    noise_state = [model.state_names.index(noise.name) for noise in model.noises] if model.Q is None else []
+
+    def q_function(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
+        if Q_dispatcher is not None:
+            Q_dispatcher(x, u, p, q, dt, out)
+            return
+        for k, j in enumerate(noise_state):
+            out[j, j] += q[k] * dt
+
+    compiled = CompiledModel(
+        model=model,
+        f=f_dispatcher,
+        h=tuple(h_dispatchers),
+        Q=q_function,
+        keep_alive=tuple(kept),
+        static={
+            "f": f,
+            "f_complex": f_complex,
+            "F": F,
+            "F_mode": ANALYTIC if F else COMPLEX_STEP if f_complex else CENTRAL,
+            "Q": Q,
+            "h": np.array(h, np.int64),
+            "h_complex": np.array(h_complex, np.int64),
+            "H": np.array(H, np.int64),
+            "H_mode": np.array(
+                [ANALYTIC if a else COMPLEX_STEP if c else CENTRAL for a, c in zip(H, h_complex, strict=True)], np.int64
+            ),
+            "row_start": np.array(model.row_start, np.int64),
+            "row_count": np.array([len(sensor.rows) for sensor in model.sensors], np.int64),
+            "circular_x": np.array([state.circular for state in model.states], np.int8),
+            "circular_y": np.array([row.circular for sensor in model.sensors for row in sensor.rows], np.int8),
+            "noise_state": np.array(noise_state, np.int64),
+            "max_step": float(model.max_step),
+            "prior_mean": np.array([state.mean for state in model.states], float),
+            "prior_cov": np.diag([state.std**2 for state in model.states]).astype(float),
+        },
+    )
+    _check_derivatives(compiled)
+    return compiled
+
+
+def _gist(error: Exception) -> str:
+    """The line of Numba's long message that says what went wrong, and where."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    where = next((line for line in reversed(lines) if line.startswith("File ")), "")
+    rows = [line for line in lines if not line.startswith(("Failed in", "File ", "During:", "^", "[1]", "[2]"))]
+    return f"{rows[0] if rows else lines[0]} ({where})" if where else (rows[0] if rows else str(error))
+
+
+def _probe(model: StateSpaceModel) -> None:
+    """Run the plain functions once with arrays of the declared sizes, where an index that is too large is an error."""
+    x = np.array([state.mean for state in model.states], float)
+    u = np.array([item.default for item in model.inputs], float)
+    p = np.array([item.value for item in model.parameters], float)
+    q = np.array([noise.variance for noise in model.noises], float)
+    dt = min(1.0, model.max_step)
+    n = model.nx
+    calls: list[tuple[str, Callable | None, tuple, tuple[int, ...]]] = [
+        ("f", model.f, (x, u, p, dt), (n,)),
+        ("F", model.F, (x, u, p, dt), (n, n)),
+        ("Q", model.Q, (x, u, p, q, dt), (n, n)),
+    ]
+    for sensor in model.sensors:
+        m = len(sensor.rows)
+        calls.append((f"h of sensor {sensor.name}", sensor.h, (x, u, p), (m,)))
+        calls.append((f"H of sensor {sensor.name}", sensor.H, (x, u, p), (m, n)))
+    for what, function, arguments, shape in calls:
+        if function is None:
+            continue
+        out = np.full(shape, np.nan)
+        if what == "Q":
+            out[:] = 0.0
+        copies = tuple(item.copy() if isinstance(item, np.ndarray) else item for item in arguments)
+        try:
+            with np.errstate(all="ignore"):
+                getattr(function, "py_func", function)(*copies, out)
+        except Exception as error:  # noqa: BLE001  the user's own function may raise anything
+            raise ModelError(
+                f"model {model.name}: {what} fails at the prior with {n} states, {u.size} inputs and {p.size} "
+                f"parameters: {type(error).__name__}: {error}; check it against the declared sizes"
+            ) from None
+        if not np.all(np.isfinite(out)):
+            raise ModelError(
+                f"model {model.name}: {what} leaves {int(np.sum(~np.isfinite(out)))} of {out.size} entries of out "
+                f"(shape {shape}) unset or not finite at the prior; it must fill them all"
+            )
+        if what == "Q" and not np.allclose(out, out.T):
+            raise ModelError(f"model {model.name}: Q is not symmetric at the prior; fill both triangles")
+
+
+def _check_derivatives(compiled: CompiledModel) -> None:
+    """Compare every analytic or complex-step Jacobian with central differences; demote or refuse what disagrees."""
+    model, static = compiled.model, compiled.static
+    rng = np.random.default_rng(0)
+    u = np.array([item.default for item in model.inputs], float)
+    p = np.array([item.value for item in model.parameters], float)
+    std = np.array([state.std for state in model.states])
+    dt = min(0.1, model.max_step)
+
+    def differences(function: Callable, x: np.ndarray, rows: int) -> np.ndarray:
+        J = np.empty((rows, x.size))
+        for j in range(x.size):
+            step = 1e-5 * max(abs(x[j]), std[j], 1e-3)
+            high, low = x.copy(), x.copy()
+            high[j] += step
+            low[j] -= step
+            a, b = np.empty(rows), np.empty(rows)
+            function(high, a)
+            function(low, b)
+            J[:, j] = (a - b) / (high[j] - low[j])
+        return J
+
+    points = [static["prior_mean"] + 0.3 * std * rng.standard_normal(model.nx) for _ in range(3)]
+
+    def disagree(jacobian: Callable, function: Callable, rows: int) -> float:
+        """Largest difference relative to the size of the Jacobian, over the points where all is finite."""
+        worst = 0.0
+        for x in points:
+            J = np.zeros((rows, model.nx))
+            jacobian(x, J)
+            D = differences(function, x, rows)
+            if np.all(np.isfinite(D)):
+                error = np.max(np.abs(J - D)) / max(1e-9, np.max(np.abs(D)))
+                worst = max(worst, error if np.isfinite(error) else np.inf)
+        return worst
+
+    def f(x, out):  # noqa: ANN001, ANN202
+        compiled.f(x, u, p, dt, out)
+
+    tolerance = 1e-4  # central differences with a step of 1e-5 are good to about 1e-8; a wrong formula is off by more
+    if static["F_mode"] == ANALYTIC:
+        error = disagree(lambda x, J: _python(model.F)(x, u, p, dt, J), f, model.nx)
+        if error > tolerance:
+            raise ModelError(f"model {model.name}: F differs from central differences of f by {error:.2g} (relative)")
+    elif static["F_mode"] == COMPLEX_STEP:
+        if disagree(lambda x, J: complex_step_f(static["f_complex"], x, u, p, dt, J), f, model.nx) > tolerance:
+            static["F_mode"] = CENTRAL
+    for k, sensor in enumerate(model.sensors):
+
+        def h(x, out, k=k):  # noqa: ANN001, ANN202
+            compiled.h[k](x, u, p, out)
+
+        rows = len(sensor.rows)
+        mode = static["H_mode"][k]
+        if mode == ANALYTIC:
+            error = disagree(lambda x, J, s=sensor: _python(s.H)(x, u, p, J), h, rows)
+            if error > tolerance:
+                raise ModelError(
+                    f"model {model.name}: H of sensor {sensor.name} differs from central differences of h "
+                    f"by {error:.2g} (relative)"
+                )
+        elif mode == COMPLEX_STEP:
+            target = int(static["h_complex"][k])
+            if disagree(lambda x, J, a=target: complex_step_h(a, x, u, p, J), h, rows) > tolerance:
+                static["H_mode"][k] = CENTRAL
+
+
+def _python(function: Any) -> Callable:
+    return getattr(function, "py_func", function)
+

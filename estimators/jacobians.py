@@ -1,0 +1,102 @@
+"""Derivatives of a model's f and h: its own, by complex step, or by central differences.
+
+Complex step: df/dx_j = Im f(x + i·e·e_j) / e, exact to rounding for an analytic f, since nothing is subtracted.
+Source: Squire & Trapp (1998), doi:10.1137/S003614459631241X.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .context import call_F, call_f, call_f_complex, call_H, call_h, call_h_complex
+from .jit import jit
+
+ANALYTIC, COMPLEX_STEP, CENTRAL = range(3)
+"""How a Jacobian is found: the model's own function, complex step, central differences."""
+
+_COMPLEX_STEP = 1e-20
+_CENTRAL_STEP = 6e-6  # about the cube root of the rounding error, where truncation and rounding balance
+
+
+@jit
+def complex_step_f(target, x, u, p, dt, J):
+    """Fill J (nx, nx) with df/dx of the complex function at address `target`."""
+    n = x.size
+    z = np.empty(n, np.complex128)
+    out = np.empty(n, np.complex128)
+    for i in range(n):
+        z[i] = x[i]
+    for j in range(n):
+        z[j] = complex(x[j], _COMPLEX_STEP)
+        call_f_complex(target, z, u, p, dt, out)
+        z[j] = x[j]
+        for i in range(n):
+            J[i, j] = out[i].imag / _COMPLEX_STEP
+
+
+@jit
+def complex_step_h(target, x, u, p, J):
+    """Fill J (ny, nx) with dh/dx of the complex function at address `target`."""
+    n = x.size
+    m = J.shape[0]
+    z = np.empty(n, np.complex128)
+    out = np.empty(m, np.complex128)
+    for i in range(n):
+        z[i] = x[i]
+    for j in range(n):
+        z[j] = complex(x[j], _COMPLEX_STEP)
+        call_h_complex(target, z, u, p, out)
+        z[j] = x[j]
+        for i in range(m):
+            J[i, j] = out[i].imag / _COMPLEX_STEP
+
+
+@jit
+def state_jacobian(context, x, u, dt, F):
+    """Fill F (nx, nx) with df/dx at x."""
+    if context.F_mode == ANALYTIC:
+        call_F(context.F, x, u, context.p, dt, F)
+    elif context.F_mode == COMPLEX_STEP:
+        complex_step_f(context.f_complex, x, u, context.p, dt, F)
+    else:
+        n = x.size
+        z = x.copy()
+        high = np.empty(n)
+        low = np.empty(n)
+        for j in range(n):
+            step = _CENTRAL_STEP * max(1.0, abs(x[j]))
+            z[j] = x[j] + step
+            above = z[j]
+            call_f(context.f, z, u, context.p, dt, high)
+            z[j] = x[j] - step
+            below = z[j]
+            call_f(context.f, z, u, context.p, dt, low)
+            z[j] = x[j]
+            for i in range(n):
+                F[i, j] = (high[i] - low[i]) / (above - below)
+
+
+@jit
+def sensor_jacobian(context, sensor, x, u, H):
+    """Fill H (ny, nx) with dh/dx of one sensor at x."""
+    mode = context.H_mode[sensor]
+    if mode == ANALYTIC:
+        call_H(context.H[sensor], x, u, context.p, H)
+    elif mode == COMPLEX_STEP:
+        complex_step_h(context.h_complex[sensor], x, u, context.p, H)
+    else:
+        m, n = H.shape
+        z = x.copy()
+        high = np.empty(m)
+        low = np.empty(m)
+        for j in range(n):
+            step = _CENTRAL_STEP * max(1.0, abs(x[j]))
+            z[j] = x[j] + step
+            above = z[j]
+            call_h(context.h[sensor], z, u, context.p, high)
+            z[j] = x[j] - step
+            below = z[j]
+            call_h(context.h[sensor], z, u, context.p, low)
+            z[j] = x[j]
+            for i in range(m):
+                H[i, j] = (high[i] - low[i]) / (above - below)

@@ -1,0 +1,78 @@
+"""How Nisus compiles: Numba, once, cached where the user can write, called through plain addresses.
+
+A filter receives a model as addresses of machine code, so one compiled set of filters serves every model. Addresses
+are plain integers in a tuple: a call from Python with them costs 3 µs, against 100 µs with `FunctionType` objects.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba import njit, types
+from numba.core import cgutils
+from numba.experimental.function_type import _get_jit_address
+from numba.extending import intrinsic
+
+F1 = types.float64[::1]
+F2 = types.Array(types.float64, 2, "C")
+C1 = types.complex128[::1]
+I1 = types.int64[::1]
+I2 = types.Array(types.int64, 2, "C")
+B1 = types.int8[::1]
+
+f64 = types.float64
+i64 = types.int64
+
+
+def cache_folder() -> Path:
+    """Where machine code is kept: per user, and apart for each version of the sources.
+
+    Numba looks only at the file of the function it compiles, not at those that the function calls; so the sources of
+    this folder are part of the path, and an edit anywhere in it compiles anew.
+    """
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    digest = hashlib.sha256(numba.__version__.encode())
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return base / "nisus" / "numba" / digest.hexdigest()[:16]
+
+
+if "NUMBA_CACHE_DIR" not in os.environ:
+    numba.config.CACHE_DIR = str(cache_folder())
+
+jit = partial(njit, cache=True, nogil=True, error_model="numpy")
+"""Numba's njit as used here: cached, without the GIL, and with IEEE division (a zero divisor gives inf, not an error)."""
+
+
+def address(dispatcher: Any, signature: Any) -> int:
+    """Compile `dispatcher` for `signature` (or load it from the cache) and return where its machine code starts.
+
+    The dispatcher must be kept alive for as long as the address is used.
+    """
+    dispatcher.compile(signature.args)
+    return int(_get_jit_address(dispatcher, signature))
+
+
+def caller(signature: Any) -> Any:
+    """A function for compiled code, `call(address, *args)`, which calls the function of `signature` at `address`."""
+    args, result = signature.args, signature.return_type
+
+    @intrinsic
+    def call(typing_context: Any, target: Any, *values: Any) -> Any:
+        def codegen(context: Any, builder: Any, _: Any, given: Any) -> Any:
+            function_type = context.call_conv.get_function_type(result, args)
+            pointer = builder.inttoptr(given[0], function_type.as_pointer())
+            unpacked = cgutils.unpack_tuple(builder, given[1], len(args))
+            status, value = context.call_conv.call_function(builder, pointer, result, args, unpacked)
+            with cgutils.if_unlikely(builder, status.is_error):
+                context.call_conv.return_status_propagate(builder, status)
+            return context.get_dummy_value() if result == types.void else value
+
+        return result(i64, types.StarArgTuple(args)), codegen
+
+    return call

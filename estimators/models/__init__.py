@@ -1,0 +1,8 @@
+"""The models that ship, by name."""
+
+from __future__ import annotations
+
+from ..model import StateSpaceModel
+from .motor_winding import MOTOR_WINDING
+
+MODELS: dict[str, StateSpaceModel] = {model.name: model for model in (MOTOR_WINDING,)}

@@ -1,0 +1,69 @@
+"""The track: everything the estimator concluded, one row an event of the log."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import types
+
+from .jit import B1, F1, F2
+
+NONE, USED, GATED, HELD_OUT, MISSING, FAILED = range(6)
+"""Verdict on an event: not a reading; used; refused by the gate; held out and scored; no finite row; not usable
+because S was not positive definite."""
+
+VERDICT_NAMES = ("none", "used", "gated", "held out", "missing", "failed")
+
+TRACKING, DEGRADED, DIVERGED, STALE = range(4)
+"""Health: the NIS is in its bounds; it is not, or readings are late; the estimate is lost; nothing arrives."""
+
+HEALTH_NAMES = ("tracking", "degraded", "diverged", "stale")
+
+
+class Track(NamedTuple):
+    """Columns of one length N.
+
+    mean, std (N, nx): the estimate after the event, in the units of the states. cross (N, pairs): the covariance of
+    each configured pair of states. innovation, innovation_std (N, width): reading minus prediction and the square
+    root of S's diagonal; NaN where there is none. nis: νᵀ S⁻¹ ν, `dof` its degrees of freedom. nis_mean with
+    nis_low and nis_high: mean NIS over the last readings, and its 95 % bounds.
+    """
+
+    mean: Any
+    std: Any
+    cross: Any
+    innovation: Any
+    innovation_std: Any
+    nis: Any
+    log_likelihood: Any
+    dof: Any
+    verdict: Any
+    nis_mean: Any
+    nis_low: Any
+    nis_high: Any
+    health: Any
+
+    @staticmethod
+    def allocate(rows: int, nx: int, pairs: int, width: int) -> Track:
+        """Columns for `rows` events, filled with NaN (so that their memory is paid for at once)."""
+        matrix = [np.full((rows, k), np.nan) for k in (nx, nx, pairs, width, width)]
+        vectors = [np.full(rows, np.nan) for _ in range(2)]
+        codes = [np.zeros(rows, np.int8) for _ in range(2)]
+        bounds = [np.full(rows, np.nan) for _ in range(3)]
+        return Track(*matrix, *vectors, *codes, *bounds, np.zeros(rows, np.int8))
+
+    def select(self, index: object) -> Track:
+        """The rows that a slice, mask or index array picks."""
+        return Track(*(column[index] for column in self))
+
+    def copy(self) -> Track:
+        """Columns of its own."""
+        return Track(*(column.copy() for column in self))
+
+    def __len__(self) -> int:
+        """Number of rows (not of columns)."""
+        return int(self.nis.size)
+
+
+track_type = types.NamedTuple((F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, B1), Track)

@@ -1,0 +1,146 @@
+"""The tuning: everything about a fold that a user may turn, in one frozen, versioned object."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
+from itertools import count
+from typing import NamedTuple
+
+import numpy as np
+
+from .errors import ConfigError
+from .model import StateSpaceModel
+
+_versions = count(1)
+
+
+class Item(NamedTuple):
+    """One entry of a tuning, as a panel shows it."""
+
+    key: str
+    value: float
+    unit: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """Noise variances, parameters, sensors in use, gate and options of one fold.
+
+    q (nw,) is the variance that each process noise adds in one second; r (rows,) the variance of each sensor row;
+    p (np,) the model's parameters; `used` (sensors,) is False where a sensor is held out: predicted and scored, never
+    used. `gate` is the probability that a good reading passes, or None. `options` are the estimator's own.
+    """
+
+    model: StateSpaceModel
+    q: np.ndarray
+    r: np.ndarray
+    p: np.ndarray
+    used: np.ndarray
+    gate: float | None = None
+    options: Mapping[str, float] = field(default_factory=dict)
+    seed: int = 0
+    version: int = field(default_factory=lambda: next(_versions))
+
+    @staticmethod
+    def of(model: StateSpaceModel) -> Tuning:
+        """What the model declares."""
+        return Tuning(
+            model=model,
+            q=np.array([noise.variance for noise in model.noises], float),
+            r=np.array([row.variance for sensor in model.sensors for row in sensor.rows], float),
+            p=np.array([parameter.value for parameter in model.parameters], float),
+            used=np.ones(len(model.sensors), bool),
+        )
+
+    def items(self) -> list[Item]:
+        """Every numeric entry with its unit and range."""
+        model = self.model
+        rows = [row for sensor in model.sensors for row in sensor.rows]
+        items = [
+            Item(f"Q.{noise.name}", float(value), noise.unit, 0.0, np.inf)
+            for noise, value in zip(model.noises, self.q, strict=True)
+        ]
+        items += [
+            Item(f"R.{name}", float(value), _squared(row.unit), 0.0, np.inf)
+            for name, row, value in zip(model.row_names, rows, self.r, strict=True)
+        ]
+        items += [
+            Item(f"p.{parameter.name}", float(value), parameter.unit, parameter.low, parameter.high)
+            for parameter, value in zip(model.parameters, self.p, strict=True)
+        ]
+        return items
+
+    def keys(self) -> list[str]:
+        """Every key that `set` takes."""
+        return [item.key for item in self.items()] + [f"use.{name}" for name in self.model.sensor_names] + ["gate"]
+
+    def get(self, key: str) -> float | bool | None:
+        """The value under a key."""
+        if key == "gate":
+            return self.gate
+        group, index = self._locate(key)
+        return bool(self.used[index]) if group == "used" else float(getattr(self, group)[index])
+
+    def set(self, key: str, value: float | bool | None) -> Tuning:
+        """A new tuning with one entry changed.
+
+        Raises:
+            ConfigError: If there is no such key, or the value breaks its rule.
+        """
+        if key == "gate":
+            if value is not None and not 0.0 < float(value) < 1.0:
+                raise ConfigError(f"gate is {value}; it must lie between 0 and 1, or be null for no gate")
+            gate = None if value is None else float(value)
+            return replace(self, gate=gate, version=next(_versions))
+        group, index = self._locate(key)
+        if group == "used":
+            changed: np.ndarray = self.used.copy()
+            changed[index] = bool(value)
+        else:
+            number = float(value) if value is not None else np.nan
+            if not np.isfinite(number):
+                raise ConfigError(f"{key} is {value}; it must be a finite number")
+            if group == "q" and number < 0:
+                raise ConfigError(f"{key} is {number:g}; a variance must be zero or positive")
+            if group == "r" and number <= 0:
+                raise ConfigError(f"{key} is {number:g}; a variance must be positive")
+            if group == "p":
+                parameter = self.model.parameters[index]
+                if not parameter.low <= number <= parameter.high:
+                    raise ConfigError(
+                        f"{key} is {number:g} {parameter.unit}; it must lie between {parameter.low:g} "
+                        f"and {parameter.high:g}"
+                    )
+            changed = getattr(self, group).copy()
+            changed[index] = number
+        return replace(self, version=next(_versions), **{group: changed})
+
+    def with_options(self, options: Mapping[str, float]) -> Tuning:
+        """A new tuning with other estimator options."""
+        return replace(self, options=dict(options), version=next(_versions))
+
+    def _locate(self, key: str) -> tuple[str, int]:
+        model = self.model
+        groups = {
+            "Q": ("q", [noise.name for noise in model.noises]),
+            "R": ("r", list(model.row_names)),
+            "p": ("p", [parameter.name for parameter in model.parameters]),
+            "use": ("used", list(model.sensor_names)),
+        }
+        prefix, _, name = key.partition(".")
+        if prefix in groups and name in groups[prefix][1]:
+            group, names = groups[prefix]
+            return group, names.index(name)
+        near = get_close_matches(key, self.keys(), n=3, cutoff=0.4)
+        raise ConfigError(f"{key} is no tuning key of {model.name}; near: {', '.join(near or self.keys())}")
+
+
+def _squared(unit: str) -> str:
+    """The unit of a variance: °C → °C², m/s → (m/s)²."""
+    if not unit or unit == "1":
+        return unit
+    return f"({unit})²" if "/" in unit or " " in unit or "·" in unit else f"{unit}²"
