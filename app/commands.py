@@ -1,0 +1,83 @@
+"""What a user can ask of a running twin.
+
+A page, an API call or a test builds one of these and hands it to `engine.submit`, from any thread; the engine carries
+them out in order, between two events, so nothing else ever touches the estimate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class SetEstimator:
+    """Fold the history with another estimator of the catalogue, and go on with it."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class SetTuning:
+    """Turn one entry of the tuning: `Q.<noise>`, `R.<row>`, `p.<parameter>`, or `gate` (None: no gate)."""
+
+    key: str
+    value: float | None
+
+
+@dataclass(frozen=True)
+class SetOption:
+    """Turn one option of the estimator that runs."""
+
+    name: str
+    value: float | bool | str
+
+
+@dataclass(frozen=True)
+class UseSensor:
+    """Use a sensor's readings, or hold them out: predicted and scored, never used."""
+
+    name: str
+    used: bool
+
+
+@dataclass(frozen=True)
+class Reset:
+    """Forget the estimate: back to the model's prior at the present time."""
+
+
+@dataclass(frozen=True)
+class Pause:
+    """Hold a replay or a simulation where it is, or let it go on."""
+
+    paused: bool
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Play `factor` times as fast as real time; infinity is as fast as the estimator can."""
+
+    factor: float
+
+
+@dataclass(frozen=True)
+class Step:
+    """While paused: play the next event."""
+
+
+@dataclass(frozen=True)
+class Seek:
+    """Go to a place in a recording, in seconds after its first event."""
+
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Record:
+    """Record into a new file at `path`, or stop with None."""
+
+    path: Path | None
+
+
+Command = SetEstimator | SetTuning | SetOption | UseSensor | Reset | Pause | Speed | Step | Seek | Record
+"""Any of them."""
