@@ -1,0 +1,103 @@
+"""The kinds of value that a twin's YAML holds, shared by the schema's sections."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
+NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0)]
+Count = Annotated[int, Field(strict=True, ge=1)]
+Flag = Annotated[bool, Field(strict=True)]
+Text = Annotated[str, Field(min_length=1)]
+Item = TypeVar("Item")
+
+
+def as_list(value: Any) -> Any:
+    """A lone value stands for a list of one."""
+    return value if isinstance(value, (list, tuple)) or value is None else [value]
+
+
+Texts = Annotated[
+    tuple[Text, ...], Field(min_length=1), BeforeValidator(as_list, json_schema_input_type=str | list[str])
+]
+Numbers = Annotated[
+    tuple[Number, ...], Field(min_length=1), BeforeValidator(as_list, json_schema_input_type=float | list[float])
+]
+Positives = Annotated[
+    tuple[Positive, ...], Field(min_length=1), BeforeValidator(as_list, json_schema_input_type=float | list[float])
+]
+
+
+class Section(BaseModel):
+    """A mapping of the YAML. A key that it does not have is an error, with the keys that it has."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys(cls, data: Any) -> Any:
+        # Before pydantic's own check, which knows the stray key but not its neighbours.
+        if isinstance(data, dict):
+            known = list(cls.model_fields)
+            for key in data:
+                if key not in known:
+                    raise PydanticCustomError("unknown_key", "unknown key", {"key": key, "known": known})
+            # `time:` with every key under it commented out means the defaults.
+            fields = cls.model_fields
+            return {key: value for key, value in data.items() if value is not None or fields[key].is_required()}
+        return data
+
+
+def one_of(section: Section, *keys: str, required: bool) -> None:
+    """Refuse a section that gives two of `keys`, or none where one is needed."""
+    given = [key for key in keys if getattr(section, key) is not None]
+    if len(given) > 1:
+        raise PydanticCustomError(
+            "both", "gives both {first} and {second}", {"first": given[0], "second": given[1], "key": given[1]}
+        )
+    if required and not given:
+        raise PydanticCustomError("neither", "gives neither {keys}", {"keys": " nor ".join(keys)})
+
+
+class LevelSection(Section):
+    """How strongly one disturbance drives the state: what it adds in one second. Give one of the two."""
+
+    variance: NotNegative | None = None
+    """Variance added in one second, in the square of the state's unit for the usual additive noise."""
+    std: NotNegative | None = None
+    """Its square root: the standard deviation after one second."""
+
+    @model_validator(mode="after")
+    def _one(self) -> LevelSection:
+        one_of(self, "variance", "std", required=True)
+        return self
+
+    @property
+    def value(self) -> float:
+        """The variance."""
+        return self.variance if self.variance is not None else float(self.std or 0.0) ** 2
+
+
+class SpreadSection(Section):
+    """The noise of one sensor."""
+
+    variance: Positives | None = None
+    """Variance of the noise, in the square of the sensor's unit; a list gives one a row. Default: the model's."""
+    std: Positives | None = None
+    """Its square root: standard deviation, in the sensor's unit; a list gives one a row. Default: the model's."""
+
+    @model_validator(mode="after")
+    def _one(self) -> SpreadSection:
+        one_of(self, "variance", "std", required=False)
+        return self
+
+    @property
+    def variances(self) -> tuple[float, ...] | None:
+        """The variances, one for all rows or one a row; None leaves the model's."""
+        if self.variance is not None:
+            return self.variance
+        return tuple(std**2 for std in self.std) if self.std is not None else None

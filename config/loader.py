@@ -1,0 +1,155 @@
+"""A twin's YAML file, read and checked; every error is one line that names file, line, value and remedy."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from estimators.errors import ConfigError
+
+from .problems import nearest, report, shown
+from .schema import TwinSection
+from .yaml_lines import Key, Places, dotted, parse
+
+TWINS = Path(str(resources.files("config"))) / "twins"
+"""Folder of the twins that ship."""
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A twin's checked configuration, the text it came from, and the place of each of its values."""
+
+    config: TwinSection
+    path: Path
+    text: str
+    places: Places
+
+    def error(self, key: Key, text: str) -> ConfigError:
+        """An error about the value at `key`, which `text` goes on to describe."""
+        return ConfigError(f"{self.places.at(key)}: {dotted(key)} {text}")
+
+
+def shipped() -> list[str]:
+    """Names of the twins that ship."""
+    return sorted(path.stem for path in TWINS.glob("*.yaml"))
+
+
+def find(name: str | os.PathLike[str]) -> Path:
+    """The YAML file that a name (of a twin that ships) or a path means.
+
+    Raises:
+        ConfigError: If there is none.
+    """
+    text = os.fspath(name)
+    path = Path(text).expanduser()
+    if path.suffix not in (".yaml", ".yml") and os.sep not in text:
+        if text in shipped():
+            return TWINS / f"{text}.yaml"
+        if path.with_suffix(".yaml").is_file():
+            return path.with_suffix(".yaml")
+        raise ConfigError(
+            f"{text}: no twin of that name ships; {nearest(text, shipped())}, give a YAML file's path, or "
+            f"write one with `nisus new {text}`"
+        )
+    return path
+
+
+def shown_path(path: Path) -> str:
+    """A path as messages show it: relative to the working directory where it lies inside."""
+    try:
+        return str(path.absolute().relative_to(Path.cwd()))
+    except (ValueError, OSError):
+        return str(path)
+
+
+def load(name: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> Loaded:
+    """Read and check a twin's YAML.
+
+    Args:
+        name: Name of a twin that ships, or path of a YAML file.
+        overrides: Values by dotted key path (source.interface), as YAML text, which replace the file's.
+
+    Raises:
+        ConfigError: With a line for each of the first problems.
+    """
+    path = find(name)
+    shown_name = shown_path(path)
+    try:
+        raw = path.read_bytes()
+    except FileNotFoundError:
+        raise ConfigError(f"{shown_name}: there is no such file; check the path, or see `nisus twins`") from None
+    except IsADirectoryError:
+        raise ConfigError(f"{shown_name}: it is a folder; give the YAML file in it") from None
+    except OSError as error:
+        raise ConfigError(f"{shown_name}: it cannot be read: {error.strerror}; check its permissions") from None
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise ConfigError(f"{shown_name}:{line}: it is not UTF-8 text; is this the YAML file?") from None
+    return load_text(text, path, overrides)
+
+
+def load_text(text: str, path: Path, overrides: Mapping[str, str] | None = None) -> Loaded:
+    """Check a twin's YAML that has been read already; relative paths in it start at the folder of `path`.
+
+    Raises:
+        ConfigError: With a line for each of the first problems.
+    """
+    file = shown_path(path)
+    data, places = parse(text, file)
+    if data is None:
+        raise ConfigError(f"{file}:1: the file is empty; a twin needs at least model and source")
+    if not isinstance(data, dict):
+        raise ConfigError(f"{file}:1: the file is {shown(data)}; it must be a mapping of keys and values")
+    for key, value in (overrides or {}).items():
+        _override(data, places, key, value)
+    try:
+        config = TwinSection.model_validate(data)
+    except ValidationError as error:
+        raise report(error, data, places) from None
+    if config.name is None:
+        config = config.model_copy(update={"name": _name(path)})
+    return Loaded(config, path, text, places)
+
+
+def _name(path: Path) -> str:
+    return "".join(letter if letter.isalnum() or letter in "_-" else "_" for letter in path.stem) or "twin"
+
+
+def _override(data: dict[str, Any], places: Places, dotted_key: str, text: str) -> None:
+    """Put one command-line value where it belongs; the schema judges the result."""
+    option = f"--set {dotted_key}={text}"
+    try:
+        value, _ = parse(text, option)
+    except ConfigError:
+        raise ConfigError(f"{option}: the value is not valid YAML; put brackets and colons in quotes") from None
+    parts = dotted_key.split(".")
+    if not all(parts):
+        raise ConfigError(f"{option}: the key has an empty part; write it like source.interface")
+    key: list[str | int] = []
+    here: Any = data
+    for k, part in enumerate(parts):
+        if isinstance(here, list):
+            if not part.isdecimal() or int(part) >= len(here):
+                raise ConfigError(
+                    f"{option}: {dotted(tuple(key))} is a list; choose an entry from 0 to {len(here) - 1}"
+                )
+            key.append(int(part))
+        elif isinstance(here, dict):
+            key.append(part)
+        else:
+            raise ConfigError(f"{option}: {dotted(tuple(key))} is {shown(here)}; it has no key {part!r}")
+        if k == len(parts) - 1:
+            here[key[-1]] = value
+        elif isinstance(here, dict) and here.get(part) is None:
+            here[part] = {}
+            places.options[tuple(key)] = option
+        here = here[key[-1]]
+    places.options[tuple(key)] = option

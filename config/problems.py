@@ -1,0 +1,141 @@
+"""What pydantic found wrong, as lines that a user can act on: `file:line: key is value; rule`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+from estimators.errors import ConfigError
+
+from .yaml_lines import Key, Places, dotted
+
+MOST = 5
+"""Problems shown at once."""
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """A remedy for a name that is not among `names`: the near ones, or all."""
+    names = [str(item) for item in names]
+    near = get_close_matches(name, names, n=3, cutoff=0.6)
+    if near:
+        return f"did you mean {' or '.join(near)}?"
+    return f"choose from {', '.join(names)}" if names else "there are none to choose from"
+
+
+def shown(value: Any) -> str:
+    """A value as an error shows it."""
+    if value is None:
+        return "empty"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, dict):
+        return "a mapping"
+    if isinstance(value, (list, tuple)):
+        text = ", ".join(shown(item) for item in value)
+        return f"[{text}]" if len(text) <= 40 else f"a list of {len(value)}"
+    if isinstance(value, str):
+        value = value if len(value) <= 60 else value[:57] + "..."
+        return repr(value)
+    return str(value) if len(str(value)) <= 60 else str(value)[:57] + "..."
+
+
+def report(error: ValidationError, data: Any, places: Places) -> ConfigError:
+    """One ConfigError with a line for each of the first problems."""
+    found: dict[tuple, str] = {}  # One line a key: pydantic repeats itself for each kind that a value might have been.
+    problems = error.errors(include_url=False)
+    for problem in problems:
+        key, value = _locate(problem["loc"], data)
+        if problem["type"] == "too_short" and value != [] and len(problems) > 1:
+            continue  # Its entries are there and have problems of their own.
+        place = (key, problem["loc"][-1] if problem["type"] == "missing" else None)
+        found.setdefault(place, _line(problem, key, value, places))
+    lines = list(found.values())
+    more = len(lines) - MOST
+    if more > 0:
+        lines[MOST:] = [f"{places.file}: and {more} more"]
+    return ConfigError("\n".join(lines))
+
+
+def _line(problem: ErrorDetails, key: Key, value: Any, places: Places) -> str:
+    kind, context = problem["type"], problem.get("ctx", {})
+    if kind == "missing":
+        name = problem["loc"][-1]
+        if isinstance(name, int):
+            return f"{places.at(key)}: {dotted(key)} is {shown(value)}; it needs {name + 1} or more entries"
+        return f"{places.at(key)}: {dotted((*key, name))} is missing; add it"
+    if kind == "unknown_key":
+        stray = (*key, context["key"])
+        return f"{places.at(stray)}: {dotted(stray)} is not known; {nearest(context['key'], context['known'])}"
+    if kind in ("length", "order"):
+        key = (*key, context["key"])
+        return f"{places.at(key)}: {dotted(key)} {problem['msg']}"
+    if kind == "both":
+        return f"{places.at((*key, context['key']))}: {dotted(key)} {problem['msg']}; keep one"
+    if kind == "neither":
+        return f"{places.at(key)}: {dotted(key)} {problem['msg']}; add it"
+    if kind == "union_tag_not_found":
+        return f"{places.at(key)}: {dotted((*key, 'type'))} is missing; {_choices(problem)}"
+    if kind == "union_tag_invalid":
+        key, value = (*key, "type"), context["tag"]
+        rule = nearest(value, [item.strip("'") for item in context["expected_tags"].split(", ")])
+    else:
+        rule = _rule(kind, context, problem["msg"])
+    return f"{places.at(key)}: {dotted(key)} is {shown(value)}; {rule}"
+
+
+def _locate(loc: tuple[str | int, ...], data: Any) -> tuple[Key, Any]:
+    """The part of a pydantic location that exists in the YAML; it also names union members and lone list items."""
+    key: list[str | int] = []
+    for part in loc:
+        if isinstance(data, dict) and part in data:
+            data = data[str(part)]
+        elif isinstance(data, list) and isinstance(part, int) and part < len(data):
+            data = data[part]
+        else:
+            continue
+        key.append(part)
+    return tuple(key), data
+
+
+def _choices(problem: ErrorDetails) -> str:
+    kinds = (
+        ("simulator", "can", "can_log", "table", "merged") if problem["loc"] == ("source",) else ("can_log", "table")
+    )
+    return f"it must be one of {', '.join(kinds)}"
+
+
+_RULES = {
+    "float": "it must be a number",
+    "int": "it must be a whole number",
+    "bool": "it must be true or false",
+    "string": "it must be text; put it in quotes if it looks like a number",
+    "dict": "it must be a mapping of keys and values",
+    "model": "it must be a mapping of keys and values",
+    "tuple": "it must be a list",
+    "list": "it must be a list",
+    "finite": "it must be a finite number",
+}
+
+
+def _rule(kind: str, context: dict[str, Any], text: str) -> str:
+    if kind == "greater_than":
+        return "it must be positive" if context["gt"] == 0 else f"it must be above {context['gt']:g}"
+    if kind == "greater_than_equal":
+        return "it must be zero or positive" if context["ge"] == 0 else f"it must be {context['ge']:g} or more"
+    if kind == "less_than":
+        return f"it must be below {context['lt']:g}"
+    if kind == "literal_error":
+        return f"it must be {context['expected']}"
+    if kind == "too_short":
+        return f"it needs {context['min_length']} or more entries"
+    if kind == "too_long":
+        return f"it may have {context['max_length']} entries at most"
+    if kind == "string_too_short":
+        return "it must not be empty"
+    if kind == "string_pattern_mismatch":
+        return "use letters, digits, _ and -, and begin with a letter or digit"
+    return _RULES.get(kind.split("_")[0], text[:1].lower() + text[1:])

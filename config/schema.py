@@ -1,0 +1,131 @@
+"""The schema of a twin's YAML.
+
+The docstring under each field is its documentation in the JSON Schema that `nisus schema` writes for editors.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from .fields import Count, Flag, LevelSection, NotNegative, Number, Positive, Section, SpreadSection, Text
+from .source_schema import SourceSection
+
+
+class PriorSection(Section):
+    """What is believed of one state before the first reading."""
+
+    mean: Number | None = None
+    """Expected value, in the state's unit. Default: the model's."""
+    std: Positive | None = None
+    """Standard deviation of that belief, in the state's unit. Default: the model's."""
+
+
+class SensorSection(SpreadSection):
+    """The noise of one sensor as the estimator assumes it, and whether the estimate uses it."""
+
+    use: Flag = True
+    """false holds the sensor out: the estimate ignores it, and its prediction of it is scored. Default: true."""
+
+
+class EstimatorSection(Section):
+    """The filter that runs first; the page swaps it."""
+
+    name: Text
+    """Name in the catalogue: kf, ekf, ukf, ..."""
+    options: dict[str, Number | Flag | Text] = {}
+    """The filter's own options by name, for example {alpha: 0.5} of the UKF. Default: the catalogue's."""
+
+
+class TimeSection(Section):
+    """How the twin treats lateness and silence."""
+
+    horizon: NotNegative = 2.0
+    """Seconds: a reading later than this is counted as stale and dropped. Size it by the worst credible latency."""
+    degraded_after: Positive = 3.0
+    """Seconds without a used reading after which the twin says that it is degraded."""
+    stale_after: Positive = 15.0
+    """Seconds without a used reading after which the twin says that it is stale. Above degraded_after."""
+    tick: Positive = 0.5
+    """Seconds of silence after which the estimate is predicted and shown without a reading."""
+
+    @model_validator(mode="after")
+    def _order(self) -> TimeSection:
+        if self.stale_after < self.degraded_after:
+            raise PydanticCustomError(
+                "order",
+                "is {value} s; it must not be below degraded_after ({other} s)",
+                {"value": self.stale_after, "other": self.degraded_after, "key": "stale_after"},
+            )
+        return self
+
+
+class SceneSection(Section):
+    """The three-dimensional scene."""
+
+    kind: Literal["belief", "vehicle"] = "belief"
+    """belief: the estimate as a point with its 2-sigma ellipsoid, over `axes`. vehicle: a body on a plane."""
+    axes: Annotated[tuple[Text, ...], Field(min_length=1, max_length=3)] | None = None
+    """belief: the states along x, y and z. Default: the first three."""
+    position: tuple[Text, Text] | None = None
+    """vehicle: the states of the position to the east and to the north."""
+    heading: Text | None = None
+    """vehicle: the state of the heading, in radians from east to the left. Default: the direction of travel."""
+
+    @model_validator(mode="after")
+    def _vehicle(self) -> SceneSection:
+        if self.kind == "vehicle" and self.position is None:
+            raise PydanticCustomError("neither", "is a vehicle and has no {keys}", {"keys": "position"})
+        return self
+
+
+class ViewSection(Section):
+    """What the page draws."""
+
+    pairs: tuple[tuple[Text, Text], ...] | None = None
+    """Pairs of states whose joint covariance is drawn as an ellipse. Default: the first two states."""
+    window: Positive = 60.0
+    """Seconds that the charts show at first."""
+    scene: SceneSection = SceneSection()
+    """The three-dimensional scene. Default: the belief over the first three states."""
+
+
+def _estimator(value: Any) -> Any:
+    return {"name": value} if isinstance(value, str) else value
+
+
+class TwinSection(Section):
+    """A twin: a model of an asset, the source of its readings, and the estimator that joins them."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")] | None = None
+    """Short name: letters, digits, _ and -. Default: the file's name without its ending."""
+    title: Text | None = None
+    """One line shown at the top of the page. Default: the model's title."""
+    model: Text
+    """The model's name in the catalogue (motor_winding), or a Python file beside this one and the name of a model, or
+    of a function that returns one, in it (./pump.py:Pump)."""
+    parameters: dict[str, Number] = {}
+    """The model's parameters by name, in their units. Default: the model's values."""
+    prior: dict[str, PriorSection] = {}
+    """The belief before the first reading, by state. Default: the model's."""
+    noise: dict[str, LevelSection] = {}
+    """Process noise Q by name: how much the model is distrusted. Default: the model's."""
+    sensors: dict[str, SensorSection] = {}
+    """Sensor noise R by sensor: how much each is distrusted. Default: the model's."""
+    estimator: Annotated[
+        EstimatorSection, BeforeValidator(_estimator, json_schema_input_type=str | EstimatorSection)
+    ] = EstimatorSection(name="ekf")
+    """The filter that runs first: a name, or {name, options}. Default: ekf."""
+    gate: Annotated[float, Field(strict=True, gt=0, lt=1)] | None = None
+    """Probability with which a good reading passes the gate, for example 0.9973; readings outside are not used.
+    Default: null, no gate."""
+    time: TimeSection = TimeSection()
+    """How the twin treats lateness and silence."""
+    history: Count = 200_000
+    """Events that are kept, and folded again when the tuning changes; the oldest are forgotten."""
+    source: SourceSection
+    """Where the readings come from; its `type` is simulator, can, can_log, table or merged."""
+    view: ViewSection = ViewSection()
+    """What the page draws."""

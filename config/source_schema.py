@@ -1,0 +1,316 @@
+"""The schema of a twin's `source`: where its readings come from."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from .fields import (
+    Count,
+    LevelSection,
+    Number,
+    Numbers,
+    Positive,
+    Section,
+    SpreadSection,
+    Text,
+    Texts,
+    as_list,
+    one_of,
+)
+
+
+class RangeSection(Section):
+    """A range of values, its ends included."""
+
+    min: Number | None = None
+    """Lowest value. Default: no limit."""
+    max: Number | None = None
+    """Highest value. Default: no limit."""
+
+
+def _range(value: Any) -> Any:
+    if isinstance(value, bool):
+        value = int(value)
+    return {"min": value, "max": value} if isinstance(value, (int, float)) else value
+
+
+Range = Annotated[RangeSection, BeforeValidator(_range, json_schema_input_type=float | bool | RangeSection)]
+
+
+class ChannelSection(Section):
+    """How the values of one sensor, input or state are taken from the source: value·scale + offset, in model units."""
+
+    units: Texts | None = None
+    """Unit of each value, converted to the model's (km/h, degC, deg/s, ...). Default: the DBC's, else the model's."""
+    scale: Numbers = (1.0,)
+    """Factor applied after the unit is converted; -1 turns an axis round. A list gives one a value. Default: 1."""
+    offset: Numbers = (0.0,)
+    """Added after `scale`, in the model's unit. A list gives one a value. Default: 0."""
+    where: dict[str, Range] = {}
+    """Conditions {name: value} or {name: {min, max}} on values that came along; where one fails, the reading is
+    missing. Default: none."""
+    convert: Literal["east_north"] | None = None
+    """east_north: the two values are latitude and longitude in degrees, and become metres east and north of `origin`.
+    Default: null, no conversion."""
+    origin: tuple[Number, Number] | None = None
+    """Latitude and longitude of the local origin, degrees. Default: the first valid fix."""
+
+    def names(self) -> tuple[str, ...]:
+        """The signals or columns, one a row."""
+        raise NotImplementedError
+
+    @model_validator(mode="after")
+    def _lengths(self) -> ChannelSection:
+        count = len(self.names())
+        for key in ("units", "scale", "offset"):
+            values = getattr(self, key)
+            if values is not None and len(values) not in (1, count):
+                raise PydanticCustomError(
+                    "length",
+                    "has {have} entries; give one, or one for each of the {count} values",
+                    {"have": len(values), "count": count, "key": key},
+                )
+        if self.convert == "east_north" and count != 2:
+            raise PydanticCustomError(
+                "length",
+                "is east_north; it needs two values, latitude and longitude, and {count} are named",
+                {"count": count, "key": "convert"},
+            )
+        return self
+
+
+class SignalSection(ChannelSection):
+    """Values from the signals of one CAN message."""
+
+    message: Text
+    """The message's name in the DBC."""
+    signals: Texts
+    """Its signal's name, or a list: one for each row of the sensor."""
+
+    def names(self) -> tuple[str, ...]:
+        """The signals, one a row."""
+        return self.signals
+
+
+class ColumnSection(ChannelSection):
+    """Values from the columns of a table."""
+
+    columns: Texts
+    """The column's name, or a list: one for each row of the sensor."""
+
+    def names(self) -> tuple[str, ...]:
+        """The columns, one a row."""
+        return self.columns
+
+
+class DatabaseSection(Section):
+    """A DBC file and the bus on which it holds."""
+
+    file: Text
+    """Path of the DBC, relative to `folder` if the source has one, else to this YAML."""
+    channel: Annotated[int, Field(strict=True)] | str | None = None
+    """The bus's number or name in the log, where one log holds several. Default: null, every bus."""
+
+
+def _databases(value: Any) -> Any:
+    return [{"file": item} if isinstance(item, str) else item for item in as_list(value) or []]
+
+
+Databases = Annotated[
+    tuple[DatabaseSection, ...],
+    Field(min_length=1),
+    BeforeValidator(_databases, json_schema_input_type=str | list[str | DatabaseSection]),
+]
+
+
+class SineSection(Section):
+    """mean + amplitude·sin(2π t / period + phase)."""
+
+    mean: Number = 0.0
+    """Mean, in the input's unit. Default: 0."""
+    amplitude: Number
+    """Amplitude, in the input's unit."""
+    period: Positive
+    """Period, s."""
+    phase: Number = 0.0
+    """Phase at t = 0, rad. Default: 0."""
+
+
+class ProfileSection(Section):
+    """How one input runs over time: exactly one of these."""
+
+    constant: Number | None = None
+    """A constant, in the input's unit."""
+    steps: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] | None = None
+    """[[t, value], ...]: from t seconds on, the value; before the first, the first value."""
+    repeat: Positive | None = None
+    """Seconds after which `steps` start again. Default: null, never."""
+    sine: SineSection | None = None
+    """A sine wave."""
+
+    @model_validator(mode="after")
+    def _one(self) -> ProfileSection:
+        one_of(self, "constant", "steps", "sine", required=True)
+        if self.steps is not None:
+            times = [t for t, _ in self.steps]
+            if any(b <= a for a, b in zip(times, times[1:], strict=False)):
+                raise PydanticCustomError("order", "must have rising times; put them in order", {"key": "steps"})
+        if self.repeat is not None and (self.steps is None or self.repeat <= self.steps[-1][0]):
+            raise PydanticCustomError(
+                "order",
+                "is {value} s; it needs steps that all begin before it",
+                {"value": self.repeat, "key": "repeat"},
+            )
+        return self
+
+
+def _profiles(value: Any) -> Any:
+    return [
+        {"constant": item} if isinstance(item, (int, float)) and not isinstance(item, bool) else item
+        for item in as_list(value) or []
+    ]
+
+
+Profiles = Annotated[
+    tuple[ProfileSection, ...],
+    Field(min_length=1),
+    BeforeValidator(_profiles, json_schema_input_type=float | ProfileSection | list[float | ProfileSection]),
+]
+
+
+class PlanSection(SpreadSection):
+    """When one simulated sensor speaks, and how noisy it truly is."""
+
+    every: Count = 1
+    """Steps between its readings. Default: 1."""
+    drop_every: Count | None = None
+    """One in so many of its readings is lost. Default: null, none."""
+
+
+class TruthSection(Section):
+    """Where the simulated asset differs from the estimator's model."""
+
+    model: Text | None = None
+    """Another model with the same states, inputs and sensors: a name, or file.py:Name. Default: the twin's."""
+    parameters: dict[str, Number] = {}
+    """The asset's true parameters. Default: the twin's."""
+    noise: dict[str, LevelSection] = {}
+    """The asset's true process noise. Default: the twin's."""
+
+
+class AssetSection(Section):
+    """A simulated asset."""
+
+    seed: Annotated[int, Field(strict=True, ge=0)] = 0
+    """Seed of the noise; the same seed gives the same run. Default: 0."""
+    step: Positive = 1.0
+    """Seconds between two steps of the simulation. Default: 1."""
+    duration: Positive | None = None
+    """Seconds after which it ends. Default: null, never."""
+    initial: dict[str, Number] = {}
+    """True state at the start, by state, in its unit. Default: the prior's mean."""
+    truth: TruthSection = TruthSection()
+    """Where the asset differs from the estimator's model. Default: nowhere."""
+    inputs: dict[str, Profiles] = {}
+    """Inputs by name: a number, {steps}, {sine}, or a list of these, which is their sum. Default: the model's."""
+    sensors: dict[str, PlanSection] = {}
+    """Rates, noise and losses by sensor. Default: every sensor at every step."""
+
+
+class SimulatorSection(AssetSection):
+    """A simulated asset that gives its readings directly."""
+
+    type: Literal["simulator"]
+    """simulator"""
+
+
+class SignalMaps(Section):
+    """Which CAN signals feed the model."""
+
+    dbc: Databases
+    """The DBC file, or a list of {file, channel} where several buses have one each."""
+    sensors: dict[str, SignalSection] = {}
+    """Sensors of the model and the signals that feed them."""
+    inputs: dict[str, SignalSection] = {}
+    """Inputs of the model and the signals that feed them."""
+    truth: dict[str, SignalSection] = {}
+    """States whose true value the bus tells. They are scored and never used."""
+
+
+class CanSection(SignalMaps):
+    """A live CAN bus."""
+
+    type: Literal["can"]
+    """can"""
+    interface: Text
+    """python-can's name of the interface: virtual, udp_multicast, socketcan, pcan, ..."""
+    channel: Annotated[int, Field(strict=True)] | str
+    """The bus: vcan0, can0, 239.74.163.2, ... as the interface names it."""
+    options: dict[str, Any] = {}
+    """Further arguments of python-can's interface, for example {bitrate: 500000}. Default: none."""
+    asset: AssetSection | None = None
+    """A simulated asset: `nisus bus` plays it on the bus; with the interface `virtual` the twin does so itself."""
+    recording: Texts | None = None
+    """Recorded logs of this bus, relative to this YAML, which `nisus fold` reads in its place. Default: none."""
+
+
+class RecordingSection(Section):
+    """Where a recording lies."""
+
+    folder: Text | None = None
+    """Folder of the recordings, relative to this YAML. The environment variable NISUS_DATA replaces it. Default: null,
+    `files` are relative to this YAML."""
+    files: Texts
+    """The recording's files in their order; * and ? match. `--log FILE...` replaces them."""
+    get: Text | None = None
+    """Where to get the recording, shown when it is absent."""
+
+
+class CanLogSection(SignalMaps, RecordingSection):
+    """A recorded CAN log: MF4, BLF, ASC, TRC, candump (.log), CSV or SQLite (.db)."""
+
+    type: Literal["can_log"]
+    """can_log"""
+
+
+class TimeColumnSection(Section):
+    """The column that tells the time."""
+
+    column: Text
+    """Its name."""
+    unit: Literal["s", "ms", "us", "ns", "min", "h"] = "s"
+    """Its unit. Default: s."""
+
+
+class TableSection(RecordingSection):
+    """A table: CSV or Parquet."""
+
+    type: Literal["table"]
+    """table"""
+    time: TimeColumnSection
+    """The column that tells the time: {column, unit}."""
+    sensors: dict[str, ColumnSection] = {}
+    """Sensors of the model and the columns that feed them."""
+    inputs: dict[str, ColumnSection] = {}
+    """Inputs of the model and the columns that feed them."""
+    truth: dict[str, ColumnSection] = {}
+    """States whose true value the table tells. They are scored and never used."""
+
+
+class MergedSection(Section):
+    """Several recordings of one drive, merged in order of time."""
+
+    type: Literal["merged"]
+    """merged"""
+    parts: Annotated[
+        tuple[Annotated[CanLogSection | TableSection, Field(discriminator="type")], ...], Field(min_length=1)
+    ]
+    """The recordings: sections of type can_log or table, whose clocks agree."""
+
+
+SourceSection = Annotated[
+    SimulatorSection | CanSection | CanLogSection | TableSection | MergedSection, Field(discriminator="type")
+]
