@@ -13,12 +13,13 @@ from .jit import jit
 
 
 @jit
-def cholesky(A, U):
-    """Upper U with Uᵀ U = A, reading A's upper triangle; False if A is not positive definite. A and U may be one.
+def cholesky(A, U, n):
+    """Upper U with Uᵀ U = A for the leading n rows; False if A is not positive definite. A and U may be one.
+
+    Reads the upper triangle of A only.
 
     Source: Golub & Van Loan, Matrix Computations, 4th ed., algorithm 4.2.2 (outer product form).
     """
-    n = A.shape[0]
     for i in range(n):
         for j in range(i):
             U[i, j] = 0.0

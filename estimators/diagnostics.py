@@ -1,0 +1,167 @@
+"""Can the estimate be trusted: NIS against its chi-square bounds, health, and errors where the truth is known."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import types
+from scipy.stats import chi2
+
+from .jit import B1, F1, I1, f64, i64, jit
+from .log import READING, TRUTH, Readings
+from .track import DEGRADED, DIVERGED, GATED, STALE, TRACKING, USED, Track, track_type
+
+PROBABILITY = 0.95
+"""Of the bounds that charts and reports show."""
+
+
+class HealthPolicy(NamedTuple):
+    """When a twin may be trusted.
+
+    `window` readings are averaged. Without a reading for `degraded_after` seconds the twin is degraded, after
+    `stale_after` stale. It is degraded when the windowed NIS exceeds what chance exceeds once in a thousand windows,
+    and diverged when it is `diverged_nis` times what it should be, when the gate refuses more than `diverged_gated` of
+    the window, or when a number is not finite.
+    """
+
+    window: int = 50
+    degraded_after: float = 5.0
+    stale_after: float = 30.0
+    diverged_nis: float = 10.0
+    diverged_gated: float = 0.5
+
+
+class Bounds(NamedTuple):
+    """Chi-square quantiles by degrees of freedom: the 95 % bounds, and the bound for `degraded`."""
+
+    low: Any
+    high: Any
+    alarm: Any
+
+
+bounds_type = types.NamedTuple((F1, F1, F1), Bounds)
+policy_type = types.NamedTuple((i64, f64, f64, f64, f64), HealthPolicy)
+
+
+def chi_square_bounds(most: int) -> Bounds:
+    """Quantiles for 0 to `most` degrees of freedom."""
+    dof = np.arange(most + 1)
+    dof[0] = 1  # of no use, but chi2 has no quantile for 0
+    tail = (1.0 - PROBABILITY) / 2.0
+    return Bounds(chi2.ppf(tail, dof), chi2.ppf(1.0 - tail, dof), chi2.ppf(0.999, dof))
+
+
+def nis_bounds(dof: int, readings: int) -> tuple[float, float]:
+    """95 % bounds of the mean NIS of `readings` readings with `dof` degrees of freedom in all.
+
+    Source: Bar-Shalom, Li & Kirubarajan (2001), 5.4.2, equation 5.4.2-18.
+    """
+    tail = (1.0 - PROBABILITY) / 2.0
+    return float(chi2.ppf(tail, dof) / readings), float(chi2.ppf(1.0 - tail, dof) / readings)
+
+
+@jit
+def assess(first, last, t, kind, track, policy, bounds):
+    """Fill windowed NIS, its bounds and health of rows `first` to `last` of a track.
+
+    Each row looks back over the rows before it, so the outcome does not depend on how a fold was cut into pieces.
+    """
+    for i in range(first, last):
+        total = 0.0
+        dof = 0
+        used = 0
+        gated = 0
+        since = np.inf
+        row = i
+        while row >= 0 and used + gated < policy.window and i - row < 20 * policy.window:
+            verdict = track.verdict[row]
+            if verdict == USED:
+                total += track.nis[row]
+                dof += track.dof[row]
+                used += 1
+            elif verdict == GATED:
+                gated += 1
+            if since == np.inf and kind[row] == READING and (verdict == USED or verdict == GATED):
+                since = (t[i] - t[row]) * 1e-9
+            row -= 1
+        finite = True
+        for j in range(track.mean.shape[1]):
+            finite = finite and np.isfinite(track.mean[i, j]) and np.isfinite(track.std[i, j])
+        health = TRACKING
+        if used > 0:
+            track.nis_mean[i] = total / used
+            track.nis_low[i] = bounds.low[dof] / used
+            track.nis_high[i] = bounds.high[dof] / used
+        else:
+            track.nis_mean[i] = np.nan
+            track.nis_low[i] = np.nan
+            track.nis_high[i] = np.nan
+        if since == np.inf:
+            since = (t[i] - t[row + 1]) * 1e-9
+        if not finite:
+            health = DIVERGED
+        elif since > policy.stale_after:
+            health = STALE
+        elif used + gated >= 10 and (
+            gated > policy.diverged_gated * (used + gated) or total > policy.diverged_nis * dof
+        ):
+            health = DIVERGED
+        elif since > policy.degraded_after:
+            health = DEGRADED
+        elif used >= 10 and total > bounds.alarm[dof]:
+            health = DEGRADED
+        track.health[i] = health
+
+
+assess_signature = types.void(i64, i64, I1, B1, track_type, policy_type, bounds_type)
+
+
+class Score(NamedTuple):
+    """What a fold was worth: NIS of the used readings with its 95 % bounds, RMSE and 95 % coverage by state."""
+
+    nis: float
+    nis_low: float
+    nis_high: float
+    nis_readings: int
+    log_likelihood: float
+    readings: int
+    gated: int
+    missing: int
+    held_out: int
+    rmse: dict[str, float]
+    coverage: dict[str, float]
+
+
+def score(track: Track, events: Readings, state_names: tuple[str, ...], circular: np.ndarray | None = None) -> Score:
+    """Sum a track up. Errors are taken at the truth events, whose rows hold the estimate at that time."""
+    used = track.verdict == USED
+    dof, count = int(track.dof[used].sum()), int(used.sum())
+    low, high = nis_bounds(dof, count) if count else (np.nan, np.nan)
+    rmse: dict[str, float] = {}
+    coverage: dict[str, float] = {}
+    truth = events.kind == TRUTH
+    for j, name in enumerate(state_names):
+        rows = truth & (events.channel == j) & np.isfinite(events.value[:, 0])
+        if not rows.any():
+            continue
+        error = track.mean[rows, j] - events.value[rows, 0]
+        if circular is not None and circular[j]:
+            error = (error + np.pi) % (2.0 * np.pi) - np.pi
+        rmse[name] = float(np.sqrt(np.mean(error**2)))
+        half = chi2.ppf(PROBABILITY, 1) ** 0.5
+        coverage[name] = float(np.mean(np.abs(error) <= half * track.std[rows, j]))
+    verdicts = np.bincount(track.verdict, minlength=6)
+    return Score(
+        nis=float(track.nis[used].mean()) if count else np.nan,
+        nis_low=low,
+        nis_high=high,
+        nis_readings=count,
+        log_likelihood=float(track.log_likelihood[used].sum()),
+        readings=int((events.kind == READING).sum()),
+        gated=int(verdicts[GATED]),
+        missing=int(verdicts[4]),
+        held_out=int(verdicts[3]),
+        rmse=rmse,
+        coverage=coverage,
+    )

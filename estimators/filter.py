@@ -1,0 +1,118 @@
+"""What a filter is: four compiled functions over a flat state, and an entry that describes it.
+
+The state of a filter is one float64 array, so it can be copied, kept and restored without knowing the filter. The
+four functions read the context and change nothing else:
+
+    start(context, mean, cov, state)                                 the state that stands for N(mean, cov)
+    predict(context, u, dt, index, state, work)                      dt seconds forward, in place
+    update(context, u, sensor, y, index, state, work, innovation, innovation_std, score) -> verdict
+    describe(context, state, mean, std, cross)                       what the track shows of it
+
+`index` numbers the event in the log, so that randomness can be a function of (seed, index, member). `work` is scratch
+that starts as NaN. `score` takes NIS, degrees of freedom and log-likelihood.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import types
+
+from .context import context_type
+from .errors import EstimatorError
+from .jit import F1, F2, address, caller, f64, i64
+from .model import StateSpaceModel
+
+start_signature = types.void(context_type, F1, F2, F1)
+predict_signature = types.void(context_type, F1, f64, i64, F1, F1)
+update_signature = i64(context_type, F1, i64, F1, i64, F1, F1, F1, F1, F1)
+describe_signature = types.void(context_type, F1, F1, F1, F1)
+
+call_start = caller(start_signature)
+call_predict = caller(predict_signature)
+call_update = caller(update_signature)
+call_describe = caller(describe_signature)
+
+
+class Option(NamedTuple):
+    """One option of an estimator: where its value starts, and the range and unit that a panel offers."""
+
+    name: str
+    default: float
+    low: float
+    high: float
+    unit: str
+    meaning: str
+
+
+class Code(NamedTuple):
+    """Addresses of a filter's four functions."""
+
+    start: Any
+    predict: Any
+    update: Any
+    describe: Any
+
+
+code_type = types.NamedTuple((i64, i64, i64, i64), Code)
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """One entry of the catalogue.
+
+    `applies(model)` gives the reason why the estimator does not fit a model, or None. `state_size(nx)` and
+    `work_size(nx, ny)` count float64s. `points(context_numbers, state)` gives what to draw beside the mean (sigma
+    points, particles) as (k, nx). `tune(options, nx)` turns the options into the numbers that the functions read.
+    """
+
+    name: str
+    title: str
+    family: str
+    assumes: str
+    model_runs: str
+    fails_when: str
+    source: str
+    functions: tuple[Any, Any, Any, Any]
+    state_size: Callable[[int], int]
+    work_size: Callable[[int, int], int]
+    moments: Callable[[np.ndarray, int], tuple[np.ndarray, np.ndarray]]
+    points: Callable[[dict[str, float], np.ndarray, int], np.ndarray]
+    options: tuple[Option, ...] = ()
+    tune: Callable[[dict[str, float], int], np.ndarray] = lambda options, nx: np.zeros(1)
+    applies: Callable[[StateSpaceModel], str | None] = lambda model: None
+
+    def complete(self, options: dict[str, float]) -> dict[str, float]:
+        """The given options and the defaults of the others.
+
+        Raises:
+            EstimatorError: If an option is unknown or out of its range.
+        """
+        known = {option.name: option for option in self.options}
+        for name, value in options.items():
+            if name not in known:
+                raise EstimatorError(
+                    f"estimator {self.name} has no option {name!r}; "
+                    + (f"it has {', '.join(known)}" if known else "it has none")
+                )
+            option = known[name]
+            if not option.low <= value <= option.high:
+                raise EstimatorError(
+                    f"estimator {self.name}: {name} is {value:g}; it must lie between {option.low:g} and "
+                    f"{option.high:g}"
+                )
+        return {option.name: float(options.get(option.name, option.default)) for option in self.options}
+
+    def code(self) -> Code:
+        """Compile the four functions, or load them from the cache."""
+        return _code(self.functions)
+
+
+@lru_cache(maxsize=64)
+def _code(functions: tuple[Any, Any, Any, Any]) -> Code:
+    signatures = (start_signature, predict_signature, update_signature, describe_signature)
+    return Code(*(address(function, signature) for function, signature in zip(functions, signatures, strict=True)))

@@ -1,0 +1,325 @@
+"""The fold: an estimator over a log. Live, replay, retuning and review are all this function.
+
+    track = fold(estimator, model, tuning, log)
+
+Same log, same tuning, same seed: the same bits, in whatever pieces the events came.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numba import types
+from scipy.stats import chi2
+
+from .compiled import compile_model
+from .context import Context, context_type
+from .diagnostics import Bounds, HealthPolicy, assess, assess_signature, chi_square_bounds
+from .errors import EstimatorError
+from .filter import Code, Estimator, call_describe, call_predict, call_start, call_update, code_type
+from .jit import B1, F1, F2, I1, i64, jit
+from .log import INPUT, READING, RESET, Log
+from .model import StateSpaceModel
+from .registry import find_estimator
+from .track import MISSING, NONE, Track, track_type
+from .tuning import Tuning
+
+UNSET = np.iinfo(np.int64).min
+"""The clock before the first event, which sets it: the prior holds at that time."""
+
+SNAPSHOT_EVERY = 64
+"""Events between snapshots of the last `RECENT` events, where late readings fall."""
+
+SPARSE_EVERY = 1024
+"""Events between the snapshots kept for ever."""
+
+RECENT = 4096
+
+
+@jit
+def _advance_to(code, context, u, clock, t, index, state, work):
+    """Predict from the clock to time t, in steps no longer than the model allows."""
+    if clock == UNSET or t <= clock:
+        return
+    dt = (t - clock) * 1e-9
+    steps = 1 if dt <= context.max_step else int(np.ceil(dt / context.max_step))
+    for _ in range(steps):
+        call_predict(code.predict, context, u, dt / steps, index, state, work)
+
+
+@jit
+def run(code, context, first, start, end, t, kind, channel, value, clock, u, state, spare, work, score, track):
+    """Fold events `start` to `end`; clock (1,), u (nu,) and state are moved on in place, one track row is filled an event.
+
+    A tick or a truth is a query: it is answered from a copy of the state, so it never changes the estimate.
+    """
+    nu = u.size
+    for i in range(start, end):
+        what = kind[i]
+        index = first + i
+        for j in range(track.innovation.shape[1]):
+            track.innovation[i, j] = np.nan
+            track.innovation_std[i, j] = np.nan
+        score[0] = np.nan
+        score[1] = 0.0
+        score[2] = np.nan
+        verdict = NONE
+        if what == READING or what == INPUT:
+            _advance_to(code, context, u, clock[0], t[i], index, state, work)
+            clock[0] = t[i]
+            if what == INPUT:
+                for j in range(nu):
+                    if np.isfinite(value[i, j]):
+                        u[j] = value[i, j]
+            else:
+                verdict = call_update(
+                    code.update,
+                    context,
+                    u,
+                    channel[i],
+                    value[i],
+                    index,
+                    state,
+                    work,
+                    track.innovation[i],
+                    track.innovation_std[i],
+                    score,
+                )
+            call_describe(code.describe, context, state, track.mean[i], track.std[i], track.cross[i])
+        elif what == RESET:
+            call_start(code.start, context, context.prior_mean, context.prior_cov, state)
+            clock[0] = t[i]
+            call_describe(code.describe, context, state, track.mean[i], track.std[i], track.cross[i])
+        else:
+            if clock[0] == UNSET:
+                clock[0] = t[i]
+            for j in range(state.size):
+                spare[j] = state[j]
+            _advance_to(code, context, u, clock[0], t[i], index, spare, work)
+            call_describe(code.describe, context, spare, track.mean[i], track.std[i], track.cross[i])
+        track.nis[i] = score[0] if verdict != MISSING else np.nan
+        track.dof[i] = int(score[1])
+        track.log_likelihood[i] = score[2]
+        track.verdict[i] = verdict
+
+
+@jit
+def _begin(code, context, mean, cov, state):
+    call_start(code.start, context, mean, cov, state)
+
+
+I4 = types.int32[::1]
+begin_signature = types.void(code_type, context_type, F1, F2, F1)
+run_signature = types.void(
+    code_type, context_type, i64, i64, i64, I1, B1, I4, F2, I1, F1, F1, F1, F1, F1, track_type
+)
+
+
+class Fold:
+    """A fold that grows with its log, and can be taken back to any event to fold again from there."""
+
+    def __init__(
+        self,
+        estimator: str,
+        model: StateSpaceModel,
+        tuning: Tuning,
+        log: Log,
+        *,
+        pairs: np.ndarray | None = None,
+        policy: HealthPolicy | None = None,
+        base: tuple[np.ndarray, np.ndarray, int, np.ndarray] | None = None,
+    ) -> None:
+        """Prepare; nothing is folded yet.
+
+        Args:
+            estimator: Name in the registry.
+            model: The model; compiled on first use.
+            tuning: Noise, parameters, gate, options.
+            log: Events; the fold follows it as it grows.
+            pairs: Pairs of states whose covariance the track keeps, shape (k, 2).
+            policy: When the estimate may be trusted.
+            base: Mean, covariance, clock and inputs before the log's first event, where earlier events were dropped;
+                without it, the prior.
+
+        Raises:
+            EstimatorError: If the estimator does not exist, does not apply, or an option is out of range.
+            ModelError: If the model's functions disagree with its declaration.
+        """
+        self.estimator: Estimator = find_estimator(estimator, model)
+        self.model, self.tuning, self.log = model, tuning, log
+        self.pairs = np.zeros((0, 2), np.int64) if pairs is None else np.ascontiguousarray(pairs, np.int64)
+        self.policy = policy or HealthPolicy()
+        self.options = self.estimator.complete(dict(tuning.options))
+        self._compiled = compile_model(model)
+        self._code: Code = self.estimator.code()
+        most = model.width * max(1, self.policy.window)
+        self._bounds: Bounds = chi_square_bounds(most)
+        self._context = self._see()
+        self._state = np.empty(self.estimator.state_size(model.nx))
+        self._spare = np.empty_like(self._state)
+        self._work = np.full(self.estimator.work_size(model.nx, model.width) + 1, np.nan)
+        self._score = np.empty(3)
+        self._clock = np.array([UNSET])
+        self._u = np.array([item.default for item in model.inputs], float)
+        mean, cov = self._context.prior_mean, self._context.prior_cov
+        if base is not None:
+            mean, cov, self._clock[0], self._u[:] = base
+        self._run, self._assess, begin = _compiled()
+        begin(self._code, self._context, np.ascontiguousarray(mean), np.ascontiguousarray(cov), self._state)
+        self.n = 0
+        self._snapshots: dict[int, tuple[int, np.ndarray, np.ndarray]] = {}
+        self._remember()
+        self._rows = Track.allocate(log.capacity, model.nx, len(self.pairs), model.width)
+
+    def _see(self) -> Context:
+        model, tuning = self.model, self.tuning
+        dof = np.arange(1, model.width + 1)
+        gate = np.full(model.width + 1, np.inf)
+        if tuning.gate is not None:
+            gate[1:] = chi2.ppf(tuning.gate, dof)
+        return Context(
+            **self._compiled.static,
+            p=np.ascontiguousarray(tuning.p, float),
+            q=np.ascontiguousarray(tuning.q, float),
+            r=np.ascontiguousarray(tuning.r, float),
+            used=tuning.used.astype(np.int8),
+            gate=gate,
+            options=np.ascontiguousarray(self.estimator.tune(self.options, model.nx), float),
+            pairs=self.pairs,
+            seed=tuning.seed,
+        )
+
+    @property
+    def track(self) -> Track:
+        """Views of the rows folded so far."""
+        return self._rows.select(slice(0, self.n))
+
+    @property
+    def clock(self) -> int:
+        """Time of the state, ns."""
+        return int(self._clock[0])
+
+    @property
+    def u(self) -> np.ndarray:
+        """Inputs that hold now."""
+        return self._u.copy()
+
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (nx,) and covariance (nx, nx) at `clock`."""
+        return self.estimator.moments(self._state, self.model.nx)
+
+    def points(self) -> np.ndarray:
+        """What to draw beside the mean, (k, nx): sigma points, particles; none for most filters."""
+        return self.estimator.points(self.options, self._state, self.model.nx)
+
+    def advance(self, limit: int | None = None) -> int:
+        """Fold the events that the log has beyond `n`, at most `limit`; return how many."""
+        end = self.log.n if limit is None else min(self.log.n, self.n + limit)
+        begun = self.n
+        if self.log.capacity > len(self._rows):
+            grown = Track.allocate(self.log.capacity, self.model.nx, len(self.pairs), self.model.width)
+            for new, old in zip(grown, self._rows, strict=True):
+                new[: self.n] = old[: self.n]
+            self._rows = grown
+        log = self.log
+        while self.n < end:
+            # Far behind the end, only the snapshots that are kept for ever are worth stopping for.
+            stride = SPARSE_EVERY if end - self.n > RECENT else SNAPSHOT_EVERY
+            boundary = self.n + stride - (log.first + self.n) % stride
+            stop = min(end, boundary)
+            self._run(
+                self._code,
+                self._context,
+                log.first,
+                self.n,
+                stop,
+                log.t,
+                log.kind,
+                log.channel,
+                log.value,
+                self._clock,
+                self._u,
+                self._state,
+                self._spare,
+                self._work,
+                self._score,
+                self._rows,
+            )
+            self.n = stop
+            if stop == boundary:
+                self._remember()
+        if end > begun:
+            self._assess(begun, end, log.t, log.kind, self._rows, self.policy, self._bounds)
+        return end - begun
+
+    def _remember(self) -> None:
+        at = self.log.first + self.n
+        self._snapshots[at] = (int(self._clock[0]), self._u.copy(), self._state.copy())
+        old = at - RECENT
+        if old % SPARSE_EVERY and old in self._snapshots and old != self.log.first:
+            del self._snapshots[old]
+
+    def rewind(self, index: int) -> None:
+        """Go back so that the event at `index` (and all behind it) will be folded again."""
+        if index >= self.n:
+            return
+        limit = self.log.first + index
+        at = max(key for key in self._snapshots if key <= limit)
+        for key in [key for key in self._snapshots if key > at]:
+            del self._snapshots[key]
+        clock, u, state = self._snapshots[at]
+        self._clock[0], self._u[:], self._state[:] = clock, u, state
+        self.n = at - self.log.first
+
+    def base_at(self, index: int) -> tuple[int, tuple[np.ndarray, np.ndarray, int, np.ndarray]]:
+        """The last snapshot at or before the event `index`: its index, and what `base` takes to start there."""
+        at = max(key for key in self._snapshots if key <= self.log.first + index)
+        clock, u, state = self._snapshots[at]
+        mean, cov = self.estimator.moments(state, self.model.nx)
+        return at - self.log.first, (mean, cov, clock, u.copy())
+
+    def drop_front(self, count: int) -> None:
+        """Follow the log in forgetting its oldest `count` events, which must end at a snapshot (see `base_at`).
+
+        Call it before the log's own `drop_front`.
+        """
+        if self.log.first + count not in self._snapshots:
+            raise EstimatorError(f"cannot drop {count} events: no snapshot there; drop up to one that base_at names")
+        for column in self._rows:
+            column[: self.n - count] = column[count : self.n].copy()
+        self.n -= count
+        for key in [key for key in self._snapshots if key < self.log.first + count]:
+            del self._snapshots[key]
+
+
+def fold(
+    estimator: str,
+    model: StateSpaceModel,
+    tuning: Tuning,
+    log: Log,
+    *,
+    pairs: np.ndarray | None = None,
+    policy: HealthPolicy | None = None,
+) -> Track:
+    """Fold an estimator over a whole log.
+
+    Returns:
+        The track, one row an event.
+
+    Raises:
+        EstimatorError: If the estimator does not exist or does not apply to the model.
+        ModelError: If the model's functions disagree with its declaration.
+    """
+    growing = Fold(estimator, model, tuning, log, pairs=pairs, policy=policy)
+    growing.advance()
+    return growing.track
+
+
+@lru_cache(maxsize=1)
+def _compiled() -> tuple[Any, Any, Any]:
+    """The three entry points, compiled for their one signature (or loaded from the cache)."""
+    for function, signature in ((run, run_signature), (assess, assess_signature), (_begin, begin_signature)):
+        function.compile(signature.args)
+    return run, assess, _begin

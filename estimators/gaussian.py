@@ -1,0 +1,203 @@
+"""What the Gaussian filters share: a mean and a covariance as state, and conditioning on a reading.
+
+The state is x (nx,) followed by P (nx, nx). The filters differ only in how mean and covariance pass through f and h;
+gate, verdict, NIS and likelihood are here.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .jit import jit
+from .linalg import cholesky, mirror, solve_transposed, solve_upper, wrap
+from .track import FAILED, GATED, HELD_OUT, MISSING, USED
+
+LOG_2PI = float(np.log(2.0 * np.pi))
+
+
+def state_size(nx: int) -> int:
+    """Numbers in the state."""
+    return nx + nx * nx
+
+
+def moments(state: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (nx,) and covariance (nx, nx) of a state."""
+    return state[:nx].copy(), state[nx : nx + nx * nx].reshape(nx, nx).copy()
+
+
+def no_points(options: dict[str, float], state: np.ndarray, nx: int) -> np.ndarray:
+    """No points to draw."""
+    return np.zeros((0, nx))
+
+
+@jit
+def start(context, mean, cov, state):
+    """The state that stands for N(mean, cov)."""
+    n = mean.size
+    for i in range(n):
+        state[i] = mean[i]
+        for j in range(n):
+            state[n + i * n + j] = cov[i, j]
+
+
+@jit
+def describe(context, state, mean, std, cross):
+    """Mean, standard deviation and the configured covariances."""
+    n = mean.size
+    for i in range(n):
+        mean[i] = state[i]
+        variance = state[n + i * n + i]
+        std[i] = np.sqrt(variance) if variance >= 0.0 else np.nan
+    for k in range(cross.size):
+        cross[k] = state[n + context.pairs[k, 0] * n + context.pairs[k, 1]]
+
+
+@jit
+def wrap_mean(context, x):
+    """Bring the circular states back to ±π."""
+    for i in range(x.size):
+        if context.circular_x[i] != 0:
+            x[i] = wrap(x[i])
+
+
+@jit
+def compare(context, sensor, y, predicted, C, S, H, innovation, innovation_std):
+    """The innovation and its covariance, over the rows of the reading that are finite.
+
+    On entry S (ny, ny) holds the spread of the predicted reading, C (nx, ny) its covariance with the state and H
+    (ny, nx) the Jacobian (or nothing). On return the leading rows and columns of all three, and of `predicted`, which
+    then holds the innovation, belong to the finite rows, and S includes R. `innovation` and `innovation_std` keep the
+    reading's own rows.
+
+    Returns:
+        The number of finite rows.
+    """
+    start = context.row_start[sensor]
+    m = 0
+    for i in range(context.row_count[sensor]):
+        if not np.isfinite(y[i]):
+            continue
+        residual = y[i] - predicted[i]
+        if context.circular_y[start + i] != 0:
+            residual = wrap(residual)
+        variance = S[i, i] + context.r[start + i]
+        innovation[i] = residual
+        innovation_std[i] = np.sqrt(variance) if variance >= 0.0 else np.nan
+        predicted[m] = residual
+        # Row i moves up to m ≤ i: what it overwrites has been read.
+        column = 0
+        for j in range(i + 1):
+            if np.isfinite(y[j]):
+                S[m, column] = S[i, j]
+                S[column, m] = S[i, j]
+                column += 1
+        S[m, m] = variance
+        for j in range(C.shape[0]):
+            C[j, m] = C[j, i]
+        for j in range(H.shape[1]):
+            H[m, j] = H[i, j]
+        m += 1
+    return m
+
+
+@jit
+def judge(context, sensor, m, nu, S, U, score):
+    """NIS, log-likelihood and verdict of an innovation; U gets the Cholesky factor of S, nu becomes U⁻ᵀ nu.
+
+    NIS = νᵀ S⁻¹ ν;  log-likelihood = -½ (NIS + log det S + m log 2π)
+
+    Source: Bar-Shalom, Li & Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), 5.4.2.
+    """
+    if m == 0:
+        return MISSING
+    score[1] = m
+    if not cholesky(S, U, m):
+        return FAILED
+    solve_transposed(U, m, nu)
+    nis = 0.0
+    log_det = 0.0
+    for i in range(m):
+        nis += nu[i] * nu[i]
+        log_det += 2.0 * np.log(U[i, i])
+    score[0] = nis
+    score[2] = -0.5 * (nis + log_det + m * LOG_2PI)
+    if context.used[sensor] == 0:
+        return HELD_OUT
+    if not nis <= context.gate[m]:
+        return GATED
+    return USED
+
+
+@jit
+def gain(m, C, U, K):
+    """K = C S⁻¹ for the leading m columns, with S = Uᵀ U."""
+    for i in range(C.shape[0]):
+        for j in range(m):
+            K[i, j] = C[i, j]
+        solve_transposed(U, m, K[i])
+        solve_upper(U, m, K[i])
+
+
+@jit
+def move_mean(m, C, U, nu, x):
+    """x += C U⁻¹ ν̃, where ν̃ = U⁻ᵀ ν is the whitened innovation."""
+    solve_upper(U, m, nu)
+    for i in range(x.size):
+        for j in range(m):
+            x[i] += C[i, j] * nu[j]
+
+
+@jit
+def joseph(context, sensor, y, m, C, H, K, P, N):
+    """P ← (I - K H) P (I - K H)ᵀ + K R Kᵀ, in O(n² m); C = P Hᵀ, N (nx, nx) is scratch.
+
+    Symmetric and positive semidefinite whatever the gain. Source: Bucy & Joseph (1968), Filtering for Stochastic
+    Processes with Applications to Guidance.
+    """
+    n = P.shape[0]
+    for i in range(n):
+        for j in range(n):
+            N[i, j] = P[i, j]
+        for k in range(m):
+            a = K[i, k]
+            for j in range(n):
+                N[i, j] -= a * C[j, k]
+    for i in range(n):
+        for j in range(n):
+            P[i, j] = N[i, j]
+    start = context.row_start[sensor]
+    for k in range(m):
+        for i in range(n):
+            s = 0.0
+            for j in range(n):
+                s += N[i, j] * H[k, j]
+            C[i, k] = s
+    for i in range(n):
+        for k in range(m):
+            a = C[i, k]
+            for j in range(i + 1):
+                P[i, j] -= a * K[j, k]
+    k = 0
+    for row in range(context.row_count[sensor]):
+        if np.isfinite(y[row]):
+            variance = context.r[start + row]
+            for i in range(n):
+                a = K[i, k] * variance
+                for j in range(i + 1):
+                    P[i, j] += a * K[j, k]
+            k += 1
+    mirror(P)
+
+
+@jit
+def downdate(m, C, U, P):
+    """P ← P - K S Kᵀ, as P - W Wᵀ with W = C U⁻¹; C becomes W."""
+    n = P.shape[0]
+    for i in range(n):
+        solve_transposed(U, m, C[i])
+    for i in range(n):
+        for k in range(m):
+            a = C[i, k]
+            for j in range(i + 1):
+                P[i, j] -= a * C[j, k]
+    mirror(P)

@@ -1,0 +1,64 @@
+"""The Kalman filter: exact for a linear model with Gaussian noise."""
+
+from __future__ import annotations
+
+from . import ekf
+from .context import add_process_noise, call_f
+from .filter import Estimator
+from .gaussian import describe, moments, no_points, start, state_size, wrap_mean
+from .jacobians import state_jacobian
+from .jit import jit
+from .linalg import congruence
+from .model import StateSpaceModel
+
+
+def work_size(nx: int, ny: int) -> int:
+    """Scratch: the EKF's for the update; behind it F and the dt for which it holds, kept from step to step."""
+    return ekf.work_size(nx, ny) + nx * nx + 1
+
+
+@jit
+def predict(context, u, dt, index, state, work):
+    """x ← F x + B u;  P ← F P Fᵀ + Q.
+
+    F is the same at every x of a linear model, so it is found once for each dt, unless inputs may change it.
+    Source: Kalman (1960), doi:10.1115/1.3662552.
+    """
+    n = context.prior_mean.size
+    x = state[:n]
+    P = state[n : n + n * n].reshape((n, n))
+    forward = work[:n]
+    scratch = work[n + n * n : n + 3 * n * n].reshape((2 * n, n))
+    last = work.size - 1
+    F = work[last - n * n : last].reshape((n, n))
+    if work[last] != dt or u.size > 0:
+        state_jacobian(context, x, u, dt, F)
+        work[last] = dt
+    call_f(context.f, x, u, context.p, dt, forward)
+    congruence(F, P, scratch)
+    add_process_noise(context, x, u, dt, P, scratch[:n])
+    for i in range(n):
+        x[i] = forward[i]
+    wrap_mean(context, x)
+
+
+def applies(model: StateSpaceModel) -> str | None:
+    """Only a linear model has one F and one H."""
+    return None if model.linear else f"{model.name} is not linear; use an extended or unscented Kalman filter"
+
+
+KF = Estimator(
+    name="kf",
+    title="Kalman filter",
+    family="Gaussian",
+    assumes="linear f and h, Gaussian noise; then exact",
+    model_runs="1",
+    fails_when="the model is wrong: the NIS leaves its bounds",
+    source="Kalman (1960), doi:10.1115/1.3662552",
+    functions=(start, predict, ekf.update, describe),
+    state_size=state_size,
+    work_size=work_size,
+    moments=moments,
+    points=no_points,
+    applies=applies,
+)
