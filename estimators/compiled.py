@@ -29,6 +29,7 @@ from .jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step_f, complex_
 from .jit import address, jit
 from .model import StateSpaceModel
 
+
 @dataclass(frozen=True)
 class CompiledModel:
     """A model whose functions are machine code; `f`, `h[k]` and `Q` can be called from Python too."""
@@ -122,8 +123,8 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
             "row_count": np.array([len(sensor.rows) for sensor in model.sensors], np.int64),
             "circular_x": np.array([state.circular for state in model.states], np.int8),
             "circular_y": np.array([row.circular for sensor in model.sensors for row in sensor.rows], np.int8),
-            "noise_state": np.array(noise_state, np.int64),
             "max_step": float(model.max_step),
+            "noise_state": np.array(noise_state, np.int64),
             "prior_mean": np.array([state.mean for state in model.states], float),
             "prior_cov": np.diag([state.std**2 for state in model.states]).astype(float),
         },

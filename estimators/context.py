@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from numba import types
 
-from .jit import B1, C1, F1, F2, I1, I2, caller, f64, i64, jit
+from .jit import C1, F1, F2, caller, f64, flags, floats, i64, ints, jit
 
 f_signature = types.void(F1, F1, F1, f64, F1)
 f_complex_signature = types.void(C1, F1, F1, f64, C1)
@@ -26,8 +26,16 @@ call_Q = caller(Q_signature)
 
 
 class Context(NamedTuple):
-    """All that a compiled filter may know: the model's code and layout, the tuning, the options. Never written to."""
+    """All that a compiled filter may know: the model's code and layout, the tuning, the options. Never written to.
 
+    Plain numbers: sizes, modes, and addresses of code and of arrays, which the functions below turn into views.
+    Passing forty numbers on costs nothing; passing twenty counted arrays costs more than a small filter's step.
+    """
+
+    nx: Any
+    nu: Any
+    n_parameters: Any
+    n_noises: Any
     f: Any
     f_complex: Any
     F: Any
@@ -37,8 +45,10 @@ class Context(NamedTuple):
     h_complex: Any
     H: Any
     H_mode: Any
+    n_sensors: Any
     row_start: Any
     row_count: Any
+    n_rows: Any
     circular_x: Any
     circular_y: Any
     noise_state: Any
@@ -50,30 +60,88 @@ class Context(NamedTuple):
     r: Any
     used: Any
     gate: Any
+    width: Any
     options: Any
+    n_options: Any
     pairs: Any
+    n_pairs: Any
     seed: Any
 
 
-context_type = types.NamedTuple(
-    (i64, i64, i64, i64, i64, I1, I1, I1, I1, I1, I1, B1, B1, I1, f64, F1, F2, F1, F1, F1, B1, F1, F1, I2, i64),
-    Context,
-)
+context_type = types.NamedTuple(tuple(f64 if name == "max_step" else i64 for name in Context._fields), Context)
+
+
+@jit
+def parameters(context):
+    """The model's parameters p."""
+    return floats(context.p, context.n_parameters)
+
+
+@jit
+def process_variances(context):
+    """q (nw,): the variance that each process noise adds in a second."""
+    return floats(context.q, context.n_noises)
+
+
+@jit
+def sensor_rows(context, sensor):
+    """A sensor's first row among all rows, and how many it has."""
+    return ints(context.row_start, context.n_sensors)[sensor], ints(context.row_count, context.n_sensors)[sensor]
+
+
+@jit
+def sensor_variances(context, sensor):
+    """r (ny,): the variances of one sensor's rows."""
+    first, count = sensor_rows(context, sensor)
+    return floats(context.r, context.n_rows)[first : first + count]
+
+
+@jit
+def circular_states(context):
+    """For each state, whether it is an angle (int8)."""
+    return flags(context.circular_x, context.nx)
+
+
+@jit
+def circular_rows(context, sensor):
+    """For each row of a sensor, whether it is an angle (int8)."""
+    first, count = sensor_rows(context, sensor)
+    return flags(context.circular_y, context.n_rows)[first : first + count]
+
+
+@jit
+def options(context):
+    """The numbers that the estimator's `tune` made of its options."""
+    return floats(context.options, context.n_options)
+
+
+@jit
+def transition(context, x, u, dt, out):
+    """out = f(x, u, p, dt)."""
+    call_f(context.f, x, u, parameters(context), dt, out)
+
+
+@jit
+def expect(context, sensor, x, u, out):
+    """out = h(x, u, p) of one sensor."""
+    call_h(ints(context.h, context.n_sensors)[sensor], x, u, parameters(context), out)
 
 
 @jit
 def add_process_noise(context, x, u, dt, P, scratch):
     """Add Q(x, u, p, q, dt) to P (nx, nx), or q·dt on the diagonal where the model gives no Q."""
-    n = P.shape[0]
+    n = context.nx
+    q = process_variances(context)
     if context.Q == 0:
-        for k in range(context.noise_state.size):
-            j = context.noise_state[k]
-            P[j, j] += context.q[k] * dt
+        state = ints(context.noise_state, context.n_noises)
+        for k in range(q.size):
+            j = state[k]
+            P[j, j] += q[k] * dt
         return
     for i in range(n):
         for j in range(n):
             scratch[i, j] = 0.0
-    call_Q(context.Q, x, u, context.p, context.q, dt, scratch)
+    call_Q(context.Q, x, u, parameters(context), q, dt, scratch)
     for i in range(n):
         for j in range(n):
             P[i, j] += scratch[i, j]

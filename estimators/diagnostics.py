@@ -8,7 +8,7 @@ import numpy as np
 from numba import types
 from scipy.stats import chi2
 
-from .jit import B1, F1, I1, f64, i64, jit
+from .jit import F1, I1, f64, i64, jit
 from .log import READING, TRUTH, Readings
 from .track import DEGRADED, DIVERGED, GATED, STALE, TRACKING, USED, Track, track_type
 
@@ -62,7 +62,7 @@ def nis_bounds(dof: int, readings: int) -> tuple[float, float]:
 
 
 @jit
-def assess(first, last, t, kind, track, policy, bounds):
+def assess(first, last, t, track, policy, bounds):
     """Fill windowed NIS, its bounds and health of rows `first` to `last` of a track.
 
     Each row looks back over the rows before it, so the outcome does not depend on how a fold was cut into pieces.
@@ -72,9 +72,8 @@ def assess(first, last, t, kind, track, policy, bounds):
         dof = 0
         used = 0
         gated = 0
-        since = np.inf
         row = i
-        while row >= 0 and used + gated < policy.window and i - row < 20 * policy.window:
+        while row >= 0 and used + gated < policy.window and i - row < 5 * policy.window:
             verdict = track.verdict[row]
             if verdict == USED:
                 total += track.nis[row]
@@ -82,9 +81,11 @@ def assess(first, last, t, kind, track, policy, bounds):
                 used += 1
             elif verdict == GATED:
                 gated += 1
-            if since == np.inf and kind[row] == READING and (verdict == USED or verdict == GATED):
-                since = (t[i] - t[row]) * 1e-9
             row -= 1
+        if i == 0 or track.verdict[i] == USED or track.verdict[i] == GATED:
+            track.age[i] = 0.0
+        else:
+            track.age[i] = track.age[i - 1] + (t[i] - t[i - 1]) * 1e-9
         finite = True
         for j in range(track.mean.shape[1]):
             finite = finite and np.isfinite(track.mean[i, j]) and np.isfinite(track.std[i, j])
@@ -97,24 +98,22 @@ def assess(first, last, t, kind, track, policy, bounds):
             track.nis_mean[i] = np.nan
             track.nis_low[i] = np.nan
             track.nis_high[i] = np.nan
-        if since == np.inf:
-            since = (t[i] - t[row + 1]) * 1e-9
         if not finite:
             health = DIVERGED
-        elif since > policy.stale_after:
+        elif track.age[i] > policy.stale_after:
             health = STALE
         elif used + gated >= 10 and (
             gated > policy.diverged_gated * (used + gated) or total > policy.diverged_nis * dof
         ):
             health = DIVERGED
-        elif since > policy.degraded_after:
+        elif track.age[i] > policy.degraded_after:
             health = DEGRADED
         elif used >= 10 and total > bounds.alarm[dof]:
             health = DEGRADED
         track.health[i] = health
 
 
-assess_signature = types.void(i64, i64, I1, B1, track_type, policy_type, bounds_type)
+assess_signature = types.void(i64, i64, I1, track_type, policy_type, bounds_type)
 
 
 class Score(NamedTuple):

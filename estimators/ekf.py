@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .context import add_process_noise, call_f, call_h
+from .context import add_process_noise, expect, sensor_rows, transition
 from .filter import Estimator
 from .gaussian import (
     compare,
@@ -34,14 +34,14 @@ def predict(context, u, dt, index, state, work):
 
     Source: Jazwinski (1970), Stochastic Processes and Filtering Theory, theorem 8.1.
     """
-    n = context.prior_mean.size
+    n = context.nx
     x = state[:n]
     P = state[n : n + n * n].reshape((n, n))
     forward = work[:n]
     F = work[n : n + n * n].reshape((n, n))
     scratch = work[n + n * n : n + 3 * n * n].reshape((2 * n, n))
     state_jacobian(context, x, u, dt, F)
-    call_f(context.f, x, u, context.p, dt, forward)
+    transition(context, x, u, dt, forward)
     congruence(F, P, scratch)
     # Noise that depends on the state does so where the step began.
     add_process_noise(context, x, u, dt, P, scratch[:n])
@@ -57,8 +57,8 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     Diverges when h curves strongly within the spread of the prediction: P then shrinks faster than the error.
     Source: Jazwinski (1970), theorem 8.1.
     """
-    n = context.prior_mean.size
-    m = context.row_count[sensor]
+    n = context.nx
+    _, m = sensor_rows(context, sensor)
     x = state[:n]
     P = state[n : n + n * n].reshape((n, n))
     at = 0
@@ -76,7 +76,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     at += n * m
     N = work[at : at + n * n].reshape((n, n))
     sensor_jacobian(context, sensor, x, u, H)
-    call_h(context.h[sensor], x, u, context.p, nu)
+    expect(context, sensor, x, u, nu)
     for i in range(n):
         for k in range(m):
             s = 0.0

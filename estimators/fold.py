@@ -19,7 +19,7 @@ from .context import Context, context_type
 from .diagnostics import Bounds, HealthPolicy, assess, assess_signature, chi_square_bounds
 from .errors import EstimatorError
 from .filter import Code, Estimator, call_describe, call_predict, call_start, call_update, code_type
-from .jit import B1, F1, F2, I1, i64, jit
+from .jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, jit
 from .log import INPUT, READING, RESET, Log
 from .model import StateSpaceModel
 from .registry import find_estimator
@@ -51,17 +51,29 @@ def _advance_to(code, context, u, clock, t, index, state, work):
 
 @jit
 def run(code, context, first, start, end, t, kind, channel, value, clock, u, state, spare, work, score, track):
-    """Fold events `start` to `end`; clock (1,), u (nu,) and state are moved on in place, one track row is filled an event.
+    """Fold events `start` to `end`: clock (1,), u (nu,) and state move on in place, one track row is filled an event.
 
     A tick or a truth is a query: it is answered from a copy of the state, so it never changes the estimate.
     """
     nu = u.size
+    nx = context.nx
+    u = borrowed(u)
+    state = borrowed(state)
+    spare = borrowed(spare)
+    work = borrowed(work)
+    score = borrowed(score)
+    value = borrowed_rows(value)
+    mean = borrowed_rows(track.mean)
+    std = borrowed_rows(track.std)
+    cross = borrowed_rows(track.cross)
+    innovation = borrowed_rows(track.innovation)
+    innovation_std = borrowed_rows(track.innovation_std)
     for i in range(start, end):
         what = kind[i]
         index = first + i
-        for j in range(track.innovation.shape[1]):
-            track.innovation[i, j] = np.nan
-            track.innovation_std[i, j] = np.nan
+        for j in range(innovation.shape[1]):
+            innovation[i, j] = np.nan
+            innovation_std[i, j] = np.nan
         score[0] = np.nan
         score[1] = 0.0
         score[2] = np.nan
@@ -83,22 +95,23 @@ def run(code, context, first, start, end, t, kind, channel, value, clock, u, sta
                     index,
                     state,
                     work,
-                    track.innovation[i],
-                    track.innovation_std[i],
+                    innovation[i],
+                    innovation_std[i],
                     score,
                 )
-            call_describe(code.describe, context, state, track.mean[i], track.std[i], track.cross[i])
+            call_describe(code.describe, context, state, mean[i], std[i], cross[i])
         elif what == RESET:
-            call_start(code.start, context, context.prior_mean, context.prior_cov, state)
+            prior_cov = floats(context.prior_cov, nx * nx).reshape((nx, nx))
+            call_start(code.start, context, floats(context.prior_mean, nx), prior_cov, state)
             clock[0] = t[i]
-            call_describe(code.describe, context, state, track.mean[i], track.std[i], track.cross[i])
+            call_describe(code.describe, context, state, mean[i], std[i], cross[i])
         else:
             if clock[0] == UNSET:
                 clock[0] = t[i]
             for j in range(state.size):
                 spare[j] = state[j]
             _advance_to(code, context, u, clock[0], t[i], index, spare, work)
-            call_describe(code.describe, context, spare, track.mean[i], track.std[i], track.cross[i])
+            call_describe(code.describe, context, spare, mean[i], std[i], cross[i])
         track.nis[i] = score[0] if verdict != MISSING else np.nan
         track.dof[i] = int(score[1])
         track.log_likelihood[i] = score[2]
@@ -163,7 +176,7 @@ class Fold:
         self._score = np.empty(3)
         self._clock = np.array([UNSET])
         self._u = np.array([item.default for item in model.inputs], float)
-        mean, cov = self._context.prior_mean, self._context.prior_cov
+        mean, cov = self._held["prior_mean"], self._held["prior_cov"]
         if base is not None:
             mean, cov, self._clock[0], self._u[:] = base
         self._run, self._assess, begin = _compiled()
@@ -174,22 +187,36 @@ class Fold:
         self._rows = Track.allocate(log.capacity, model.nx, len(self.pairs), model.width)
 
     def _see(self) -> Context:
+        """The context of this model and tuning; the arrays that it points to are kept in `self._held`."""
         model, tuning = self.model, self.tuning
-        dof = np.arange(1, model.width + 1)
         gate = np.full(model.width + 1, np.inf)
         if tuning.gate is not None:
-            gate[1:] = chi2.ppf(tuning.gate, dof)
-        return Context(
-            **self._compiled.static,
-            p=np.ascontiguousarray(tuning.p, float),
-            q=np.ascontiguousarray(tuning.q, float),
-            r=np.ascontiguousarray(tuning.r, float),
-            used=tuning.used.astype(np.int8),
-            gate=gate,
-            options=np.ascontiguousarray(self.estimator.tune(self.options, model.nx), float),
-            pairs=self.pairs,
-            seed=tuning.seed,
-        )
+            gate[1:] = chi2.ppf(tuning.gate, np.arange(1, model.width + 1))
+        held = {
+            "p": np.ascontiguousarray(tuning.p, float),
+            "q": np.ascontiguousarray(tuning.q, float),
+            "r": np.ascontiguousarray(tuning.r, float),
+            "used": tuning.used.astype(np.int8),
+            "gate": gate,
+            "options": np.ascontiguousarray(self.estimator.tune(self.options, model.nx), float),
+            "pairs": self.pairs,
+        }
+        values = {**self._compiled.static, **held}
+        self._held = values
+        sizes = {
+            "nx": model.nx,
+            "nu": model.nu,
+            "n_parameters": held["p"].size,
+            "n_noises": held["q"].size,
+            "n_sensors": len(model.sensors),
+            "n_rows": held["r"].size,
+            "n_options": held["options"].size,
+            "n_pairs": len(self.pairs),
+            "width": model.width,
+            "seed": tuning.seed,
+        }
+        plain = {k: v.ctypes.data if isinstance(v, np.ndarray) else v for k, v in values.items()}
+        return Context(**plain, **sizes)
 
     @property
     def track(self) -> Track:
@@ -251,7 +278,7 @@ class Fold:
             if stop == boundary:
                 self._remember()
         if end > begun:
-            self._assess(begun, end, log.t, log.kind, self._rows, self.policy, self._bounds)
+            self._assess(begun, end, log.t, self._rows, self.policy, self._bounds)
         return end - begun
 
     def _remember(self) -> None:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .jit import jit
+from .context import circular_rows, circular_states, sensor_variances
+from .jit import flags, floats, ints, jit
 from .linalg import cholesky, mirror, solve_transposed, solve_upper, wrap
 from .track import FAILED, GATED, HELD_OUT, MISSING, USED
 
@@ -48,15 +49,17 @@ def describe(context, state, mean, std, cross):
         mean[i] = state[i]
         variance = state[n + i * n + i]
         std[i] = np.sqrt(variance) if variance >= 0.0 else np.nan
+    pairs = ints(context.pairs, 2 * context.n_pairs)
     for k in range(cross.size):
-        cross[k] = state[n + context.pairs[k, 0] * n + context.pairs[k, 1]]
+        cross[k] = state[n + pairs[2 * k] * n + pairs[2 * k + 1]]
 
 
 @jit
 def wrap_mean(context, x):
     """Bring the circular states back to ±π."""
+    circular = circular_states(context)
     for i in range(x.size):
-        if context.circular_x[i] != 0:
+        if circular[i] != 0:
             x[i] = wrap(x[i])
 
 
@@ -72,15 +75,16 @@ def compare(context, sensor, y, predicted, C, S, H, innovation, innovation_std):
     Returns:
         The number of finite rows.
     """
-    start = context.row_start[sensor]
+    r = sensor_variances(context, sensor)
+    circular = circular_rows(context, sensor)
     m = 0
-    for i in range(context.row_count[sensor]):
+    for i in range(r.size):
         if not np.isfinite(y[i]):
             continue
         residual = y[i] - predicted[i]
-        if context.circular_y[start + i] != 0:
+        if circular[i] != 0:
             residual = wrap(residual)
-        variance = S[i, i] + context.r[start + i]
+        variance = S[i, i] + r[i]
         innovation[i] = residual
         innovation_std[i] = np.sqrt(variance) if variance >= 0.0 else np.nan
         predicted[m] = residual
@@ -121,9 +125,9 @@ def judge(context, sensor, m, nu, S, U, score):
         log_det += 2.0 * np.log(U[i, i])
     score[0] = nis
     score[2] = -0.5 * (nis + log_det + m * LOG_2PI)
-    if context.used[sensor] == 0:
+    if flags(context.used, context.n_sensors)[sensor] == 0:
         return HELD_OUT
-    if not nis <= context.gate[m]:
+    if not nis <= floats(context.gate, context.width + 1)[m]:
         return GATED
     return USED
 
@@ -165,7 +169,7 @@ def joseph(context, sensor, y, m, C, H, K, P, N):
     for i in range(n):
         for j in range(n):
             P[i, j] = N[i, j]
-    start = context.row_start[sensor]
+    r = sensor_variances(context, sensor)
     for k in range(m):
         for i in range(n):
             s = 0.0
@@ -178,9 +182,9 @@ def joseph(context, sensor, y, m, C, H, K, P, N):
             for j in range(i + 1):
                 P[i, j] -= a * K[j, k]
     k = 0
-    for row in range(context.row_count[sensor]):
+    for row in range(r.size):
         if np.isfinite(y[row]):
-            variance = context.r[start + row]
+            variance = r[row]
             for i in range(n):
                 a = K[i, k] * variance
                 for j in range(i + 1):

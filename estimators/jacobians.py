@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .context import call_F, call_f, call_f_complex, call_H, call_h, call_h_complex
-from .jit import jit
+from .context import call_F, call_f_complex, call_H, call_h_complex, expect, parameters, transition
+from .jit import ints, jit
 
 ANALYTIC, COMPLEX_STEP, CENTRAL = range(3)
 """How a Jacobian is found: the model's own function, complex step, central differences."""
@@ -55,9 +55,9 @@ def complex_step_h(target, x, u, p, J):
 def state_jacobian(context, x, u, dt, F):
     """Fill F (nx, nx) with df/dx at x."""
     if context.F_mode == ANALYTIC:
-        call_F(context.F, x, u, context.p, dt, F)
+        call_F(context.F, x, u, parameters(context), dt, F)
     elif context.F_mode == COMPLEX_STEP:
-        complex_step_f(context.f_complex, x, u, context.p, dt, F)
+        complex_step_f(context.f_complex, x, u, parameters(context), dt, F)
     else:
         n = x.size
         z = x.copy()
@@ -67,10 +67,10 @@ def state_jacobian(context, x, u, dt, F):
             step = _CENTRAL_STEP * max(1.0, abs(x[j]))
             z[j] = x[j] + step
             above = z[j]
-            call_f(context.f, z, u, context.p, dt, high)
+            transition(context, z, u, dt, high)
             z[j] = x[j] - step
             below = z[j]
-            call_f(context.f, z, u, context.p, dt, low)
+            transition(context, z, u, dt, low)
             z[j] = x[j]
             for i in range(n):
                 F[i, j] = (high[i] - low[i]) / (above - below)
@@ -79,11 +79,11 @@ def state_jacobian(context, x, u, dt, F):
 @jit
 def sensor_jacobian(context, sensor, x, u, H):
     """Fill H (ny, nx) with dh/dx of one sensor at x."""
-    mode = context.H_mode[sensor]
+    mode = ints(context.H_mode, context.n_sensors)[sensor]
     if mode == ANALYTIC:
-        call_H(context.H[sensor], x, u, context.p, H)
+        call_H(ints(context.H, context.n_sensors)[sensor], x, u, parameters(context), H)
     elif mode == COMPLEX_STEP:
-        complex_step_h(context.h_complex[sensor], x, u, context.p, H)
+        complex_step_h(ints(context.h_complex, context.n_sensors)[sensor], x, u, parameters(context), H)
     else:
         m, n = H.shape
         z = x.copy()
@@ -93,10 +93,10 @@ def sensor_jacobian(context, sensor, x, u, H):
             step = _CENTRAL_STEP * max(1.0, abs(x[j]))
             z[j] = x[j] + step
             above = z[j]
-            call_h(context.h[sensor], z, u, context.p, high)
+            expect(context, sensor, z, u, high)
             z[j] = x[j] - step
             below = z[j]
-            call_h(context.h[sensor], z, u, context.p, low)
+            expect(context, sensor, z, u, low)
             z[j] = x[j]
             for i in range(m):
                 H[i, j] = (high[i] - low[i]) / (above - below)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba import njit, types
+from numba import carray, njit, types
 from numba.core import cgutils
 from numba.experimental.function_type import _get_jit_address
 from numba.extending import intrinsic
@@ -46,7 +46,7 @@ if "NUMBA_CACHE_DIR" not in os.environ:
     numba.config.CACHE_DIR = str(cache_folder())
 
 jit = partial(njit, cache=True, nogil=True, error_model="numpy")
-"""Numba's njit as used here: cached, without the GIL, and with IEEE division (a zero divisor gives inf, not an error)."""
+"""Numba's njit as used here: cached, without the GIL, and with IEEE division (zero divisors give inf, no error)."""
 
 
 def address(dispatcher: Any, signature: Any) -> int:
@@ -76,3 +76,51 @@ def caller(signature: Any) -> Any:
         return result(i64, types.StarArgTuple(args)), codegen
 
     return call
+
+
+def _pointer_to(element: Any) -> Any:
+    """A function for compiled code that reads an integer as a pointer to `element`s."""
+
+    @intrinsic
+    def pointer(typing_context: Any, target: Any) -> Any:
+        def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+            return builder.inttoptr(given[0], context.get_value_type(signature.return_type))
+
+        return types.CPointer(element)(i64), codegen
+
+    return pointer
+
+
+_to_float = _pointer_to(types.float64)
+_to_int = _pointer_to(types.int64)
+_to_byte = _pointer_to(types.int8)
+
+
+@jit
+def floats(target, n):
+    """The n float64s at an address, as an array that is not reference-counted (counting costs more than the filter)."""
+    return carray(_to_float(target), (n,))
+
+
+@jit
+def ints(target, n):
+    """The n int64s at an address."""
+    return carray(_to_int(target), (n,))
+
+
+@jit
+def flags(target, n):
+    """The n int8s at an address."""
+    return carray(_to_byte(target), (n,))
+
+
+@jit
+def borrowed(vector):
+    """The same float64s, not reference-counted."""
+    return floats(vector.ctypes.data, vector.size)
+
+
+@jit
+def borrowed_rows(matrix):
+    """The same matrix of float64s, not reference-counted."""
+    return carray(_to_float(matrix.ctypes.data), matrix.shape)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from . import ekf
-from .context import add_process_noise, call_f
+from .context import add_process_noise, transition
 from .filter import Estimator
 from .gaussian import describe, moments, no_points, start, state_size, wrap_mean
 from .jacobians import state_jacobian
@@ -24,7 +24,7 @@ def predict(context, u, dt, index, state, work):
     F is the same at every x of a linear model, so it is found once for each dt, unless inputs may change it.
     Source: Kalman (1960), doi:10.1115/1.3662552.
     """
-    n = context.prior_mean.size
+    n = context.nx
     x = state[:n]
     P = state[n : n + n * n].reshape((n, n))
     forward = work[:n]
@@ -34,7 +34,7 @@ def predict(context, u, dt, index, state, work):
     if work[last] != dt or u.size > 0:
         state_jacobian(context, x, u, dt, F)
         work[last] = dt
-    call_f(context.f, x, u, context.p, dt, forward)
+    transition(context, x, u, dt, forward)
     congruence(F, P, scratch)
     add_process_noise(context, x, u, dt, P, scratch[:n])
     for i in range(n):

@@ -137,7 +137,7 @@ class StateSpaceModel:
             strays = [noise.name for noise in self.noises if noise.name not in self.state_names]
             if strays:
                 raise ModelError(
-                    f"model {self.name}: noise {strays[0]!r} is not a state; name a state, or write Q(x, u, p, q, dt, out)"
+                    f"model {self.name}: noise {strays[0]!r} is not a state; name one, or write Q(x, u, p, q, dt, out)"
                 )
         if not self.max_step > 0:
             raise ModelError(f"model {self.name}: max_step is {self.max_step} s; it must be positive")

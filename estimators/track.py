@@ -27,7 +27,8 @@ class Track(NamedTuple):
     mean, std (N, nx): the estimate after the event, in the units of the states. cross (N, pairs): the covariance of
     each configured pair of states. innovation, innovation_std (N, width): reading minus prediction and the square
     root of S's diagonal; NaN where there is none. nis: νᵀ S⁻¹ ν, `dof` its degrees of freedom. nis_mean with
-    nis_low and nis_high: mean NIS over the last readings, and its 95 % bounds.
+    nis_low and nis_high: mean NIS over the last readings, and its 95 % bounds. age: seconds since the last reading that
+    was used or gated. age: seconds since a reading was last used.
     """
 
     mean: Any
@@ -39,6 +40,7 @@ class Track(NamedTuple):
     log_likelihood: Any
     dof: Any
     verdict: Any
+    age: Any
     nis_mean: Any
     nis_low: Any
     nis_high: Any
@@ -50,8 +52,8 @@ class Track(NamedTuple):
         matrix = [np.full((rows, k), np.nan) for k in (nx, nx, pairs, width, width)]
         vectors = [np.full(rows, np.nan) for _ in range(2)]
         codes = [np.zeros(rows, np.int8) for _ in range(2)]
-        bounds = [np.full(rows, np.nan) for _ in range(3)]
-        return Track(*matrix, *vectors, *codes, *bounds, np.zeros(rows, np.int8))
+        windowed = [np.full(rows, np.nan) for _ in range(4)]
+        return Track(*matrix, *vectors, *codes, *windowed, np.zeros(rows, np.int8))
 
     def select(self, index: object) -> Track:
         """The rows that a slice, mask or index array picks."""
@@ -66,4 +68,4 @@ class Track(NamedTuple):
         return int(self.nis.size)
 
 
-track_type = types.NamedTuple((F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, B1), Track)
+track_type = types.NamedTuple((F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, F1, B1), Track)

@@ -11,7 +11,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from .context import add_process_noise, call_f, call_h
+from .context import (
+    add_process_noise,
+    circular_rows,
+    circular_states,
+    expect,
+    options,
+    sensor_rows,
+    transition,
+)
 from .filter import Estimator, Option
 from .gaussian import compare, describe, downdate, judge, moments, move_mean, start, state_size, wrap_mean
 from .jit import jit
@@ -22,19 +30,19 @@ CENTRAL_COV, OUTER, SPREAD = range(3)
 """Positions in the context's options: the central covariance weight, the outer weight, √(n+λ)."""
 
 
-def tune(options: dict[str, float], nx: int) -> np.ndarray:
+def tune(values: dict[str, float], nx: int) -> np.ndarray:
     """The weights that alpha, beta and kappa give for nx states."""
-    alpha, beta, kappa = options["alpha"], options["beta"], options["kappa"]
+    alpha, beta, kappa = values["alpha"], values["beta"], values["kappa"]
     total = alpha**2 * (nx + kappa)
     central = 1.0 - nx / total
     return np.array([central + 1.0 - alpha**2 + beta, 0.5 / total, np.sqrt(total)])
 
 
-def points(options: dict[str, float], state: np.ndarray, nx: int) -> np.ndarray:
+def points(values: dict[str, float], state: np.ndarray, nx: int) -> np.ndarray:
     """The sigma points (2 nx + 1, nx) of a state."""
     x, P = moments(state, nx)
     try:
-        U = np.linalg.cholesky(P).T * tune(options, nx)[SPREAD]
+        U = np.linalg.cholesky(P).T * tune(values, nx)[SPREAD]
     except np.linalg.LinAlgError:
         return np.zeros((0, nx))
     return np.vstack((x, x + U, x - U))
@@ -76,7 +84,7 @@ def predict(context, u, dt, index, state, work):
     Fails when P loses positive definiteness; the state then becomes NaN and the twin reports divergence.
     Source: Julier & Uhlmann (2004), section IV.
     """
-    n = context.prior_mean.size
+    n = context.nx
     x = state[:n]
     P = state[n : n + n * n].reshape((n, n))
     U = work[: n * n].reshape((n, n))
@@ -85,23 +93,24 @@ def predict(context, u, dt, index, state, work):
     at += (2 * n + 1) * n
     point = work[at : at + n]
     forward = work[at + n : at + 2 * n]
-    w = context.options[OUTER]
-    spread = context.options[SPREAD]
+    weights = options(context)
+    w = weights[OUTER]
+    spread = weights[SPREAD]
     if not cholesky(P, U, n):
         for i in range(state.size):
             state[i] = np.nan
         return
-    call_f(context.f, x, u, context.p, dt, D[0])
+    transition(context, x, u, dt, D[0])
     for k in range(n):
         for j in range(n):
             point[j] = x[j] + spread * U[k, j]
-        call_f(context.f, point, u, context.p, dt, D[1 + k])
+        transition(context, point, u, dt, D[1 + k])
         for j in range(n):
             point[j] = x[j] - spread * U[k, j]
-        call_f(context.f, point, u, context.p, dt, D[1 + n + k])
-    _mean_of(D, w, context.circular_x, forward)
+        transition(context, point, u, dt, D[1 + n + k])
+    _mean_of(D, w, circular_states(context), forward)
     for i in range(n):
-        a = context.options[CENTRAL_COV] * D[0, i]
+        a = weights[CENTRAL_COV] * D[0, i]
         for j in range(i + 1):
             P[i, j] = a * D[0, j]
     for k in range(1, 2 * n + 1):
@@ -122,8 +131,8 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
 
     Source: Julier & Uhlmann (2004), section IV; sigma points are drawn anew from the prediction, so that they carry Q.
     """
-    n = context.prior_mean.size
-    m = context.row_count[sensor]
+    n = context.nx
+    _, m = sensor_rows(context, sensor)
     x = state[:n]
     P = state[n : n + n * n].reshape((n, n))
     U = work[: n * n].reshape((n, n))
@@ -139,22 +148,22 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     V = work[at : at + m * m].reshape((m, m))
     at += m * m
     C = work[at : at + n * m].reshape((n, m))
-    w = context.options[OUTER]
-    spread = context.options[SPREAD]
+    weights = options(context)
+    w = weights[OUTER]
+    spread = weights[SPREAD]
     if not cholesky(P, U, n):
         return FAILED
-    call_h(context.h[sensor], x, u, context.p, D[0])
+    expect(context, sensor, x, u, D[0])
     for k in range(n):
         for j in range(n):
             point[j] = x[j] + spread * U[k, j]
-        call_h(context.h[sensor], point, u, context.p, D[1 + k])
+        expect(context, sensor, point, u, D[1 + k])
         for j in range(n):
             point[j] = x[j] - spread * U[k, j]
-        call_h(context.h[sensor], point, u, context.p, D[1 + n + k])
-    first = context.row_start[sensor]
-    _mean_of(D, w, context.circular_y[first : first + m], nu)
+        expect(context, sensor, point, u, D[1 + n + k])
+    _mean_of(D, w, circular_rows(context, sensor), nu)
     for i in range(m):
-        a = context.options[CENTRAL_COV] * D[0, i]
+        a = weights[CENTRAL_COV] * D[0, i]
         for j in range(m):
             S[i, j] = a * D[0, j]
     for k in range(1, 2 * n + 1):
