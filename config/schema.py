@@ -35,7 +35,7 @@ class EstimatorSection(Section):
 
     name: Text
     """Name in the catalogue: kf, ekf, ukf, ..."""
-    options: dict[str, Number | Flag | Text] = {}
+    options: dict[str, Number] = {}
     """The filter's own options by name, for example {alpha: 0.5} of the UKF. Default: the catalogue's."""
 
 

@@ -1,0 +1,154 @@
+"""`nisus new NAME`: a working pair of files, one YAML and one Python, for a user to change into a twin of their own."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from config.loader import shipped
+from estimators.errors import ConfigError
+
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+
+_YAML = """\
+# {name}: a tank that a pump fills and a valve empties. Change it, and {name}.py beside it, into a twin of your own.
+#
+# Source: simulated; the true pump delivers less than the model expects, as a worn one does.
+# Expect: the level is known to a few millimetres at once. The pump's delivery, which no sensor measures, is found
+# within a minute of the first valve movement, 15 % below its start.
+# Run it: nisus run {name}.yaml      Score it: nisus fold {name}.yaml      Every key: nisus schema
+title: Level of a tank and delivery of its pump
+model: ./{name}.py:{model}       # file beside this one, and the name of the model in it
+
+parameters:                      # constants of the model
+  area: 0.5                         # m², base of the tank
+  outlet: 0.02                      # m²·√m/s, outflow through the open valve at one metre of level
+
+prior:                           # belief before the first reading
+  level: {mean: 1.0, std: 0.3}      # m
+  delivery: {mean: 0.0010, std: 0.0003}  # m³ a turn
+
+noise:                           # how much the model is distrusted: what it adds in one second
+  level: {std: 0.001}               # m
+  delivery: {std: 0.000002}         # m³
+
+sensors:                         # how much each sensor is distrusted
+  level: {std: 0.01}                # m
+  outflow: {std: 0.0005, use: true} # m³/s; use: false holds it out, and scores what is predicted of it
+
+estimator: ekf                   # kf, ekf, ukf
+gate: 0.9999                     # probability with which a good reading passes; null uses every reading
+
+source:
+  type: simulator
+  seed: 1
+  step: 0.5                      # s
+  duration: 600                  # s
+  initial: {level: 0.8, delivery: 0.00085}  # true state at the start
+  inputs:
+    speed: {sine: {mean: 15, amplitude: 5, period: 90}}                 # turns/s
+    valve: {steps: [[0, 0.5], [60, 0.8], [180, 0.4], [300, 0.7]], repeat: 420}  # opening, 0 to 1
+  sensors:
+    level: {every: 1}            # one reading a step
+    outflow: {every: 4, drop_every: 10}  # a slower sensor that loses one reading in ten
+
+view:
+  pairs: [[level, delivery]]     # covariance ellipse
+  window: 120                    # s that the charts show
+"""
+
+_PYTHON = '''\
+"""A tank that a pump fills and a valve empties.
+
+level' = (delivery · speed - outlet · valve · √level) / area,   delivery' = 0
+"""
+
+import math
+
+from estimators.model import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+
+# Every function is written for ONE state and fills `out`. x: states, u: inputs, p: parameters, in the order below.
+# They are compiled, so keep to numbers, math and loops; names outside the function must be constants.
+
+
+def tank(x, u, p, dt, out):
+    """The next state, dt seconds later."""
+    level, delivery = x[0], x[1]
+    speed, valve = u[0], u[1]
+    area, outlet = p[0], p[1]
+    outflow = outlet * valve * math.sqrt(max(level, 0.0))
+    out[0] = level + dt * (delivery * speed - outflow) / area
+    out[1] = delivery  # wears slowly; the noise lets it move
+
+
+def level(x, u, p, out):
+    """What the level sensor reads, m."""
+    out[0] = x[0]
+
+
+def outflow(x, u, p, out):
+    """What the flow meter behind the valve reads, m³/s."""
+    out[0] = p[1] * u[1] * math.sqrt(max(x[0], 0.0))
+
+
+{model} = StateSpaceModel(
+    name="{name}",
+    title="Tank with pump and valve",
+    states=(
+        State("level", "m", mean=1.0, std=0.3),
+        State("delivery", "m³", mean=0.001, std=0.0003),  # a turn
+    ),
+    inputs=(
+        Input("speed", "1/s", default=0.0),
+        Input("valve", "1", default=0.0),
+    ),
+    parameters=(
+        Parameter("area", "m²", 0.5, low=0.01, high=100.0),
+        Parameter("outlet", "m²·√m/s", 0.02, low=0.0, high=1.0),
+    ),
+    noises=(
+        Noise("level", "m²/s", variance=1e-6),
+        Noise("delivery", "m⁶/s", variance=4e-12),
+    ),
+    sensors=(
+        Sensor("level", (Row("level", "m", variance=1e-4),), h=level),
+        Sensor("outflow", (Row("outflow", "m³/s", variance=2.5e-7),), h=outflow),
+    ),
+    f=tank,
+    max_step=1.0,  # seconds; the crude integration above is split into steps no longer than this
+)
+'''
+
+
+def write_twin(name: str, folder: Path) -> tuple[Path, Path]:
+    """Write NAME.yaml and NAME.py, a pair that runs.
+
+    Args:
+        name: Letters, digits, _ and -, beginning with a letter.
+        folder: An existing folder.
+
+    Returns:
+        The two paths.
+
+    Raises:
+        ConfigError: If the name or the folder will not do, or one of the files is there already.
+    """
+    if not _NAME.fullmatch(name):
+        raise ConfigError(f"the name {name!r} will not do; use letters, digits, _ and -, and begin with a letter")
+    if name in shipped():
+        raise ConfigError(f"the name {name!r} is that of a twin that ships; choose another")
+    if not folder.is_dir():
+        raise ConfigError(f"{folder}: there is no such folder; make it first")
+    texts = {folder / f"{name}.yaml": _YAML, folder / f"{name}.py": _PYTHON}
+    for path in texts:
+        if path.exists():
+            raise ConfigError(f"{path}: it is there already and is not overwritten; choose another name")
+    model = "".join(part[:1].upper() + part[1:] for part in re.split(r"[_-]+", name))
+    for path, text in texts.items():
+        try:
+            with path.open("x", encoding="utf-8") as file:
+                file.write(text.replace("{name}", name).replace("{model}", model))
+        except OSError as error:
+            raise ConfigError(f"{path}: it cannot be written: {error.strerror}; check the folder") from None
+    yaml_path, python_path = texts
+    return yaml_path, python_path

@@ -1,0 +1,178 @@
+"""A twin put together: its YAML, model, tuning and source."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from config.loader import Loaded, load, load_text
+from config.schema import TwinSection
+from config.yaml_lines import parse
+from estimators.errors import ConfigError, EstimatorError
+from estimators.model import StateSpaceModel
+from estimators.registry import find_estimator
+from estimators.tuning import Tuning
+
+from .twin_model import check_named, configure, find_model
+from .twin_source import Plan, plan_source
+
+if TYPE_CHECKING:
+    from sources.source import Report, Source
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A model set up as its YAML says, the first tuning, and what it takes to open the source.
+
+    `pairs` (k, 2) holds the indices of the states whose ellipses are drawn. `overrides` are the command line's
+    changes to the YAML, which `text` holds as it was read.
+    """
+
+    loaded: Loaded
+    model: StateSpaceModel
+    tuning: Tuning
+    estimator: str
+    pairs: np.ndarray
+    overrides: Mapping[str, str]
+    plan: Plan
+
+    @property
+    def config(self) -> TwinSection:
+        """The checked configuration, with defaults filled in."""
+        return self.loaded.config
+
+    @property
+    def path(self) -> Path:
+        """The YAML file."""
+        return self.loaded.path
+
+    @property
+    def text(self) -> str:
+        """The YAML as it was read."""
+        return self.loaded.text
+
+    @property
+    def name(self) -> str:
+        """Short name."""
+        return self.config.name or self.path.stem
+
+    @property
+    def title(self) -> str:
+        """One line for the top of the page."""
+        return self.config.title or self.model.title
+
+    @property
+    def options(self) -> Mapping[str, float]:
+        """The estimator's options that the YAML gives."""
+        return self.config.estimator.options
+
+    def open_source(self, report: Report, *, live: bool = True) -> Source:
+        """Open the source.
+
+        Args:
+            report: Called as report(key, text) with what is worth counting; from the source's thread.
+            live: False asks for events that end: a recording in place of a bus.
+
+        Raises:
+            SourceError: If it cannot be opened, with the remedy.
+        """
+        return self.plan.open(report, live=live)
+
+
+def load_twin(
+    name_or_path: str | os.PathLike[str],
+    *,
+    log_files: Sequence[str | os.PathLike[str]] | None = None,
+    overrides: Mapping[str, str] | None = None,
+) -> Twin:
+    """Put a twin together.
+
+    Args:
+        name_or_path: Name of a twin that ships, or path of a YAML file.
+        log_files: Recordings in place of the twin's own.
+        overrides: The command line's `--set KEY=VALUE`: a tuning key (Q.temperature), or a dotted key of the YAML.
+
+    Raises:
+        ConfigError: If the YAML or an override breaks a rule.
+        ModelError: If the model's file fails.
+    """
+    overrides = dict(overrides or {})
+    return _assemble(load(name_or_path, _of_yaml(overrides)), overrides, log_files)
+
+
+def restore_twin(text: str, base_path: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> Twin:
+    """Put a twin together from the YAML text that a recording holds; `base_path` is where its file was.
+
+    Raises:
+        ConfigError: If the YAML breaks a rule.
+        ModelError: If the model's file fails, or is no longer there.
+    """
+    overrides = dict(overrides or {})
+    return _assemble(load_text(text, Path(base_path), _of_yaml(overrides)), overrides, None)
+
+
+def _of_yaml(overrides: Mapping[str, str]) -> dict[str, str]:
+    """The overrides that change the YAML; the others are keys of the tuning."""
+    return {key: value for key, value in overrides.items() if key.split(".")[0] in TwinSection.model_fields}
+
+
+def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[str | os.PathLike[str]] | None) -> Twin:
+    config = loaded.config
+    model = configure(find_model(loaded, ("model",), config.model), loaded)
+    try:
+        find_estimator(config.estimator.name, model).complete(dict(config.estimator.options))
+    except EstimatorError as error:
+        raise ConfigError(f"{loaded.places.at(('estimator',))}: {error}") from None
+    tuning = Tuning.of(model).with_options(config.estimator.options).set("gate", config.gate)
+    for name, section in config.sensors.items():
+        if not section.use:
+            tuning = tuning.set(f"use.{name}", False)
+    for key, value in overrides.items():
+        if key not in _of_yaml(overrides):
+            tuning = _set(tuning, key, value)
+    return Twin(
+        loaded=loaded,
+        model=model,
+        tuning=tuning,
+        estimator=config.estimator.name,
+        pairs=_pairs(loaded, model),
+        overrides=overrides,
+        plan=plan_source(loaded, model, [Path(file) for file in log_files] if log_files else None),
+    )
+
+
+def _set(tuning: Tuning, key: str, text: str) -> Tuning:
+    option = f"--set {key}={text}"
+    try:
+        value, _ = parse(text, option)
+    except ConfigError:
+        value = text
+    wants_bool = key.startswith("use.")
+    tuning_keys = tuning.keys()
+    if key in tuning_keys and (not isinstance(value, (int, float)) or isinstance(value, bool) != wants_bool):
+        raise ConfigError(f"{option}: {key} must be {'true or false' if wants_bool else 'a number'}")
+    try:
+        return tuning.set(key, value if key in tuning_keys else None)
+    except ConfigError as error:
+        more = "" if key in tuning_keys else f"; or a key of the YAML: {', '.join(TwinSection.model_fields)}"
+        raise ConfigError(f"{option}: {error}{more}") from None
+
+
+def _pairs(loaded: Loaded, model: StateSpaceModel) -> np.ndarray:
+    """Indices of the pairs of states in the view; the scene's names are checked on the way."""
+    view = loaded.config.view
+    for key in ("axes", "position", "heading"):
+        value = getattr(view.scene, key)
+        check_named(loaded, ("view", "scene", key), (value,) if isinstance(value, str) else value or (), model)
+    if view.pairs is None:
+        return np.array([[0, 1]] if model.nx > 1 else np.zeros((0, 2)), int)
+    for k, pair in enumerate(view.pairs):
+        check_named(loaded, ("view", "pairs", k), pair, model)
+        if pair[0] == pair[1]:
+            raise loaded.error(("view", "pairs", k), f"names {pair[0]} twice; an ellipse needs two states")
+    return np.array([[model.state_names.index(name) for name in pair] for pair in view.pairs], int).reshape(-1, 2)

@@ -1,0 +1,78 @@
+"""The channels of a twin: which signals or columns feed which sensor, input or true state."""
+
+from __future__ import annotations
+
+from math import inf
+from typing import TYPE_CHECKING, Any
+
+from config.loader import Loaded
+from config.source_schema import ChannelSection, SignalSection
+from config.yaml_lines import Key
+from estimators.log import INPUT, READING, TRUTH
+from estimators.model import StateSpaceModel
+
+from .twin_model import check_names
+
+if TYPE_CHECKING:
+    from sources.source import Channel
+
+
+def channels(loaded: Loaded, section: Any, key: Key, model: StateSpaceModel) -> list[tuple[Key, Channel]]:
+    """The channels of a section, each with its key in the YAML.
+
+    Raises:
+        ConfigError: With file and line, if a name or a number of rows does not fit the model.
+    """
+    rows_of = {sensor.name: [(row.name, row.unit) for row in sensor.rows] for sensor in model.sensors}
+    inputs_of = {item.name: [(item.name, item.unit)] for item in model.inputs}
+    states_of = {state.name: [(state.name, state.unit)] for state in model.states}
+    found: list[tuple[Key, Channel]] = []
+    for group, kind, known, word in (
+        ("sensors", READING, rows_of, "sensor"),
+        ("inputs", INPUT, inputs_of, "input"),
+        ("truth", TRUTH, states_of, "state"),
+    ):
+        given = getattr(section, group)
+        check_names(loaded, (*key, group), given, list(known), word, model)
+        for name, item in given.items():
+            place = (*key, group, name)
+            found.append((place, _channel(loaded, place, item, kind, list(known).index(name), name, known[name])))
+    if not section.sensors:
+        raise loaded.error(key, f"feeds no sensor; name at least one of {', '.join(rows_of)} under sensors")
+    return found
+
+
+def _channel(
+    loaded: Loaded, key: Key, item: ChannelSection, kind: int, index: int, name: str, rows: list[tuple[str, str]]
+) -> Channel:
+    from sources.source import Channel, Condition
+
+    names = item.names()
+    word = "signals" if isinstance(item, SignalSection) else "columns"
+    if len(names) != len(rows):
+        row_names = ", ".join(row for row, _ in rows)
+        raise loaded.error((*key, word), f"names {len(names)}; {name} takes {len(rows)}: {row_names}")
+    if item.convert is not None and kind != READING:
+        raise loaded.error((*key, "convert"), f"is {item.convert}; only a sensor can take it")
+    return Channel(
+        kind=kind,
+        index=index,
+        name=name,
+        signals=names,
+        message=item.message if isinstance(item, SignalSection) else None,
+        units=_spread(item.units or (None,), len(rows)),
+        model_units=tuple(unit for _, unit in rows),
+        scale=_spread(item.scale, len(rows)),
+        offset=_spread(item.offset, len(rows)),
+        where=tuple(
+            Condition(signal, -inf if limits.min is None else limits.min, inf if limits.max is None else limits.max)
+            for signal, limits in item.where.items()
+        ),
+        convert=item.convert,
+        origin=item.origin,
+    )
+
+
+def _spread(values: tuple, count: int) -> tuple:
+    """A value for each row, from one for all or one each (the schema has checked the number)."""
+    return values * count if len(values) == 1 else values

@@ -1,0 +1,276 @@
+"""The source of a twin: its YAML section turned into channels and an open source."""
+
+from __future__ import annotations
+
+import fnmatch
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from config.loader import Loaded, shown_path
+from config.source_schema import (
+    AssetSection,
+    CanLogSection,
+    CanSection,
+    MergedSection,
+    ProfileSection,
+    SignalMaps,
+    SimulatorSection,
+    TableSection,
+)
+from config.yaml_lines import Key, dotted
+from estimators.errors import SourceError
+from estimators.model import StateSpaceModel
+
+from .twin_channels import channels
+from .twin_model import check_names, find_model, one_each
+
+if TYPE_CHECKING:
+    from sources.source import Channel, Report, Source
+
+TABLES = (".csv", ".parquet", ".pq")
+"""File endings that `--log` gives to the tables of a merged source."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What it takes to open the source; the YAML is checked, no file has been touched."""
+
+    loaded: Loaded
+    model: StateSpaceModel
+    log_files: tuple[Path, ...] | None
+
+    def open(self, report: Report, *, live: bool = True) -> Source:
+        """Open the source; `live` False takes a recording in place of a bus.
+
+        Raises:
+            SourceError: If it cannot be opened, with the remedy.
+        """
+        section = self.loaded.config.source
+        key: Key = ("source",)
+        if isinstance(section, SimulatorSection):
+            return self.simulator(section, key)
+        if isinstance(section, MergedSection):
+            return self._merged(section, key, report)
+        if isinstance(section, CanSection) and self.log_files is None and live:
+            return self._bus(section, key, report)
+        return self._recording(section, key, report, self.log_files)
+
+    def simulator(self, section: AssetSection, key: Key) -> Any:
+        """The simulated asset."""
+        from sources.simulator import SensorPlan, Simulator
+
+        truth = section.truth
+        truth_model = find_model(self.loaded, (*key, "truth", "model"), truth.model) if truth.model else None
+        if truth_model is not None:
+            _check_same(self.loaded, (*key, "truth", "model"), truth_model, self.model)
+        plans = {}
+        for sensor in self.model.sensors:
+            plan = section.sensors.get(sensor.name)
+            if plan is None:
+                continue
+            variances = plan.variances
+            if variances is not None:
+                place = (*key, "sensors", sensor.name, "std" if plan.std is not None else "variance")
+                variances = one_each(self.loaded, place, variances, [row.name for row in sensor.rows])
+            plans[sensor.name] = SensorPlan(every=plan.every, variances=variances, drop_every=plan.drop_every)
+        return Simulator(
+            self.model,
+            seed=section.seed,
+            step=section.step,
+            duration=section.duration,
+            initial=dict(section.initial),
+            truth_parameters=dict(truth.parameters),
+            truth_model=truth_model,
+            truth_noise={name: level.value for name, level in truth.noise.items()},
+            inputs={name: _profile(profiles) for name, profiles in section.inputs.items()},
+            sensors=plans,
+        )
+
+    def _bus(self, section: CanSection, key: Key, report: Report) -> Source:
+        from sources.can_bus import CanBus
+
+        decoder = self._decoder(section, key, report, None)
+        return CanBus(section.interface, section.channel, decoder, bus_options=dict(section.options), report=report)
+
+    def _recording(self, section: Any, key: Key, report: Report, log_files: Sequence[Path] | None) -> Source:
+        files = self._files(section, key, log_files)
+        if isinstance(section, TableSection):
+            from sources.table import Table
+
+            return self._blamed(
+                section,
+                key,
+                lambda channels: Table(
+                    files,
+                    time_column=section.time.column,
+                    time_unit=section.time.unit,
+                    channels=channels,
+                    width=self.model.width,
+                ),
+            )
+        from sources.can_log import CanLog
+
+        return CanLog(files, self._decoder(section, key, report, section), report=report)
+
+    def _merged(self, section: MergedSection, key: Key, report: Report) -> Source:
+        from sources.merged import Merged
+
+        shares: list[list[Path] | None] = [None] * len(section.parts)
+        if self.log_files is not None:
+            shares = self._shares(section)
+        parts = [
+            self._recording(part, (*key, "parts", k), report, share)
+            for k, (part, share) in enumerate(zip(section.parts, shares, strict=True))
+            if share != []
+        ]
+        return Merged(parts)
+
+    def _shares(self, section: MergedSection) -> list[list[Path] | None]:
+        """Which part reads which of the `--log` files: by name, else tables to the table and logs to the CAN log."""
+        shares: list[list[Path] | None] = [[] for _ in section.parts]
+        for file in self.log_files or ():
+            fits = [
+                k
+                for k, part in enumerate(section.parts)
+                if any(fnmatch.fnmatch(file.name, Path(pattern).name) for pattern in part.files)
+            ]
+            if not fits:
+                kind = TableSection if file.suffix.lower() in TABLES else CanLogSection
+                fits = [k for k, part in enumerate(section.parts) if isinstance(part, kind)]
+            if len(fits) != 1:
+                raise SourceError(
+                    f"--log {file}: {len(fits)} parts of {self.loaded.places.at(('source', 'parts'))} could read it; "
+                    "give it the name of the file that it replaces"
+                )
+            share = shares[fits[0]]
+            assert share is not None
+            share.append(file)
+        return shares
+
+    def _decoder(self, section: SignalMaps, key: Key, report: Report, recording: Any) -> Any:
+        from sources.decoder import Decoder
+
+        databases = [(self._database(item.file, (*key, "dbc"), recording), item.channel) for item in section.dbc]
+        return self._blamed(
+            section,
+            key,
+            lambda channels: Decoder(databases, channels, width=self.model.width, report=report),
+        )
+
+    def _database(self, file: str, key: Key, recording: Any) -> Path:
+        tried = [self._root(recording) / file] if recording is not None else []
+        tried.append(self.loaded.path.absolute().parent / Path(file).expanduser())
+        for path in tried:
+            if path.is_file():
+                return path
+        raise self._absent(key, tried[0], recording)
+
+    def _blamed(self, section: Any, key: Key, build: Callable[[list[Channel]], Any]) -> Any:
+        """Build with every channel; if that fails, find the one at fault and name its line."""
+        named = channels(self.loaded, section, key, self.model)
+        try:
+            return build([channel for _, channel in named])
+        except SourceError:
+            for place, channel in named:
+                try:
+                    build([channel])
+                except SourceError as error:
+                    raise SourceError(f"{self.loaded.places.at(place)}: {dotted(place)}: {error}") from None
+            raise
+
+    def _root(self, section: Any) -> Path:
+        """The folder of a recording: NISUS_DATA in place of `folder`, where the YAML gives one."""
+        beside = self.loaded.path.absolute().parent
+        folder = getattr(section, "folder", None)
+        if folder is None:
+            return beside
+        return Path(os.environ.get("NISUS_DATA") or beside / Path(folder).expanduser())
+
+    def _files(self, section: Any, key: Key, log_files: Sequence[Path] | None) -> list[Path]:
+        if log_files is not None:
+            for file in log_files:
+                if not file.expanduser().is_file():
+                    raise SourceError(f"--log {file}: there is no such file; check the path")
+            return [file.expanduser() for file in log_files]
+        if isinstance(section, CanSection):
+            patterns, where = section.recording, "recording"
+            if patterns is None:
+                raise SourceError(
+                    f"{self.loaded.places.at(key)}: {dotted(key)} is a live bus, which does not end; give a recording "
+                    "of it with --log FILE"
+                )
+        else:
+            patterns, where = section.files, "files"
+        root, found = self._root(section), []
+        for pattern in patterns:
+            path = root / Path(pattern).expanduser()
+            matches = sorted(path.parent.glob(path.name)) if any(c in path.name for c in "*?[") else [path]
+            matches = [match for match in matches if match.is_file()]
+            if not matches:
+                raise self._absent((*key, where), path, section)
+            found += matches
+        return found
+
+    def _absent(self, key: Key, path: Path, section: Any) -> SourceError:
+        folder = getattr(section, "folder", None)
+        get = getattr(section, "get", None)
+        remedies = ["set NISUS_DATA to the folder that holds the recordings"] if folder is not None else []
+        remedies += ["give other recordings with --log FILE"] if key[-1] != "dbc" else []
+        text = f"; {' or '.join(remedies)}" if remedies else "; check the path"
+        if get:
+            text += "; to get it: " + " ".join(get.split())
+        return SourceError(f"{self.loaded.places.at(key)}: {dotted(key)}: there is no {shown_path(path)}{text}")
+
+
+def plan_source(loaded: Loaded, model: StateSpaceModel, log_files: Sequence[Path] | None) -> Plan:
+    """Check the source's section against the model.
+
+    Raises:
+        ConfigError: With file and line, if it names what the model lacks.
+        SourceError: If the source reads no recording and one was given.
+    """
+    section = loaded.config.source
+    key: Key = ("source",)
+    plan = Plan(loaded, model, tuple(log_files) if log_files is not None else None)
+    if isinstance(section, SimulatorSection):
+        if log_files is not None:
+            raise SourceError(
+                f"--log {log_files[0]}: the source of {loaded.config.name} is a simulator; --log needs type can, "
+                "can_log, table or merged"
+            )
+        _check_asset(loaded, section, key, model)
+    elif isinstance(section, MergedSection):
+        for k, part in enumerate(section.parts):
+            channels(loaded, part, (*key, "parts", k), model)
+    else:
+        channels(loaded, section, key, model)
+        if isinstance(section, CanSection) and section.asset is not None:
+            _check_asset(loaded, section.asset, (*key, "asset"), model)
+    return plan
+
+
+def _check_asset(loaded: Loaded, section: AssetSection, key: Key, model: StateSpaceModel) -> None:
+    parameters = [item.name for item in model.parameters]
+    noises = [item.name for item in model.noises]
+    check_names(loaded, (*key, "initial"), section.initial, model.state_names, "state", model)
+    check_names(loaded, (*key, "inputs"), section.inputs, model.input_names, "input", model)
+    check_names(loaded, (*key, "sensors"), section.sensors, model.sensor_names, "sensor", model)
+    if section.truth.model is None:
+        check_names(loaded, (*key, "truth", "parameters"), section.truth.parameters, parameters, "parameter", model)
+        check_names(loaded, (*key, "truth", "noise"), section.truth.noise, noises, "noise", model)
+
+
+def _check_same(loaded: Loaded, key: Key, truth: StateSpaceModel, model: StateSpaceModel) -> None:
+    for what in ("state_names", "input_names", "row_names"):
+        theirs, ours = getattr(truth, what), getattr(model, what)
+        if theirs != ours:
+            raise loaded.error(
+                key, f"has {what.replace('_names', 's')} {', '.join(theirs)}; they must be {', '.join(ours)}"
+            )
+
+
+def _profile(profiles: tuple[ProfileSection, ...]) -> Any:
+    raise NotImplementedError

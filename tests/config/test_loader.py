@@ -1,0 +1,210 @@
+from pathlib import Path
+
+import pytest
+
+from config.loader import find, load, load_text, shipped
+from estimators.errors import ConfigError
+
+MOTOR = """\
+model: motor_winding
+noise:
+  temperature: {variance: 1e-3}
+sensors:
+  winding:
+    std: 2
+estimator: kf
+gate: 0.9973
+source:
+  type: simulator
+  duration: 120
+  inputs:
+    torque: [1, {steps: [[0, 1], [5, 2]]}]
+"""
+
+
+def message(text: str, overrides: dict[str, str] | None = None) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load_text(text, Path("motor.yaml"), overrides)
+    return str(caught.value)
+
+
+def test_values_are_read_and_defaults_filled_in() -> None:
+    loaded = load_text(MOTOR, Path("folder/motor.yaml"))
+    config = loaded.config
+    assert config.name == "motor"
+    assert config.noise["temperature"].value == 1e-3
+    assert config.sensors["winding"].variances == (4.0,)
+    assert config.sensors["winding"].use is True
+    assert config.estimator.name == "kf" and config.estimator.options == {}
+    assert config.history == 200_000 and config.time.horizon == 2.0
+    assert config.source.type == "simulator" and config.source.duration == 120.0
+    assert [profile.constant for profile in config.source.inputs["torque"]] == [1.0, None]
+    assert config.source.inputs["torque"][1].steps == ((0.0, 1.0), (5.0, 2.0))
+    assert loaded.text == MOTOR
+    assert loaded.places.at(("sensors", "winding", "std")) == "folder/motor.yaml:6"
+    assert loaded.places.at(("source", "inputs", "torque", 1)) == "folder/motor.yaml:13"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("    std: 2", "    sdt: 2", "motor.yaml:6: sensors.winding.sdt is not known; did you mean std?"),
+        ("    std: 2", "    std: -0.1", "motor.yaml:6: sensors.winding.std is -0.1; it must be positive"),
+        ("    std: 2", "    variance: 0", "motor.yaml:6: sensors.winding.variance is 0; it must be positive"),
+        ("    std: 2", "    std: [1, -1]", "motor.yaml:6: sensors.winding.std[1] is -1; it must be positive"),
+        ("    std: 2", "    std: .nan", "motor.yaml:6: sensors.winding.std is nan; it must be a finite number"),
+        ("    std: 2", "    std: []", "motor.yaml:6: sensors.winding.std is []; it needs 1 or more entries"),
+        (
+            "    std: 2",
+            "    std: 2\n    variance: 4",
+            "motor.yaml:6: sensors.winding gives both variance and std; keep one",
+        ),
+        (
+            "{variance: 1e-3}",
+            "{variance: -1e-3}",
+            "motor.yaml:3: noise.temperature.variance is -0.001; it must be zero or positive",
+        ),
+        ("{variance: 1e-3}", "{}", "motor.yaml:3: noise.temperature gives neither variance nor std; add it"),
+        ("gate: 0.9973", "gate: 99.73", "motor.yaml:8: gate is 99.73; it must be below 1"),
+        ("gate: 0.9973", "gates: 0.9973", "motor.yaml:8: gates is not known; did you mean gate?"),
+        ("duration: 120", "duration: no", "motor.yaml:11: source.duration is 'no'; it must be a number"),
+        ("duration: 120", "duration: true", "motor.yaml:11: source.duration is true; it must be a number"),
+        ("duration: 120", "duration: 1:30", "motor.yaml:11: source.duration is '1:30'; it must be a number"),
+        ("  type: simulator\n", "", "motor.yaml:9: source.type is missing; it must be one of simulator, can, can_log, table, merged"),
+        ("simulator", "simulater", "motor.yaml:10: source.type is 'simulater'; did you mean simulator?"),
+        ("model: motor_winding\n", "", "motor.yaml:1: model is missing; add it"),
+        ("motor_winding", "5", "motor.yaml:1: model is 5; it must be text; put it in quotes if it looks like a number"),
+        ("[5, 2]", "[0, 2]", "motor.yaml:13: source.inputs.torque[1].steps must have rising times; put them in order"),
+        ("[5, 2]", "[5]", "motor.yaml:13: source.inputs.torque[1].steps[1] is [5]; it needs 2 or more entries"),
+        ("estimator: kf", "estimator: {name: kf, options: {a: b}}", "motor.yaml:7: estimator.options.a is 'b'; it must be a number"),
+    ],
+)  # fmt: skip
+def test_a_value_that_breaks_a_rule_is_one_line(old: str, new: str, expected: str) -> None:
+    assert old in MOTOR
+    assert message(MOTOR.replace(old, new, 1)) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "motor.yaml:1: the file is empty; a twin needs at least model and source"),
+        ("# only a comment\n", "motor.yaml:1: the file is empty; a twin needs at least model and source"),
+        ("- a\n", "motor.yaml:1: the file is ['a']; it must be a mapping of keys and values"),
+        ("just text\n", "motor.yaml:1: the file is 'just text'; it must be a mapping of keys and values"),
+        (
+            "model: a\nsource: b: c\n",
+            "motor.yaml:2: not valid YAML: mapping values are not allowed here; check indentation, quotes and brackets",
+        ),
+        (
+            "model: [a\n",
+            "motor.yaml:2: not valid YAML: expected ',' or ']', but got '<stream end>'; "
+            "check indentation, quotes and brackets",
+        ),
+        ("model: a\ngate: 0.9\nmodel: b\n", "motor.yaml:3: model is given twice, first in line 1; remove one"),
+        ("model: &a [*a]\n", "motor.yaml:1: it contains itself through an alias (*name); write the value out"),
+        ("[" * 5000, "motor.yaml:1: it is nested too deeply; a twin needs six levels"),
+        ("model: a\n? [1]\n: 2\n", "motor.yaml:2: a key must be one word, not a list or mapping; put braces in quotes"),
+        ("model: !!python/name:os.system ''\n", "motor.yaml:1: the tag tag:yaml.org,2002:python/name:os.system has no meaning here; remove it"),
+        ("model: a\ntitle: '\x01'\n", "motor.yaml:2: the character '\\x01' is not text; remove it"),
+        (
+            "model: a\n---\nmodel: b\n",
+            "motor.yaml:2: not valid YAML: a second document begins here (---); check indentation, quotes and brackets",
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_not_a_twin_at_all_is_one_line(text: str, expected: str) -> None:
+    assert message(text) == expected
+
+
+def test_nested_aliases_cannot_ask_for_billions_of_values() -> None:
+    text = "a: &a [x, x, x, x, x, x, x, x, x, x]\n"
+    for old, new in zip("abcdefghi", "bcdefghij", strict=True):
+        text += f"{new}: &{new} [{', '.join([f'*{old}'] * 10)}]\n"
+    assert message(text).endswith("it holds more than 100000 values; are its aliases (*name) meant?")
+
+
+def test_several_problems_are_a_line_each_and_no_more_than_five() -> None:
+    text = MOTOR.replace("    std: 2", "    std: -2").replace("gate: 0.9973", "gate: 2")
+    assert message(text).splitlines() == [
+        "motor.yaml:6: sensors.winding.std is -2; it must be positive",
+        "motor.yaml:8: gate is 2; it must be below 1",
+    ]
+    noise = "".join(f"  n{k}: {{variance: -1}}\n" for k in range(8))
+    lines = message(MOTOR.replace("  temperature: {variance: 1e-3}\n", noise)).splitlines()
+    assert len(lines) == 6 and lines[-1] == "motor.yaml: and 3 more"
+
+
+def test_words_that_yaml_1_1_takes_for_booleans_are_names() -> None:
+    text = MOTOR.replace("  winding:", "  no: {use: false}\n  on:")
+    assert list(load_text(text, Path("motor.yaml")).config.sensors) == ["no", "on"]
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("1e-3", 1e-3), ("010", 10.0), (".5", 0.5), ("2_000", 2000.0), ("5.", 5.0)]
+)
+def test_numbers_are_read_as_people_write_them(text: str, value: float) -> None:
+    assert load_text(MOTOR.replace("120", text), Path("motor.yaml")).config.source.duration == value
+
+
+def test_a_section_left_empty_means_its_defaults() -> None:
+    text = MOTOR + "time:\n  # tick: 1\nview:\n"
+    assert load_text(text, Path("motor.yaml")).config.time.tick == 0.5
+
+
+def test_overrides_replace_values_and_errors_name_the_option() -> None:
+    loaded = load_text(MOTOR, Path("motor.yaml"), {"source.duration": "5", "time.tick": "1e-1", "gate": "null"})
+    assert loaded.config.source.duration == 5.0 and loaded.config.time.tick == 0.1 and loaded.config.gate is None
+    assert (
+        message(MOTOR, {"source.duration": "-5"})
+        == "--set source.duration=-5: source.duration is -5; it must be positive"
+    )
+    assert message(MOTOR, {"source.sed": "5"}) == "--set source.sed=5: source.sed is not known; did you mean seed?"
+    assert message(MOTOR, {"time.tock.x": "5"}).startswith(
+        "--set time.tock.x=5: time.tock is not known; did you mean tick?"
+    )
+    assert message(MOTOR, {"model.x": "5"}) == "--set model.x=5: model is 'motor_winding'; it has no key 'x'"
+    assert (
+        message(MOTOR, {"source.inputs.torque.7": "5"})
+        == "--set source.inputs.torque.7=5: source.inputs.torque is a list; choose an entry from 0 to 1"
+    )
+    assert (
+        message(MOTOR, {"gate": "["}) == "--set gate=[: the value is not valid YAML; put brackets and colons in quotes"
+    )
+
+
+def test_files_that_cannot_be_read_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError) as caught:
+        load("absent.yaml")
+    assert str(caught.value) == "absent.yaml: there is no such file; check the path, or see `nisus twins`"
+    with pytest.raises(ConfigError) as caught:
+        load("motor_windng")
+    assert str(caught.value) == (
+        "motor_windng: no twin of that name ships; did you mean motor_winding?, give a YAML file's path, or "
+        "write one with `nisus new motor_windng`"
+    )
+    (tmp_path / "folder.yaml").mkdir()
+    with pytest.raises(ConfigError) as caught:
+        load("folder.yaml")
+    assert str(caught.value) == "folder.yaml: it is a folder; give the YAML file in it"
+    (tmp_path / "binary.yaml").write_bytes(b"a: 1\n\x89PNG\xff")
+    with pytest.raises(ConfigError) as caught:
+        load("binary.yaml")
+    assert str(caught.value) == "binary.yaml:2: it is not UTF-8 text; is this the YAML file?"
+
+
+def test_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "motor.yaml"
+    path.write_bytes(b"\xef\xbb\xbf" + MOTOR.replace("\n", "\r\n").encode())
+    loaded = load(path)
+    assert loaded.config.model == "motor_winding"
+    assert loaded.places.at(("gate",)).endswith("motor.yaml:8")
+
+
+def test_every_twin_that_ships_loads_by_name() -> None:
+    assert "motor_winding" in shipped()
+    for name in shipped():
+        loaded = load(name)
+        assert loaded.config.name == name
+        assert find(name).name == f"{name}.yaml"
+        assert loaded.text.startswith("#"), f"{name} must open with its source and what to expect"
