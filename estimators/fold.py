@@ -307,6 +307,25 @@ class Fold:
         mean, cov = self.estimator.moments(state, self.model.nx)
         return at - self.log.first, (mean, cov, clock, u.copy())
 
+    def follow(self, log: Log, changed_from: int | None) -> None:
+        """Go on with the log of which the present one is an earlier copy.
+
+        Args:
+            log: The log that grew meanwhile, and may have dropped its oldest events.
+            changed_from: Absolute index from which its events differ from the copy's, if a late reading came.
+
+        Raises:
+            EstimatorError: If the log was cut where this fold has no snapshot.
+        """
+        cut = log.first - self.log.first
+        if cut < 0 or cut > self.n:
+            raise EstimatorError("the log is another one; fold it from its start")
+        if cut:
+            self.drop_front(cut)
+        self.log = log
+        if changed_from is not None:
+            self.rewind(max(0, changed_from - log.first))
+
     def drop_front(self, count: int) -> None:
         """Follow the log in forgetting its oldest `count` events, which must end at a snapshot (see `base_at`).
 

@@ -1,0 +1,1 @@
+"""The running twin: engine, views, page server, recorder, command line."""

@@ -1,0 +1,438 @@
+"""The engine: one thread that owns the log and the fold, and lets everybody else read copies.
+
+Readings, commands and finished refolds come through one inbox and are dealt with in order. Views pull; nothing they
+do, or fail to do, reaches this thread.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from estimators.diagnostics import HealthPolicy
+from estimators.errors import ConfigError, EstimatorError, NisusError
+from estimators.fold import SPARSE_EVERY, UNSET, Fold
+from estimators.log import READING, RESET, TICK, Log, Readings
+from estimators.registry import find_estimator
+from estimators.track import FAILED, GATED, HEALTH_NAMES, MISSING, VERDICT_NAMES
+
+from . import commands
+from .feeder import Feeder, Finished, Restarted
+from .notices import Notices
+from .pull import Belief, Cursor, Pull, Status
+from .refolder import Refolded, Refolder
+
+if TYPE_CHECKING:
+    from sources.source import Source
+
+    from .twin import Twin
+
+LATENCIES = 4096
+STATUS_AGE = 0.1
+LISTED = 8192
+"""Rows of the status counts that are looked at again; older ones are summed up once."""
+
+
+class Engine:
+    """A running twin."""
+
+    def __init__(self, twin: Twin, open_source: Callable[[Callable[[str, str], None]], Source]) -> None:
+        """Open the source and prepare the fold.
+
+        Args:
+            twin: What to run.
+            open_source: Called with a report function; must give the source, paced or live.
+
+        Raises:
+            NisusError: If the source cannot be opened or the model does not compile.
+        """
+        self.twin = twin
+        self.model = twin.model
+        self.pairs = twin.pairs
+        section = twin.config.time
+        self._policy = HealthPolicy(degraded_after=section.degraded_after, stale_after=section.stale_after)
+        self._horizon = round(section.horizon * 1e9)
+        self._tick = section.tick
+        self._history = max(2 * SPARSE_EVERY, twin.config.history)
+        self.estimator, self.tuning = twin.estimator, twin.tuning
+        self._lock = threading.Lock()
+        self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._cursors: list[Cursor] = []
+        self.notices = Notices(lambda: self._log.newest if self._log.n else 0)
+        self._base: tuple[np.ndarray, np.ndarray, int, np.ndarray] | None = None
+        self._clear()
+        self._feeder = Feeder(lambda: open_source(self.notices.report), self._inbox, self.notices.report)
+        self._refolder = Refolder(self._inbox.put)
+        self._ticket = 0
+        self._answered = 0
+        self._changed_from: int | None = None
+        self._previous: Pull | None = None
+        self._revision = 0
+        self._stopping = threading.Event()
+        self._finished = False
+        self._heard = time.monotonic()
+        self._newest_at_heard: int | None = None
+        self._latencies = np.zeros(LATENCIES)
+        self._n_latencies = 0
+        self._health = 0
+        self._status: tuple[float, Status] | None = None
+        self.recorder: Any = None
+        self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
+
+    def _clear(self) -> None:
+        """An empty log and the fold that follows it."""
+        self._log = Log(self.model.width, self._history + 4 * SPARSE_EVERY)
+        self._base = None
+        self._fold = self._make_fold(self.estimator, self.tuning, self._log, None)
+
+    def _make_fold(self, estimator: str, tuning: Any, log: Log, base: Any) -> Fold:
+        return Fold(estimator, self.model, tuning, log, pairs=self.pairs, policy=self._policy, base=base)
+
+    # For everybody, from any thread
+
+    def start(self) -> None:
+        """Begin to read and fold."""
+        self._refolder.start()
+        self._thread.start()
+        self._feeder.start()
+
+    def stop(self) -> None:
+        """Stop reading and folding."""
+        self._stopping.set()
+        self._feeder.stop()
+        self._refolder.stop()
+        if self._thread.is_alive():
+            self._thread.join(timeout=5.0)
+
+    def submit(self, command: commands.Command) -> None:
+        """Queue a command."""
+        self._inbox.put(command)
+
+    def cursor(self) -> Cursor:
+        """A cursor for one consumer, for `pull`; give it back with `release`."""
+        cursor = Cursor()
+        with self._lock:
+            self._cursors.append(cursor)
+        return cursor
+
+    def release(self, cursor: Cursor) -> None:
+        """Forget a cursor."""
+        with self._lock:
+            self._cursors = [item for item in self._cursors if item is not cursor]
+
+    def pull(self, cursor: Cursor, limit: int | None = None) -> Pull:
+        """Copies of the rows since the cursor, at most `limit`, and the notices since."""
+        with self._lock:
+            log, fold = self._log, self._fold
+            fresh = cursor.revision != self._revision
+            if fresh:
+                cursor.revision, cursor.next = self._revision, 0
+            start = max(cursor.next, log.first)
+            end = log.first + fold.n
+            if limit is not None:
+                end = min(end, start + limit)
+            rows = slice(start - log.first, max(start, end) - log.first)
+            readings = log.readings.select(rows)
+            pull = Pull(
+                self._revision,
+                fresh,
+                start,
+                Readings(*(column.copy() for column in readings)),
+                fold.track.select(rows).copy(),
+            )
+            cursor.next = max(start, end)
+        lines = self.notices.since(cursor.notice)
+        if lines:
+            cursor.notice = lines[-1].number + 1
+        return replace(pull, notices=lines)
+
+    def previous(self) -> Pull | None:
+        """The whole previous revision, for comparison; its arrays never change."""
+        return self._previous
+
+    def belief(self) -> Belief:
+        """The estimate now."""
+        with self._lock:
+            mean, cov = self._fold.moments()
+            return Belief(self._fold.clock, mean, cov, self._fold.points())
+
+    def status(self) -> Status:
+        """What a panel shows; found anew at most ten times a second."""
+        kept = self._status
+        if kept is not None and time.monotonic() - kept[0] < STATUS_AGE:
+            return kept[1]
+        with self._lock:
+            log, fold = self._log, self._fold
+            track = fold.track
+            verdicts = np.bincount(track.verdict, minlength=len(VERDICT_NAMES))
+            readings = int(np.count_nonzero(log.kind[: fold.n] == READING))
+            last = fold.n - 1
+            status = Status(
+                estimator=self.estimator,
+                tuning=self.tuning,
+                options=find_estimator(self.estimator, self.model).complete(dict(self.tuning.options)),
+                revision=self._revision,
+                refolding=self._answered != self._ticket,
+                t=int(log.t[last]) if last >= 0 else None,
+                health=int(track.health[last]) if last >= 0 else 0,
+                counts={
+                    "readings": readings,
+                    **{name: int(count) for name, count in zip(VERDICT_NAMES[1:], verdicts[1:], strict=True)},
+                    **self.notices.counts(),
+                },
+                nis=float(track.nis_mean[last]) if last >= 0 else np.nan,
+                nis_low=float(track.nis_low[last]) if last >= 0 else np.nan,
+                nis_high=float(track.nis_high[last]) if last >= 0 else np.nan,
+                paused=bool(getattr(self._feeder.source, "paused", False)),
+                speed=getattr(self._feeder.source, "speed", None),
+                seekable=hasattr(self._feeder.source, "seek"),
+                span=getattr(self._feeder.source, "span", None),
+                finished=self._finished,
+                recording=self.recorder.path if self.recorder is not None else None,
+                latency_ms=self._latency(99.0),
+                latency_p50_ms=self._latency(50.0),
+            )
+        self._status = (time.monotonic(), status)
+        return status
+
+    def _latency(self, percent: float) -> float | None:
+        count = min(self._n_latencies, LATENCIES)
+        return float(np.percentile(self._latencies[:count], percent)) if count else None
+
+    # The engine's own thread
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                self._round()
+            except NisusError as error:
+                self.notices.report("engine error", str(error), level="error")
+            except Exception as error:  # noqa: BLE001  nothing a user or a sensor does may stop the twin
+                self.notices.report("engine error", f"{type(error).__name__}: {error}", level="error")
+
+    def _round(self) -> None:
+        """Wait for something, then deal with all that is there."""
+        try:
+            item = self._inbox.get(timeout=min(0.05, self._tick))
+        except queue.Empty:
+            self._when_silent()
+            return
+        batches: list[Readings] = []
+        while item is not None:
+            if isinstance(item, Readings):
+                batches.append(item)
+                if not self._feeder.live:
+                    self._feeder.taken()
+            else:
+                self._accept(batches)
+                batches = []
+                self._obey(item)
+            try:
+                item = self._inbox.get_nowait() if sum(map(len, batches)) < SPARSE_EVERY else None
+            except queue.Empty:
+                item = None
+        self._accept(batches)
+
+    def _accept(self, batches: list[Readings]) -> None:
+        if not batches:
+            return
+        batch = batches[0] if len(batches) == 1 else Readings.concat(batches, self.model.width)
+        self._heard = time.monotonic()
+        with self._lock:
+            first, stale = self._log.extend(batch, self._horizon)
+            self._newest_at_heard = self._log.newest
+            before = min(first, self._fold.n)
+            if first < self._fold.n:
+                self._go_back(first)
+            self._fold.advance()
+            self._look(before)
+            if self._log.n > self._history + 3 * SPARSE_EVERY:
+                self._forget()
+        if stale:
+            self.notices.report("stale", f"{stale} reading(s) older than the horizon of {self._horizon / 1e9:g} s dropped")
+        if self._feeder.live:
+            self._note_latency(batch)
+
+    def _go_back(self, index: int) -> None:
+        """Events at and behind `index` changed: fold them again, and let every cursor fetch them again."""
+        self._fold.rewind(index)
+        absolute = self._log.first + index
+        self._changed_from = absolute if self._changed_from is None else min(self._changed_from, absolute)
+        for cursor in self._cursors:
+            cursor.next = min(cursor.next, absolute)
+
+    def _note_latency(self, batch: Readings) -> None:
+        arrivals = batch.arrival[batch.kind == READING]
+        if not arrivals.size:
+            return
+        took = (time.time_ns() - arrivals[-LATENCIES:]) * 1e-6
+        at = (self._n_latencies + np.arange(took.size)) % LATENCIES
+        self._latencies[at] = took
+        self._n_latencies += took.size
+
+    def _look(self, before: int) -> None:
+        """Report what the new rows say: readings that could not be used, and changes of health."""
+        track, log = self._fold.track, self._log
+        verdict = track.verdict[before:]
+        for code, what in ((GATED, "refused by the gate"), (MISSING, "has no value"), (FAILED, "could not be used")):
+            rows = np.flatnonzero(verdict == code)
+            if rows.size:
+                row = before + int(rows[-1])
+                sensor = self.model.sensors[log.channel[row]].name
+                self.notices.report(f"{VERDICT_NAMES[code]} {sensor}", f"{sensor}: reading {what} (NIS {track.nis[row]:.3g})")
+        if len(track) and track.health[-1] != self._health:
+            self._health = int(track.health[-1])
+            self.notices.say(f"health: {HEALTH_NAMES[self._health]}", level="info" if self._health == 0 else "warn")
+
+    def _forget(self) -> None:
+        """Drop the oldest events, up to a snapshot, from which later refolds start."""
+        count = (self._log.n - self._history) // SPARSE_EVERY * SPARSE_EVERY
+        count, self._base = self._fold.base_at(count)
+        if count:
+            self._fold.drop_front(count)
+            self._log.drop_front(count)
+
+    def _when_silent(self) -> None:
+        """Nothing arrived: ask what the estimate is now, so that its growing uncertainty shows."""
+        silent = time.monotonic() - self._heard
+        if self._finished or silent < self._tick or not self._log.n:
+            return
+        source = self._feeder.source
+        if source.live:
+            assert self._newest_at_heard is not None
+            # Counted from the newest reading: a driver's clock need not be this machine's.
+            now: int | None = self._newest_at_heard + int(silent * 1e9)
+        else:
+            now = None if getattr(source, "paused", False) else source.now()
+        if now is None or now <= self._log.t[self._log.n - 1] + self._tick * 0.9e9:
+            return
+        tick = Readings.one(now, time.time_ns(), TICK, 0, [], self.model.width)
+        with self._lock:
+            before = self._fold.n
+            # Not through the horizon's clock: a reading from before the tick is not late because of it.
+            newest = self._log.newest
+            self._log.extend(tick)
+            self._log.newest = newest
+            self._fold.advance()
+            self._look(before)
+
+    def _obey(self, item: Any) -> None:
+        """Carry one command out, or take a refold or a word from the feeder."""
+        source = self._feeder.source
+        if isinstance(item, Refolded):
+            self._adopt(item)
+        elif isinstance(item, Restarted):
+            self._restart()
+        elif isinstance(item, Finished):
+            self._finished = True
+            self.notices.say("the source has ended; the estimate stays")
+        elif isinstance(item, commands.SetEstimator):
+            self._retune(item.name, self.tuning.with_options({}))
+        elif isinstance(item, commands.SetTuning):
+            self._retune(self.estimator, self.tuning.set(item.key, item.value))
+        elif isinstance(item, commands.SetOption):
+            options = {**self.tuning.options, item.name: float(item.value)}
+            find_estimator(self.estimator, self.model).complete(options)
+            self._retune(self.estimator, self.tuning.with_options(options))
+        elif isinstance(item, commands.UseSensor):
+            self._retune(self.estimator, self.tuning.set(f"use.{item.name}", item.used))
+        elif isinstance(item, commands.Reset):
+            self._reset()
+        elif isinstance(item, commands.Record):
+            if self.recorder is None:
+                raise ConfigError("this session cannot record")
+            self.recorder.record(item.path)
+        elif isinstance(item, (commands.Pause, commands.Speed, commands.Step, commands.Seek)):
+            self._play(source, item)
+
+    def _play(self, source: Any, item: Any) -> None:
+        if not hasattr(source, "seek"):
+            raise ConfigError("a live source cannot be paused, stepped or sought; only a replay or a simulation can")
+        if isinstance(item, commands.Pause):
+            source.pause() if item.paused else source.resume()
+        elif isinstance(item, commands.Speed):
+            source.set_speed(item.factor)
+        elif isinstance(item, commands.Step):
+            source.step()
+        else:
+            start = source.span[0] if getattr(source, "span", None) else int(self._log.t[0]) if self._log.n else 0
+            source.seek(start + round(item.seconds * 1e9))
+
+    def _restart(self) -> None:
+        """The source began again: so does the log. The fold is a new revision of it."""
+        with self._lock:
+            self._previous = None
+            self._clear()
+            self._revision += 1
+            self._finished = False
+            self._ticket += 1
+            self._answered = self._ticket
+
+    def _reset(self) -> None:
+        if not self._log.n:
+            return
+        at = int(self._log.t[self._log.n - 1])
+        event = Readings.one(at, time.time_ns(), RESET, 0, [], self.model.width)
+        with self._lock:
+            self._log.extend(event)
+            self._fold.advance()
+        self.notices.say("estimate reset to the prior")
+
+    def _retune(self, estimator: str, tuning: Any) -> None:
+        """Fold the history again, beside the running fold, over a copy of the log."""
+        find_estimator(estimator, self.model)
+        self.estimator, self.tuning = estimator, tuning
+        self._ticket += 1
+        self._changed_from = None
+        log, base = self._log.copy(), self._base
+        self._refolder.request(self._ticket, lambda: self._make_fold(estimator, tuning, log, base))
+        self._status = None
+
+    def _adopt(self, done: Refolded) -> None:
+        """Swap a finished refold in, after it has caught up with what came meanwhile."""
+        self._answered = max(self._answered, done.ticket)
+        if done.fold is None:
+            self.notices.say(f"not folded again: {done.error}", level="error")
+            if done.ticket == self._ticket:
+                self.estimator, self.tuning = self._fold.estimator.name, self._fold.tuning
+            return
+        fold = done.fold
+        with self._lock:
+            old, log = self._fold, self._log
+            try:
+                fold.follow(log, self._changed_from)
+            except EstimatorError:
+                # The log was cut or started anew meanwhile: the answer no longer fits, ask again.
+                stale = True
+            else:
+                stale = False
+                fold.advance()
+                self._previous = Pull(
+                    self._revision,
+                    False,
+                    log.first,
+                    Readings(*(column[: old.n].copy() for column in log.readings)),
+                    old.track,
+                )
+                self._fold = fold
+                self._revision += 1
+        if stale:
+            self._retune(self.estimator, self.tuning)
+
+    @property
+    def clock(self) -> int | None:
+        """Time of the estimate, ns, or None before the first event."""
+        clock = self._fold.clock
+        return None if clock == UNSET else clock
+
+    @property
+    def recording_path(self) -> Path | None:
+        """Where a recording is being written, if one is."""
+        return self.recorder.path if self.recorder is not None else None

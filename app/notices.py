@@ -1,0 +1,67 @@
+"""What happened: counters, and a bounded list of lines for people."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+SECONDS_APART = 1.0
+"""Between two lines under one key; those in between are counted only, so a flood of bad frames stays readable."""
+
+KEPT = 1000
+
+
+@dataclass(frozen=True)
+class Notice:
+    """One line for people: when (ns, the twin's time), how bad, what."""
+
+    number: int
+    t: int
+    level: str
+    text: str
+
+
+class Notices:
+    """Counters and lines, written by any thread, read by views that remember the number of the last line they had."""
+
+    def __init__(self, now: Callable[[], int], clock: Callable[[], float] = time.monotonic) -> None:
+        self._now = now
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._counts: Counter[str] = Counter()
+        self._lines: deque[Notice] = deque(maxlen=KEPT)
+        self._next = 0
+        self._last: dict[str, tuple[float, int]] = {}
+
+    def report(self, key: str, text: str, level: str = "warn") -> None:
+        """Count under `key`, and add a line unless one of that key came within the last second."""
+        with self._lock:
+            self._counts[key] += 1
+            when, at_count = self._last.get(key, (-SECONDS_APART, 0))
+            if self._clock() - when < SECONDS_APART:
+                return
+            more = self._counts[key] - at_count - 1
+            self._last[key] = (self._clock(), self._counts[key])
+            self._add(level, text if more < 1 else f"{text} ({more} more before)")
+
+    def say(self, text: str, level: str = "info") -> None:
+        """Add a line."""
+        with self._lock:
+            self._add(level, text)
+
+    def _add(self, level: str, text: str) -> None:
+        self._lines.append(Notice(self._next, self._now(), level, text))
+        self._next += 1
+
+    def since(self, number: int) -> list[Notice]:
+        """Lines from `number` on."""
+        with self._lock:
+            return [line for line in self._lines if line.number >= number]
+
+    def counts(self) -> dict[str, int]:
+        """The counters."""
+        with self._lock:
+            return dict(self._counts)

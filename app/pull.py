@@ -1,0 +1,77 @@
+"""What the engine shows to views, recorder and API: copies, so that nobody ever waits for anybody."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from estimators.log import Readings
+from estimators.track import Track
+from estimators.tuning import Tuning
+
+from .notices import Notice
+
+
+@dataclass
+class Cursor:
+    """How far one consumer has read. `next` is the absolute index of the next row; a rewritten row moves it back."""
+
+    revision: int = -1
+    next: int = 0
+    notice: int = 0
+
+
+@dataclass(frozen=True)
+class Pull:
+    """Rows since the cursor.
+
+    `fresh`: these rows start anew (another revision, or the first pull): forget what was drawn. `first` is the
+    absolute index of the first row; if it is below what was pulled before, a late reading rewrote the rows from there.
+    """
+
+    revision: int
+    fresh: bool
+    first: int
+    readings: Readings
+    track: Track
+    notices: list[Notice] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Belief:
+    """The estimate now: time (ns), mean (nx,), covariance (nx, nx), and points to draw (k, nx)."""
+
+    t: int
+    mean: np.ndarray
+    cov: np.ndarray
+    points: np.ndarray
+
+
+@dataclass(frozen=True)
+class Status:
+    """The state of the running twin, for panels and the API.
+
+    `t` is the time of the last event (ns), `latency_ms` the 99th percentile from a reading's arrival to its row.
+    """
+
+    estimator: str
+    tuning: Tuning
+    options: dict[str, float]
+    revision: int
+    refolding: bool
+    t: int | None
+    health: int
+    counts: dict[str, int]
+    nis: float
+    nis_low: float
+    nis_high: float
+    paused: bool
+    speed: float | None
+    seekable: bool
+    span: tuple[int, int] | None
+    finished: bool
+    recording: Path | None
+    latency_ms: float | None
+    latency_p50_ms: float | None

@@ -1,0 +1,84 @@
+"""Folds the whole history again beside the running twin: another estimator, another tuning."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from estimators.errors import NisusError
+from estimators.fold import Fold
+
+CHUNK = 16384
+"""Events between two looks at whether the twin is stopping."""
+
+
+@dataclass(frozen=True)
+class Refolded:
+    """A finished fold over a copy of the log, or the reason why there is none; `ticket` says which request it answers."""
+
+    ticket: int
+    fold: Fold | None
+    error: str
+
+
+class Refolder:
+    """One thread, one fold at a time; of the requests that come meanwhile only the latest counts."""
+
+    def __init__(self, done: Callable[[Refolded], None]) -> None:
+        self._done = done
+        self._wake = threading.Condition()
+        self._pending: tuple[int, Callable[[], Fold]] | None = None
+        self._busy = False
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="refold", daemon=True)
+
+    def start(self) -> None:
+        """Wait for requests."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Give up what is under way."""
+        with self._wake:
+            self._stopping = True
+            self._wake.notify()
+        if self._thread.is_alive():
+            self._thread.join(timeout=2.0)
+
+    def request(self, ticket: int, make: Callable[[], Fold]) -> None:
+        """Fold what `make` prepares (in this thread: it may have to compile), as soon as the present one is done."""
+        with self._wake:
+            self._pending = (ticket, make)
+            self._wake.notify()
+
+    @property
+    def busy(self) -> bool:
+        """Whether a fold is under way or waiting."""
+        with self._wake:
+            return self._busy or self._pending is not None
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                self._busy = False
+                while self._pending is None and not self._stopping:
+                    self._wake.wait()
+                if self._stopping:
+                    return
+                assert self._pending is not None
+                ticket, make = self._pending
+                self._pending = None
+                self._busy = True
+            self._done(self._fold(ticket, make))
+
+    def _fold(self, ticket: int, make: Callable[[], Any]) -> Refolded:
+        try:
+            fold = make()
+            while fold.advance(CHUNK) and not self._stopping:
+                pass
+        except NisusError as error:
+            return Refolded(ticket, None, str(error))
+        except Exception as error:  # noqa: BLE001  a user's model may raise anything; the running fold goes on
+            return Refolded(ticket, None, f"{type(error).__name__}: {error}")
+        return Refolded(ticket, fold, "")
