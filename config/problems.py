@@ -20,7 +20,8 @@ MOST = 5
 def nearest(name: str, names: Iterable[str]) -> str:
     """A remedy for a name that is not among `names`: the near ones, or all."""
     names = [str(item) for item in names]
-    near = get_close_matches(name, names, n=3, cutoff=0.6)
+    low = name.lower()
+    near = get_close_matches(name, names, n=3, cutoff=0.6) or [item for item in names if item.lower().startswith(low)]
     if near:
         return f"did you mean {' or '.join(near)}?"
     return f"choose from {', '.join(names)}" if names else "there are none to choose from"

@@ -70,15 +70,23 @@ def test_values_are_read_and_defaults_filled_in() -> None:
         ("duration: 120", "duration: no", "motor.yaml:11: source.duration is 'no'; it must be a number"),
         ("duration: 120", "duration: true", "motor.yaml:11: source.duration is true; it must be a number"),
         ("duration: 120", "duration: 1:30", "motor.yaml:11: source.duration is '1:30'; it must be a number"),
-        ("  type: simulator\n", "", "motor.yaml:9: source.type is missing; it must be one of simulator, can, can_log, table, merged"),
+        (
+            "  type: simulator\n",
+            "",
+            "motor.yaml:9: source.type is missing; it must be one of simulator, can, can_log, table, merged",
+        ),
         ("simulator", "simulater", "motor.yaml:10: source.type is 'simulater'; did you mean simulator?"),
         ("model: motor_winding\n", "", "motor.yaml:1: model is missing; add it"),
         ("motor_winding", "5", "motor.yaml:1: model is 5; it must be text; put it in quotes if it looks like a number"),
         ("[5, 2]", "[0, 2]", "motor.yaml:13: source.inputs.torque[1].steps must have rising times; put them in order"),
         ("[5, 2]", "[5]", "motor.yaml:13: source.inputs.torque[1].steps[1] is [5]; it needs 2 or more entries"),
-        ("estimator: kf", "estimator: {name: kf, options: {a: b}}", "motor.yaml:7: estimator.options.a is 'b'; it must be a number"),
+        (
+            "estimator: kf",
+            "estimator: {name: kf, options: {a: b}}",
+            "motor.yaml:7: estimator.options.a is 'b'; it must be a number",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_value_that_breaks_a_rule_is_one_line(old: str, new: str, expected: str) -> None:
     assert old in MOTOR
     assert message(MOTOR.replace(old, new, 1)) == expected
@@ -104,14 +112,18 @@ def test_a_value_that_breaks_a_rule_is_one_line(old: str, new: str, expected: st
         ("model: &a [*a]\n", "motor.yaml:1: it contains itself through an alias (*name); write the value out"),
         ("[" * 5000, "motor.yaml:1: it is nested too deeply; a twin needs six levels"),
         ("model: a\n? [1]\n: 2\n", "motor.yaml:2: a key must be one word, not a list or mapping; put braces in quotes"),
-        ("model: !!python/name:os.system ''\n", "motor.yaml:1: the tag tag:yaml.org,2002:python/name:os.system has no meaning here; remove it"),
+        ("model: !car x\n", "motor.yaml:1: the tag !car has no meaning here; remove it"),
+        (
+            "model: !!python/name:os.system ''\n",
+            "motor.yaml:1: the tag tag:yaml.org,2002:python/name:os.system has no meaning here; remove it",
+        ),
         ("model: a\ntitle: '\x01'\n", "motor.yaml:2: the character '\\x01' is not text; remove it"),
         (
             "model: a\n---\nmodel: b\n",
             "motor.yaml:2: not valid YAML: a second document begins here (---); check indentation, quotes and brackets",
         ),
     ],
-)  # fmt: skip
+)
 def test_what_is_not_a_twin_at_all_is_one_line(text: str, expected: str) -> None:
     assert message(text) == expected
 
