@@ -54,8 +54,8 @@ def find(name: str | os.PathLike[str]) -> Path:
         if path.with_suffix(".yaml").is_file():
             return path.with_suffix(".yaml")
         raise ConfigError(
-            f"{text}: no twin of that name ships; {nearest(text, shipped())}, give a YAML file's path, or "
-            f"write one with `nisus new {text}`"
+            f"{text}: no twin of that name ships; {nearest(text, shipped()).rstrip('?')}, give a YAML file's "
+            f"path, or write one with `nisus new {text}`"
         )
     return path
 

@@ -191,10 +191,9 @@ def test_files_that_cannot_be_read_are_one_line(tmp_path: Path, monkeypatch: pyt
     assert str(caught.value) == "absent.yaml: there is no such file; check the path, or see `nisus twins`"
     with pytest.raises(ConfigError) as caught:
         load("motor_windng")
-    assert str(caught.value) == (
-        "motor_windng: no twin of that name ships; did you mean motor_winding?, give a YAML file's path, or "
-        "write one with `nisus new motor_windng`"
-    )
+    text = str(caught.value)
+    assert text.startswith("motor_windng: no twin of that name ships; did you mean motor_winding")
+    assert text.endswith(", give a YAML file's path, or write one with `nisus new motor_windng`")
     (tmp_path / "folder.yaml").mkdir()
     with pytest.raises(ConfigError) as caught:
         load("folder.yaml")
