@@ -32,23 +32,33 @@ from .refolder import Refolded, Refolder
 if TYPE_CHECKING:
     from sources.source import Source
 
+    from estimators.tuning import Tuning
+
+    from .recording import Base
     from .twin import Twin
 
 LATENCIES = 4096
 STATUS_AGE = 0.1
-LISTED = 8192
-"""Rows of the status counts that are looked at again; older ones are summed up once."""
-
 
 class Engine:
     """A running twin."""
 
-    def __init__(self, twin: Twin, open_source: Callable[[Callable[[str, str], None]], Source]) -> None:
+    def __init__(
+        self,
+        twin: Twin,
+        open_source: Callable[[Callable[[str, str], None]], Source],
+        *,
+        base: Base | None = None,
+        horizon: float | None = None,
+    ) -> None:
         """Open the source and prepare the fold.
 
         Args:
             twin: What to run.
             open_source: Called with a report function; must give the source, paced or live.
+            base: Where the fold of the source's first event starts, if not at the prior (a recording's).
+            horizon: Seconds of lateness allowed, in place of the twin's; infinity takes every reading (a recording's
+                were judged when they came).
 
         Raises:
             NisusError: If the source cannot be opened or the model does not compile.
@@ -58,7 +68,9 @@ class Engine:
         self.pairs = twin.pairs
         section = twin.config.time
         self._policy = HealthPolicy(degraded_after=section.degraded_after, stale_after=section.stale_after)
-        self._horizon = round(section.horizon * 1e9)
+        allowed = section.horizon if horizon is None else horizon
+        self._horizon = round(allowed * 1e9) if np.isfinite(allowed) else None
+        self._first_base = base
         self._tick = section.tick
         self._history = max(2 * SPARSE_EVERY, twin.config.history)
         self.estimator, self.tuning = twin.estimator, twin.tuning
@@ -66,8 +78,8 @@ class Engine:
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._cursors: list[Cursor] = []
         self.notices = Notices(lambda: self._log.newest if self._log.n else 0)
-        self._base: tuple[np.ndarray, np.ndarray, int, np.ndarray] | None = None
-        self._clear()
+        self._base: Base | None = base
+        self._clear(base)
         self._feeder = Feeder(lambda: open_source(self.notices.report), self._inbox, self.notices.report)
         self._refolder = Refolder(self._inbox.put)
         self._ticket = 0
@@ -86,13 +98,13 @@ class Engine:
         self.recorder: Any = None
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
 
-    def _clear(self) -> None:
+    def _clear(self, base: Base | None) -> None:
         """An empty log and the fold that follows it."""
         self._log = Log(self.model.width, self._history + 4 * SPARSE_EVERY)
-        self._base = None
-        self._fold = self._make_fold(self.estimator, self.tuning, self._log, None)
+        self._base = base
+        self._fold = self._make_fold(self.estimator, self.tuning, self._log, base)
 
-    def _make_fold(self, estimator: str, tuning: Any, log: Log, base: Any) -> Fold:
+    def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
         return Fold(estimator, self.model, tuning, log, pairs=self.pairs, policy=self._policy, base=base)
 
     # For everybody, from any thread
@@ -152,6 +164,15 @@ class Engine:
         if lines:
             cursor.notice = lines[-1].number + 1
         return replace(pull, notices=lines)
+
+    def base(self) -> Base | None:
+        """Where a fold of the present log starts, if its oldest events were dropped; else None, for the prior."""
+        return self._base
+
+    def folded_with(self) -> tuple[Tuning, str]:
+        """Tuning and estimator of the fold that `pull` shows."""
+        with self._lock:
+            return self._fold.tuning, self._fold.estimator.name
 
     def previous(self) -> Pull | None:
         """The whole previous revision, for comparison; its arrays never change."""
@@ -256,7 +277,7 @@ class Engine:
             if self._log.n > self._history + 3 * SPARSE_EVERY:
                 self._forget()
         if stale:
-            self.notices.report("stale", f"{stale} reading(s) older than the horizon of {self._horizon / 1e9:g} s dropped")
+            self.notices.report("stale", f"{stale} reading(s) later than the horizon dropped")
         if self._feeder.live:
             self._note_latency(batch)
 
@@ -286,7 +307,8 @@ class Engine:
             if rows.size:
                 row = before + int(rows[-1])
                 sensor = self.model.sensors[log.channel[row]].name
-                self.notices.report(f"{VERDICT_NAMES[code]} {sensor}", f"{sensor}: reading {what} (NIS {track.nis[row]:.3g})")
+                text = f"{sensor}: reading {what} (NIS {track.nis[row]:.3g})"
+                self.notices.report(f"{VERDICT_NAMES[code]} {sensor}", text)
         if len(track) and track.health[-1] != self._health:
             self._health = int(track.health[-1])
             self.notices.say(f"health: {HEALTH_NAMES[self._health]}", level="info" if self._health == 0 else "warn")
@@ -316,10 +338,7 @@ class Engine:
         tick = Readings.one(now, time.time_ns(), TICK, 0, [], self.model.width)
         with self._lock:
             before = self._fold.n
-            # Not through the horizon's clock: a reading from before the tick is not late because of it.
-            newest = self._log.newest
             self._log.extend(tick)
-            self._log.newest = newest
             self._fold.advance()
             self._look(before)
 
@@ -369,7 +388,7 @@ class Engine:
         """The source began again: so does the log. The fold is a new revision of it."""
         with self._lock:
             self._previous = None
-            self._clear()
+            self._clear(self._first_base)
             self._revision += 1
             self._finished = False
             self._ticket += 1
@@ -385,7 +404,7 @@ class Engine:
             self._fold.advance()
         self.notices.say("estimate reset to the prior")
 
-    def _retune(self, estimator: str, tuning: Any) -> None:
+    def _retune(self, estimator: str, tuning: Tuning) -> None:
         """Fold the history again, beside the running fold, over a copy of the log."""
         find_estimator(estimator, self.model)
         self.estimator, self.tuning = estimator, tuning

@@ -16,7 +16,7 @@ CHUNK = 16384
 
 @dataclass(frozen=True)
 class Refolded:
-    """A finished fold over a copy of the log, or the reason why there is none; `ticket` says which request it answers."""
+    """A finished fold over a copy of the log, or why there is none; `ticket` says which request it answers."""
 
     ticket: int
     fold: Fold | None

@@ -106,7 +106,9 @@ class Log:
         """
         if not len(batch):
             return self.n, 0
-        newest = np.maximum(np.maximum.accumulate(batch.t), self.newest)
+        # A tick says nothing of the asset, so nothing is late because of it.
+        said = np.where(batch.kind == TICK, self.newest, batch.t)
+        newest = np.maximum(np.maximum.accumulate(said), self.newest)
         self.newest = int(newest[-1])
         stale = 0
         if horizon is not None:

@@ -1,0 +1,253 @@
+"""The recording: an .rrd file that Rerun opens, and that holds all it takes to fold again, to the bit.
+
+Beside what charts show, the file keeps under /nisus, as plain columns: `twin` (YAML, estimator, base), `tuning` (each
+one, with the event from which it held), `events` (the log) and `track` (float64). Rows carry their absolute index; a
+late reading makes a recorder write rows again from the index where it belongs, and another revision from the start.
+Reading therefore takes rows in the order of the file, and an index that is not new cuts off what lay behind it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from rerun.chunk import RrdReader
+
+from estimators.errors import SourceError
+from estimators.log import Readings
+from estimators.model import StateSpaceModel
+from estimators.track import Track
+from estimators.tuning import Tuning
+
+from .pull import Pull
+
+FORMAT = 1
+TIMELINE = "event"
+Base = tuple[np.ndarray, np.ndarray, int, np.ndarray]
+
+
+def tuning_to_json(tuning: Tuning, estimator: str) -> str:
+    """A tuning and its estimator as text; float64s survive exactly."""
+    return json.dumps(
+        {
+            "estimator": estimator,
+            "q": tuning.q.tolist(),
+            "r": tuning.r.tolist(),
+            "p": tuning.p.tolist(),
+            "used": tuning.used.tolist(),
+            "gate": tuning.gate,
+            "options": dict(tuning.options),
+            "seed": tuning.seed,
+        }
+    )
+
+
+def tuning_from_json(text: str, model: StateSpaceModel) -> tuple[Tuning, str]:
+    """The tuning and the estimator that `tuning_to_json` wrote."""
+    values = json.loads(text)
+    tuning = Tuning(
+        model=model,
+        q=np.array(values["q"], float),
+        r=np.array(values["r"], float),
+        p=np.array(values["p"], float),
+        used=np.array(values["used"], bool),
+        gate=values["gate"],
+        options=values["options"],
+        seed=values["seed"],
+    )
+    return tuning, values["estimator"]
+
+
+class RecordingFile:
+    """An .rrd that is being written, in a stream of its own: no viewer can hold it up."""
+
+    def __init__(self, path: Path, *, name: str, text: str, twin_path: Path, base: Base | None) -> None:
+        """Begin a file.
+
+        Args:
+            path: Where; the folder must exist.
+            name: Of the twin.
+            text: The twin's YAML.
+            twin_path: Where the YAML was, for the model's file beside it.
+            base: Where the fold of the first event starts, if older events were dropped before.
+
+        Raises:
+            SourceError: If the file cannot be written.
+        """
+        self.path = path
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.open("wb").close()
+        except OSError as error:
+            raise SourceError(f"recording {path}: {error.strerror}; choose a place that can be written") from None
+        self.stream = rr.RecordingStream(f"nisus_{name}", recording_id=f"{name}-{path.stem}")
+        self.stream.set_sinks(rr.FileSink(str(path)))
+        self.rows = 0
+        start = None
+        if base is not None:
+            mean, cov, clock, u = base
+            start = {"mean": mean.tolist(), "cov": cov.tolist(), "clock": clock, "u": u.tolist()}
+        self.stream.log(
+            "/nisus/twin",
+            rr.AnyValues(format=FORMAT, name=name, yaml=text, path=str(twin_path), base=json.dumps(start)),
+            static=True,
+        )
+
+    def tuning(self, tuning: Tuning, estimator: str, index: int, revision: int) -> None:
+        """Write the tuning that holds from event `index` on."""
+        self.stream.send_columns(
+            "/nisus/tuning",
+            indexes=[rr.TimeColumn(TIMELINE, sequence=[index])],
+            columns=rr.AnyValues.columns(json=[tuning_to_json(tuning, estimator)], revision=[revision]),
+        )
+
+    def write(self, pull: Pull) -> None:
+        """Write rows of log and track."""
+        count = len(pull.readings)
+        if not count:
+            return
+        index = [rr.TimeColumn(TIMELINE, sequence=np.arange(pull.first, pull.first + count))]
+        for entity, columns in (("/nisus/events", pull.readings), ("/nisus/track", pull.track)):
+            flat: dict[str, np.ndarray] = {}
+            for name, column in zip(columns._fields, columns, strict=True):
+                if column.ndim == 1:
+                    flat[name] = column
+                else:
+                    flat |= {f"{name}_{k}": np.ascontiguousarray(column[:, k]) for k in range(column.shape[1])}
+            self.stream.send_columns(entity, indexes=index, columns=rr.AnyValues.columns(**flat))
+        self.rows += count
+
+    def flush(self) -> None:
+        """Hand everything to the operating system."""
+        self.stream.flush()
+
+    def close(self) -> None:
+        """Finish the file."""
+        self.stream.flush()
+        self.stream.disconnect()
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What a recording holds: twin, the last tuning, the log and the track as they were at the end."""
+
+    path: Path
+    name: str
+    text: str
+    twin_path: Path
+    base: Base | None
+    tuning: str
+    tunings: int
+    readings: Readings
+    track: Track
+    first: int
+    rows: int
+
+
+def read_recording(path: Path) -> Recorded:
+    """Read a recording back, also one whose writer was killed.
+
+    Raises:
+        SourceError: If it cannot be read, or is not a recording of Nisus.
+    """
+    if not path.is_file():
+        raise SourceError(f"{path}: there is no such recording; check the path")
+    header: dict[str, Any] = {}
+    tunings: list[str] = []
+    events: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
+    tracks: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
+    try:
+        for chunk in RrdReader(str(path)).stream():
+            if not chunk.entity_path.startswith("/nisus/"):
+                continue
+            batch = chunk.to_record_batch()
+            names = {name: k for k, name in enumerate(batch.schema.names)}
+            if chunk.entity_path == "/nisus/twin":
+                header = {name: _flat(batch.column(k))[0] for name, k in names.items() if not _control(name)}
+            elif chunk.entity_path == "/nisus/tuning":
+                tunings += _flat(batch.column(names["json"])).tolist()
+            else:
+                index = batch.column(names[TIMELINE]).to_numpy()
+                columns = {name: _flat(batch.column(k)) for name, k in names.items() if not _control(name)}
+                (events if chunk.entity_path == "/nisus/events" else tracks).append((index, columns))
+    except Exception as error:  # noqa: BLE001  Rerun's reader raises many kinds on a damaged file
+        if not (header and events):
+            raise SourceError(f"{path}: cannot be read ({_line(error)}); is it an .rrd file?") from None
+    if not header or not tunings:
+        raise SourceError(f"{path}: holds no recording of Nisus; record one with `nisus run TWIN --record FILE.rrd`")
+    if int(header["format"]) != FORMAT:
+        raise SourceError(f"{path}: is of format {header['format']}, this version reads {FORMAT}; use the other version")
+    first, log_columns = _latest(events)
+    _, track_columns = _latest(tracks)
+    readings = _assemble(Readings, log_columns)
+    track = _assemble(Track, track_columns)
+    rows = min(len(readings), len(track))
+    start = json.loads(str(header["base"]))
+    base: Base | None = None
+    if start is not None:
+        base = (np.array(start["mean"]), np.array(start["cov"]), int(start["clock"]), np.array(start["u"], float))
+    return Recorded(
+        path=path,
+        name=str(header["name"]),
+        text=str(header["yaml"]),
+        twin_path=Path(str(header["path"])),
+        base=base,
+        tuning=str(tunings[-1]),
+        tunings=len(tunings),
+        readings=readings.select(slice(0, rows)),
+        track=track.select(slice(0, rows)),
+        first=first,
+        rows=rows,
+    )
+
+
+def _control(name: str) -> bool:
+    return name == TIMELINE or name.startswith("rerun.") or name in ("log_time", "log_tick")
+
+
+def _flat(column: Any) -> np.ndarray:
+    return column.flatten().to_numpy(zero_copy_only=False)
+
+
+def _line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+
+
+def _latest(chunks: list[tuple[np.ndarray, dict[str, np.ndarray]]]) -> tuple[int, dict[str, np.ndarray]]:
+    """The rows that hold at the end: the last one written under each index, nothing behind an index written anew."""
+    if not chunks:
+        return 0, {}
+    index = np.concatenate([chunk for chunk, _ in chunks])
+    names = chunks[0][1].keys()
+    columns = {name: np.concatenate([values[name] for _, values in chunks]) for name in names}
+    # A row holds if no later row has an index that is not above its own.
+    later = np.minimum.accumulate(index[::-1])[::-1]
+    keep = np.append(index[:-1] < later[1:], True)
+    kept = {name: column[keep] for name, column in columns.items()}
+    return int(index[keep][0]), kept
+
+
+def _assemble(kind: Callable[..., Any], columns: dict[str, np.ndarray]) -> Any:
+    return kind(*(_column(name, columns) for name in kind._fields))  # type: ignore[attr-defined]
+
+
+def _column(name: str, columns: dict[str, np.ndarray]) -> np.ndarray:
+    if name in columns:
+        return columns[name]
+    wide = list(_numbered(name, columns))
+    rows = len(next(iter(columns.values()))) if columns else 0
+    return np.stack(wide, axis=1) if wide else np.zeros((rows, 0))
+
+
+def _numbered(name: str, columns: dict[str, np.ndarray]) -> Iterator[np.ndarray]:
+    k = 0
+    while f"{name}_{k}" in columns:
+        yield columns[f"{name}_{k}"]
+        k += 1
+
+
