@@ -1,0 +1,205 @@
+"""The command line: `nisus run`, `fold`, `review`, `bus`, `twins`, `schema`, `new`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from estimators.errors import ConfigError, NisusError
+
+Twin = Annotated[str, tyro.conf.Positional]
+Settings = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+
+
+@dataclass(frozen=True)
+class Run:
+    """Run a twin, and show it in the browser."""
+
+    twin: Twin
+    """Name of a twin that ships (see `nisus twins`), or path of a YAML file."""
+    estimator: str | None = None
+    """Estimator in place of the twin's own: kf, ekf, ukf."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable: Q.temperature=0.02, R.winding=9, p.NAME, use.SENSOR=false, gate, or a dotted YAML key."""
+    log: tuple[Path, ...] = ()
+    """Recordings in place of the twin's own."""
+    record: Path | None = None
+    """Record into this .rrd file from the start."""
+    speed: float = 1.0
+    """Times real time for replays and simulations; inf is as fast as possible."""
+    duration: float | None = None
+    """Stop after so many seconds."""
+    port: int = 9900
+    """Of the page, on 127.0.0.1; 0 takes a free one."""
+    no_browser: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the URL, open nothing."""
+    headless: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """No page at all: run, and record if asked."""
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Fold a twin's readings as fast as possible, and print what the estimate was worth."""
+
+    twin: Twin
+    """Name of a twin that ships, or path of a YAML file."""
+    estimator: str | None = None
+    """Estimator in place of the twin's own."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable, as for `run`."""
+    log: tuple[Path, ...] = ()
+    """Recordings in place of the twin's own."""
+    duration: float | None = None
+    """Take only so many seconds of the source."""
+    out: Path | None = None
+    """Write the track to this .parquet, or a recording to this .rrd."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print one JSON object."""
+
+
+@dataclass(frozen=True)
+class Review:
+    """Open a recording on the page, with the panel that folds its readings again."""
+
+    file: Annotated[Path, tyro.conf.Positional]
+    """The .rrd file."""
+    port: int = 9900
+    """Of the page, on 127.0.0.1; 0 takes a free one."""
+    no_browser: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the URL, open nothing."""
+    duration: float | None = None
+    """Stop after so many seconds."""
+
+
+@dataclass(frozen=True)
+class Bus:
+    """Play a twin's asset on its CAN bus, in a process of its own."""
+
+    twin: Twin
+    """Name of a twin with a CAN source that has an `asset`, or path of a YAML file."""
+    interface: str = "udp_multicast"
+    """python-can's name of the bus: udp_multicast reaches other processes of this machine, socketcan a real bus."""
+    channel: str | None = None
+    """Channel of the interface; default: the twin's where it suits, else the interface's own."""
+    set: Settings = ()
+    """KEY=VALUE of the YAML, repeatable."""
+    duration: float | None = None
+    """Stop after so many seconds."""
+    record: Path | None = None
+    """Also write the frames to this log, in any format python-can writes (.blf, .asc, .log, .csv, .mf4)."""
+
+
+@dataclass(frozen=True)
+class Twins:
+    """List the twins that ship."""
+
+
+@dataclass(frozen=True)
+class Schema:
+    """Write the JSON Schema of a twin's YAML, for editors that complete and check."""
+
+    out: Path | None = None
+    """File; without it, standard output."""
+
+
+@dataclass(frozen=True)
+class New:
+    """Write a working pair NAME.yaml and NAME.py to start a twin of your own from."""
+
+    name: Annotated[str, tyro.conf.Positional]
+    """Of the twin."""
+    folder: Path = field(default_factory=Path.cwd)
+    """Where to."""
+
+
+Command = (
+    Annotated[Run, tyro.conf.subcommand("run")]
+    | Annotated[Fold, tyro.conf.subcommand("fold")]
+    | Annotated[Review, tyro.conf.subcommand("review")]
+    | Annotated[Bus, tyro.conf.subcommand("bus")]
+    | Annotated[Twins, tyro.conf.subcommand("twins")]
+    | Annotated[Schema, tyro.conf.subcommand("schema")]
+    | Annotated[New, tyro.conf.subcommand("new")]
+)
+
+
+def settings(given: Sequence[str], estimator: str | None = None) -> dict[str, str]:
+    """The KEY=VALUE pairs of `--set`, and `--estimator` as one more.
+
+    Raises:
+        ConfigError: If one has no `=`.
+    """
+    pairs: dict[str, str] = {}
+    for text in given:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip():
+            raise ConfigError(f"--set {text}: has no value; write KEY=VALUE, for example --set R.winding=9")
+        pairs[key.strip()] = value.strip()
+    if estimator is not None:
+        pairs["estimator"] = estimator
+    return pairs
+
+
+def carry_out(command: Command) -> int:
+    """Run one command; imports only what it needs, so that `nisus twins` answers at once."""
+    if isinstance(command, Run):
+        from .run import run_twin
+
+        return run_twin(command)
+    if isinstance(command, Fold):
+        from .fold import fold_twin
+
+        return fold_twin(command)
+    if isinstance(command, Review):
+        from .review import review_recording
+
+        return review_recording(command)
+    if isinstance(command, Bus):
+        from .bus import play_bus
+
+        return play_bus(command)
+    if isinstance(command, Twins):
+        from config.loader import load, shipped
+
+        for name in shipped():
+            print(f"{name:<16} {load(name).config.title or ''}")
+        return 0
+    if isinstance(command, Schema):
+        from config.json_schema import json_schema_text
+
+        text = json_schema_text()
+        if command.out is None:
+            print(text)
+        else:
+            command.out.write_text(text + "\n", encoding="utf-8")
+        return 0
+    from .new import write_twin
+
+    for path in write_twin(command.name, command.folder):
+        print(path)
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point: 0 when all went well, 2 with one line on standard error when it did not."""
+    try:
+        return carry_out(
+            tyro.cli(Command, args=arguments, prog="nisus", description=__doc__)  # type: ignore[call-overload]
+        )
+    except NisusError as error:
+        print(f"nisus: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"nisus: {error.filename or ''}: {error.strerror or error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,169 @@
+"""`nisus fold`: a twin's readings folded as fast as possible, and what the estimate was worth."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from estimators.diagnostics import HealthPolicy, Score, score
+from estimators.errors import ConfigError, SourceError
+from estimators.fold import Fold
+from estimators.log import KIND_NAMES, Log
+from estimators.track import HEALTH_NAMES, VERDICT_NAMES, Track
+
+from .cli import settings
+from .compile import prepare
+from .twin import Twin, load_twin
+
+if TYPE_CHECKING:
+    from .cli import Fold as Arguments
+
+
+def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
+    """Everything that the twin's source says, in the order of time, and what was counted on the way.
+
+    Raises:
+        SourceError: If the source cannot be opened, has no end, or says nothing.
+    """
+    counts: Counter[str] = Counter()
+    lines: dict[str, str] = {}
+
+    def report(key: str, text: str) -> None:
+        counts[key] += 1
+        lines.setdefault(key, text)
+
+    source = twin.open_source(report, live=False)
+    if duration is None and getattr(source, "endless", False):
+        source.close()
+        raise SourceError(f"{twin.name}: its source has no end; give --duration SECONDS")
+    log = Log(twin.model.width)
+    horizon = round(twin.config.time.horizon * 1e9)
+    try:
+        while (batch := source.read(1.0)) is not None:
+            _, stale = log.extend(batch, horizon)
+            counts["stale"] += stale
+            if duration is not None and log.n and log.t[log.n - 1] - log.t[0] > duration * 1e9:
+                log.n = int(np.searchsorted(log.t[: log.n], log.t[0] + round(duration * 1e9), side="right"))
+                break
+    finally:
+        source.close()
+    if not log.n:
+        raise SourceError(f"{twin.name}: its source said nothing that a sensor needs; check the channel maps")
+    return log, +counts
+
+
+def fold_twin(arguments: Arguments) -> int:
+    """Carry the command out."""
+    twin = load_twin(
+        arguments.twin, log_files=arguments.log or None, overrides=settings(arguments.set, arguments.estimator)
+    )
+    if arguments.out is not None and arguments.out.suffix not in (".parquet", ".rrd"):
+        raise ConfigError(f"--out {arguments.out}: must end in .parquet or .rrd")
+    prepare(twin)
+    log, counts = read_log(twin, arguments.duration)
+    section = twin.config.time
+    policy = HealthPolicy(degraded_after=section.degraded_after, stale_after=section.stale_after)
+    fold = Fold(twin.estimator, twin.model, twin.tuning, log, pairs=twin.pairs, policy=policy)
+    begun = time.perf_counter()
+    fold.advance()
+    seconds = (time.perf_counter() - begun) / log.n
+    circular = np.array([state.circular for state in twin.model.states])
+    result = score(fold.track, log.readings, twin.model.state_names, circular)
+    if arguments.out is not None:
+        _write(arguments.out, twin, log, fold.track)
+    if arguments.json:
+        print(json.dumps(_as_dict(twin, result, seconds)))
+    else:
+        _print(twin, result, seconds, counts, fold.track)
+    return 0
+
+
+def _as_dict(twin: Twin, result: Score, seconds: float) -> dict[str, Any]:
+    def number(value: float) -> float | None:
+        return float(value) if np.isfinite(value) else None
+
+    return {
+        "twin": twin.name,
+        "estimator": twin.estimator,
+        "readings": result.readings,
+        "rmse": {name: number(value) for name, value in result.rmse.items()},
+        "nis": {
+            "mean": number(result.nis),
+            "low": number(result.nis_low),
+            "high": number(result.nis_high),
+            "n": result.nis_readings,
+        },
+        "log_likelihood": number(result.log_likelihood),
+        "gated": result.gated,
+        "missing": result.missing,
+        "seconds_per_event": seconds,
+    }
+
+
+def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], track: Track) -> None:
+    units = {state.name: state.unit for state in twin.model.states}
+    rows = [
+        ("twin", f"{twin.name}: {twin.title}"),
+        ("estimator", twin.estimator),
+        ("readings", f"{result.readings}"),
+    ]
+    rows += [
+        (f"RMSE {name}", f"{value:.4f} {units[name]}   in the 95 % band: {100 * result.coverage[name]:.1f} %")
+        for name, value in result.rmse.items()
+    ]
+    if result.nis_readings:
+        inside = "inside" if result.nis_low <= result.nis <= result.nis_high else "OUTSIDE"
+        bounds = f"{result.nis_low:.4f} to {result.nis_high:.4f} of {result.nis_readings} readings"
+        rows.append(("mean NIS", f"{result.nis:.4f}   {inside} its 95 % bounds {bounds}"))
+    rows += [
+        ("log-likelihood", f"{result.log_likelihood:.2f}"),
+        ("gated", f"{result.gated}"),
+        ("missing", f"{result.missing}"),
+    ]
+    if result.held_out:
+        rows.append(("held out", f"{result.held_out}"))
+    rows += [(key, f"{count}") for key, count in sorted(counts.items())]
+    variances = ", ".join(
+        f"{name} {value**2:.5g}" for name, value in zip(twin.model.state_names, track.std[-1], strict=True)
+    )
+    rows += [
+        ("final variances", variances),
+        ("health at the end", HEALTH_NAMES[int(track.health[-1])]),
+        ("time per event", f"{1e6 * seconds:.2f} µs"),
+    ]
+    width = max(len(name) for name, _ in rows)
+    for name, value in rows:
+        print(f"{name:<{width}}  {value}")
+
+
+def _write(path: Path, twin: Twin, log: Log, track: Track) -> None:
+    if path.suffix == ".rrd":
+        from .recorder import write_recording
+
+        write_recording(path, twin, log, track)
+        return
+    events = log.readings
+    model = twin.model
+    columns: dict[str, Any] = {
+        "t_ns": events.t,
+        "arrival_ns": events.arrival,
+        "event": np.array(KIND_NAMES)[events.kind],
+        "channel": events.channel,
+    }
+    columns |= {f"value_{k}": events.value[:, k] for k in range(model.width)}
+    columns |= {name: track.mean[:, k] for k, name in enumerate(model.state_names)}
+    columns |= {f"{name}_std": track.std[:, k] for k, name in enumerate(model.state_names)}
+    columns |= {f"innovation_{k}": track.innovation[:, k] for k in range(model.width)}
+    columns |= {f"innovation_std_{k}": track.innovation_std[:, k] for k in range(model.width)}
+    for name in ("nis", "nis_mean", "nis_low", "nis_high", "log_likelihood"):
+        columns[name] = getattr(track, name)
+    columns["verdict"] = np.array(VERDICT_NAMES)[track.verdict]
+    columns["health"] = np.array(HEALTH_NAMES)[track.health]
+    pq.write_table(pa.table({name: np.ascontiguousarray(column) for name, column in columns.items()}), path)

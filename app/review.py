@@ -1,0 +1,62 @@
+"""`nisus review`: a recording on the page, folded again from its readings."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .compile import prepare
+from .recording import read_recording, tuning_from_json
+from .session import Page, Session
+from .twin import Twin, restore_twin
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from .cli import Review
+    from .recording import Recorded
+
+
+def recorded_twin(recorded: Recorded) -> Twin:
+    """The twin as it was when the recording ended: its YAML, with the last tuning and estimator."""
+    from dataclasses import replace
+
+    twin = restore_twin(recorded.text, recorded.twin_path)
+    tuning, estimator = tuning_from_json(recorded.tuning, twin.model)
+    return replace(twin, tuning=tuning, estimator=estimator)
+
+
+def open_review(path: Path, page: Page | None) -> tuple[Session, Recorded]:
+    """A session over the recorded readings: the same engine, the same fold.
+
+    Raises:
+        NisusError: If the recording cannot be read, or its model is not there.
+    """
+    recorded = read_recording(path)
+    twin = recorded_twin(recorded)
+    prepare(twin)
+
+    def open_source(report: Callable[[str, str], None]) -> object:
+        from sources.memory import MemorySource
+
+        return MemorySource(recorded.readings)
+
+    session = Session(
+        twin,
+        open_source,  # type: ignore[arg-type]
+        page=page,
+        base=recorded.base,
+        horizon=np.inf,
+        review=path,
+    )
+    session.engine.notices.say(f"{path.name}: {recorded.rows} rows, {recorded.tunings} tuning(s), folded again")
+    return session, recorded
+
+
+def review_recording(arguments: Review) -> int:
+    """Carry the command out."""
+    session, _ = open_review(arguments.file, Page(arguments.port, not arguments.no_browser))
+    session.run(record=None, duration=arguments.duration, until_finished=False)
+    return 0
