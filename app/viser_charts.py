@@ -1,0 +1,268 @@
+"""The charts: each state with its filled 2σ band and what is known of it, and the NIS with its bounds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import viser
+
+from estimators.log import READING, TRUTH
+from estimators.model import StateSpaceModel
+from estimators.track import GATED
+
+from .viser_decimate import Buckets, bridge
+from .viser_history import History
+
+BLUE, GREEN, GREY, RED = "#2563eb", "#16a34a", "#9ca3af", "#dc2626"
+DOTS = ("#f59e0b", "#8b5cf6", "#0891b2")
+WINDOWS = {"10 s": 10.0, "30 s": 30.0, "60 s": 60.0, "300 s": 300.0, "all": None}
+BUCKETS = 300
+SHOWN = 6
+"""States that have a chart of their own; of more, the last chart shows the one chosen."""
+
+
+def observers(model: StateSpaceModel) -> list[list[tuple[int, int]]]:
+    """For each state, the sensor rows (sensor, row) that read it directly: h(x) = x_j, whatever x is."""
+    direct: list[list[tuple[int, int]]] = [[] for _ in model.states]
+    rng = np.random.default_rng(0)
+    mean = np.array([state.mean for state in model.states])
+    std = np.array([state.std for state in model.states])
+    u = np.array([item.default for item in model.inputs])
+    p = np.array([parameter.value for parameter in model.parameters])
+    points = mean + std * rng.uniform(0.3, 0.9, (2, model.nx))
+    for k, sensor in enumerate(model.sensors):
+        out = np.full((2, len(sensor.rows)), np.nan)
+        for x, row in zip(points, out, strict=True):
+            sensor.h(x, u, p, row)
+        for r in range(len(sensor.rows)):
+            for j in np.flatnonzero(np.all(np.isclose(out[:, r, None], points, rtol=1e-9, atol=1e-12), axis=0)):
+                direct[j].append((k, r))
+    return direct
+
+
+def _line(color: str, width: float, **more: Any) -> dict[str, Any]:
+    return {"stroke": color, "width": width, "auto": False, "spanGaps": True, "points": {"show": False}, **more}
+
+
+def _frame_series() -> dict[str, Any]:
+    # uPlot finds no range of a series with NaN. So this invisible one, which has none, spans the range for all.
+    return {"label": "range", "stroke": "rgba(0,0,0,0)", "width": 0, "points": {"show": False}}
+
+
+def _dots(color: str, size: float) -> dict[str, Any]:
+    # A line of no width: uPlot draws the points only.
+    return {
+        "stroke": color,
+        "width": 0,
+        "auto": False,
+        "points": {"show": True, "size": size, "fill": color, "width": 0},
+    }
+
+
+class Range:
+    """The values that an axis spans: grows at once, shrinks only when much of it is empty, so it does not twitch."""
+
+    def __init__(self) -> None:
+        self._low, self._high = np.nan, np.nan
+
+    def series(self, columns: list[np.ndarray]) -> np.ndarray:
+        """A series as long as the columns that holds the two ends of their range."""
+        values = np.concatenate(columns)
+        values = values[np.isfinite(values)]
+        if values.size:
+            low, high = float(values.min()), float(values.max())
+            roomy = (high - low) < 0.5 * (self._high - self._low)
+            if not (self._low <= low and high <= self._high) or roomy:
+                margin = 0.08 * (high - low) or max(1e-9, 1e-3 * abs(high))
+                self._low, self._high = low - margin, high + margin
+        out = np.full(columns[0].size, self._low if np.isfinite(self._low) else 0.0)
+        out[1::2] = self._high if np.isfinite(self._high) else 1.0
+        return out
+
+
+class Charts:
+    """The chart handles, and the decimated columns that they show."""
+
+    def __init__(self, server: viser.ViserServer, model: StateSpaceModel, window: float) -> None:
+        self.model = model
+        self.direct = observers(model)
+        self.window: float | None = window
+        self._previous: tuple[np.ndarray, np.ndarray] | None = None
+        nx = model.nx
+        self._dot_columns = [[4 * nx + j * 4 + d for d in range(min(3, len(self.direct[j])))] for j in range(nx)]
+        self._nis = 8 * nx
+        self._columns = 8 * nx + 4
+        self._buckets = Buckets(self._columns, 1)
+        self._shown = list(range(min(nx, SHOWN)))
+        self._ranges = [Range() for _ in range(nx + 1)]
+        options = {name: value for name, value in WINDOWS.items() if value is None or value != window}
+        self.windows = {f"{window:g} s": window, **options}
+        self.windows = dict(sorted(self.windows.items(), key=lambda item: item[1] or np.inf))
+        gui = server.gui
+        self.window_choice = gui.add_dropdown("Window", tuple(self.windows), initial_value=f"{window:g} s")
+        self.key = gui.add_html(self._key())
+        self._charts = [self._state_chart(gui, j) for j in self._shown[: SHOWN - 1]]
+        self.state_choice = None
+        if nx > SHOWN:
+            rest = model.state_names[SHOWN - 1 :]
+            self.state_choice = gui.add_dropdown("State", rest, initial_value=rest[0])
+        if nx >= SHOWN:
+            self._charts.append(self._state_chart(gui, SHOWN - 1))
+        self._nis_chart = self._make_nis_chart(gui)
+        self.set_window(window)
+
+    def set_window(self, window: float | None) -> None:
+        """Show the last `window` seconds, or everything; the caller pulls the history again."""
+        self.window = window
+        self._buckets = Buckets(self._columns, int(1e9 * window / BUCKETS) if window else 1)
+
+    def choose_state(self, name: str) -> None:
+        """Show another state in the last chart."""
+        self._shown[-1] = self.model.state_names.index(name)
+        chart, state = self._charts[-1], self.model.states[self._shown[-1]]
+        chart.title = _title(state.name, state.unit)
+
+    def set_previous(self, pull: Any) -> None:
+        """The track of the previous revision, drawn as a thin grey line."""
+        self._previous = None if pull is None else (pull.readings.t.copy(), pull.track.mean.copy())
+
+    def update(self, history: History, changed: int) -> None:
+        """Bring the decimated columns up to date."""
+        t = history.column("t")
+        if self.window is None and t.size:
+            # Everything: buckets double in width when the history has outgrown them.
+            span = int(t[-1] - t[0])
+            if span > self._buckets.width * 2 * BUCKETS or self._buckets.width == 1:
+                self._buckets = Buckets(self._columns, max(1, span // BUCKETS))
+                changed = 0
+        self._buckets.update(t, changed, lambda start, end: self._values(history, start, end))
+
+    def draw(self, history: History) -> None:
+        """Send what the charts show now."""
+        t = history.column("t")
+        if not t.size or history.origin is None:
+            return
+        since = int(t[0]) if self.window is None else int(t[-1] - self.window * 1e9)
+        times, values = self._buckets.points(since)
+        x = (times - history.origin) * 1e-9
+        if x.size == 1:
+            x, times, values = np.repeat(x, 2), np.repeat(times, 2), np.repeat(values, 2, axis=0)
+        for chart, j in zip(self._charts, self._shown, strict=True):
+            chart.data = self._state_data(x, times, values, j)
+        self._nis_chart.data = self._nis_data(x, values)
+
+    def _values(self, history: History, start: int, end: int) -> np.ndarray:
+        nx = self.model.nx
+        rows = slice(start, end)
+        mean, std = history.column("mean")[rows], history.column("std")[rows]
+        kind, channel = history.column("kind")[rows], history.column("channel")[rows]
+        value, verdict = history.column("value")[rows], history.column("verdict")[rows]
+        out = np.full((end - start, self._columns), np.nan)
+        out[:, :nx] = mean
+        out[:, nx : 2 * nx] = mean + 2 * std
+        out[:, 2 * nx : 3 * nx] = mean - 2 * std
+        true = np.flatnonzero(kind == TRUTH)
+        out[true, 3 * nx + channel[true]] = value[true, 0]
+        reading, gated = kind == READING, verdict == GATED
+        for j in range(nx):
+            for column, (sensor, row) in zip(self._dot_columns[j], self.direct[j], strict=False):
+                mine = reading & (channel == sensor)
+                out[:, column] = np.where(mine & ~gated, value[:, row], np.nan)
+                refused = np.flatnonzero(mine & gated)
+                out[refused, 4 * nx + j * 4 + 3] = value[refused, row]
+        for k, name in enumerate(("nis", "nis_mean", "nis_low", "nis_high")):
+            out[:, self._nis + k] = history.column(name)[rows]
+        return out
+
+    def _state_data(self, x: np.ndarray, times: np.ndarray, values: np.ndarray, j: int) -> tuple[np.ndarray, ...]:
+        nx = self.model.nx
+        previous = np.full(x.size, np.nan)
+        if self._previous is not None and self._previous[0].size:
+            t, mean = self._previous
+            previous = np.interp(times, t, mean[:, j], left=np.nan, right=np.nan)
+        columns = [values[:, nx + j], values[:, 2 * nx + j], previous, bridge(values[:, 3 * nx + j]), values[:, j]]
+        columns += [values[:, 4 * nx + j * 4 + d] for d in range(4)]
+        return x, *columns, self._ranges[j].series(columns)
+
+    def _nis_data(self, x: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, ...]:
+        nis, mean, low, high = (values[:, self._nis + k] for k in range(4))
+        bound = np.nanmax(high) if np.isfinite(high).any() else np.nan
+        if np.isfinite(bound):
+            # One outlier must not flatten the rest: what lies far above the bound is drawn at the top.
+            nis = np.minimum(nis, 4 * bound)
+        columns = [bridge(high), bridge(low), bridge(mean), nis]
+        return x, *columns, self._ranges[-1].series([*columns, np.zeros(x.size)])
+
+    def _state_chart(self, gui: viser.GuiApi, j: int) -> viser.GuiUplotHandle:
+        state = self.model.states[j]
+        nothing = np.array([0.0, 1.0])
+        band = _line("rgba(37,99,235,0)", 0)
+        series = [
+            {"label": "s"},
+            {**band, "label": "+2σ"},
+            {**band, "label": "-2σ"},
+            _line(GREY, 1, label="previous"),
+            _line(GREEN, 1.5, label="truth"),
+            _line(BLUE, 1.5, label="mean"),
+            *(_dots(color, 4) for color in DOTS),
+            _dots(RED, 5),
+            _frame_series(),
+        ]
+        return gui.add_uplot(
+            (nothing, *(nothing for _ in series[1:])),
+            tuple(series),  # type: ignore[arg-type]
+            title=_title(state.name, state.unit),
+            bands=({"series": (1, 2), "fill": "rgba(37,99,235,0.16)"},),
+            **_frame(150),
+        )
+
+    def _make_nis_chart(self, gui: viser.GuiApi) -> viser.GuiUplotHandle:
+        nothing = np.array([0.0, 1.0])
+        edge = _line(GREY, 1, dash=(4, 4))
+        series = (
+            {"label": "s"},
+            {**edge, "label": "high"},
+            {**edge, "label": "low"},
+            _line(BLUE, 1.5, label="windowed mean"),
+            _dots("#94a3b8", 3),
+            _frame_series(),
+        )
+        return gui.add_uplot(
+            (nothing, *(nothing for _ in series[1:])),
+            series,  # type: ignore[arg-type]
+            title="NIS: mean of the last readings in its 95 % bounds",
+            bands=({"series": (1, 2), "fill": "rgba(22,163,74,0.10)"},),
+            **_frame(150),
+        )
+
+    def _key(self) -> str:
+        def mark(color: str, text: str) -> str:
+            return (
+                f'<span style="white-space:nowrap;margin-right:0.9em"><span style="color:{color}">{text}</span></span>'
+            )
+
+        parts = [
+            mark(BLUE, "━ estimate"),
+            mark("#93b4f5", "▮ ±2σ"),
+            mark(DOTS[0], "● reading"),
+            mark(RED, "● gated"),
+            mark(GREEN, "━ truth"),
+            mark(GREY, "━ previous revision"),
+        ]
+        return f'<div style="font-size:0.75em;padding:0 0.8em 0.3em;font-weight:400">{"".join(parts)}</div>'
+
+
+def _title(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit and unit != "1" else name
+
+
+def _frame(height: int) -> dict[str, Any]:
+    axis = {"font": "11px sans-serif", "ticks": {"size": 4}}
+    return {
+        "scales": {"x": {"time": False}},
+        "axes": ({**axis, "size": 24}, {**axis, "size": 52}),
+        "legend": {"show": False},
+        "height": height,
+        "padding": (4, 10, 0, 0),
+    }

@@ -1,0 +1,100 @@
+"""Many rows drawn as few points, without losing a peak.
+
+Time is cut into buckets that are as wide as a pixel or two. Of each bucket only its extremes are drawn, so a spike of
+one row stays visible; the buckets stand at fixed times, so the drawn line does not shimmer while the window slides;
+and only the newest buckets are computed again, so a redraw costs what has arrived, not what is shown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+CHUNK = 16_384
+"""Rows that are worked on at once, so that a rebuild of a long history needs little memory."""
+
+
+def extremes(values: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest of each group of rows, ignoring NaN.
+
+    Args:
+        values: Shape (rows, columns).
+        starts: First row of each group, ascending; a group ends where the next begins.
+    """
+    return np.fmin.reduceat(values, starts, axis=0), np.fmax.reduceat(values, starts, axis=0)
+
+
+class Buckets:
+    """Extremes of some columns in buckets of `width` nanoseconds."""
+
+    def __init__(self, columns: int, width: int) -> None:
+        self.width = width
+        self.first = np.zeros(0, np.int64)
+        """Time of the first row of each bucket, and of the last."""
+        self.last = np.zeros(0, np.int64)
+        self.low = np.zeros((0, columns))
+        self.high = np.zeros((0, columns))
+        self.rising = np.zeros((0, columns), bool)
+
+    def update(self, t: np.ndarray, changed: int, values: Callable[[int, int], np.ndarray]) -> None:
+        """Bring the buckets up to date with rows of which those from `changed` on are new.
+
+        Args:
+            t: Times of all rows, shape (rows,), ascending.
+            changed: First row that is new or rewritten.
+            values: values(start, end) gives the columns of some rows, shape (end - start, columns).
+        """
+        if not t.size:
+            self._keep(slice(0, 0))
+            return
+        kept = self.first // self.width
+        bucket = int(t[min(changed, t.size - 1)]) // self.width
+        self._keep(slice(int(np.searchsorted(kept, t[0] // self.width)), int(np.searchsorted(kept, bucket))))
+        row = int(np.searchsorted(t, bucket * self.width))
+        parts = [(self.first, self.last, self.low, self.high, self.rising)]
+        ids = t[row:] // self.width
+        starts = np.flatnonzero(np.diff(ids, prepend=ids[0] - 1)) + row
+        ends = np.append(starts[1:], t.size)
+        group = 0
+        while group < starts.size:
+            stop = max(group + 1, int(np.searchsorted(ends, starts[group] + CHUNK, side="right")))
+            begin, end = int(starts[group]), int(ends[stop - 1])
+            block = values(begin, end)
+            low, high = extremes(block, starts[group:stop] - begin)
+            rising = block[ends[group:stop] - 1 - begin] >= block[starts[group:stop] - begin]
+            parts.append((t[starts[group:stop]], t[ends[group:stop] - 1], low, high, rising))
+            group = stop
+        self.first, self.last, self.low, self.high, self.rising = (
+            np.concatenate(column) for column in zip(*parts, strict=True)
+        )
+
+    def _keep(self, part: slice) -> None:
+        self.first, self.last = self.first[part], self.last[part]
+        self.low, self.high, self.rising = self.low[part], self.high[part], self.rising[part]
+
+    def points(self, since: int) -> tuple[np.ndarray, np.ndarray]:
+        """What to draw of the buckets that end at or after `since`: times (k,) and values (k, columns).
+
+        A bucket of several times gives two points, its extremes in the order in which they lead on to the next.
+        """
+        start = int(np.searchsorted(self.last, since))
+        first, last = self.first[start:], self.last[start:]
+        low, high, rising = self.low[start:], self.high[start:], self.rising[start:]
+        wide = last > first
+        times = np.stack((first, last), axis=1)
+        values = np.stack((np.where(rising, low, high), np.where(rising, high, low)), axis=1)
+        # One extreme, as of a single reading among many rows: one point, not two side by side.
+        same = low == high
+        values[:, 1][same & ~rising] = np.nan
+        mask = np.stack((np.ones_like(wide), wide), axis=1)
+        return times[mask], values[mask]
+
+
+def bridge(values: np.ndarray) -> np.ndarray:
+    """Fill NaN between finite points on the straight line through them; outside, NaN stays."""
+    good = np.flatnonzero(np.isfinite(values))
+    if good.size < 2:
+        return values
+    index = np.arange(values.size)
+    return np.interp(index, good, values[good], left=np.nan, right=np.nan)

@@ -1,0 +1,69 @@
+"""A Viser server that only our own page server can reach.
+
+Viser serves whoever connects, checks no Origin, and lets any client ask for a public tunnel. Here each HTTP request
+and each WebSocket upgrade must carry a secret that only the page's proxy knows, and the tunnel is gone.
+"""
+
+from __future__ import annotations
+
+import hmac
+import http
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import rich
+import viser
+import websockets.asyncio.server
+from viser import _messages
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+HEADER = "X-Nisus-Secret"
+
+_patching = threading.Lock()
+
+
+def guarded_server(secret: str, label: str) -> viser.ViserServer:
+    """A Viser server on a free loopback port that answers 403 to whatever lacks the secret."""
+    with _patching, unprinted():
+        serve = websockets.asyncio.server.serve
+
+        def guarded_serve(*args: Any, process_request: Callable, **options: Any) -> Any:
+            return serve(*args, process_request=_guard(process_request, secret), **options)
+
+        # Viser has no option for this, and its constructor returns once the port is bound: patch just that long.
+        websockets.asyncio.server.serve = guarded_serve  # type: ignore[misc,assignment]
+        try:
+            server = viser.ViserServer(host="127.0.0.1", port=0, label=label, verbose=False)
+        finally:
+            websockets.asyncio.server.serve = serve  # type: ignore[misc]
+    # The theme only hides the button; a client could still ask for the tunnel.
+    server._websock_server.unregister_handler(_messages.ShareUrlRequest)
+    return server
+
+
+@contextmanager
+def unprinted() -> Iterator[None]:
+    """Viser prints an address that answers nobody, and that it stopped; neither helps a user."""
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
+
+
+def _guard(inner: Callable, secret: str) -> Callable:
+    wanted = secret.encode()
+
+    def process_request(connection: Any, request: Request) -> Response | None:
+        given = request.headers.get_all(HEADER)
+        if len(given) == 1 and hmac.compare_digest(given[0].encode("utf-8", "surrogateescape"), wanted):
+            return inner(connection, request)
+        body = b"Nisus: open the page at the address that `nisus run` printed.\n"
+        headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(body)), "Connection": "close"})
+        return Response(http.HTTPStatus.FORBIDDEN.value, "Forbidden", headers, body)
+
+    return process_request

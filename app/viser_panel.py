@@ -1,0 +1,228 @@
+"""The control panel: what runs, what may be turned, and how it goes."""
+
+from __future__ import annotations
+
+import html
+from collections import deque
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import viser
+
+from estimators.filter import Estimator
+from estimators.registry import ESTIMATORS
+
+from .commands import Pause, Record, Reset, Seek, SetEstimator, SetOption, SetTuning, Speed, Step, UseSensor
+from .viser_rows import ChoiceRow, Held, NumberRow
+from .viser_status import events_html, note_html, status_html
+from .viser_submit import Coalescer
+
+SPEEDS = {"0.1×": 0.1, "0.25×": 0.25, "0.5×": 0.5, "1×": 1.0, "2×": 2.0, "5×": 5.0, "10×": 10.0, "max": np.inf}
+GATES = {"off": None, "95 %": 0.95, "99 %": 0.99, "99.73 %": 0.9973, "99.99 %": 0.9999}
+PAUSE, RESUME, STEP, RESET = "Pause", "Resume", "Step", "Reset"
+
+
+class Panel:
+    """Builds the panel once; `sync` brings it up to what the engine says."""
+
+    def __init__(self, server: viser.ViserServer, engine: Any, coalescer: Coalescer) -> None:
+        self._engine, self._coalescer = engine, coalescer
+        self._configured = engine.twin.tuning
+        self._events: deque[Any] = deque(maxlen=8)
+        self._events_changed = True
+        self._shown: dict[str, str] = {}
+        gui = server.gui
+        self.status = gui.add_html("")
+        self._note = gui.add_html("")
+        status = engine.status()
+        self.run_buttons = gui.add_button_group("Run", _buttons(status))
+        self.run_buttons.on_click(self._pressed)
+        tabs = gui.add_tab_group()
+        self.rows: dict[str, NumberRow] = {}
+        with tabs.add_tab("Tune"):
+            self._build_estimator(gui, status)
+            self._build_tuning(gui, status)
+        with tabs.add_tab("Sensors"):
+            gui.add_html('<div style="font-size:0.8em;padding:0 0.9em 0.6em">Off: held out. Predicted and scored, '
+                         "never used.</div>")  # fmt: skip
+            self.sensors = {name: self._sensor(gui, name, status) for name in engine.model.sensor_names}
+        with tabs.add_tab("Play"):
+            self._build_play(gui, status)
+            self.scene_folder = gui.add_folder("Scene")
+        with tabs.add_tab("Events"):
+            self._events_list = gui.add_html("")
+
+    def _build_estimator(self, gui: viser.GuiApi, status: Any) -> None:
+        model = self._engine.model
+        reasons = {name: entry.applies(model) for name, entry in ESTIMATORS.items()}
+        self._titles = {name: entry.title for name, entry in ESTIMATORS.items() if reasons[name] is None}
+        names = {title: name for name, title in self._titles.items()}
+        dropdown = gui.add_dropdown(
+            "Estimator", tuple(names), initial_value=self._titles[status.estimator], hint="Folds the history again"
+        )
+        self.estimator = ChoiceRow(dropdown, lambda title: self._engine.submit(SetEstimator(names[title])))
+        refused = [f"{ESTIMATORS[name].title}: {reason}" for name, reason in reasons.items() if reason]
+        if refused:
+            text = html.escape("; ".join(refused))
+            gui.add_html(f'<div style="font-size:0.75em;opacity:0.7;padding:0 0.9em 0.5em">Not here: {text}</div>')
+        self._option_folders = {
+            name: self._options(gui, ESTIMATORS[name], status) for name in self._titles if ESTIMATORS[name].options
+        }
+
+    def _options(self, gui: viser.GuiApi, entry: Estimator, status: Any) -> tuple[Any, dict[str, NumberRow]]:
+        mine = entry.name == status.estimator
+        given = status.options if mine else {}
+        folder = gui.add_folder("Options", expand_by_default=False, visible=mine)
+        with folder:
+            rows = {
+                option.name: NumberRow(
+                    gui, self._coalescer, key=f"{entry.name}.{option.name}", label=option.name, unit=option.unit,
+                    value=float(given.get(option.name, option.default)), configured=option.default,
+                    low=option.low, high=option.high, hint=option.meaning, complain=self.complain,
+                    command=lambda value, name=option.name: SetOption(name, value),
+                )
+                for option in entry.options
+            }  # fmt: skip
+        return folder, rows
+
+    def _build_tuning(self, gui: viser.GuiApi, status: Any) -> None:
+        configured = {item.key: item.value for item in self._configured.items()}
+        titles = {"Q": "Process noise Q", "R": "Sensor noise R", "p": "Parameters"}
+        for prefix, title in titles.items():
+            items = [item for item in status.tuning.items() if item.key.startswith(f"{prefix}.")]
+            if not items:
+                continue
+            with gui.add_folder(title, expand_by_default=prefix != "p"):
+                for item in items:
+                    self.rows[item.key] = NumberRow(
+                        gui, self._coalescer, key=item.key, label=item.key.partition(".")[2], unit=item.unit,
+                        value=item.value, configured=configured[item.key], low=item.low, high=item.high,
+                        logarithmic=prefix != "p", complain=self.complain,
+                        command=lambda value, key=item.key: SetTuning(key, value),
+                    )  # fmt: skip
+        self._gates = dict(GATES)
+        if status.tuning.gate not in self._gates.values():
+            self._gates[f"{status.tuning.gate:.6g}"] = status.tuning.gate
+        dropdown = gui.add_dropdown(
+            "Gate", tuple(self._gates), initial_value=self._gate_text(status.tuning.gate),
+            hint="Probability with which a good reading passes; readings outside are not used",
+        )  # fmt: skip
+        self.gate = ChoiceRow(dropdown, lambda text: self._engine.submit(SetTuning("gate", self._gates[text])))
+
+    def _gate_text(self, gate: float | None) -> str:
+        for text, value in self._gates.items():
+            if value == gate:
+                return text
+        self._gates[f"{gate:.6g}"] = gate
+        self.gate.handle.options = tuple(self._gates)
+        return f"{gate:.6g}"
+
+    def _sensor(self, gui: viser.GuiApi, name: str, status: Any) -> ChoiceRow:
+        box = gui.add_checkbox(name.replace("_", " "), bool(status.tuning.get(f"use.{name}")))
+        return ChoiceRow(box, lambda used: self._engine.submit(UseSensor(name, used)))
+
+    def _build_play(self, gui: viser.GuiApi, status: Any) -> None:
+        speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1×")
+        self.speed = ChoiceRow(speed, lambda text: self._engine.submit(Speed(SPEEDS[text])))
+        self.seek = gui.add_slider("Position [s]", 0.0, 1.0, 1.0, 0.0, marks=(), visible=False)
+        self.seek.on_update(self._sought)
+        self._sought_to = Held()
+        with gui.add_folder("Recording"):
+            self.file = gui.add_text("File", "", hint="Name of the .rrd file; empty: the twin's name and the time")
+            self.record = gui.add_button("Record", color="red")
+            self._record_state = gui.add_html("")
+        self.record.on_click(self._record_pressed)
+
+    def complain(self, text: str) -> None:
+        """Show one line about an edit that cannot be used, or nothing."""
+        self._show(self._note, "note", note_html(text))
+
+    def note(self, notices: list[Any]) -> None:
+        """Take events from the engine."""
+        if notices:
+            self._events.extend(notices)
+            self._events_changed = True
+
+    def sync(self, status: Any, origin: int | None) -> None:
+        """Show what the engine says; whoever changed it, a browser, the API, or the engine itself."""
+        self.estimator.sync(self._titles.get(status.estimator, self.estimator.handle.value))
+        for name, (folder, rows) in self._option_folders.items():
+            if folder.visible != (name == status.estimator):
+                folder.visible = name == status.estimator
+            if name == status.estimator:
+                for option, row in rows.items():
+                    row.sync(float(status.options[option]))
+        for item in status.tuning.items():
+            self.rows[item.key].sync(float(item.value))
+        self.gate.sync(self._gate_text(status.tuning.gate))
+        for name, box in self.sensors.items():
+            box.sync(bool(status.tuning.get(f"use.{name}")))
+        self._sync_play(status)
+        recording = status.recording
+        label = "Record" if recording is None else "Stop recording"
+        if self.record.label != label:
+            self.record.label = label
+        text = "not recording" if recording is None else f"● recording {Path(recording).name}"
+        style = "padding:0 0.9em 0.5em;font-size:0.8em;overflow-wrap:anywhere"
+        self._show(self._record_state, "record", f'<div style="{style}">{html.escape(text)}</div>')
+        self._show(self.status, "status", status_html(status, origin))
+        if self._events_changed:
+            self._events_changed = False
+            self._show(self._events_list, "events", events_html(list(self._events), origin))
+
+    def _sync_play(self, status: Any) -> None:
+        labels = _buttons(status)
+        if tuple(self.run_buttons.options) != labels:
+            self.run_buttons.options = labels
+        speed = next((text for text, factor in SPEEDS.items() if factor == status.speed), None)
+        if speed is not None:
+            self.speed.sync(speed)
+        for handle, wanted in ((self.speed.handle, status.seekable), (self.seek, status.span is not None)):
+            if handle.visible != wanted:
+                handle.visible = wanted
+        if status.span is None or status.t is None:
+            return
+        start, end = status.span
+        length = max(1.0, float(np.ceil((end - start) * 1e-9)))
+        if self.seek.max != length:
+            self.seek.max = length
+        place = float(np.clip(np.floor((status.t - start) * 1e-9), 0.0, length))
+        if not self._coalescer.waiting("seek") and self._sought_to.shows(place) and self.seek.value != place:
+            self.seek.value = place
+
+    def _show(self, handle: Any, key: str, content: str) -> None:
+        if self._shown.get(key) != content:
+            self._shown[key] = content
+            handle.content = content
+
+    def _pressed(self, event: viser.GuiEvent) -> None:
+        if event.client is None:
+            return
+        command = {PAUSE: Pause(True), RESUME: Pause(False), STEP: Step(), RESET: Reset()}.get(event.target.value)
+        if command is not None:
+            self._engine.submit(command)
+
+    def _sought(self, event: viser.GuiEvent) -> None:
+        if event.client is not None:
+            place = float(self.seek.value)
+            self._sought_to.edited(place)
+            self._coalescer.typed("seek", Seek(place))
+
+    def _record_pressed(self, event: viser.GuiEvent) -> None:
+        if event.client is None:
+            return
+        if self._engine.status().recording is not None:
+            self._engine.submit(Record(None))
+            return
+        # A bare name: a browser chooses what the file is called, not where on the disk it goes.
+        name = Path(self.file.value.strip()).name
+        if not name:
+            name = f"{self._engine.twin.name}-{datetime.now():%Y%m%d-%H%M%S}.rrd"
+        self._engine.submit(Record(Path(name if name.endswith(".rrd") else f"{name}.rrd")))
+
+
+def _buttons(status: Any) -> tuple[str, ...]:
+    """What can be done: a live source cannot be held up."""
+    return (RESUME if status.paused else PAUSE, STEP, RESET) if status.seekable else (RESET,)

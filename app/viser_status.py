@@ -1,0 +1,60 @@
+"""The panel's texts: the status line, the list of events, the note about an edit."""
+
+from __future__ import annotations
+
+import html
+from typing import Any
+
+from estimators.track import HEALTH_NAMES
+
+COLORS = {"tracking": "#16a34a", "degraded": "#d97706", "diverged": "#dc2626", "stale": "#6b7280"}
+LEVELS = {"info": "#6b7280", "warn": "#d97706", "error": "#dc2626"}
+COUNTED = ("readings", "gated", "missing", "stale")
+
+
+def status_html(status: Any, origin: int | None) -> str:
+    """Health, revision and counts in two lines that keep their places while the numbers run."""
+    health = HEALTH_NAMES[status.health] if isinstance(status.health, int) else str(status.health)
+    at = "" if status.t is None or origin is None else f"{(status.t - origin) * 1e-9:.1f} s"
+    state = "ended" if status.finished else "paused" if status.paused else ""
+    fold = "⟳ refolding" if status.refolding else f"revision {status.revision}"
+    latency = status.latency_ms
+    counts = dict(status.counts)
+    known = [(name, counts.pop(name, 0)) for name in COUNTED]
+    known += [(name, counts[name]) for name in ("held out", "failed") if counts.get(name)]
+    cells = "".join(
+        f'<span style="margin-right:0.9em;white-space:nowrap"><span style="opacity:0.65">{html.escape(name)}</span> '
+        f"{count:,}</span>"
+        for name, count in known
+    )
+    if latency is not None:
+        cells += f'<span style="white-space:nowrap"><span style="opacity:0.65">latency</span> {latency:.1f} ms</span>'
+    return (
+        '<div style="padding:0.5em 0.9em 0.6em;font-size:0.8em;line-height:1.6;font-variant-numeric:tabular-nums">'
+        '<div style="display:flex;justify-content:space-between;gap:0.5em">'
+        f'<b style="color:{COLORS.get(health, "#6b7280")}">● {html.escape(health)}</b>'
+        f"<span>{state}</span><span>{fold}</span><span>{at}</span></div><div>{cells}</div></div>"
+    )
+
+
+def events_html(notices: list[Any], origin: int | None) -> str:
+    """The last events, newest first."""
+    style = "padding:0.2em 0.9em 0.6em;font-size:0.8em;line-height:1.5;overflow-wrap:anywhere"
+    if not notices:
+        return f'<div style="{style};opacity:0.65">Nothing to report.</div>'
+    lines = []
+    for notice in reversed(notices):
+        at = "" if origin is None or notice.t is None else f"{(notice.t - origin) * 1e-9:.1f} s"
+        color = LEVELS.get(str(notice.level).lower(), LEVELS["info"])
+        lines.append(
+            f'<div style="border-left:3px solid {color};padding-left:0.5em;margin-bottom:0.35em">'
+            f'<span style="opacity:0.65">{at}</span> {html.escape(str(notice.text))}</div>'
+        )
+    return f'<div style="{style}">{"".join(lines)}</div>'
+
+
+def note_html(text: str) -> str:
+    """One line in red, or nothing."""
+    if not text:
+        return ""
+    return f'<div style="color:#dc2626;font-size:0.8em;padding:0 0.9em 0.5em">{html.escape(text)}</div>'

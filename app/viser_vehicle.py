@@ -1,0 +1,143 @@
+"""The scene of a twin that moves on a plane: vehicle, its track, position readings, truth, and the 2σ ellipse."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import viser
+
+from estimators.log import READING, TRUTH
+from estimators.model import StateSpaceModel
+
+from .viser_camera import fit_cameras
+from .viser_charts import observers
+from .viser_geometry import about_z, circle, disc, ellipsoid, segments
+from .viser_history import History
+
+TRAIL = 600
+POINTS = 1500
+SOFTNESS = 0.15
+"""Part of the way to the vehicle that the view moves in one frame."""
+
+
+class VehicleScene:
+    """The plane with east to the right and north up the screen, under a camera that the user turns freely.
+
+    The view follows by moving the world under the camera, never the camera: a user's own turning and zooming is not
+    disturbed, and coordinates near the camera stay small, which single precision needs.
+    """
+
+    def __init__(self, server: viser.ViserServer, model: StateSpaceModel, scene: Any) -> None:
+        names = model.state_names
+        self.east, self.north = (names.index(name) for name in scene.position)
+        self.heading = names.index(scene.heading) if scene.heading else None
+        direct = observers(model)
+        self._fixes = [
+            (sensor, row, row_n)
+            for sensor, row in direct[self.east]
+            for sensor_n, row_n in direct[self.north]
+            if sensor == sensor_n
+        ]
+        self.follow = True
+        self._anchor: np.ndarray | None = None
+        self._course = 0.0
+        api = server.scene
+        api.set_up_direction("+z")
+        self.world = api.add_frame("/world", show_axes=False)
+        self._grid = api.add_grid(
+            "/grid", infinite_grid=True, cell_size=10.0, section_size=50.0, fade_distance=900.0,
+            cell_color=(226, 232, 240), section_color=(186, 196, 210), shadow_opacity=0.0,
+        )  # fmt: skip
+        line = {"thickness_units": "screen"}
+        nothing = np.zeros((1, 2, 3), np.float32)
+        self._trail = api.add_line_segments("/world/trail", nothing, (37, 99, 235), thickness=3, **line)
+        self._truth = api.add_line_segments("/world/truth", nothing, (22, 163, 74), thickness=2, **line)
+        self._readings = api.add_point_cloud(
+            "/world/readings", np.zeros((1, 3), np.float32), (245, 158, 11), point_size=0.8, point_shape="circle",
+            precision="float32", point_shading="flat", visible=False,
+        )  # fmt: skip
+        vertices, faces = disc()
+        self._ellipse = api.add_mesh_simple(
+            "/world/ellipse", vertices, faces, color=(96, 146, 246), opacity=0.35, side="double", cast_shadow=False,
+            receive_shadow=False,
+        )  # fmt: skip
+        self._rim = api.add_line_segments("/world/rim", circle(), (37, 99, 235), thickness=2, **line)
+        self._vehicle = api.add_frame("/world/vehicle", show_axes=False)
+        api.add_box("/world/vehicle/body", (30, 64, 175), (4.4, 1.8, 0.7), position=(0, 0, 0.65), cast_shadow=False)
+        api.add_box(
+            "/world/vehicle/cabin", (147, 180, 245), (2.2, 1.6, 0.6), position=(-0.3, 0, 1.3), cast_shadow=False
+        )
+        camera = server.initial_camera
+        camera.position, camera.look_at, camera.up = (0.0, -55.0, 60.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+        camera.far = 20_000.0
+        fit_cameras(server, float(np.radians(40)))
+
+    def controls(self, gui: viser.GuiApi) -> None:
+        """What a user may choose about the scene."""
+        follow = gui.add_checkbox("Follow", self.follow, hint="Keep the vehicle in the middle")
+
+        @follow.on_update
+        def _(event: viser.GuiEvent) -> None:
+            self.follow = follow.value
+
+    def draw(self, history: History, belief: Any) -> None:
+        """Send where everything is now."""
+        if not history.n or not np.isfinite(belief.mean[[self.east, self.north]]).all():
+            return
+        here = belief.mean[[self.east, self.north]]
+        if self._anchor is None or np.linalg.norm(here - self._anchor) > 200.0:
+            self._anchor = here.copy()
+        if self.follow:
+            self._anchor += SOFTNESS * (here - self._anchor)
+        shift = np.array([*-self._anchor, 0.0])
+        self.world.position = shift
+        # The grid is endless: only where its lines fall matters.
+        self._grid.position = (*np.mod(shift[:2], 50.0), 0.0)
+        mean = history.column("mean")
+        self._trail.points = segments(self._plane(mean[:, self.east], mean[:, self.north], 0.06))
+        self._draw_truth(history)
+        self._draw_readings(history)
+        self._vehicle.position = (*here, 0.0)
+        self._vehicle.wxyz = about_z(self._direction(belief, mean))
+        cov = np.zeros((3, 3))
+        cov[:2, :2] = belief.cov[np.ix_([self.east, self.north], [self.east, self.north])]
+        cov[2, 2] = 2 * cov.max() + 1.0  # the largest, so that the ellipse is the first two axes
+        if np.isfinite(cov).all():
+            axes, turn = ellipsoid(cov)
+            for handle in (self._ellipse, self._rim):
+                handle.position, handle.wxyz = (*here, 0.04), turn
+                handle.scale = (float(axes[0]), float(axes[1]), 1.0)
+
+    def _plane(self, east: np.ndarray, north: np.ndarray, height: float) -> np.ndarray:
+        pick = np.unique(np.linspace(0, east.size - 1, min(east.size, TRAIL)).astype(int))
+        return np.stack((east[pick], north[pick], np.full(pick.size, height)), axis=1)
+
+    def _draw_truth(self, history: History) -> None:
+        kind, channel = history.column("kind"), history.column("channel")
+        rows = [np.flatnonzero((kind == TRUTH) & (channel == j)) for j in (self.east, self.north)]
+        count = min(rows[0].size, rows[1].size)
+        if count:
+            value = history.column("value")
+            east, north = (value[part[-count:], 0] for part in rows)
+            self._truth.points = segments(self._plane(east, north, 0.05))
+
+    def _draw_readings(self, history: History) -> None:
+        kind, channel, value = (history.column(name) for name in ("kind", "channel", "value"))
+        parts = []
+        for sensor, row, row_n in self._fixes:
+            mine = np.flatnonzero((kind == READING) & (channel == sensor))[-POINTS:]
+            parts.append(np.stack((value[mine, row], value[mine, row_n], np.full(mine.size, 0.1)), axis=1))
+        points = np.concatenate(parts) if parts else np.zeros((0, 3))
+        points = points[np.isfinite(points).all(axis=1)]
+        self._readings.visible = bool(len(points))
+        if len(points):
+            self._readings.points = points
+
+    def _direction(self, belief: Any, mean: np.ndarray) -> float:
+        if self.heading is not None:
+            return float(belief.mean[self.heading])
+        step = mean[-1, [self.east, self.north]] - mean[max(0, len(mean) - 20), [self.east, self.north]]
+        if np.hypot(*step) > 1.0:
+            self._course = float(np.arctan2(step[1], step[0]))
+        return self._course

@@ -1,0 +1,134 @@
+"""The left pane of the page: scene, control panel and charts, served by Viser to any number of browsers."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+import viser
+
+from .viser_belief import BeliefScene
+from .viser_charts import Charts
+from .viser_guard import guarded_server, unprinted
+from .viser_history import History
+from .viser_panel import Panel
+from .viser_submit import Coalescer
+from .viser_vehicle import VehicleScene
+
+FRAME = 0.1
+"""Seconds between two frames, when they are cheap."""
+
+SHARE = 0.08
+"""Part of a core that drawing may take: dearer frames come less often."""
+
+SLOWEST = 2.0
+"""Seconds between two frames at most."""
+
+COLUMN = 400
+"""Width of the panel's and the charts' column, in pixels."""
+
+
+class ViserView:
+    """Pulls rows from the engine at its own rate, with a cursor of its own, and never keeps the engine waiting.
+
+    `port` is known once the view is built; browsers reach it through the page's server only, which knows `secret`.
+    """
+
+    def __init__(self, engine: Any, *, secret: str) -> None:
+        self.engine = engine
+        view = engine.twin.config.view
+        model = engine.model
+        self.server = guarded_server(secret, engine.twin.title)
+        self.port: int = self.server.get_port()
+        gui = self.server.gui
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(37, 99, 235))
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(COLUMN)
+        self.coalescer = Coalescer(engine.submit)
+        self.panel = Panel(self.server, engine, self.coalescer)
+        self.scene: VehicleScene | BeliefScene
+        if view.scene.kind == "vehicle":
+            self.scene = VehicleScene(self.server, model, view.scene)
+        else:
+            self.scene = BeliefScene(self.server, model, view.scene.axes)
+        with self.panel.scene_folder:
+            self.scene.controls(gui)
+        below = gui.add_panel()
+        with below.add_tab("Charts"):
+            self.charts = Charts(self.server, model, view.window)
+        below.dock_below(gui.main_panel)
+        self.charts.window_choice.on_update(self._choose_window)
+        if self.charts.state_choice is not None:
+            self.charts.state_choice.on_update(self._choose_state)
+        self.history = History(model.nx, model.width)
+        self._cursor: Any = None
+        self._begin_again(view.window)
+        self._revision: int | None = None
+        self._wanted_window: str | None = None
+        self._redraw = True
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="viser view", daemon=True)
+
+    def start(self) -> None:
+        """Begin to draw."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End drawing, and the server with it."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self.engine.release(self._cursor)
+        with unprinted():
+            self.server.stop()
+
+    def frame(self) -> None:
+        """Bring the panel, the charts and the scene up to what the engine has now."""
+        if self._wanted_window is not None:
+            window, self._wanted_window = self.charts.windows[self._wanted_window], None
+            self.charts.set_window(window)
+            self._begin_again(window)
+        pull = self.engine.pull(self._cursor)
+        changed = bool(len(pull.readings)) or pull.fresh or self._redraw
+        if pull.revision != self._revision:
+            self._revision = pull.revision
+            self.charts.set_previous(self.engine.previous())
+            changed = True
+        with self.server.atomic():
+            if changed:
+                self._redraw = False
+                first = self.history.take(pull)
+                dropped = self.history.trim()
+                self.charts.update(self.history, max(0, first - dropped))
+                self.charts.draw(self.history)
+                self.scene.draw(self.history, self.engine.belief())
+            self.panel.note(pull.notices)
+            self.panel.sync(self.engine.status(), self.history.origin)
+
+    def _begin_again(self, window: float | None) -> None:
+        """Pull the history from its start, to keep as much of it as the window shows."""
+        if self._cursor is not None:
+            self.engine.release(self._cursor)
+        self._cursor = self.engine.cursor()
+        self.history.clear()
+        self.history.span = None if window is None else int(window * 1e9)
+
+    def _choose_window(self, event: viser.GuiEvent) -> None:
+        if event.client is not None:
+            self._wanted_window = self.charts.window_choice.value
+
+    def _choose_state(self, event: viser.GuiEvent) -> None:
+        if event.client is not None and self.charts.state_choice is not None:
+            self.charts.choose_state(self.charts.state_choice.value)
+            self._redraw = True
+
+    def _run(self) -> None:
+        due = time.monotonic()
+        while not self._stop.wait(FRAME / 2):
+            self.coalescer.flush()
+            begun = time.monotonic()
+            if begun >= due:
+                self.frame()
+                cost = time.monotonic() - begun
+                due = begun + min(SLOWEST, max(FRAME, cost / SHARE))

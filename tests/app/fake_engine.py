@@ -1,0 +1,115 @@
+"""An engine without threads, for the views' tests: readings are put in by hand, commands are carried out at once."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from app.commands import Pause, Record, SetEstimator, SetOption, SetTuning, Speed, UseSensor
+from config.schema import ViewSection
+from estimators.fold import Fold
+from estimators.log import Log, Readings
+from estimators.registry import ESTIMATORS
+from estimators.track import TRACKING
+from estimators.tuning import Tuning
+
+
+class FakeEngine:
+    def __init__(self, model, estimator="ekf", view=None, carry_out=True):
+        self.model = model
+        tuning = Tuning.of(model)
+        config = SimpleNamespace(view=view or ViewSection())
+        self.twin = SimpleNamespace(
+            model=model, name=model.name, title=model.title, tuning=tuning, config=config, estimator=estimator
+        )
+        self.commands = []
+        self.carry_out = carry_out
+        self.log = Log(model.width)
+        self.state = SimpleNamespace(
+            estimator=estimator, tuning=tuning, revision=0, refolding=False, speed=1.0, paused=False, recording=None,
+            counts={"readings": 0, "gated": 0, "missing": 0, "stale": 0}, t=None, health=TRACKING, latency_ms=0.4,
+            seekable=True, span=None, finished=False, options={},
+        )  # fmt: skip
+        self.fold = Fold(estimator, model, tuning, self.log)
+        self.before = None
+        self.notices = []
+
+    def put(self, readings):
+        index, _ = self.log.extend(readings)
+        self.fold.rewind(index)
+        self.fold.advance()
+        self.state.t = int(self.log.t[self.log.n - 1])
+        self.state.counts["readings"] = self.log.n
+        self.changed = min(index, getattr(self, "changed", index))
+
+    def submit(self, command):
+        self.commands.append(command)
+        if not self.carry_out:
+            return
+        state = self.state
+        if isinstance(command, SetEstimator):
+            state.estimator = command.name
+            state.tuning = state.tuning.with_options({})
+        elif isinstance(command, SetTuning):
+            state.tuning = state.tuning.set(command.key, command.value)
+        elif isinstance(command, UseSensor):
+            state.tuning = state.tuning.set(f"use.{command.name}", command.used)
+        elif isinstance(command, SetOption):
+            state.tuning = state.tuning.with_options({**state.tuning.options, command.name: command.value})
+        elif isinstance(command, Pause):
+            state.paused = command.paused
+        elif isinstance(command, Speed):
+            state.speed = command.factor
+        elif isinstance(command, Record):
+            state.recording = command.path
+        if isinstance(command, (SetEstimator, SetTuning, UseSensor, SetOption)):
+            self.before = self._pull(0, True)
+            self.fold = Fold(state.estimator, self.model, state.tuning, self.log)
+            self.fold.advance()
+            state.revision += 1
+
+    def release(self, cursor):
+        pass
+
+    def status(self):
+        self.state.options = ESTIMATORS[self.state.estimator].complete(dict(self.state.tuning.options))
+        return self.state
+
+    def cursor(self):
+        return SimpleNamespace(n=0, revision=None, told=0)
+
+    def pull(self, cursor, limit=None):
+        fresh = cursor.revision != self.state.revision
+        first = 0 if fresh else min(cursor.n, getattr(self, "changed", cursor.n))
+        self.changed = self.log.n
+        pull = self._pull(first, fresh)
+        pull.notices = self.notices[cursor.told :]
+        cursor.n, cursor.revision, cursor.told = self.log.n, self.state.revision, len(self.notices)
+        return pull
+
+    def previous(self):
+        return self.before
+
+    def belief(self):
+        mean, cov = self.fold.moments()
+        return SimpleNamespace(t=self.state.t, mean=mean, cov=cov, points=self.fold.points())
+
+    def _pull(self, first, fresh):
+        rows = slice(first, self.log.n)
+        return SimpleNamespace(
+            revision=self.state.revision, fresh=fresh, first=first, readings=self.log.readings.select(rows),
+            track=self.fold.track.select(rows).copy(), notices=[],
+        )  # fmt: skip
+
+
+def events(model, kind, channel, times, values):
+    """Readings of one channel at times in seconds; `values` (n,) or (n, k)."""
+    times = np.asarray(times, float)
+    values = np.asarray(values, float).reshape(times.size, -1)
+    padded = np.full((times.size, model.width), np.nan)
+    padded[:, : values.shape[1]] = values
+    t = np.round(times * 1e9).astype(np.int64)
+    return Readings(
+        t, t, np.full(t.size, kind, np.int8), np.full(t.size, channel, np.int32), padded
+    )
