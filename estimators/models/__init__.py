@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ..model import StateSpaceModel
+from .motor_drive import MOTOR_DRIVE
 from .motor_winding import MOTOR_WINDING
 
-MODELS: dict[str, StateSpaceModel] = {model.name: model for model in (MOTOR_WINDING,)}
+MODELS: dict[str, StateSpaceModel] = {model.name: model for model in (MOTOR_WINDING, MOTOR_DRIVE)}
