@@ -25,7 +25,7 @@ from .context import (
     h_signature,
 )
 from .errors import ModelError
-from .jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step_f, complex_step_h
+from .jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step_f, complex_step_h, scratch_size
 from .jit import address, jit
 from .model import StateSpaceModel
 
@@ -190,6 +190,7 @@ def _check_derivatives(compiled: CompiledModel) -> None:
     p = np.array([item.value for item in model.parameters], float)
     std = np.array([state.std for state in model.states])
     dt = min(0.1, model.max_step)
+    scratch = np.empty(scratch_size(model.nx, model.width))
 
     def differences(function: Callable, x: np.ndarray, rows: int) -> np.ndarray:
         J = np.empty((rows, x.size))
@@ -227,7 +228,7 @@ def _check_derivatives(compiled: CompiledModel) -> None:
         if error > tolerance:
             raise ModelError(f"model {model.name}: F differs from central differences of f by {error:.2g} (relative)")
     elif static["F_mode"] == COMPLEX_STEP:
-        if disagree(lambda x, J: complex_step_f(static["f_complex"], x, u, p, dt, J), f, model.nx) > tolerance:
+        if disagree(lambda x, J: complex_step_f(static["f_complex"], x, u, p, dt, J, scratch), f, model.nx) > tolerance:
             static["F_mode"] = CENTRAL
     for k, sensor in enumerate(model.sensors):
 
@@ -245,7 +246,7 @@ def _check_derivatives(compiled: CompiledModel) -> None:
                 )
         elif mode == COMPLEX_STEP:
             target = int(static["h_complex"][k])
-            if disagree(lambda x, J, a=target: complex_step_h(a, x, u, p, J), h, rows) > tolerance:
+            if disagree(lambda x, J, a=target: complex_step_h(a, x, u, p, J, scratch), h, rows) > tolerance:
                 static["H_mode"][k] = CENTRAL
 
 

@@ -17,15 +17,16 @@ from .gaussian import (
     state_size,
     wrap_mean,
 )
-from .jacobians import sensor_jacobian, state_jacobian
-from .jit import jit
+from .jacobians import scratch_size, sensor_jacobian, state_jacobian
+from .jit import jit, matrix
 from .linalg import congruence
 from .track import USED
 
 
 def work_size(nx: int, ny: int) -> int:
-    """Scratch: x', F and twice the square for the congruence; or ŷ, S, its factor, C, K, H and a square."""
-    return max(nx + 3 * nx * nx, ny + 2 * ny * ny + 3 * nx * ny + nx * nx)
+    """Scratch: x', F and twice the square for the congruence; or ŷ, S, its factor, C, K, H, a square; a Jacobian's."""
+    filters = max(nx + 3 * nx * nx, ny + 2 * ny * ny + 3 * nx * ny + nx * nx)
+    return filters + scratch_size(nx, ny)
 
 
 @jit
@@ -36,11 +37,11 @@ def predict(context, u, dt, index, state, work):
     """
     n = context.nx
     x = state[:n]
-    P = state[n : n + n * n].reshape((n, n))
+    P = matrix(state, n, n, n)
     forward = work[:n]
-    F = work[n : n + n * n].reshape((n, n))
-    scratch = work[n + n * n : n + 3 * n * n].reshape((2 * n, n))
-    state_jacobian(context, x, u, dt, F)
+    F = matrix(work, n, n, n)
+    scratch = matrix(work, n + n * n, 2 * n, n)
+    state_jacobian(context, x, u, dt, F, work[n + 3 * n * n :])
     transition(context, x, u, dt, forward)
     congruence(F, P, scratch)
     # Noise that depends on the state does so where the step began.
@@ -60,22 +61,22 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     n = context.nx
     _, m = sensor_rows(context, sensor)
     x = state[:n]
-    P = state[n : n + n * n].reshape((n, n))
+    P = matrix(state, n, n, n)
     at = 0
     nu = work[at : at + m]
     at += m
-    S = work[at : at + m * m].reshape((m, m))
+    S = matrix(work, at, m, m)
     at += m * m
-    U = work[at : at + m * m].reshape((m, m))
+    U = matrix(work, at, m, m)
     at += m * m
-    C = work[at : at + n * m].reshape((n, m))
+    C = matrix(work, at, n, m)
     at += n * m
-    K = work[at : at + n * m].reshape((n, m))
+    K = matrix(work, at, n, m)
     at += n * m
-    H = work[at : at + n * m].reshape((m, n))
+    H = matrix(work, at, m, n)
     at += n * m
-    N = work[at : at + n * n].reshape((n, n))
-    sensor_jacobian(context, sensor, x, u, H)
+    N = matrix(work, at, n, n)
+    sensor_jacobian(context, sensor, x, u, H, work[at + n * n :])
     expect(context, sensor, x, u, nu)
     for i in range(n):
         for k in range(m):

@@ -19,7 +19,7 @@ from .context import Context, context_type
 from .diagnostics import Bounds, HealthPolicy, assess, assess_signature, chi_square_bounds
 from .errors import EstimatorError
 from .filter import Code, Estimator, call_describe, call_predict, call_start, call_update, code_type
-from .jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, jit
+from .jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, jit, matrix
 from .log import INPUT, READING, RESET, Log
 from .model import StateSpaceModel
 from .registry import find_estimator
@@ -101,7 +101,7 @@ def run(code, context, first, start, end, t, kind, channel, value, clock, u, sta
                 )
             call_describe(code.describe, context, state, mean[i], std[i], cross[i])
         elif what == RESET:
-            prior_cov = floats(context.prior_cov, nx * nx).reshape((nx, nx))
+            prior_cov = matrix(floats(context.prior_cov, nx * nx), 0, nx, nx)
             call_start(code.start, context, floats(context.prior_mean, nx), prior_cov, state)
             clock[0] = t[i]
             call_describe(code.describe, context, state, mean[i], std[i], cross[i])

@@ -6,24 +6,28 @@ Source: Squire & Trapp (1998), doi:10.1137/S003614459631241X.
 
 from __future__ import annotations
 
-import numpy as np
-
 from .context import call_F, call_f_complex, call_H, call_h_complex, expect, parameters, transition
-from .jit import ints, jit
+from .jit import complexes, ints, jit
 
 ANALYTIC, COMPLEX_STEP, CENTRAL = range(3)
 """How a Jacobian is found: the model's own function, complex step, central differences."""
+
+
+def scratch_size(nx: int, ny: int) -> int:
+    """Numbers that a Jacobian takes to work in: two complex vectors, or three real ones."""
+    return 2 * nx + 2 * max(nx, ny)
+
 
 _COMPLEX_STEP = 1e-20
 _CENTRAL_STEP = 6e-6  # about the cube root of the rounding error, where truncation and rounding balance
 
 
 @jit
-def complex_step_f(target, x, u, p, dt, J):
+def complex_step_f(target, x, u, p, dt, J, scratch):
     """Fill J (nx, nx) with df/dx of the complex function at address `target`."""
     n = x.size
-    z = np.empty(n, np.complex128)
-    out = np.empty(n, np.complex128)
+    z = complexes(scratch, 0, n)
+    out = complexes(scratch, 2 * n, n)
     for i in range(n):
         z[i] = x[i]
     for j in range(n):
@@ -35,12 +39,12 @@ def complex_step_f(target, x, u, p, dt, J):
 
 
 @jit
-def complex_step_h(target, x, u, p, J):
+def complex_step_h(target, x, u, p, J, scratch):
     """Fill J (ny, nx) with dh/dx of the complex function at address `target`."""
     n = x.size
     m = J.shape[0]
-    z = np.empty(n, np.complex128)
-    out = np.empty(m, np.complex128)
+    z = complexes(scratch, 0, n)
+    out = complexes(scratch, 2 * n, m)
     for i in range(n):
         z[i] = x[i]
     for j in range(n):
@@ -52,17 +56,19 @@ def complex_step_h(target, x, u, p, J):
 
 
 @jit
-def state_jacobian(context, x, u, dt, F):
-    """Fill F (nx, nx) with df/dx at x."""
+def state_jacobian(context, x, u, dt, F, scratch):
+    """Fill F (nx, nx) with df/dx at x; `scratch` has `scratch_size` numbers."""
     if context.F_mode == ANALYTIC:
         call_F(context.F, x, u, parameters(context), dt, F)
     elif context.F_mode == COMPLEX_STEP:
-        complex_step_f(context.f_complex, x, u, parameters(context), dt, F)
+        complex_step_f(context.f_complex, x, u, parameters(context), dt, F, scratch)
     else:
         n = x.size
-        z = x.copy()
-        high = np.empty(n)
-        low = np.empty(n)
+        z = scratch[:n]
+        high = scratch[n : 2 * n]
+        low = scratch[2 * n : 3 * n]
+        for i in range(n):
+            z[i] = x[i]
         for j in range(n):
             step = _CENTRAL_STEP * max(1.0, abs(x[j]))
             z[j] = x[j] + step
@@ -77,18 +83,21 @@ def state_jacobian(context, x, u, dt, F):
 
 
 @jit
-def sensor_jacobian(context, sensor, x, u, H):
-    """Fill H (ny, nx) with dh/dx of one sensor at x."""
+def sensor_jacobian(context, sensor, x, u, H, scratch):
+    """Fill H (ny, nx) with dh/dx of one sensor at x; `scratch` has `scratch_size` numbers."""
     mode = ints(context.H_mode, context.n_sensors)[sensor]
     if mode == ANALYTIC:
         call_H(ints(context.H, context.n_sensors)[sensor], x, u, parameters(context), H)
     elif mode == COMPLEX_STEP:
-        complex_step_h(ints(context.h_complex, context.n_sensors)[sensor], x, u, parameters(context), H)
+        target = ints(context.h_complex, context.n_sensors)[sensor]
+        complex_step_h(target, x, u, parameters(context), H, scratch)
     else:
         m, n = H.shape
-        z = x.copy()
-        high = np.empty(m)
-        low = np.empty(m)
+        z = scratch[:n]
+        high = scratch[n : n + m]
+        low = scratch[n + m : n + 2 * m]
+        for i in range(n):
+            z[i] = x[i]
         for j in range(n):
             step = _CENTRAL_STEP * max(1.0, abs(x[j]))
             z[j] = x[j] + step

@@ -94,6 +94,7 @@ def _pointer_to(element: Any) -> Any:
 _to_float = _pointer_to(types.float64)
 _to_int = _pointer_to(types.int64)
 _to_byte = _pointer_to(types.int8)
+_to_complex = _pointer_to(types.complex128)
 
 
 @jit
@@ -112,6 +113,18 @@ def ints(target, n):
 def flags(target, n):
     """The n int8s at an address."""
     return carray(_to_byte(target), (n,))
+
+
+@jit
+def matrix(vector, start, rows, columns):
+    """A matrix that lives in `vector` from `start` on (NumPy's reshape costs 50 ns here, this nothing)."""
+    return carray(_to_float(vector.ctypes.data + 8 * start), (rows, columns))
+
+
+@jit
+def complexes(scratch, start, n):
+    """n complex numbers that live in the float64s of `scratch` from `start` on."""
+    return carray(_to_complex(scratch.ctypes.data + 8 * start), (n,))
 
 
 @jit

@@ -7,7 +7,7 @@ from .context import add_process_noise, transition
 from .filter import Estimator
 from .gaussian import describe, moments, no_points, start, state_size, wrap_mean
 from .jacobians import state_jacobian
-from .jit import jit
+from .jit import jit, matrix
 from .linalg import congruence
 from .model import StateSpaceModel
 
@@ -26,13 +26,13 @@ def predict(context, u, dt, index, state, work):
     """
     n = context.nx
     x = state[:n]
-    P = state[n : n + n * n].reshape((n, n))
+    P = matrix(state, n, n, n)
     forward = work[:n]
-    scratch = work[n + n * n : n + 3 * n * n].reshape((2 * n, n))
+    scratch = matrix(work, n + n * n, 2 * n, n)
     last = work.size - 1
-    F = work[last - n * n : last].reshape((n, n))
+    F = matrix(work, last - n * n, n, n)
     if work[last] != dt or u.size > 0:
-        state_jacobian(context, x, u, dt, F)
+        state_jacobian(context, x, u, dt, F, work[n + 3 * n * n :])
         work[last] = dt
     transition(context, x, u, dt, forward)
     congruence(F, P, scratch)

@@ -22,7 +22,7 @@ from .context import (
 )
 from .filter import Estimator, Option
 from .gaussian import compare, describe, downdate, judge, moments, move_mean, start, state_size, wrap_mean
-from .jit import jit
+from .jit import jit, matrix
 from .linalg import cholesky, mirror, wrap
 from .track import FAILED, USED
 
@@ -86,10 +86,10 @@ def predict(context, u, dt, index, state, work):
     """
     n = context.nx
     x = state[:n]
-    P = state[n : n + n * n].reshape((n, n))
-    U = work[: n * n].reshape((n, n))
+    P = matrix(state, n, n, n)
+    U = matrix(work, 0, n, n)
     at = n * n
-    D = work[at : at + (2 * n + 1) * n].reshape((2 * n + 1, n))
+    D = matrix(work, at, 2 * n + 1, n)
     at += (2 * n + 1) * n
     point = work[at : at + n]
     forward = work[at + n : at + 2 * n]
@@ -134,20 +134,20 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     n = context.nx
     _, m = sensor_rows(context, sensor)
     x = state[:n]
-    P = state[n : n + n * n].reshape((n, n))
-    U = work[: n * n].reshape((n, n))
+    P = matrix(state, n, n, n)
+    U = matrix(work, 0, n, n)
     at = n * n
-    D = work[at : at + (2 * n + 1) * m].reshape((2 * n + 1, m))
+    D = matrix(work, at, 2 * n + 1, m)
     at += (2 * n + 1) * m
     point = work[at : at + n]
     at += n
     nu = work[at : at + m]
     at += m
-    S = work[at : at + m * m].reshape((m, m))
+    S = matrix(work, at, m, m)
     at += m * m
-    V = work[at : at + m * m].reshape((m, m))
+    V = matrix(work, at, m, m)
     at += m * m
-    C = work[at : at + n * m].reshape((n, m))
+    C = matrix(work, at, n, m)
     weights = options(context)
     w = weights[OUTER]
     spread = weights[SPREAD]
