@@ -124,7 +124,7 @@ def test_an_unknown_override_names_what_is_near() -> None:
         (
             "model: motor_winding",
             "model: motor_windin",
-            "motor.yaml:1: model is 'motor_windin'; no model of that name ships; did you mean motor_winding, or write ./file.py:Name",
+            "motor.yaml:1: model is 'motor_windin'; no model of that name ships; did you mean motor_winding ",
         ),
         (
             "  temperature: {mean",
@@ -191,7 +191,17 @@ def test_what_the_model_lacks_is_one_line_with_what_is_near(old: str, new: str, 
     assert "\n" not in text
 
 
-def test_a_model_from_a_file_beside_the_yaml() -> None:
+def test_a_parameter_out_of_its_range_is_one_line() -> None:
+    text = PUMP.replace("Noise, Row", "Noise, Parameter, Row")
+    Path("pump.py").write_text(
+        text.replace("f=f,", 'f=f, parameters=(Parameter("area", "m²", 1.0, low=0.5, high=2.0),),')
+    )
+    yaml = "model: ./pump.py:Pump\nparameters:\n  area: 3\nsource: {type: simulator}\n"
+    assert message(yaml) == "motor.yaml:3: parameters.area is 3 m²; it must lie between 0.5 and 2"
+
+
+def test_a_model_from_a_file_beside_the_yaml(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.dont_write_bytecode", False)
     Path("twins").mkdir()
     Path("twins/pump.py").write_text(PUMP)
     Path("twins/pump.yaml").write_text("model: ./pump.py:Pump\nsource: {type: simulator}\n")

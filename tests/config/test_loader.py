@@ -128,6 +128,45 @@ def test_what_is_not_a_twin_at_all_is_one_line(text: str, expected: str) -> None
     assert message(text) == expected
 
 
+@pytest.mark.parametrize(
+    ("more", "expected"),
+    [
+        (
+            "time: {degraded_after: 20}",
+            "motor.yaml:14: time.stale_after is 15.0 s; it must not be below degraded_after (20.0 s)",
+        ),
+        ("view: {scene: {kind: vehicle}}", "motor.yaml:14: view.scene is a vehicle and has no position; add it"),
+        ("view: {pairs: [[a]]}", "motor.yaml:14: view.pairs[0] is ['a']; it needs 2 or more entries"),
+        (
+            "name: my motor",
+            "motor.yaml:14: name is 'my motor'; use letters, digits, _ and -, and begin with a letter or digit",
+        ),
+        ("history: 2.5", "motor.yaml:14: history is 2.5; it must be a whole number"),
+        ("prior: {a: {std: 0}}", "motor.yaml:14: prior.a.std is 0; it must be positive"),
+    ],
+)
+def test_settings_that_contradict_each_other_are_one_line(more: str, expected: str) -> None:
+    assert message(MOTOR + more) == expected
+
+
+@pytest.mark.parametrize("repeat", ["{steps: [[0, 1], [5, 2]], repeat: 5}", "{constant: 1, repeat: 5}"])
+def test_a_profile_that_cannot_repeat_is_one_line(repeat: str) -> None:
+    text = MOTOR.replace("{steps: [[0, 1], [5, 2]]}", repeat)
+    assert message(text) == (
+        "motor.yaml:13: source.inputs.torque[1].repeat is 5.0 s; it needs steps that all begin before it"
+    )
+
+
+def test_one_mistake_is_one_line_though_it_breaks_several_rules() -> None:
+    text = MOTOR.replace("    std: 2", "    std: [-1]").replace("[1, {steps: [[0, 1], [5, 2]]}]", "{a: 1}")
+    assert message(text).splitlines() == [
+        "motor.yaml:6: sensors.winding.std[0] is -1; it must be positive",
+        "motor.yaml:13: source.inputs.torque.a is not known; choose from constant, steps, repeat, sine",
+    ]
+    text = "model: a\nsource: {type: can, interface: virtual, channel: [1], dbc: a.dbc}\n"
+    assert message(text) == "motor.yaml:2: source.channel is [1]; it must be a whole number"
+
+
 def test_nested_aliases_cannot_ask_for_billions_of_values() -> None:
     text = "a: &a [x, x, x, x, x, x, x, x, x, x]\n"
     for old, new in zip("abcdefghi", "bcdefghij", strict=True):
@@ -208,7 +247,7 @@ def test_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path: Path) -> Non
     path = tmp_path / "motor.yaml"
     path.write_bytes(b"\xef\xbb\xbf" + MOTOR.replace("\n", "\r\n").encode())
     loaded = load(path)
-    assert loaded.config.model == "motor_winding"
+    assert loaded.config.model == "motor_winding" and loaded.text.startswith("model")
     assert loaded.places.at(("gate",)).endswith("motor.yaml:8")
 
 
