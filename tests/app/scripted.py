@@ -1,0 +1,75 @@
+"""A twin and a source for engine tests: the source gives what a test hands it, when it hands it."""
+
+import queue
+from types import SimpleNamespace
+
+import numpy as np
+
+from estimators.log import READING, Readings
+from estimators.models import MODELS
+from estimators.tuning import Tuning
+
+MODEL = MODELS["motor_winding"]
+SECOND = 10**9
+
+
+def readings(times_s, values):
+    """Readings of the winding sensor."""
+    t = np.round(np.asarray(times_s, float) * SECOND).astype(np.int64)
+    n = t.size
+    return Readings(
+        t, t.copy(), np.full(n, READING, np.int8), np.zeros(n, np.int32), np.asarray(values, float).reshape(n, 1)
+    )
+
+
+def twin(history=200_000, horizon=2.0, tick=1000.0):
+    time = SimpleNamespace(horizon=horizon, degraded_after=5.0, stale_after=30.0, tick=tick)
+    config = SimpleNamespace(time=time, history=history)
+    return SimpleNamespace(
+        name="scripted",
+        title="scripted",
+        text="model: motor_winding\n",
+        path="scripted.yaml",
+        model=MODEL,
+        tuning=Tuning.of(MODEL),
+        estimator="kf",
+        pairs=np.array([[0, 1]]),
+        config=config,
+    )
+
+
+class Scripted:
+    """Hands on the batches that were put into it; None ends it."""
+
+    def __init__(self, live=False):
+        self.live = live
+        self.batches = queue.Queue()
+
+    def put(self, batch):
+        self.batches.put(batch)
+
+    def read(self, timeout):
+        try:
+            item = self.batches.get(timeout=timeout)
+        except queue.Empty:
+            return Readings.empty(MODEL.width)
+        if isinstance(item, Exception):
+            raise item
+        return item
+
+    def now(self):
+        return None
+
+    def close(self):
+        pass
+
+
+def wait_for(condition, seconds=20.0):
+    """Poll until a condition holds; what another thread does has no event to wait on."""
+    import time
+
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            raise AssertionError("waited in vain")
+        time.sleep(0.002)

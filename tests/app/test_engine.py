@@ -1,0 +1,253 @@
+"""The engine: whatever order, pieces, retunes and failures, the track is the fold of the log."""
+
+import numpy as np
+import pytest
+from scripted import MODEL, SECOND, Scripted, readings, twin, wait_for
+
+from app import commands
+from app.engine import Engine
+from estimators.fold import fold
+from estimators.log import Log, Readings
+from estimators.tuning import Tuning
+
+
+@pytest.fixture
+def started():
+    engines = []
+
+    def start(source, **options):
+        engine = Engine(twin(**options), lambda report: source)
+        engines.append(engine)
+        engine.start()
+        return engine
+
+    yield start
+    for engine in engines:
+        engine.stop()
+
+
+def series(n, seed=1):
+    rng = np.random.default_rng(seed)
+    return np.arange(1, n + 1) * 0.01, 40 + np.cumsum(rng.normal(size=n)) * 0.1 + rng.normal(size=n)
+
+
+def everything(engine):
+    cursor = engine.cursor()
+    pull = engine.pull(cursor)
+    engine.release(cursor)
+    return pull
+
+
+def rows(engine):
+    return len(everything(engine).readings)
+
+
+def assert_same(track, expected):
+    for name, a, b in zip(track._fields, track, expected, strict=True):
+        np.testing.assert_array_equal(a, b, err_msg=name)
+
+
+def reference(times, values, estimator="kf", tuning=None):
+    log = Log(1)
+    log.extend(readings(times, values))
+    return fold(estimator, MODEL, tuning or Tuning.of(MODEL), log, pairs=np.array([[0, 1]]))
+
+
+def test_live_in_pieces_out_of_order_equals_one_fold(started):
+    times, values = series(3000)
+    source = Scripted()
+    engine = started(source)
+    rng = np.random.default_rng(0)
+    late = rng.choice(np.arange(100, 3000), 40, replace=False)
+    prompt = np.setdiff1d(np.arange(3000), late)
+    order = np.concatenate((prompt, late))
+    # Each late reading comes about 0.3 s after its time, within the horizon of 2 s.
+    order = order[np.argsort(np.where(np.isin(order, late), times[order] + 0.3, times[order]), kind="stable")]
+    at = 0
+    while at < order.size:
+        size = int(rng.integers(1, 60))
+        piece = order[at : at + size]
+        source.put(readings(times[piece], values[piece]))
+        at += size
+    wait_for(lambda: rows(engine) == 3000)
+    assert_same(everything(engine).track, reference(times, values))
+
+
+def test_cursor_is_taken_back_by_a_late_reading(started):
+    source = Scripted()
+    engine = started(source)
+    cursor = engine.cursor()
+    source.put(readings([1.0, 2.0, 3.0], [40, 41, 42]))
+    wait_for(lambda: rows(engine) == 3)
+    assert engine.pull(cursor).first == 0
+    source.put(readings([2.5], [41.5]))
+    wait_for(lambda: rows(engine) == 4)
+    again = engine.pull(cursor)
+    assert not again.fresh
+    assert again.first == 2
+    np.testing.assert_array_equal(again.readings.t, np.array([2.5, 3.0]) * SECOND)
+
+
+def test_reading_beyond_the_horizon_is_counted_and_dropped(started):
+    source = Scripted()
+    engine = started(source)
+    source.put(readings([10.0, 7.9, 8.1], [40, 41, 42]))
+    wait_for(lambda: rows(engine) == 2)
+    wait_for(lambda: engine.notices.counts().get("stale") == 1)
+    np.testing.assert_array_equal(everything(engine).readings.t, np.array([8.1, 10.0]) * SECOND)
+
+
+@pytest.mark.parametrize(
+    ("command", "estimator", "tuned"),
+    [
+        (commands.SetEstimator("ukf"), "ukf", lambda tuning: tuning),
+        (commands.SetTuning("Q.rate", 0.1), "kf", lambda tuning: tuning.set("Q.rate", 0.1)),
+        (commands.UseSensor("winding", False), "kf", lambda tuning: tuning.set("use.winding", False)),
+    ],
+)
+def test_refold_replaces_the_whole_history(started, command, estimator, tuned):
+    times, values = series(2000)
+    source = Scripted()
+    engine = started(source)
+    source.put(readings(times, values))
+    wait_for(lambda: rows(engine) == 2000)
+    before = everything(engine)
+    cursor = engine.cursor()
+    engine.pull(cursor)
+    engine.submit(command)
+    wait_for(lambda: everything(engine).revision == 1)
+    pull = engine.pull(cursor)
+    assert pull.fresh and pull.first == 0
+    assert_same(pull.track, reference(times, values, estimator, tuned(Tuning.of(MODEL))))
+    previous = engine.previous()
+    assert_same(previous.track, before.track)
+
+
+def test_readings_that_come_during_a_refold_are_not_lost(started):
+    times, values = series(60_000)
+    source = Scripted()
+    engine = started(source)
+    source.put(readings(times[:50_000], values[:50_000]))
+    wait_for(lambda: rows(engine) == 50_000)
+    engine.submit(commands.SetTuning("Q.rate", 0.01))
+    late = [50_850, 50_900]
+    for start in range(50_000, 60_000, 250):
+        piece = np.setdiff1d(np.arange(start, start + 250), late)
+        source.put(readings(times[piece], values[piece]))
+        if start == 50_750:
+            source.put(readings(times[late], values[late]))
+    wait_for(lambda: rows(engine) == 60_000 and not engine.status().refolding)
+    assert_same(everything(engine).track, reference(times, values, "kf", Tuning.of(MODEL).set("Q.rate", 0.01)))
+
+
+def test_of_many_slider_values_the_last_one_holds(started):
+    times, values = series(5000)
+    source = Scripted()
+    engine = started(source)
+    source.put(readings(times, values))
+    wait_for(lambda: rows(engine) == 5000)
+    for value in np.geomspace(1e-4, 1e-1, 50):
+        engine.submit(commands.SetTuning("Q.rate", float(value)))
+    wait_for(lambda: not engine.status().refolding and engine.status().tuning.get("Q.rate") == pytest.approx(0.1))
+    assert_same(everything(engine).track, reference(times, values, "kf", Tuning.of(MODEL).set("Q.rate", 0.1)))
+
+
+def test_history_is_bounded_and_a_refold_starts_where_it_was_cut(started):
+    n = 30_000
+    times, values = series(n)
+    source = Scripted()
+    engine = started(source, history=8000)
+    for start in range(0, n, 500):
+        source.put(readings(times[start : start + 500], values[start : start + 500]))
+    wait_for(lambda: (status := engine.status()).t == round(times[-1] * SECOND) and status.counts["readings"] < n)
+    pull = everything(engine)
+    assert 8000 <= len(pull.readings) <= 8000 + 4 * 1024
+    expected = reference(times, values)
+    windowed = ("nis_mean", "nis_low", "nis_high", "health", "age")
+    kept = expected.select(slice(pull.first, n))
+    for name, a, b in zip(kept._fields, pull.track, kept, strict=True):
+        if name not in windowed:
+            np.testing.assert_array_equal(a, b, err_msg=name)
+    # A Kalman filter's mean and covariance are all of its state: refolding from the cut changes nothing.
+    engine.submit(commands.SetTuning("Q.rate", Tuning.of(MODEL).get("Q.rate")))
+    wait_for(lambda: everything(engine).revision == 1)
+    again = everything(engine)
+    np.testing.assert_array_equal(again.track.mean, kept.mean)
+
+
+def test_bad_commands_are_one_line_and_change_nothing(started):
+    source = Scripted()
+    engine = started(source)
+    source.put(readings([1.0], [40]))
+    wait_for(lambda: rows(engine) == 1)
+    for command in (
+        commands.SetTuning("R.winding", -1.0),
+        commands.SetTuning("Q.nothing", 1.0),
+        commands.SetEstimator("magic"),
+        commands.SetOption("alpha", 5.0),
+        commands.Pause(True),
+    ):
+        engine.submit(command)
+    engine.submit(commands.SetTuning("R.winding", 9.0))
+    wait_for(lambda: everything(engine).revision == 1)
+    assert engine.status().tuning.get("R.winding") == 9.0
+    errors = [line.text for line in engine.notices.since(0) if line.level == "error"]
+    assert errors and all("\n" not in text for text in errors)
+
+
+def test_reset_goes_back_to_the_prior(started):
+    source = Scripted()
+    engine = started(source)
+    source.put(readings([1.0, 2.0], [50, 51]))
+    wait_for(lambda: rows(engine) == 2)
+    engine.submit(commands.Reset())
+    wait_for(lambda: rows(engine) == 3)
+    np.testing.assert_array_equal(everything(engine).track.mean[-1], [35.0, 0.0])
+    np.testing.assert_allclose(everything(engine).track.std[-1], [5.0, 1.0], rtol=1e-15)
+
+
+def test_nan_is_missing_and_the_twin_goes_on(started):
+    source = Scripted()
+    engine = started(source)
+    source.put(readings([1.0, 2.0, 3.0], [40, np.nan, 41]))
+    wait_for(lambda: rows(engine) == 3)
+    assert engine.status().counts["missing"] == 1
+    assert np.isfinite(everything(engine).track.mean).all()
+    assert any("no value" in line.text for line in engine.notices.since(0))
+
+
+def test_a_live_source_that_fails_is_reopened():
+    sources = [Scripted(live=True), Scripted(live=True)]
+    opened = iter(sources)
+    engine = Engine(twin(), lambda report: next(opened))
+    engine.start()
+    try:
+        sources[0].put(readings([1.0], [40]))
+        sources[0].put(OSError("bus off"))
+        sources[1].put(readings([2.0], [41]))
+        wait_for(lambda: rows(engine) == 2)
+        texts = [line.text for line in engine.notices.since(0)]
+        assert any("bus off" in text for text in texts)
+        assert engine.notices.counts()["source reopened"] == 1
+    finally:
+        engine.stop()
+
+
+def test_end_of_source_is_said_and_the_page_stays(started):
+    source = Scripted()
+    engine = started(source)
+    source.put(readings([1.0], [40]))
+    source.put(None)
+    wait_for(lambda: engine.status().finished)
+    engine.submit(commands.SetEstimator("ekf"))
+    wait_for(lambda: everything(engine).revision == 1)
+
+
+def test_silence_predicts_and_health_degrades(started):
+    source = Scripted(live=True)
+    engine = started(source, tick=0.02)
+    source.put(readings([1.0], [40]))
+    wait_for(lambda: rows(engine) >= 4)
+    track = everything(engine).track
+    assert np.all(np.diff(track.std[:, 0]) > 0)
+    assert isinstance(everything(engine).readings, Readings)
