@@ -66,11 +66,18 @@ class Feeder:
 
     def _run(self) -> None:
         wait = 0.1
+        ended = False
         while not self._stop.is_set():
             try:
-                if not self._read():
+                if self._read():
+                    ended = False
+                elif not hasattr(self.source, "seek"):
                     self._inbox.put(Finished())
                     return
+                elif not ended:
+                    # A replay can still be sought back, so it is asked again.
+                    ended = True
+                    self._inbox.put(Finished())
                 wait = 0.1
             except Exception as error:  # noqa: BLE001  whatever a driver raises, the twin goes on
                 if not isinstance(error, NisusError):

@@ -28,6 +28,7 @@ from .twin_channels import channels
 from .twin_model import check_names, find_model, one_each
 
 if TYPE_CHECKING:
+    from sources.profiles import Profile
     from sources.source import Channel, Report, Source
 
 TABLES = (".csv", ".parquet", ".pq")
@@ -66,6 +67,7 @@ class Plan:
         truth_model = find_model(self.loaded, (*key, "truth", "model"), truth.model) if truth.model else None
         if truth_model is not None:
             _check_same(self.loaded, (*key, "truth", "model"), truth_model, self.model)
+            _check_truth(self.loaded, section, key, truth_model)
         plans = {}
         for sensor in self.model.sensors:
             plan = section.sensors.get(sensor.name)
@@ -253,14 +255,19 @@ def plan_source(loaded: Loaded, model: StateSpaceModel, log_files: Sequence[Path
 
 
 def _check_asset(loaded: Loaded, section: AssetSection, key: Key, model: StateSpaceModel) -> None:
-    parameters = [item.name for item in model.parameters]
-    noises = [item.name for item in model.noises]
     check_names(loaded, (*key, "initial"), section.initial, model.state_names, "state", model)
     check_names(loaded, (*key, "inputs"), section.inputs, model.input_names, "input", model)
     check_names(loaded, (*key, "sensors"), section.sensors, model.sensor_names, "sensor", model)
     if section.truth.model is None:
-        check_names(loaded, (*key, "truth", "parameters"), section.truth.parameters, parameters, "parameter", model)
-        check_names(loaded, (*key, "truth", "noise"), section.truth.noise, noises, "noise", model)
+        _check_truth(loaded, section, key, model)
+
+
+def _check_truth(loaded: Loaded, section: AssetSection, key: Key, model: StateSpaceModel) -> None:
+    """`model` is the asset's: the twin's own, or truth.model."""
+    truth = section.truth
+    parameters, noises = [item.name for item in model.parameters], [item.name for item in model.noises]
+    check_names(loaded, (*key, "truth", "parameters"), truth.parameters, parameters, "parameter", model)
+    check_names(loaded, (*key, "truth", "noise"), truth.noise, noises, "noise", model)
 
 
 def _check_same(loaded: Loaded, key: Key, truth: StateSpaceModel, model: StateSpaceModel) -> None:
@@ -272,5 +279,17 @@ def _check_same(loaded: Loaded, key: Key, truth: StateSpaceModel, model: StateSp
             )
 
 
-def _profile(profiles: tuple[ProfileSection, ...]) -> Any:
-    raise NotImplementedError
+def _profile(sections: tuple[ProfileSection, ...]) -> Profile:
+    """The sum of an input's profiles."""
+    from sources.profiles import Constant, Sine, Steps, Sum
+
+    parts: list[Profile] = []
+    for section in sections:
+        if section.steps is not None:
+            parts.append(Steps(section.steps, section.repeat))
+        elif section.sine is not None:
+            sine = section.sine
+            parts.append(Sine(sine.amplitude, sine.period, sine.mean, sine.phase))
+        else:
+            parts.append(Constant(section.constant or 0.0))
+    return parts[0] if len(parts) == 1 else Sum(tuple(parts))

@@ -9,6 +9,9 @@ import numpy as np
 READING, INPUT, TRUTH, TICK, RESET = range(5)
 """Kinds of event: a sensor's reading; inputs; a true state (scored, never used); a query; back to the prior."""
 
+BEFORE = -(2**62)
+"""Earlier than any event, and far enough from the end of int64 that a horizon can be taken off."""
+
 KIND_NAMES = ("reading", "input", "truth", "tick", "reset")
 
 
@@ -72,7 +75,7 @@ class Log:
         self.width = width
         self.n = 0
         self.first = 0
-        self.newest = np.iinfo(np.int64).min
+        self.newest = BEFORE
         # Filled, not empty: the pages are paid for now, and memory stays flat while the log fills.
         self.t = np.full(capacity, 0, np.int64)
         self.arrival = np.full(capacity, 0, np.int64)

@@ -1,0 +1,1 @@
+"""Where readings come from: CAN buses, recordings, tables and simulators."""

@@ -1,0 +1,197 @@
+"""Plays a recording or a simulation in its own time: speed, pause, step, seek."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from estimators.log import Readings
+
+from .source import Source
+
+BATCH = 4096
+"""Events given at once at most, so that whoever reads can breathe at full speed."""
+
+
+class Pacer:
+    """A source whose events come when the playhead reaches their time.
+
+    `restarts` counts how often the source was begun again, by seeking back: what was read before no longer holds.
+    Speed, pause, step and seek may be called from any thread; `read` from one.
+    """
+
+    live = False
+
+    def __init__(
+        self,
+        open_source: Callable[[], Source],
+        *,
+        speed: float = 1.0,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """Open the source; the playhead starts at its first event.
+
+        Args:
+            open_source: Called again to begin anew.
+            speed: Times real time; inf is as fast as possible.
+            clock: Nanoseconds that only rise.
+
+        Raises:
+            SourceError: If the source cannot be opened.
+        """
+        self._open = open_source
+        self._clock = clock
+        self._changed = threading.Condition()
+        self._source = open_source()
+        self._pending: Readings | None = None
+        self._reach = np.zeros(0, np.int64)
+        self._ended = False
+        self._first: int | None = None
+        self._last: int | None = None
+        self._playhead: int | None = None
+        self._anchor = clock()
+        self._steps = 0
+        self._seek: int | None = None
+        self.speed = speed
+        self.paused = False
+        self.restarts = 0
+
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """Time of the first event and of the last one known, ns."""
+        span = getattr(self._source, "span", None)
+        if span is not None:
+            return span
+        return None if self._first is None or self._last is None else (self._first, self._last)
+
+    def now(self) -> int | None:
+        """The playhead, ns, or None before the first event and after the last."""
+        with self._changed:
+            return None if self._ended and self._pending is None else self._position()
+
+    def _position(self) -> int | None:
+        if self._playhead is None or not np.isfinite(self.speed):
+            return self._playhead
+        if self.paused:
+            return self._playhead
+        return self._playhead + round((self._clock() - self._anchor) * self.speed)
+
+    def _settle(self) -> None:
+        """Make the present position the anchor, before speed or pause change it."""
+        self._playhead = self._position()
+        self._anchor = self._clock()
+
+    def pause(self) -> None:
+        """Hold the playhead."""
+        with self._changed:
+            self._settle()
+            self.paused = True
+            self._changed.notify_all()
+
+    def resume(self) -> None:
+        """Let it go on."""
+        with self._changed:
+            self._settle()
+            self.paused = False
+            self._changed.notify_all()
+
+    def set_speed(self, speed: float) -> None:
+        """Play `speed` times real time from here on."""
+        with self._changed:
+            self._settle()
+            self.speed = speed
+            self._changed.notify_all()
+
+    def step(self) -> None:
+        """Release the events of the next time at which there are any, and move the playhead there."""
+        with self._changed:
+            self._steps += 1
+            self._changed.notify_all()
+
+    def seek(self, t: int) -> None:
+        """Move the playhead to t (ns): ahead, what lies between is released at once; back, the source begins anew."""
+        with self._changed:
+            self._seek = t
+            self._changed.notify_all()
+
+    def read(self, timeout: float) -> Readings | None:
+        """The events that are due; an empty batch if none becomes due within `timeout` seconds; None at the end."""
+        with self._changed:
+            self._obey_seek()
+            self._fill()
+            if self._pending is None:
+                self._changed.wait_for(lambda: self._seek is not None, timeout)
+                if self._seek is None:
+                    return None
+                self._obey_seek()
+                self._fill()
+                if self._pending is None:
+                    return None
+            count = self._due()
+            if count == 0:
+                self._wait(timeout)
+                if self._seek is None:
+                    count = self._due()
+            batch = self._pending.select(slice(0, count))
+            rest = self._pending.select(slice(count, None))
+            self._pending = rest if len(rest) else None
+            self._reach = self._reach[count:]
+            return batch
+
+    def _obey_seek(self) -> None:
+        if self._seek is None:
+            return
+        t, self._seek = self._seek, None
+        position = self._position()
+        if position is not None and t < position:
+            self._source.close()
+            self._source = self._open()
+            self._pending, self._ended = None, False
+            self.restarts += 1
+        self._playhead, self._anchor = t, self._clock()
+
+    def _fill(self) -> None:
+        """Have at least one event waiting, unless the source has ended."""
+        while self._pending is None and not self._ended:
+            batch = self._source.read(0.0)
+            if batch is None:
+                self._ended = True
+            elif len(batch):
+                self._pending = batch
+                self._reach = np.maximum.accumulate(batch.t)
+                self._last = max(int(self._reach[-1]), self._last if self._last is not None else int(self._reach[-1]))
+                if self._first is None:
+                    self._first = int(batch.t[0])
+                if self._playhead is None:
+                    self._playhead, self._anchor = int(batch.t[0]), self._clock()
+
+    def _due(self) -> int:
+        """How many of the waiting events the playhead has reached."""
+        if self._steps:
+            self._steps -= 1
+            t = int(self._reach[0])
+            self._playhead, self._anchor = t, self._clock()
+            return int(np.searchsorted(self._reach, t, side="right"))
+        if np.isinf(self.speed) and not self.paused:
+            count = min(BATCH, self._reach.size)
+            self._playhead, self._anchor = int(self._reach[count - 1]), self._clock()
+            return count
+        position = self._position()
+        assert position is not None
+        return min(BATCH, int(np.searchsorted(self._reach, position, side="right")))
+
+    def _wait(self, timeout: float) -> None:
+        """Until the next event is due, something changes, or the time is up."""
+        if not self.paused and np.isfinite(self.speed):
+            position = self._position()
+            assert position is not None
+            timeout = min(timeout, max(0.0, (int(self._reach[0]) - position) / self.speed * 1e-9))
+        self._changed.wait(timeout)
+
+    def close(self) -> None:
+        """Close the source."""
+        with self._changed:
+            self._source.close()

@@ -1,0 +1,96 @@
+"""What a source is, and how a twin says what of it feeds the model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Protocol
+
+from estimators.log import Readings
+
+Report = Callable[[str, str], None]
+"""report(key, text): counted under `key`, `text` shown among the events; called from the source's thread."""
+
+
+class Source(Protocol):
+    """Gives events in the order in which they arrived.
+
+    `live` True is a bus, which sets its own pace and holds nothing back; False gives its events when it is asked.
+    """
+
+    live: bool
+
+    def read(self, timeout: float) -> Readings | None:
+        """The next events; none after `timeout` seconds without one; None at the end."""
+
+    def now(self) -> int | None:
+        """The source's present time, ns; None if it has none."""
+
+    def close(self) -> None:
+        """Let go of files and buses."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A value that came along must lie in [low, high], or the reading is missing."""
+
+    signal: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Channel:
+    """Where the values of one sensor, input or true state come from.
+
+    `kind` is READING, INPUT or TRUTH and `index` that of the sensor, input or state. `signals` are signals of the CAN
+    `message`, or columns of a table, one for each row. A value is converted from its unit to the model's and becomes
+    scale * value + offset. `units` None means the DBC's own unit, or the model's where that is empty too.
+    With convert "east_north" the two signals are latitude and longitude in degrees and become metres east and north of
+    `origin`, which is the first valid fix unless given.
+    """
+
+    kind: int
+    index: int
+    name: str
+    signals: tuple[str, ...]
+    message: str | None = None
+    units: tuple[str | None, ...] = ()
+    model_units: tuple[str, ...] = ()
+    scale: tuple[float, ...] = ()
+    offset: tuple[float, ...] = ()
+    where: tuple[Condition, ...] = ()
+    convert: str | None = None
+    origin: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        """Spread the defaults over the rows."""
+        count = len(self.signals)
+        for field, default in (("units", None), ("model_units", ""), ("scale", 1.0), ("offset", 0.0)):
+            value = tuple(getattr(self, field)) or (default,) * count
+            if len(value) != count:
+                raise ValueError(f"channel {self.name}: {field} has {len(value)} entries for {count} signals")
+            object.__setattr__(self, field, value)
+
+    @property
+    def needed(self) -> tuple[str, ...]:
+        """The signals and those of the conditions, each once."""
+        return tuple(dict.fromkeys((*self.signals, *(item.signal for item in self.where))))
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """What to offer in place of a name that is not among `names`: the near ones, or all if they are few."""
+    names = list(names)
+    near = get_close_matches(name, names, n=3, cutoff=0.6)
+    if not near:
+        lower = name.lower()
+        near = [item for item in names if lower in item.lower() or item.lower() in lower][:3]
+    if near:
+        return f"did you mean {' or '.join(near)}?"
+    shown = ", ".join(names[:12])
+    return f"choose from {shown}{', ...' if len(names) > 12 else ''}" if names else "there are none to choose from"
+
+
+def ignore(key: str, text: str) -> None:
+    """A report that nobody wants."""
