@@ -70,33 +70,37 @@ class BeliefScene:
             for k in range(2 if flat else 3)
         ]  # fmt: skip
         self._titles = [
-            api.add_label(f"/titles/{k}", " ", position=_beside(k, 0.0, 1.26, flat), anchor="center-center",
-                          font_screen_scale=0.9)
+            api.add_label(f"/titles/{k}", " ", position=_title_place(k, flat), font_screen_scale=0.9,
+                          anchor="bottom-left" if flat and k else "center-center")
             for k in range(2 if flat else 3)
         ]  # fmt: skip
         nothing = np.zeros((1, 2, 3), np.float32)
         dot = {"point_shape": "circle", "precision": "float32", "point_shading": "flat"}
         one = np.zeros((1, 3), np.float32)
         self._trail = api.add_line_segments("/trail", nothing, (120, 160, 240), thickness=2, **line)
-        self._points = api.add_point_cloud("/points", one, (124, 58, 237), point_size=0.03, visible=False, **dot)
+        # All that moves with the estimate hangs on one frame, so that no redraw shows half of a step.
+        self._belief = api.add_frame("/belief", show_axes=False)
+        self._points = api.add_point_cloud("/belief/points", one, (124, 58, 237), point_size=0.03, visible=False, **dot)
         self._truth = api.add_point_cloud("/truth", one, (22, 163, 74), point_size=0.04, visible=False, **dot)
-        self._mean = api.add_point_cloud("/mean", one, (29, 78, 216), point_size=0.04, **dot)
+        self._mean = api.add_point_cloud(
+            "/belief/mean", one + [0.0, 0.0, 0.04 if flat else 0.0], (29, 78, 216), point_size=0.04, **dot
+        )
         if flat:
             vertices, faces = disc()
-            body = api.add_mesh_simple("/ellipse/disc", vertices, faces, color=(96, 146, 246), opacity=0.25,
+            body = api.add_mesh_simple("/belief/ellipse/disc", vertices, faces, color=(96, 146, 246), opacity=0.25,
                                        side="double", cast_shadow=False, receive_shadow=False)  # fmt: skip
-            rim = api.add_line_segments("/ellipse/rim", circle(), (37, 99, 235), thickness=2, **line)
+            rim = api.add_line_segments("/belief/ellipse/rim", circle(), (37, 99, 235), thickness=2, **line)
             self._bodies = [body, rim]
         else:
             shape = {"cast_shadow": False, "receive_shadow": False}
-            body = api.add_icosphere("/ellipse/body", 1.0, (96, 146, 246), opacity=0.28, subdivisions=4, **shape)
-            wire = api.add_icosphere("/ellipse/wire", 1.0, (59, 110, 220), wireframe=True, opacity=0.25,
+            body = api.add_icosphere("/belief/ellipse/body", 1.0, (96, 146, 246), opacity=0.28, subdivisions=4, **shape)
+            wire = api.add_icosphere("/belief/ellipse/wire", 1.0, (59, 110, 220), wireframe=True, opacity=0.25,
                                      subdivisions=2, **shape)  # fmt: skip
             self._bodies = [body, wire]
         camera = server.initial_camera
         if flat:
             camera.position, camera.look_at, camera.up = (0.0, -0.01, 17.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)
-            fit_cameras(server, float(np.radians(10.5)))
+            fit_cameras(server, float(np.radians(9.2)))
         else:
             camera.position, camera.look_at, camera.up = (3.6, -5.2, 3.4), (0.0, 0.0, -0.1), (0.0, 0.0, 1.0)
             fit_cameras(server, float(np.radians(33)))
@@ -135,24 +139,27 @@ class BeliefScene:
             full[1, 1] = 1e-4
         half, turn = ellipsoid(full)
         centre = self._place(axes, mean[None])[0]
+        self._belief.position = centre
         for handle in self._bodies:
-            handle.position, handle.wxyz = centre, turn
+            handle.wxyz = turn
             handle.scale = (float(half[0]), float(half[1]), float(half[2]) if n == 3 else 1.0)
         lift = np.array([0.0, 0.0, 0.02 if n < 3 else 0.0])
-        self._mean.points = centre[None] + 2 * lift
-        recent = history.column("mean")[-TRAIL:, index]
-        trail = self._place(axes, recent)
+        trail = self._place(axes, history.settled("mean", TRAIL)[:, index])
         trail[(np.abs(trail) > 1.0).any(axis=1)] = np.nan
         self._trail.points = segments(trail)
-        self._cloud(self._points, axes, belief.points[:, index] if len(belief.points) else np.zeros((0, n)), lift)
+        self._cloud(
+            self._points, axes, belief.points[:, index] if len(belief.points) else np.zeros((0, n)), lift, centre
+        )
         self._cloud(self._truth, axes, self._true_point(history, index), lift)
 
-    def _cloud(self, handle: Any, axes: list[_Axis], states: np.ndarray, lift: np.ndarray) -> None:
+    def _cloud(
+        self, handle: Any, axes: list[_Axis], states: np.ndarray, lift: np.ndarray, origin: np.ndarray | float = 0.0
+    ) -> None:
         places = self._place(axes, states) + lift
         places = places[np.isfinite(places).all(axis=1) & (np.abs(places) <= 1.3).all(axis=1)]
         handle.visible = bool(len(places))
         if len(places):
-            handle.points = places
+            handle.points = places - origin
 
     def _true_point(self, history: History, index: list[int]) -> np.ndarray:
         kind, channel, value = (history.column(name)[-4096:] for name in ("kind", "channel", "value"))
@@ -182,6 +189,12 @@ def _beside(k: int, along: float, away: float, flat: bool) -> tuple[float, float
     if flat:
         return ((along, -away, 0.0), (-away - 0.04, along, 0.0))[k]
     return ((along, -away, -1.06), (away, along, -1.06), (-away, -away, along))[k]
+
+
+def _title_place(k: int, flat: bool) -> tuple[float, float, float]:
+    if flat:
+        return ((0.0, -1.22, 0.0), (-1.0, 1.04, 0.0))[k]
+    return _beside(k, 0.0, (1.38, 1.62)[k], flat) if k < 2 else (-1.0, -1.0, 1.16)
 
 
 def _frame(flat: bool) -> np.ndarray:

@@ -18,6 +18,7 @@ BLUE, GREEN, GREY, RED = "#2563eb", "#16a34a", "#9ca3af", "#dc2626"
 DOTS = ("#f59e0b", "#8b5cf6", "#0891b2")
 WINDOWS = {"10 s": 10.0, "30 s": 30.0, "60 s": 60.0, "300 s": 300.0, "all": None}
 BUCKETS = 300
+HEIGHT = 118
 SHOWN = 6
 """States that have a chart of their own; of more, the last chart shows the one chosen."""
 
@@ -181,8 +182,9 @@ class Charts:
         if self._previous is not None and self._previous[0].size:
             t, mean = self._previous
             previous = np.interp(times, t, mean[:, j], left=np.nan, right=np.nan)
-        columns = [values[:, nx + j], values[:, 2 * nx + j], previous, bridge(values[:, 3 * nx + j]), values[:, j]]
-        columns += [values[:, 4 * nx + j * 4 + d] for d in range(4)]
+        dots = [values[:, 4 * nx + j * 4 + d] for d in range(4)]
+        lines = [previous, bridge(values[:, 3 * nx + j]), values[:, j]]
+        columns = [values[:, nx + j], values[:, 2 * nx + j], *dots[:3], *lines, dots[3]]
         return x, *columns, self._ranges[j].series(columns)
 
     def _nis_data(self, x: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -202,10 +204,10 @@ class Charts:
             {"label": "s"},
             {**band, "label": "+2σ"},
             {**band, "label": "-2σ"},
+            *(_dots(color, 4) for color in DOTS),
             _line(GREY, 1, label="previous"),
             _line(GREEN, 1.5, label="truth"),
             _line(BLUE, 1.5, label="mean"),
-            *(_dots(color, 4) for color in DOTS),
             _dots(RED, 5),
             _frame_series(),
         ]
@@ -214,7 +216,7 @@ class Charts:
             tuple(series),  # type: ignore[arg-type]
             title=_title(state.name, state.unit),
             bands=({"series": (1, 2), "fill": "rgba(37,99,235,0.16)"},),
-            **_frame(150),
+            **_frame(HEIGHT),
         )
 
     def _make_nis_chart(self, gui: viser.GuiApi) -> viser.GuiUplotHandle:
@@ -233,7 +235,7 @@ class Charts:
             series,  # type: ignore[arg-type]
             title="NIS: mean of the last readings in its 95 % bounds",
             bands=({"series": (1, 2), "fill": "rgba(22,163,74,0.10)"},),
-            **_frame(150),
+            **_frame(HEIGHT),
         )
 
     def _key(self) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from collections import deque
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +82,7 @@ class Panel:
                     gui, self._coalescer, key=f"{entry.name}.{option.name}", label=option.name, unit=option.unit,
                     value=float(given.get(option.name, option.default)), configured=option.default,
                     low=option.low, high=option.high, hint=option.meaning, complain=self.complain,
-                    command=lambda value, name=option.name: SetOption(name, value),
+                    command=partial(SetOption, option.name),
                 )
                 for option in entry.options
             }  # fmt: skip
@@ -90,17 +91,18 @@ class Panel:
     def _build_tuning(self, gui: viser.GuiApi, status: Any) -> None:
         configured = {item.key: item.value for item in self._configured.items()}
         titles = {"Q": "Process noise Q", "R": "Sensor noise R", "p": "Parameters"}
+        room = len(configured) <= 4
         for prefix, title in titles.items():
             items = [item for item in status.tuning.items() if item.key.startswith(f"{prefix}.")]
             if not items:
                 continue
-            with gui.add_folder(title, expand_by_default=prefix != "p"):
+            with gui.add_folder(title, expand_by_default=prefix == "Q" or room):
                 for item in items:
                     self.rows[item.key] = NumberRow(
                         gui, self._coalescer, key=item.key, label=item.key.partition(".")[2], unit=item.unit,
                         value=item.value, configured=configured[item.key], low=item.low, high=item.high,
                         logarithmic=prefix != "p", complain=self.complain,
-                        command=lambda value, key=item.key: SetTuning(key, value),
+                        command=partial(SetTuning, item.key),
                     )  # fmt: skip
         self._gates = dict(GATES)
         if status.tuning.gate not in self._gates.values():
@@ -185,7 +187,7 @@ class Panel:
         if status.span is None or status.t is None:
             return
         start, end = status.span
-        length = max(1.0, float(np.ceil((end - start) * 1e-9)))
+        length = float(max(1, -((start - end) // 1_000_000_000)))
         if self.seek.max != length:
             self.seek.max = length
         place = float(np.clip(np.floor((status.t - start) * 1e-9), 0.0, length))

@@ -30,7 +30,8 @@ def status_html(status: Any, origin: int | None) -> str:
     if latency is not None:
         cells += f'<span style="white-space:nowrap"><span style="opacity:0.65">latency</span> {latency:.1f} ms</span>'
     return (
-        '<div style="padding:0.5em 0.9em 0.6em;font-size:0.8em;line-height:1.6;font-variant-numeric:tabular-nums">'
+        '<div style="padding:0.2em 1.4em 0.6em 0.9em;font-size:0.8em;line-height:1.6;'
+        'font-variant-numeric:tabular-nums">'
         '<div style="display:flex;justify-content:space-between;gap:0.5em">'
         f'<b style="color:{COLORS.get(health, "#6b7280")}">● {html.escape(health)}</b>'
         f"<span>{state}</span><span>{fold}</span><span>{at}</span></div><div>{cells}</div></div>"

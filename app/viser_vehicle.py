@@ -17,7 +17,7 @@ from .viser_history import History
 
 TRAIL = 600
 POINTS = 1500
-SOFTNESS = 0.15
+SOFTNESS = 0.3
 """Part of the way to the vehicle that the view moves in one frame."""
 
 
@@ -54,7 +54,7 @@ class VehicleScene:
         self._trail = api.add_line_segments("/world/trail", nothing, (37, 99, 235), thickness=3, **line)
         self._truth = api.add_line_segments("/world/truth", nothing, (22, 163, 74), thickness=2, **line)
         self._readings = api.add_point_cloud(
-            "/world/readings", np.zeros((1, 3), np.float32), (245, 158, 11), point_size=0.8, point_shape="circle",
+            "/world/readings", np.zeros((1, 3), np.float32), (245, 158, 11), point_size=0.5, point_shape="circle",
             precision="float32", point_shading="flat", visible=False,
         )  # fmt: skip
         vertices, faces = disc()

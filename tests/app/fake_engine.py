@@ -110,6 +110,4 @@ def events(model, kind, channel, times, values):
     padded = np.full((times.size, model.width), np.nan)
     padded[:, : values.shape[1]] = values
     t = np.round(times * 1e9).astype(np.int64)
-    return Readings(
-        t, t, np.full(t.size, kind, np.int8), np.full(t.size, channel, np.int32), padded
-    )
+    return Readings(t, t, np.full(t.size, kind, np.int8), np.full(t.size, channel, np.int32), padded)
