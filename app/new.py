@@ -14,8 +14,8 @@ _YAML = """\
 # {name}: a tank that a pump fills and a valve empties. Change it, and {name}.py beside it, into a twin of your own.
 #
 # Source: simulated; the true pump delivers less than the model expects, as a worn one does.
-# Expect: the level is known to a few millimetres at once. The pump's delivery, which no sensor measures, is found
-# within a minute of the first valve movement, 15 % below its start.
+# Expect: the level within a few millimetres from the start, better than its sensor's 10 mm. The pump's delivery, which
+# no sensor measures, is found within ten seconds, 15 % below where the belief begins.
 # Run it: nisus run {name}.yaml      Score it: nisus fold {name}.yaml      Every key: nisus schema
 title: Level of a tank and delivery of its pump
 model: ./{name}.py:{model}       # file beside this one, and the name of the model in it

@@ -28,7 +28,7 @@ from .twin_channels import channels
 from .twin_model import check_names, find_model, one_each
 
 if TYPE_CHECKING:
-    from sources.profiles import Profile
+    from sources.profile import Profile
     from sources.source import Channel, Report, Source
 
 TABLES = (".csv", ".parquet", ".pq")
@@ -281,15 +281,16 @@ def _check_same(loaded: Loaded, key: Key, truth: StateSpaceModel, model: StateSp
 
 def _profile(sections: tuple[ProfileSection, ...]) -> Profile:
     """The sum of an input's profiles."""
-    from sources.profiles import Constant, Sine, Steps, Sum
+    from sources.profile import Constant, Sine, Steps, Sum
 
     parts: list[Profile] = []
     for section in sections:
         if section.steps is not None:
-            parts.append(Steps(section.steps, section.repeat))
+            times, values = zip(*section.steps, strict=True)
+            parts.append(Steps(times, values, section.repeat))
         elif section.sine is not None:
             sine = section.sine
-            parts.append(Sine(sine.amplitude, sine.period, sine.mean, sine.phase))
+            parts.append(Sine(sine.mean, sine.amplitude, sine.period, sine.phase))
         else:
             parts.append(Constant(section.constant or 0.0))
     return parts[0] if len(parts) == 1 else Sum(tuple(parts))

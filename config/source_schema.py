@@ -196,9 +196,9 @@ class TruthSection(Section):
     model: Text | None = None
     """Another model with the same states, inputs and sensors: a name, or file.py:Name. Default: the twin's."""
     parameters: dict[str, Number] = {}
-    """The asset's true parameters. Default: the twin's."""
+    """The asset's true parameters. Default: those of the twin, or of `model` if it is given."""
     noise: dict[str, LevelSection] = {}
-    """The asset's true process noise. Default: the twin's."""
+    """The asset's true process noise. Default: that of the twin, or of `model` if it is given."""
 
 
 class AssetSection(Section):

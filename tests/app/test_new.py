@@ -2,10 +2,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from app.new import write_twin
 from app.twin import load_twin
 from estimators.errors import ConfigError
+from estimators.fold import fold
+from estimators.log import READING, TRUTH, Log
+from estimators.track import USED
 
 
 def test_the_pair_that_new_writes_loads_as_it_stands(tmp_path: Path) -> None:
@@ -45,3 +49,24 @@ def test_nothing_is_overwritten(there: str, tmp_path: Path) -> None:
 def test_a_folder_that_is_absent_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="there is no such folder; make it first$"):
         write_twin("pump", tmp_path / "absent")
+
+
+def test_the_pair_folds_and_does_what_its_text_promises(tmp_path: Path) -> None:
+    twin = load_twin(write_twin("pump", tmp_path)[0])
+    log = Log(twin.model.width)
+    source = twin.open_source(lambda key, text: None, live=False)
+    while (batch := source.read(0.0)) is not None:
+        log.extend(batch)
+    track = fold(twin.estimator, twin.model, twin.tuning, log)
+    events = log.readings
+    truth = events.kind == TRUTH
+    level, delivery = (truth & (events.channel == k) for k in (0, 1))
+    late = events.t > 60_000_000_000
+    error = track.mean[level & late, 0] - events.value[level & late, 0]
+    assert np.sqrt(np.mean(error**2)) < 0.01, "below the noise of one reading, 0.01 m"
+    miss = track.mean[delivery & late, 1] - events.value[delivery & late, 0]
+    assert np.abs(miss).max() < 5e-5, "a third of the 0.00015 m³ by which the prior is wrong"
+    # χ² bounds at 99.99 % of the mean of the NIS of all used readings, one degree of freedom each.
+    nis = track.nis[(events.kind == READING) & (track.verdict == USED)]
+    low, high = chi2.ppf([0.00005, 0.99995], nis.size) / nis.size
+    assert low < nis.mean() < high

@@ -1,0 +1,233 @@
+# ruff: noqa: E501  (a table of whole messages reads better unbroken)
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.twin import Twin, load_twin
+from estimators.errors import ConfigError, NisusError, SourceError
+from estimators.log import INPUT, READING, TRUTH, Readings
+
+DBC = """\
+VERSION ""
+BU_: A
+BO_ 256 THERMAL: 4 A
+ SG_ WindingTemp : 0|16@1+ (0.01,-50) [0|0] "degC" A
+ SG_ Valid : 16|1@1+ (1,0) [0|1] "" A
+"""
+
+LOG = """\
+model: motor_winding
+source:
+  type: can_log
+  folder: data
+  files: drive.log
+  get: ask the test bench
+  dbc: thermal.dbc
+  sensors:
+    winding:
+      message: THERMAL
+      signals: WindingTemp
+      where: {Valid: 1}
+"""
+
+TABLE = """\
+model: motor_winding
+source:
+  type: table
+  files: [a*.csv]
+  time: {column: t_ms, unit: ms}
+  sensors:
+    winding: {columns: temp_f, units: degF}
+  truth:
+    rate: {columns: rate, units: K/min}
+"""
+
+CSV = "t_ms,temp_f,rate\n0,32,60\n500,212,30\n1000,,0\n"
+
+
+@pytest.fixture(autouse=True)
+def _inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Messages show paths as they look from the working directory."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("NISUS_DATA", raising=False)
+    Path("data").mkdir()
+    Path("data/thermal.dbc").write_text(DBC)
+    Path("data/drive.log").write_text(
+        "(1.000000) can0 100#401F0100\n(1.500000) can0 100#FFFF0000\n(2.000000) can0 100#50230100\n"
+    )
+
+
+def twin_of(text: str, **options: object) -> Twin:
+    Path("motor.yaml").write_text(text)
+    return load_twin("motor.yaml", **options)  # type: ignore[arg-type]
+
+
+def events(twin: Twin, *, live: bool = False) -> Readings:
+    reports: list[tuple[str, str]] = []
+    source = twin.open_source(lambda key, text: reports.append((key, text)), live=live)
+    batches = []
+    while (batch := source.read(1.0)) is not None:
+        batches.append(batch)
+    source.close()
+    return Readings.concat(batches, twin.model.width)
+
+
+def of(batch: Readings, kind: int) -> Readings:
+    return batch.select(batch.kind == kind)
+
+
+def message(text: str, kind: type[NisusError], **options: object) -> str:
+    with pytest.raises(kind) as caught:
+        events(twin_of(text, **options))
+    return str(caught.value)
+
+
+def test_a_can_log_is_read_through_its_dbc_and_conditions() -> None:
+    batch = of(events(twin_of(LOG)), READING)
+    np.testing.assert_array_equal(batch.t, [1_000_000_000, 1_500_000_000, 2_000_000_000])
+    np.testing.assert_allclose(batch.value[:, 0], [30.0, np.nan, 40.4], rtol=1e-12)
+
+
+def test_a_table_is_read_in_the_models_units() -> None:
+    Path("a1.csv").write_text(CSV)
+    batch = events(twin_of(TABLE))
+    readings, truth = of(batch, READING), of(batch, TRUTH)
+    np.testing.assert_array_equal(readings.t - readings.t[0], [0, 500_000_000, 1_000_000_000])
+    np.testing.assert_allclose(readings.value[:, 0], [0.0, 100.0, np.nan], atol=1e-9)
+    assert set(truth.channel.tolist()) == {1}
+    np.testing.assert_allclose(truth.value[:, 0], [1.0, 0.5, 0.0], rtol=1e-12)
+
+
+def test_nisus_data_replaces_the_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("data").rename("elsewhere")
+    monkeypatch.setenv("NISUS_DATA", "elsewhere")
+    assert len(of(events(twin_of(LOG)), READING)) == 3
+
+
+def test_nisus_data_leaves_a_twin_without_folder_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("a1.csv").write_text(CSV)
+    monkeypatch.setenv("NISUS_DATA", "elsewhere")
+    assert len(of(events(twin_of(TABLE)), READING)) == 3
+
+
+def test_log_files_replace_the_recording() -> None:
+    Path("other.log").write_text("(5.000000) can0 100#401F0100\n")
+    assert of(events(twin_of(LOG, log_files=["other.log"])), READING).t.tolist() == [5_000_000_000]
+
+
+def test_a_recording_stands_in_for_a_bus() -> None:
+    bus = LOG.replace("can_log", "can\n  interface: virtual\n  channel: x\n  recording: data/drive.log")
+    bus = bus.replace("  folder: data\n  files: drive.log\n  get: ask the test bench\n", "").replace(
+        "dbc: t", "dbc: data/t"
+    )
+    assert len(of(events(twin_of(bus)), READING)) == 3
+    without = bus.replace("  recording: data/drive.log\n", "")
+    assert message(without, SourceError) == (
+        "motor.yaml:2: source is a live bus, which does not end; give a recording of it with --log FILE"
+    )
+    assert len(of(events(twin_of(without, log_files=["data/drive.log"])), READING)) == 3
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "kind", "expected"),
+    [
+        ("files: drive.log", "files: absent.log", SourceError, "motor.yaml:5: source.files: there is no data/absent.log; set NISUS_DATA to the folder that holds the recordings or give other recordings with --log FILE; to get it: ask the test bench"),
+        ("files: drive.log", "files: [drive.log, 'x*.log']", SourceError, "motor.yaml:5: source.files: there is no data/x*.log; set NISUS_DATA to the folder that holds the recordings or give other recordings with --log FILE; to get it: ask the test bench"),
+        ("dbc: thermal.dbc", "dbc: absent.dbc", SourceError, "motor.yaml:7: source.dbc: there is no data/absent.dbc; set NISUS_DATA to the folder that holds the recordings; to get it: ask the test bench"),
+        ("    winding:\n", "    windin:\n", ConfigError, "motor.yaml:9: source.sensors.windin is no sensor of motor_winding; did you mean winding?"),
+        ("signals: WindingTemp", "signals: [WindingTemp, Valid]", ConfigError, "motor.yaml:11: source.sensors.winding.signals names 2; winding takes 1: winding"),
+        ("  sensors:\n", "  inputs:\n", ConfigError, "motor.yaml:9: source.inputs.winding is no input of motor_winding; there are none to choose from"),
+    ],
+)  # fmt: skip
+def test_a_source_that_cannot_be_opened_is_one_line(old: str, new: str, kind: type[NisusError], expected: str) -> None:
+    assert old in LOG
+    assert message(LOG.replace(old, new, 1), kind) == expected
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "place", "words"),
+    [
+        ("WindingTemp", "WindingTmp", "motor.yaml:9: source.sensors.winding: ", ["WindingTmp", "THERMAL", "WindingTemp"]),
+        ("message: THERMAL", "message: THERMIC", "motor.yaml:9: source.sensors.winding: ", ["THERMIC", "THERMAL", "thermal.dbc"]),
+        ("where: {Valid", "where: {Vald", "motor.yaml:9: source.sensors.winding: ", ["Vald", "Valid"]),
+        ("where:", "units: km/h\n      where:", "motor.yaml:9: source.sensors.winding: ", ["km/h", "°C"]),
+        ("where:", "units: furlong2x\n      where:", "motor.yaml:9: source.sensors.winding: ", ["furlong2x"]),
+    ],
+)  # fmt: skip
+def test_what_the_dbc_lacks_is_one_line_at_the_mapping(old: str, new: str, place: str, words: list[str]) -> None:
+    assert old in LOG
+    text = message(LOG.replace(old, new, 1), SourceError)
+    assert text.startswith(place) and "\n" not in text
+    for word in words:
+        assert word in text
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("columns: temp_f", "columns: temp_c", ["temp_c", "temp_f"]),
+        ("units: degF", "units: m/s", ["m/s", "°C"]),
+    ],
+)
+def test_what_a_table_lacks_is_one_line_at_the_mapping(old: str, new: str, words: list[str]) -> None:
+    Path("a1.csv").write_text(CSV)
+    text = message(TABLE.replace(old, new, 1), SourceError)
+    assert text.startswith("motor.yaml:7: source.sensors.winding: ") and "\n" not in text
+    for word in words:
+        assert word in text
+
+
+def test_log_files_that_fit_nothing_are_one_line() -> None:
+    assert (
+        message(LOG, SourceError, log_files=["absent.blf"]) == "--log absent.blf: there is no such file; check the path"
+    )
+    simulator = "model: motor_winding\nsource: {type: simulator}\n"
+    assert message(simulator, SourceError, log_files=["a.blf"]) == (
+        "--log a.blf: the source of motor is a simulator; --log needs type can, can_log, table or merged"
+    )
+
+
+def test_merged_recordings_and_their_replacements() -> None:
+    Path("a1.csv").write_text(CSV)
+    indent = lambda text: "".join("      " + line + "\n" for line in text.split("source:\n")[1].splitlines())  # noqa: E731
+    part = lambda text: "    - " + indent(text).replace("        ", "      ").lstrip()  # noqa: E731
+    merged = "model: motor_winding\nsource:\n  type: merged\n  parts:\n" + part(LOG) + part(TABLE)
+    batch = events(twin_of(merged))
+    assert len(of(batch, READING)) == 6 and len(of(batch, TRUTH)) == 3
+    assert np.all(np.diff(batch.t) >= 0)
+    Path("new.log").write_text("(5.000000) can0 100#401F0100\n")
+    assert of(events(twin_of(merged, log_files=["new.log"])), READING).t.tolist() == [5_000_000_000]
+    Path("new.csv").write_text(CSV)
+    assert len(of(events(twin_of(merged, log_files=["new.log", "new.csv"])), READING)) == 4
+    two = merged + part(TABLE).replace("a*.csv", "b*.csv")
+    Path("b1.csv").write_text(CSV)
+    assert message(two, SourceError, log_files=["new.csv"]) == (
+        "--log new.csv: 2 parts of motor.yaml:4 could read it; give it the name of the file that it replaces"
+    )
+    Path("new").mkdir()
+    Path("new/b7.csv").write_text(CSV)
+    assert len(of(events(twin_of(two, log_files=["new/b7.csv"])), READING)) == 3
+
+
+def test_a_simulators_inputs_and_plans_reach_it() -> None:
+    text = """\
+model: motor_drive
+source:
+  type: simulator
+  step: 0.5
+  duration: 5
+  inputs: {i_q: [10, {steps: [[0, 0], [2, 5]]}], ambient: {sine: {mean: 20, amplitude: 1, period: 4}}}
+  sensors: {winding: {every: 2, std: 1e-9}, tooth: {drop_every: 5}}
+"""
+    twin = twin_of(text)
+    batch = events(twin)
+    readings, inputs = of(batch, READING), of(batch, INPUT)
+    assert np.bincount(readings.channel).tolist() == [5, 10, 10]
+    assert np.isnan(readings.value[readings.channel == 1, 0]).sum() == 2
+    i_q = inputs.value[:, 1]
+    assert i_q[inputs.t < 2_000_000_000][0] == 10.0 and np.nanmax(i_q) == 15.0
+    truth = of(batch, TRUTH)
+    winding = readings.select(readings.channel == 0)
+    exact = truth.select((truth.channel == 0) & np.isin(truth.t, winding.t))
+    np.testing.assert_allclose(winding.value[:, 0], exact.value[:, 0], atol=1e-7)
