@@ -9,6 +9,7 @@ Reading therefore takes rows in the order of the file, and an index that is not 
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -162,7 +163,11 @@ def read_recording(path: Path) -> Recorded:
     events: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
     tracks: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
     try:
-        for chunk in RrdReader(str(path)).stream():
+        with warnings.catch_warnings():
+            # A killed writer leaves no footer; that such a file can still be read is the point.
+            warnings.simplefilter("ignore")
+            reader = RrdReader(str(path))
+        for chunk in reader.stream():
             if not chunk.entity_path.startswith("/nisus/"):
                 continue
             batch = chunk.to_record_batch()
@@ -181,7 +186,7 @@ def read_recording(path: Path) -> Recorded:
     if not header or not tunings:
         raise SourceError(f"{path}: holds no recording of Nisus; record one with `nisus run TWIN --record FILE.rrd`")
     if int(header["format"]) != FORMAT:
-        raise SourceError(f"{path}: is of format {header['format']}, this version reads {FORMAT}; use the other version")
+        raise SourceError(f"{path}: has format {header['format']}, this version reads {FORMAT}; use the other")
     first, log_columns = _latest(events)
     _, track_columns = _latest(tracks)
     readings = _assemble(Readings, log_columns)

@@ -1,0 +1,196 @@
+"""Recordings: what is read back is what was seen, and folds again to the same bits."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scripted import MODEL, SECOND, Scripted, readings, twin, wait_for
+
+from app import commands
+from app.engine import Engine
+from app.recorder import Recorder
+from app.recording import read_recording, tuning_from_json
+from estimators.errors import SourceError
+from estimators.fold import Fold
+from estimators.log import Log
+
+
+def drawn(stream):
+    return lambda pull: None
+
+
+@pytest.fixture
+def running():
+    source = Scripted()
+    engine = Engine(twin(), lambda report: source)
+    recorder = engine.recorder = Recorder(engine, drawn)
+    recorder.start()
+    engine.start()
+    yield source, engine, recorder
+    engine.stop()
+    recorder.stop()
+
+
+def rows(engine):
+    cursor = engine.cursor()
+    pull = engine.pull(cursor)
+    engine.release(cursor)
+    return pull
+
+
+def refold(recorded):
+    """The recorded readings through the fold, as a review does it."""
+    tuning, estimator = tuning_from_json(recorded.tuning, MODEL)
+    log = Log(MODEL.width)
+    log.extend(recorded.readings)
+    fold = Fold(estimator, MODEL, tuning, log, pairs=np.array([[0, 1]]), base=recorded.base)
+    fold.advance()
+    return fold.track
+
+
+def assert_same(track, expected):
+    for name, a, b in zip(track._fields, track, expected, strict=True):
+        np.testing.assert_array_equal(a, b, err_msg=name)
+
+
+def test_recording_holds_history_late_readings_and_retunes(running, tmp_path):
+    source, engine, recorder = running
+    rng = np.random.default_rng(3)
+    times = np.arange(1, 2001) * 0.01
+    values = 40 + rng.normal(size=2000)
+    source.put(readings(times[:500], values[:500]))
+    wait_for(lambda: len(rows(engine).readings) == 500)
+    path = tmp_path / "run.rrd"
+    engine.submit(commands.Record(path))
+    wait_for(lambda: recorder.path == path)
+    late = [700, 701, 1500]
+    for start in range(500, 2000, 100):
+        piece = np.setdiff1d(np.arange(start, start + 100), late)
+        source.put(readings(times[piece], values[piece]))
+        for k in late:
+            if start <= k < start + 100:
+                source.put(readings(times[[k]], values[[k]]))
+    wait_for(lambda: len(rows(engine).readings) == 2000)
+    engine.submit(commands.SetTuning("Q.rate", 0.02))
+    engine.submit(commands.SetEstimator("ukf"))
+    wait_for(lambda: engine.status().estimator == "ukf" and not engine.status().refolding)
+    wait_for(lambda: rows(engine).revision >= 1 and rows(engine).track.mean.shape[0] == 2000)
+    seen = rows(engine)
+    engine.submit(commands.Record(None))
+    wait_for(lambda: recorder.finished == [path])
+    recorded = read_recording(path)
+    assert recorded.name == "scripted" and recorded.text == "model: motor_winding\n"
+    np.testing.assert_array_equal(recorded.readings.t, np.round(times * SECOND).astype(np.int64))
+    np.testing.assert_array_equal(recorded.readings.value[:, 0], values)
+    assert_same(recorded.track, seen.track)
+    assert_same(refold(recorded), seen.track)
+    tuning, estimator = tuning_from_json(recorded.tuning, MODEL)
+    assert estimator == "ukf"
+    assert tuning.get("Q.rate") == 0.02
+
+
+def test_several_recordings_one_after_the_other(running, tmp_path):
+    source, engine, recorder = running
+    source.put(readings([1.0, 2.0], [40, 41]))
+    wait_for(lambda: len(rows(engine).readings) == 2)
+    for name in ("a.rrd", "b.rrd"):
+        engine.submit(commands.Record(tmp_path / name))
+        wait_for(lambda name=name: recorder.path == tmp_path / name)
+        engine.submit(commands.Record(None))
+        wait_for(lambda name=name: tmp_path / name in recorder.finished)
+    assert read_recording(tmp_path / "a.rrd").rows == 2
+    assert read_recording(tmp_path / "b.rrd").rows == 2
+
+
+def test_place_that_cannot_be_written_is_one_line_and_the_twin_goes_on(running, tmp_path):
+    source, engine, recorder = running
+    (tmp_path / "file").write_text("")
+    engine.submit(commands.Record(tmp_path / "file" / "run.rrd"))
+    wait_for(lambda: any("recording" in line.text and line.level == "error" for line in engine.notices.since(0)))
+    assert recorder.path is None
+    source.put(readings([1.0], [40]))
+    wait_for(lambda: len(rows(engine).readings) == 1)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a recording", b"RRF2" + bytes(200)])
+def test_what_is_no_recording_is_one_line(tmp_path, content):
+    path = tmp_path / "x.rrd"
+    path.write_bytes(content)
+    with pytest.raises(SourceError) as caught:
+        read_recording(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_absent_recording_is_one_line(tmp_path):
+    with pytest.raises(SourceError, match="there is no such recording"):
+        read_recording(tmp_path / "none.rrd")
+
+
+CHILD = """
+import sys
+sys.path[:0] = [{tests!r}, {root!r}]
+import numpy as np
+from pathlib import Path
+from scripted import Scripted, readings, twin, wait_for
+from app import commands
+from app.engine import Engine
+from app.recorder import Recorder
+import time
+source = Scripted(live=True)
+engine = Engine(twin(), lambda report: source)
+engine.recorder = Recorder(engine, lambda stream: lambda pull: None)
+engine.recorder.start()
+engine.start()
+engine.submit(commands.Record(Path({path!r})))
+begun = time.monotonic()
+k = 0
+while True:
+    k += 1
+    source.put(readings([k * 0.005], [40.0]))
+    print(k, flush=True)
+    time.sleep(0.005)
+"""
+
+
+def test_killed_process_loses_less_than_a_second(tmp_path):
+    path = tmp_path / "killed.rrd"
+    code = CHILD.format(tests=str(Path(__file__).parent), root=str(Path(__file__).parents[2]), path=str(path))
+    child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    try:
+        for line in child.stdout:
+            if int(line) >= 800:
+                break
+    finally:
+        os.kill(child.pid, signal.SIGKILL)
+        rest = child.stdout.read().split()
+        child.wait()
+    sent = int(rest[-1]) if rest and rest[-1].isdigit() else 800
+    recorded = read_recording(path)
+    # 200 readings a second: a second's worth may be lost, with what the queue held.
+    assert recorded.rows > sent - 200
+    assert_same(refold(recorded), recorded.track)
+
+
+def test_truncated_recording_keeps_what_is_whole(running, tmp_path):
+    source, engine, recorder = running
+    path = tmp_path / "run.rrd"
+    engine.submit(commands.Record(path))
+    wait_for(lambda: recorder.path == path)
+    for start in range(0, 1000, 100):
+        source.put(readings(np.arange(start + 1, start + 101) * 0.01, np.full(100, 40.0)))
+        wait_for(lambda start=start: len(rows(engine).readings) == start + 100)
+    engine.submit(commands.Record(None))
+    wait_for(lambda: recorder.finished == [path])
+    whole = path.read_bytes()
+    cut = tmp_path / "cut.rrd"
+    cut.write_bytes(whole[: int(len(whole) * 0.6)])
+    try:
+        recorded = read_recording(cut)
+    except SourceError as error:
+        assert "cut.rrd" in str(error)  # too little was left to hold a row
+    else:
+        assert_same(refold(recorded), recorded.track)
