@@ -1,0 +1,89 @@
+"""Several recordings of one asset, merged in order of time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from estimators.errors import SourceError
+from estimators.log import Readings
+
+from .source import Source
+
+
+class Merged:
+    """Merges sources that are not live; events of equal time keep the order in which the sources are given.
+
+    A source whose own events step back in time (a late reading, as recorded) keeps its order: such an event comes
+    with the one that came before it.
+    """
+
+    live = False
+
+    def __init__(self, sources: Sequence[Source]) -> None:
+        if not sources:
+            raise SourceError("merged: parts is empty; name at least one recording")
+        if any(source.live for source in sources):
+            raise SourceError("merged: a live source cannot be merged with others; use recordings")
+        self._sources: list[Source] = list(sources)
+        self._pending: list[Readings | None] = [None] * len(self._sources)
+        self._order: list[np.ndarray] = [np.zeros(0, np.int64)] * len(self._sources)
+        self._latest = [np.iinfo(np.int64).min] * len(self._sources)
+        self._ended = [False] * len(self._sources)
+
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """First and last time of all, ns; None if a source does not tell."""
+        spans = [getattr(source, "span", None) for source in self._sources]
+        if any(span is None for span in spans):
+            return None
+        known = [span for span in spans if span is not None]
+        return min(span[0] for span in known), max(span[1] for span in known)
+
+    @property
+    def endless(self) -> bool:
+        """Whether one of them has no end."""
+        return any(getattr(source, "endless", False) for source in self._sources)
+
+    def read(self, timeout: float) -> Readings | None:
+        """The next events of all sources, up to the earliest time to which every one of them is known."""
+        for k, source in enumerate(self._sources):
+            while not self._ended[k] and not self._order[k].size:
+                batch = source.read(timeout)
+                if batch is None:
+                    self._ended[k] = True
+                elif len(batch):
+                    order = np.maximum(np.maximum.accumulate(batch.t), self._latest[k])
+                    self._pending[k], self._order[k], self._latest[k] = batch, order, int(order[-1])
+        waiting = [k for k in range(len(self._sources)) if self._order[k].size]
+        if not waiting:
+            return None
+        # What ended sets no limit. At the limit itself a source may still have more, so events there wait for it.
+        running = [k for k in waiting if not self._ended[k]]
+        limit = min(int(self._order[k][-1]) for k in running) if running else None
+        parts, orders = [], []
+        for k in waiting:
+            pending = self._pending[k]
+            assert pending is not None
+            # At a tie an earlier source goes first, so a later one gives only what is before the limit.
+            side = "right" if limit is None or self._first_at(limit, running) >= k else "left"
+            count = self._order[k].size if limit is None else int(np.searchsorted(self._order[k], limit, side=side))
+            parts.append(pending.select(slice(0, count)))
+            orders.append(self._order[k][:count])
+            self._pending[k], self._order[k] = pending.select(slice(count, None)), self._order[k][count:]
+        joined = Readings(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+        return joined.select(np.argsort(np.concatenate(orders), kind="stable"))
+
+    def _first_at(self, limit: int, running: list[int]) -> int:
+        """The first source that may have more events at the limit."""
+        return next(k for k in running if int(self._order[k][-1]) == limit)
+
+    def now(self) -> int | None:
+        """Recordings have no clock."""
+        return None
+
+    def close(self) -> None:
+        """Close them all."""
+        for source in self._sources:
+            source.close()

@@ -1,0 +1,116 @@
+"""Conversion of units, in the spellings that DBC files and people use."""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+from estimators.errors import SourceError
+
+if TYPE_CHECKING:
+    import pint
+
+_SAME = {
+    "%": "percent",
+    "kmh": "km/h",
+    "kph": "km/h",
+    "km/hr": "km/h",
+    "Nm": "N*m",
+    "1/min": "rpm",
+    "U/min": "rpm",
+    "r/min": "rpm",
+    "rev/min": "rpm",
+    "min-1": "rpm",
+    "1/s": "Hz",
+    "m/s/s": "m/s**2",
+    "G": "standard_gravity",
+    "sec": "s",
+    "Volt": "V",
+    "volts": "V",
+    "Amp": "A",
+    "Amps": "A",
+    "Ohm": "ohm",
+    "celsius": "degC",
+    "Celsius": "degC",
+    "deg C": "degC",
+    "Deg C": "degC",
+    "DegC": "degC",
+    "degrees": "deg",
+}
+"""Spellings that stand for one thing only (1/min on a bus is a rotation)."""
+
+_OTHERWISE = {"g": "standard_gravity", "C": "degC", "F": "degF"}
+"""What a spelling means where its first meaning (gram, coulomb, farad) has the wrong dimension."""
+
+
+def _normal(unit: str) -> str:
+    """One spelling of a unit: ASCII, with ** for powers."""
+    text = unit.strip()
+    text = _SAME.get(text, text)
+    for old, new in (("°C", "degC"), ("°F", "degF"), ("°", "deg"), ("·", "*"), ("²", "**2"), ("³", "**3"), ("^", "**")):
+        text = text.replace(old, new)
+    return re.sub(r"(?<=[A-Za-z])(?=\d)", "**", text) if "/" in text or text[-1:].isdigit() else text
+
+
+@lru_cache(maxsize=1)
+def _registry() -> pint.UnitRegistry:
+    import pint  # Here, not above: it takes half a second, and most twins speak in the model's own units.
+
+    return pint.UnitRegistry(cache_folder=None)
+
+
+def _unit(text: str) -> Any:
+    """A unit of pint's; a temperature within a product is a difference of temperatures.
+
+    Raises:
+        LookupError: If nobody knows it.
+    """
+    import pint
+
+    if re.search(r"[*/]", text):
+        text = re.sub(r"\b(degC|degF)\b", r"delta_\1", text)
+    try:
+        return _registry().Unit(text)
+    except (pint.PintError, AttributeError, TypeError, ValueError, SyntaxError, AssertionError) as error:
+        raise LookupError(text) from error
+
+
+@lru_cache(maxsize=256)
+def conversion(given: str | None, wanted: str, where: str) -> tuple[float, float]:
+    """Factor and offset that turn a value in `given` into one in `wanted`: factor * value + offset.
+
+    A unit that is None or empty is taken to be the other.
+
+    Raises:
+        SourceError: Beginning with `where`, if they measure different things or one is unknown.
+    """
+    if not given or not given.strip() or not wanted.strip():
+        return 1.0, 0.0
+    a, b = _normal(given), _normal(wanted)
+    if a == b:
+        return 1.0, 0.0
+    import pint
+
+    remedy = "declare its `units`" if a in ("", "-") else "write one that converts, under `units`"
+    try:
+        target = _unit(b)
+    except LookupError:
+        raise SourceError(
+            f"{where}: the model's unit {wanted!r} is unknown, and {given!r} is not it; {remedy}"
+        ) from None
+    for text in dict.fromkeys((a, _OTHERWISE.get(a, a), a.lower())):
+        try:
+            source = _unit(text)
+            at_zero = float(_registry().Quantity(0.0, source).to(target).magnitude)
+            if at_zero == 0.0:
+                return float(_registry().Quantity(1.0, source).to(target).magnitude), 0.0
+            at_thousand = float(_registry().Quantity(1000.0, source).to(target).magnitude)
+            return round((at_thousand - at_zero) / 1000.0, 12), at_zero
+        except (LookupError, pint.PintError):
+            continue
+    try:
+        _unit(a)
+    except LookupError:
+        raise SourceError(f"{where}: unit {given!r} is unknown, and the model's is {wanted!r}; {remedy}") from None
+    raise SourceError(f"{where}: {given!r} does not convert to the model's {wanted!r}; {remedy}")
