@@ -77,7 +77,10 @@ def _emit(tables, plan, skip, values, state, source, kind, channel, value, refus
                 for r in range(tables.row[c], tables.row[c + 1]):
                     converted = tables.factor[r] * values[i, tables.slot[r]] + tables.shift[r]
                     column = tables.index[c] if tables.kind[c] == INPUT else r - tables.row[c]
-                    value[event, column] = tables.scale[r] * converted + tables.offset[r]
+                    final = tables.scale[r] * converted + tables.offset[r]
+                    value[event, column] = final if np.isfinite(final) else np.nan
+                if tables.kind[c] == TRUTH and np.isnan(value[event, 0]):
+                    n -= 1
     return n
 
 

@@ -1,0 +1,167 @@
+"""The columns of CSV and Parquet files, a few thousand rows at a time."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Generator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from estimators.errors import SourceError
+
+from .source import nearest
+
+CHUNK = 4096
+
+UNREADABLE = "unreadable value"
+
+Problem = Callable[[str, int, str], None]
+"""problem(key, line or row number, text)."""
+
+
+class Chunk(NamedTuple):
+    """Rows of a table: the raw time column, and the values (n, columns) with masks of what is blank.
+
+    `line` is the line (CSV) or row (Parquet) of each, counted from 1.
+    """
+
+    line: np.ndarray
+    time: Any
+    values: np.ndarray
+    blank: np.ndarray
+
+
+def missing_column(path: Path, name: str, names: Sequence[str]) -> SourceError:
+    """The error of a column that a file does not have."""
+    return SourceError(f"{path}: there is no column {name!r}; {nearest(name, names)}")
+
+
+def check_columns(path: Path, wanted: Sequence[str]) -> None:
+    """Refuse a file that lacks a column, or that is no table at all.
+
+    Raises:
+        SourceError: Naming the file, the column and those that are near.
+    """
+    if not path.is_file():
+        raise SourceError(f"{path}: there is no such file; check the path of the recording")
+    if path.stat().st_size == 0:
+        raise SourceError(f"{path}: the file is empty; record it again")
+    names = parquet_names(path) if is_parquet(path) else _header(path)[0]
+    for name in wanted:
+        if name not in names:
+            raise missing_column(path, name, names)
+
+
+def is_parquet(path: Path) -> bool:
+    """Whether the name says so."""
+    return path.suffix.lower() in (".parquet", ".pq")
+
+
+def parquet_names(path: Path) -> list[str]:
+    """Columns of a Parquet file.
+
+    Raises:
+        SourceError: If it is none, or cut short: its columns are listed at its end.
+    """
+    import pyarrow
+    import pyarrow.parquet
+
+    try:
+        return list(pyarrow.parquet.read_schema(path).names)
+    except (pyarrow.ArrowException, OSError) as error:
+        gist = " ".join(str(error).split())[:160]
+        raise SourceError(f"{path}: it cannot be read as Parquet ({gist}); check that it is whole") from None
+
+
+def _header(path: Path) -> tuple[list[str], str]:
+    """Names in the first line of a CSV, and the mark between them."""
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
+        first = file.readline()
+    mark = max(",;\t", key=first.count)
+    names = next(csv.reader([first], delimiter=mark), [])
+    return [name.strip() for name in names], mark
+
+
+def read_csv(path: Path, time: str, columns: Sequence[str], problem: Problem) -> Generator[Chunk, None, None]:
+    """Rows of a CSV; text that is no number is missing and told to `problem`, and so is a row that is cut short."""
+    names, mark = _header(path)
+    at_time = names.index(time)
+    places = [names.index(name) for name in columns]
+    broken: tuple[int, int] | None = None
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
+        reader = csv.reader(file, delimiter=mark)
+        next(reader)
+        ended = False
+        while not ended:
+            rows: list[list[str]] = []
+            lines: list[int] = []
+            while len(rows) < CHUNK and not ended:
+                try:
+                    row = next(reader, None)
+                except csv.Error as error:
+                    problem("truncated file", reader.line_num, f"{error}; the rest is left out")
+                    row = None
+                if row is None:
+                    ended = True
+                elif row:
+                    if broken is not None:
+                        problem(UNREADABLE, broken[0], f"has {broken[1]} cells, not {len(names)}; the row is left out")
+                    broken = None if len(row) == len(names) else (reader.line_num, len(row))
+                    if broken is None:
+                        rows.append(row)
+                        lines.append(reader.line_num)
+            if rows:
+                values = np.empty((len(rows), len(columns)))
+                blank = np.zeros(values.shape, np.bool_)
+                for k, place in enumerate(places):
+                    _numbers([row[place] for row in rows], columns[k], lines, values[:, k], blank[:, k], problem)
+                yield Chunk(np.array(lines), [row[at_time].strip() for row in rows], values, blank)
+    if broken is not None:
+        problem("truncated file", broken[0], f"the last line has {broken[1]} cells, not {len(names)}")
+
+
+def _numbers(
+    cells: list[str], name: str, lines: list[int], values: np.ndarray, blank: np.ndarray, problem: Problem
+) -> None:
+    """Fill a column of values from text."""
+    try:
+        values[:] = [float(cell) for cell in cells]
+        return
+    except ValueError:
+        pass
+    for k, cell in enumerate(cells):
+        try:
+            values[k] = float(cell)
+        except ValueError:
+            values[k] = np.nan
+            if not cell.strip():
+                blank[k] = True
+            elif cell.strip().lower() not in ("na", "n/a", "null", "none"):
+                problem(UNREADABLE, lines[k], f"{name} is {cell.strip()!r}, which is no number; the value is missing")
+
+
+def read_parquet(path: Path, time: str, columns: Sequence[str], problem: Problem) -> Generator[Chunk, None, None]:
+    """Rows of a Parquet file; null is blank, and text is read as in a CSV."""
+    import pyarrow
+    import pyarrow.parquet
+
+    row = 1
+    with pyarrow.parquet.ParquetFile(path) as file:
+        for batch in file.iter_batches(CHUNK, columns=list(dict.fromkeys((time, *columns)))):
+            n = batch.num_rows
+            values = np.empty((n, len(columns)))
+            blank = np.zeros(values.shape, np.bool_)
+            lines = list(range(row, row + n))
+            for k, name in enumerate(columns):
+                column = batch.column(name)
+                blank[:, k] = column.is_null().to_numpy(zero_copy_only=False)
+                if pyarrow.types.is_string(column.type) or pyarrow.types.is_large_string(column.type):
+                    cells = [item or "" for item in column.to_pylist()]
+                    _numbers(cells, name, lines, values[:, k], blank[:, k], problem)
+                else:
+                    numbers = column.cast(pyarrow.float64(), safe=False)
+                    values[:, k] = numbers.to_numpy(zero_copy_only=False)
+            yield Chunk(np.array(lines), batch.column(time), values, blank)
+            row += n
