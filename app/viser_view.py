@@ -127,8 +127,9 @@ class ViserView:
         due = time.monotonic()
         while not self._stop.wait(FRAME / 2):
             self.coalescer.flush()
-            begun = time.monotonic()
-            if begun >= due:
+            now = time.monotonic()
+            if now >= due:
+                begun = time.thread_time()
                 self.frame()
-                cost = time.monotonic() - begun
-                due = begun + min(SLOWEST, max(FRAME, cost / SHARE))
+                # This thread's own work counts, not the time it waited for its turn.
+                due = now + min(SLOWEST, max(FRAME, (time.thread_time() - begun) / SHARE))
