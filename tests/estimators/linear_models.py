@@ -1,0 +1,222 @@
+"""Random linear models for the tests, with all their matrices in the parameters, so that Numba compiles them once.
+
+    x' = x + dt (A x + B u) + w,  w ~ N(0, q₀ dt W),      y_k = H_k x + D_k u + v,  v ~ N(0, R_k)
+
+Parameters p: nx, nu, then A, B, W, then for each of three sensors H_k, D_k. A sensor's size is that of `out`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimators.log import INPUT, READING, Log, Readings
+from estimators.model import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+
+SECOND = 1_000_000_000
+ROWS = (1, 2, 3)
+"""Rows of the three sensors."""
+
+
+def f(x, u, p, dt, out):
+    n = x.size
+    m = u.size
+    for i in range(n):
+        s = x[i]
+        for j in range(n):
+            s += dt * p[i * n + j] * x[j]
+        for j in range(m):
+            s += dt * p[n * n + i * m + j] * u[j]
+        out[i] = s
+
+
+def Q(x, u, p, q, dt, out):
+    n = x.size
+    at = n * n + n * u.size
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = q[0] * dt * p[at + i * n + j]
+
+
+def first(x, u, p, out):
+    n = x.size
+    m = u.size
+    at = 2 * n * n + n * m
+    for i in range(1):
+        s = 0.0 * x[0]
+        for j in range(n):
+            s += p[at + i * (n + m) + j] * x[j]
+        for j in range(m):
+            s += p[at + i * (n + m) + n + j] * u[j]
+        out[i] = s
+
+
+def second(x, u, p, out):
+    n = x.size
+    m = u.size
+    at = 2 * n * n + n * m + (n + m)
+    for i in range(2):
+        s = 0.0 * x[0]
+        for j in range(n):
+            s += p[at + i * (n + m) + j] * x[j]
+        for j in range(m):
+            s += p[at + i * (n + m) + n + j] * u[j]
+        out[i] = s
+
+
+def third(x, u, p, out):
+    n = x.size
+    m = u.size
+    at = 2 * n * n + n * m + 3 * (n + m)
+    for i in range(3):
+        s = 0.0 * x[0]
+        for j in range(n):
+            s += p[at + i * (n + m) + j] * x[j]
+        for j in range(m):
+            s += p[at + i * (n + m) + n + j] * u[j]
+        out[i] = s
+
+
+@dataclass(frozen=True)
+class Matrices:
+    """A random linear model as matrices, and the model that says the same."""
+
+    A: np.ndarray
+    B: np.ndarray
+    W: np.ndarray
+    H: tuple[np.ndarray, ...]
+    D: tuple[np.ndarray, ...]
+    R: tuple[np.ndarray, ...]
+    mean: np.ndarray
+    std: np.ndarray
+    q: float
+    u: np.ndarray
+    model: StateSpaceModel
+
+
+def random_linear(rng: np.random.Generator, nx: int, nu: int) -> Matrices:
+    A = rng.normal(0, 0.3, (nx, nx)) - 0.2 * np.eye(nx)
+    B = rng.normal(0, 1, (nx, nu))
+    root = rng.normal(0, 1, (nx, nx))
+    W = root @ root.T / nx + 0.1 * np.eye(nx)
+    H = tuple(rng.normal(0, 1, (m, nx)) for m in ROWS)
+    D = tuple(rng.normal(0, 1, (m, nu)) for m in ROWS)
+    R = tuple(rng.uniform(0.2, 2.0, m) for m in ROWS)
+    mean, std, u = rng.normal(0, 2, nx), rng.uniform(0.5, 2.0, nx), rng.normal(0, 1, nu)
+    numbers = [A, B, W, *(np.hstack(pair) for pair in zip(H, D, strict=True))]
+    p = np.concatenate([block.ravel() for block in numbers])
+    model = StateSpaceModel(
+        name="linear",
+        title="random linear model",
+        states=tuple(State(f"x{i}", "m", mean=mean[i], std=std[i]) for i in range(nx)),
+        inputs=tuple(Input(f"u{i}", "m", default=u[i]) for i in range(nu)),
+        parameters=tuple(Parameter(f"p{i}", "1", value) for i, value in enumerate(p)),
+        noises=(Noise("all", "m²/s", variance=0.3),),
+        sensors=tuple(
+            Sensor(name, tuple(Row(f"r{j}", "m", variance=r) for j, r in enumerate(variances)), h=h)
+            for name, variances, h in zip(("first", "second", "third"), R, (first, second, third), strict=True)
+        ),
+        f=f,
+        Q=Q,
+        linear=True,
+    )
+    return Matrices(A, B, W, H, D, R, mean, std, 0.3, u, model)
+
+
+def random_log(rng: np.random.Generator, matrices: Matrices, events: int, *, missing: float = 0.2) -> Log:
+    """Readings of three sensors at rates 3:2:1 and irregular times (some equal), inputs now and then, lost rows."""
+    width = matrices.model.width
+    nu = matrices.u.size
+    t, batch = 5 * SECOND, []
+    for _ in range(events):
+        t += int(rng.choice([0, 10**7, 10**8, 3 * 10**8]) * rng.uniform(0.5, 1.5))
+        if nu and rng.random() < 0.15:
+            values = np.where(rng.random(nu) < 0.3, np.nan, rng.normal(0, 1, nu))
+            batch.append(Readings.one(t, t, INPUT, 0, values, width))
+            continue
+        sensor = int(rng.choice(3, p=[0.5, 0.33, 0.17]))
+        y = rng.normal(0, 2, ROWS[sensor])
+        y[rng.random(y.size) < missing] = np.nan
+        batch.append(Readings.one(t, t, READING, sensor, y, width))
+    log = Log(width)
+    log.extend(Readings.concat(batch, width))
+    return log
+
+
+class JointGaussian:
+    """All states of a linear model at all events, and all readings, as ONE Gaussian; no recursion over time.
+
+    The states stacked, X = (x_0 … x_K), obey M X = c + e with M block bidiagonal (identity, and -F below), e block
+    diagonal with the prior and the process noises. So X ~ N(M⁻¹ c, M⁻¹ E M⁻ᵀ); the readings are Y = H X + d + v.
+    """
+
+    def __init__(self, matrices: Matrices, log: Log) -> None:
+        events = log.readings
+        n, K = matrices.mean.size, len(events)
+        M = np.eye(n * K)
+        c = np.zeros(n * K)
+        E = np.zeros((n * K, n * K))
+        u = matrices.u.copy()
+        rows, offsets, values, noise, self.owner = [], [], [], [], []
+        for k in range(K):
+            here = slice(n * k, n * (k + 1))
+            if k == 0:
+                c[here], E[here, here] = matrices.mean, np.diag(matrices.std**2)
+            else:
+                dt = (int(events.t[k]) - int(events.t[k - 1])) / SECOND
+                M[here, n * (k - 1) : n * k] = -(np.eye(n) + dt * matrices.A)
+                c[here] = dt * matrices.B @ u
+                E[here, here] = matrices.q * dt * matrices.W
+            if events.kind[k] == INPUT:
+                given = events.value[k, : u.size]
+                u = np.where(np.isfinite(given), given, u)
+            if events.kind[k] == READING:
+                sensor = events.channel[k]
+                for row in range(ROWS[sensor]):
+                    if np.isfinite(events.value[k, row]):
+                        line = np.zeros(n * K)
+                        line[here] = matrices.H[sensor][row]
+                        rows.append(line)
+                        offsets.append(matrices.D[sensor][row] @ u)
+                        values.append(events.value[k, row])
+                        noise.append(matrices.R[sensor][row])
+                        self.owner.append(k)
+        inverse = np.linalg.inv(M)
+        self.n, self.owner = n, np.array(self.owner)
+        self.mean, self.cov = inverse @ c, inverse @ E @ inverse.T
+        self.H, self.offset, self.y, self.R = np.array(rows), np.array(offsets), np.array(values), np.diag(noise)
+        self.channel = events.channel[self.owner]
+        self.events = np.unique(self.owner)
+        self._kept: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+
+    def _given(self, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and covariance of all states given the rows of a mask, in one solve."""
+        key = mask.tobytes()
+        if key not in self._kept:
+            H = self.H[mask]
+            S = H @ self.cov @ H.T + self.R[np.ix_(mask, mask)]
+            gain = np.linalg.solve(S, H @ self.cov).T
+            mean = self.mean + gain @ (self.y[mask] - self.offset[mask] - H @ self.mean)
+            self._kept[key] = mean, self.cov - gain @ S @ gain.T
+        return self._kept[key]
+
+    def filtered(self, k: int, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and covariance of x_k given the readings up to event k of the sensors in use."""
+        mean, cov = self._given((self.owner <= k) & used[self.channel])
+        here = slice(self.n * k, self.n * (k + 1))
+        return mean[here], cov[here, here]
+
+    def predictive(self, k: int, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Innovation of event k and its covariance, given the readings before it of the sensors in use."""
+        mean, cov = self._given((self.owner < k) & used[self.channel])
+        mask = self.owner == k
+        H = self.H[mask]
+        return self.y[mask] - self.offset[mask] - H @ mean, H @ cov @ H.T + self.R[np.ix_(mask, mask)]
+
+    def log_likelihood(self, used: np.ndarray) -> float:
+        """log p(all readings of the sensors in use), from the joint density."""
+        mask = used[self.channel]
+        H = self.H[mask]
+        S = H @ self.cov @ H.T + self.R[np.ix_(mask, mask)]
+        nu = self.y[mask] - self.offset[mask] - H @ self.mean
+        _, log_det = np.linalg.slogdet(S)
+        return float(-0.5 * (nu @ np.linalg.solve(S, nu) + log_det + nu.size * np.log(2 * np.pi)))

@@ -1,0 +1,81 @@
+"""Imports run one way: app → sources → estimators; config describes and may know only the errors."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("app", "sources", "estimators", "config")
+MAY_IMPORT = {
+    "estimators": ("estimators",),
+    "sources": ("sources", "estimators"),
+    "config": ("config", "estimators.errors"),
+    "app": ("app", "sources", "config", "estimators"),
+}
+IMPURE = {"os", "io", "time", "datetime", "logging", "socket", "subprocess", "threading", "asyncio", "random"}
+"""What the numerics may not touch: files, clocks, logs, threads. `jit` alone finds its cache with `os`."""
+
+
+def imported(source: str, package: str) -> list[str]:
+    """Every module that a source imports, anywhere in it, with relative names made absolute."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            parts = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            base = ".".join([*parts, *([node.module] if node.module else [])])
+            # `from package import name` may import a module of that name, so the name counts too.
+            found += [f"{base}.{alias.name}" for alias in node.names]
+    return found
+
+
+def modules() -> list[Path]:
+    return sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+
+
+def within(name: str, allowed: str) -> bool:
+    return name == allowed or name.startswith(allowed + ".")
+
+
+@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_direction(path):
+    package = ".".join(path.relative_to(ROOT).parent.parts)
+    top = path.relative_to(ROOT).parts[0]
+    wrong = [
+        name
+        for name in imported(path.read_text(), package)
+        if name.split(".")[0] in PACKAGES and not any(within(name, allowed) for allowed in MAY_IMPORT[top])
+    ]
+    assert not wrong, f"{path.relative_to(ROOT)} imports {wrong}; {top} may import {MAY_IMPORT[top]}"
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "estimators").rglob("*.py")), ids=lambda path: path.name)
+def test_estimators_are_pure(path):
+    allowed = {"os"} if path.name == "jit.py" else set()
+    touched = {name.split(".")[0] for name in imported(path.read_text(), "estimators")} & IMPURE
+    assert not touched - allowed
+
+
+def test_the_reader_of_imports_sees_every_form():
+    source = """
+import app.engine
+from app import engine
+from . import errors
+from .errors import ModelError
+from ..sources import can_bus
+def later():
+    from sources.source import Source
+if TYPE_CHECKING:
+    import config.schema as schema
+"""
+    assert imported(source, "estimators.models") == [
+        "app.engine",
+        "app.engine",
+        "estimators.models.errors",
+        "estimators.models.errors.ModelError",
+        "estimators.sources.can_bus",
+        "sources.source.Source",
+        "config.schema",
+    ]
