@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -55,9 +55,9 @@ class Readings(NamedTuple):
             return Readings.empty(width)
         return Readings(*(np.concatenate(columns) for columns in zip(*batches, strict=True)))
 
-    def select(self, index: object) -> Readings:
+    def select(self, index: Any) -> Readings:
         """The events that a mask, slice or index array picks."""
-        return Readings(*(column[index] for column in self))  # type: ignore[index]
+        return Readings(*(column[index] for column in self))
 
     def __len__(self) -> int:
         """Number of events (not of columns)."""

@@ -53,7 +53,8 @@ class Track(NamedTuple):
         vectors = [np.full(rows, np.nan) for _ in range(2)]
         codes = [np.zeros(rows, np.int8) for _ in range(2)]
         windowed = [np.full(rows, np.nan) for _ in range(4)]
-        return Track(*matrix, *vectors, *codes, *windowed, np.zeros(rows, np.int8))
+        columns: list[Any] = [*matrix, *vectors, *codes, *windowed, np.zeros(rows, np.int8)]
+        return Track(*columns)
 
     def select(self, index: object) -> Track:
         """The rows that a slice, mask or index array picks."""

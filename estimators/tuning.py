@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from itertools import count
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -117,7 +117,8 @@ class Tuning:
                     )
             changed = getattr(self, group).copy()
             changed[index] = number
-        return replace(self, version=next(_versions), **{group: changed})
+        entry: dict[str, Any] = {group: changed}
+        return replace(self, version=next(_versions), **entry)
 
     def with_options(self, options: Mapping[str, float]) -> Tuning:
         """A new tuning with other estimator options."""
