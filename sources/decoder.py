@@ -53,7 +53,7 @@ class Decoder:
         report: Report = ignore,
     ) -> None:
         self._report = report
-        self._width = width
+        self.width = width
         found = [(Path(path), bus) for path, bus in databases]
         for path, _ in found:
             load_database(path)

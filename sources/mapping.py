@@ -69,7 +69,8 @@ def _emit(tables, plan, skip, values, state, source, kind, channel, value, refus
                 source[n] = i
                 kind[n] = tables.kind[c]
                 channel[n] = 0 if tables.kind[c] == INPUT else tables.index[c]
-                value[n, :] = np.nan
+                for column in range(value.shape[1]):
+                    value[n, column] = np.nan
                 n += 1
                 if tables.kind[c] == INPUT:
                     input_event = event
@@ -147,8 +148,12 @@ class Mapping:
             high=np.array(high, real),
         )
         self._most = int(np.diff(self._tables.group).max(initial=0))
-        self._positions = [channel for channel in self._channels if channel.convert == "east_north"]
-        self._origins = {channel.index: channel.origin for channel in self._positions}
+        # By sensor: a message that comes under two ids has its channels twice here.
+        self._positions = {c.index: c for c in self._channels if c.convert == "east_north"}
+        self._origins = {index: channel.origin for index, channel in self._positions.items()}
+        empty, none = np.zeros(0, np.int64), np.zeros(0, np.int8)
+        # Compiles now, not when the first event waits.
+        self.events(empty, empty, empty, np.zeros((0, 1)), none.reshape(0, 1), none)
 
     @staticmethod
     def _factor(channel: Channel, name: str, unit: str | None, wanted: str) -> tuple[float, float]:
@@ -187,7 +192,7 @@ class Mapping:
         batch = Readings(t[source], arrival[source], kind[:n].copy(), channel[:n].copy(), value[:n].copy())
         if refused.any() or cut.any():
             self._tell(refused, cut)
-        for item in self._positions:
+        for item in self._positions.values():
             self._place(batch, item)
         return batch
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -59,25 +60,21 @@ class Merged:
         waiting = [k for k in range(len(self._sources)) if self._order[k].size]
         if not waiting:
             return None
-        # What ended sets no limit. At the limit itself a source may still have more, so events there wait for it.
+        # What ended sets no limit. At the limit itself a source may still have more events: those of the sources behind
+        # it wait for them, so that events of equal time come in the order of the sources.
         running = [k for k in waiting if not self._ended[k]]
-        limit = min(int(self._order[k][-1]) for k in running) if running else None
+        limit, holder = min(((int(self._order[k][-1]), k) for k in running), default=(None, len(self._sources)))
         parts, orders = [], []
         for k in waiting:
             pending = self._pending[k]
             assert pending is not None
-            # At a tie an earlier source goes first, so a later one gives only what is before the limit.
-            side = "right" if limit is None or self._first_at(limit, running) >= k else "left"
+            side: Literal["left", "right"] = "right" if k <= holder else "left"
             count = self._order[k].size if limit is None else int(np.searchsorted(self._order[k], limit, side=side))
             parts.append(pending.select(slice(0, count)))
             orders.append(self._order[k][:count])
             self._pending[k], self._order[k] = pending.select(slice(count, None)), self._order[k][count:]
         joined = Readings(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
         return joined.select(np.argsort(np.concatenate(orders), kind="stable"))
-
-    def _first_at(self, limit: int, running: list[int]) -> int:
-        """The first source that may have more events at the limit."""
-        return next(k for k in running if int(self._order[k][-1]) == limit)
 
     def now(self) -> int | None:
         """Recordings have no clock."""
