@@ -77,9 +77,9 @@ class BeliefScene:
         nothing = np.zeros((1, 2, 3), np.float32)
         dot = {"point_shape": "circle", "precision": "float32", "point_shading": "flat"}
         one = np.zeros((1, 3), np.float32)
-        self._trail = api.add_line_segments("/trail", nothing, (120, 160, 240), thickness=2, **line)
         # All that moves with the estimate hangs on one frame, so that no redraw shows half of a step.
         self._belief = api.add_frame("/belief", show_axes=False)
+        self._trail = api.add_line_segments("/belief/trail", nothing, (120, 160, 240), thickness=2, **line)
         self._points = api.add_point_cloud("/belief/points", one, (124, 58, 237), point_size=0.03, visible=False, **dot)
         self._truth = api.add_point_cloud("/truth", one, (22, 163, 74), point_size=0.04, visible=False, **dot)
         self._mean = api.add_point_cloud(
@@ -146,7 +146,7 @@ class BeliefScene:
         lift = np.array([0.0, 0.0, 0.02 if n < 3 else 0.0])
         trail = self._place(axes, history.settled("mean", TRAIL)[:, index])
         trail[(np.abs(trail) > 1.0).any(axis=1)] = np.nan
-        self._trail.points = segments(trail)
+        self._trail.points = segments(np.vstack((trail, centre)) - centre)
         self._cloud(
             self._points, axes, belief.points[:, index] if len(belief.points) else np.zeros((0, n)), lift, centre
         )

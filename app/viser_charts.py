@@ -198,7 +198,6 @@ class Charts:
 
     def _state_chart(self, gui: viser.GuiApi, j: int) -> viser.GuiUplotHandle:
         state = self.model.states[j]
-        nothing = np.array([0.0, 1.0])
         band = _line("rgba(37,99,235,0)", 0)
         series = [
             {"label": "s"},
@@ -212,7 +211,7 @@ class Charts:
             _frame_series(),
         ]
         return gui.add_uplot(
-            (nothing, *(nothing for _ in series[1:])),
+            _no_data(len(series)),
             tuple(series),  # type: ignore[arg-type]
             title=_title(state.name, state.unit),
             bands=({"series": (1, 2), "fill": "rgba(37,99,235,0.16)"},),
@@ -220,7 +219,6 @@ class Charts:
         )
 
     def _make_nis_chart(self, gui: viser.GuiApi) -> viser.GuiUplotHandle:
-        nothing = np.array([0.0, 1.0])
         edge = _line(GREY, 1, dash=(4, 4))
         series = (
             {"label": "s"},
@@ -231,7 +229,7 @@ class Charts:
             _frame_series(),
         )
         return gui.add_uplot(
-            (nothing, *(nothing for _ in series[1:])),
+            _no_data(len(series)),
             series,  # type: ignore[arg-type]
             title="NIS: mean of the last readings in its 95 % bounds",
             bands=({"series": (1, 2), "fill": "rgba(22,163,74,0.10)"},),
@@ -253,6 +251,12 @@ class Charts:
             mark(GREY, "━ previous revision"),
         ]
         return f'<div style="font-size:0.75em;padding:0 0.8em 0.3em;font-weight:400">{"".join(parts)}</div>'
+
+
+def _no_data(series: int) -> tuple[np.ndarray, ...]:
+    """Empty axes: all NaN but the times and the range."""
+    ends = np.array([0.0, 1.0])
+    return ends, *(np.full(2, np.nan) for _ in range(series - 2)), ends
 
 
 def _title(name: str, unit: str) -> str:
