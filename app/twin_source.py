@@ -115,7 +115,14 @@ class Plan:
             )
         from sources.can_log import CanLog
 
-        return CanLog(files, self._decoder(section, key, report, section), report=report)
+        decoder = self._decoder(section, key, report, section)
+        try:
+            return CanLog(files, decoder, report=report)
+        except SourceError as error:
+            if log_files is not None:
+                raise
+            where = "recording" if isinstance(section, CanSection) else "files"
+            raise self._at((*key, where), str(error)) from None
 
     def _merged(self, section: MergedSection, key: Key, report: Report) -> Source:
         from sources.merged import Merged
@@ -175,13 +182,22 @@ class Plan:
         named = channels(self.loaded, section, key, self.model)
         try:
             return build([channel for _, channel in named])
-        except SourceError:
-            for place, channel in named:
-                try:
-                    build([channel])
-                except SourceError as error:
-                    raise SourceError(f"{self.loaded.places.at(place)}: {dotted(place)}: {error}") from None
-            raise
+        except SourceError as error:
+            reason = str(error)
+        try:
+            build([])
+        except SourceError as error:
+            if str(error) == reason:  # No channel's fault: a file, or the column that tells the time.
+                raise self._at(key, reason) from None
+        for place, channel in named:
+            try:
+                build([channel])
+            except SourceError as error:
+                raise self._at(place, str(error).removeprefix(f"{channel.name}: ")) from None
+        raise self._at(key, reason)
+
+    def _at(self, key: Key, text: str) -> SourceError:
+        return SourceError(f"{self.loaded.places.at(key)}: {dotted(key)}: {text}")
 
     def _root(self, section: Any) -> Path:
         """The folder of a recording: NISUS_DATA in place of `folder`, where the YAML gives one."""
@@ -224,7 +240,7 @@ class Plan:
         text = f"; {' or '.join(remedies)}" if remedies else "; check the path"
         if get:
             text += "; to get it: " + " ".join(get.split())
-        return SourceError(f"{self.loaded.places.at(key)}: {dotted(key)}: there is no {shown_path(path)}{text}")
+        return self._at(key, f"there is no {shown_path(path)}{text}")
 
 
 def plan_source(loaded: Loaded, model: StateSpaceModel, log_files: Sequence[Path] | None) -> Plan:

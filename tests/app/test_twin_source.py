@@ -93,8 +93,8 @@ def test_a_table_is_read_in_the_models_units() -> None:
     Path("a1.csv").write_text(CSV)
     batch = events(twin_of(TABLE))
     readings, truth = of(batch, READING), of(batch, TRUTH)
-    np.testing.assert_array_equal(readings.t - readings.t[0], [0, 500_000_000, 1_000_000_000])
-    np.testing.assert_allclose(readings.value[:, 0], [0.0, 100.0, np.nan], atol=1e-9)
+    np.testing.assert_array_equal(readings.t - readings.t[0], [0, 500_000_000])  # an empty cell is no reading
+    np.testing.assert_allclose(readings.value[:, 0], [0.0, 100.0], atol=1e-9)
     assert set(truth.channel.tolist()) == {1}
     np.testing.assert_allclose(truth.value[:, 0], [1.0, 0.5, 0.0], rtol=1e-12)
 
@@ -108,7 +108,7 @@ def test_nisus_data_replaces_the_folder(monkeypatch: pytest.MonkeyPatch) -> None
 def test_nisus_data_leaves_a_twin_without_folder_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     Path("a1.csv").write_text(CSV)
     monkeypatch.setenv("NISUS_DATA", "elsewhere")
-    assert len(of(events(twin_of(TABLE)), READING)) == 3
+    assert len(of(events(twin_of(TABLE)), READING)) == 2
 
 
 def test_log_files_replace_the_recording() -> None:
@@ -178,6 +178,18 @@ def test_what_a_table_lacks_is_one_line_at_the_mapping(old: str, new: str, words
         assert word in text
 
 
+def test_what_is_no_channels_fault_is_not_blamed_on_one() -> None:
+    Path("a1.csv").write_text(CSV)
+    text = message(TABLE.replace("t_ms", "t_s"), SourceError)
+    assert text.startswith("motor.yaml:2: source: ") and "t_s" in text and "did you mean t_ms?" in text
+    Path("data/thermal.dbc").write_text("no DBC at all {")
+    text = message(LOG, SourceError)
+    assert text.startswith("motor.yaml:2: source: ") and "thermal.dbc" in text and "\n" not in text
+    Path("data/thermal.dbc").write_text(DBC)
+    text = message(LOG.replace("drive.log", "thermal.dbc"), SourceError)
+    assert text.startswith("motor.yaml:5: source.files: ") and "thermal.dbc" in text and "\n" not in text
+
+
 def test_log_files_that_fit_nothing_are_one_line() -> None:
     assert (
         message(LOG, SourceError, log_files=["absent.blf"]) == "--log absent.blf: there is no such file; check the path"
@@ -194,12 +206,12 @@ def test_merged_recordings_and_their_replacements() -> None:
     part = lambda text: "    - " + indent(text).replace("        ", "      ").lstrip()  # noqa: E731
     merged = "model: motor_winding\nsource:\n  type: merged\n  parts:\n" + part(LOG) + part(TABLE)
     batch = events(twin_of(merged))
-    assert len(of(batch, READING)) == 6 and len(of(batch, TRUTH)) == 3
+    assert len(of(batch, READING)) == 5 and len(of(batch, TRUTH)) == 3
     assert np.all(np.diff(batch.t) >= 0)
     Path("new.log").write_text("(5.000000) can0 100#401F0100\n")
     assert of(events(twin_of(merged, log_files=["new.log"])), READING).t.tolist() == [5_000_000_000]
     Path("new.csv").write_text(CSV)
-    assert len(of(events(twin_of(merged, log_files=["new.log", "new.csv"])), READING)) == 4
+    assert len(of(events(twin_of(merged, log_files=["new.log", "new.csv"])), READING)) == 3
     two = merged + part(TABLE).replace("a*.csv", "b*.csv")
     Path("b1.csv").write_text(CSV)
     assert message(two, SourceError, log_files=["new.csv"]) == (
@@ -207,7 +219,7 @@ def test_merged_recordings_and_their_replacements() -> None:
     )
     Path("new").mkdir()
     Path("new/b7.csv").write_text(CSV)
-    assert len(of(events(twin_of(two, log_files=["new/b7.csv"])), READING)) == 3
+    assert len(of(events(twin_of(two, log_files=["new/b7.csv"])), READING)) == 2
 
 
 def test_a_simulators_inputs_and_plans_reach_it() -> None:
