@@ -162,7 +162,7 @@ class Decoder:
         fast = np.where(self._slow[frames.plan], -1, frames.plan) if self._any_slow else frames.plan
         extract(self._signals, fast, frames.length, frames.data, values, state, bad)
         if self._any_slow:
-            for i in np.flatnonzero(fast != frames.plan):
+            for i in np.flatnonzero(fast != frames.plan).tolist():
                 self._by_cantools(frames, i, values, state, bad)
         if bad.any():
             self._tell(frames, bad)

@@ -62,8 +62,7 @@ class Encoder:
     """Turns what a simulated asset says into frames.
 
     A message goes out when one of its channels says something, with the last values of the others. If one of them
-    lost its reading, the frame is lost. Values that a signal cannot carry are held at its limit. A channel without a
-    message in the databases (a truth that no DBC knows) stays unsaid if it is a truth.
+    lost its reading, the frame is lost. Values that a signal cannot carry are held at its limit.
 
     Raises:
         SourceError: If a message or signal is missing, a unit does not convert, or a channel cannot be read backwards.
@@ -99,10 +98,6 @@ class Encoder:
                 low, high = _range(signal)
                 frame.values[condition.signal] = min(max(0.0, condition.low, low), condition.high, high)
             self._routes[channel.kind, channel.index] = (frame, rows)
-
-    def can_say(self, kind: int, index: int) -> bool:
-        """Whether there is a message for it."""
-        return (kind, index) in self._routes
 
     def set(self, kind: int, index: int, values: Sequence[float]) -> _Frame | None:
         """Put an event's values into its message; the message, or None if it has none."""

@@ -22,7 +22,7 @@ class _Tables(NamedTuple):
 
     group: np.ndarray
     kind: np.ndarray
-    index: np.ndarray
+    target: np.ndarray
     row: np.ndarray
     slot: np.ndarray
     factor: np.ndarray
@@ -68,7 +68,7 @@ def _emit(tables, plan, skip, values, state, source, kind, channel, value, refus
                 event = n
                 source[n] = i
                 kind[n] = tables.kind[c]
-                channel[n] = 0 if tables.kind[c] == INPUT else tables.index[c]
+                channel[n] = 0 if tables.kind[c] == INPUT else tables.target[c]
                 for column in range(value.shape[1]):
                     value[n, column] = np.nan
                 n += 1
@@ -77,7 +77,7 @@ def _emit(tables, plan, skip, values, state, source, kind, channel, value, refus
             if good:
                 for r in range(tables.row[c], tables.row[c + 1]):
                     converted = tables.factor[r] * values[i, tables.slot[r]] + tables.shift[r]
-                    column = tables.index[c] if tables.kind[c] == INPUT else r - tables.row[c]
+                    column = tables.target[c] if tables.kind[c] == INPUT else r - tables.row[c]
                     final = tables.scale[r] * converted + tables.offset[r]
                     value[event, column] = final if np.isfinite(final) else np.nan
                 if tables.kind[c] == TRUTH and np.isnan(value[event, 0]):
@@ -135,7 +135,7 @@ class Mapping:
         self._tables = _Tables(
             group=np.array(group, whole),
             kind=np.array(kind, whole),
-            index=np.array(index, whole),
+            target=np.array(index, whole),
             row=np.array(row, whole),
             slot=np.array(slot, whole),
             factor=np.array([factor for factor, _ in factors], real),

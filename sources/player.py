@@ -59,11 +59,11 @@ class Player:
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._simulator = simulator
+        channels = list(channels)
         self._encoder = Encoder(databases, channels)
+        self._inputs = [channel.index for channel in channels if channel.kind == INPUT]
         self._report = report
         self._clock = clock
-        self._defaults = [item.default for item in simulator.model.inputs]
-        self._rows = [len(sensor.rows) for sensor in simulator.model.sensors]
         self._stop = threading.Event()
         self._bus = connect() if connect else open_bus(interface, channel, bus_options or {})
         self._name = f"{interface}:{channel}"
@@ -86,7 +86,6 @@ class Player:
     def run(self) -> None:
         """Play here until the simulation ends or another thread calls `close`."""
         begun = self._clock()
-        self._say(0, [(INPUT, k, (value,)) for k, value in enumerate(self._defaults)], send=False)
         while not self._stop.is_set():
             batch = self._simulator.read(0.0)
             if batch is None:
@@ -109,18 +108,12 @@ class Player:
                 moments.append((t, []))
             events = moments[-1][1]
             if kind == INPUT:
-                events += [(INPUT, k, (value[k],)) for k in range(len(self._defaults))]
-            elif kind == READING:
-                events.append((READING, channel, value[: self._rows[channel]]))
-            elif kind == TRUTH:
-                events.append((TRUTH, channel, value[:1]))
+                events += [(INPUT, k, (value[k],)) for k in self._inputs]
+            elif kind in (READING, TRUTH):
+                events.append((kind, channel, value))
         return moments
 
-    def _say(self, t: int, events: list[tuple[int, int, Sequence[float]]], *, send: bool = True) -> None:
-        if not send:
-            for kind, index, values in events:
-                self._encoder.set(kind, index, values)
-            return
+    def _say(self, t: int, events: list[tuple[int, int, Sequence[float]]]) -> None:
         for frame in self._encoder.frames(t, events, REPEAT):
             try:
                 self._bus.send(frame)

@@ -172,7 +172,8 @@ def ordered(message: Any, names: tuple[str, ...]) -> list[Any]:
 def tabulate(messages: list[tuple[Any, list[Any]]]) -> Signals:
     """The tables of messages (cantools) and the signals of each that are wanted, in the order of `ordered`."""
     first, ids_first, known_first = [0], [0], [0]
-    start, length, big, kind, scale, offset, parent, ids, known = ([] for _ in range(9))
+    columns: list[list[Any]] = [[] for _ in range(9)]
+    start, length, big, kind, scale, offset, parent, ids, known = columns
     for message, signals in messages:
         names = [signal.name for signal in signals]
         for signal in signals:
