@@ -1,4 +1,4 @@
-"""What tests share: the recordings and the browser, which a machine may lack, but never the one that judges (CI=true)."""
+"""What tests share: recordings and browser, which a machine may lack, but not the one that judges (CI=true)."""
 
 import os
 import shutil
