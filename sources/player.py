@@ -70,6 +70,13 @@ class Player:
         self._thread: threading.Thread | None = None
         self.sent = 0
         """Frames sent so far."""
+        self.listeners: list[Callable[[can.Message], object]] = []
+        """Called with every frame that was sent, with the wall clock's time; a `can.Logger`, for example."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether `start` was called and all has been played."""
+        return self._thread is not None and not self._thread.is_alive()
 
     def start(self) -> None:
         """Play in a thread until `close`, or until the simulation ends."""
@@ -116,7 +123,11 @@ class Player:
     def _say(self, t: int, events: list[tuple[int, int, Sequence[float]]]) -> None:
         for frame in self._encoder.frames(t, events, REPEAT):
             try:
+                frame.timestamp = time.time()
                 self._bus.send(frame)
-                self.sent += 1
             except (can.CanError, OSError) as error:
                 self._report("send failed", f"CAN bus {self._name}: a frame was not sent ({error})")
+                continue
+            self.sent += 1
+            for listener in self.listeners:
+                listener(frame)
