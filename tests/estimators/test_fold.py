@@ -1,0 +1,368 @@
+"""The fold is a pure function of its log: pieces, order of arrival, copies and cuts leave every bit as it was."""
+
+import numpy as np
+import pytest
+from linear_models import ROWS, random_linear, random_log
+
+from estimators.errors import EstimatorError
+from estimators.fold import RECENT, Fold, fold
+from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Log, Readings
+from estimators.registry import ESTIMATORS
+from estimators.track import FAILED, GATED, HELD_OUT, MISSING, NONE, USED
+from estimators.tuning import Tuning
+
+SECOND = 1_000_000_000
+MATRICES = random_linear(np.random.default_rng(1), 3, 2)
+MODEL = MATRICES.model
+NAMES = list(ESTIMATORS)
+
+
+def identical(a, b):
+    """The same bits in every column; NaN equals NaN."""
+    for name, left, right in zip(a._fields, a, b, strict=True):
+        np.testing.assert_array_equal(left, right, err_msg=name)
+
+
+def as_log(readings):
+    log = Log(MODEL.width)
+    log.extend(readings)
+    return log
+
+
+def everything(rng, events):
+    """Readings, inputs, lost rows, and among them ticks, truths and a few resets."""
+    readings = random_log(rng, MATRICES, events).readings
+    t = readings.t.copy()
+    extra = []
+    for kind, share in ((TICK, 5), (TRUTH, 5), (RESET, 80)):
+        for _ in range(max(1, events // share)):
+            at = int(rng.integers(t[0] + SECOND // 10, t[-1]))
+            extra.append(Readings.one(at, at, kind, 0, rng.normal(), MODEL.width))
+    log = as_log(Readings.concat([readings, *extra], MODEL.width))
+    return Readings(*(column.copy() for column in log.readings))
+
+
+def reading(t, sensor, values, width=MODEL.width):
+    return Readings.one(t, t, READING, sensor, values, width)
+
+
+@pytest.fixture(params=NAMES)
+def estimator(request):
+    return request.param
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_pieces_do_not_matter(estimator, seed):
+    rng = np.random.default_rng(seed)
+    events = everything(rng, 300)
+    whole = fold(estimator, MODEL, Tuning.of(MODEL), as_log(events))
+    log = Log(MODEL.width, capacity=1)
+    growing = Fold(estimator, MODEL, Tuning.of(MODEL), log)
+    at = 0
+    while at < len(events):
+        size = int(rng.choice([1, 2, 7, 63, 64, 65, 130]))
+        log.extend(events.select(slice(at, at + size)))
+        at += size
+        growing.advance(int(rng.integers(1, 40)) if rng.random() < 0.5 else None)
+    growing.advance()
+    identical(growing.track, whole)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_order_of_arrival_does_not_matter(estimator, seed):
+    """Late events: each extends the log, rewinds the fold to where it belongs, and is folded again."""
+    rng = np.random.default_rng(seed)
+    events = everything(rng, 300)
+    # Distinct times: events of equal time keep their order of arrival, which here is to be shuffled.
+    events = events.select(np.unique(events.t, return_index=True)[1])
+    whole = fold(estimator, MODEL, Tuning.of(MODEL), as_log(events))
+    order = np.argsort(np.arange(len(events)) + rng.exponential(12, len(events)))
+    log = Log(MODEL.width, capacity=1)
+    # Anchored by the first event, as a live twin is; what is older than it never comes.
+    order = np.concatenate(([0], order[order != 0]))
+    growing = Fold(estimator, MODEL, Tuning.of(MODEL), log)
+    late = 0
+    for part in np.array_split(order, 120):
+        changed, _ = log.extend(events.select(part))
+        late += changed < growing.n
+        growing.rewind(changed)
+        growing.advance()
+    assert late > 30
+    identical(growing.track, whole)
+
+
+def test_a_reading_older_than_the_first_event(estimator):
+    events = random_log(np.random.default_rng(4), MATRICES, 50).readings
+    log = as_log(events)
+    growing = Fold(estimator, MODEL, Tuning.of(MODEL), log)
+    growing.advance()
+    changed, _ = log.extend(reading(int(events.t[0]) - SECOND, 1, [0.3, -0.4]))
+    growing.rewind(changed)
+    growing.advance()
+    identical(growing.track, fold(estimator, MODEL, Tuning.of(MODEL), log.copy()))
+
+
+def test_rewind_far_behind_the_recent_snapshots(estimator):
+    events = random_log(np.random.default_rng(5), MATRICES, 2 * RECENT + 500).readings
+    log = as_log(events)
+    growing = Fold(estimator, MODEL, Tuning.of(MODEL), log)
+    while growing.advance(700):
+        pass
+    for index in (2 * RECENT, RECENT + 3, 1500, 1024, 1023, 5):
+        growing.rewind(index)
+        assert growing.n <= index
+        growing.advance()
+    identical(growing.track, fold(estimator, MODEL, Tuning.of(MODEL), log.copy()))
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_follow_a_log_that_grew_meanwhile(estimator, late):
+    """A refold on a copy, with another tuning, joins the live log: as if it had folded that from the start."""
+    events = everything(np.random.default_rng(6), 1500)
+    tuning = Tuning.of(MODEL).set("R.first", 3.0)
+    log = as_log(events.select(slice(0, 900)))
+    beside = Fold(estimator, MODEL, tuning, log.copy())
+    beside.advance(500)
+    log.extend(events.select(slice(900, None)))
+    changed = None
+    if late:
+        changed = log.first + log.extend(reading(int(events.t[450]) + 1, 0, [2.0]))[0]
+    beside.advance()
+    beside.follow(log, changed)
+    beside.advance()
+    identical(beside.track, fold(estimator, MODEL, tuning, log.copy()))
+
+
+def test_drop_front_and_base_at(estimator):
+    events = everything(np.random.default_rng(7), 6000)
+    log = as_log(events)
+    tuning = Tuning.of(MODEL)
+    whole = fold(estimator, MODEL, tuning, log.copy())
+    growing = Fold(estimator, MODEL, tuning, log)
+    growing.advance(4000)
+    at, base = growing.base_at(1500)
+    assert 0 < at <= 1500
+    fresh_log = as_log(events.select(slice(at, None)))
+    fresh_log.first = at
+    fresh = Fold(estimator, MODEL, tuning, fresh_log, base=base)
+    growing.drop_front(at)
+    log.drop_front(at)
+    assert log.first == at
+    for one in (growing, fresh):
+        one.advance()
+        assert one.n == len(events) - at
+        # What does not look back over the cut: everything but the windowed columns of the fresh one.
+        for name in ("mean", "std", "cross", "innovation", "innovation_std", "nis", "log_likelihood", "dof", "verdict"):
+            np.testing.assert_array_equal(getattr(one.track, name), getattr(whole, name)[at:], err_msg=name)
+    identical(growing.track, whole.select(slice(at, None)))
+    with pytest.raises(EstimatorError, match="no snapshot"):
+        growing.drop_front(1)
+
+
+def test_follow_over_a_cut(estimator):
+    """The live log forgot its oldest events while a copy was refolded."""
+    events = everything(np.random.default_rng(8), 5000)
+    log = as_log(events.select(slice(0, 4000)))
+    tuning = Tuning.of(MODEL)
+    live = Fold(estimator, MODEL, tuning, log)
+    live.advance()
+    beside = Fold(estimator, MODEL, tuning, log.copy())
+    beside.advance()
+    at, _ = live.base_at(1100)
+    live.drop_front(at)
+    log.drop_front(at)
+    log.extend(events.select(slice(4000, None)))
+    beside.follow(log, None)
+    beside.advance()
+    identical(beside.track, fold(estimator, MODEL, tuning, as_log(events)).select(slice(at, None)))
+    with pytest.raises(EstimatorError, match="another"):
+        beside.follow(as_log(events), None)
+
+
+def test_queries_never_change_the_estimate(estimator):
+    rng = np.random.default_rng(9)
+    events = random_log(rng, MATRICES, 200).readings
+    bare = fold(estimator, MODEL, Tuning.of(MODEL), as_log(events))
+    queries = [
+        Readings.one(t, t, kind, 0, 1e6, MODEL.width)
+        for kind in (TICK, TRUTH)
+        for t in rng.integers(events.t[0] + 1, events.t[-1] + 10 * SECOND, 150)
+    ]
+    log = as_log(Readings.concat([events, *queries], MODEL.width))
+    track = fold(estimator, MODEL, Tuning.of(MODEL), log)
+    query = np.isin(log.readings.kind, (TICK, TRUTH))
+    assert query.sum() == 300
+    for name in ("mean", "std", "innovation", "innovation_std", "nis", "log_likelihood", "dof", "verdict"):
+        np.testing.assert_array_equal(getattr(track.select(~query), name), getattr(bare, name), err_msg=name)
+    assert np.all(track.verdict[query] == NONE)
+    assert np.all(np.isnan(track.nis[query]))
+
+
+def test_a_query_says_what_a_missing_reading_says(estimator):
+    """Prediction to t is prediction to t, asked in either way."""
+    events = random_log(np.random.default_rng(10), MATRICES, 40).readings
+    t = int(events.t[-1]) + SECOND // 3
+    asked = as_log(Readings.concat([events, Readings.one(t, t, TICK, 0, (), MODEL.width)], MODEL.width))
+    missed = as_log(Readings.concat([events, reading(t, 2, np.full(3, np.nan))], MODEL.width))
+    a, b = (fold(estimator, MODEL, Tuning.of(MODEL), log) for log in (asked, missed))
+    np.testing.assert_array_equal(a.mean[-1], b.mean[-1])
+    np.testing.assert_array_equal(a.std[-1], b.std[-1])
+    assert b.verdict[-1] == MISSING
+    assert np.all(b.std[-1] != b.std[-2])
+
+
+def test_reset_is_a_fresh_start(estimator):
+    rng = np.random.default_rng(11)
+    events = random_log(rng, MATRICES, 120).readings
+    events = events.select(events.kind == READING)
+    t = int(events.t[60]) + 7
+    log = as_log(Readings.concat([events, Readings.one(t, t, RESET, 0, (), MODEL.width)], MODEL.width))
+    at = int(np.flatnonzero(log.readings.kind == RESET)[0])
+    track = fold(estimator, MODEL, Tuning.of(MODEL), log)
+    # A tick anchors the prior of the fresh start at the time of the reset.
+    after = as_log(
+        Readings.concat([Readings.one(t, t, TICK, 0, (), MODEL.width), log.readings.select(slice(at + 1, None))], 3)
+    )
+    fresh = fold(estimator, MODEL, Tuning.of(MODEL), after)
+    for name in ("mean", "std", "innovation", "nis", "log_likelihood", "verdict"):
+        np.testing.assert_array_equal(getattr(track, name)[at:], getattr(fresh, name), err_msg=name)
+    np.testing.assert_array_equal(track.mean[at], MATRICES.mean)
+
+
+def test_reset_keeps_the_inputs(estimator):
+    """Inputs are facts about the asset, not beliefs: a reset does not forget them."""
+    events = [
+        Readings.one(0, 0, INPUT, 0, [5.0, -3.0], MODEL.width),
+        Readings.one(SECOND, 0, RESET, 0, (), MODEL.width),
+        Readings.one(2 * SECOND, 0, TICK, 0, (), MODEL.width),
+    ]
+    track = fold(estimator, MODEL, Tuning.of(MODEL), as_log(Readings.concat(events, MODEL.width)))
+    expected = MATRICES.mean + MATRICES.A @ MATRICES.mean + MATRICES.B @ [5.0, -3.0]
+    # One step of a linear map: a few roundings of numbers of order 10.
+    np.testing.assert_allclose(track.mean[2], expected, rtol=1e-13, atol=1e-13)
+
+
+def test_dt_of_zero_predicts_nothing(estimator):
+    tuning = Tuning.of(MODEL)
+    t = 3 * SECOND
+    log = as_log(Readings.concat([reading(t, 0, [1.0]), reading(t, 1, [np.nan] * 2), reading(t, 0, [np.nan])], 3))
+    track = fold(estimator, MODEL, tuning, log)
+    np.testing.assert_array_equal(track.mean[1], track.mean[0])
+    np.testing.assert_array_equal(track.std[2], track.std[0])
+    # The first reading meets the prior as it is: nothing was predicted before the first event.
+    H, R = MATRICES.H[0], MATRICES.R[0]
+    S = float(H[0] @ np.diag(MATRICES.std**2) @ H[0] + R[0])
+    np.testing.assert_allclose(track.innovation_std[0, 0], np.sqrt(S), rtol=1e-14)
+
+
+def test_one_missing_row_leaves_the_others(estimator):
+    """A NaN row is as if the sensor had not had that row."""
+    t = 3 * SECOND
+    y = np.array([0.4, np.nan, -1.0])
+    fold_ = Fold(estimator, MODEL, Tuning.of(MODEL), as_log(reading(t, 2, y)))
+    fold_.advance()
+    mean, cov = fold_.moments()
+    keep = [0, 2]
+    H, D, R = MATRICES.H[2][keep], MATRICES.D[2][keep], np.diag(MATRICES.R[2][keep])
+    P = np.diag(MATRICES.std**2)
+    information = np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H  # information form: other algebra than the filters'
+    expected = np.linalg.inv(information)
+    innovation = y[keep] - H @ MATRICES.mean - D @ MATRICES.u
+    np.testing.assert_allclose(cov, expected, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(mean, MATRICES.mean + expected @ H.T @ np.linalg.inv(R) @ innovation, rtol=1e-11)
+    assert fold_.track.dof[0] == 2
+    assert np.isnan(fold_.track.innovation[0, 1])
+
+
+@pytest.mark.parametrize("bad", [np.inf, -np.inf, np.nan])
+def test_a_reading_that_is_not_finite_is_missing(estimator, bad):
+    """An infinite row is no number; it must not reach the estimate."""
+    t = 3 * SECOND
+    track = fold(
+        estimator, MODEL, Tuning.of(MODEL), as_log(Readings.concat([reading(t, 0, [1.0]), reading(2 * t, 0, [bad])], 3))
+    )
+    assert track.verdict[1] == MISSING
+    assert np.isnan(track.nis[1])
+    assert np.all(np.isfinite(track.mean))
+    assert np.all(np.isfinite(track.std))
+
+
+def test_an_enormous_reading_does_not_raise(estimator):
+    """1e300 overflows the NIS: the estimate is lost and says so, or is gated; but nothing raises."""
+    log = as_log(Readings.concat([reading(SECOND, 0, [1.0]), reading(2 * SECOND, 0, [1e300])], 3))
+    assert fold(estimator, MODEL, Tuning.of(MODEL).set("gate", 0.999), log).verdict[1] == GATED
+    assert fold(estimator, MODEL, Tuning.of(MODEL), log).nis[1] == np.inf
+
+
+def test_gate_refuses_and_leaves_the_prediction(estimator):
+    t = [SECOND, 2 * SECOND, 3 * SECOND]
+    tuning = Tuning.of(MODEL).set("gate", 0.99)
+    both = as_log(Readings.concat([reading(t[0], 1, [0.1, 0.2]), reading(t[1], 1, [80.0, -90.0])], 3))
+    missed = as_log(Readings.concat([reading(t[0], 1, [0.1, 0.2]), reading(t[1], 1, [np.nan, np.nan])], 3))
+    gated, missing = (fold(estimator, MODEL, tuning, log) for log in (both, missed))
+    assert gated.verdict[1] == GATED
+    np.testing.assert_array_equal(gated.mean[1], missing.mean[1])
+    np.testing.assert_array_equal(gated.std[1], missing.std[1])
+    assert np.isfinite(gated.nis[1])
+    assert fold(estimator, MODEL, Tuning.of(MODEL), both).verdict[1] == USED
+
+
+def test_gate_is_the_chi_square_quantile_of_the_rows_that_came(estimator):
+    """A reading just inside and one just outside: 6.6349 for one row, 9.2103 for two, at 0.99 (tables)."""
+    H, S0 = MATRICES.H[1], np.diag(MATRICES.std**2)
+    S = H @ S0 @ H.T + np.diag(MATRICES.R[1])
+    expected = H @ MATRICES.mean + MATRICES.D[1] @ MATRICES.u
+    for rows, quantile in ((1, 6.634897), (2, 9.210340)):
+        direction = np.array([1.0, 0.0]) if rows == 1 else np.array([0.6, -0.8])
+        size = (1 / S[0, 0]) if rows == 1 else direction @ np.linalg.solve(S, direction)
+        for factor, verdict in ((0.9999, USED), (1.0001, GATED)):
+            y = expected + direction * np.sqrt(quantile * factor / size)
+            y = np.array([y[0], np.nan]) if rows == 1 else y
+            track = fold(estimator, MODEL, Tuning.of(MODEL).set("gate", 0.99), as_log(reading(SECOND, 1, y)))
+            assert track.verdict[0] == verdict, (rows, factor)
+
+
+def test_an_unused_sensor_is_held_out_and_a_gated_one_stays_held_out(estimator):
+    log = as_log(reading(SECOND, 0, [1e3]))
+    tuning = Tuning.of(MODEL).set("gate", 0.99).set("use.first", False)
+    assert fold(estimator, MODEL, tuning, log).verdict[0] == HELD_OUT
+
+
+def test_inputs_that_are_nan_stay(estimator):
+    events = [
+        Readings.one(0, 0, INPUT, 0, [5.0, np.nan], MODEL.width),
+        Readings.one(SECOND, 0, TICK, 0, (), MODEL.width),
+    ]
+    growing = Fold(estimator, MODEL, Tuning.of(MODEL), as_log(Readings.concat(events, MODEL.width)))
+    growing.advance()
+    u = np.array([5.0, MATRICES.u[1]])
+    np.testing.assert_array_equal(growing.u, u)
+    expected = MATRICES.mean + MATRICES.A @ MATRICES.mean + MATRICES.B @ u
+    np.testing.assert_allclose(growing.track.mean[1], expected, rtol=1e-13, atol=1e-13)
+
+
+def test_seed_and_version_do_not_change_a_filter_without_randomness(estimator):
+    events = random_log(np.random.default_rng(12), MATRICES, 100).readings
+    identical(
+        fold(estimator, MODEL, Tuning.of(MODEL), as_log(events)),
+        fold(estimator, MODEL, Tuning.of(MODEL), as_log(events)),
+    )
+
+
+def test_covariance_stays_symmetric_and_positive(estimator):
+    """Thousands of precise readings: where P - K S Kᵀ in plain form would lose its sign."""
+    rng = np.random.default_rng(13)
+    tuning = Tuning.of(MODEL)
+    for key in [item.key for item in tuning.items() if item.key.startswith("R.")]:
+        tuning = tuning.set(key, 1e-6)
+    log = Log(MODEL.width)
+    for k in range(2000):
+        sensor = k % 3
+        log.extend(reading(k * SECOND // 100, sensor, rng.normal(0, 1, ROWS[sensor])))
+    growing = Fold(estimator, MODEL, tuning, log)
+    while growing.advance(97):
+        _, P = growing.moments()
+        np.testing.assert_array_equal(P, P.T)
+        # Rounding of P is 1e-16 of its largest entry: an eigenvalue may be that much below zero, no more.
+        assert np.linalg.eigvalsh(P).min() > -1e-14 * np.abs(P).max()
+    assert not np.any(growing.track.verdict == FAILED)
