@@ -22,6 +22,7 @@ from .twin_model import check_named, configure, find_model
 from .twin_source import Plan, plan_source
 
 if TYPE_CHECKING:
+    from sources.player import Player
     from sources.source import Report, Source
 
 
@@ -82,6 +83,14 @@ class Twin:
             SourceError: If it cannot be opened, with the remedy.
         """
         return self.plan.open(report, live=live)
+
+    def player(self, report: Report, *, interface: str | None = None, channel: str | int | None = None) -> Player:
+        """The asset of a twin on a CAN bus, ready to play there, or on another `interface` and `channel`.
+
+        Raises:
+            SourceError: If the source is no bus, it has no `asset`, or the bus cannot be opened.
+        """
+        return self.plan.player(report, interface=interface, channel=channel)
 
 
 def load_twin(

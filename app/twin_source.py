@@ -3,31 +3,32 @@
 from __future__ import annotations
 
 import fnmatch
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from config.loader import Loaded, shown_path
+from config.loader import Loaded
 from config.source_schema import (
     AssetSection,
     CanLogSection,
     CanSection,
     MergedSection,
     ProfileSection,
-    SignalMaps,
     SimulatorSection,
     TableSection,
 )
 from config.yaml_lines import Key, dotted
-from estimators.errors import SourceError
+from estimators.errors import NisusError, SourceError
+from estimators.log import Readings
 from estimators.model import StateSpaceModel
 
 from .twin_channels import channels
+from .twin_files import failure, find_databases, find_recording
 from .twin_model import check_names, find_model, one_each
 
 if TYPE_CHECKING:
+    from sources.player import Player
     from sources.profile import Profile
     from sources.source import Channel, Report, Source
 
@@ -91,14 +92,48 @@ class Plan:
             sensors=plans,
         )
 
+    def player(self, report: Report, *, interface: str | None = None, channel: str | int | None = None) -> Player:
+        """The twin's asset, ready to play on its bus, or on another one.
+
+        Raises:
+            SourceError: If the source is no bus, it has no `asset`, or the bus cannot be opened.
+        """
+        from sources.player import Player
+
+        section, key = self.loaded.config.source, ("source",)
+        if not isinstance(section, CanSection):
+            raise failure(
+                self.loaded, key, f"is of type {section.type}; only one of type can has a bus to play an asset on"
+            )
+        if section.asset is None:
+            raise failure(self.loaded, key, "has no asset to play; describe one under source.asset")
+        same = interface in (None, section.interface)
+        return Player(
+            self.simulator(section.asset, (*key, "asset")),
+            find_databases(self.loaded, section, key),
+            [item for _, item in channels(self.loaded, section, key, self.model)],
+            interface=interface or section.interface,
+            channel=section.channel if channel is None else channel,
+            bus_options=dict(section.options) if same else {},
+            report=report,
+        )
+
     def _bus(self, section: CanSection, key: Key, report: Report) -> Source:
         from sources.can_bus import CanBus
 
-        decoder = self._decoder(section, key, report, None)
-        return CanBus(section.interface, section.channel, decoder, bus_options=dict(section.options), report=report)
+        decoder = self._decoder(section, key, report)
+        bus = CanBus(section.interface, section.channel, decoder, bus_options=dict(section.options), report=report)
+        if section.interface != "virtual" or section.asset is None:
+            return bus
+        # Nobody outside this process could speak on it. The listener is there first, so it hears the first frame.
+        try:
+            return PlayedBus(bus, self.player(report))
+        except NisusError:
+            bus.close()
+            raise
 
     def _recording(self, section: Any, key: Key, report: Report, log_files: Sequence[Path] | None) -> Source:
-        files = self._files(section, key, log_files)
+        files = find_recording(self.loaded, section, key, log_files)
         if isinstance(section, TableSection):
             from sources.table import Table
 
@@ -115,14 +150,14 @@ class Plan:
             )
         from sources.can_log import CanLog
 
-        decoder = self._decoder(section, key, report, section)
+        decoder = self._decoder(section, key, report)
         try:
             return CanLog(files, decoder, report=report)
         except SourceError as error:
             if log_files is not None:
                 raise
             where = "recording" if isinstance(section, CanSection) else "files"
-            raise self._at((*key, where), str(error)) from None
+            raise _about(self.loaded, (*key, where), str(error)) from None
 
     def _merged(self, section: MergedSection, key: Key, report: Report) -> Source:
         from sources.merged import Merged
@@ -159,23 +194,15 @@ class Plan:
             share.append(file)
         return shares
 
-    def _decoder(self, section: SignalMaps, key: Key, report: Report, recording: Any) -> Any:
+    def _decoder(self, section: CanSection | CanLogSection, key: Key, report: Report) -> Any:
         from sources.decoder import Decoder
 
-        databases = [(self._database(item.file, (*key, "dbc"), recording), item.channel) for item in section.dbc]
+        databases = find_databases(self.loaded, section, key)
         return self._blamed(
             section,
             key,
             lambda channels: Decoder(databases, channels, width=self.model.width, report=report),
         )
-
-    def _database(self, file: str, key: Key, recording: Any) -> Path:
-        tried = [self._root(recording) / file] if recording is not None else []
-        tried.append(self.loaded.path.absolute().parent / Path(file).expanduser())
-        for path in tried:
-            if path.is_file():
-                return path
-        raise self._absent(key, tried[0], recording)
 
     def _blamed(self, section: Any, key: Key, build: Callable[[list[Channel]], Any]) -> Any:
         """Build with every channel; if that fails, find the one at fault and name its line."""
@@ -188,59 +215,42 @@ class Plan:
             build([])
         except SourceError as error:
             if str(error) == reason:  # No channel's fault: a file, or the column that tells the time.
-                raise self._at(key, reason) from None
+                raise _about(self.loaded, key, reason) from None
         for place, channel in named:
             try:
                 build([channel])
             except SourceError as error:
-                raise self._at(place, str(error).removeprefix(f"{channel.name}: ")) from None
-        raise self._at(key, reason)
+                raise _about(self.loaded, place, str(error).removeprefix(f"{channel.name}: ")) from None
+        raise _about(self.loaded, key, reason)
 
-    def _at(self, key: Key, text: str) -> SourceError:
-        return SourceError(f"{self.loaded.places.at(key)}: {dotted(key)}: {text}")
 
-    def _root(self, section: Any) -> Path:
-        """The folder of a recording: NISUS_DATA in place of `folder`, where the YAML gives one."""
-        beside = self.loaded.path.absolute().parent
-        folder = getattr(section, "folder", None)
-        if folder is None:
-            return beside
-        return Path(os.environ.get("NISUS_DATA") or beside / Path(folder).expanduser())
+def _about(loaded: Loaded, key: Key, text: str) -> SourceError:
+    """What a source says of itself, with the place in the YAML that it concerns."""
+    return SourceError(f"{loaded.places.at(key)}: {dotted(key)}: {text}")
 
-    def _files(self, section: Any, key: Key, log_files: Sequence[Path] | None) -> list[Path]:
-        if log_files is not None:
-            for file in log_files:
-                if not file.expanduser().is_file():
-                    raise SourceError(f"--log {file}: there is no such file; check the path")
-            return [file.expanduser() for file in log_files]
-        if isinstance(section, CanSection):
-            patterns, where = section.recording, "recording"
-            if patterns is None:
-                raise SourceError(
-                    f"{self.loaded.places.at(key)}: {dotted(key)} is a live bus, which does not end; give a recording "
-                    "of it with --log FILE"
-                )
-        else:
-            patterns, where = section.files, "files"
-        root, found = self._root(section), []
-        for pattern in patterns:
-            path = root / Path(pattern).expanduser()
-            matches = sorted(path.parent.glob(path.name)) if any(c in path.name for c in "*?[") else [path]
-            matches = [match for match in matches if match.is_file()]
-            if not matches:
-                raise self._absent((*key, where), path, section)
-            found += matches
-        return found
 
-    def _absent(self, key: Key, path: Path, section: Any) -> SourceError:
-        folder = getattr(section, "folder", None)
-        get = getattr(section, "get", None)
-        remedies = ["set NISUS_DATA to the folder that holds the recordings"] if folder is not None else []
-        remedies += ["give other recordings with --log FILE"] if key[-1] != "dbc" else []
-        text = f"; {' or '.join(remedies)}" if remedies else "; check the path"
-        if get:
-            text += "; to get it: " + " ".join(get.split())
-        return self._at(key, f"there is no {shown_path(path)}{text}")
+class PlayedBus:
+    """A bus inside this process, and the asset that speaks on it."""
+
+    live = True
+
+    def __init__(self, bus: Source, player: Player) -> None:
+        self._bus = bus
+        self._player = player
+        player.start()
+
+    def read(self, timeout: float) -> Readings | None:
+        """The next events of the bus."""
+        return self._bus.read(timeout)
+
+    def now(self) -> int | None:
+        """The bus's time, ns."""
+        return self._bus.now()
+
+    def close(self) -> None:
+        """Silence the asset, then leave the bus."""
+        self._player.close()
+        self._bus.close()
 
 
 def plan_source(loaded: Loaded, model: StateSpaceModel, log_files: Sequence[Path] | None) -> Plan:

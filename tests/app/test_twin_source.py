@@ -132,9 +132,9 @@ def test_a_recording_stands_in_for_a_bus() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "kind", "expected"),
     [
-        ("files: drive.log", "files: absent.log", SourceError, "motor.yaml:5: source.files: there is no data/absent.log; set NISUS_DATA to the folder that holds the recordings or give other recordings with --log FILE; to get it: ask the test bench"),
-        ("files: drive.log", "files: [drive.log, 'x*.log']", SourceError, "motor.yaml:5: source.files: there is no data/x*.log; set NISUS_DATA to the folder that holds the recordings or give other recordings with --log FILE; to get it: ask the test bench"),
-        ("dbc: thermal.dbc", "dbc: absent.dbc", SourceError, "motor.yaml:7: source.dbc: there is no data/absent.dbc; set NISUS_DATA to the folder that holds the recordings; to get it: ask the test bench"),
+        ("files: drive.log", "files: absent.log", SourceError, "motor.yaml:5: source.files is not there: data/absent.log; set NISUS_DATA to the folder that holds the recordings or give other recordings with --log FILE; to get it: ask the test bench"),
+        ("files: drive.log", "files: [drive.log, 'x*.log']", SourceError, "motor.yaml:5: source.files is not there: data/x*.log; set NISUS_DATA to the folder that holds the recordings or give other recordings with --log FILE; to get it: ask the test bench"),
+        ("dbc: thermal.dbc", "dbc: absent.dbc", SourceError, "motor.yaml:7: source.dbc is not there: data/absent.dbc; set NISUS_DATA to the folder that holds the recordings; to get it: ask the test bench"),
         ("    winding:\n", "    windin:\n", ConfigError, "motor.yaml:9: source.sensors.windin is no sensor of motor_winding; did you mean winding?"),
         ("signals: WindingTemp", "signals: [WindingTemp, Valid]", ConfigError, "motor.yaml:11: source.sensors.winding.signals names 2; winding takes 1: winding"),
         ("  sensors:\n", "  inputs:\n", ConfigError, "motor.yaml:9: source.inputs.winding is no input of motor_winding; there are none to choose from"),
