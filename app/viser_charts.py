@@ -270,5 +270,5 @@ def _frame(height: int) -> dict[str, Any]:
         "axes": ({**axis, "size": 24}, {**axis, "size": 52}),
         "legend": {"show": False},
         "height": height,
-        "padding": (4, 10, 0, 0),
+        "padding": (4, 14, 0, 0),
     }
