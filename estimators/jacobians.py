@@ -6,8 +6,19 @@ Source: Squire & Trapp (1998), doi:10.1137/S003614459631241X.
 
 from __future__ import annotations
 
-from .context import call_F, call_f_complex, call_H, call_h_complex, expect, parameters, transition
+from .context import (
+    call_F,
+    call_f_complex,
+    call_H,
+    call_h_complex,
+    circular_rows,
+    circular_states,
+    expect,
+    parameters,
+    transition,
+)
 from .jit import complexes, ints, jit
+from .linalg import wrap
 
 ANALYTIC, COMPLEX_STEP, CENTRAL = range(3)
 """How a Jacobian is found: the model's own function, complex step, central differences."""
@@ -67,6 +78,7 @@ def state_jacobian(context, x, u, dt, F, scratch):
         z = scratch[:n]
         high = scratch[n : 2 * n]
         low = scratch[2 * n : 3 * n]
+        circular = circular_states(context)
         for i in range(n):
             z[i] = x[i]
         for j in range(n):
@@ -79,7 +91,11 @@ def state_jacobian(context, x, u, dt, F, scratch):
             transition(context, z, u, dt, low)
             z[j] = x[j]
             for i in range(n):
-                F[i, j] = (high[i] - low[i]) / (above - below)
+                difference = high[i] - low[i]
+                # An angle may jump by 2π between the two: a model that wraps, atan2 on its cut.
+                if circular[i] != 0:
+                    difference = wrap(difference)
+                F[i, j] = difference / (above - below)
 
 
 @jit
@@ -96,6 +112,7 @@ def sensor_jacobian(context, sensor, x, u, H, scratch):
         z = scratch[:n]
         high = scratch[n : n + m]
         low = scratch[n + m : n + 2 * m]
+        circular = circular_rows(context, sensor)
         for i in range(n):
             z[i] = x[i]
         for j in range(n):
@@ -108,4 +125,7 @@ def sensor_jacobian(context, sensor, x, u, H, scratch):
             expect(context, sensor, z, u, low)
             z[j] = x[j]
             for i in range(m):
-                H[i, j] = (high[i] - low[i]) / (above - below)
+                difference = high[i] - low[i]
+                if circular[i] != 0:
+                    difference = wrap(difference)
+                H[i, j] = difference / (above - below)
