@@ -7,7 +7,7 @@ from .context import add_process_noise, transition
 from .filter import Estimator
 from .gaussian import describe, moments, no_points, start, state_size, wrap_mean
 from .jacobians import state_jacobian
-from .jit import jit, matrix
+from .jit import floats, jit, matrix
 from .linalg import congruence
 from .model import StateSpaceModel
 
@@ -32,7 +32,8 @@ def predict(context, u, dt, index, state, work):
     last = work.size - 1
     F = matrix(work, last - n * n, n, n)
     if work[last] != dt or u.size > 0:
-        state_jacobian(context, x, u, dt, F, work[n + 3 * n * n :])
+        # At the prior, not at x: differences round differently at each x, and F must not depend on when it was found.
+        state_jacobian(context, floats(context.prior_mean, n), u, dt, F, work[n + 3 * n * n :])
         work[last] = dt
     transition(context, x, u, dt, forward)
     congruence(F, P, scratch)
