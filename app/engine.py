@@ -40,6 +40,10 @@ if TYPE_CHECKING:
 LATENCIES = 4096
 STATUS_AGE = 0.1
 
+UNSETTLED = 8192
+"""Rows at the end that the tally counts again each time."""
+
+
 class Engine:
     """A running twin."""
 
@@ -103,6 +107,8 @@ class Engine:
         self._log = Log(self.model.width, self._history + 4 * SPARSE_EVERY)
         self._base = base
         self._fold = self._make_fold(self.estimator, self.tuning, self._log, base)
+        self._forgotten = np.zeros(len(VERDICT_NAMES), np.int64)
+        self._count_again()
 
     def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
         return Fold(estimator, self.model, tuning, log, pairs=self.pairs, policy=self._policy, base=base)
@@ -192,8 +198,7 @@ class Engine:
         with self._lock:
             log, fold = self._log, self._fold
             track = fold.track
-            verdicts = np.bincount(track.verdict, minlength=len(VERDICT_NAMES))
-            readings = int(np.count_nonzero(log.kind[: fold.n] == READING))
+            verdicts = self._tally()
             last = fold.n - 1
             status = Status(
                 estimator=self.estimator,
@@ -204,7 +209,7 @@ class Engine:
                 t=int(log.t[last]) if last >= 0 else None,
                 health=int(track.health[last]) if last >= 0 else 0,
                 counts={
-                    "readings": readings,
+                    "readings": int(verdicts[1:].sum()),
                     **{name: int(count) for name, count in zip(VERDICT_NAMES[1:], verdicts[1:], strict=True)},
                     **self.notices.counts(),
                 },
@@ -222,6 +227,20 @@ class Engine:
             )
         self._status = (time.monotonic(), status)
         return status
+
+    def _tally(self) -> np.ndarray:
+        """Rows by verdict since the start; rows that no late reading will touch are counted once."""
+        verdict = self._fold.track.verdict
+        settled = max(self._settled, len(verdict) - UNSETTLED)
+        self._settled_counts += np.bincount(verdict[self._settled : settled], minlength=len(VERDICT_NAMES))
+        self._settled = settled
+        return self._settled_counts + np.bincount(verdict[settled:], minlength=len(VERDICT_NAMES))
+
+    def _count_again(self, forgotten: np.ndarray | None = None) -> None:
+        """Rows moved or changed: begin the tally anew, on top of what the forgotten rows held."""
+        if forgotten is not None:
+            self._forgotten = self._forgotten + np.bincount(forgotten, minlength=len(VERDICT_NAMES))
+        self._settled, self._settled_counts = 0, self._forgotten.copy()
 
     def _latency(self, percent: float) -> float | None:
         count = min(self._n_latencies, LATENCIES)
@@ -284,6 +303,8 @@ class Engine:
     def _go_back(self, index: int) -> None:
         """Events at and behind `index` changed: fold them again, and let every cursor fetch them again."""
         self._fold.rewind(index)
+        if index < self._settled:
+            self._count_again()
         absolute = self._log.first + index
         self._changed_from = absolute if self._changed_from is None else min(self._changed_from, absolute)
         for cursor in self._cursors:
@@ -307,7 +328,8 @@ class Engine:
             if rows.size:
                 row = before + int(rows[-1])
                 sensor = self.model.sensors[log.channel[row]].name
-                text = f"{sensor}: reading {what} (NIS {track.nis[row]:.3g})"
+                nis = f" (NIS {track.nis[row]:.3g})" if np.isfinite(track.nis[row]) else ""
+                text = f"{sensor}: reading {what}{nis}"
                 self.notices.report(f"{VERDICT_NAMES[code]} {sensor}", text)
         if len(track) and track.health[-1] != self._health:
             self._health = int(track.health[-1])
@@ -318,6 +340,7 @@ class Engine:
         count = (self._log.n - self._history) // SPARSE_EVERY * SPARSE_EVERY
         count, self._base = self._fold.base_at(count)
         if count:
+            self._count_again(self._fold.track.verdict[:count])
             self._fold.drop_front(count)
             self._log.drop_front(count)
 
@@ -441,6 +464,7 @@ class Engine:
                     old.track,
                 )
                 self._fold = fold
+                self._count_again()
                 self._revision += 1
         if stale:
             self._retune(self.estimator, self.tuning)

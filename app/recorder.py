@@ -12,7 +12,11 @@ from .pull import Pull
 from .recording import RecordingFile
 
 if TYPE_CHECKING:
+    from estimators.log import Log
+    from estimators.track import Track
+
     from .engine import Engine
+    from .twin import Twin
 
 PERIOD = 0.2
 """Seconds between two writes; with what the operating system has after each, a killed process loses less than this."""
@@ -113,3 +117,20 @@ class Recorder:
         self._file = None
         if cursor is not None:
             self._engine.release(cursor)
+
+
+def write_recording(path: Path, twin: Twin, log: Log, track: Track) -> None:
+    """Write a finished fold as a recording, in the same form as a running twin's.
+
+    Raises:
+        SourceError: If the file cannot be written.
+    """
+    file = RecordingFile(path, name=twin.name, text=twin.text, twin_path=twin.path, base=None)
+    drawing = RerunRows(file.stream, twin)
+    file.tuning(twin.tuning, twin.estimator, 0, 0)
+    for start in range(0, log.n, ROWS):
+        rows = slice(start, min(log.n, start + ROWS))
+        pull = Pull(0, start == 0, start, log.readings.select(rows), track.select(rows))
+        file.write(pull)
+        drawing(pull)
+    file.close()

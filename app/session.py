@@ -1,4 +1,4 @@
-"""A running twin with everything around it: engine, recorder, both views, page. `run` and `review` differ in the source."""
+"""A running twin with all around it: engine, recorder, views, page. `run` and `review` differ in the source."""
 
 from __future__ import annotations
 
