@@ -30,9 +30,8 @@ from .pull import Belief, Cursor, Pull, Status
 from .refolder import Refolded, Refolder
 
 if TYPE_CHECKING:
-    from sources.source import Source
-
     from estimators.tuning import Tuning
+    from sources.source import Source
 
     from .recording import Base
     from .twin import Twin
