@@ -7,11 +7,13 @@ import sqlite3
 import struct
 import zlib
 from collections.abc import Generator, Sequence
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import can
+from can.io.blf import BLFParseError
 
 from estimators.errors import SourceError
 from estimators.log import Readings
@@ -40,6 +42,7 @@ _UNREADABLE = (
     zlib.error,
     sqlite3.Error,
     can.CanError,
+    BLFParseError,
     NotImplementedError,
 )
 """What python-can's readers raise where a file is damaged or is not of the format that its name says."""
@@ -158,7 +161,9 @@ class CanLog:
                 size = CHUNK
             fault = fault or self._missing_end(path, reader)
         finally:
-            reader.stop()
+            # SQLite lets only the thread that opened a file close it; from another, it is closed with its last reference.
+            with suppress(sqlite3.ProgrammingError):
+                reader.stop()
         if fault and not count:
             raise SourceError(
                 f"{path}: it cannot be read as {_suffix(path)[1:].upper()} ({fault}); check that it is one"

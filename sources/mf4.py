@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import sys
 from collections.abc import Iterator
@@ -49,7 +50,10 @@ def _open(path: Path) -> Any:
         # From memory: asammdf completes an unfinished file (a logger that lost power) in place.
         return MDF(BytesIO(path.read_bytes()))
     except Exception as error:  # noqa: BLE001  a damaged file makes asammdf raise anything
-        raise DamagedError(" ".join(f"{error}".split())[:160] or type(error).__name__) from None
+        reason = " ".join(f"{error}".split())[:160] or type(error).__name__
+    # What was half opened complains when it is let go of, so that is done here, where nobody listens.
+    gc.collect()
+    raise DamagedError(reason)
 
 
 def read_mf4(path: Path, decoder: Decoder) -> Recorded:
