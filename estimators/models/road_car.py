@@ -94,7 +94,7 @@ ROAD_CAR = StateSpaceModel(
     states=(
         State("east", "m", std=1000.0),
         State("north", "m", std=1000.0),
-        State("heading", "rad", std=2.0, circular=True),
+        State("heading", "rad", std=1.0, circular=True),
         State("speed", "m/s", std=10.0),
         State("accel_bias", "m/s²", std=0.5),
         State("yaw_rate_bias", "rad/s", std=0.01),
