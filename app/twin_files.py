@@ -62,7 +62,7 @@ def find_databases(
     found: list[tuple[Path, int | str | None]] = []
     for item in section.dbc:
         name = Path(item.file).expanduser()
-        tried = [_root(loaded, section) / name, _beside(loaded, name)]
+        tried = [Path(os.path.normpath(_root(loaded, section) / name)), _beside(loaded, name)]
         path = next((path for path in tried if path.is_file()), None)
         if path is None:
             raise _absent(loaded, (*key, "dbc"), tried[0], section)

@@ -122,7 +122,7 @@ def _databases(value: Any) -> Any:
 Databases = Annotated[
     tuple[DatabaseSection, ...],
     Field(min_length=1),
-    BeforeValidator(_databases, json_schema_input_type=str | list[str | DatabaseSection]),
+    BeforeValidator(_databases, json_schema_input_type=str | DatabaseSection | list[str | DatabaseSection]),
 ]
 
 
@@ -231,7 +231,7 @@ class SignalMaps(Section):
     """Which CAN signals feed the model."""
 
     dbc: Databases
-    """The DBC file, or a list of {file, channel} where several buses have one each."""
+    """The DBC file, as path or {file, channel}; or a list of these where several buses have one each."""
     sensors: dict[str, SignalSection] = {}
     """Sensors of the model and the signals that feed them."""
     inputs: dict[str, SignalSection] = {}

@@ -243,3 +243,56 @@ source:
     winding = readings.select(readings.channel == 0)
     exact = truth.select((truth.channel == 0) & np.isin(truth.t, winding.t))
     np.testing.assert_allclose(winding.value[:, 0], exact.value[:, 0], atol=1e-7)
+
+
+BUS = """\
+model: motor_winding
+source:
+  type: can
+  interface: virtual
+  channel: CHANNEL
+  dbc: data/thermal.dbc
+  sensors: {winding: {message: THERMAL, signals: WindingTemp}}
+  asset: {step: 0.01, duration: 0.2, initial: {temperature: 60}, sensors: {winding: {std: 1e-9}}}
+"""
+
+
+def test_a_virtual_bus_plays_its_own_asset() -> None:
+    source = twin_of(BUS.replace("CHANNEL", "test-played")).open_source(lambda key, text: None)
+    assert source.live
+    batches: list[Readings] = []
+    try:
+        for _ in range(100):  # reads wait for frames; 20 come, and silence for ten seconds is a failure
+            batches.append(source.read(0.1) or Readings.empty(1))
+            if sum(map(len, batches)) >= 20:
+                break
+    finally:
+        source.close()
+    batch = Readings.concat(batches, 1)
+    assert len(batch) == 20 and set(batch.kind.tolist()) == {READING}
+    # 60 °C ± the process noise of 0.2 s, some hundredths, in steps of the DBC's 0.01 °C.
+    np.testing.assert_allclose(batch.value[:, 0], 60.0, atol=1.0)
+    np.testing.assert_allclose(batch.value[:, 0] * 100, np.round(batch.value[:, 0] * 100), atol=1e-6)
+    assert source.read(0.0) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (LOG, "motor.yaml:2: source is of type can_log; only one of type can has a bus to play an asset on"),
+        (BUS[: BUS.index("  asset")], "motor.yaml:2: source has no asset to play; describe one under source.asset"),
+    ],
+)
+def test_what_has_no_asset_cannot_play_one(text: str, expected: str) -> None:
+    with pytest.raises(SourceError) as caught:
+        twin_of(text).player(lambda key, text: None)
+    assert str(caught.value) == expected
+
+
+def test_a_truth_of_another_model_must_fit() -> None:
+    Path("other.py").write_text("from estimators.models import MODELS\nOther = MODELS['motor_drive']\n")
+    text = "model: motor_winding\nsource:\n  type: simulator\n  duration: 2\n  truth:\n    model: ./other.py:Other\n"
+    assert message(text, ConfigError) == (
+        "motor.yaml:6: source.truth.model has states winding, tooth, yoke, magnet; they must be temperature, rate"
+    )
+    assert len(events(twin_of(text.replace("./other.py:Other", "motor_winding")))) == 7

@@ -30,6 +30,7 @@ def test_every_twin_that_ships_satisfies_it(name: str) -> None:
         "model: a\nsource: {type: simulator}\nestimator: {name: kf, options: {a: 1}}",
         "model: a\nsource: {type: simulator, inputs: {i: 3, j: [1, {sine: {amplitude: 1, period: 2}}]}}",
         "model: a\nsource: {type: can, interface: virtual, channel: 1, dbc: [a.dbc, {file: b.dbc}]}",
+        "model: a\nsource: {type: can, interface: virtual, channel: x, dbc: {file: b.dbc, channel: 1}}",
         "model: a\nsource: {type: table, files: a.csv, time: {column: t}, truth: {s: {columns: [a], where: {q: 1}}}}",
         "model: a\nsource: {type: simulator}\nsensors: {s: {std: [1, 2]}}\nview: {pairs: [[a, b]]}",
     ],

@@ -1,0 +1,58 @@
+"""Every twin that ships opens, folds, and does what its opening text promises."""
+
+import numpy as np
+import pytest
+
+from app.twin import load_twin
+from config.loader import TWINS, shipped
+from estimators.errors import SourceError
+from estimators.fold import fold
+from estimators.log import READING, TRUTH, Log, Readings
+from estimators.track import GATED, USED, Track
+from tests.conftest import absent
+
+
+def folded(name: str) -> tuple[Readings, Track]:
+    twin = load_twin(name)
+    try:
+        source = twin.open_source(lambda key, text: None, live=False)
+    except SourceError as error:
+        if "is not there" in str(error):
+            absent(str(error))
+        raise
+    log = Log(twin.model.width)
+    while (batch := source.read(1.0)) is not None:
+        log.extend(batch)
+    source.close()
+    return log.readings, fold(twin.estimator, twin.model, twin.tuning, log)
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_it_opens_and_folds(name: str) -> None:
+    events, track = folded(name)
+    readings = events.kind == READING
+    assert readings.sum() > 100
+    used, gated = (np.sum(track.verdict[readings] == verdict) for verdict in (USED, GATED))
+    assert used > 100 and gated < 0.1 * used, f"{used} readings were used and {gated} gated"
+    assert np.isfinite(track.mean).all() and (track.std > 0).all()
+
+
+def test_the_motor_on_the_bus_finds_its_magnet() -> None:
+    events, track = folded("motor_can")
+    assert (TWINS.parent / "logs" / "motor_can.blf").stat().st_size < 1_000_000
+    seconds = (events.t - events.t[0]) * 1e-9
+    for state, bound in ((0, 0.5), (1, 0.5), (2, 0.5)):
+        rows = (events.kind == TRUTH) & (events.channel == state) & (seconds > 20)
+        assert np.abs(track.mean[rows, state] - events.value[rows, 0]).max() < bound
+    magnet = (events.kind == TRUTH) & (events.channel == 3)
+    miss = np.abs(track.mean[magnet, 3] - events.value[magnet, 0])
+    assert miss[0] > 5 and miss[seconds[magnet] > 150].max() < 4
+    assert track.std[magnet, 3][-1] < 3
+
+
+def test_the_winding_gives_the_articles_numbers() -> None:
+    events, track = folded("motor_winding")
+    rows = (events.kind == TRUTH) & (events.channel == 0) & (events.t > 0)
+    assert np.sqrt(np.mean((track.mean[rows, 0] - events.value[rows, 0]) ** 2)) == pytest.approx(1.0432, abs=5e-5)
+    assert np.nanmean(track.nis) == pytest.approx(0.8227, abs=5e-5)
+    np.testing.assert_allclose(track.std[-1] ** 2, [0.81306, 0.012751], rtol=1e-5)
