@@ -161,7 +161,7 @@ class CanLog:
                 size = CHUNK
             fault = fault or self._missing_end(path, reader)
         finally:
-            # SQLite lets only the thread that opened a file close it; from another, it is closed with its last reference.
+            # SQLite lets only the thread that opened a file close it; else it is closed with its last reference.
             with suppress(sqlite3.ProgrammingError):
                 reader.stop()
         if fault and not count:

@@ -74,9 +74,9 @@ class Encoder:
         self._routes: dict[tuple[int, int], tuple[_Frame, list[tuple[str, float, float, float, float]]]] = {}
         found = [(Path(path), bus) for path, bus in databases]
         for channel in channels:
-            if channel.convert is not None or any(signal is None for signal in channel.signals):
+            if channel.convert is not None:
                 raise SourceError(
-                    f"{channel.name}: convert {channel.convert} cannot be encoded; give a sensor in metres"
+                    f"{channel.name}: convert is {channel.convert}; it cannot be encoded, so leave it out"
                 )
             messages, _, path = find_messages(found, channel)
             message = messages[0]

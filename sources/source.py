@@ -85,7 +85,7 @@ def nearest(name: str, names: Iterable[str]) -> str:
     near = get_close_matches(name, names, n=3, cutoff=0.6)
     if not near:
         lower = name.lower()
-        near = [item for item in names if lower in item.lower() or item.lower() in lower][:3]
+        near = [item for item in names if lower in item.lower() or (len(item) > 2 and item.lower() in lower)][:3]
     if near:
         return f"did you mean {' or '.join(near)}?"
     shown = ", ".join(names[:12])

@@ -1,0 +1,58 @@
+"""Units convert by their definitions, in the spellings of DBC files; what does not convert is refused."""
+
+import math
+
+import pytest
+
+from estimators.errors import SourceError
+from sources.units import conversion
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted", "factor", "offset"),
+    [
+        ("km/h", "m/s", 1 / 3.6, 0.0),
+        ("kph", "m/s", 1 / 3.6, 0.0),
+        ("deg", "rad", math.pi / 180, 0.0),
+        ("°/s", "rad/s", math.pi / 180, 0.0),
+        ("deg/s", "rad/s", math.pi / 180, 0.0),
+        ("degC", "°C", 1.0, 0.0),
+        ("C", "°C", 1.0, 0.0),
+        ("°C", "K", 1.0, 273.15),
+        ("degF", "°C", 5 / 9, -160 / 9),
+        ("m/s^2", "m/s²", 1.0, 0.0),
+        ("m/s2", "m/s²", 1.0, 0.0),
+        ("g", "m/s²", 9.80665, 0.0),
+        ("g", "kg", 1e-3, 0.0),
+        ("rpm", "rad/s", 2 * math.pi / 60, 0.0),
+        ("1/min", "rad/s", 2 * math.pi / 60, 0.0),
+        ("%", "1", 0.01, 0.0),
+        ("bar", "Pa", 1e5, 0.0),
+        ("kPa", "bar", 0.01, 0.0),
+        ("Nm", "N·m", 1.0, 0.0),
+        ("mV", "V", 1e-3, 0.0),
+        ("Ah", "A*s", 3600.0, 0.0),
+        ("°C/min", "°C/s", 1 / 60, 0.0),
+        ("", "m/s", 1.0, 0.0),
+        (None, "m/s", 1.0, 0.0),
+        ("bits", "", 1.0, 0.0),
+    ],
+)
+def test_conversions(given, wanted, factor, offset):
+    a, b = conversion(given, wanted, "x")
+    assert a == pytest.approx(factor, rel=1e-9) and b == pytest.approx(offset, rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted", "expected"),
+    [
+        ("km/h", "°C", "speed: 'km/h' does not convert to the model's '°C'; write one that converts, under `units`"),
+        ("g", "V", "speed: 'g' does not convert to the model's 'V'; write one that converts, under `units`"),
+        ("furz", "m", "speed: unit 'furz' is unknown, and the model's is 'm'; write one that converts, under `units`"),
+        ("-", "m", "speed: unit '-' is unknown, and the model's is 'm'; declare its `units`"),
+    ],
+)
+def test_what_does_not_convert_names_both(given, wanted, expected):
+    with pytest.raises(SourceError) as caught:
+        conversion(given, wanted, "speed")
+    assert str(caught.value) == expected
