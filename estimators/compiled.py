@@ -173,6 +173,10 @@ def _probe(model: StateSpaceModel) -> None:
                 f"model {model.name}: {what} fails at the prior with {n} states, {u.size} inputs and {p.size} "
                 f"parameters: {type(error).__name__}: {error}; check it against the declared sizes"
             ) from None
+        if not all(np.array_equal(copy, item) for copy, item in zip(copies, arguments, strict=True)):
+            raise ModelError(
+                f"model {model.name}: {what} writes to its arguments, which are the filter's own; it may fill out only"
+            )
         if not np.all(np.isfinite(out)):
             raise ModelError(
                 f"model {model.name}: {what} leaves {int(np.sum(~np.isfinite(out)))} of {out.size} entries of out "
