@@ -12,10 +12,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from estimators.diagnostics import HealthPolicy, Score, score
+from estimators.diagnostics import HealthPolicy
 from estimators.errors import ConfigError, SourceError
 from estimators.fold import Fold
 from estimators.log import KIND_NAMES, Log
+from estimators.score import Score, score
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES, Track
 
 from .cli import settings
@@ -74,8 +75,7 @@ def fold_twin(arguments: Arguments) -> int:
     begun = time.perf_counter()
     fold.advance()
     seconds = (time.perf_counter() - begun) / log.n
-    circular = np.array([state.circular for state in twin.model.states])
-    result = score(fold.track, log.readings, twin.model.state_names, circular)
+    result = score(fold.track, log.readings, twin.model)
     if arguments.out is not None:
         _write(arguments.out, twin, log, fold.track)
     if arguments.json:
@@ -93,7 +93,7 @@ def _as_dict(twin: Twin, result: Score, seconds: float) -> dict[str, Any]:
         "twin": twin.name,
         "estimator": twin.estimator,
         "readings": result.readings,
-        "rmse": {name: number(value) for name, value in result.rmse.items()},
+        "rmse": {name: number(fit.rmse) for name, fit in result.states.items()},
         "nis": {
             "mean": number(result.nis),
             "low": number(result.nis_low),
@@ -115,8 +115,8 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], trac
         ("readings", f"{result.readings}"),
     ]
     rows += [
-        (f"RMSE {name}", f"{value:.4f} {units[name]}   in the 95 % band: {100 * result.coverage[name]:.1f} %")
-        for name, value in result.rmse.items()
+        (f"RMSE {name}", f"{fit.rmse:.4f} {units[name]}   in the 95 % band: {100 * fit.coverage:.1f} %")
+        for name, fit in result.states.items()
     ]
     if result.nis_readings:
         inside = "inside" if result.nis_low <= result.nis <= result.nis_high else "OUTSIDE"
@@ -127,8 +127,13 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], trac
         ("gated", f"{result.gated}"),
         ("missing", f"{result.missing}"),
     ]
-    if result.held_out:
-        rows.append(("held out", f"{result.held_out}"))
+    row_units = dict(
+        zip(twin.model.row_names, [row.unit for sensor in twin.model.sensors for row in sensor.rows], strict=True)
+    )
+    rows += [
+        (f"held out {name}", f"RMSE {fit.rmse:.4f} {row_units[name]}   in the 95 % band: {100 * fit.coverage:.1f} %")
+        for name, fit in result.held_out.items()
+    ]
     rows += [(key, f"{count}") for key, count in sorted(counts.items())]
     variances = ", ".join(
         f"{name} {value**2:.5g}" for name, value in zip(twin.model.state_names, track.std[-1], strict=True)

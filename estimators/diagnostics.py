@@ -1,4 +1,4 @@
-"""Can the estimate be trusted: NIS against its chi-square bounds, health, and errors where the truth is known."""
+"""Can the estimate be trusted: NIS against its chi-square bounds, and health."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from numba import types
 from scipy.stats import chi2
 
 from .jit import F1, I1, f64, i64, jit
-from .log import READING, TRUTH, Readings
-from .track import DEGRADED, DIVERGED, GATED, STALE, TRACKING, USED, Track, track_type
+from .track import DEGRADED, DIVERGED, GATED, STALE, TRACKING, USED, track_type
 
 PROBABILITY = 0.95
 """Of the bounds that charts and reports show."""
@@ -114,53 +113,3 @@ def assess(first, last, t, track, policy, bounds):
 
 
 assess_signature = types.void(i64, i64, I1, track_type, policy_type, bounds_type)
-
-
-class Score(NamedTuple):
-    """What a fold was worth: NIS of the used readings with its 95 % bounds, RMSE and 95 % coverage by state."""
-
-    nis: float
-    nis_low: float
-    nis_high: float
-    nis_readings: int
-    log_likelihood: float
-    readings: int
-    gated: int
-    missing: int
-    held_out: int
-    rmse: dict[str, float]
-    coverage: dict[str, float]
-
-
-def score(track: Track, events: Readings, state_names: tuple[str, ...], circular: np.ndarray | None = None) -> Score:
-    """Sum a track up. Errors are taken at the truth events, whose rows hold the estimate at that time."""
-    used = track.verdict == USED
-    dof, count = int(track.dof[used].sum()), int(used.sum())
-    low, high = nis_bounds(dof, count) if count else (np.nan, np.nan)
-    rmse: dict[str, float] = {}
-    coverage: dict[str, float] = {}
-    truth = events.kind == TRUTH
-    for j, name in enumerate(state_names):
-        rows = truth & (events.channel == j) & np.isfinite(events.value[:, 0])
-        if not rows.any():
-            continue
-        error = track.mean[rows, j] - events.value[rows, 0]
-        if circular is not None and circular[j]:
-            error = (error + np.pi) % (2.0 * np.pi) - np.pi
-        rmse[name] = float(np.sqrt(np.mean(error**2)))
-        half = chi2.ppf(PROBABILITY, 1) ** 0.5
-        coverage[name] = float(np.mean(np.abs(error) <= half * track.std[rows, j]))
-    verdicts = np.bincount(track.verdict, minlength=6)
-    return Score(
-        nis=float(track.nis[used].mean()) if count else np.nan,
-        nis_low=low,
-        nis_high=high,
-        nis_readings=count,
-        log_likelihood=float(track.log_likelihood[used].sum()),
-        readings=int((events.kind == READING).sum()),
-        gated=int(verdicts[GATED]),
-        missing=int(verdicts[4]),
-        held_out=int(verdicts[3]),
-        rmse=rmse,
-        coverage=coverage,
-    )

@@ -33,12 +33,14 @@ def cache_folder() -> Path:
     """Where machine code is kept: per user, and apart for each version of the sources.
 
     Numba looks only at the file of the function it compiles, not at those that the function calls; so the sources of
-    this folder are part of the path, and an edit anywhere in it compiles anew.
+    this folder that hold compiled functions are part of the path, and an edit to any of them compiles all anew.
     """
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     digest = hashlib.sha256(numba.__version__.encode())
     for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
+        source = path.read_bytes()
+        if b"@jit" in source or path.name in ("jit.py", "context.py"):
+            digest.update(source)
     return base / "nisus" / "numba" / digest.hexdigest()[:16]
 
 

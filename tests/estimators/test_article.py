@@ -7,7 +7,7 @@ matrices), the same draws of NumPy's seed 7.
 import numpy as np
 import pytest
 
-from estimators.diagnostics import score
+from estimators.score import score
 from estimators.fold import Fold
 from estimators.log import READING, TICK, TRUTH, Log, Readings
 from estimators.models import MODELS
@@ -85,8 +85,8 @@ def test_every_row(folded, rows):
 
 
 def test_published_numbers(folded, rows):
-    result = score(folded.track, folded.log.readings, folded.model.state_names)
-    assert round(result.rmse["temperature"], 4) == 1.0432
+    result = score(folded.track, folded.log.readings, folded.model)
+    assert round(result.states["temperature"].rmse, 4) == 1.0432
     assert round(result.nis, 4) == 0.8227
     mean, cov = folded.moments()
     assert round(cov[0, 0], 5) == 0.81306

@@ -10,7 +10,7 @@ import pytest
 
 from app.twin import load_twin
 from estimators.compiled import compile_model
-from estimators.diagnostics import score
+from estimators.score import score
 from estimators.fold import fold
 from estimators.jacobians import COMPLEX_STEP
 from estimators.log import INPUT, READING, TRUTH, Log, Readings
@@ -269,7 +269,7 @@ def run(name: str, estimator: str) -> Run:
 
 
 def in_bounds(run: Run) -> bool:
-    result = score(run.track, run.events, run.model.state_names)
+    result = score(run.track, run.events, run.model)
     return result.nis_low < result.nis < result.nis_high
 
 
