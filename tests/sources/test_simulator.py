@@ -1,0 +1,162 @@
+"""The simulated asset: the article's very numbers, the same for a seed, losses that change nothing else."""
+
+import numpy as np
+import pytest
+from can_tools import read_all, same
+
+from estimators.errors import SourceError
+from estimators.log import INPUT, READING, TICK, TRUTH
+from estimators.model import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from estimators.models import MODELS
+from sources.profile import Constant, Sine, Steps, Sum
+from sources.simulator import SensorPlan, Simulator
+
+WINDING = MODELS["motor_winding"]
+
+
+def article():
+    """The article's draws, letter by letter: its true temperature and rate, and its measurement, or None if lost."""
+    rng = np.random.default_rng(7)
+    dt = 1.0
+    F = np.array([[1.0, dt], [0.0, 1.0]])
+    H = np.array([[1.0, 0.0]])
+    Q = np.array([[0.01, 0.0], [0.0, 0.001]])
+    R = np.array([[4.0]])
+    x_true = np.array([40.0, 0.2])
+    for k in range(120):
+        x_true = F @ x_true + rng.multivariate_normal([0, 0], Q)
+        y = H @ x_true + rng.normal(0, np.sqrt(R[0, 0]), size=1)
+        yield x_true, None if k % 15 == 14 else y
+
+
+def winding(**more):
+    given = {"seed": 7, "step": 1.0, "duration": 120.0, "initial": {"temperature": 40.0, "rate": 0.2}, **more}
+    return Simulator(WINDING, **given)
+
+
+def test_the_articles_numbers():
+    got = read_all(winding(sensors={"winding": SensorPlan(drop_every=15)}))
+    assert (got.t[0], got.kind[0]) == (0, TICK)
+    truth = got.value[got.kind == TRUTH, 0].reshape(120, 2)
+    reading = got.value[got.kind == READING, 0]
+    assert got.kind[1:].tolist() == [READING, TRUTH, TRUTH] * 120
+    assert got.t[1:].tolist() == [10**9 * (k + 1) for k in range(120) for _ in range(3)]
+    for k, (x, y) in enumerate(article()):
+        np.testing.assert_allclose(truth[k], x, rtol=1e-14)  # a sum in another order
+        assert np.isnan(reading[k]) if y is None else reading[k] == pytest.approx(y[0], rel=1e-14)
+
+
+def test_a_seed_gives_one_run_and_losses_change_nothing_else():
+    plain, lossy = read_all(winding()), read_all(winding(sensors={"winding": SensorPlan(drop_every=4)}))
+    assert same(plain, read_all(winding())) and not same(plain, read_all(winding(seed=8)))
+    lost = np.isnan(lossy.value[:, 0]) & (lossy.kind == READING)
+    assert lost.sum() == 30 and same(plain.select(~lost), lossy.select(~lost))
+
+
+def f(x, u, p, dt, out):
+    out[0] = x[0] + dt * (p[0] * u[0] + u[1])
+    out[1] = x[1] - dt * x[1] * x[1]
+
+
+def both(x, u, p, out):
+    out[0] = x[0] + u[0]
+    out[1] = x[1]
+
+
+def one(x, u, p, out):
+    out[0] = x[1]
+
+
+def model(**more):
+    given = {
+        "name": "two",
+        "title": "Two",
+        "states": (State("a", "", 1.0, 1.0), State("b", "", 1.0, 1.0)),
+        "noises": (Noise("a", "", 0.0), Noise("b", "", 0.0)),
+        "inputs": (Input("u", "", 0.5), Input("v", "", 0.0)),
+        "parameters": (Parameter("gain", "", 2.0),),
+        "sensors": (
+            Sensor("both", (Row("x", "", 1.0), Row("y", "", 1.0)), both),
+            Sensor("one", (Row("one", "", 1.0),), one),
+        ),
+        "f": f,
+        **more,
+    }
+    return StateSpaceModel(**given)
+
+
+QUIET = {
+    "both": SensorPlan(variances=(1e-30, 1e-30)),
+    "one": SensorPlan(every=3, variances=(1e-30,), drop_every=2),
+}
+
+
+def test_inputs_parameters_rates_and_losses():
+    """Without noise every number follows by hand: u steps from 0.5 to 1 at 2 s, the true gain is 4."""
+    source = Simulator(
+        model(),
+        seed=0,
+        step=0.5,
+        duration=6.0,
+        truth_parameters={"gain": 4.0},
+        inputs={"u": Steps((0.0, 2.0), (0.5, 1.0))},
+        sensors=QUIET,
+    )
+    got = read_all(source)
+    assert source.span == (0, 6 * 10**9) and not source.endless
+    a, b, expected = 1.0, 1.0, []
+    for k in range(12):
+        a += 0.5 * 4.0 * (1.0 if 0.5 * k >= 2.0 else 0.5)
+        b -= 0.5 * b * b
+        u = 1.0 if 0.5 * (k + 1) >= 2.0 else 0.5
+        expected.append((a + u, b))
+    kinds = (got.kind == READING) & (got.channel == 0)
+    np.testing.assert_allclose(got.value[kinds, :2], expected, rtol=1e-12, atol=1e-12)
+    once = (got.kind == READING) & (got.channel == 1)
+    assert got.t[once].tolist() == [1_500_000_000, 3_000_000_000, 4_500_000_000, 6_000_000_000]
+    assert np.isnan(got.value[once, 0]).tolist() == [False, True, False, True]
+    changes = got.t[(got.kind == INPUT) & (got.t > 0)]
+    assert changes.tolist() == [2 * 10**9], "inputs are said when they change, at the time from which they hold"
+
+
+def test_long_steps_are_split_as_the_model_asks():
+    source = Simulator(model(max_step=0.1), seed=0, step=0.5, duration=0.5, sensors=QUIET)
+    b = 1.0
+    for _ in range(5):
+        b -= 0.1 * b * b
+    assert read_all(source).value[-1, 0] == pytest.approx(b, rel=1e-12)
+
+
+def test_another_truth():
+    def slower(x, u, p, dt, out):
+        out[0] = x[0]
+        out[1] = x[1] - 0.5 * dt
+
+    source = Simulator(model(), seed=0, step=1.0, duration=2.0, truth_model=model(f=slower), sensors=QUIET)
+    got = read_all(source)
+    assert got.value[(got.kind == TRUTH) & (got.channel == 1), 0].tolist() == [0.5, 0.0]
+
+
+def test_true_noise_has_its_variance():
+    """10,000 increments: the estimated variance is within 5 standard errors, sqrt(2/n)."""
+    got = read_all(winding(duration=10_000.0, truth_noise={"temperature": 0.25, "rate": 0.0}))
+    x = got.value[got.kind == TRUTH, 0].reshape(-1, 2)
+    steps = np.diff(x[:, 0]) - x[:-1, 1]
+    assert np.var(steps) == pytest.approx(0.25, rel=5 * np.sqrt(2 / steps.size))
+    assert np.all(x[:, 1] == 0.2)
+
+
+def test_profiles():
+    steps = Steps((0.0, 2.0, 5.0), (1.0, 2.0, 3.0), repeat=10.0)
+    assert [steps.at(t) for t in (-0.0, 1.9, 2.0, 4.9, 5.0, 9.9, 10.0, 12.5)] == [1, 1, 2, 2, 3, 3, 1, 2]
+    assert Steps((1.0,), (4.0,)).at(0.0) == 4.0
+    sine = Sine(mean=1.0, amplitude=2.0, period=4.0, phase=np.pi / 2)
+    assert [sine.at(t) for t in (0.0, 1.0, 2.0)] == pytest.approx([3.0, 1.0, -1.0])
+    assert Sum((Constant(1.5), steps, sine)).at(2.0) == pytest.approx(1.5 + 2.0 - 1.0)
+
+
+def test_what_is_out_of_range_is_refused():
+    with pytest.raises(SourceError, match="step is 0"):
+        winding(step=0.0)
+    with pytest.raises(SourceError, match="duration is -1"):
+        winding(duration=-1.0)
