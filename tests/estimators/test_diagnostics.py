@@ -1,0 +1,231 @@
+"""Diagnostics must be able to fail: inside their bounds for a model that fits, outside for one that does not."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from estimators.diagnostics import HealthPolicy, chi_square_bounds, nis_bounds
+from estimators.score import score
+from estimators.fold import Fold, fold
+from estimators.log import READING, TICK, TRUTH, Log, Readings
+from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.models import MODELS
+from estimators.registry import ESTIMATORS
+from estimators.track import DEGRADED, DIVERGED, GATED, STALE, TRACKING, USED
+from estimators.tuning import Tuning
+
+SECOND = 1_000_000_000
+MOTOR = MODELS["motor_winding"]
+F = np.array([[1.0, 1.0], [0.0, 1.0]])
+Q = np.diag([0.01, 0.001])
+RUNS, STEPS = 200, 40
+
+
+def simulated(seed, bias=0.0):
+    """A run of the motor drawn from its own model; the truth starts from the prior, as the filter believes."""
+    rng = np.random.default_rng(seed)
+    x = np.array([35.0, 0.0]) + rng.normal(0, 1, 2) * [5.0, 1.0]
+    batch = [Readings.one(0, 0, TICK, 0, (), 1)]
+    for k in range(1, STEPS + 1):
+        x = F @ x + rng.normal(0, np.sqrt(np.diag(Q)))
+        batch.append(Readings.one(k * SECOND, 0, READING, 0, x[0] + bias + rng.normal(0, 2.0), 1))
+        batch += [Readings.one(k * SECOND, 0, TRUTH, j, x[j], 1) for j in range(2)]
+    log = Log(1)
+    log.extend(Readings.concat(batch, 1))
+    return log
+
+
+def averages(estimator, tuning, bias=0.0):
+    """NIS summed over all runs and steps; NEES of the last step summed over the runs (independent between runs)."""
+    nis = nees = 0.0
+    for seed in range(RUNS):
+        log = simulated(seed, bias)
+        folded = Fold(estimator, MOTOR, tuning, log)
+        folded.advance()
+        nis += folded.track.nis[folded.track.verdict == USED].sum()
+        mean, cov = folded.moments()
+        error = mean - log.readings.value[-2:, 0]
+        nees += error @ np.linalg.solve(cov, error)
+    return nis, nees
+
+
+# The chance that a sum of chi-squares leaves these bounds is 1e-4; the seeds are fixed, so it does not flicker.
+TAIL = 5e-5
+
+
+@pytest.mark.parametrize("estimator", list(ESTIMATORS))
+def test_a_model_that_fits_is_inside_its_bounds(estimator):
+    nis, nees = averages(estimator, Tuning.of(MOTOR))
+    assert chi2.ppf(TAIL, RUNS * STEPS) < nis < chi2.ppf(1 - TAIL, RUNS * STEPS)
+    assert chi2.ppf(TAIL, 2 * RUNS) < nees < chi2.ppf(1 - TAIL, 2 * RUNS)
+
+
+@pytest.mark.parametrize(("variance", "side"), [(2.0, "high"), (8.0, "low")])
+def test_a_wrong_sensor_variance_is_outside(variance, side):
+    nis, nees = averages("kf", Tuning.of(MOTOR).set("R.winding", variance))
+    for total, dof in ((nis, RUNS * STEPS), (nees, 2 * RUNS)):
+        if side == "high":
+            assert total > chi2.ppf(1 - TAIL, dof)
+        else:
+            assert total < chi2.ppf(TAIL, dof)
+
+
+def test_a_process_noise_that_is_too_small_is_outside():
+    """Seen in NEES first: where R rules S, the innovations hardly show it (NIS 2.8 % too high, 200 runs of 40 steps)."""
+    _, nees = averages("kf", Tuning.of(MOTOR).set("Q.rate", 1e-6).set("Q.temperature", 1e-6))
+    assert nees > 10 * chi2.ppf(1 - TAIL, 2 * RUNS)
+
+
+def test_a_biased_sensor_is_seen_where_the_truth_is_known():
+    _, nees = averages("kf", Tuning.of(MOTOR), bias=3.0)
+    assert nees > chi2.ppf(1 - TAIL, 2 * RUNS)
+
+
+def test_bounds_are_the_published_quantiles():
+    """Chi-square 95 %: 0.0010 to 5.0239 for one degree of freedom, 74.222 to 129.561 for a hundred (tables)."""
+    low, high = nis_bounds(1, 1)
+    assert (round(low, 4), round(high, 4)) == (0.0010, 5.0239)
+    low, high = nis_bounds(100, 50)
+    assert (round(low * 50, 3), round(high * 50, 3)) == (74.222, 129.561)
+    table = chi_square_bounds(100)
+    assert (round(table.low[100], 3), round(table.high[100], 3)) == (74.222, 129.561)
+    assert round(table.alarm[1], 3) == 10.828
+    assert len(table.low) == 101
+
+
+def test_score_is_the_definitions():
+    log = simulated(3)
+    track = fold("kf", MOTOR, Tuning.of(MOTOR).set("gate", 0.9), log)
+    events = log.readings
+    result = score(track, events, MOTOR)
+    used = track.verdict == USED
+    assert result.gated == np.sum(track.verdict == GATED) > 0
+    assert result.readings == STEPS
+    assert result.nis_readings == used.sum()
+    np.testing.assert_allclose(result.nis, track.nis[used].mean(), rtol=1e-14)
+    np.testing.assert_allclose(result.log_likelihood, track.log_likelihood[used].sum(), rtol=1e-14)
+    for j, name in enumerate(MOTOR.state_names):
+        rows = (events.kind == TRUTH) & (events.channel == j)
+        error = track.mean[rows, j] - events.value[rows, 0]
+        np.testing.assert_allclose(result.states[name].rmse ** 2, np.mean(error**2), rtol=1e-13)
+        # 1.959964 is the two-sided 95 % quantile of the normal distribution.
+        assert result.states[name].coverage == np.mean(np.abs(error) <= 1.959964 * track.std[rows, j])
+
+
+def test_errors_of_angles_are_the_short_way():
+    log = Log(1)
+    log.extend(Readings.one(0, 0, TRUTH, 0, 3.1, 1))
+    track = fold("kf", COMPASS, Tuning.of(COMPASS), log)
+    short = score(track, log.readings, COMPASS).states["heading"].rmse
+    np.testing.assert_allclose(short, 2 * np.pi - 6.2, rtol=1e-12)
+
+
+def still(x, u, p, dt, out):
+    out[0] = x[0]
+
+
+def itself(x, u, p, out):
+    out[0] = x[0]
+
+
+COMPASS = StateSpaceModel(
+    name="compass",
+    title="compass",
+    states=(State("heading", "rad", mean=-3.1, std=0.1, circular=True),),
+    noises=(Noise("heading", "rad²/s", 0.01),),
+    sensors=(Sensor("compass", (Row("compass", "rad", 0.01),), h=itself),),
+    f=still,
+    linear=True,
+)
+
+
+# Health
+
+
+def history(values, kind=READING, step=1.0):
+    """Readings `step` seconds apart, one a value."""
+    log = Log(1)
+    for k, value in enumerate(values):
+        log.extend(Readings.one(round(k * step * SECOND), 0, kind, 0, value, 1))
+    return log
+
+
+def healths(log, policy=None, gate=None):
+    return fold("kf", COMPASS, Tuning.of(COMPASS).set("gate", gate), log, policy=policy).health
+
+
+GOOD = list(-3.1 + 0.1 * np.random.default_rng(0).normal(0, 1, 60))
+
+
+def test_good_readings_track():
+    assert np.all(healths(history(GOOD)) == TRACKING)
+
+
+def test_silence_degrades_then_goes_stale_and_a_reading_heals():
+    """Defaults: degraded after 5 s without a reading that is used, stale after 30 s."""
+    log = history(GOOD[:20])
+    last = 19
+    for seconds in (5, 5.001, 29.999, 30.001):
+        log.extend(Readings.one(round((last + seconds) * SECOND), 0, TICK, 0, (), 1))
+    log.extend(Readings.one(60 * SECOND, 0, READING, 0, -3.1, 1))
+    track = fold("kf", COMPASS, Tuning.of(COMPASS), log)
+    assert list(track.health[20:]) == [TRACKING, DEGRADED, DEGRADED, STALE, TRACKING]
+    np.testing.assert_allclose(track.age[20:], [5, 5.001, 29.999, 30.001, 0], atol=1e-12)
+
+
+def test_missing_readings_are_silence():
+    log = history(GOOD[:20] + [np.nan] * 6)
+    assert list(healths(log)[-2:]) == [TRACKING, DEGRADED]
+
+
+def test_readings_too_far_off_degrade_then_diverge():
+    """White steps of `scale` sigmas: mean NIS near scale². Alarm at the 99.9 % quantile, diverged at ten times 1."""
+    rng = np.random.default_rng(1)
+    for scale, expected in ((1.0, TRACKING), (2.2, DEGRADED), (6.0, DIVERGED)):
+        values = -3.1 + scale * 0.127 * rng.choice([-1.0, 1.0], 80)
+        track = fold("kf", COMPASS, Tuning.of(COMPASS), history(values))
+        assert track.health[-1] == expected, (scale, track.nis_mean[-1])
+
+
+def test_a_gate_that_refuses_most_is_divergence():
+    values = GOOD[:20] + [5.0] * 60
+    health = healths(history(values), gate=0.999)
+    assert health[19] == TRACKING
+    assert DIVERGED in health[20:]
+    track = fold("kf", COMPASS, Tuning.of(COMPASS).set("gate", 0.999), history(values))
+    first = int(np.flatnonzero(track.health == DIVERGED)[0])
+    # More than half of the window, which by then holds all that came: 20 good ones and 21 refused.
+    assert np.sum(track.verdict[: first + 1] == GATED) == 21
+
+
+def test_an_estimate_that_is_not_finite_is_divergence():
+    track = fold("kf", COMPASS, Tuning.of(COMPASS).set("Q.heading", 1e308), history([-3.1, -3.1, -3.1], step=1e6))
+    assert track.health[-1] == DIVERGED
+    assert not np.isfinite(track.std[-1, 0]) or not np.isfinite(track.mean[-1, 0])
+
+
+def test_window_is_the_last_readings():
+    policy = HealthPolicy(window=7)
+    track = fold("kf", COMPASS, Tuning.of(COMPASS), history(GOOD), policy=policy)
+    for k in (0, 3, 6, 7, 30, 59):
+        rows = slice(max(0, k - 6), k + 1)
+        count = rows.stop - rows.start
+        np.testing.assert_allclose(track.nis_mean[k], track.nis[rows].mean(), rtol=1e-13)
+        np.testing.assert_allclose(track.nis_low[k], chi2.ppf(0.025, count) / count, rtol=1e-12)
+        np.testing.assert_allclose(track.nis_high[k], chi2.ppf(0.975, count) / count, rtol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_health_does_not_depend_on_pieces(seed):
+    rng = np.random.default_rng(seed)
+    regimes = ([-3.1, -3.0], [-3.1, 0.0, 2.0], [np.nan], [-3.6, -2.6])
+    values = np.concatenate([rng.choice(regimes[int(rng.integers(4))], 25) for _ in range(16)])
+    log = history(values, step=0.7)
+    tuning = Tuning.of(COMPASS).set("gate", 0.999)
+    whole = fold("kf", COMPASS, tuning, log)
+    assert len(set(whole.health)) > 1
+    growing = Fold("kf", COMPASS, tuning, log)
+    while growing.advance(int(rng.integers(1, 50))):
+        pass
+    for name in ("health", "age", "nis_mean", "nis_low", "nis_high"):
+        np.testing.assert_array_equal(getattr(growing.track, name), getattr(whole, name))

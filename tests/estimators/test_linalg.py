@@ -1,0 +1,112 @@
+"""Our dense linear algebra against NumPy's."""
+
+import numpy as np
+import pytest
+
+from estimators.linalg import cholesky, congruence, mirror, solve_transposed, solve_upper, wrap
+
+SIZES = (1, 2, 3, 5, 8, 16, 33)
+# LAPACK's bound for these algorithms is n ε cond(A), relative; the matrices below have a condition of 1e2 to 1e4.
+TOLERANCE = 1e-10
+
+
+def spd(rng, n):
+    root = rng.normal(0, 1, (n, n))
+    return root @ root.T + 0.1 * n * np.eye(n)
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_cholesky(n):
+    A = spd(np.random.default_rng(n), n)
+    U = np.full((n, n), np.nan)
+    assert cholesky(A, U, n)
+    np.testing.assert_allclose(U, np.linalg.cholesky(A).T, rtol=0, atol=TOLERANCE * np.abs(A).max())
+    assert np.all(U[np.tril_indices(n, -1)] == 0)
+
+
+def test_cholesky_reads_the_upper_triangle_only_and_works_in_place():
+    A = spd(np.random.default_rng(1), 6)
+    expected = np.linalg.cholesky(A).T
+    A[np.tril_indices(6, -1)] = np.nan
+    assert cholesky(A, A, 6)
+    np.testing.assert_allclose(A, expected, rtol=0, atol=TOLERANCE * np.abs(expected).max())
+
+
+def test_cholesky_of_leading_rows_leaves_the_rest():
+    A = spd(np.random.default_rng(2), 6)
+    U = np.full((6, 6), 7.0)
+    assert cholesky(A, U, 4)
+    np.testing.assert_allclose(U[:4, :4], np.linalg.cholesky(A[:4, :4]).T, rtol=0, atol=TOLERANCE * np.abs(A).max())
+    assert np.all(U[4:] == 7.0)
+    assert np.all(U[:, 4:] == 7.0)
+
+
+@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
+def test_cholesky_refuses_what_has_no_factor(n, value):
+    rng = np.random.default_rng(n)
+    A = spd(rng, n)
+    spoilt = int(rng.integers(n))
+    A[spoilt, spoilt] = value
+    assert not cholesky(A, np.empty((n, n)), n)
+
+
+def test_cholesky_refuses_an_indefinite_matrix_with_a_positive_diagonal():
+    assert not cholesky(np.array([[1.0, 2.0], [2.0, 1.0]]), np.empty((2, 2)), 2)
+    assert not cholesky(np.ones((2, 2)), np.empty((2, 2)), 2)
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_solves(n):
+    rng = np.random.default_rng(n)
+    A = spd(rng, n)
+    U = np.linalg.cholesky(A).T.copy()
+    b = rng.normal(0, 1, n)
+    for solve, matrix in ((solve_transposed, U.T), (solve_upper, U)):
+        x = b.copy()
+        solve(U, n, x)
+        np.testing.assert_allclose(x, np.linalg.solve(matrix, b), rtol=TOLERANCE, atol=TOLERANCE)
+    x = b.copy()
+    solve_transposed(U, n, x)
+    solve_upper(U, n, x)
+    np.testing.assert_allclose(A @ x, b, rtol=0, atol=TOLERANCE)
+
+
+def test_solves_with_leading_rows_leave_the_rest():
+    rng = np.random.default_rng(3)
+    U = np.linalg.cholesky(spd(rng, 5)).T.copy()
+    for solve, matrix in ((solve_transposed, U[:3, :3].T), (solve_upper, U[:3, :3])):
+        b = rng.normal(0, 1, 5)
+        x = b.copy()
+        solve(U, 3, x)
+        np.testing.assert_allclose(x[:3], np.linalg.solve(matrix, b[:3]), rtol=TOLERANCE)
+        np.testing.assert_array_equal(x[3:], b[3:])
+
+
+@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize("sparse", [False, True])
+def test_congruence(n, sparse):
+    """F P Fᵀ, exactly symmetric; zeros of F, which are skipped, included."""
+    rng = np.random.default_rng(n)
+    P = spd(rng, n)
+    F = rng.normal(0, 1, (n, n)) * (rng.random((n, n)) < (0.4 if sparse else 1.0))
+    expected = F @ P @ F.T
+    congruence(F, P, np.full((2 * n, n), np.nan))
+    np.testing.assert_allclose(P, expected, rtol=0, atol=1e-13 * n * max(1.0, np.abs(expected).max()))
+    np.testing.assert_array_equal(P, P.T)
+
+
+def test_mirror():
+    P = np.arange(16.0).reshape(4, 4)
+    mirror(P)
+    np.testing.assert_array_equal(P, P.T)
+    assert P[0, 3] == 12.0
+
+
+def test_wrap():
+    rng = np.random.default_rng(0)
+    for angle in (*rng.uniform(-50, 50, 100), np.pi, -np.pi, 3 * np.pi, 0.0):
+        wrapped = wrap(angle)
+        assert -np.pi <= wrapped < np.pi
+        # sin and cos are a second opinion on which angle it is; 50 rad has lost a digit of its fraction of a turn.
+        np.testing.assert_allclose([np.sin(wrapped), np.cos(wrapped)], [np.sin(angle), np.cos(angle)], atol=2e-14)

@@ -1,0 +1,153 @@
+"""The log: order of time, whatever the order and pieces of arrival; nothing lost, nothing twice."""
+
+import numpy as np
+import pytest
+
+from estimators.log import READING, TICK, Log, Readings
+
+SECOND = 1_000_000_000
+
+
+def batch(times, first=0, kind=READING, width=2):
+    """Events whose value[0] numbers them."""
+    t = np.asarray(times, np.int64)
+    n = t.size
+    value = np.full((n, width), np.nan)
+    value[:, 0] = first + np.arange(n)
+    return Readings(t, t + 5, np.full(n, kind, np.int8), np.zeros(n, np.int32), value)
+
+
+def pieces(rng, events):
+    at = 0
+    while at < len(events):
+        size = int(rng.integers(1, 12))
+        yield events.select(slice(at, at + size))
+        at += size
+
+
+def same(a, b):
+    for left, right in zip(a, b, strict=True):
+        np.testing.assert_array_equal(left, right)
+
+
+def lately(rng, n):
+    """Times that mostly grow, some of them late, many of them equal."""
+    t = np.cumsum(rng.integers(0, 4, n)) * SECOND
+    late = rng.random(n) < 0.3
+    return t - late * rng.integers(0, 30, n) * SECOND
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_order_is_a_stable_sort_whatever_the_pieces(seed):
+    rng = np.random.default_rng(seed)
+    events = batch(lately(rng, 200))
+    expected = events.select(np.array(sorted(range(200), key=lambda i: (events.t[i], i))))
+    log = Log(2, capacity=1)
+    for piece in pieces(rng, events):
+        before = Readings(*(column.copy() for column in log.readings))
+        start, stale = log.extend(piece)
+        assert stale == 0
+        assert start <= len(before)
+        # Nothing before `start` has changed; so a fold need not look there.
+        same(log.readings.select(slice(0, start)), before.select(slice(0, start)))
+    same(log.readings, expected)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_stale_is_judged_event_by_event(seed):
+    """An event is stale against the newest that arrived before it, not against its batch."""
+    rng = np.random.default_rng(seed)
+    events = batch(lately(rng, 200))
+    horizon = 10 * SECOND
+    newest, keep = -np.inf, []
+    for i in range(200):  # the rule, literally
+        keep.append(events.t[i] >= newest - horizon)
+        newest = max(newest, events.t[i])
+    assert 5 < 200 - sum(keep) < 100
+    kept = events.select(np.array(keep))
+    expected = kept.select(np.argsort(kept.t, kind="stable"))
+    for _ in range(3):
+        log, stale = Log(2), 0
+        for piece in pieces(rng, events):
+            stale += log.extend(piece, horizon)[1]
+        assert stale == 200 - sum(keep)
+        same(log.readings, expected)
+
+
+def test_exactly_at_the_horizon_is_kept():
+    log = Log(2)
+    log.extend(batch([100]))
+    assert log.extend(batch([90]), horizon=10) == (0, 0)
+    assert log.extend(batch([89]), horizon=10) == (2, 1)
+
+
+def test_a_tick_makes_nothing_late():
+    """A tick at the wall clock, ahead of all readings, must not turn the readings that follow into stale ones."""
+    log = Log(2)
+    log.extend(batch([0]))
+    log.extend(batch([100 * SECOND], kind=TICK))
+    assert log.extend(batch([SECOND]), horizon=10 * SECOND) == (1, 0)
+    assert list(log.readings.t) == [0, SECOND, 100 * SECOND]
+
+
+def test_ticks_before_anything_was_said():
+    log = Log(2)
+    assert log.extend(batch([5], kind=TICK), horizon=10) == (0, 0)
+    assert log.extend(batch([-100]), horizon=10) == (0, 0)
+
+
+def test_equal_times_stay_in_order_of_arrival():
+    log = Log(2)
+    log.extend(batch([10, 20, 20, 30]))
+    start, _ = log.extend(batch([20, 20], first=100))
+    assert start == 3
+    assert list(log.readings.value[:, 0]) == [0, 1, 2, 100, 101, 3]
+
+
+def test_appending_says_where():
+    log = Log(2)
+    assert log.extend(batch([10, 20])) == (0, 0)
+    assert log.extend(batch([20])) == (2, 0)
+    assert log.extend(Readings.empty(2)) == (3, 0)
+
+
+def test_drop_front_keeps_absolute_indices():
+    log = Log(2, capacity=4)
+    log.extend(batch(np.arange(10)))
+    log.drop_front(7)
+    assert (log.first, log.n) == (7, 3)
+    assert list(log.readings.value[:, 0]) == [7, 8, 9]
+    log.extend(batch([8], first=50))
+    assert list(log.readings.value[:, 0]) == [7, 8, 50, 9]
+    log.drop_front(4)
+    assert (log.first, log.n) == (11, 0)
+
+
+def test_a_copy_is_its_own():
+    log = Log(2)
+    log.extend(batch([10, 20, 30]))
+    log.drop_front(1)
+    twin = log.copy()
+    log.extend(batch([25, 40], first=9))
+    assert (twin.n, twin.first, twin.newest) == (2, 1, 30)
+    assert list(twin.readings.t) == [20, 30]
+    # It judges staleness as the log would have.
+    assert twin.extend(batch([15]), horizon=10) == (2, 1)
+
+
+def test_growth_keeps_everything():
+    log = Log(2, capacity=1)
+    for k in range(300):
+        log.extend(batch([k], first=k))
+    same(log.readings, batch(np.arange(300)))
+    assert log.capacity < 1000
+
+
+def test_one_and_concat():
+    one = Readings.one(7, 8, READING, 3, [1.5], 3)
+    np.testing.assert_array_equal(one.value, [[1.5, np.nan, np.nan]])
+    assert (one.t[0], one.arrival[0], one.kind[0], one.channel[0], len(one)) == (7, 8, READING, 3, 1)
+    both = Readings.concat([one, one], 3)
+    assert len(both) == 2
+    assert len(Readings.concat([], 3)) == 0
+    assert Readings.concat([], 3).value.shape == (0, 3)

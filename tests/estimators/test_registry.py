@@ -1,0 +1,113 @@
+"""The catalogue: every entry is complete, and refuses what it cannot do with the reason."""
+
+import numpy as np
+import pytest
+from test_filterpy import PENDULUM
+
+from estimators.errors import EstimatorError
+from estimators.fold import Fold
+from estimators.log import READING, Log, Readings
+from estimators.models import MODELS
+from estimators.registry import ESTIMATORS, find_estimator
+from estimators.tuning import Tuning
+
+
+@pytest.mark.parametrize("name", list(ESTIMATORS))
+def test_entries_are_complete(name):
+    entry = ESTIMATORS[name]
+    assert entry.name == name
+    for text in ("title", "family", "assumes", "model_runs", "fails_when", "source"):
+        assert getattr(entry, text).strip(), text
+    assert "doi:" in entry.source or "19" in entry.source or "20" in entry.source
+    for option in entry.options:
+        assert option.low <= option.default <= option.high
+        assert option.meaning
+
+
+@pytest.mark.parametrize("name", list(ESTIMATORS))
+def test_sizes_are_enough(name):
+    """The state and scratch that an entry asks for hold what its functions write; what follows stays as it was."""
+    entry = ESTIMATORS[name]
+    model = MODELS["motor_winding"]
+    log = Log(1)
+    for k in range(5):
+        log.extend(Readings.one(k * 10**9, 0, READING, 0, 36.0 + k, 1))
+    fold = Fold(name, model, Tuning.of(model), log)
+    work = entry.work_size(model.nx, model.width)
+    fold._work = np.full(work + 64, np.pi) if name != "kf" else fold._work  # the KF finds its F from the end
+    fold.advance()
+    if name != "kf":
+        assert np.all(fold._work[work:] == np.pi)
+    assert fold._state.size == entry.state_size(model.nx)
+
+
+@pytest.mark.parametrize("name", list(ESTIMATORS))
+def test_options_are_checked(name):
+    entry = ESTIMATORS[name]
+    assert entry.complete({}) == {option.name: option.default for option in entry.options}
+    with pytest.raises(EstimatorError, match=f"{name} has no option 'wings'"):
+        entry.complete({"wings": 2.0})
+    for option in entry.options:
+        assert entry.complete({option.name: option.high})[option.name] == option.high
+        for value in (option.low - 1e-6, option.high + 1e-6, np.nan, np.inf):
+            with pytest.raises(EstimatorError, match=f"{option.name} is .* must lie between"):
+                entry.complete({option.name: value})
+    model = MODELS["motor_winding"]
+    with pytest.raises(EstimatorError, match="no option"):
+        Fold(name, model, Tuning.of(model).with_options({"wings": 2.0}), Log(1))
+
+
+def test_kf_refuses_a_nonlinear_model_and_names_what_to_use():
+    with pytest.raises(EstimatorError, match="kf does not apply: pendulum is not linear; use an extended or unscented"):
+        find_estimator("kf", PENDULUM)
+    assert find_estimator("ekf", PENDULUM) is ESTIMATORS["ekf"]
+
+
+def test_an_unknown_name_is_told_the_near_ones():
+    with pytest.raises(EstimatorError, match="'ukff' does not exist; near: ukf"):
+        find_estimator("ukff", PENDULUM)
+
+
+@pytest.mark.parametrize("name", list(ESTIMATORS))
+@pytest.mark.parametrize("model", [m for m in MODELS.values()], ids=lambda m: m.name)
+def test_every_estimator_runs_every_model_it_applies_to(name, model):
+    """Readings of exactly what the model expects at its prior: the estimate stays finite and near."""
+    if reason := ESTIMATORS[name].applies(model):
+        assert model.name in reason
+        return
+    from estimators.compiled import compile_model
+
+    compiled = compile_model(model)
+    x = np.array([state.mean for state in model.states])
+    u = np.array([item.default for item in model.inputs])
+    p = np.array([item.value for item in model.parameters])
+    log = Log(model.width)
+    for k, sensor in enumerate(model.sensors):
+        y = np.empty(len(sensor.rows))
+        compiled.h[k](x, u, p, y)
+        log.extend(Readings.one(0, 0, READING, k, y, model.width))
+    fold = Fold(name, model, Tuning.of(model), log)
+    fold.advance()
+    mean, cov = fold.moments()
+    assert np.all(np.linalg.eigvalsh(cov) > 0)
+    std = np.array([state.std for state in model.states])
+    assert np.all(np.sqrt(np.diag(cov)) <= std * (1 + 1e-12))
+    # The reading is what is expected at the mean, so a linearised filter does not move; the UKF moves by curvature.
+    if name != "ukf":
+        np.testing.assert_allclose(mean, x, atol=1e-9)
+
+
+def test_ukf_points_have_the_moments_of_the_state():
+    model = MODELS["motor_winding"]
+    log = Log(1)
+    log.extend(Readings.one(0, 0, READING, 0, 36.0, 1))
+    fold = Fold("ukf", model, Tuning.of(model).with_options({"alpha": 0.7, "kappa": 1.0}), log)
+    fold.advance()
+    points = fold.points()
+    mean, cov = fold.moments()
+    assert points.shape == (5, 2)
+    total = 0.7**2 * 3.0
+    w = np.full(5, 0.5 / total)
+    w[0] = 1 - 2 / total
+    np.testing.assert_allclose(w @ points, mean, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose((points - mean).T @ np.diag(w) @ (points - mean), cov, rtol=1e-12, atol=1e-13)
