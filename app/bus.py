@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 GROUP = "239.74.163.2"
 """python-can's own multicast address."""
 
+FORMATS = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")
+"""What python-can writes and `nisus fold --log` reads."""
+
 
 def play_bus(arguments: Bus) -> int:
     """Carry the command out."""
@@ -79,10 +82,9 @@ def _logger(path: Path) -> Any:
 
     if not path.absolute().parent.is_dir():
         raise ConfigError(f"--record {path}: there is no folder {path.parent}; create it first")
-    try:
-        return can.Logger(path)
-    except ValueError:
-        raise ConfigError(f"--record {path}: is no CAN log format; end it in .blf, .asc, .log, .csv or .mf4") from None
+    if path.suffix.lower() not in FORMATS:
+        raise ConfigError(f"--record {path}: is no CAN log format; end it in {', '.join(FORMATS)}")
+    return can.Logger(path)
 
 
 def _play(player: Any, duration: float | None) -> None:
