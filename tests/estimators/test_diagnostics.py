@@ -5,12 +5,12 @@ import pytest
 from scipy.stats import chi2
 
 from estimators.diagnostics import HealthPolicy, chi_square_bounds, nis_bounds
-from estimators.score import score
 from estimators.fold import Fold, fold
 from estimators.log import READING, TICK, TRUTH, Log, Readings
 from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS
+from estimators.score import score
 from estimators.track import DEGRADED, DIVERGED, GATED, STALE, TRACKING, USED
 from estimators.tuning import Tuning
 
@@ -71,7 +71,7 @@ def test_a_wrong_sensor_variance_is_outside(variance, side):
 
 
 def test_a_process_noise_that_is_too_small_is_outside():
-    """Seen in NEES first: where R rules S, the innovations hardly show it (NIS 2.8 % too high, 200 runs of 40 steps)."""
+    """Seen in NEES first: where R rules S, the innovations hardly show it (NIS 2.8 % too high here)."""
     _, nees = averages("kf", Tuning.of(MOTOR).set("Q.rate", 1e-6).set("Q.temperature", 1e-6))
     assert nees > 10 * chi2.ppf(1 - TAIL, 2 * RUNS)
 
@@ -133,7 +133,7 @@ COMPASS = StateSpaceModel(
     title="compass",
     states=(State("heading", "rad", mean=-3.1, std=0.1, circular=True),),
     noises=(Noise("heading", "rad²/s", 0.01),),
-    sensors=(Sensor("compass", (Row("compass", "rad", 0.01),), h=itself),),
+    sensors=(Sensor("compass", (Row("compass", "rad", 0.01, circular=True),), h=itself),),
     f=still,
     linear=True,
 )
