@@ -1,0 +1,191 @@
+"""What Rerun shows where: entity paths, colours, and the blueprint of the right side of the page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from scipy.stats import chi2
+
+from estimators.model import StateSpaceModel
+
+ESTIMATE = (37, 99, 235)
+BAND = (147, 187, 253)
+TRUTH = (22, 163, 74)
+READING = (245, 158, 11)
+REFUSED = (220, 38, 38)
+PREVIOUS = (160, 160, 168)
+TIMELINE = "time"
+AT_ONCE = 3
+"""Charts of states that are shown at the same time; more come in tabs, which cost nothing while they are hidden."""
+
+HEALTH_COLORS = (0x16A34AFF, 0xF59E0BFF, 0xDC2626FF, 0x9CA3AFFF)
+
+
+@dataclass(frozen=True)
+class Observed:
+    """One row of a sensor, drawn as dots over the state that it reads."""
+
+    sensor: int
+    row: int
+    state: int
+
+
+def observed(model: StateSpaceModel) -> list[Observed]:
+    """The sensor rows that read one state, give or take a scale near one: ∂h/∂x_j = 1 at the prior, in its unit."""
+    x = np.array([state.mean for state in model.states])
+    u = np.array([item.default for item in model.inputs])
+    p = np.array([parameter.value for parameter in model.parameters])
+    found = []
+    for k, sensor in enumerate(model.sensors):
+        here, there = np.zeros(len(sensor.rows)), np.zeros(len(sensor.rows))
+        sensor.h(x, u, p, here)
+        slopes = np.zeros((len(sensor.rows), model.nx))
+        for j, state in enumerate(model.states):
+            step = np.zeros(model.nx)
+            step[j] = 1e-3 * state.std
+            sensor.h(x + step, u, p, there)
+            slopes[:, j] = (there - here) / step[j]
+        for r, row in enumerate(sensor.rows):
+            likely = [
+                j
+                for j, state in enumerate(model.states)
+                if state.unit == row.unit and abs(slopes[r, j] - 1.0) < 0.05
+            ]
+            likely.sort(key=lambda j: model.state_names[j] not in (row.name, sensor.name))
+            if likely:
+                found.append(Observed(k, r, likely[0]))
+    return found
+
+
+def with_unit(name: str, unit: str) -> str:
+    """`gnss_speed`, `m/s` as a chart's title."""
+    words = name.replace("_", " ").replace(".", " ")
+    return words if unit in ("", "1") else f"{words} [{unit}]"
+
+
+def row_title(model: StateSpaceModel, sensor: int, row: int) -> str:
+    """Title of one sensor row."""
+    return with_unit(model.row_names[model.row_start[sensor] + row], model.sensors[sensor].rows[row].unit)
+
+
+def pair_name(model: StateSpaceModel, pair: Any) -> str:
+    """Name of the entity of one pair of states."""
+    return f"{model.state_names[pair[0]]}_{model.state_names[pair[1]]}"
+
+
+def nis_limit(model: StateSpaceModel) -> float:
+    """Where the NIS chart ends: what one reading in ten thousand exceeds. A spike must not flatten the rest."""
+    return float(chi2.ppf(0.9999, max(len(sensor.rows) for sensor in model.sensors)))
+
+
+def blueprint(model: StateSpaceModel, pairs: np.ndarray, *, window: float, root: str = "") -> rrb.Blueprint:
+    """The layout of the charts.
+
+    Args:
+        model: Names and units.
+        pairs: Indices of the states of each ellipse, shape (k, 2).
+        window: Seconds that the charts show.
+        root: Path before all entities.
+    """
+    span = rr.TimeRange(
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-window),
+        end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.02 * window),
+    )
+    axis = rrb.TimeAxis(view_range=span)
+
+    def chart(name: str, contents: list[str], **more: Any) -> rrb.TimeSeriesView:
+        return rrb.TimeSeriesView(
+            origin=f"{root}/", contents=[f"+ {root}{path}" for path in contents], name=name, axis_x=axis,
+            plot_legend=rrb.PlotLegend(visible=False), **more,
+        )  # fmt: skip
+
+    names = model.state_names
+    dots = observed(model)
+    states = []
+    for j, state in enumerate(model.states):
+        rows = [model.row_names[model.row_start[d.sensor] + d.row] for d in dots if d.state == j]
+        over = [f"/{kind}/{row}" for row in rows for kind in ("reading", "refused")]
+        contents = [f"/previous/state/{names[j]}", f"/state/{names[j]}", f"/truth/{names[j]}", *over]
+        states.append(chart(with_unit(state.name, state.unit), contents))
+    innovations = [
+        chart(f"innovation: {row_title(model, k, r)}", [f"/innovation/{model.row_names[model.row_start[k] + r]}"])
+        for k, sensor in enumerate(model.sensors)
+        for r in range(len(sensor.rows))
+    ]
+    nis = chart(
+        "NIS, windowed mean in its 95 % bounds",
+        ["/nis/reading", "/previous/nis", "/nis/window"],
+        axis_y=rrb.ScalarAxis(range=(0.0, nis_limit(model)), zoom_lock=True),
+    )
+    health = rrb.StateTimelineView(origin=f"{root}/health", name="health", time_view=axis)
+    events = rrb.TextLogView(origin=f"{root}/events", name="events")
+    ellipses = [
+        rrb.Spatial2DView(
+            origin=f"{root}/pair/{pair_name(model, pair)}",
+            name=" · ".join(with_unit(names[j], model.states[j].unit) for j in pair) + ", 2σ",
+        )
+        for pair in pairs
+    ]
+    bottom = rrb.Horizontal(*_tabs(ellipses), events, column_shares=[1.0] * (bool(ellipses) + 1))
+    above = _stacked(states)
+    return rrb.Blueprint(
+        rrb.Vertical(
+            *above, rrb.Horizontal(*_tabs(innovations), nis), health, bottom,
+            row_shares=[1.25 * min(len(states), AT_ONCE) / len(above)] * len(above) + [1.1, 0.5, 1.5],
+        ),
+        rrb.TopPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
+        auto_views=False,
+        auto_layout=False,
+    )  # fmt: skip
+
+
+def _tabs(views: list[Any]) -> list[Any]:
+    return views if len(views) < 2 else [rrb.Tabs(*views)]
+
+
+def _stacked(views: list[Any]) -> list[Any]:
+    """Views one above the other; if they are many, in tabs that hold as many as one can read at once."""
+    if len(views) <= AT_ONCE:
+        return views
+    groups = [views[k : k + AT_ONCE] for k in range(0, len(views), AT_ONCE)]
+    return [rrb.Tabs(*(rrb.Vertical(*group, name=_group_name(group)) for group in groups))]
+
+
+def _group_name(views: list[Any]) -> str:
+    return ", ".join(str(view.name).split(" [")[0] for view in views)
+
+
+def styles(stream: rr.RecordingStream, model: StateSpaceModel, pairs: np.ndarray, root: str = "") -> None:
+    """Log how everything is drawn; static, so that it holds at every time."""
+
+    def style(path: str, what: Any) -> None:
+        stream.log(f"{root}{path}", what, static=True)
+
+    def band(name: str, color: tuple[int, int, int]) -> rr.SeriesLines:
+        return rr.SeriesLines(colors=[color, BAND, BAND], names=[name, "+2σ", "−2σ"], widths=[2.0, 1.0, 1.0])
+
+    for state in model.states:
+        style(f"/state/{state.name}", band("estimate", ESTIMATE))
+        style(f"/truth/{state.name}", rr.SeriesLines(colors=[TRUTH], names=["truth"], widths=[1.0]))
+        style(f"/previous/state/{state.name}", rr.SeriesLines(colors=[PREVIOUS], names=["previous"], widths=[1.0]))
+    for name in model.row_names:
+        words = name.replace("_", " ")
+        for kind, color, size in (("reading", READING, 2.0), ("refused", REFUSED, 3.5)):
+            title = words if kind == "reading" else f"{words}, refused"
+            style(f"/{kind}/{name}", rr.SeriesPoints(colors=[color], names=[title], marker_sizes=[size]))
+        style(f"/innovation/{name}", band("innovation", READING))
+    style("/nis/reading", rr.SeriesPoints(colors=[BAND], names=["NIS of a reading"], marker_sizes=[1.5]))
+    style("/nis/window", rr.SeriesLines(
+        colors=[ESTIMATE, TRUTH, TRUTH], names=["windowed mean", "95 % low", "95 % high"], widths=[2.0, 1.0, 1.0]
+    ))  # fmt: skip
+    style("/previous/nis", rr.SeriesLines(colors=[PREVIOUS], names=["previous"], widths=[1.0]))
+    for pair in pairs:
+        # Rerun's 2D view has y downwards.
+        style(f"/pair/{pair_name(model, pair)}/up", rr.Transform3D(scale=[1.0, -1.0, 1.0]))

@@ -1,0 +1,73 @@
+// The stream of frames from the server, for as long as somebody can see them.
+
+const SLOWEST = 8000; // ms between two attempts to connect
+const SHARE = 0.5; // part of the time that drawing may take; the panel beside it needs the rest
+
+const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
+
+export class Stream {
+  // told(message): JSON messages; changed(state): "live", "waiting", "hidden"
+  constructor({ viewer, told, changed }) {
+    this.viewer = viewer;
+    this.told = told;
+    this.changed = changed;
+    this.layout = true;
+    this.delay = 250;
+    document.addEventListener("visibilitychange", () => (document.hidden ? this.close("hidden") : this.open()));
+    if (!document.hidden) this.open();
+  }
+
+  open() {
+    clearTimeout(this.timer);
+    if (this.socket || document.hidden) return;
+    const socket = new WebSocket(`ws://${location.host}/rerun/stream?layout=${this.layout ? 1 : 0}`);
+    socket.binaryType = "arraybuffer";
+    this.socket = socket;
+    // One message after the other: each is drawn before the next is looked at.
+    let line = Promise.resolve();
+    socket.onmessage = (event) => {
+      line = line.then(() => this.take(socket, event.data)).catch((error) => this.fail(error));
+    };
+    socket.onopen = () => {
+      this.delay = 250;
+      this.changed("live");
+    };
+    socket.onclose = () => {
+      if (this.socket !== socket) return;
+      this.socket = null;
+      this.changed("waiting");
+      this.timer = setTimeout(() => this.open(), this.delay);
+      this.delay = Math.min(SLOWEST, 2 * this.delay);
+    };
+  }
+
+  close(why) {
+    clearTimeout(this.timer);
+    const socket = this.socket;
+    this.socket = null;
+    if (socket) socket.close();
+    this.changed(why);
+  }
+
+  async take(socket, data) {
+    if (this.socket !== socket) return;
+    if (typeof data === "string") {
+      const message = JSON.parse(data);
+      if (message.recording) this.viewer.announce(message.recording);
+      this.told(message);
+      return;
+    }
+    const took = await this.viewer.feed(new Uint8Array(data));
+    this.layout = false;
+    this.told({ drawn: true });
+    await pause(Math.min(2000, took * (1 / SHARE - 1)));
+    if (socket.readyState === WebSocket.OPEN) socket.send("drawn");
+  }
+
+  fail(error) {
+    const reason = this.viewer.broken;
+    console.error(reason ?? error);
+    this.close("failed");
+    this.told({ failed: String(reason ?? error) });
+  }
+}

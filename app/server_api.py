@@ -1,0 +1,89 @@
+"""The page's API: what the twin says of itself, and commands to it, as JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from pathlib import Path
+from typing import Any
+
+from estimators.errors import ConfigError
+from estimators.track import HEALTH_NAMES
+
+from . import commands
+
+
+def status_json(engine: Any) -> dict[str, Any]:
+    """What the page's header shows, and more for whoever asks."""
+    status = engine.status()
+    return {
+        "twin": engine.twin.name,
+        "title": engine.twin.title,
+        "estimator": status.estimator,
+        "options": _plain(dict(status.options)),
+        "tuning": {key: _plain(value) for key, value, *_ in status.tuning.items()},
+        "revision": status.revision,
+        "refolding": status.refolding,
+        "t": status.t,
+        "health": HEALTH_NAMES[status.health],
+        "nis": _plain(getattr(status, "nis", None)),
+        "nis_low": _plain(getattr(status, "nis_low", None)),
+        "nis_high": _plain(getattr(status, "nis_high", None)),
+        "counts": dict(status.counts),
+        "paused": status.paused,
+        "finished": status.finished,
+        "speed": _plain(status.speed),
+        "seekable": status.seekable,
+        "recording": str(status.recording) if status.recording is not None else None,
+        "latency_ms": _plain(status.latency_ms),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """JSON has no infinity and no NaN."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if value is None or isinstance(value, (bool, str, int)):
+        return value
+    number = float(value)
+    return number if math.isfinite(number) else str(number) if math.isinf(number) else None
+
+
+def command_from_json(body: Any) -> Any:
+    """The command that `{"command": NAME, field: value, ...}` stands for; infinity is written "inf".
+
+    Raises:
+        ConfigError: If there is no such command, or a field is missing, unknown or of another kind.
+    """
+    known = {kind.__name__: kind for kind in typing.get_args(commands.Command)}
+    if not isinstance(body, dict) or body.get("command") not in known:
+        name = body.get("command") if isinstance(body, dict) else body
+        raise ConfigError(f"command: {name!r} is not known; one of {', '.join(known)}")
+    kind = known[body["command"]]
+    hints = typing.get_type_hints(kind)
+    given = {key: value for key, value in body.items() if key != "command"}
+    names = [item.name for item in dataclasses.fields(kind)]
+    if sorted(given) != sorted(names):
+        has, takes = (", ".join(part) or "no field" for part in (given, names))
+        raise ConfigError(f"{kind.__name__}: has {has}; it takes {takes}")
+    return kind(**{name: _converted(kind.__name__, name, given[name], hints[name]) for name in names})
+
+
+def _converted(command: str, name: str, value: Any, hint: Any) -> Any:
+    allowed = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    for kind in allowed:
+        if kind is type(None) and value is None:
+            return None
+        if kind in (bool, str) and isinstance(value, kind):
+            return value
+        if kind is float and not isinstance(value, bool) and (isinstance(value, (int, float)) or value == "inf"):
+            return float(value)
+        if kind is Path and isinstance(value, str):
+            if Path(value).suffix != ".rrd":
+                raise ConfigError(f"{command}: {name} is {value!r}; it must end in .rrd")
+            return Path(value)
+    wanted = " or ".join({"float": "a number", "bool": "true or false", "NoneType": "null", "str": "a text",
+                          "Path": "a path"}[kind.__name__] for kind in allowed)  # fmt: skip
+    raise ConfigError(f"{command}: {name} is {value!r}; it must be {wanted}")

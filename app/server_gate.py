@@ -1,0 +1,144 @@
+"""Who may speak to the page server: a browser on this machine, on the page itself, that has shown the token.
+
+A web page anywhere can make the user's browser send requests to 127.0.0.1, and a name anywhere can be made to point
+there. So every request, WebSocket upgrades included, is refused before any work unless its Host is a loopback name, its
+Origin (if it has one) is this server, and it carries the token or the cookie that the token was exchanged for.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import os
+import re
+import secrets
+from collections.abc import Awaitable, Callable, MutableMapping
+from typing import Any
+from urllib.parse import parse_qs
+
+from .viewer_assets import cache_folder
+
+Scope = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
+Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
+App = Callable[[Scope, Receive, Send], Awaitable[None]]
+
+_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?", re.IGNORECASE)
+
+REFUSED_HOST = "Nisus: this Host is not served; open the page at 127.0.0.1.\n"
+REFUSED_ORIGIN = "Nisus: requests from other sites are refused.\n"
+REFUSED_TOKEN = "Nisus: open the page at the address, with its token, that `nisus run` printed.\n"
+
+
+def user_token() -> str:
+    """The user's token: kept, so that an open page survives a restart, and readable by nobody else."""
+    path = cache_folder() / "token"
+    try:
+        token = path.read_text().strip()
+        if len(token) >= 32 and (os.name != "posix" or not path.stat().st_mode & 0o077):
+            return token
+    except OSError:
+        pass
+    token = secrets.token_urlsafe(32)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(handle, "w") as file:
+            file.write(token)
+    except OSError:
+        pass  # A folder that cannot be written: the token then holds for this run only.
+    return token
+
+
+class Gate:
+    """Lets a request through to `app`, or answers 403 with one line."""
+
+    def __init__(self, app: App, token: str, port: int) -> None:
+        self._app = app
+        self._token = token.encode()
+        self._cookie_name = f"nisus_{port}"
+        # The cookie is not the token: whoever reads one cannot make the other's address of it.
+        self._cookie = hmac.new(self._token, f"cookie {port}".encode(), hashlib.sha256).hexdigest().encode()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request (ASGI)."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = _Headers(scope["headers"])
+        host = headers.one("host")
+        if host is None or not _HOST.fullmatch(host):
+            await _refuse(scope, receive, send, REFUSED_HOST)
+            return
+        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [])
+        shows_token = len(given) == 1 and hmac.compare_digest(given[0].encode(), self._token)
+        exchange = shows_token and scope["type"] == "http" and scope["path"] == "/" and scope["method"] == "GET"
+        if not self._from_here(headers, host, exchange):
+            await _refuse(scope, receive, send, REFUSED_ORIGIN)
+        elif exchange:
+            await self._exchange(headers, send)
+        elif shows_token or self._has_cookie(headers) or self._has_bearer(headers):
+            await self._app(scope, receive, send)
+        else:
+            await _refuse(scope, receive, send, REFUSED_TOKEN)
+
+    def _from_here(self, headers: _Headers, host: str, exchange: bool) -> bool:
+        origins = headers.all("origin")
+        if origins:
+            return origins == [f"http://{host}"]
+        # Without Origin: a navigation, a request of the page itself, or no browser. Browsers say which it is.
+        site = headers.one("sec-fetch-site") or "none"
+        return exchange or site in ("none", "same-origin")
+
+    def _has_cookie(self, headers: _Headers) -> bool:
+        for line in headers.all("cookie"):
+            for part in line.split(";"):
+                name, _, value = part.strip().partition("=")
+                if name == self._cookie_name and hmac.compare_digest(value.encode(), self._cookie):
+                    return True
+        return False
+
+    def _has_bearer(self, headers: _Headers) -> bool:
+        kind, _, value = (headers.one("authorization") or "").partition(" ")
+        return kind.lower() == "bearer" and hmac.compare_digest(value.strip().encode(), self._token)
+
+    async def _exchange(self, headers: _Headers, send: Send) -> None:
+        """Put the token into a cookie and out of the address."""
+        cookie = f"{self._cookie_name}={self._cookie.decode()}; Path=/; HttpOnly; SameSite=Strict; Max-Age=2592000"
+        common = [
+            (b"set-cookie", cookie.encode()), (b"cache-control", b"no-store"), (b"referrer-policy", b"no-referrer"),
+        ]  # fmt: skip
+        if (headers.one("sec-fetch-site") or "none") in ("none", "same-origin"):
+            start = {"type": "http.response.start", "status": 303, "headers": [*common, (b"location", b"/")]}
+            body = b""
+        else:
+            # A link on another page brought us here: a redirect would be its doing too, without the strict cookie.
+            kind = (b"content-type", b"text/html")
+            start = {"type": "http.response.start", "status": 200, "headers": [*common, kind]}
+            body = b'<!doctype html><meta http-equiv="refresh" content="0;url=/"><title>Nisus</title>'
+        await send(start)
+        await send({"type": "http.response.body", "body": body})
+
+
+class _Headers:
+    def __init__(self, raw: Any) -> None:
+        self._raw = raw
+
+    def all(self, name: str) -> list[str]:
+        key = name.encode()
+        return [value.decode("latin-1") for found, value in self._raw if found == key]
+
+    def one(self, name: str) -> str | None:
+        """The header's value; None if it is absent or given twice, which no honest client does."""
+        values = self.all(name)
+        return values[0] if len(values) == 1 else None
+
+
+async def _refuse(scope: Scope, receive: Receive, send: Send, line: str) -> None:
+    prefix = "http.response" if scope["type"] == "http" else "websocket.http.response"
+    headers = [(b"content-type", b"text/plain; charset=utf-8"), (b"connection", b"close")]
+    if scope["type"] == "websocket":
+        await receive()
+    await send({"type": f"{prefix}.start", "status": 403, "headers": headers})
+    await send({"type": f"{prefix}.body", "body": line.encode()})
