@@ -68,40 +68,69 @@ PARAMETERS = (
 
 
 @jit
-def rates(winding, tooth, yoke, magnet, u, p):
-    """dT/dt of the four nodes, K/s, at their temperatures in °C."""
+def network(u, p):
+    """What of the network does not change within a step: conductances, losses, reciprocal capacities, surroundings.
+
+    Divisions cost most of a step, so each is done once here and not in each of the four stages.
+    """
     speed = abs(u[SPEED])
-    theta = 1.0 + COPPER * (winding - 20.0)
     current = 1.5 * p[COPPER_RESISTANCE] * (u[I_D] ** 2 + u[I_Q] ** 2)
-    copper = current * (theta + p[COPPER_EDDY] * speed**2 / theta)
     iron = (p[IRON_LINEAR] + p[IRON_SQUARE] * speed) * speed
-    rest = 1.0 - p[IRON_TOOTH] - p[IRON_MAGNET]  # the yoke's; their ranges keep it from becoming a heat sink
-    winding_tooth = (winding - tooth) / p[R_WINDING_TOOTH]
-    winding_magnet = (winding - magnet) / p[R_WINDING_MAGNET]
-    tooth_yoke = (tooth - yoke) / p[R_TOOTH_YOKE]
-    tooth_magnet = (tooth - magnet) / p[R_TOOTH_MAGNET]
-    coolant = (yoke - u[COOLANT]) / p[R_YOKE_COOLANT]
-    winding_out = (winding - u[AMBIENT]) / p[R_WINDING_AMBIENT]
-    magnet_out = (magnet - u[AMBIENT]) / p[R_MAGNET_AMBIENT]
     return (
-        (copper - winding_tooth - winding_magnet - winding_out) / p[C_WINDING],
-        (iron * p[IRON_TOOTH] + winding_tooth - tooth_yoke - tooth_magnet) / p[C_TOOTH],
-        (iron * rest + tooth_yoke - coolant) / p[C_YOKE],
-        (iron * p[IRON_MAGNET] + winding_magnet + tooth_magnet - magnet_out) / p[C_MAGNET],
+        current,
+        current * p[COPPER_EDDY] * speed**2,
+        iron * p[IRON_TOOTH],
+        iron * (1.0 - p[IRON_TOOTH] - p[IRON_MAGNET]),  # the yoke's; the ranges keep it from becoming a heat sink
+        iron * p[IRON_MAGNET],
+        1.0 / p[R_WINDING_TOOTH],
+        1.0 / p[R_TOOTH_YOKE],
+        1.0 / p[R_TOOTH_MAGNET],
+        1.0 / p[R_WINDING_MAGNET],
+        1.0 / p[R_YOKE_COOLANT],
+        1.0 / p[R_WINDING_AMBIENT],
+        1.0 / p[R_MAGNET_AMBIENT],
+        1.0 / p[C_WINDING],
+        1.0 / p[C_TOOTH],
+        1.0 / p[C_YOKE],
+        1.0 / p[C_MAGNET],
+        u[COOLANT],
+        u[AMBIENT],
+    )
+
+
+@jit
+def rates(winding, tooth, yoke, magnet, constants):
+    """dT/dt of the four nodes, K/s, at their temperatures in °C."""
+    current, eddy, iron_tooth, iron_yoke, iron_magnet, wt, ty, tm, wm, yc, wa, ma, cw, ct, cy, cm, coolant, ambient = (
+        constants
+    )
+    theta = 1.0 + COPPER * (winding - 20.0)
+    copper = current * theta + eddy / theta
+    winding_tooth = (winding - tooth) * wt
+    winding_magnet = (winding - magnet) * wm
+    tooth_yoke = (tooth - yoke) * ty
+    tooth_magnet = (tooth - magnet) * tm
+    return (
+        (copper - winding_tooth - winding_magnet - (winding - ambient) * wa) * cw,
+        (iron_tooth + winding_tooth - tooth_yoke - tooth_magnet) * ct,
+        (iron_yoke + tooth_yoke - (yoke - coolant) * yc) * cy,
+        (iron_magnet + winding_magnet + tooth_magnet - (magnet - ambient) * ma) * cm,
     )
 
 
 def f(x, u, p, dt, out):
     """One step of the classical Runge-Kutta method."""
-    a0, a1, a2, a3 = rates(x[0], x[1], x[2], x[3], u, p)
+    k = network(u, p)
+    a0, a1, a2, a3 = rates(x[0], x[1], x[2], x[3], k)
     h = 0.5 * dt
-    b0, b1, b2, b3 = rates(x[0] + h * a0, x[1] + h * a1, x[2] + h * a2, x[3] + h * a3, u, p)
-    c0, c1, c2, c3 = rates(x[0] + h * b0, x[1] + h * b1, x[2] + h * b2, x[3] + h * b3, u, p)
-    d0, d1, d2, d3 = rates(x[0] + dt * c0, x[1] + dt * c1, x[2] + dt * c2, x[3] + dt * c3, u, p)
-    out[0] = x[0] + dt / 6.0 * (a0 + 2.0 * b0 + 2.0 * c0 + d0)
-    out[1] = x[1] + dt / 6.0 * (a1 + 2.0 * b1 + 2.0 * c1 + d1)
-    out[2] = x[2] + dt / 6.0 * (a2 + 2.0 * b2 + 2.0 * c2 + d2)
-    out[3] = x[3] + dt / 6.0 * (a3 + 2.0 * b3 + 2.0 * c3 + d3)
+    b0, b1, b2, b3 = rates(x[0] + h * a0, x[1] + h * a1, x[2] + h * a2, x[3] + h * a3, k)
+    c0, c1, c2, c3 = rates(x[0] + h * b0, x[1] + h * b1, x[2] + h * b2, x[3] + h * b3, k)
+    d0, d1, d2, d3 = rates(x[0] + dt * c0, x[1] + dt * c1, x[2] + dt * c2, x[3] + dt * c3, k)
+    sixth = dt / 6.0
+    out[0] = x[0] + sixth * (a0 + 2.0 * b0 + 2.0 * c0 + d0)
+    out[1] = x[1] + sixth * (a1 + 2.0 * b1 + 2.0 * c1 + d1)
+    out[2] = x[2] + sixth * (a2 + 2.0 * b2 + 2.0 * c2 + d2)
+    out[3] = x[3] + sixth * (a3 + 2.0 * b3 + 2.0 * c3 + d3)
 
 
 def winding(x, u, p, out):
