@@ -8,6 +8,7 @@ import struct
 import zlib
 from collections.abc import Generator, Sequence
 from contextlib import suppress
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from estimators.errors import SourceError
 from estimators.log import Readings
 
 from .decoder import Decoder, Frames
+from .log_span import log_span
 from .mf4 import DamagedError, read_mf4
 from .source import Report, ignore
 
@@ -78,6 +80,11 @@ class CanLog:
         self.frames = 0
         """Frames read so far, wanted or not."""
         self._batches = self._all()
+
+    @cached_property
+    def span(self) -> tuple[int, int] | None:
+        """First and last time, ns; None where the format does not tell without being read."""
+        return log_span(self._files)
 
     @staticmethod
     def _check(path: Path) -> None:

@@ -71,9 +71,34 @@ def read_mf4(path: Path, decoder: Decoder) -> Recorded:
             mdf.close()
 
 
+def mf4_span(path: Path) -> tuple[int, int] | None:
+    """First and last time of a file's frames, ns; None if it has none.
+
+    Raises:
+        DamagedError: If nothing can be read.
+        OSError: If the file cannot be opened.
+    """
+    with _hushed():
+        mdf = _open(path)
+        try:
+            ends = []
+            for index, group in enumerate(mdf.groups):
+                if group.channel_group.cycles_nr and any(c.name == "CAN_DataFrame" for c in group.channels):
+                    times = mdf.get_master(index)
+                    ends += [float(times[0]), float(times[-1])] if len(times) else []
+            start = _start(mdf)
+        finally:
+            mdf.close()
+    return (start + round(min(ends) * 1e9), start + round(max(ends) * 1e9)) if ends else None
+
+
+def _start(mdf: Any) -> int:
+    """When the file's clock began, ns: start_time knows the zone, abs_time the part of the second."""
+    return int(mdf.header.start_time.timestamp() // 1) * 1_000_000_000 + int(mdf.header.abs_time) % 1_000_000_000
+
+
 def _read(mdf: Any, decoder: Decoder) -> Recorded:
-    # The whole seconds of the one and the nanoseconds of the other: start_time knows the zone, abs_time the rest.
-    start = int(mdf.header.start_time.timestamp() // 1) * 1_000_000_000 + int(mdf.header.abs_time) % 1_000_000_000
+    start = _start(mdf)
     parts: list[Frames] = []
     total = errors = 0
     fault = ""

@@ -219,6 +219,24 @@ def test_an_unfinished_mf4_of_a_logger_that_lost_power(data):
     assert len(got) / (171 + 189) == pytest.approx(10.0, rel=0.05)
 
 
+def test_the_span_is_known_before_a_log_is_read(tmp_path, data, messages):
+    folder = data("can_css_imu100_obd2", "session_00000164")
+    log = CanLog(sorted(folder.glob("*.MF4")), css_decoder(data, Reports()))
+    first, last = log.span
+    got = read_all(log)
+    assert 0 <= got.t[0] - first < 10**9 and 0 <= last - got.t[-1] < 10**9
+    for suffix in (".blf", ".log"):
+        path = tmp_path / f"a{suffix}"
+        write(path, messages)
+        log = CanLog([path], decoder_of(tmp_path))
+        first, last = log.span
+        got = read_all(log)
+        # BLF keeps the log's start and end in whole milliseconds.
+        assert abs(got.t[0] - first) <= 10**6 and abs(last - got.t[-1]) <= 2 * 10**7, suffix
+    write(tmp_path / "a.asc", messages)
+    assert CanLog([tmp_path / "a.asc"], decoder_of(tmp_path)).span is None
+
+
 def test_times_keep_the_microseconds_of_a_log():
     micros = START * 10**6 + np.random.default_rng(0).integers(0, 10**9, 10000)
     assert np.array_equal(to_ns(micros / 1e6), micros * 1000)
