@@ -7,12 +7,13 @@ matrices), the same draws of NumPy's seed 7.
 import numpy as np
 import pytest
 
-from estimators.score import score
 from estimators.fold import Fold
 from estimators.log import READING, TICK, TRUTH, Log, Readings
 from estimators.models import MODELS
+from estimators.score import score
 from estimators.track import MISSING, USED
 from estimators.tuning import Tuning
+from sources.simulator import SensorPlan, Simulator
 
 SECOND = 1_000_000_000
 
@@ -113,15 +114,14 @@ def test_lost_samples_are_missing_and_covariance_grows(folded, rows):
 
 
 def test_the_simulator_draws_the_same(rows):
-    simulator = pytest.importorskip("sources.simulator")
     model = MODELS["motor_winding"]
-    source = simulator.Simulator(
+    source = Simulator(
         model,
         seed=7,
         step=1.0,
         duration=120.0,
         initial={"temperature": 40.0, "rate": 0.2},
-        sensors={"winding": simulator.SensorPlan(drop_every=15)},
+        sensors={"winding": SensorPlan(drop_every=15)},
     )
     batches = []
     while (batch := source.read(0.0)) is not None:

@@ -1,0 +1,35 @@
+"""`make bench`: prints what Nisus costs. It never fails on a number; it says which fall short."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Callable
+from time import perf_counter
+
+# One thread each: FilterPy's small matrices are only slowed by BLAS threads, and neighbours are left in peace.
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
+
+
+def main() -> None:
+    from . import filters, history, sources
+
+    begun = perf_counter()
+    load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
+    print(f"{platform.machine()}, {os.cpu_count()} cores{load}, Python {platform.python_version()}")
+    sections: list[Callable[[], None]] = [
+        filters.beside_filterpy,
+        filters.growing_n,
+        history.growing_history,
+        history.refold,
+        sources.blf,
+    ]
+    for section in sections:
+        print()
+        section()
+    print(f"\n{perf_counter() - begun:.0f} s in all")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,167 @@
+"""What a step (predict and update) of each filter costs, beside FilterPy's, and how it grows with n."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
+
+from estimators.fold import Fold
+from estimators.log import READING, Log, Readings
+from estimators.model import StateSpaceModel
+from estimators.models import MODELS
+from estimators.tuning import Tuning
+
+from . import ring
+from .timing import compare, judged, medians
+
+SECOND = 1_000_000_000
+STEPS = 4096
+THEIR_STEPS = 200
+REPETITIONS = 15
+
+
+def log_of(model: StateSpaceModel, events: int, *, step: float = 1.0) -> Log:
+    """Readings of the first sensor, `step` seconds apart: noise about what the model expects at its prior."""
+    rng = np.random.default_rng(0)
+    m = len(model.sensors[0].rows)
+    x = np.array([state.mean for state in model.states])
+    expected = np.empty(m)
+    model.sensors[0].h(x, np.zeros(0), np.zeros(0), expected)
+    t = np.arange(events, dtype=np.int64) * round(step * SECOND)
+    value = expected + 0.3 * rng.standard_normal((events, m))
+    log = Log(model.width, events)
+    log.extend(
+        Readings(t, t, np.full(events, READING, np.int8), np.zeros(events, np.int32), np.ascontiguousarray(value))
+    )
+    return log
+
+
+def folding(estimator: str, model: StateSpaceModel, log: Log) -> Callable[[], None]:
+    """A call that folds the whole log again: estimate, NIS, verdict and health of every event."""
+    growing = Fold(estimator, model, Tuning.of(model), log)
+    growing.advance()
+
+    def again() -> None:
+        growing.rewind(0)
+        growing.advance()
+
+    return again
+
+
+def theirs_kf() -> Callable[[], None]:
+    kf = KalmanFilter(dim_x=2, dim_z=1)
+    kf.x, kf.P = np.array([35.0, 0.0]), np.diag([25.0, 1.0])
+    kf.F, kf.H = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 0.0]])
+    kf.Q, kf.R = np.diag([0.01, 0.001]), np.array([[4.0]])
+    y = np.array([36.0])
+
+    def steps() -> None:
+        for _ in range(THEIR_STEPS):
+            kf.predict()
+            kf.update(y)
+
+    return steps
+
+
+def theirs_ekf() -> Callable[[], None]:
+    H = np.array([[1.0, 0.0]])
+    ekf = ExtendedKalmanFilter(dim_x=2, dim_z=1)
+    ekf.x, ekf.P = np.array([35.0, 0.0]), np.diag([25.0, 1.0])
+    ekf.Q, ekf.R = np.diag([0.01, 0.001]), np.array([[4.0]])
+    y = np.array([36.0])
+
+    def steps() -> None:
+        for _ in range(THEIR_STEPS):
+            ekf.F = np.array([[1.0, 1.0], [0.0, 1.0]])
+            ekf.predict()
+            ekf.update(y, lambda x: H, lambda x: x[:1])
+
+    return steps
+
+
+def theirs_ukf(n: int, m: int, x: np.ndarray, P: np.ndarray, Q: np.ndarray, R: np.ndarray, f, h) -> Callable[[], None]:
+    points = MerweScaledSigmaPoints(n, alpha=1.0, beta=2.0, kappa=0.0)
+    ukf = UnscentedKalmanFilter(n, m, 1.0, h, f, points)
+    y = h(x)
+    steps_each = THEIR_STEPS if n < 10 else THEIR_STEPS // 4
+
+    def steps() -> None:
+        ukf.x, ukf.P, ukf.Q, ukf.R = x.copy(), P.copy(), Q, R
+        for _ in range(steps_each):
+            ukf.predict(dt=0.1)
+            ukf.update(y)
+
+    return steps
+
+
+def beside_filterpy() -> None:
+    """Each filter beside FilterPy's, in one run."""
+    motor, ring24 = MODELS["motor_winding"], ring.ring(24, 8)
+    small, large = log_of(motor, STEPS), log_of(ring24, STEPS // 16, step=0.1)
+    x24 = np.array([state.mean for state in ring24.states])
+
+    def f2(x, dt):
+        return np.array([x[0] + dt * x[1], x[1]])
+
+    rows = [
+        ("KF   n=2  m=1", folding("kf", motor, small), theirs_kf(), STEPS, THEIR_STEPS, 15.0),
+        ("EKF  n=2  m=1", folding("ekf", motor, small), theirs_ekf(), STEPS, THEIR_STEPS, None),
+        (
+            "UKF  n=2  m=1",
+            folding("ukf", motor, small),
+            theirs_ukf(
+                2,
+                1,
+                np.array([35.0, 0.0]),
+                np.diag([25.0, 1.0]),
+                np.diag([0.01, 0.001]),
+                np.eye(1) * 4,
+                f2,
+                lambda x: x[:1],
+            ),
+            STEPS,
+            THEIR_STEPS,
+            80.0,
+        ),
+        (
+            "UKF  n=24 m=8",
+            folding("ukf", ring24, large),
+            theirs_ukf(
+                24,
+                8,
+                x24,
+                np.eye(24) * ring.STD**2,
+                np.eye(24) * ring.Q * 0.1,
+                np.eye(8) * ring.R,
+                ring.f_numpy,
+                ring.h_numpy,
+            ),
+            STEPS // 16,
+            THEIR_STEPS // 4,
+            10.0,
+        ),
+    ]
+    print("A step: predict and update, with NIS, verdict and health on our side; processor time, medians, interleaved")
+    print(f"  {'filter':15s} {'Nisus µs':>9s} {'FilterPy µs':>12s} {'ratio':>7s}   wanted")
+    for name, ours, theirs, our_steps, their_steps, bound in rows:
+        pair = compare(ours, theirs, steps=(our_steps, their_steps), repetitions=REPETITIONS)
+        verdict = f">= {bound:3.0f}   {judged(pair.ratio, bound, at_least=True)}" if bound else "   -"
+        print(f"  {name:15s} {pair.ours * 1e6:9.3f} {pair.theirs * 1e6:12.1f} {pair.ratio:7.1f}   {verdict}")
+
+
+def growing_n() -> None:
+    """The cost of n: as n³ where the matrices rule, and what is left of that at small n."""
+    sizes = (2, 4, 8, 16, 24, 32, 48)
+    print("A step against n (ring of n states, every third read): µs, and ns / n³ in brackets")
+    print(f"  {'n':>4s} {'m':>3s}" + "".join(f"{name:>20s}" for name in ("kf (linear)", "ekf", "ukf")))
+    for n in sizes:
+        m = (n + 2) // 3
+        steps = max(64, 60_000 // n**2)
+        calls = []
+        for name in ("kf", "ekf", "ukf"):
+            model = ring.ring(n, m, linear=name == "kf")
+            calls.append(folding(name, model, log_of(model, steps, step=0.1)))
+        each = [value / steps for value in medians(calls, 7)]
+        print(f"  {n:4d} {m:3d}" + "".join(f"{s * 1e6:11.2f} [{s * 1e9 / n**3:6.2f}]" for s in each))

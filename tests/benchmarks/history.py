@@ -1,0 +1,95 @@
+"""What history costs: the fold of longer logs, one more event at their end, a late one, and a slider's refold."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from app.twin import load_twin
+from estimators.fold import Fold
+from estimators.log import READING, Log, Readings
+from estimators.models import MODELS
+from estimators.tuning import Tuning
+
+from .filters import SECOND, log_of
+from .timing import both, judged, medians
+
+REFOLD_READINGS = 100_000
+REFOLD_BOUND = 0.2
+DEFAULT_TWIN = "motor_can"
+
+
+def growing_history() -> None:
+    """Per event, so a flat column is what is wanted."""
+    model = MODELS["motor_winding"]
+    tuning = Tuning.of(model)
+    print("History (KF n=2 m=1): µs an event of the whole fold, of one event appended, of one reading 100 events late")
+    print(f"  {'events':>9s} {'fold':>9s} {'append':>9s} {'late':>9s}")
+    for size in (1_000, 10_000, 100_000, 1_000_000):
+        log = log_of(model, size)
+        # Room for what is appended, so that the one growth of the arrays is not in the measure.
+        log._reserve(4096)
+        growing = Fold("kf", model, tuning, log)
+        growing.advance()
+
+        def fold(growing=growing) -> None:
+            growing.rewind(0)
+            growing.advance()
+
+        def event(t: int) -> Readings:
+            return Readings.one(t, t, READING, 0, 35.0, 1)
+
+        def append(log=log, growing=growing) -> None:
+            log.extend(event(int(log.t[log.n - 1]) + SECOND))
+            growing.advance()
+
+        def late(log=log, growing=growing) -> None:
+            start, _ = log.extend(event(int(log.t[log.n - 100]) + 1))
+            growing.rewind(start)
+            growing.advance()
+
+        (whole,) = medians([fold], 5 if size < 1_000_000 else 3)
+        one, after = medians([append, late], 301)
+        print(f"  {size:9,d} {whole / size * 1e6:9.3f} {one * 1e6:9.1f} {after * 1e6:9.1f}")
+
+
+def recorded(twin, readings: int) -> Log:
+    """The twin's own recording, one copy after the other until there are enough readings."""
+    source = twin.open_source(lambda key, text: None, live=False)
+    once = []
+    try:
+        while (batch := source.read(1.0)) is not None:
+            once.append(batch)
+    finally:
+        source.close()
+    events = Readings.concat(once, twin.model.width)
+    events = events.select(np.argsort(events.t, kind="stable"))
+    span = int(events.t[-1] - events.t[0]) + SECOND // 10
+    copies = -(-readings // int(np.sum(events.kind == READING)))
+    log = Log(twin.model.width, copies * len(events))
+    for k in range(copies):
+        log.extend(Readings(events.t + k * span, events.arrival + k * span, *events[2:]))
+    enough = int(np.searchsorted(np.cumsum(log.readings.kind == READING), readings)) + 1
+    log.n = min(log.n, enough)
+    return log
+
+
+def refold() -> None:
+    """A slider moved: the history folded again from its start, for the default twin and every estimator that fits."""
+    twin = load_twin(DEFAULT_TWIN)
+    log = recorded(twin, REFOLD_READINGS)
+    print(
+        f"Refold of {REFOLD_READINGS:,} readings ({log.n:,} events with inputs and truths) of {DEFAULT_TWIN}, seconds"
+    )
+    for name in ("ekf", "ukf"):
+        times = []
+        for k in range(5):
+            tuning = twin.tuning.set(twin.tuning.items()[0].key, 0.01 + 0.001 * k)
+
+            def slider(name=name, tuning=tuning) -> None:
+                Fold(name, twin.model, tuning, log, pairs=twin.pairs).advance()
+
+            times.append(both(slider))
+        value, processor = np.median(times[1:], axis=0)
+        default = name == twin.estimator
+        verdict = f"<= {REFOLD_BOUND}   {judged(value, REFOLD_BOUND, at_least=False)}" if default else "   -"
+        print(f"  {name:15s} {value:9.3f}   {verdict}   (processor {processor:.3f})")
