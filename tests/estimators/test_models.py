@@ -10,7 +10,6 @@ import pytest
 
 from app.twin import load_twin
 from estimators.compiled import compile_model
-from estimators.score import score
 from estimators.fold import fold
 from estimators.jacobians import COMPLEX_STEP
 from estimators.log import INPUT, READING, TRUTH, Log, Readings
@@ -18,6 +17,7 @@ from estimators.model import StateSpaceModel
 from estimators.models import MODELS
 from estimators.models.motor_drive import COPPER, MOTOR_DRIVE
 from estimators.models.road_car import ROAD_CAR
+from estimators.score import score
 from estimators.track import HELD_OUT, Track
 
 P = {item.name: k for k, item in enumerate(MOTOR_DRIVE.parameters)}
@@ -327,3 +327,12 @@ def test_rav4_predicts_both_receivers_that_are_held_out(data: Callable[..., Path
     rate = np.mean(result.events.value[inputs, 1]) - turned / span
     assert abs(rate) > np.radians(0.3)
     assert result.final("yaw_rate_bias") == pytest.approx(rate, abs=np.radians(0.05))
+    # Left is positive: what the gyroscope adds up to in two seconds goes with the turn that the receiver sees.
+    t = (result.events.t - result.events.t[0]) * 1e-9
+    yaw = np.concatenate(([0.0], np.cumsum(result.events.value[inputs, 1][:-1] * np.diff(t[inputs]))))
+    at = np.arange(2.0, t[-1] - 4.0, 0.1)
+    turns = [
+        np.interp(at + 2.0, t[k], c) - np.interp(at, t[k], c)
+        for k, c in ((inputs, yaw), (heading, result.events.value[heading, 0]))
+    ]
+    assert np.corrcoef(*turns)[0, 1] > 0.4
