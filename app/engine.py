@@ -11,23 +11,24 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from estimators.diagnostics import HealthPolicy
 from estimators.errors import ConfigError, EstimatorError, NisusError
-from estimators.fold import SPARSE_EVERY, UNSET, Fold
-from estimators.log import READING, RESET, TICK, Log, Readings
+from estimators.fold import SPARSE_EVERY, Fold
+from estimators.log import RESET, TICK, Log, Readings
 from estimators.registry import find_estimator
 from estimators.track import FAILED, GATED, HEALTH_NAMES, MISSING, VERDICT_NAMES
 
 from . import commands
 from .feeder import Feeder, Finished, Restarted
 from .notices import Notices
+from .playback import PLAYBACK, play, playback_status
 from .pull import Belief, Cursor, Pull, Status
 from .refolder import Refolded, Refolder
+from .tally import Latency, Tally
 
 if TYPE_CHECKING:
     from estimators.tuning import Tuning
@@ -36,11 +37,7 @@ if TYPE_CHECKING:
     from .recording import Base
     from .twin import Twin
 
-LATENCIES = 4096
 STATUS_AGE = 0.1
-
-UNSETTLED = 8192
-"""Rows at the end that the tally counts again each time."""
 
 
 class Engine:
@@ -94,8 +91,7 @@ class Engine:
         self._finished = False
         self._heard = time.monotonic()
         self._newest_at_heard: int | None = None
-        self._latencies = np.zeros(LATENCIES)
-        self._n_latencies = 0
+        self._latency = Latency()
         self._health = 0
         self._status: tuple[float, Status] | None = None
         self.recorder: Any = None
@@ -106,8 +102,7 @@ class Engine:
         self._log = Log(self.model.width, self._history + 4 * SPARSE_EVERY)
         self._base = base
         self._fold = self._make_fold(self.estimator, self.tuning, self._log, base)
-        self._forgotten = np.zeros(len(VERDICT_NAMES), np.int64)
-        self._count_again()
+        self._tally = Tally()
 
     def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
         return Fold(estimator, self.model, tuning, log, pairs=self.pairs, policy=self._policy, base=base)
@@ -197,7 +192,6 @@ class Engine:
         with self._lock:
             log, fold = self._log, self._fold
             track = fold.track
-            verdicts = self._tally()
             last = fold.n - 1
             status = Status(
                 estimator=self.estimator,
@@ -208,42 +202,20 @@ class Engine:
                 t=int(log.t[last]) if last >= 0 else None,
                 health=int(track.health[last]) if last >= 0 else 0,
                 counts={
-                    "readings": int(verdicts[1:].sum()),
-                    **{name: int(count) for name, count in zip(VERDICT_NAMES[1:], verdicts[1:], strict=True)},
+                    **self._tally.count(track.verdict),
                     **self.notices.counts(),
                 },
                 nis=float(track.nis_mean[last]) if last >= 0 else np.nan,
                 nis_low=float(track.nis_low[last]) if last >= 0 else np.nan,
                 nis_high=float(track.nis_high[last]) if last >= 0 else np.nan,
-                paused=bool(getattr(self._feeder.source, "paused", False)),
-                speed=getattr(self._feeder.source, "speed", None),
-                seekable=hasattr(self._feeder.source, "seek"),
-                span=getattr(self._feeder.source, "span", None),
+                **playback_status(self._feeder.source),
                 finished=self._finished,
                 recording=self.recorder.path if self.recorder is not None else None,
-                latency_ms=self._latency(99.0),
-                latency_p50_ms=self._latency(50.0),
+                latency_ms=self._latency.percentile(99.0),
+                latency_p50_ms=self._latency.percentile(50.0),
             )
         self._status = (time.monotonic(), status)
         return status
-
-    def _tally(self) -> np.ndarray:
-        """Rows by verdict since the start; rows that no late reading will touch are counted once."""
-        verdict = self._fold.track.verdict
-        settled = max(self._settled, len(verdict) - UNSETTLED)
-        self._settled_counts += np.bincount(verdict[self._settled : settled], minlength=len(VERDICT_NAMES))
-        self._settled = settled
-        return self._settled_counts + np.bincount(verdict[settled:], minlength=len(VERDICT_NAMES))
-
-    def _count_again(self, forgotten: np.ndarray | None = None) -> None:
-        """Rows moved or changed: begin the tally anew, on top of what the forgotten rows held."""
-        if forgotten is not None:
-            self._forgotten = self._forgotten + np.bincount(forgotten, minlength=len(VERDICT_NAMES))
-        self._settled, self._settled_counts = 0, self._forgotten.copy()
-
-    def _latency(self, percent: float) -> float | None:
-        count = min(self._n_latencies, LATENCIES)
-        return float(np.percentile(self._latencies[:count], percent)) if count else None
 
     # The engine's own thread
 
@@ -297,26 +269,16 @@ class Engine:
         if stale:
             self.notices.report("stale", f"{stale} reading(s) later than the horizon dropped")
         if self._feeder.live:
-            self._note_latency(batch)
+            self._latency.note(batch)
 
     def _go_back(self, index: int) -> None:
         """Events at and behind `index` changed: fold them again, and let every cursor fetch them again."""
         self._fold.rewind(index)
-        if index < self._settled:
-            self._count_again()
+        self._tally.changed(index)
         absolute = self._log.first + index
         self._changed_from = absolute if self._changed_from is None else min(self._changed_from, absolute)
         for cursor in self._cursors:
             cursor.next = min(cursor.next, absolute)
-
-    def _note_latency(self, batch: Readings) -> None:
-        arrivals = batch.arrival[batch.kind == READING]
-        if not arrivals.size:
-            return
-        took = (time.time_ns() - arrivals[-LATENCIES:]) * 1e-6
-        at = (self._n_latencies + np.arange(took.size)) % LATENCIES
-        self._latencies[at] = took
-        self._n_latencies += took.size
 
     def _look(self, before: int) -> None:
         """Report what the new rows say: readings that could not be used, and changes of health."""
@@ -339,7 +301,7 @@ class Engine:
         count = (self._log.n - self._history) // SPARSE_EVERY * SPARSE_EVERY
         count, self._base = self._fold.base_at(count)
         if count:
-            self._count_again(self._fold.track.verdict[:count])
+            self._tally.forget(self._fold.track.verdict[:count])
             self._fold.drop_front(count)
             self._log.drop_front(count)
 
@@ -366,7 +328,6 @@ class Engine:
 
     def _obey(self, item: Any) -> None:
         """Carry one command out, or take a refold or a word from the feeder."""
-        source = self._feeder.source
         if isinstance(item, Refolded):
             self._adopt(item)
         elif isinstance(item, Restarted):
@@ -390,21 +351,8 @@ class Engine:
             if self.recorder is None:
                 raise ConfigError("this session cannot record")
             self.recorder.record(item.path)
-        elif isinstance(item, (commands.Pause, commands.Speed, commands.Step, commands.Seek)):
-            self._play(source, item)
-
-    def _play(self, source: Any, item: Any) -> None:
-        if not hasattr(source, "seek"):
-            raise ConfigError("a live source cannot be paused, stepped or sought; only a replay or a simulation can")
-        if isinstance(item, commands.Pause):
-            source.pause() if item.paused else source.resume()
-        elif isinstance(item, commands.Speed):
-            source.set_speed(item.factor)
-        elif isinstance(item, commands.Step):
-            source.step()
-        else:
-            start = source.span[0] if getattr(source, "span", None) else int(self._log.t[0]) if self._log.n else 0
-            source.seek(start + round(item.seconds * 1e9))
+        elif isinstance(item, PLAYBACK):
+            play(self._feeder.source, item, int(self._log.t[0]) if self._log.n else 0)
 
     def _restart(self) -> None:
         """The source began again: so does the log. The fold is a new revision of it."""
@@ -463,18 +411,7 @@ class Engine:
                     old.track,
                 )
                 self._fold = fold
-                self._count_again()
+                self._tally.again()
                 self._revision += 1
         if stale:
             self._retune(self.estimator, self.tuning)
-
-    @property
-    def clock(self) -> int | None:
-        """Time of the estimate, ns, or None before the first event."""
-        clock = self._fold.clock
-        return None if clock == UNSET else clock
-
-    @property
-    def recording_path(self) -> Path | None:
-        """Where a recording is being written, if one is."""
-        return self.recorder.path if self.recorder is not None else None

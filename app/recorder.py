@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .engine import Engine
     from .twin import Twin
 
-PERIOD = 0.2
+PERIOD = 0.4
 """Seconds between two writes; with what the operating system has after each, a killed process loses less than this."""
 
 ROWS = 20_000
