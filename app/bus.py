@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 GROUP = "239.74.163.2"
 """python-can's own multicast address."""
 
-FORMATS = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")
-"""What python-can writes and `nisus fold --log` reads."""
+FORMATS = (".asc", ".blf", ".csv", ".log", ".mf4", ".trc")
+"""What python-can writes and `nisus fold --log` reads; not .db, whose writer forgets what is queued when it stops."""
 
 
 def play_bus(arguments: Bus) -> int:
