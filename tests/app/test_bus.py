@@ -104,7 +104,10 @@ def test_the_channel(interface: str, channel: str | None, expected: str | int) -
         (["motor_can", "--interface", "socketcan"], "which bus is not known; give --channel, for example can0"),
         (["motor_winding"], "source is of type simulator"),
         (["motor_can", "--interface", "virtual", "--record", "drive.txt"], "--record drive.txt: is no CAN log format"),
-        (["motor_can", "--interface", "virtual", "--record", "drive.db"], "end it in .asc, .blf, .csv, .log, .mf4, .trc"),
+        (
+            ["motor_can", "--interface", "virtual", "--record", "drive.db"],
+            "end it in .asc, .blf, .csv, .log, .mf4, .trc",
+        ),
         (["motor_can", "--interface", "virtual", "--record", "no/drive.blf"], "there is no folder no; create it first"),
         (["motor_can", "--interface", "no_such_bus", "--channel", "x"], "CAN bus no_such_bus:x: it cannot be opened"),
     ],
