@@ -184,6 +184,13 @@ class CanLog:
         if isinstance(reader, can.BLFReader):
             size = path.stat().st_size
             return f"{size} of {reader.file_size} bytes are there" if reader.file_size > size else ""
+        if path.suffix.lower() == ".db":
+            # SQLite takes what a cut last page lacks for zeros, and gives rows of them without a word.
+            with path.open("rb") as file:
+                header = file.read(100)
+            page, pages = int.from_bytes(header[16:18], "big"), int.from_bytes(header[28:32], "big")
+            size, whole = path.stat().st_size, (65536 if page == 1 else page) * pages
+            return f"{size} of {whole} bytes are there" if whole > size else ""
         if path.suffix.lower() in (".asc", ".csv", ".log", ".trc"):
             with path.open("rb") as file:
                 file.seek(-1, os.SEEK_END)

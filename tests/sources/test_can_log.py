@@ -124,6 +124,25 @@ def test_a_cut_database_and_archive_say_so(tmp_path, messages):
             assert str(tmp_path / cut) in str(error) and "\n" not in str(error)
 
 
+def test_a_database_whose_last_page_is_cut_says_so(tmp_path, messages):
+    """SQLite itself reads on: what is missing of a page counts as zeros."""
+    write(tmp_path / "a.db", messages[:40])
+    whole = (tmp_path / "a.db").read_bytes()
+    reports = Reports()
+    read_all(CanLog([tmp_path / "a.db"], decoder_of(tmp_path), report=reports))
+    assert reports.counts["truncated file"] == 0
+    texts = []
+    for size in range(4500, len(whole), 300):
+        (tmp_path / "c.db").write_bytes(whole[:size])
+        reports = Reports()
+        log = CanLog([tmp_path / "c.db"], decoder_of(tmp_path), report=reports)
+        while log.read(0.0) is not None:
+            pass
+        assert reports.counts["truncated file"] == 1, size
+        texts.append(reports.texts["truncated file"])
+    assert any(f"of {len(whole)} bytes are there" in text for text in texts), "SQLite saw nothing wrong itself"
+
+
 @pytest.mark.parametrize(
     ("name", "content", "expected"),
     [
