@@ -1,0 +1,126 @@
+"""A page server over a scripted engine and a stand-in for Viser, and a client that sends exactly what it is told."""
+
+import http
+import http.client
+import io
+import json
+import socket
+import threading
+from types import SimpleNamespace
+from urllib.parse import parse_qs, urlsplit
+
+from scripted import twin
+from websockets.datastructures import Headers
+from websockets.http11 import Response
+from websockets.sync.server import serve
+
+from app.viser_guard import HEADER
+
+SECRET = "the secret between the servers"
+PATIENCE = 20.0
+
+
+def shown_twin(**options):
+    """The scripted twin with the section that views read."""
+    made = twin(**options)
+    scene = SimpleNamespace(kind="belief", axes=None, position=None, heading=None)
+    made.config.view = SimpleNamespace(window=60.0, pairs=None, scene=scene)
+    return made
+
+
+class FakeViser:
+    """Answers a file request with what it saw of it, and echoes what comes over a WebSocket."""
+
+    def __init__(self):
+        self.requests = []
+        self.server = serve(
+            self.echo, "127.0.0.1", 0, process_request=self.process, subprotocols=["viser-test"], max_size=None
+        )
+        self.port = self.server.socket.getsockname()[1]
+        self.thread = threading.Thread(target=self.server.serve_forever, daemon=True)
+        self.thread.start()
+
+    def process(self, connection, request):
+        self.requests.append((request.path, request.headers.get_all(HEADER)))
+        if "upgrade" in request.headers:
+            return None
+        body = json.dumps({"path": request.path, "secret": request.headers.get_all(HEADER)}).encode()
+        headers = Headers({"Content-Type": "application/json", "Content-Length": str(len(body)), "Connection": "close"})
+        return Response(http.HTTPStatus.OK.value, "OK", headers, body)
+
+    def echo(self, connection):
+        for message in connection:
+            connection.send(message)
+
+    def stop(self):
+        self.server.shutdown()
+        self.thread.join()
+
+
+class _Received:
+    """What `http.client` reads an answer from, in place of a socket."""
+
+    def __init__(self, data):
+        self.data = data
+
+    def makefile(self, mode):
+        return io.BytesIO(self.data)
+
+
+class Answer:
+    """Status, headers and body of one answer."""
+
+    def __init__(self, data):
+        answer = http.client.HTTPResponse(_Received(data))
+        answer.begin()
+        self.status = answer.status
+        self.headers = {name.lower(): value for name, value in answer.getheaders()}
+        self.body = b"" if self.status == 101 else answer.read()
+
+    @property
+    def text(self):
+        return self.body.decode()
+
+
+class Client:
+    """Sends requests with the headers given, none of its own."""
+
+    def __init__(self, server):
+        self.port = server.port
+        self.host = f"127.0.0.1:{server.port}"
+        self.origin = f"http://{self.host}"
+        self.token = parse_qs(urlsplit(server.url).query)["token"][0]
+        self._cookie = None
+
+    @property
+    def cookie(self):
+        if self._cookie is None:
+            answer = self.raw("GET", f"/?token={self.token}", [("Host", self.host)])
+            self._cookie = answer.headers["set-cookie"].partition(";")[0]
+        return self._cookie
+
+    def raw(self, method, target, headers, body=b"", upgrade=False):
+        lines = [f"{method} {target} HTTP/1.1", *(f"{name}: {value}" for name, value in headers)]
+        if upgrade:
+            lines += ["Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13"]
+            lines += ["Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="]
+        else:
+            lines += ["Connection: close"]
+        if body:
+            lines += [f"Content-Length: {len(body)}"]
+        with socket.create_connection(("127.0.0.1", self.port), timeout=PATIENCE) as sock:
+            sock.sendall(("\r\n".join(lines) + "\r\n\r\n").encode("latin-1") + body)
+            data = b""
+            while piece := sock.recv(65536):
+                data += piece
+                if upgrade and b"\r\n\r\n" in data and data.startswith(b"HTTP/1.1 101"):
+                    break
+        return Answer(data)
+
+    def get(self, target, **more):
+        return self.raw("GET", target, [("Host", self.host), ("Cookie", self.cookie)], **more)
+
+    def post(self, target, body):
+        kind = ("Content-Type", "application/json")
+        headers = [("Host", self.host), ("Cookie", self.cookie), ("Origin", self.origin), kind]
+        return self.raw("POST", target, headers, json.dumps(body).encode() if not isinstance(body, bytes) else body)
