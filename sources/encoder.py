@@ -10,7 +10,7 @@ from typing import Any
 import can
 
 from estimators.errors import SourceError
-from estimators.log import INPUT, KIND_NAMES
+from estimators.log import INPUT, KIND_NAMES, READING
 
 from .databases import BusName, find_messages
 from .source import Channel
@@ -30,6 +30,7 @@ class _Frame:
         self.known: set[str] = set()
         self.wanted: set[str] = set()
         self.lost = False
+        self.reads = False
         self.sent_at: int | None = None
 
     def frame(self) -> can.Message:
@@ -61,8 +62,9 @@ def _range(signal: Any) -> tuple[float, float]:
 class Encoder:
     """Turns what a simulated asset says into frames.
 
-    A message goes out when one of its channels says something, with the last values of the others. If one of them
-    lost its reading, the frame is lost. Values that a signal cannot carry are held at its limit.
+    A message goes out when one of its channels says something, with the last values of the others; one that carries
+    readings only with a new reading, so that an old one is not taken for new. If a reading is lost, the frame is
+    lost. Values that a signal cannot carry are held at its limit.
 
     Raises:
         SourceError: If a message or signal is missing, a unit does not convert, or a channel cannot be read backwards.
@@ -83,6 +85,7 @@ class Encoder:
             if any(signal.multiplexer_ids for signal in message.signals):
                 raise SourceError(f"{path.name}: message {message.name} is multiplexed; it cannot be encoded")
             frame = self._frames.setdefault(message.name, _Frame(message))
+            frame.reads = frame.reads or channel.kind == READING
             rows = []
             for k, name in enumerate(channel.signals):
                 signal = message.get_signal_by_name(name)
@@ -107,7 +110,7 @@ class Encoder:
         frame, rows = route
         for (name, slope, shift, low, high), value in zip(rows, values, strict=False):
             if math.isnan(value):
-                frame.lost = True
+                frame.lost = frame.lost or kind != INPUT  # an input that is NaN stays as it was
             else:
                 frame.values[name] = min(max((value - shift) / slope, low), high)
                 frame.known.add(name)
@@ -124,10 +127,10 @@ class Encoder:
         touched: dict[int, _Frame] = {}
         for kind, index, values in events:
             frame = self.set(kind, index, values)
-            if frame is not None:
+            if frame is not None and (kind == READING or not frame.reads):
                 touched[id(frame)] = frame
         for (kind, _), (frame, _) in self._routes.items():
-            if kind == INPUT and (frame.sent_at is None or t - frame.sent_at >= repeat):
+            if kind == INPUT and not frame.reads and (frame.sent_at is None or t - frame.sent_at >= repeat):
                 touched[id(frame)] = frame
         out = []
         for frame in touched.values():

@@ -12,6 +12,7 @@ from estimators.log import INPUT, READING, TRUTH
 from estimators.model import Input, Noise, Row, Sensor, State, StateSpaceModel
 from sources.can_bus import CanBus
 from sources.decoder import Decoder
+from sources.encoder import Encoder
 from sources.player import Player
 from sources.profile import Steps
 from sources.simulator import SensorPlan, Simulator
@@ -194,3 +195,18 @@ def test_a_thread_beside_the_listener(tmp_path):
     player.close()
     source.close()
     assert got == 100 and not player._thread.is_alive()
+
+
+def test_an_old_reading_is_not_sent_again_with_an_input(tmp_path):
+    path = dbc(tmp_path, ASSET)
+    shared = (CHANNELS[0], Channel(INPUT, 0, "power", ("Flow",), "SENSE", units=("W",), model_units=("W",)))
+    encoder = Encoder([(path, None)], shared)
+    second = 1_000_000_000
+    assert len(encoder.frames(0, [(INPUT, 0, (1.0,)), (READING, 0, (5.0,))], second)) == 1
+    assert encoder.frames(second // 2, [(INPUT, 0, (2.0,))], second) == []
+    assert encoder.frames(5 * second, [], second) == []
+    assert encoder.frames(6 * second, [(READING, 0, (float("nan"),))], second) == []
+    (frame,) = encoder.frames(7 * second, [(INPUT, 0, (float("nan"),)), (READING, 0, (6.0,))], second)
+    decoder = Decoder([(path, None)], shared, width=1)
+    got = decoder.decode(decoder.gather([frame], None))
+    assert got.value[:, 0].tolist() == pytest.approx([2.0, 6.0]), "the input as it was last, and the new reading"
