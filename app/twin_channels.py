@@ -37,8 +37,6 @@ def channels(loaded: Loaded, section: Any, key: Key, model: StateSpaceModel) -> 
         for name, item in given.items():
             place = (*key, group, name)
             found.append((place, _channel(loaded, place, item, kind, list(known).index(name), name, known[name])))
-    if not section.sensors:
-        raise loaded.error(key, f"feeds no sensor; name at least one of {', '.join(rows_of)} under sensors")
     return found
 
 
@@ -52,8 +50,6 @@ def _channel(
     if len(names) != len(rows):
         row_names = ", ".join(row for row, _ in rows)
         raise loaded.error((*key, word), f"names {len(names)}; {name} takes {len(rows)}: {row_names}")
-    if item.convert is not None and kind != READING:
-        raise loaded.error((*key, "convert"), f"is {item.convert}; only a sensor can take it")
     return Channel(
         kind=kind,
         index=index,

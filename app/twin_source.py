@@ -20,7 +20,7 @@ from config.source_schema import (
 )
 from config.yaml_lines import Key, dotted
 from estimators.errors import NisusError, SourceError
-from estimators.log import Readings
+from estimators.log import READING, Readings
 from estimators.model import StateSpaceModel
 
 from .twin_channels import channels
@@ -146,6 +146,7 @@ class Plan:
                     time_unit=section.time.unit,
                     channels=channels,
                     width=self.model.width,
+                    report=report,
                 ),
             )
         from sources.can_log import CanLog
@@ -270,13 +271,16 @@ def plan_source(loaded: Loaded, model: StateSpaceModel, log_files: Sequence[Path
                 "can_log, table or merged"
             )
         _check_asset(loaded, section, key, model)
-    elif isinstance(section, MergedSection):
-        for k, part in enumerate(section.parts):
-            channels(loaded, part, (*key, "parts", k), model)
-    else:
-        channels(loaded, section, key, model)
-        if isinstance(section, CanSection) and section.asset is not None:
-            _check_asset(loaded, section.asset, (*key, "asset"), model)
+        return plan
+    parts: dict[Key, Any] = {key: section}
+    if isinstance(section, MergedSection):
+        parts = {(*key, "parts", k): part for k, part in enumerate(section.parts)}
+    found = [item for place, part in parts.items() for _, item in channels(loaded, part, place, model)]
+    if not any(item.kind == READING for item in found):
+        names = ", ".join(model.sensor_names)
+        raise loaded.error(key, f"feeds no sensor; name at least one of {names} under sensors")
+    if isinstance(section, CanSection) and section.asset is not None:
+        _check_asset(loaded, section.asset, (*key, "asset"), model)
     return plan
 
 

@@ -212,6 +212,13 @@ def test_merged_recordings_and_their_replacements() -> None:
     assert of(events(twin_of(merged, log_files=["new.log"])), READING).t.tolist() == [5_000_000_000]
     Path("new.csv").write_text(CSV)
     assert len(of(events(twin_of(merged, log_files=["new.log", "new.csv"])), READING)) == 3
+    truth_only = part(TABLE).replace("sensors:\n        winding: {columns: temp_f, units: degF}\n      ", "")
+    assert "sensors" not in truth_only
+    log_and_truth = merged.replace(part(TABLE), truth_only)
+    assert len(of(events(twin_of(log_and_truth)), TRUTH)) == 3
+    assert message(merged[: merged.index("    - ")] + truth_only, ConfigError).startswith(
+        "motor.yaml:2: source feeds no"
+    )
     two = merged + part(TABLE).replace("a*.csv", "b*.csv")
     Path("b1.csv").write_text(CSV)
     assert message(two, SourceError, log_files=["new.csv"]) == (
@@ -296,3 +303,39 @@ def test_a_truth_of_another_model_must_fit() -> None:
         "motor.yaml:6: source.truth.model has states winding, tooth, yoke, magnet; they must be temperature, rate"
     )
     assert len(events(twin_of(text.replace("./other.py:Other", "motor_winding")))) == 7
+
+
+CAR = """\
+model: road_car
+source:
+  type: table
+  files: car.csv
+  time: {column: t}
+  sensors:
+    gnss_position: {columns: [lat, lon], convert: east_north, origin: [55.0, 12.0]}
+    gnss_heading: {columns: compass, units: deg, scale: -1, offset: 1.5}
+"""
+
+
+def test_scale_offset_and_origin_reach_the_source() -> None:
+    Path("car.csv").write_text("t,lat,lon,compass\n0,55.0,12.0,90\n1,55.001,12.0,0\n")
+    batch = of(events(twin_of(CAR)), READING)
+    twin = twin_of(CAR)
+    position = batch.select(batch.channel == twin.model.sensor_names.index("gnss_position"))
+    # One thousandth of a degree of latitude at 55° is 111.34 m on the WGS84 ellipsoid.
+    np.testing.assert_allclose(position.value[:, :2], [[0.0, 0.0], [0.0, 111.34]], atol=0.02)
+    heading = batch.select(batch.channel == twin.model.sensor_names.index("gnss_heading"))
+    np.testing.assert_allclose(heading.value[:, 0], [1.5 - np.pi / 2, 1.5], atol=1e-9)
+    moved = of(events(twin_of(CAR.replace("[55.0, 12.0]", "[55.001, 12.0]"))), READING)
+    np.testing.assert_allclose(moved.value[0, :2], [0.0, -111.34], atol=0.02)
+
+
+def test_conversions_that_make_no_sense_are_one_line() -> None:
+    inputs = CAR + "  inputs:\n    accel: {columns: a, convert: east_north}\n"
+    assert message(inputs, ConfigError) == (
+        "motor.yaml:10: source.inputs.accel.convert is east_north; it needs two values, latitude and longitude, and 1 are named"
+    )
+    inputs = CAR + "  inputs:\n    accel: {columns: [a, b], convert: east_north}\n"
+    assert message(inputs, ConfigError) == "motor.yaml:10: source.inputs.accel.columns names 2; accel takes 1: accel"
+    nothing = CAR[: CAR.index("  sensors")]
+    assert message(nothing, ConfigError).startswith("motor.yaml:2: source feeds no sensor; name at least one of ")
