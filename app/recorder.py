@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from estimators.errors import NisusError
 
 from .pull import Pull
 from .recording import RecordingFile
+from .rerun_rows import RerunRows
 
 if TYPE_CHECKING:
     from estimators.log import Log
@@ -126,7 +128,7 @@ def write_recording(path: Path, twin: Twin, log: Log, track: Track) -> None:
         SourceError: If the file cannot be written.
     """
     file = RecordingFile(path, name=twin.name, text=twin.text, twin_path=twin.path, base=None)
-    drawing = RerunRows(file.stream, twin)
+    drawing = RerunRows(file.stream, SimpleNamespace(model=twin.model, pairs=twin.pairs, twin=twin), series=None)
     file.tuning(twin.tuning, twin.estimator, 0, 0)
     for start in range(0, log.n, ROWS):
         rows = slice(start, min(log.n, start + ROWS))

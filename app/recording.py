@@ -254,5 +254,3 @@ def _numbered(name: str, columns: dict[str, np.ndarray]) -> Iterator[np.ndarray]
     while f"{name}_{k}" in columns:
         yield columns[f"{name}_{k}"]
         k += 1
-
-

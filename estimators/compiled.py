@@ -256,4 +256,3 @@ def _check_derivatives(compiled: CompiledModel) -> None:
 
 def _python(function: Any) -> Callable:
     return getattr(function, "py_func", function)
-

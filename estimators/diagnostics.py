@@ -39,7 +39,7 @@ class Bounds(NamedTuple):
     alarm: Any
 
 
-bounds_type = types.NamedTuple((F1, F1, F1), Bounds)
+bounds_type = types.NamedUniTuple(F1, len(Bounds._fields), Bounds)
 policy_type = types.NamedTuple((i64, f64, f64, f64, f64), HealthPolicy)
 
 

@@ -58,7 +58,7 @@ class Code(NamedTuple):
     describe: Any
 
 
-code_type = types.NamedTuple((i64, i64, i64, i64), Code)
+code_type = types.NamedUniTuple(i64, len(Code._fields), Code)
 
 
 @dataclass(frozen=True)

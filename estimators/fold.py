@@ -125,9 +125,7 @@ def _begin(code, context, mean, cov, state):
 
 I4 = types.int32[::1]
 begin_signature = types.void(code_type, context_type, F1, F2, F1)
-run_signature = types.void(
-    code_type, context_type, i64, i64, i64, I1, B1, I4, F2, I1, F1, F1, F1, F1, F1, track_type
-)
+run_signature = types.void(code_type, context_type, i64, i64, i64, I1, B1, I4, F2, I1, F1, F1, F1, F1, F1, track_type)
 
 
 class Fold:
