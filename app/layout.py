@@ -51,9 +51,7 @@ def observed(model: StateSpaceModel) -> list[Observed]:
             slopes[:, j] = (there - here) / step[j]
         for r, row in enumerate(sensor.rows):
             likely = [
-                j
-                for j, state in enumerate(model.states)
-                if state.unit == row.unit and abs(slopes[r, j] - 1.0) < 0.05
+                j for j, state in enumerate(model.states) if state.unit == row.unit and abs(slopes[r, j] - 1.0) < 0.05
             ]
             likely.sort(key=lambda j: model.state_names[j] not in (row.name, sensor.name))
             if likely:
@@ -78,8 +76,8 @@ def pair_name(model: StateSpaceModel, pair: Any) -> str:
 
 
 def nis_limit(model: StateSpaceModel) -> float:
-    """Where the NIS chart ends: what one reading in ten thousand exceeds. A spike must not flatten the rest."""
-    return float(chi2.ppf(0.9999, max(len(sensor.rows) for sensor in model.sensors)))
+    """Where the NIS chart ends: what one good reading in a hundred exceeds. A spike must not flatten the rest."""
+    return float(chi2.ppf(0.99, max(len(sensor.rows) for sensor in model.sensors)))
 
 
 def blueprint(model: StateSpaceModel, pairs: np.ndarray, *, window: float, root: str = "") -> rrb.Blueprint:
@@ -122,7 +120,8 @@ def blueprint(model: StateSpaceModel, pairs: np.ndarray, *, window: float, root:
         axis_y=rrb.ScalarAxis(range=(0.0, nis_limit(model)), zoom_lock=True),
     )
     health = rrb.StateTimelineView(origin=f"{root}/health", name="health", time_view=axis)
-    events = rrb.TextLogView(origin=f"{root}/events", name="events")
+    columns = rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["LogLevel", "Body"])
+    events = rrb.TextLogView(origin=f"{root}/events", name="events", columns=columns)
     ellipses = [
         rrb.Spatial2DView(
             origin=f"{root}/pair/{pair_name(model, pair)}",

@@ -62,6 +62,12 @@ def strips(lines: list[np.ndarray]) -> pa.Array:
     return pa.ListArray.from_arrays(pa.array(ends), points, type=_STRIP)
 
 
+def _lines(lines: list[np.ndarray], color: tuple[int, int, int], width: float) -> rr.ComponentColumnList:
+    # A negative radius is in pixels.
+    radii = np.full(len(lines), -width, np.float32)
+    return rr.LineStrips2D.columns(strips=strips(lines), colors=[color] * len(lines), radii=radii)
+
+
 def axis_scales(model: StateSpaceModel, pair: np.ndarray) -> np.ndarray:
     """Units that one length of the picture stands for: the states' own if they agree, else the priors' widths.
 
@@ -114,7 +120,7 @@ class PairDrawing:
         stream.send_columns(
             f"{self._path}/ellipse",
             indexes=at,
-            columns=rr.LineStrips2D.columns(strips=strips(list(points)), colors=[ESTIMATE] * t.size).partition(count),
+            columns=_lines(list(points), ESTIMATE, 1.0).partition(count),
         )
         stream.send_columns(
             f"{self._path}/mean",
@@ -128,14 +134,14 @@ class PairDrawing:
         stream.send_columns(
             f"{self._path}/way",
             indexes=at,
-            columns=rr.LineStrips2D.columns(strips=strips(way), colors=[PREVIOUS] * t.size).partition(count),
+            columns=_lines(way, PREVIOUS, 0.5).partition(count),
         )
 
     def _labels(self, track: Track) -> list[str]:
         units = [self._model.states[j].unit.replace("1", "") for j in self._pair]
         means, stds = track.mean[:, self._pair], track.std[:, self._pair]
         return [
-            f"{m[0]:.4g} ± {s[0]:.2g} {units[0]}, {m[1]:.4g} ± {s[1]:.2g} {units[1]}"
+            f"{m[0]:.4g} ± {s[0]:.2g} {units[0]}\n{m[1]:.4g} ± {s[1]:.2g} {units[1]}"
             for m, s in zip(means, stds, strict=True)
         ]
 

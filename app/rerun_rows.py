@@ -243,4 +243,3 @@ class RerunRows:
 
     def _not_drawn(self, readings: Readings) -> np.ndarray:
         return ~np.isin(self._keys(readings), self._drawn)
-

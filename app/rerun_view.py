@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import uuid
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -22,9 +23,11 @@ import rerun as rr
 from estimators.log import Readings
 from estimators.track import Track
 
+from .notices import KEPT
 from .rerun_rows import RerunRows
 
 if TYPE_CHECKING:
+    from .notices import Notice
     from .pull import Pull
 
 ROWS = 20_000
@@ -35,6 +38,9 @@ SERIES = 3000
 
 AHEAD = 1.5
 """Windows of the charts that a new revision sends first, so that they are drawn before the rest of a long history."""
+
+FRAMES = "frame"
+"""A timeline that only counts the messages, so that the page sees how far the viewer has got with them."""
 
 Message = str | bytes
 
@@ -52,6 +58,8 @@ class RerunFeed:
         self._engine = engine
         self._cursor = engine.cursor()
         self._layout = layout
+        self._frame = 0
+        self._notices: deque[Notice] = deque(maxlen=KEPT)
         self._name = uuid.uuid4().hex[:8]
         self.application = f"nisus_{engine.twin.name}"
         self._stream: rr.RecordingStream | None = None
@@ -62,13 +70,15 @@ class RerunFeed:
     def next(self) -> list[Message]:
         """The next messages, none if nothing has happened: bytes for Rerun, or a line of JSON for the page.
 
-        `{"recording": id}` announces that the bytes which follow belong to another recording.
+        `{"recording": id}` announces that the bytes which follow belong to another recording. The k-th bytes of a
+        recording end with row k of the timeline `FRAMES`.
         """
         if self._later is not None:
             later, self._later = self._later, None
             later()
             return self._read()
         pull = self._engine.pull(self._cursor, ROWS)
+        self._notices.extend(pull.notices)
         if pull.fresh:
             return self._begin(self._whole(pull))
         if self._rows is None or not (len(pull.readings) or pull.notices):
@@ -87,6 +97,7 @@ class RerunFeed:
         parts = [pull]
         while len(parts[-1].readings) == ROWS:
             more = self._engine.pull(self._cursor, ROWS)
+            self._notices.extend(more.notices)
             # Another revision may begin meanwhile, or a late reading rewrite rows: those are the ones that hold.
             parts = [more] if more.fresh else [*parts, more]
         if len(parts) == 1:
@@ -106,7 +117,6 @@ class RerunFeed:
             first=parts[0].first,
             readings=Readings(*(np.concatenate(column) for column in zip(*readings, strict=True))),
             track=Track(*(np.concatenate(column) for column in zip(*tracks, strict=True))),
-            notices=[notice for part in parts for notice in part.notices],
         )
 
     def _begin(self, pull: Pull) -> list[Message]:
@@ -118,6 +128,7 @@ class RerunFeed:
         self._bytes = self._stream.binary_stream()
         rows = self._rows = RerunRows(self._stream, self._engine, series=SERIES, layout=self._layout)
         self._layout = False
+        self._frame = 0
         announcement = json.dumps({"recording": f"Recording:{self.application}:{name}", "revision": pull.revision})
         t = pull.readings.t
         cut = int(np.searchsorted(t, t[-1] - int(AHEAD * rows.window * 1e9))) if t.size and pull.revision else 0
@@ -135,12 +146,20 @@ class RerunFeed:
         if t.size:
             rows.begin(pull)
             draw(slice(cut, None), slice(grey_cut, None), past=False)
-        rows.notices(pull.notices)
+        # The engine gives a line once; the viewer forgets it with the recording that it closes.
+        rows.notices(list(self._notices))
         if cut:
             self._later = lambda: draw(slice(0, cut), slice(known, grey_cut), past=True)
         return [announcement, *self._read()]
 
     def _read(self) -> list[Message]:
+        assert self._stream is not None
+        self._frame += 1
+        self._stream.send_columns(
+            "/frame",
+            indexes=[rr.TimeColumn(FRAMES, sequence=[self._frame])],
+            columns=rr.AnyValues.columns(count=[self._frame]),
+        )
         data = self._bytes.read()
         return [data] if data else []
 

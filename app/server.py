@@ -33,7 +33,7 @@ from .server_gate import Gate, user_token
 from .server_proxy import ViserProxy
 from .viewer_assets import FILES, viewer_assets, viewer_version
 
-PERIOD = 0.1
+PERIOD = 0.2
 """Seconds between two frames that one Rerun viewer is fed, at least."""
 
 STATUS_PERIOD = 0.5
@@ -156,8 +156,8 @@ class PageServer:
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             return PlainTextResponse("Nisus: Content-Type must be application/json.\n", 415)
         try:
-            command = command_from_json(await request.json())
-        except (ConfigError, json.JSONDecodeError, UnicodeDecodeError) as error:
+            command = command_from_json(await request.json(), self._engine)
+        except (NisusError, ValueError) as error:
             return JSONResponse({"error": str(error)}, 400)
         self._engine.submit(command)
         return JSONResponse({"submitted": type(command).__name__}, 202)

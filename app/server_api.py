@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from estimators.errors import ConfigError
+from estimators.registry import find_estimator
 from estimators.track import HEALTH_NAMES
 
 from . import commands
@@ -51,11 +52,12 @@ def _plain(value: Any) -> Any:
     return number if math.isfinite(number) else str(number) if math.isinf(number) else None
 
 
-def command_from_json(body: Any) -> Any:
+def command_from_json(body: Any, engine: Any) -> commands.Command:
     """The command that `{"command": NAME, field: value, ...}` stands for; infinity is written "inf".
 
     Raises:
-        ConfigError: If there is no such command, or a field is missing, unknown or of another kind.
+        NisusError: If there is no such command, a field is missing, unknown or of another kind, or the engine would
+            refuse it: better said to who asked than shown later as an event.
     """
     known = {kind.__name__: kind for kind in typing.get_args(commands.Command)}
     if not isinstance(body, dict) or body.get("command") not in known:
@@ -68,7 +70,38 @@ def command_from_json(body: Any) -> Any:
     if sorted(given) != sorted(names):
         has, takes = (", ".join(part) or "no field" for part in (given, names))
         raise ConfigError(f"{kind.__name__}: has {has}; it takes {takes}")
-    return kind(**{name: _converted(kind.__name__, name, given[name], hints[name]) for name in names})
+    command = kind(**{name: _converted(kind.__name__, name, given[name], hints[name]) for name in names})
+    _check(command, engine)
+    return command
+
+
+def _check(command: commands.Command, engine: Any) -> None:
+    if isinstance(command, commands.SetEstimator):
+        find_estimator(command.name, engine.model)
+    elif isinstance(command, commands.SetTuning):
+        engine.tuning.set(command.key, command.value)
+    elif isinstance(command, commands.UseSensor):
+        engine.tuning.set(f"use.{command.name}", command.used)
+    elif isinstance(command, commands.SetOption):
+        estimator = find_estimator(engine.estimator, engine.model)
+        estimator.complete({**engine.tuning.options, command.name: float(command.value)})
+    elif isinstance(command, commands.Speed) and not command.factor > 0:
+        raise ConfigError(f'Speed: factor is {command.factor:g}; it must be positive, or "inf"')
+    elif isinstance(command, commands.Record) and engine.recorder is None:
+        raise ConfigError("Record: this session cannot record")
+    if isinstance(command, (commands.Pause, commands.Speed, commands.Step, commands.Seek)):
+        if not engine.status().seekable:
+            raise ConfigError("a live source cannot be paused, stepped or sought; only a replay or a simulation can")
+
+
+def _recording(where: str, name: str) -> Path:
+    # A bare name: a browser says what the file is called, not where on the disk it goes, nor what it replaces.
+    path = Path(name)
+    if path.suffix != ".rrd" or name != path.name or "\\" in name or name.startswith("."):
+        raise ConfigError(f"{where}; it must be a file name that ends in .rrd, without folders")
+    if path.exists():
+        raise ConfigError(f"{where}, which is there already; choose another name")
+    return path
 
 
 def _converted(command: str, name: str, value: Any, hint: Any) -> Any:
@@ -79,11 +112,10 @@ def _converted(command: str, name: str, value: Any, hint: Any) -> Any:
         if kind in (bool, str) and isinstance(value, kind):
             return value
         if kind is float and not isinstance(value, bool) and (isinstance(value, (int, float)) or value == "inf"):
-            return float(value)
+            if not math.isnan(float(value)):
+                return float(value)
         if kind is Path and isinstance(value, str):
-            if Path(value).suffix != ".rrd":
-                raise ConfigError(f"{command}: {name} is {value!r}; it must end in .rrd")
-            return Path(value)
+            return _recording(f"{command}: {name} is {value!r}", value)
     wanted = " or ".join({"float": "a number", "bool": "true or false", "NoneType": "null", "str": "a text",
                           "Path": "a path"}[kind.__name__] for kind in allowed)  # fmt: skip
     raise ConfigError(f"{command}: {name} is {value!r}; it must be {wanted}")

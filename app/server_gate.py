@@ -74,7 +74,7 @@ class Gate:
         given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [])
         shows_token = len(given) == 1 and hmac.compare_digest(given[0].encode(), self._token)
         exchange = shows_token and scope["type"] == "http" and scope["path"] == "/" and scope["method"] == "GET"
-        if not self._from_here(headers, host, exchange):
+        if not self._from_here(headers, host, scope["type"] == "websocket", exchange):
             await _refuse(scope, receive, send, REFUSED_ORIGIN)
         elif exchange:
             await self._exchange(headers, send)
@@ -83,9 +83,10 @@ class Gate:
         else:
             await _refuse(scope, receive, send, REFUSED_TOKEN)
 
-    def _from_here(self, headers: _Headers, host: str, exchange: bool) -> bool:
+    def _from_here(self, headers: _Headers, host: str, upgrade: bool, exchange: bool) -> bool:
         origins = headers.all("origin")
-        if origins:
+        if origins or upgrade:
+            # A browser always names the origin of a WebSocket.
             return origins == [f"http://{host}"]
         # Without Origin: a navigation, a request of the page itself, or no browser. Browsers say which it is.
         site = headers.one("sec-fetch-site") or "none"

@@ -62,9 +62,7 @@ def viewer_assets(progress: Callable[[str], None] = lambda line: None) -> Path:
                 part.replace(folder / f"{name}.gz")
     except OSError as error:
         reason = error.strerror or str(error)
-        raise ConfigError(
-            f"{folder}: {reason}; set XDG_CACHE_HOME to a folder that can be written"
-        ) from None
+        raise ConfigError(f"{folder}: {reason}; set XDG_CACHE_HOME to a folder that can be written") from None
     return folder
 
 

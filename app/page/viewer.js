@@ -1,9 +1,9 @@
 // Rerun's web viewer in a canvas of this page. It has no connection of its own: what it shows is handed to it.
 
-import { closeRecordings, readState, setTimeCursor } from "./wire.js";
+import { FOLLOWING, closeRecordings, readState, setTimeCursor } from "./wire.js";
 
-const SCRUBBED = 2_000_000_000n; // ns before the end, from which on the user has chosen the time and we keep it
 const CHANNEL = "nisus";
+const PATIENCE = 30000; // ms until bytes must have been taken in
 
 const frame = () => new Promise((resolve) => requestAnimationFrame(resolve));
 const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
@@ -47,7 +47,9 @@ export class Viewer {
   }
 
   constructor() {
-    this.announced = null;
+    this.id = null;
+    this.frames = 0n;
+    this.announced = false;
     this.kept = null;
   }
 
@@ -63,34 +65,42 @@ export class Viewer {
   announce(id) {
     const { active, recordings } = this.state();
     const shown = recordings.find((recording) => recording.id === active);
-    const scrubbed = shown && shown.time !== null && shown.end !== null && shown.end - shown.time > SCRUBBED;
-    if (scrubbed) this.kept = shown;
-    this.announced = id;
+    // Once only: a revision that is overtaken by the next has no place of its own yet.
+    if (!this.announced && shown && shown.time !== null && shown.play !== FOLLOWING) this.kept = shown;
+    this.id = id;
+    this.frames = 0n;
+    this.announced = true;
   }
 
   // Hand bytes over and wait until the viewer has drawn them. Resolves to the milliseconds that took.
   async feed(bytes) {
     const begun = performance.now();
+    const { id } = this;
+    this.frames += 1n;
     this.handle.send_rrd_to_channel(CHANNEL, bytes);
+    // The viewer takes in only so much between two frames.
+    while (performance.now() - begun < PATIENCE) {
+      await frame();
+      if (this.broken) throw new Error(this.broken);
+      const { active, recordings } = this.state();
+      const taken = recordings.find((recording) => recording.id === id)?.ends.frame ?? 0n;
+      if (taken < this.frames) continue;
+      if (!this.announced) break;
+      if (active === id) {
+        await this.arrive(recordings);
+        break;
+      }
+    }
     await frame();
-    await frame();
-    if (this.announced !== null) await this.swap();
     return performance.now() - begun;
   }
 
-  async swap() {
-    const id = this.announced;
-    for (let turn = 0; turn < 100; turn++) {
-      if (this.announced !== id) return;
-      if (this.state().active === id) break;
-      await pause(20);
-    }
-    this.announced = null;
-    const { active, recordings } = this.state();
-    if (active !== id) return;
-    const kept = this.kept;
+  // The announced recording is shown: go to where the user was, and close those before.
+  async arrive(recordings) {
+    this.announced = false;
+    const { id, kept } = this;
     this.kept = null;
-    if (kept?.timeline) await this.control(setTimeCursor(id, kept.timeline, kept.time));
+    if (kept?.timeline) await this.control(setTimeCursor(id, kept.timeline, kept.time, kept.play));
     const old = recordings.map((recording) => recording.id).filter((other) => other !== id);
     if (old.length) await this.control(closeRecordings(old));
   }

@@ -51,19 +51,24 @@ function fields(bytes) {
 
 const string = (bytes) => (bytes ? words.decode(bytes) : null);
 
-// {active, recordings: [{id, timeline, time, end}]}; time and end are bigints or null.
+export const PAUSED = 1n; // play states; FOLLOWING keeps to the newest row
+export const FOLLOWING = 3n;
+
+// {active, recordings: [{id, timeline, time, play, ends: {timeline: last time}}]}; times are bigints or null.
 export function readState(bytes) {
   const state = fields(bytes);
   const recordings = (state[3] ?? []).map((entry) => {
     const recording = fields(entry);
     const cursor = recording[3] ? fields(recording[3][0]) : {};
     const timeline = cursor[1] ? string(fields(cursor[1][0])[1]?.[0]) : null;
-    let end = null;
+    const ends = {};
     for (const item of recording[2] ?? []) {
       const known = fields(item);
-      if (known[3] && string(fields(known[1][0])[1]?.[0]) === timeline) end = fields(known[3][0])[2]?.[0] ?? 0n;
+      const name = string(fields(known[1][0])[1]?.[0]);
+      if (known[3]) ends[name] = fields(known[3][0])[2]?.[0] ?? 0n;
     }
-    return { id: string(recording[1]?.[0]), timeline, time: cursor[3] ? (fields(cursor[3][0])[1]?.[0] ?? 0n) : null, end };
+    const time = cursor[3] ? (fields(cursor[3][0])[1]?.[0] ?? 0n) : null;
+    return { id: string(recording[1]?.[0]), timeline, time, play: recording[5]?.[0] ?? null, ends };
   });
   return { active: string(state[2]?.[0]), recordings };
 }
@@ -73,7 +78,7 @@ export function closeRecordings(ids) {
   return new Uint8Array(field(1, field(1 + 2, list)));
 }
 
-export function setTimeCursor(id, timeline, time) {
-  const request = [...field(1, id), ...field(2, field(1, timeline)), ...field(3, field(1, time))];
+export function setTimeCursor(id, timeline, time, play) {
+  const request = [...field(1, id), ...field(2, field(1, timeline)), ...field(3, field(1, time)), ...field(5, play)];
   return new Uint8Array(field(6, request));
 }
