@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
-from scipy.stats import chi2
 
 from .jit import F1, I1, f64, i64, jit
+from .quantiles import chi_square_quantile
 from .track import DEGRADED, DIVERGED, GATED, STALE, TRACKING, USED, track_type
 
 PROBABILITY = 0.95
@@ -46,9 +46,9 @@ policy_type = types.NamedTuple((i64, f64, f64, f64, f64), HealthPolicy)
 def chi_square_bounds(most: int) -> Bounds:
     """Quantiles for 0 to `most` degrees of freedom."""
     dof = np.arange(most + 1)
-    dof[0] = 1  # of no use, but chi2 has no quantile for 0
+    dof[0] = 1  # of no use, but chi-square has no quantile for 0
     tail = (1.0 - PROBABILITY) / 2.0
-    return Bounds(chi2.ppf(tail, dof), chi2.ppf(1.0 - tail, dof), chi2.ppf(0.999, dof))
+    return Bounds(chi_square_quantile(tail, dof), chi_square_quantile(1.0 - tail, dof), chi_square_quantile(0.999, dof))
 
 
 def nis_bounds(dof: int, readings: int) -> tuple[float, float]:
@@ -57,7 +57,7 @@ def nis_bounds(dof: int, readings: int) -> tuple[float, float]:
     Source: Bar-Shalom, Li & Kirubarajan (2001), 5.4.2, equation 5.4.2-18.
     """
     tail = (1.0 - PROBABILITY) / 2.0
-    return float(chi2.ppf(tail, dof) / readings), float(chi2.ppf(1.0 - tail, dof) / readings)
+    return float(chi_square_quantile(tail, dof) / readings), float(chi_square_quantile(1.0 - tail, dof) / readings)
 
 
 @jit

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from numba import types
-from scipy.stats import chi2
 
 from .compiled import compile_model
 from .context import Context, context_type
@@ -22,6 +21,7 @@ from .filter import Code, Estimator, call_describe, call_predict, call_start, ca
 from .jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, jit, matrix
 from .log import INPUT, READING, RESET, Log
 from .model import StateSpaceModel
+from .quantiles import chi_square_quantile
 from .registry import find_estimator
 from .track import MISSING, NONE, Track, track_type
 from .tuning import Tuning
@@ -189,7 +189,7 @@ class Fold:
         model, tuning = self.model, self.tuning
         gate = np.full(model.width + 1, np.inf)
         if tuning.gate is not None:
-            gate[1:] = chi2.ppf(tuning.gate, np.arange(1, model.width + 1))
+            gate[1:] = chi_square_quantile(tuning.gate, np.arange(1, model.width + 1))
         held = {
             "p": np.ascontiguousarray(tuning.p, float),
             "q": np.ascontiguousarray(tuning.q, float),

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import norm
 
 from .diagnostics import PROBABILITY, nis_bounds
 from .log import READING, TRUTH, Readings
 from .model import StateSpaceModel
+from .quantiles import normal_quantile
 from .track import GATED, HELD_OUT, MISSING, USED, VERDICT_NAMES, Track
 
 
@@ -85,5 +85,5 @@ def _held_out(track: Track, events: Readings, model: StateSpaceModel) -> dict[st
 
 
 def _fit(error: np.ndarray, std: np.ndarray) -> Fit:
-    half = norm.ppf(0.5 + PROBABILITY / 2.0)
+    half = normal_quantile(0.5 + PROBABILITY / 2.0)
     return Fit(float(np.sqrt(np.mean(error**2))), float(np.mean(np.abs(error) <= half * std)))
