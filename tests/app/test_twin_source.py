@@ -246,6 +246,8 @@ source:
     assert np.isnan(readings.value[readings.channel == 1, 0]).sum() == 2
     i_q = inputs.value[:, 1]
     assert i_q[inputs.t < 2_000_000_000][0] == 10.0 and np.nanmax(i_q) == 15.0
+    ambient = inputs.value[:, 4]  # 20 + sin(2π t / 4 s) at every half second
+    np.testing.assert_allclose([np.nanmin(ambient), np.nanmax(ambient)], [19.0, 21.0], atol=1e-9)
     truth = of(batch, TRUTH)
     winding = readings.select(readings.channel == 0)
     exact = truth.select((truth.channel == 0) & np.isin(truth.t, winding.t))
