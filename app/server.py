@@ -126,6 +126,7 @@ class PageServer:
         routes: list[Any] = [
             Route("/", self._page),
             Route("/api/status", self._status),
+            Route("/api/recordings", self._list_recordings),
             Route("/api/command", self._command, methods=["POST"]),
             Route(f"/viewer/{viewer_version()}/{{name}}", self._viewer_file),
             Route("/rec/{name}", self._recording),
@@ -151,6 +152,10 @@ class PageServer:
     async def _status(self, request: Request) -> Response:
         status = status_json(self._engine)
         return JSONResponse({**status, "recordings": sorted(self._recordings())})
+
+    async def _list_recordings(self, request: Request) -> Response:
+        found = {name: path for name, path in self._recordings().items() if path.is_file()}
+        return JSONResponse([{"name": name, "bytes": path.stat().st_size} for name, path in sorted(found.items())])
 
     async def _command(self, request: Request) -> Response:
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":

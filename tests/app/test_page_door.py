@@ -176,6 +176,7 @@ def test_nothing_else_of_the_disk_is_served(page, target):
 def test_the_reviewed_recording_is_served(page):
     assert page.client.get("/rec/reviewed.rrd").body == b"RRF2 and so on"
     assert "reviewed.rrd" in json.loads(page.client.get("/api/status").text)["recordings"]
+    assert json.loads(page.client.get("/api/recordings").text) == [{"name": "reviewed.rrd", "bytes": 14}]
 
 
 def test_every_answer_forbids_to_leave_the_machine(page):
