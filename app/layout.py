@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from scipy.stats import chi2
 
 from estimators.model import StateSpaceModel
+from estimators.quantiles import chi_square_quantile
 
 ESTIMATE = (37, 99, 235)
 BAND = (147, 187, 253)
@@ -77,7 +77,7 @@ def pair_name(model: StateSpaceModel, pair: Any) -> str:
 
 def nis_limit(model: StateSpaceModel) -> float:
     """Where the NIS chart ends: what one good reading in a hundred exceeds. A spike must not flatten the rest."""
-    return float(chi2.ppf(0.99, max(len(sensor.rows) for sensor in model.sensors)))
+    return float(chi_square_quantile(0.99, max(len(sensor.rows) for sensor in model.sensors)))
 
 
 def blueprint(model: StateSpaceModel, pairs: np.ndarray, *, window: float, root: str = "") -> rrb.Blueprint:
