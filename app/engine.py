@@ -317,7 +317,9 @@ class Engine:
             now: int | None = self._newest_at_heard + int(silent * 1e9)
         else:
             now = None if getattr(source, "paused", False) else source.now()
-        if now is None or now <= self._log.t[self._log.n - 1] + self._tick * 0.9e9:
+        # The longer the silence, the rarer the question: a night of it must not fill the log.
+        apart = max(self._tick, silent / 20)
+        if now is None or now <= self._log.t[self._log.n - 1] + apart * 0.9e9:
             return
         tick = Readings.one(now, time.time_ns(), TICK, 0, [], self.model.width)
         with self._lock:

@@ -107,7 +107,8 @@ def blueprint(model: StateSpaceModel, pairs: np.ndarray, *, window: float, root:
     for j, state in enumerate(model.states):
         rows = [model.row_names[model.row_start[d.sensor] + d.row] for d in dots if d.state == j]
         over = [f"/{kind}/{row}" for row in rows for kind in ("reading", "refused")]
-        contents = [f"/previous/state/{names[j]}", f"/state/{names[j]}", f"/truth/{names[j]}", *over]
+        # Drawn in this order: dots would hide the lines.
+        contents = [*over, f"/previous/state/{names[j]}", f"/state/{names[j]}", f"/truth/{names[j]}"]
         states.append(chart(with_unit(state.name, state.unit), contents))
     innovations = [
         chart(f"innovation: {row_title(model, k, r)}", [f"/innovation/{model.row_names[model.row_start[k] + r]}"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 SECONDS_APART = 1.0
@@ -52,8 +52,14 @@ class Notices:
         with self._lock:
             self._add(level, text)
 
-    def _add(self, level: str, text: str) -> None:
-        self._lines.append(Notice(self._next, self._now(), level, text))
+    def restore(self, lines: Iterable[tuple[int, str, str]]) -> None:
+        """Add lines (t, level, text) of an earlier run."""
+        with self._lock:
+            for t, level, text in lines:
+                self._add(level, text, t)
+
+    def _add(self, level: str, text: str, t: int | None = None) -> None:
+        self._lines.append(Notice(self._next, self._now() if t is None else t, level, text))
         self._next += 1
 
     def since(self, number: int) -> list[Notice]:

@@ -1,9 +1,10 @@
 """The recording: an .rrd file that Rerun opens, and that holds all it takes to fold again, to the bit.
 
 Beside what charts show, the file keeps under /nisus, as plain columns: `twin` (YAML, estimator, base), `tuning` (each
-one, with the event from which it held), `events` (the log) and `track` (float64). Rows carry their absolute index; a
-late reading makes a recorder write rows again from the index where it belongs, and another revision from the start.
-Reading therefore takes rows in the order of the file, and an index that is not new cuts off what lay behind it.
+one, with the event from which it held), `events` (the log), `track` (float64) and `notices` (lines for people). Rows
+carry their absolute index; a late reading makes a recorder write rows again from the index where it belongs, and
+another revision from the start. Reading therefore takes rows in the order of the file, and an index that is not new
+cuts off what lay behind it.
 """
 
 from __future__ import annotations
@@ -108,7 +109,17 @@ class RecordingFile:
         )
 
     def write(self, pull: Pull) -> None:
-        """Write rows of log and track."""
+        """Write rows of log and track, and the lines for people."""
+        if pull.notices:
+            self.stream.send_columns(
+                "/nisus/notices",
+                indexes=[rr.TimeColumn("notice", sequence=[line.number for line in pull.notices])],
+                columns=rr.AnyValues.columns(
+                    t=np.array([line.t for line in pull.notices], np.int64),
+                    level=[line.level for line in pull.notices],
+                    text=[line.text for line in pull.notices],
+                ),
+            )
         count = len(pull.readings)
         if not count:
             return
@@ -135,7 +146,7 @@ class RecordingFile:
 
 @dataclass(frozen=True)
 class Recorded:
-    """What a recording holds: twin, the last tuning, the log and the track as they were at the end."""
+    """What a recording holds: twin, the last tuning, log and track as they were at the end, lines (t, level, text)."""
 
     path: Path
     name: str
@@ -146,6 +157,7 @@ class Recorded:
     tunings: int
     readings: Readings
     track: Track
+    notices: list[tuple[int, str, str]]
     first: int
     rows: int
 
@@ -160,6 +172,7 @@ def read_recording(path: Path) -> Recorded:
         raise SourceError(f"{path}: there is no such recording; check the path")
     header: dict[str, Any] = {}
     tunings: list[str] = []
+    notices: list[tuple[int, str, str]] = []
     events: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
     tracks: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
     try:
@@ -174,6 +187,9 @@ def read_recording(path: Path) -> Recorded:
             names = {name: k for k, name in enumerate(batch.schema.names)}
             if chunk.entity_path == "/nisus/twin":
                 header = {name: _flat(batch.column(k))[0] for name, k in names.items() if not _control(name)}
+            elif chunk.entity_path == "/nisus/notices":
+                parts = (_flat(batch.column(names[name])).tolist() for name in ("t", "level", "text"))
+                notices += zip(*parts, strict=True)
             elif chunk.entity_path == "/nisus/tuning":
                 tunings += _flat(batch.column(names["json"])).tolist()
             else:
@@ -206,6 +222,7 @@ def read_recording(path: Path) -> Recorded:
         tunings=len(tunings),
         readings=readings.select(slice(0, rows)),
         track=track.select(slice(0, rows)),
+        notices=notices,
         first=first,
         rows=rows,
     )

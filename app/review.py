@@ -51,6 +51,7 @@ def open_review(path: Path, page: Page | None) -> tuple[Session, Recorded]:
         horizon=np.inf,
         review=path,
     )
+    session.engine.notices.restore(recorded.notices)
     session.engine.notices.say(f"{path.name}: {recorded.rows} rows, {recorded.tunings} tuning(s), folded again")
     return session, recorded
 

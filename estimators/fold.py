@@ -19,7 +19,7 @@ from .diagnostics import Bounds, HealthPolicy, assess, assess_signature, chi_squ
 from .errors import EstimatorError
 from .filter import Code, Estimator, call_describe, call_predict, call_start, call_update, code_type
 from .jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, jit, matrix
-from .log import INPUT, READING, RESET, Log
+from .log import INPUT, READING, RESET, TICK, TRUTH, Log
 from .model import StateSpaceModel
 from .quantiles import chi_square_quantile
 from .registry import find_estimator
@@ -28,6 +28,9 @@ from .tuning import Tuning
 
 UNSET = np.iinfo(np.int64).min
 """The clock before the first event, which sets it: the prior holds at that time."""
+
+LONGEST = 10_000
+"""Steps of the model's `max_step` that are predicted in one go; a clock that jumps must not keep the fold busy."""
 
 SNAPSHOT_EVERY = 64
 """Events between snapshots of the last `RECENT` events, where late readings fall."""
@@ -40,10 +43,17 @@ RECENT = 4096
 
 @jit
 def _advance_to(code, context, u, clock, t, index, state, work):
-    """Predict from the clock to time t, in steps no longer than the model allows."""
+    """Predict from the clock to time t, in steps no longer than the model allows.
+
+    After `LONGEST` of them the model alone says no more than the prior does, so the state is the prior again.
+    """
     if clock == UNSET or t <= clock:
         return
     dt = (t - clock) * 1e-9
+    if dt > LONGEST * context.max_step:
+        prior_cov = matrix(floats(context.prior_cov, context.nx * context.nx), 0, context.nx, context.nx)
+        call_start(code.start, context, floats(context.prior_mean, context.nx), prior_cov, state)
+        return
     steps = 1 if dt <= context.max_step else int(np.ceil(dt / context.max_step))
     for _ in range(steps):
         call_predict(code.predict, context, u, dt / steps, index, state, work)
@@ -108,9 +118,11 @@ def run(code, context, first, start, end, t, kind, channel, value, clock, u, sta
         else:
             if clock[0] == UNSET:
                 clock[0] = t[i]
-            for j in range(state.size):
-                spare[j] = state[j]
-            _advance_to(code, context, u, clock[0], t[i], index, spare, work)
+            # Several true states at one time are one query: `spare` still holds its answer.
+            if i == start or kind[i - 1] < TRUTH or kind[i - 1] > TICK or t[i] != t[i - 1]:
+                for j in range(state.size):
+                    spare[j] = state[j]
+                _advance_to(code, context, u, clock[0], t[i], index, spare, work)
             call_describe(code.describe, context, spare, mean[i], std[i], cross[i])
         track.nis[i] = score[0] if verdict != MISSING else np.nan
         track.dof[i] = int(score[1])

@@ -47,6 +47,10 @@ def cache_folder() -> Path:
 if "NUMBA_CACHE_DIR" not in os.environ:
     numba.config.CACHE_DIR = str(cache_folder())
 
+# Vectors of a few entries lose more to the set-up of a vectorised loop than they gain: without it the filters take 20
+# to 30 % less time at n = 2 to 4, and no more at n = 48.
+numba.config.LOOP_VECTORIZE = 0
+
 jit = partial(njit, cache=True, nogil=True, error_model="numpy")
 """Numba's njit as used here: cached, without the GIL, and with IEEE division (zero divisors give inf, no error)."""
 

@@ -88,6 +88,9 @@ def test_recording_holds_history_late_readings_and_retunes(running, tmp_path):
     np.testing.assert_array_equal(recorded.readings.value[:, 0], values)
     assert_same(recorded.track, seen.track)
     assert_same(refold(recorded), seen.track)
+    texts = [line.text for line in engine.notices.since(0)]
+    assert [text for _, _, text in recorded.notices] == texts[: len(recorded.notices)]
+    assert any("recording into" in text for _, _, text in recorded.notices)
     tuning, estimator = tuning_from_json(recorded.tuning, MODEL)
     assert estimator == "ukf"
     assert tuning.get("Q.rate") == 0.02

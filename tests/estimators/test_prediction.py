@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from estimators.fold import Fold, fold
-from estimators.log import READING, RESET, TICK, Log, Readings
+from estimators.fold import LONGEST, Fold, fold
+from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Log, Readings
 from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS
@@ -184,3 +184,34 @@ def test_a_reset_recovers_from_an_estimate_that_was_lost(estimator):
     assert not np.all(np.isfinite(lost.mean[:4])) or np.abs(lost.mean[:4]).max() > 1e200
     fresh = run(estimator, model(drift, states=2, q=1e300), (1, TICK, 0.0), *after[1:]).track
     np.testing.assert_array_equal(lost.mean[-3:], fresh.mean)
+
+
+def test_after_a_clock_jump_the_estimate_is_the_prior():
+    model = MODELS["motor_drive"]
+    log = Log(model.width)
+    log.extend(Readings.one(0, 0, READING, 0, 90.0, model.width))
+    just, beyond = int(model.max_step * LONGEST * 1e9), int(model.max_step * LONGEST * 1e9) + 10**9
+    log.extend(Readings.one(just, 0, TICK, 0, [], model.width))
+    log.extend(Readings.one(beyond, 0, TICK, 0, [], model.width))
+    log.extend(Readings.one(1_700_000_000 * 10**9, 0, INPUT, 0, [0, 0, 0, 40, 25], model.width))
+    track = fold("ekf", model, Tuning.of(model), log)
+    prior = np.array([state.mean for state in model.states])
+    assert np.all(np.abs(track.mean[1] - prior) > 1e-3)  # still predicted, towards its surroundings
+    np.testing.assert_array_equal(track.mean[2:], [prior, prior])
+    np.testing.assert_array_equal(track.std[3], [state.std for state in model.states])
+
+
+def test_several_truths_at_one_time_are_one_query():
+    model = MODELS["motor_drive"]
+    log = Log(model.width)
+    log.extend(Readings.one(0, 0, READING, 0, 90.0, model.width))
+    for kind, t in ((TRUTH, 5), (TRUTH, 5), (TICK, 5), (TRUTH, 9), (INPUT, 12), (TRUTH, 12), (TRUTH, 12)):
+        log.extend(Readings.one(t * 10**8, 0, kind, 0, 50.0, model.width))
+    whole = fold("ekf", model, Tuning.of(model), log)
+    alone = Fold("ekf", model, Tuning.of(model), log)
+    while alone.advance(1):
+        pass
+    np.testing.assert_array_equal(whole.mean, alone.track.mean)
+    np.testing.assert_array_equal(whole.std, alone.track.std)
+    np.testing.assert_array_equal(whole.mean[1], whole.mean[3])
+    assert np.any(whole.mean[3] != whole.mean[4])

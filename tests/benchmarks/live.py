@@ -1,0 +1,131 @@
+"""`python -m tests.benchmarks.live`: a thousand readings a second for a minute, with page, browser and recording.
+
+Prints losses, latency from arrival to track row, and memory; then moves a slider on what has come to be a long history.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+from app import commands
+from app.compile import prepare
+from app.recording import read_recording
+from app.run import live_source
+from app.session import Page, Session
+from app.twin import load_twin
+
+FLAGS = (
+    "--headless=new --no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-background-networking "
+    "--disable-component-update --disable-sync --no-first-run --disable-quic"
+).split()
+THERMAL = 3
+"""Readings in one frame."""
+
+
+def resident() -> float:
+    """Resident memory of this process, MB."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--no-browser", action="store_true")
+    given = parser.parse_args()
+    folder = Path(tempfile.mkdtemp())
+    twin = load_twin("motor_can", overrides={"source.asset.step": "0.003"})
+    prepare(twin)
+    session = Session(twin, live_source(twin, 1.0), page=Page(0, open_browser=False))
+    engine = session.engine
+    frames = {"sent": 0}
+    thermal = 0x100
+
+    def count(message: object) -> None:
+        frames["sent"] += getattr(message, "arbitration_id", None) == thermal
+
+    player = engine._feeder.source._player  # type: ignore[attr-defined]
+    thermal = next(
+        message.frame_id for message in _messages(twin.path.parent.parent / "dbc" / "motor_can.dbc", "THERMAL")
+    )
+    player.listeners.append(count)
+    session.start()
+    engine.submit(commands.Record(folder / "live.rrd"))
+    path = None if given.no_browser else shutil.which("chromium") or shutil.which("google-chrome")
+    playwright = browser = None
+    if path is not None:
+        from playwright.sync_api import sync_playwright
+
+        playwright = sync_playwright().start()
+        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        page = browser.new_page(viewport={"width": 1500, "height": 950})
+        page.goto(session.url)
+        while not page.evaluate("window.nisus?.drawn > 0"):
+            time.sleep(0.5)
+    cpu = os.times()
+    begun = time.monotonic()
+    seen = engine.status().counts["readings"]
+    print(f"{'s':>4} {'readings':>9} {'p50 ms':>7} {'p99 ms':>7} {'MB':>6}")
+    while (gone := time.monotonic() - begun) < given.seconds:
+        time.sleep(5.0)
+        status = engine.status()
+        print(
+            f"{gone + 5:4.0f} {status.counts['readings']:9d} {status.latency_p50_ms:7.2f} {status.latency_ms:7.2f} "
+            f"{resident():6.0f}",
+            flush=True,
+        )
+    used = os.times()
+    share = (used.user + used.system - cpu.user - cpu.system) / (time.monotonic() - begun)
+    rate = (engine.status().counts["readings"] - seen) / (time.monotonic() - begun)
+    print(f"{rate:.0f} readings/s, {100 * share:.0f} % of a core, load {os.getloadavg()[0]:.1f}")
+    if path is not None:
+        print(f"pictures drawn in the browser: {page.evaluate('window.nisus.drawn')}")
+
+    for value in (0.02, 0.03, 0.05):
+        events = engine.status().counts["readings"]
+        revision = engine.status().revision
+        begun = time.monotonic()
+        engine.submit(commands.SetTuning("Q.winding", value))
+        while engine.pull(cursor := engine.cursor(), 1).revision == revision:
+            engine.release(cursor)
+            time.sleep(0.002)
+        engine.release(cursor)
+        took = time.monotonic() - begun
+        print(f"slider on {events} readings: folded again in {took:.3f} s", end="")
+        if path is not None:
+            while page.evaluate("window.nisus.revision") == revision:
+                time.sleep(0.01)
+            arrived = time.monotonic() - begun
+            drawn = page.evaluate("window.nisus.drawn")
+            while page.evaluate("window.nisus.drawn") == drawn:
+                time.sleep(0.01)
+            print(f", in the browser after {arrived:.2f} s, drawn after {time.monotonic() - begun:.2f} s", end="")
+        print()
+
+    player.close()
+    time.sleep(1.0)
+    rows = engine.status().counts["readings"]
+    print(f"sent {frames['sent'] * THERMAL} readings, rows {rows}, lost {frames['sent'] * THERMAL - rows}")
+    session.stop()
+    recorded = read_recording(folder / "live.rrd")
+    print(f"recorded readings {int((recorded.track.verdict > 0).sum())}, health of it: {engine.status().counts}")
+    if browser is not None and playwright is not None:
+        browser.close()
+        playwright.stop()
+    shutil.rmtree(folder)
+
+
+def _messages(path: Path, name: str) -> list:
+    import cantools
+
+    return [message for message in cantools.database.load_file(path).messages if message.name == name]
+
+
+if __name__ == "__main__":
+    main()
