@@ -133,6 +133,50 @@ def f(x, u, p, dt, out):
     out[3] = x[3] + sixth * (a3 + 2.0 * b3 + 2.0 * c3 + d3)
 
 
+@jit
+def tangent(winding, tooth, yoke, magnet, theta, constants):
+    """Derivative of `rates` along a direction (winding, tooth, yoke, magnet), where the copper has resistivity theta."""
+    current, eddy, _, _, _, wt, ty, tm, wm, yc, wa, ma, cw, ct, cy, cm, _, _ = constants
+    copper = COPPER * (current - eddy / theta**2) * winding
+    winding_tooth = (winding - tooth) * wt
+    winding_magnet = (winding - magnet) * wm
+    tooth_yoke = (tooth - yoke) * ty
+    tooth_magnet = (tooth - magnet) * tm
+    return (
+        (copper - winding_tooth - winding_magnet - winding * wa) * cw,
+        (winding_tooth - tooth_yoke - tooth_magnet) * ct,
+        (tooth_yoke - yoke * yc) * cy,
+        (winding_magnet + tooth_magnet - magnet * ma) * cm,
+    )
+
+
+def F(x, u, p, dt, out):
+    """Derivative of the step: the same method along each state's direction, a fifth of complex step's cost."""
+    k = network(u, p)
+    h = 0.5 * dt
+    a0, a1, a2, a3 = rates(x[0], x[1], x[2], x[3], k)
+    b0, b1, b2, b3 = rates(x[0] + h * a0, x[1] + h * a1, x[2] + h * a2, x[3] + h * a3, k)
+    c0, _, _, _ = rates(x[0] + h * b0, x[1] + h * b1, x[2] + h * b2, x[3] + h * b3, k)
+    theta_a = 1.0 + COPPER * (x[0] - 20.0)
+    theta_b = theta_a + COPPER * h * a0
+    theta_c = theta_a + COPPER * h * b0
+    theta_d = theta_a + COPPER * dt * c0
+    sixth = dt / 6.0
+    for j in range(4):
+        v0 = 1.0 if j == WINDING else 0.0
+        v1 = 1.0 if j == TOOTH else 0.0
+        v2 = 1.0 if j == YOKE else 0.0
+        v3 = 1.0 if j == MAGNET else 0.0
+        a0, a1, a2, a3 = tangent(v0, v1, v2, v3, theta_a, k)
+        b0, b1, b2, b3 = tangent(v0 + h * a0, v1 + h * a1, v2 + h * a2, v3 + h * a3, theta_b, k)
+        c0, c1, c2, c3 = tangent(v0 + h * b0, v1 + h * b1, v2 + h * b2, v3 + h * b3, theta_c, k)
+        d0, d1, d2, d3 = tangent(v0 + dt * c0, v1 + dt * c1, v2 + dt * c2, v3 + dt * c3, theta_d, k)
+        out[0, j] = v0 + sixth * (a0 + 2.0 * b0 + 2.0 * c0 + d0)
+        out[1, j] = v1 + sixth * (a1 + 2.0 * b1 + 2.0 * c1 + d1)
+        out[2, j] = v2 + sixth * (a2 + 2.0 * b2 + 2.0 * c2 + d2)
+        out[3, j] = v3 + sixth * (a3 + 2.0 * b3 + 2.0 * c3 + d3)
+
+
 def winding(x, u, p, out):
     """The thermometer in the winding."""
     out[0] = x[WINDING]
@@ -177,6 +221,7 @@ MOTOR_DRIVE = StateSpaceModel(
         Sensor("yoke", (Row("yoke", "°C", variance=0.25),), h=yoke),
     ),
     f=f,
+    F=F,
     max_step=1.0,
     source="Wallscheid & Böcker (2016), doi:10.1109/TEC.2015.2473673",
 )
