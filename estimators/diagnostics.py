@@ -15,6 +15,14 @@ PROBABILITY = 0.95
 """Of the bounds that charts and reports show."""
 
 
+FEW = 10
+"""Readings in a window below which it says nothing of health."""
+
+
+FAR = 20
+"""Rows for each reading of the window, beyond which a reading is too old to count."""
+
+
 class HealthPolicy(NamedTuple):
     """When a twin may be trusted.
 
@@ -62,54 +70,83 @@ def nis_bounds(dof: int, readings: int) -> tuple[float, float]:
 
 @jit
 def assess(first, last, t, track, policy, bounds):
-    """Fill windowed NIS, its bounds and health of rows `first` to `last` of a track.
+    """Fill age, windowed NIS, its bounds and health of rows `first` to `last` of a track.
 
-    Each row looks back over the rows before it, so the outcome does not depend on how a fold was cut into pieces.
+    A row looks only at rows before it, so the outcome does not depend on how a fold was cut into pieces. The window
+    changes with a used or gated reading; the other rows have that of the row before.
     """
+    judged = np.empty(policy.window, np.int64)  # rows of the last readings, a ring; the newest is at `newest`
+    held = 0
+    newest = -1
+    row = first - 1
+    while row >= 0 and held < policy.window and first - row < FAR * policy.window:
+        if track.verdict[row] == USED or track.verdict[row] == GATED:
+            held += 1
+            judged[policy.window - held] = row
+            newest = policy.window - 1
+        row -= 1
     for i in range(first, last):
-        total = 0.0
-        dof = 0
-        used = 0
-        gated = 0
-        row = i
-        while row >= 0 and used + gated < policy.window and i - row < 5 * policy.window:
-            verdict = track.verdict[row]
-            if verdict == USED:
-                total += track.nis[row]
-                dof += track.dof[row]
-                used += 1
-            elif verdict == GATED:
-                gated += 1
-            row -= 1
         if i == 0 or track.verdict[i] == USED or track.verdict[i] == GATED:
             track.age[i] = 0.0
+            if track.verdict[i] == USED or track.verdict[i] == GATED:
+                newest = (newest + 1) % policy.window
+                judged[newest] = i
+                held = min(held + 1, policy.window)
+            _look_back(i, judged, held, newest, track, policy, bounds)
         else:
             track.age[i] = track.age[i - 1] + (t[i] - t[i - 1]) * 1e-9
+            track.nis_mean[i] = track.nis_mean[i - 1]
+            track.nis_low[i] = track.nis_low[i - 1]
+            track.nis_high[i] = track.nis_high[i - 1]
+            track.consistency[i] = track.consistency[i - 1]
         finite = True
         for j in range(track.mean.shape[1]):
             finite = finite and np.isfinite(track.mean[i, j]) and np.isfinite(track.std[i, j])
-        health = TRACKING
-        if used > 0:
-            track.nis_mean[i] = total / used
-            track.nis_low[i] = bounds.low[dof] / used
-            track.nis_high[i] = bounds.high[dof] / used
-        else:
-            track.nis_mean[i] = np.nan
-            track.nis_low[i] = np.nan
-            track.nis_high[i] = np.nan
+        health = track.consistency[i]
         if not finite:
             health = DIVERGED
         elif track.age[i] > policy.stale_after:
             health = STALE
-        elif used + gated >= 10 and (
-            gated > policy.diverged_gated * (used + gated) or total > policy.diverged_nis * dof
-        ):
-            health = DIVERGED
-        elif track.age[i] > policy.degraded_after:
-            health = DEGRADED
-        elif used >= 10 and total > bounds.alarm[dof]:
+        elif track.age[i] > policy.degraded_after and health == TRACKING:
             health = DEGRADED
         track.health[i] = health
+
+
+@jit
+def _look_back(i, judged, held, newest, track, policy, bounds):
+    """Mean NIS of the window that ends at row i, its bounds, and what it alone says of the estimate.
+
+    Summed from the newest reading to the oldest, each time anew: a running sum would keep the rounding of an outlier.
+    """
+    total = 0.0
+    dof = 0
+    used = 0
+    gated = 0
+    at = newest
+    for _ in range(held):
+        row = judged[at]
+        if i - row >= FAR * policy.window:
+            break
+        if track.verdict[row] == USED:
+            total += track.nis[row]
+            dof += track.dof[row]
+            used += 1
+        else:
+            gated += 1
+        at = at - 1 if at > 0 else policy.window - 1
+    if used > 0:
+        track.nis_mean[i] = total / used
+        track.nis_low[i] = bounds.low[dof] / used
+        track.nis_high[i] = bounds.high[dof] / used
+    else:
+        track.nis_mean[i] = np.nan
+        track.nis_low[i] = np.nan
+        track.nis_high[i] = np.nan
+    track.consistency[i] = TRACKING
+    if used + gated >= FEW and (gated > policy.diverged_gated * (used + gated) or total > policy.diverged_nis * dof):
+        track.consistency[i] = DIVERGED
+    elif used >= FEW and total > bounds.alarm[dof]:
+        track.consistency[i] = DEGRADED
 
 
 assess_signature = types.void(i64, i64, I1, track_type, policy_type, bounds_type)

@@ -28,7 +28,7 @@ class Track(NamedTuple):
     each configured pair of states. innovation, innovation_std (N, width): reading minus prediction and the square
     root of S's diagonal; NaN where there is none. nis: νᵀ S⁻¹ ν, `dof` its degrees of freedom. nis_mean with
     nis_low and nis_high: mean NIS over the last readings, and its 95 % bounds. age: seconds since the last reading that
-    was used or gated. age: seconds since a reading was last used.
+    was used or gated. consistency: the health that the window's NIS and gate alone would give.
     """
 
     mean: Any
@@ -44,6 +44,7 @@ class Track(NamedTuple):
     nis_mean: Any
     nis_low: Any
     nis_high: Any
+    consistency: Any
     health: Any
 
     @staticmethod
@@ -53,7 +54,8 @@ class Track(NamedTuple):
         vectors = [np.full(rows, np.nan) for _ in range(2)]
         codes = [np.zeros(rows, np.int8) for _ in range(2)]
         windowed = [np.full(rows, np.nan) for _ in range(4)]
-        columns: list[Any] = [*matrix, *vectors, *codes, *windowed, np.zeros(rows, np.int8)]
+        health = [np.zeros(rows, np.int8) for _ in range(2)]
+        columns: list[Any] = [*matrix, *vectors, *codes, *windowed, *health]
         return Track(*columns)
 
     def select(self, index: object) -> Track:
@@ -69,4 +71,4 @@ class Track(NamedTuple):
         return int(self.nis.size)
 
 
-track_type = types.NamedTuple((F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, F1, B1), Track)
+track_type = types.NamedTuple((F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, F1, B1, B1), Track)

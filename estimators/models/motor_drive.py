@@ -135,7 +135,7 @@ def f(x, u, p, dt, out):
 
 @jit
 def tangent(winding, tooth, yoke, magnet, theta, constants):
-    """Derivative of `rates` along a direction (winding, tooth, yoke, magnet), where the copper has resistivity theta."""
+    """Derivative of `rates` along a direction (winding, tooth, yoke, magnet) at the copper's resistivity theta."""
     current, eddy, _, _, _, wt, ty, tm, wm, yc, wa, ma, cw, ct, cy, cm, _, _ = constants
     copper = COPPER * (current - eddy / theta**2) * winding
     winding_tooth = (winding - tooth) * wt
@@ -182,14 +182,32 @@ def winding(x, u, p, out):
     out[0] = x[WINDING]
 
 
+def winding_slope(x, u, p, out):
+    """It sees that temperature alone."""
+    out[0, :] = 0.0
+    out[0, WINDING] = 1.0
+
+
 def tooth(x, u, p, out):
     """The thermometer in a stator tooth."""
     out[0] = x[TOOTH]
 
 
+def tooth_slope(x, u, p, out):
+    """It sees that temperature alone."""
+    out[0, :] = 0.0
+    out[0, TOOTH] = 1.0
+
+
 def yoke(x, u, p, out):
     """The thermometer in the stator yoke."""
     out[0] = x[YOKE]
+
+
+def yoke_slope(x, u, p, out):
+    """It sees that temperature alone."""
+    out[0, :] = 0.0
+    out[0, YOKE] = 1.0
 
 
 MOTOR_DRIVE = StateSpaceModel(
@@ -216,9 +234,9 @@ MOTOR_DRIVE = StateSpaceModel(
         Noise("magnet", "°C²/s", variance=0.003),
     ),
     sensors=(
-        Sensor("winding", (Row("winding", "°C", variance=0.25),), h=winding),
-        Sensor("tooth", (Row("tooth", "°C", variance=0.25),), h=tooth),
-        Sensor("yoke", (Row("yoke", "°C", variance=0.25),), h=yoke),
+        Sensor("winding", (Row("winding", "°C", variance=0.25),), h=winding, H=winding_slope),
+        Sensor("tooth", (Row("tooth", "°C", variance=0.25),), h=tooth, H=tooth_slope),
+        Sensor("yoke", (Row("yoke", "°C", variance=0.25),), h=yoke, H=yoke_slope),
     ),
     f=f,
     F=F,
