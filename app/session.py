@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import secrets
 import signal
 import sys
@@ -96,6 +97,9 @@ class Session:
 
     def start(self) -> None:
         """Start everything."""
+        # What the start has built stays; looking through it again and again would hold readings up for milliseconds.
+        gc.collect()
+        gc.freeze()
         self.recorder.start()
         if self.server is not None:
             self.view.start()
