@@ -107,7 +107,6 @@ def blueprint(model: StateSpaceModel, pairs: np.ndarray, *, window: float, root:
     for j, state in enumerate(model.states):
         rows = [model.row_names[model.row_start[d.sensor] + d.row] for d in dots if d.state == j]
         over = [f"/{kind}/{row}" for row in rows for kind in ("reading", "refused")]
-        # Drawn in this order: dots would hide the lines.
         contents = [*over, f"/previous/state/{names[j]}", f"/state/{names[j]}", f"/truth/{names[j]}"]
         states.append(chart(with_unit(state.name, state.unit), contents))
     innovations = [
@@ -135,7 +134,7 @@ def blueprint(model: StateSpaceModel, pairs: np.ndarray, *, window: float, root:
     return rrb.Blueprint(
         rrb.Vertical(
             *above, rrb.Horizontal(*_tabs(innovations), nis), health, bottom,
-            row_shares=[1.25 * min(len(states), AT_ONCE) / len(above)] * len(above) + [1.1, 0.5, 1.5],
+            row_shares=[1.25 * min(len(states), AT_ONCE) / len(above)] * len(above) + [1.1, 0.8, 1.5],
         ),
         rrb.TopPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
@@ -177,7 +176,8 @@ def styles(stream: rr.RecordingStream, model: StateSpaceModel, pairs: np.ndarray
         style(f"/previous/state/{state.name}", rr.SeriesLines(colors=[PREVIOUS], names=["previous"], widths=[1.0]))
     for name in model.row_names:
         words = name.replace("_", " ")
-        for kind, color, size in (("reading", READING, 2.0), ("refused", REFUSED, 3.5)):
+        # Points are drawn over lines, so they must let them shine through.
+        for kind, color, size in (("reading", (*READING, 70), 1.5), ("refused", REFUSED, 3.5)):
             title = words if kind == "reading" else f"{words}, refused"
             style(f"/{kind}/{name}", rr.SeriesPoints(colors=[color], names=[title], marker_sizes=[size]))
         style(f"/innovation/{name}", band("innovation", READING))
