@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -194,6 +195,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except NisusError as error:
         print(f"nisus: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:
+        # Whoever read the output has had enough of it (`| head`). Python's own flush at exit must not fail again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except OSError as error:
         print(f"nisus: {error.filename or ''}: {error.strerror or error}", file=sys.stderr)
         return 2

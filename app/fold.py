@@ -115,7 +115,7 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], trac
         ("readings", f"{result.readings}"),
     ]
     rows += [
-        (f"RMSE {name}", f"{fit.rmse:.4f} {units[name]}   in the 95 % band: {100 * fit.coverage:.1f} %")
+        (f"RMSE {name}", f"{fit.rmse:.5g} {units[name]}   in the 95 % band: {100 * fit.coverage:.1f} %")
         for name, fit in result.states.items()
     ]
     if result.nis_readings:
@@ -131,7 +131,7 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], trac
         zip(twin.model.row_names, [row.unit for sensor in twin.model.sensors for row in sensor.rows], strict=True)
     )
     rows += [
-        (f"held out {name}", f"RMSE {fit.rmse:.4f} {row_units[name]}   in the 95 % band: {100 * fit.coverage:.1f} %")
+        (f"held out {name}", f"RMSE {fit.rmse:.5g} {row_units[name]}   in the 95 % band: {100 * fit.coverage:.1f} %")
         for name, fit in result.held_out.items()
     ]
     rows += [(key, f"{count}") for key, count in sorted(counts.items())]
