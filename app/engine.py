@@ -20,7 +20,7 @@ from estimators.errors import ConfigError, EstimatorError, NisusError
 from estimators.fold import SPARSE_EVERY, Fold
 from estimators.log import RESET, TICK, Log, Readings
 from estimators.registry import find_estimator
-from estimators.track import FAILED, GATED, HEALTH_NAMES, MISSING, VERDICT_NAMES
+from estimators.track import HEALTH_NAMES
 
 from . import commands
 from .feeder import Feeder, Finished, Restarted
@@ -28,7 +28,7 @@ from .notices import Notices
 from .playback import PLAYBACK, play, playback_status
 from .pull import Belief, Cursor, Pull, Status
 from .refolder import Refolded, Refolder
-from .tally import Latency, Tally
+from .tally import Latency, Tally, complaints
 
 if TYPE_CHECKING:
     from estimators.tuning import Tuning
@@ -283,15 +283,8 @@ class Engine:
     def _look(self, before: int) -> None:
         """Report what the new rows say: readings that could not be used, and changes of health."""
         track, log = self._fold.track, self._log
-        verdict = track.verdict[before:]
-        for code, what in ((GATED, "refused by the gate"), (MISSING, "has no value"), (FAILED, "could not be used")):
-            rows = np.flatnonzero(verdict == code)
-            if rows.size:
-                row = before + int(rows[-1])
-                sensor = self.model.sensors[log.channel[row]].name
-                nis = f" (NIS {track.nis[row]:.3g})" if np.isfinite(track.nis[row]) else ""
-                text = f"{sensor}: reading {what}{nis}"
-                self.notices.report(f"{VERDICT_NAMES[code]} {sensor}", text)
+        for key, text in complaints(self.model, log.channel, track, before):
+            self.notices.report(key, text)
         if len(track) and track.health[-1] != self._health:
             self._health = int(track.health[-1])
             self.notices.say(f"health: {HEALTH_NAMES[self._health]}", level="info" if self._health == 0 else "warn")

@@ -1,13 +1,15 @@
-"""Counts for the status line: verdicts, and how long a reading took from its arrival to its row."""
+"""Counts for the status line and complaints for the events: verdicts, and the time from arrival to row."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 
 import numpy as np
 
 from estimators.log import READING, Readings
-from estimators.track import VERDICT_NAMES
+from estimators.model import StateSpaceModel
+from estimators.track import FAILED, GATED, MISSING, VERDICT_NAMES, Track
 
 UNSETTLED = 8192
 """Rows at the end that the tally counts each time; a late reading rarely reaches behind them."""
@@ -44,6 +46,17 @@ class Tally:
         totals = self._counts + np.bincount(verdict[settled:], minlength=len(VERDICT_NAMES))
         names = zip(VERDICT_NAMES[1:], totals[1:], strict=True)
         return {"readings": int(totals[1:].sum()), **{name: int(count) for name, count in names}}
+
+
+def complaints(model: StateSpaceModel, channel: np.ndarray, track: Track, first: int) -> Iterator[tuple[str, str]]:
+    """Key and text for each kind of reading among the rows from `first` on that could not be used: its last one."""
+    for code, what in ((GATED, "refused by the gate"), (MISSING, "has no value"), (FAILED, "could not be used")):
+        rows = np.flatnonzero(track.verdict[first:] == code)
+        if rows.size:
+            row = first + int(rows[-1])
+            sensor = model.sensors[channel[row]].name
+            nis = f" (NIS {track.nis[row]:.3g})" if np.isfinite(track.nis[row]) else ""
+            yield f"{VERDICT_NAMES[code]} {sensor}", f"{sensor}: reading {what}{nis}"
 
 
 class Latency:
