@@ -81,7 +81,7 @@ def drawn(page, selector):
 
 
 def drag_right(page, thumb, reached):
-    """Drag a slider until the engine has it. The panel still moves while a swapped filter's options unfold: try again."""
+    """Drag a slider until the engine has it; while a swapped filter's options unfold, the panel moves: try again."""
     for _ in range(6):
         box = thumb.bounding_box()
         x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
