@@ -1,8 +1,5 @@
 """The Viser pane in headless Chromium: what is drawn, and what a hand on the controls makes the engine do."""
 
-import os
-import shutil
-
 import numpy as np
 import pytest
 from fake_engine import FakeEngine, events
@@ -24,14 +21,10 @@ CHARTS = "Object.values(window.__viserTestpoints?.uplots ?? {}).map(item => item
 
 
 @pytest.fixture(scope="module")
-def chromium():
+def browser(chromium):
     sync_api = pytest.importorskip("playwright.sync_api")
-    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if path is None:
-        message = "no Chromium on this machine"
-        pytest.fail(message) if os.environ.get("CI") == "true" else pytest.skip(message)
     with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
         yield browser
         browser.close()
 
@@ -57,8 +50,8 @@ def view(engine):
 
 
 @pytest.fixture
-def page(chromium, view):
-    context = chromium.new_context(viewport={"width": 900, "height": 1000}, extra_http_headers={HEADER: "s3cret"})
+def page(browser, view):
+    context = browser.new_context(viewport={"width": 900, "height": 1000}, extra_http_headers={HEADER: "s3cret"})
     page = context.new_page()
     page.set_default_timeout(60_000)
     errors = []
@@ -137,8 +130,8 @@ def test_chosen_estimator_reaches_the_engine(page, engine):
     page.get_by_text("revision 1").wait_for()
 
 
-def test_two_browsers_show_the_same(page, chromium, view, engine):
-    other = chromium.new_context(viewport={"width": 900, "height": 1000}, extra_http_headers={HEADER: "s3cret"})
+def test_two_browsers_show_the_same(page, browser, view, engine):
+    other = browser.new_context(viewport={"width": 900, "height": 1000}, extra_http_headers={HEADER: "s3cret"})
     second = other.new_page()
     second.goto(f"http://127.0.0.1:{view.port}/")
     second.wait_for_function(f"{CHARTS}.length === 3 && {CHARTS}[0].data[0].length >= 60")
