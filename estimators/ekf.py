@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .context import add_process_noise, expect, sensor_rows, transition
-from .filter import Estimator
+from .filter import Estimator, Options
 from .gaussian import (
     compare,
     describe,
@@ -23,7 +23,7 @@ from .linalg import congruence
 from .track import USED
 
 
-def work_size(nx: int, ny: int) -> int:
+def work_size(options: Options, nx: int, ny: int) -> int:
     """Scratch: x', F and twice the square for the congruence; or ŷ, S, its factor, C, K, H, a square; a Jacobian's."""
     filters = max(nx + 3 * nx * nx, ny + 2 * ny * ny + 3 * nx * ny + nx * nx)
     return filters + scratch_size(nx, ny)

@@ -38,6 +38,10 @@ call_update = caller(update_signature)
 call_describe = caller(describe_signature)
 
 
+Options = dict[str, float]
+"""Values of an estimator's options by name."""
+
+
 class Option(NamedTuple):
     """One option of an estimator: where its value starts, and the range and unit that a panel offers."""
 
@@ -65,9 +69,10 @@ code_type = types.NamedUniTuple(i64, len(Code._fields), Code)
 class Estimator:
     """One entry of the catalogue.
 
-    `applies(model)` gives the reason why the estimator does not fit a model, or None. `state_size(nx)` and
-    `work_size(nx, ny)` count float64s. `points(context_numbers, state)` gives what to draw beside the mean (sigma
-    points, particles) as (k, nx). `tune(options, nx)` turns the options into the numbers that the functions read.
+    `applies(model)` gives the reason why the estimator does not fit a model, or None. `options` below are complete
+    (see `complete`). `state_size(options, nx)` and `work_size(options, nx, ny)` count float64s; `moments(options,
+    state, nx)` gives mean and covariance, `points(options, state, nx)` what to draw beside the mean (sigma points,
+    particles) as (k, nx). `tune(options, nx)` turns the options into the numbers that the compiled functions read.
     """
 
     name: str
@@ -78,12 +83,12 @@ class Estimator:
     fails_when: str
     source: str
     functions: tuple[Any, Any, Any, Any]
-    state_size: Callable[[int], int]
-    work_size: Callable[[int, int], int]
-    moments: Callable[[np.ndarray, int], tuple[np.ndarray, np.ndarray]]
-    points: Callable[[dict[str, float], np.ndarray, int], np.ndarray]
+    state_size: Callable[[Options, int], int]
+    work_size: Callable[[Options, int, int], int]
+    moments: Callable[[Options, np.ndarray, int], tuple[np.ndarray, np.ndarray]]
+    points: Callable[[Options, np.ndarray, int], np.ndarray]
     options: tuple[Option, ...] = ()
-    tune: Callable[[dict[str, float], int], np.ndarray] = lambda options, nx: np.zeros(1)
+    tune: Callable[[Options, int], np.ndarray] = lambda options, nx: np.zeros(1)
     applies: Callable[[StateSpaceModel], str | None] = lambda model: None
 
     def complete(self, options: dict[str, float]) -> dict[str, float]:

@@ -180,9 +180,9 @@ class Fold:
         most = model.width * max(1, self.policy.window)
         self._bounds: Bounds = chi_square_bounds(most)
         self._context = self._see()
-        self._state = np.empty(self.estimator.state_size(model.nx))
+        self._state = np.empty(self.estimator.state_size(self.options, model.nx))
         self._spare = np.empty_like(self._state)
-        self._work = np.full(self.estimator.work_size(model.nx, model.width) + 1, np.nan)
+        self._work = np.full(self.estimator.work_size(self.options, model.nx, model.width) + 1, np.nan)
         self._score = np.empty(3)
         self._clock = np.array([UNSET])
         self._u = np.array([item.default for item in model.inputs], float)
@@ -245,7 +245,7 @@ class Fold:
 
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean (nx,) and covariance (nx, nx) at `clock`."""
-        return self.estimator.moments(self._state, self.model.nx)
+        return self.estimator.moments(self.options, self._state, self.model.nx)
 
     def points(self) -> np.ndarray:
         """What to draw beside the mean, (k, nx): sigma points, particles; none for most filters."""
@@ -314,7 +314,7 @@ class Fold:
         """The last snapshot at or before the event `index`: its index, and what `base` takes to start there."""
         at = max(key for key in self._snapshots if key <= self.log.first + index)
         clock, u, state = self._snapshots[at]
-        mean, cov = self.estimator.moments(state, self.model.nx)
+        mean, cov = self.estimator.moments(self.options, state, self.model.nx)
         return at - self.log.first, (mean, cov, clock, u.copy())
 
     def follow(self, log: Log, changed_from: int | None) -> None:

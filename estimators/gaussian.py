@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from .context import circular_rows, circular_states, sensor_variances
+from .filter import Options
 from .jit import flags, floats, ints, jit
 from .linalg import cholesky, mirror, solve_transposed, solve_upper, wrap
 from .track import FAILED, GATED, HELD_OUT, MISSING, USED
@@ -16,17 +17,17 @@ from .track import FAILED, GATED, HELD_OUT, MISSING, USED
 LOG_2PI = float(np.log(2.0 * np.pi))
 
 
-def state_size(nx: int) -> int:
+def state_size(options: Options, nx: int) -> int:
     """Numbers in the state."""
     return nx + nx * nx
 
 
-def moments(state: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray]:
+def moments(options: Options, state: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray]:
     """Mean (nx,) and covariance (nx, nx) of a state."""
     return state[:nx].copy(), state[nx : nx + nx * nx].reshape(nx, nx).copy()
 
 
-def no_points(options: dict[str, float], state: np.ndarray, nx: int) -> np.ndarray:
+def no_points(options: Options, state: np.ndarray, nx: int) -> np.ndarray:
     """No points to draw."""
     return np.zeros((0, nx))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from . import ekf
 from .context import add_process_noise, transition
-from .filter import Estimator
+from .filter import Estimator, Options
 from .gaussian import describe, moments, no_points, start, state_size, wrap_mean
 from .jacobians import state_jacobian
 from .jit import floats, jit, matrix
@@ -12,9 +12,9 @@ from .linalg import congruence
 from .model import StateSpaceModel
 
 
-def work_size(nx: int, ny: int) -> int:
+def work_size(options: Options, nx: int, ny: int) -> int:
     """Scratch: the EKF's for the update; behind it F and the dt for which it holds, kept from step to step."""
-    return ekf.work_size(nx, ny) + nx * nx + 1
+    return ekf.work_size(options, nx, ny) + nx * nx + 1
 
 
 @jit

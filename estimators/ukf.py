@@ -20,7 +20,7 @@ from .context import (
     sensor_rows,
     transition,
 )
-from .filter import Estimator, Option
+from .filter import Estimator, Option, Options
 from .gaussian import compare, describe, downdate, judge, moments, move_mean, start, state_size, wrap_mean
 from .jit import jit, matrix
 from .linalg import cholesky, mirror, wrap
@@ -30,7 +30,7 @@ CENTRAL_COV, OUTER, SPREAD = range(3)
 """Positions in the context's options: the central covariance weight, the outer weight, √(n+λ)."""
 
 
-def tune(values: dict[str, float], nx: int) -> np.ndarray:
+def tune(values: Options, nx: int) -> np.ndarray:
     """The weights that alpha, beta and kappa give for nx states."""
     alpha, beta, kappa = values["alpha"], values["beta"], values["kappa"]
     total = alpha**2 * (nx + kappa)
@@ -38,9 +38,9 @@ def tune(values: dict[str, float], nx: int) -> np.ndarray:
     return np.array([central + 1.0 - alpha**2 + beta, 0.5 / total, np.sqrt(total)])
 
 
-def points(values: dict[str, float], state: np.ndarray, nx: int) -> np.ndarray:
+def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
     """The sigma points (2 nx + 1, nx) of a state."""
-    x, P = moments(state, nx)
+    x, P = moments(values, state, nx)
     try:
         U = np.linalg.cholesky(P).T * tune(values, nx)[SPREAD]
     except np.linalg.LinAlgError:
@@ -48,7 +48,7 @@ def points(values: dict[str, float], state: np.ndarray, nx: int) -> np.ndarray:
     return np.vstack((x, x + U, x - U))
 
 
-def work_size(nx: int, ny: int) -> int:
+def work_size(options: Options, nx: int, ny: int) -> int:
     """Scratch: the factor, deviations of state and reading, mean, point; and ŷ, S, its factor, C."""
     return nx * nx + (2 * nx + 1) * (nx + ny) + 2 * nx + ny + 2 * ny * ny + nx * ny + ny
 

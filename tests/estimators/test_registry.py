@@ -33,12 +33,12 @@ def test_sizes_are_enough(name):
     for k in range(5):
         log.extend(Readings.one(k * 10**9, 0, READING, 0, 36.0 + k, 1))
     fold = Fold(name, model, Tuning.of(model), log)
-    work = entry.work_size(model.nx, model.width)
+    work = entry.work_size(fold.options, model.nx, model.width)
     fold._work = np.full(work + 64, np.pi) if name != "kf" else fold._work  # the KF finds its F from the end
     fold.advance()
     if name != "kf":
         assert np.all(fold._work[work:] == np.pi)
-    assert fold._state.size == entry.state_size(model.nx)
+    assert fold._state.size == entry.state_size(fold.options, model.nx)
 
 
 @pytest.mark.parametrize("name", list(ESTIMATORS))
