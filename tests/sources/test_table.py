@@ -63,7 +63,7 @@ def test_true_states_of_a_row_are_blocks(tmp_path):
     names = {0: "w", 1: "a", 2: "b", 5: "power"}
     channels = [Channel(TRUTH, index, names[index], (names[index],)) for index in (5, 2, 0, 1)]
     channels[1] = Channel(TRUTH, 2, "b", ("b",), where=(Condition("ok", 1, 1),))
-    path = write(tmp_path, "t,w,a,b,ok,power\n0,1,2,3,1,6\n1,,2,3,1,6\n2,1,,3,1,\n3,1,2,3,0,6\n4,,,,1,\n")
+    path = write(tmp_path, "t,w,a,b,ok,power\n0,1,2,3,1,6\n1,,2,3,1,6\n2,1,,3,1,\n3,1,2,3,0,6\n4,,,,1,\n5,nan,2,3,1,\n")
     got = events(read_all(table(path, channels=channels)))
     expected = [
         (0, TRUTH, 0, 1.0, 2.0),
@@ -75,6 +75,7 @@ def test_true_states_of_a_row_are_blocks(tmp_path):
         (2 * 10**9, TRUTH, 2, 3.0, NAN),
         (3 * 10**9, TRUTH, 0, 1.0, 2.0),
         (3 * 10**9, TRUTH, 5, 6.0, NAN),
+        (5 * 10**9, TRUTH, 1, 2.0, 3.0),
     ]
     np.testing.assert_array_equal(np.array(got), np.array(expected))
 
