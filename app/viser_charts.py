@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from estimators.log import BEFORE, READING, TRUTH
+from estimators.log import BEFORE, READING, truth_of
 from estimators.model import StateSpaceModel
 from estimators.track import GATED
 
@@ -165,21 +165,20 @@ class Charts:
         nx = self.model.nx
         rows = slice(start, end)
         mean, std = history.column("mean")[rows], history.column("std")[rows]
-        kind, channel = history.column("kind")[rows], history.column("channel")[rows]
-        value, verdict = history.column("value")[rows], history.column("verdict")[rows]
+        events, verdict = history.events(rows), history.column("verdict")[rows]
         out = np.full((end - start, self._columns), np.nan)
         out[:, :nx] = mean
         out[:, nx : 2 * nx] = mean + 2 * std
         out[:, 2 * nx : 3 * nx] = mean - 2 * std
-        true = np.flatnonzero(kind == TRUTH)
-        out[true, 3 * nx + channel[true]] = value[true, 0]
-        reading, gated = kind == READING, verdict == GATED
+        reading, gated = events.kind == READING, verdict == GATED
         for j in range(nx):
+            true, values = truth_of(events, j)
+            out[true, 3 * nx + j] = values
             for column, (sensor, row) in zip(self._dot_columns[j], self.direct[j], strict=False):
-                mine = reading & (channel == sensor)
-                out[:, column] = np.where(mine & ~gated, value[:, row], np.nan)
+                mine = reading & (events.channel == sensor)
+                out[:, column] = np.where(mine & ~gated, events.value[:, row], np.nan)
                 refused = np.flatnonzero(mine & gated)
-                out[refused, 4 * nx + j * 4 + 3] = value[refused, row]
+                out[refused, 4 * nx + j * 4 + 3] = events.value[refused, row]
         for k, name in enumerate(("nis", "nis_mean", "nis_low", "nis_high")):
             out[:, self._nis + k] = history.column(name)[rows]
         return out

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from estimators.log import Readings
+
 _COLUMNS = ("t", "kind", "channel", "value", "mean", "std", "nis", "nis_mean", "nis_low", "nis_high", "verdict")
 
 
@@ -34,6 +36,11 @@ class History:
     def column(self, name: str) -> np.ndarray:
         """The valid rows of one column, as a view."""
         return self._columns[name][: self.n]
+
+    def events(self, rows: slice = slice(None)) -> Readings:
+        """Some of the valid rows as events, as views; each as if it had arrived when it was measured."""
+        t, kind, channel, value = (self.column(name)[rows] for name in ("t", "kind", "channel", "value"))
+        return Readings(t, t, kind, channel, value)
 
     def settled(self, name: str, rows: int) -> np.ndarray:
         """The newest rows of a column, only the last one of each time: what all sensors together made of it."""

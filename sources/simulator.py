@@ -36,7 +36,7 @@ class Simulator:
     In each step, in this order: x ← f(x, u, p, dt) + w with w ~ N(0, Q); then y = h(x, u, p) + v with v ~ N(0, R) for
     each sensor that is due, drawn even if the reading is lost, so that a loss does not change what follows. Its first
     event is a tick at time zero, where the estimator's prior holds; then, after every step: the inputs if they
-    changed, the readings, and the true value of every state.
+    changed, the readings, and the true states in blocks of the log's width.
     """
 
     live = False
@@ -161,7 +161,8 @@ class Simulator:
             lost = plan.drop_every is not None and self._spoken[i] % plan.drop_every == plan.drop_every - 1
             self._spoken[i] += 1
             rows.append((t, READING, i, np.full(y.size, np.nan) if lost else y))
-        rows += [(t, TRUTH, j, self._x[j : j + 1].copy()) for j in range(self._x.size)]
+        width = self._model.width
+        rows += [(t, TRUTH, j, self._x[j : j + width].copy()) for j in range(0, self._x.size, width)]
 
     def _noise(self) -> np.ndarray:
         """A draw of N(0, Q), as numpy's multivariate_normal makes it, with the factor kept while Q stays."""
