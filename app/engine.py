@@ -331,7 +331,7 @@ class Engine:
             self._finished = True
             self.notices.say("the source has ended; the estimate stays")
         elif isinstance(item, commands.SetEstimator):
-            self._retune(item.name, self.tuning.with_options({}))
+            self._retune(item.name, self.tuning.with_options(self.twin.options_of(item.name)))
         elif isinstance(item, commands.SetTuning):
             self._retune(self.estimator, self.tuning.set(item.key, item.value))
         elif isinstance(item, commands.SetOption):

@@ -118,6 +118,9 @@ class TwinSection(Section):
         EstimatorSection, BeforeValidator(_estimator, json_schema_input_type=str | EstimatorSection)
     ] = EstimatorSection(name="ekf")
     """The filter that runs first: a name, or {name, options}. Default: ekf."""
+    filters: dict[str, dict[str, Number]] = {}
+    """Options of other filters, by name, for when one is chosen on the page or compared, for example
+    {letkf: {radius: 4}}. Default: the catalogue's."""
     gate: Annotated[float, Field(strict=True, gt=0, lt=1)] | None = None
     """Probability with which a good reading passes the gate, for example 0.9973; readings outside are not used.
     Default: null, no gate."""

@@ -109,6 +109,7 @@ EKF = Estimator(
     fails_when="curvature makes it overconfident: it stops listening to the sensors",
     source="Jazwinski (1970), Stochastic Processes and Filtering Theory, theorem 8.1",
     functions=(start, predict, update, describe),
+    runs=lambda options, nx: nx + 1,
     state_size=state_size,
     work_size=work_size,
     moments=moments,

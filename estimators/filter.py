@@ -73,6 +73,7 @@ class Estimator:
     (see `complete`). `state_size(options, nx)` and `work_size(options, nx, ny)` count float64s; `moments(options,
     state, nx)` gives mean and covariance, `points(options, state, nx)` what to draw beside the mean (sigma points,
     particles) as (k, nx). `tune(options, nx)` turns the options into the numbers that the compiled functions read.
+    `runs(options, nx)` is `model_runs` as a number: how often a step runs f.
     """
 
     name: str
@@ -90,6 +91,7 @@ class Estimator:
     options: tuple[Option, ...] = ()
     tune: Callable[[Options, int], np.ndarray] = lambda options, nx: np.zeros(1)
     applies: Callable[[StateSpaceModel], str | None] = lambda model: None
+    runs: Callable[[Options, int], float] = lambda options, nx: 1.0
 
     def complete(self, options: dict[str, float]) -> dict[str, float]:
         """The given options and the defaults of the others.

@@ -14,16 +14,26 @@ from .ukf import UKF
 ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in (KF, EKF, UKF)}
 
 
+def find_entry(name: str) -> Estimator:
+    """The entry of that name.
+
+    Raises:
+        EstimatorError: If there is none, with near names.
+    """
+    if name not in ESTIMATORS:
+        near = get_close_matches(name, ESTIMATORS, n=3, cutoff=0.4) or list(ESTIMATORS)
+        raise EstimatorError(f"estimator {name!r} does not exist; near: {', '.join(near)}")
+    return ESTIMATORS[name]
+
+
 def find_estimator(name: str, model: StateSpaceModel) -> Estimator:
     """The entry of that name, if it applies to the model.
 
     Raises:
         EstimatorError: If there is none, with near names; or if it does not apply, with the reason.
     """
-    if name not in ESTIMATORS:
-        near = get_close_matches(name, ESTIMATORS, n=3, cutoff=0.4) or list(ESTIMATORS)
-        raise EstimatorError(f"estimator {name!r} does not exist; near: {', '.join(near)}")
-    reason = ESTIMATORS[name].applies(model)
+    entry = find_entry(name)
+    reason = entry.applies(model)
     if reason:
         raise EstimatorError(f"estimator {name} does not apply: {reason}")
-    return ESTIMATORS[name]
+    return entry

@@ -199,6 +199,7 @@ UKF = Estimator(
     fails_when="P stops being positive definite, or the posterior has several peaks",
     source="Julier & Uhlmann (2004), doi:10.1109/JPROC.2003.823141",
     functions=(start, predict, update, describe),
+    runs=lambda options, nx: 2 * nx + 1,
     state_size=state_size,
     work_size=work_size,
     moments=moments,
