@@ -62,7 +62,7 @@ class Readings(NamedTuple):
         missing = width - self.value.shape[1]
         if missing <= 0:
             return self
-        return self._replace(value=np.pad(self.value, ((0, 0), (0, missing)), constant_values=np.nan))
+        return Readings(*self[:4], np.pad(self.value, ((0, 0), (0, missing)), constant_values=np.nan))
 
     def select(self, index: Any) -> Readings:
         """The events that a mask, slice or index array picks."""

@@ -10,7 +10,7 @@ from app import bus
 from app.cli import Bus, main
 from app.twin import load_twin
 from estimators.errors import ConfigError
-from estimators.log import INPUT, READING, TRUTH, Readings
+from estimators.log import INPUT, READING, TRUTH, Readings, truth_of
 
 
 class Clock:
@@ -56,12 +56,14 @@ def test_what_is_recorded_is_what_the_asset_said(suffix: str, tmp_path: Path, mo
     while (batch := simulator.read(0.0)) is not None:
         batches.append(batch)
     said = Readings.concat(batches, 5)
-    for kind, count in ((READING, 3), (TRUTH, 4)):
-        for k in range(count):
-            ours = got.value[(got.kind == kind) & (got.channel == k), 0]
-            theirs = said.value[(said.kind == kind) & (said.channel == k), 0]
-            assert ours.size == 120
-            np.testing.assert_allclose(ours, theirs, atol=0.00501, err_msg="half of the signal's 0.01 °C")
+    sensors = [
+        [batch.value[(batch.kind == READING) & (batch.channel == k), 0] for batch in (got, said)] for k in range(3)
+    ]
+    states = [[truth_of(batch, k)[1] for batch in (got, said)] for k in range(4)]
+    assert (got.kind == TRUTH).sum() == (said.kind == TRUTH).sum() == 120, "one block of true states a step"
+    for ours, theirs in sensors + states:
+        assert ours.size == 120
+        np.testing.assert_allclose(ours, theirs, atol=0.00501, err_msg="half of the signal's 0.01 °C")
     pulled = got.value[(got.kind == INPUT) & np.isfinite(got.value[:, 1]), 1]
     assert dict(Counter(pulled.tolist())).keys() == {60.0, 160.0}, "the cycle's first step of i_q is at 8 s"
 

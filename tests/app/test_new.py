@@ -8,7 +8,7 @@ from app.new import write_twin
 from app.twin import load_twin
 from estimators.errors import ConfigError
 from estimators.fold import fold
-from estimators.log import READING, TRUTH, Log
+from estimators.log import READING, Log, truth_of
 from estimators.track import USED
 
 
@@ -59,12 +59,12 @@ def test_the_pair_folds_and_does_what_its_text_promises(tmp_path: Path) -> None:
         log.extend(batch)
     track = fold(twin.estimator, twin.model, twin.tuning, log)
     events = log.readings
-    truth = events.kind == TRUTH
-    level, delivery = (truth & (events.channel == k) for k in (0, 1))
-    late = events.t > 60_000_000_000
-    error = track.mean[level & late, 0] - events.value[level & late, 0]
+    late = events.select(events.t > 60_000_000_000)
+    (rows, level), (other, delivery) = (truth_of(late, k) for k in (0, 1))
+    late_mean = track.mean[-len(late) :]
+    error = late_mean[rows, 0] - level
     assert np.sqrt(np.mean(error**2)) < 0.01, "below the noise of one reading, 0.01 m"
-    miss = track.mean[delivery & late, 1] - events.value[delivery & late, 0]
+    miss = late_mean[other, 1] - delivery
     assert np.abs(miss).max() < 5e-5, "a third of the 0.00015 m³ by which the prior is wrong"
     # χ² bounds at 99.99 % of the mean of the NIS of all used readings, one degree of freedom each.
     nis = track.nis[(events.kind == READING) & (track.verdict == USED)]

@@ -12,11 +12,15 @@ from scripted import MODEL, SECOND, Scripted, readings, twin, wait_for
 
 from app import commands
 from app.engine import Engine
+from app.pull import Pull
 from app.recorder import Recorder
-from app.recording import read_recording, tuning_from_json
+from app.recording import RecordingFile, read_recording, tuning_from_json
 from estimators.errors import SourceError
-from estimators.fold import Fold
-from estimators.log import Log
+from estimators.fold import Fold, fold
+from estimators.log import TRUTH, Log, Readings
+from estimators.score import score
+from estimators.track import Track
+from estimators.tuning import Tuning
 
 
 def drawn(stream):
@@ -197,3 +201,33 @@ def test_truncated_recording_keeps_what_is_whole(running, tmp_path):
         assert "cut.rrd" in str(error)  # too little was left to hold a row
     else:
         assert_same(refold(recorded), recorded.track)
+
+
+def test_recordings_with_one_true_value_an_event_read_back(tmp_path):
+    """As they were written before true states came in blocks: one value column, two truth events a step."""
+    rng = np.random.default_rng(5)
+    t = np.arange(1, 51) * 0.1
+    x = np.stack((40 + t, rng.normal(0, 0.1, 50)), axis=1)
+    spoken = readings(t, x[:, 0] + rng.normal(0, 2, 50))
+
+    def truths(channel, values):
+        channels = np.full(50, channel, np.int32)
+        return Readings(spoken.t, spoken.t, np.full(50, TRUTH, np.int8), channels, values)
+
+    old = Readings.concat([spoken, truths(0, x[:, :1]), truths(1, x[:, 1:])], 1)
+    old = old.select(np.argsort(old.t, kind="stable"))
+    path = tmp_path / "old.rrd"
+    file = RecordingFile(path, name="scripted", text="model: motor_winding\n", twin_path=Path("x.yaml"), base=None)
+    file.tuning(Tuning.of(MODEL), "kf", 0, 0)
+    file.write(Pull(0, True, 0, old, Track.allocate(150, 2, 1, 1)))
+    file.close()
+    recorded = read_recording(path)
+    assert recorded.readings.value.shape == (150, 1) and MODEL.width == 2
+    log, blocks = Log(MODEL.width), Log(MODEL.width)
+    log.extend(recorded.readings)
+    blocks.extend(spoken)
+    blocks.extend(truths(0, x))
+    scores = [
+        score(fold("kf", MODEL, Tuning.of(MODEL), events), events.readings, MODEL).states for events in (log, blocks)
+    ]
+    assert scores[0] == scores[1] and list(scores[0]) == ["temperature", "rate"]

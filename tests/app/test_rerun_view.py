@@ -11,8 +11,8 @@ from scripted import Scripted, readings, twin, wait_for
 
 from app import commands, rerun_view
 from app.engine import Engine
-from app.layout import observed
-from app.rerun_pairs import ellipse_points
+from app.layout import observed, pair_name
+from app.rerun_pairs import axis_scales, ellipse_points
 from app.rerun_rows import CALENDAR
 from app.rerun_thin import last_of_each_time, thin
 from app.rerun_view import AHEAD, RerunFeed
@@ -98,13 +98,16 @@ def fed(tmp_path):
 
 
 def truths(times_s, values):
-    batch = readings(times_s, values)
-    return Readings(batch.t, batch.arrival, np.full(len(batch), TRUTH, np.int8), batch.channel, batch.value)
+    """Blocks of true states from the first one on, or single values of it."""
+    values = np.asarray(values, float).reshape(len(times_s), -1)
+    batch = readings(times_s, values[:, 0])
+    return Readings(batch.t, batch.arrival, np.full(len(batch), TRUTH, np.int8), batch.channel, values)
 
 
 def test_bytes_hold_the_rows_of_the_track(fed):
     t = np.arange(1, 31) * 0.25
-    batch = Readings.concat([readings(t, 40 + np.sin(t)), truths(t, 40 + np.cos(t))], fed.engine.model.width)
+    block = np.stack((40 + np.cos(t), np.where(np.arange(30) % 3, np.sin(t), np.nan)), axis=1)
+    batch = Readings.concat([readings(t, 40 + np.sin(t)), truths(t, block)], fed.engine.model.width)
     fed.put(batch.select(np.argsort(batch.t, kind="stable")))
     fed.next()
     pull = fed.track()
@@ -121,7 +124,14 @@ def test_bytes_hold_the_rows_of_the_track(fed):
     _, values = fed.column(f"/innovation/{sensor}")
     np.testing.assert_array_equal(values[:, 0], pull.track.innovation[reading, 0])
     np.testing.assert_array_equal(values[:, 1], 2 * pull.track.innovation_std[reading, 0])
-    np.testing.assert_array_equal(fed.column("/truth/temperature")[1][:, 0], 40 + np.cos(t))
+    np.testing.assert_array_equal(fed.column("/truth/temperature")[1][:, 0], block[:, 0])
+    np.testing.assert_array_equal(fed.column("/truth/rate")[1][:, 0], block[np.arange(30) % 3 > 0, 1])
+    both = np.isfinite(block).all(axis=1)
+    times, values = fed.column(f"/pair/{pair_name(fed.engine.model, [0, 1])}/up/truth", "Points2D:positions")
+    assert set(times.tolist()) == set(np.round(t[both] * 1e9).astype(int).tolist())
+    at = np.searchsorted(np.round(t * 1e9).astype(int), times)
+    points = np.stack([np.concatenate(row) for row in values])
+    np.testing.assert_allclose(points, block[at] / axis_scales(fed.engine.model, np.array([0, 1])), rtol=1e-6)
     _, values = fed.column("/nis/window")
     assert np.all((values[:, 1] < values[:, 2])[1:])
     assert fed.column("/health", "StateChange:state")[1].ravel().tolist() == ["tracking"]

@@ -7,7 +7,7 @@ from app.twin import load_twin
 from config.loader import TWINS, shipped
 from estimators.errors import SourceError
 from estimators.fold import fold
-from estimators.log import READING, TRUTH, Log, Readings
+from estimators.log import READING, Log, Readings, truth_of
 from estimators.track import GATED, USED, Track
 from tests.conftest import absent
 
@@ -42,17 +42,18 @@ def test_the_motor_on_the_bus_finds_its_magnet() -> None:
     assert (TWINS.parent / "logs" / "motor_can.blf").stat().st_size < 1_000_000
     seconds = (events.t - events.t[0]) * 1e-9
     for state, bound in ((0, 0.5), (1, 0.5), (2, 0.5)):
-        rows = (events.kind == TRUTH) & (events.channel == state) & (seconds > 20)
-        assert np.abs(track.mean[rows, state] - events.value[rows, 0]).max() < bound
-    magnet = (events.kind == TRUTH) & (events.channel == 3)
-    miss = np.abs(track.mean[magnet, 3] - events.value[magnet, 0])
+        rows, values = truth_of(events, state)
+        assert np.abs(track.mean[rows, state] - values)[seconds[rows] > 20].max() < bound
+    magnet, values = truth_of(events, 3)
+    miss = np.abs(track.mean[magnet, 3] - values)
     assert miss[0] > 5 and miss[seconds[magnet] > 150].max() < 4
     assert track.std[magnet, 3][-1] < 3
 
 
 def test_the_winding_gives_the_articles_numbers() -> None:
     events, track = folded("motor_winding")
-    rows = (events.kind == TRUTH) & (events.channel == 0) & (events.t > 0)
-    assert np.sqrt(np.mean((track.mean[rows, 0] - events.value[rows, 0]) ** 2)) == pytest.approx(1.0432, abs=5e-5)
+    rows, values = truth_of(events, 0)
+    assert events.t[rows[0]] > 0
+    assert np.sqrt(np.mean((track.mean[rows, 0] - values) ** 2)) == pytest.approx(1.0432, abs=5e-5)
     assert np.nanmean(track.nis) == pytest.approx(0.8227, abs=5e-5)
     np.testing.assert_allclose(track.std[-1] ** 2, [0.81306, 0.012751], rtol=1e-5)

@@ -304,7 +304,7 @@ def test_a_truth_of_another_model_must_fit() -> None:
     assert message(text, ConfigError) == (
         "motor.yaml:6: source.truth.model has states winding, tooth, yoke, magnet; they must be temperature, rate"
     )
-    assert len(events(twin_of(text.replace("./other.py:Other", "motor_winding")))) == 7
+    assert len(events(twin_of(text.replace("./other.py:Other", "motor_winding")))) == 5
 
 
 CAR = """\

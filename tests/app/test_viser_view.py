@@ -309,6 +309,22 @@ def test_belief_scene_follows_the_estimate(view, engine):
     assert labels[0] < belief.mean[0] < labels[-1]
 
 
+def test_blocks_of_true_states_are_drawn(engine):
+    """Both states in one event, the second not always known: each chart and the belief's point get their own."""
+    t = 100.0 + np.arange(5)
+    block = np.stack((50.0 + t, [0.1, np.nan, 0.3, 0.4, np.nan]), axis=1)
+    engine.put(events(WINDING, TRUTH, 0, t, block))
+    view = ViserView(engine, secret="x")
+    try:
+        view.frame()
+        for j, expected in enumerate((block[:, 0], [0.1, 0.3, 0.4])):
+            values = view.charts._values(view.history, view.history.n - 5, view.history.n)[:, 3 * WINDING.nx + j]
+            np.testing.assert_array_equal(values[np.isfinite(values)], expected)
+        np.testing.assert_array_equal(view.scene._true_point(view.history, [1, 0]), [[0.4, 154.0]])
+    finally:
+        view.stop()
+
+
 def test_the_thread_draws_and_stops(engine):
     view = ViserView(engine, secret="x")
     view.start()
@@ -337,12 +353,17 @@ def test_vehicle_scene_keeps_the_vehicle_in_the_middle():
     engine = FakeEngine(model, "kf", ViewSection(scene=SceneSection(kind="vehicle", position=("east", "north"))))
     t = np.arange(1.0, 61.0)
     engine.put(events(model, READING, 0, t, np.stack((10 * t, 0 * t), axis=1)))
+    north = np.where(t == 30.0, np.nan, 3.0)
+    engine.put(events(model, TRUTH, 0, t, np.stack((10 * t, north), axis=1)))
     view = ViserView(engine, secret="x")
     try:
         view.frame()
         np.testing.assert_allclose(view.scene.world.position, [-600.0, 0.0, 0.0], atol=2.0)
         np.testing.assert_allclose(view.scene._vehicle.position[:2], engine.belief().mean[:2], atol=1e-6)
         assert view.scene._readings.points.shape == (60, 3)
+        way = np.unique(np.asarray(view.scene._truth.points).reshape(-1, 3), axis=0)
+        np.testing.assert_allclose(way[:, 0], 10 * t[t != 30.0], err_msg="where both true states are known")
+        np.testing.assert_allclose(way[:, 1], 3.0)
         assert view.scene._course == pytest.approx(0.0, abs=0.05)
         cov = engine.belief().cov[:2, :2]
         np.testing.assert_allclose(view.scene._ellipse.scale[:2], 2 * np.sqrt(np.linalg.eigvalsh(cov)), rtol=1e-6)

@@ -53,10 +53,10 @@ def as_log(rows):
     batch = [Readings.one(0, 0, TICK, 0, (), 1)]
     for k, (truth, y, lost, *_) in enumerate(rows):
         t = (k + 1) * SECOND
-        batch.append(Readings.one(t, t, READING, 0, np.nan if lost else y, 1))
-        batch += [Readings.one(t, t, TRUTH, j, truth[j], 1) for j in range(2)]
-    log = Log(1)
-    log.extend(Readings.concat(batch, 1))
+        batch.append(Readings.one(t, t, READING, 0, np.nan if lost else y, 2))
+        batch.append(Readings.one(t, t, TRUTH, 0, truth, 2))
+    log = Log(2)
+    log.extend(Readings.concat(batch, 2))
     return log
 
 

@@ -120,6 +120,52 @@ def test_errors_of_angles_are_the_short_way():
     np.testing.assert_allclose(short, 2 * np.pi - 6.2, rtol=1e-12)
 
 
+def test_true_states_come_in_blocks():
+    """40 states, truth from 0 on and from 32 on, partly unknown, and one event with a single value of old.
+
+    The filter stays at its prior, mean j/10 and 95 % band 1.96 * 0.5, so every number follows by hand.
+    """
+    names = [f"s{j}" for j in range(40)]
+    many = StateSpaceModel(
+        name="many",
+        title="many",
+        states=tuple(State(name, "", mean=j / 10, std=0.5, circular=j == 33) for j, name in enumerate(names)),
+        noises=(Noise("s0", "", 0.0),),
+        sensors=(Sensor("compass", (Row("compass", "", 0.01),), h=itself),),
+        f=unmoved,
+        linear=True,
+    )
+    nan = np.nan
+    low, high = np.full(32, nan), np.full(32, nan)
+    low[0], low[5], low[31] = 0.3, 1.5, 3.1  # errors -0.3, -1, 0
+    high[0], high[1], high[7] = nan, -2.8, 4.3  # state 33: 3.3 + 2.8 = 6.1 is -0.1832 the short way; state 39: -0.4
+    batch = [
+        Readings.one(0, 0, TRUTH, 0, low, 32),
+        Readings.one(0, 0, TRUTH, 32, high, 32),
+        Readings.one(SECOND, 0, TRUTH, 5, 0.5 - 2.0, 32),  # error 2, outside the band as the -1 before it
+        Readings.one(SECOND, 0, TRUTH, 0, nan, 32),
+    ]
+    log = Log(many.width)
+    log.extend(Readings.concat(batch, many.width))
+    fits = score(fold("kf", many, Tuning.of(many), log), log.readings, many).states
+    expected = {
+        "s0": (0.3, 1.0),
+        "s5": (np.sqrt((1.0 + 4.0) / 2), 0.0),
+        "s31": (0.0, 1.0),
+        "s33": (2 * np.pi - 6.1, 1.0),
+        "s39": (0.4, 1.0),
+    }
+    assert list(fits) == list(expected)
+    for name, (rmse, coverage) in expected.items():
+        # The circular mean 3.3 is kept as 3.3 - 2π: one rounding of numbers near 6.
+        assert fits[name].rmse == pytest.approx(rmse, rel=1e-12, abs=1e-14) and fits[name].coverage == coverage
+
+
+def unmoved(x, u, p, dt, out):
+    for j in range(x.size):
+        out[j] = x[j]
+
+
 def still(x, u, p, dt, out):
     out[0] = x[0]
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimators.log import READING, TICK, Log, Readings
+from estimators.log import READING, TICK, TRUTH, Log, Readings, truth_of
 
 SECOND = 1_000_000_000
 
@@ -151,3 +151,39 @@ def test_one_and_concat():
     assert len(both) == 2
     assert len(Readings.concat([], 3)) == 0
     assert Readings.concat([], 3).value.shape == (0, 3)
+
+
+def test_fewer_columns_are_filled_up_not_repeated():
+    """A recording of old holds one true value an event; in a wider log it must not become that of its neighbour."""
+    old = Readings.one(1, 1, TRUTH, 0, 7.0, 1)
+    log = Log(3)
+    log.extend(old)
+    log.extend(Readings.concat([old, Readings.one(2, 2, TRUTH, 1, 8.0, 3)], 3))
+    expected = [[7.0, np.nan, np.nan], [7.0, np.nan, np.nan], [8.0, np.nan, np.nan]]
+    np.testing.assert_array_equal(log.readings.value, expected)
+    assert old.widened(1) is old and log.readings.widened(2).value.shape == (3, 3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_truth_of_is_its_definition(seed):
+    """Event by event: values from the state `channel` on, some NaN, among readings and ticks that must not count."""
+    rng = np.random.default_rng(seed)
+    n, width, states = 1000, 4, 11
+    events = Readings(
+        np.arange(n),
+        np.arange(n),
+        rng.choice([READING, TRUTH, TICK], n).astype(np.int8),
+        rng.integers(0, states, n).astype(np.int32),
+        np.where(rng.random((n, width)) < 0.3, np.nan, rng.normal(size=(n, width))),
+    )
+    known = {j: ([], []) for j in range(states + width)}
+    for i in range(n):
+        for k in range(width):
+            if events.kind[i] == TRUTH and np.isfinite(events.value[i, k]):
+                known[events.channel[i] + k][0].append(i)
+                known[events.channel[i] + k][1].append(events.value[i, k])
+    for j, (rows, values) in known.items():
+        got = truth_of(events, j)
+        assert got[0].tolist() == rows and got[1].tolist() == values
+    assert all(len(rows) > 5 for rows, _ in list(known.values())[:states])
+    assert truth_of(Readings.empty(2), 0)[1].size == 0

@@ -12,7 +12,7 @@ from app.twin import load_twin
 from estimators.compiled import compile_model
 from estimators.fold import fold
 from estimators.jacobians import ANALYTIC, COMPLEX_STEP
-from estimators.log import INPUT, READING, TRUTH, Log, Readings
+from estimators.log import INPUT, READING, Log, Readings, truth_of
 from estimators.model import StateSpaceModel
 from estimators.models import MODELS
 from estimators.models.motor_drive import COPPER, MOTOR_DRIVE
@@ -281,8 +281,8 @@ def test_bench_magnet_is_found_without_its_thermometer(data: Callable[..., Path]
     data("motor_pmsm_paderborn", "session60_first_30min_2hz.csv")
     result = run("motor_bench", estimator)
     assert in_bounds(result)
-    rows = (result.events.kind == TRUTH) & (result.events.channel == 3)
-    truth, estimate = result.events.value[rows, 0], result.track.mean[rows, 3]
+    rows, truth = truth_of(result.events, 3)
+    estimate = result.track.mean[rows, 3]
     late = np.arange(truth.size) >= 2400  # the parameters were fitted on what is before
     assert truth.size == 3600 and truth[late].max() - truth[late].min() > 5.0
     # 0.93 K was measured; the margin is for other libraries' rounding, not for other tunings.

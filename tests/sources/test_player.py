@@ -8,7 +8,7 @@ import pytest
 from can_tools import Reports, dbc, read_all
 
 from estimators.errors import SourceError
-from estimators.log import INPUT, READING, TRUTH
+from estimators.log import INPUT, READING, TRUTH, truth_of
 from estimators.model import Input, Noise, Row, Sensor, State, StateSpaceModel
 from sources.can_bus import CanBus
 from sources.decoder import Decoder
@@ -136,12 +136,10 @@ def test_what_is_decoded_is_what_was_simulated(tmp_path):
         ours = got.value[(got.kind == READING) & (got.channel == index), 0]
         assert lost.sum() == 12 and ours.size == theirs.size - lost.sum(), "a lost reading is a lost frame"
         np.testing.assert_allclose(ours, theirs[~lost], atol=step / 2 * 1.0001)
-    truth = got.value[(got.kind == TRUTH) & (got.channel == 0), 0]
-    np.testing.assert_allclose(
-        truth, expected.value[(expected.kind == TRUTH) & (expected.channel == 0), 0], atol=0.00051
-    )
-    narrow = got.value[(got.kind == TRUTH) & (got.channel == 1), 0]
-    assert (narrow == 2.0).all(), "held at the signal's limit"
+    truth = truth_of(got, 0)[1]
+    np.testing.assert_allclose(truth, truth_of(expected, 0)[1], atol=0.00051)
+    narrow = truth_of(got, 1)[1]
+    assert narrow.size == truth.size == 120 and (narrow == 2.0).all(), "held at the signal's limit"
 
 
 def test_inputs_are_said_when_they_change_and_every_second(tmp_path):

@@ -5,7 +5,7 @@ import pytest
 from can_tools import read_all, same
 
 from estimators.errors import SourceError
-from estimators.log import INPUT, READING, TICK, TRUTH
+from estimators.log import INPUT, READING, TICK, TRUTH, truth_of
 from estimators.model import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from sources.profile import Constant, Sine, Steps, Sum
@@ -37,10 +37,10 @@ def winding(**more):
 def test_the_articles_numbers():
     got = read_all(winding(sensors={"winding": SensorPlan(drop_every=15)}))
     assert (got.t[0], got.kind[0]) == (0, TICK)
-    truth = got.value[got.kind == TRUTH, 0].reshape(120, 2)
+    truth = got.value[got.kind == TRUTH]
     reading = got.value[got.kind == READING, 0]
-    assert got.kind[1:].tolist() == [READING, TRUTH, TRUTH] * 120
-    assert got.t[1:].tolist() == [10**9 * (k + 1) for k in range(120) for _ in range(3)]
+    assert got.kind[1:].tolist() == [READING, TRUTH] * 120
+    assert got.t[1:].tolist() == [10**9 * (k + 1) for k in range(120) for _ in range(2)]
     for k, (x, y) in enumerate(article()):
         np.testing.assert_allclose(truth[k], x, rtol=1e-14)  # a sum in another order
         assert np.isnan(reading[k]) if y is None else reading[k] == pytest.approx(y[0], rel=1e-14)
@@ -124,7 +124,7 @@ def test_long_steps_are_split_as_the_model_asks():
     b = 1.0
     for _ in range(5):
         b -= 0.1 * b * b
-    assert read_all(source).value[-1, 0] == pytest.approx(b, rel=1e-12)
+    assert read_all(source).value[-1, 1] == pytest.approx(b, rel=1e-12)
 
 
 def test_another_truth():
@@ -134,13 +134,39 @@ def test_another_truth():
 
     source = Simulator(model(), seed=0, step=1.0, duration=2.0, truth_model=model(f=slower), sensors=QUIET)
     got = read_all(source)
-    assert got.value[(got.kind == TRUTH) & (got.channel == 1), 0].tolist() == [0.5, 0.0]
+    assert truth_of(got, 1)[1].tolist() == [0.5, 0.0]
+
+
+def test_many_true_states_are_blocks():
+    """75 states in blocks of 32: two that are full and one of 11; state j is j + t."""
+
+    def grow(x, u, p, dt, out):
+        for j in range(x.size):
+            out[j] = x[j] + dt
+
+    names = [f"s{j}" for j in range(75)]
+    many = model(
+        states=tuple(State(name, "", float(j), 1.0) for j, name in enumerate(names)),
+        noises=(Noise("s0", "", 0.0),),
+        sensors=(Sensor("one", (Row("one", "", 1.0),), one),),
+        f=grow,
+    )
+    assert many.width == 32
+    got = read_all(Simulator(many, seed=0, step=0.5, duration=1.0))
+    truth = got.select(got.kind == TRUTH)
+    assert truth.channel.tolist() == [0, 32, 64] * 2
+    assert truth.t.tolist() == [500_000_000] * 3 + [10**9] * 3
+    assert np.isfinite(truth.value).sum(axis=1).tolist() == [32, 32, 11] * 2
+    for j in range(75):
+        rows, values = truth_of(got, j)
+        np.testing.assert_allclose(values, j + got.t[rows] * 1e-9, rtol=1e-14, atol=1e-12)
+        assert rows.size == 2
 
 
 def test_true_noise_has_its_variance():
     """10,000 increments: the estimated variance is within 5 standard errors, sqrt(2/n)."""
     got = read_all(winding(duration=10_000.0, truth_noise={"temperature": 0.25, "rate": 0.0}))
-    x = got.value[got.kind == TRUTH, 0].reshape(-1, 2)
+    x = got.value[got.kind == TRUTH]
     steps = np.diff(x[:, 0]) - x[:-1, 1]
     assert np.var(steps) == pytest.approx(0.25, rel=5 * np.sqrt(2 / steps.size))
     assert np.all(x[:, 1] == 0.2)

@@ -58,6 +58,27 @@ def test_a_row_is_inputs_then_readings_then_truths(tmp_path):
     assert reports.counts == {"condition pair": 1}
 
 
+def test_true_states_of_a_row_are_blocks(tmp_path):
+    """A block begins with a state that is known and reaches as far as the log is wide; here are 2 columns."""
+    names = {0: "w", 1: "a", 2: "b", 5: "power"}
+    channels = [Channel(TRUTH, index, names[index], (names[index],)) for index in (5, 2, 0, 1)]
+    channels[1] = Channel(TRUTH, 2, "b", ("b",), where=(Condition("ok", 1, 1),))
+    path = write(tmp_path, "t,w,a,b,ok,power\n0,1,2,3,1,6\n1,,2,3,1,6\n2,1,,3,1,\n3,1,2,3,0,6\n4,,,,1,\n")
+    got = events(read_all(table(path, channels=channels)))
+    expected = [
+        (0, TRUTH, 0, 1.0, 2.0),
+        (0, TRUTH, 2, 3.0, NAN),
+        (0, TRUTH, 5, 6.0, NAN),
+        (10**9, TRUTH, 1, 2.0, 3.0),
+        (10**9, TRUTH, 5, 6.0, NAN),
+        (2 * 10**9, TRUTH, 0, 1.0, NAN),
+        (2 * 10**9, TRUTH, 2, 3.0, NAN),
+        (3 * 10**9, TRUTH, 0, 1.0, 2.0),
+        (3 * 10**9, TRUTH, 5, 6.0, NAN),
+    ]
+    np.testing.assert_array_equal(np.array(got), np.array(expected))
+
+
 def test_blank_says_nothing_and_what_is_no_number_is_missing_with_its_line(tmp_path):
     reports = Reports()
     path = write(tmp_path, HEADER + "0,,1,2,1,,\n\n1,hot,3,,1,nan,oops\n2,NaN,inf,1,1,n/a,\n")
