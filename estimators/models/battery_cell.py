@@ -3,11 +3,11 @@
     dz/dt  = -i / C                                    z state of charge, i > 0 discharges
     dV1/dt = (R1 g(T) (1 + k e^(-z / 0.05)) i - V1) / τ1
     m dT/dt = i (R0 g(T) i + V1) - (T - T_air) / R_air
-    v = U(z) - V1 - R0 g(T) i,      g(T) = exp(B (1 / T - 1 / 298.15 K))
+    v = U(z) + e - V1 - R0 g(T) i,  g(T) = exp(B (1 / T - 1 / 298.15 K))
 
 U is a monotone cubic through its values at 14 states of charge, which are parameters; outside 0 to 1 it goes on
 straight. R1 rises when the cell is nearly empty, where diffusion cannot follow. C1 = τ1 / R1. Entropic heat is left
-out. z and V1 are exact for a current that is held; T takes Euler steps of at most 2 s, against minutes of its own.
+out. e is zero; estimated jointly, it stands for hysteresis and age, by which U is off for hours. z and V1 are exact for a current that is held; T takes Euler steps of at most 2 s, against minutes of its own.
 
 The values are of a Panasonic NCR18650PF of 2.9 Ah at 25 °C, from the recordings of P. Kollmeyer, Panasonic 18650PF
 Li-ion Battery Data (2018), doi:10.17632/wykht8y7tg.1, CC BY 4.0: least squares of the simulated voltage and
@@ -50,7 +50,7 @@ COMMON = (
 """Parameters that a pack's cells have in common: U at 0 %, 2 %, ... of charge, R1, τ1, k, B, m, R_air."""
 
 R1, TAU_1, R1_RISE, ACTIVATION, HEAT_CAPACITY, TO_AIR = range(len(NODES), len(COMMON))
-CAPACITY, R0 = len(COMMON), len(COMMON) + 1
+CAPACITY, R0, OCV_ERROR = range(len(COMMON), len(COMMON) + 3)
 CURRENT, AIR = range(2)
 SOC, V1, TEMPERATURE = range(3)
 
@@ -156,7 +156,7 @@ def voltage(x, u, p, out):
     """Terminal voltage."""
     g, _ = warmth(x[TEMPERATURE], p)
     rest, _ = open_circuit(x[SOC], p)
-    out[0] = rest - x[V1] - p[R0] * g * u[CURRENT]
+    out[0] = rest + p[OCV_ERROR] - x[V1] - p[R0] * g * u[CURRENT]
 
 
 def voltage_slope(x, u, p, out):
@@ -187,7 +187,12 @@ BATTERY_CELL = StateSpaceModel(
         State("temperature", "°C", mean=25.0, std=3.0),
     ),
     inputs=(Input("current", "A"), Input("air", "°C", default=25.0)),
-    parameters=(*COMMON, Parameter("capacity", "A h", 2.9, 0.1, 500.0), Parameter("r0", "Ω", 0.0328, 1e-4, 0.5)),
+    parameters=(
+        *COMMON,
+        Parameter("capacity", "A h", 2.9, 0.1, 500.0),
+        Parameter("r0", "Ω", 0.0328, 1e-4, 0.5),
+        Parameter("ocv_error", "V", 0.0, -0.2, 0.2),
+    ),
     noises=(
         Noise("soc", "1/s", variance=1e-10),
         Noise("v1", "V²/s", variance=4e-7),

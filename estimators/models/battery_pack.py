@@ -117,7 +117,7 @@ def temperatures_slope(x, u, p, out):
         out[k, 3 * k + TEMPERATURE] = 1.0
 
 
-_capacity, _r0 = BATTERY_CELL.parameters[-2:]
+_capacity, _r0 = BATTERY_CELL.parameters[NEIGHBOUR : NEIGHBOUR + 2]
 
 BATTERY_PACK = StateSpaceModel(
     name="battery_pack",
