@@ -147,3 +147,49 @@ def scored(name: str, estimator: str) -> Score:
         raise
     track = fold(estimator, twin.model, twin.tuning, log)
     return score(track, log.readings, twin.model)
+
+
+@pytest.mark.parametrize(
+    ("name", "estimator", "rmse", "coverage", "nis"),
+    [
+        # Half as much again as measured, RMSE and coverage; the mean NIS near the one that the twin's opening tells.
+        ("battery_panasonic", "ekf", 0.0125, 0.90, (0.5, 0.65)),
+        ("battery_panasonic", "ukf", 0.0125, 0.90, (0.5, 0.65)),
+        ("battery_dmegc", "ekf", 0.015, 0.93, (0.8964, 1.1092)),
+        ("battery_dmegc", "ukf", 0.008, 0.93, (0.8964, 1.1092)),
+    ],
+)
+def test_charge_is_found_on_recordings_from_forty_percent_wrong(name, estimator, rmse, coverage, nis) -> None:
+    result = scored(name, estimator)
+    assert result.states["soc"].rmse < rmse
+    assert result.states["soc"].coverage > coverage
+    assert nis[0] < result.nis < nis[1]
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "ukf"])
+def test_the_pack_tells_the_weak_cell(estimator: str) -> None:
+    result = scored("battery_pack", estimator)
+    for k in range(1, CELLS + 1):
+        fit = result.states[f"soc_{k}"]
+        assert fit.rmse < (0.007 if k == 5 else 0.0035) and fit.coverage > (0.85 if k == 5 else 0.95)
+        assert result.states[f"temperature_{k}"].rmse < 0.08
+    assert 7.2 < result.nis < 8.1076
+
+
+def test_lost_capacity_is_found_when_it_is_estimated() -> None:
+    twin = load_twin(
+        "battery_pack",
+        overrides={
+            "estimate": "{capacity_5: {std: 0.3}}",
+            "noise.soc": "{variance: 1e-11}",
+            "noise.v1": "{variance: 1e-7}",
+            "source.truth.parameters": "{r0_5: 0.044}",
+            "source.truth.noise.capacity_5": "{variance: 0}",
+            "source.initial.capacity_5": "2.54",
+        },
+    )
+    log, _ = read_log(twin, None)
+    track = fold("ekf", twin.model, twin.tuning, log)
+    assert twin.model.state_names[-1] == "capacity_5"
+    assert track.mean[0, -1] == pytest.approx(2.9)
+    assert track.mean[-1, -1] == pytest.approx(2.54, abs=0.1)

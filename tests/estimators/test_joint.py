@@ -2,10 +2,15 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from app.fold import read_log
+from app.twin import load_twin
 from estimators.compiled import compile_model
 from estimators.errors import ModelError
 from estimators.fold import fold
@@ -13,6 +18,7 @@ from estimators.joint import Unknown, joint
 from estimators.log import READING, Log, Readings
 from estimators.model import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
+from estimators.score import score
 from estimators.tuning import Tuning
 
 SECOND = 1_000_000_000
@@ -76,8 +82,6 @@ def readings(n: int = 80) -> Log:
 @pytest.mark.parametrize("with_q", [False, True])
 @pytest.mark.parametrize("estimator", ["ekf", "ukf"])
 def test_an_unknown_inflow_is_estimated_as_by_a_kalman_filter_augmented_by_hand(estimator: str, with_q: bool) -> None:
-    from dataclasses import replace
-
     tank = replace(TANK, Q=spread) if with_q else TANK
     model = joint(tank, {"inflow": Unknown(0.2, 0.03)})
     assert model.state_names == ("level", "inflow")
@@ -150,3 +154,29 @@ def test_another_process_finds_the_compiled_code() -> None:
     for _ in range(2):
         told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert told.split()[-1] == "0", told
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "ukf"])
+def test_a_silted_jacket_is_found(estimator: str) -> None:
+    twin = load_twin("motor_joint")
+    log, _ = read_log(twin, None)
+    track = fold(estimator, twin.model, twin.tuning, log)
+    result = score(track, log.readings, twin.model)
+    late = slice(len(track.mean) // 2, None)
+    np.testing.assert_allclose(track.mean[late, 4], 0.04, atol=4 * track.std[late, 4].max())
+    assert track.std[-1, 4] < 5e-4 and track.mean[0, 4] == pytest.approx(0.03)
+    assert result.states["yoke_coolant"].coverage > 0.9
+    assert result.states["magnet"].rmse < 1.8
+    assert result.nis_low < result.nis < result.nis_high
+
+
+def test_on_the_bench_the_magnet_is_found_without_the_jackets_resistance(data: Callable[..., Path]) -> None:
+    data("motor_pmsm_paderborn", "session60_first_30min_2hz.csv")
+    twin = load_twin("motor_bench_joint")
+    log, _ = read_log(twin, None)
+    track = fold("ekf", twin.model, twin.tuning, log)
+    result = score(track, log.readings, twin.model)
+    assert track.mean[0, 4] == pytest.approx(0.048)
+    assert 0.026 < track.mean[-1, 4] < 0.033  # fitted with all temperatures: 0.032
+    assert result.states["magnet"].rmse < 1.1
+    assert result.nis_low < result.nis < result.nis_high
