@@ -15,6 +15,7 @@ from config.loader import Loaded, shown_path
 from config.problems import nearest
 from config.yaml_lines import Key
 from estimators.errors import ModelError, NisusError
+from estimators.joint import Unknown, joint
 from estimators.model import StateSpaceModel
 from estimators.models import MODELS
 
@@ -99,12 +100,9 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
         ConfigError: With file and line, if the YAML names what the model lacks or a value breaks its rule.
     """
     config = loaded.config
-    check_names(
-        loaded, ("parameters",), config.parameters, [item.name for item in model.parameters], "parameter", model
-    )
-    check_names(loaded, ("prior",), config.prior, model.state_names, "state", model)
-    check_names(loaded, ("noise",), config.noise, [item.name for item in model.noises], "noise", model)
-    check_names(loaded, ("sensors",), config.sensors, model.sensor_names, "sensor", model)
+    names = [item.name for item in model.parameters]
+    check_names(loaded, ("parameters",), config.parameters, names, "parameter", model)
+    check_names(loaded, ("estimate",), config.estimate, names, "parameter", model)
     for item in model.parameters:
         value = config.parameters.get(item.name, item.value)
         if not item.low <= value <= item.high:
@@ -112,6 +110,12 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
                 ("parameters", item.name),
                 f"is {value:g} {item.unit}; it must lie between {item.low:g} and {item.high:g}",
             )
+    parameters = tuple(replace(p, value=config.parameters.get(p.name, p.value)) for p in model.parameters)
+    unknowns = {name: Unknown(section.std, section.drift) for name, section in config.estimate.items()}
+    model = joint(replace(model, parameters=parameters), unknowns)
+    check_names(loaded, ("prior",), config.prior, model.state_names, "state", model)
+    check_names(loaded, ("noise",), config.noise, [item.name for item in model.noises], "noise", model)
+    check_names(loaded, ("sensors",), config.sensors, model.sensor_names, "sensor", model)
     states = []
     for state in model.states:
         prior = config.prior.get(state.name)
@@ -120,7 +124,6 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     return replace(
         model,
         states=tuple(states),
-        parameters=tuple(replace(p, value=config.parameters.get(p.name, p.value)) for p in model.parameters),
         noises=tuple(
             replace(noise, variance=config.noise[noise.name].value) if noise.name in config.noise else noise
             for noise in model.noises

@@ -23,6 +23,15 @@ class PriorSection(Section):
     """Standard deviation of that belief, in the state's unit. Default: the model's."""
 
 
+class UnknownSection(Section):
+    """A parameter of the model that is estimated with the state."""
+
+    std: Positive
+    """Standard deviation of what is believed of it at the start, about its value, in its unit."""
+    drift: NotNegative = 0.0
+    """What one second adds to it: standard deviation of a random walk. Default: 0, an unknown constant."""
+
+
 class SensorSection(SpreadSection):
     """The noise of one sensor as the estimator assumes it, and whether the estimate uses it."""
 
@@ -108,6 +117,9 @@ class TwinSection(Section):
     of a function that returns one, in it (./pump.py:Pump)."""
     parameters: dict[str, Number] = {}
     """The model's parameters by name, in their units. Default: the model's values."""
+    estimate: dict[str, UnknownSection] = {}
+    """Parameters that are moved into the state and estimated with it, by name: {std, drift}. They become the last
+    states, which may be named wherever a state may. Default: none."""
     prior: dict[str, PriorSection] = {}
     """The belief before the first reading, by state. Default: the model's."""
     noise: dict[str, LevelSection] = {}

@@ -286,7 +286,7 @@ class TimeColumnSection(Section):
 
 
 class TableSection(RecordingSection):
-    """A table: CSV or Parquet."""
+    """A table: CSV, Parquet, or the vectors of a MATLAB file (.mat up to version 7), named as in MATLAB: meas.Voltage."""
 
     type: Literal["table"]
     """table"""
