@@ -7,7 +7,9 @@
 
 U is a monotone cubic through its values at 14 states of charge, which are parameters; outside 0 to 1 it goes on
 straight. R1 rises when the cell is nearly empty, where diffusion cannot follow. C1 = τ1 / R1. Entropic heat is left
-out. e is zero; estimated jointly, it stands for hysteresis and age, by which U is off for hours. z and V1 are exact for a current that is held; T takes Euler steps of at most 2 s, against minutes of its own.
+out. e is zero; estimated jointly, it stands for hysteresis and age, by which U is off for hours. z is exact for a
+current that is held, and so is V1 but for R1, which is held over a step; T takes Euler steps of at most 2 s, against
+minutes of its own.
 
 The values are of a Panasonic NCR18650PF of 2.9 Ah at 25 °C, from the recordings of P. Kollmeyer, Panasonic 18650PF
 Li-ion Battery Data (2018), doi:10.17632/wykht8y7tg.1, CC BY 4.0: least squares of the simulated voltage and
