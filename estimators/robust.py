@@ -1,0 +1,246 @@
+"""What every Gaussian filter offers against a wrong model or wrong readings: inflation, weights, adaptation.
+
+All of it is off by default and then costs a comparison. What an adaptation remembers stands behind the filter's own
+state, so it is rewound and reproduced with it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .context import add_process_noise, options, sensor_rows, sensor_variances
+from .filter import Option, Options
+from .jit import floats, jit, matrix
+from .linalg import cholesky, solve_transposed, solve_upper
+from .model import StateSpaceModel
+
+JOSEPH, INFLATION, ROBUST, ROBUST_AT, ADAPT, ADAPT_RATE, ADAPT_BOUND, OWN = range(8)
+"""Positions in the context's options; those of the filter itself begin at OWN."""
+
+NONE, HUBER, STUDENT_T = range(3)
+"""How a reading is weighted."""
+
+OFF, ADAPT_R, ADAPT_Q = range(3)
+"""What is adapted."""
+
+JOSEPH_OPTION = Option.choice("joseph", ("off", "on"), "update P by the Joseph form; off subtracts K S Kᵀ, faster", 1)
+
+INFLATION_OPTION = Option("inflation", 1.0, 1.0, 100.0, "1/s", "factor by which P grows in a second, beside Q; 1: none")
+
+OPTIONS = (
+    INFLATION_OPTION,
+    Option.choice("robust", ("none", "huber", "student-t"), "how the weight of a reading falls with its distance"),
+    Option("huber", 1.345, 0.1, 10.0, "std", "distance from which Huber's weight falls"),
+    Option("dof", 4.0, 1.0, 100.0, "", "degrees of freedom of Student's t; fewer have heavier tails"),
+    Option.choice("adapt", ("off", "R", "Q"), "what follows the innovations: each sensor row's variance, or all of Q"),
+    Option("memory", 200.0, 10.0, 1e5, "readings", "over how many readings an adaptation averages"),
+    Option("bound", 10.0, 1.0, 1e4, "", "an adapted variance stays within this factor of the tuned one"),
+)
+"""Options of every Gaussian filter that has a gain of its own."""
+
+MOST = 100
+"""Iterations of a weight, at most."""
+
+
+def shared(values: Options) -> list[float]:
+    """The numbers of the shared options, in the order of the positions above."""
+    kind = values.get("robust", NONE)
+    return [
+        values.get("joseph", 0.0),
+        float(np.log(values["inflation"])),
+        kind,
+        values["dof"] if kind == STUDENT_T else values.get("huber", 0.0),
+        values.get("adapt", OFF),
+        1.0 / values.get("memory", 1.0),
+        values.get("bound", 1.0),
+    ]
+
+
+def memory(values: Options, model: StateSpaceModel) -> int:
+    """Numbers that an adaptation keeps: for each sensor row its mean and the variance in use; or one scale of Q."""
+    rows = sum(len(sensor.rows) for sensor in model.sensors)
+    return {OFF: 0, ADAPT_R: 2 * rows, ADAPT_Q: 1}[int(values["adapt"])]
+
+
+def scratch_size(ny: int) -> int:
+    """Numbers that `reweigh` takes to work in."""
+    return ny * ny + 4 * ny
+
+
+@jit
+def forget(context, state):
+    """Set what an adaptation remembers to the tuned values."""
+    kind = options(context)[ADAPT]
+    if kind == ADAPT_R:
+        rows = context.n_rows
+        r = floats(context.r, rows)
+        at = state.size - 2 * rows
+        for i in range(rows):
+            state[at + i] = r[i]
+            state[at + rows + i] = r[i]
+    elif kind == ADAPT_Q:
+        state[state.size - 1] = 1.0
+
+
+@jit
+def growth(context, dt):
+    """The factor by which P grows in dt seconds beside Q.
+
+    Old readings are forgotten exponentially, which keeps the gain from dying; a rate, so that it does not matter in how
+    many steps the time is crossed. Source: Simon (2006), Optimal State Estimation, 7.4 (the fading-memory filter).
+    """
+    rate = options(context)[INFLATION]
+    return np.exp(rate * dt) if rate != 0.0 else 1.0
+
+
+@jit
+def noise_scale(context, state):
+    """The adapted factor of Q, or 1."""
+    return state[state.size - 1] if options(context)[ADAPT] == ADAPT_Q else 1.0
+
+
+@jit
+def add_noise(context, x, u, dt, state, P, scratch):
+    """P ← growth·P + scale·Q; scratch is (nx, nx)."""
+    scale = noise_scale(context, state)
+    before = growth(context, dt) / scale
+    if before != 1.0:
+        for i in range(P.shape[0]):
+            for j in range(P.shape[0]):
+                P[i, j] *= before
+    add_process_noise(context, x, u, dt, P, scratch)
+    if scale != 1.0:
+        for i in range(P.shape[0]):
+            for j in range(P.shape[0]):
+                P[i, j] *= scale
+
+
+@jit
+def reading_variances(context, sensor, state):
+    """r (ny,): the variances of one sensor's rows, as adapted."""
+    if options(context)[ADAPT] != ADAPT_R:
+        return sensor_variances(context, sensor)
+    first, count = sensor_rows(context, sensor)
+    return floats(state.ctypes.data + 8 * (state.size - context.n_rows + first), count)
+
+
+@jit
+def weight(kind, at, m, nu, r, S, V, z):
+    """The weight w by which a reading counts: as if its noise were N(0, R / w). NaN if S + R (1/w - 1) has no factor.
+
+    With T = S + (1/w - 1) R, the reading's residual after its own update is ε = R/w T⁻¹ ν, and its distance
+    d² = εᵀ R⁻¹ ε. Both weights are found by iterating from w = 1:
+
+    Huber's, w = min(1, k / d), minimises ½ |x - x̂|²_P⁻¹ + ρ_k(d), quadratic near and linear far.
+    Student's t, w = (dof + m) / (dof + d² + tr(R⁻¹ H P⁺ Hᵀ)), is the variational mean of the precision of noise that
+    follows a multivariate t with scale matrix R; there H P⁺ Hᵀ = R/w - R/w T⁻¹ R/w.
+
+    nu, r (m,): raw innovation and variances; S (m, m) includes R; V (m, m) and z (2 m,) are scratch.
+
+    Sources: Huber (1964), doi:10.1214/aoms/1177703732, by iteratively reweighted least squares; Piché, Särkkä &
+    Hartikainen (2012), doi:10.1109/MLSP.2012.6349794, algorithm 1.
+    """
+    w = 1.0
+    unit = z[m : 2 * m]
+    for _ in range(MOST):
+        for i in range(m):
+            for j in range(m):
+                V[i, j] = S[i, j]
+            V[i, i] += (1.0 / w - 1.0) * r[i]
+            z[i] = nu[i]
+        if not cholesky(V, V, m):
+            return np.nan
+        solve_transposed(V, m, z)
+        solve_upper(V, m, z)
+        distance = 0.0
+        for i in range(m):
+            distance += r[i] * z[i] * z[i]
+        distance /= w * w
+        if kind == HUBER:
+            better = 1.0 if distance <= at * at else at / np.sqrt(distance)
+        else:
+            for i in range(m):
+                for j in range(m):
+                    unit[j] = 1.0 if j == i else 0.0
+                solve_transposed(V, m, unit)
+                inverse = 0.0
+                for j in range(m):
+                    inverse += unit[j] * unit[j]
+                distance += 1.0 / w - r[i] * inverse / (w * w)
+            better = (at + m) / (at + distance)
+        if abs(better - w) <= 1e-12 * w:
+            return better
+        w = better
+    return w
+
+
+@jit
+def reweigh(context, y, r, innovation, m, nu, S, U, scratch):
+    """Weight the noise of a reading; S, its factor U and the whitened nu then belong to the noise that is returned.
+
+    Returns:
+        Whether S still has a factor, and the variances r (ny,) to use.
+    """
+    kind = int(options(context)[ROBUST])
+    if kind == NONE:
+        return True, r
+    V = matrix(scratch, 0, m, m)
+    at = m * m
+    raw = scratch[at : at + m]
+    variance = scratch[at + m : at + 2 * m]
+    rows(y, innovation, raw)
+    rows(y, r, variance)
+    w = weight(kind, options(context)[ROBUST_AT], m, raw, variance, S, V, scratch[at + 2 * m : at + 4 * m])
+    for i in range(m):
+        S[i, i] += (1.0 / w - 1.0) * variance[i]
+        nu[i] = raw[i]
+    if not cholesky(S, U, m):
+        return False, r
+    solve_transposed(U, m, nu)
+    scaled = floats(scratch.ctypes.data, r.size)
+    for i in range(r.size):
+        scaled[i] = r[i] / w
+    return True, scaled
+
+
+@jit
+def rows(y, full, finite):
+    """Fill `finite` (m,) with the entries of `full` (ny,) whose row of the reading is there."""
+    k = 0
+    for i in range(full.size):
+        if np.isfinite(y[i]):
+            finite[k] = full[i]
+            k += 1
+
+
+@jit
+def adapt(context, sensor, y, state, innovation, innovation_std, score):
+    """Let R or Q follow the innovations of a reading that was used, over a fading memory of N readings.
+
+    R: r ← mean of ν² - (S - r), of each row. Q: one factor s of all of Q, s ← s (1 + (NIS / m - 1) / N), so that
+    the mean NIS becomes what it should be. One of the two: both show in the size of ν alone, where any split between
+    them fits as well. What is in use stays within the bound. The spread of an adapted r is about
+    S √(2 / (2N - 1)), that of ln s about 1 / √(N m γ) with γ the share of S that scales with s.
+
+    An outlier is taken at its face value: use the gate. Sources: Mohamed & Schwarz (1999), doi:10.1007/s001900050236,
+    for R (there over a window); Bar-Shalom, Li & Kirubarajan (2001), 11.2, for the level of Q.
+    """
+    kind = options(context)[ADAPT]
+    if kind == OFF:
+        return
+    rate = options(context)[ADAPT_RATE]
+    bound = options(context)[ADAPT_BOUND]
+    if kind == ADAPT_Q:
+        scale = noise_scale(context, state) * (1.0 + rate * (score[0] / score[1] - 1.0))
+        state[state.size - 1] = min(max(scale, 1.0 / bound), bound)
+        return
+    n_rows = context.n_rows
+    first, count = sensor_rows(context, sensor)
+    tuned = sensor_variances(context, sensor)
+    mean = state.size - 2 * n_rows + first
+    used = state.size - n_rows + first
+    for i in range(count):
+        if np.isfinite(y[i]):
+            sample = innovation[i] ** 2 - innovation_std[i] ** 2 + state[used + i]
+            state[mean + i] += rate * (sample - state[mean + i])
+            state[used + i] = min(max(state[mean + i], tuned[i] / bound), tuned[i] * bound)
