@@ -26,16 +26,19 @@ from .errors import EstimatorError
 from .filter import Estimator, Option, Options
 from .gaussian import compare, describe, factor, gain, joseph, judge, no_points, wrap_mean
 from .jit import jit, matrix
+from .kf import constant_jacobian
+from .linalg import congruence
 from .model import StateSpaceModel
-from .robust import INFLATION_OPTION, OWN, reading_variances, shared
+from .robust import INFLATION_OPTION, OWN, add_noise, reading_variances, shared
 from .track import FAILED, MISSING, USED
 from .tuning import Tuning
 
-PERIOD = OWN
-"""Position in the context's options; behind it K (nx, ny), P after and P before a reading, (nx, nx) each."""
+STEP, WHOLE, GAIN = range(OWN, OWN + 3)
+"""Positions in the context's options: a step of the period, whether that is all of it, and K (nx, ny); behind K stand
+P after and P before a reading, (nx, nx) each."""
 
 NEAR = 0.01
-"""Share of the period by which readings may come early or late and P still be taken as the steady one."""
+"""Share of a step by which it may be shorter or longer and count, for P, as the one that the gain was found for."""
 
 MOVING, AFTER, BEFORE = range(3)
 """What P is: on its way, the steady one after a reading, the steady one before a reading."""
@@ -92,19 +95,27 @@ def predict(context, u, dt, index, state, work):
     """
     n = context.nx
     numbers = options(context)
-    phase = state.size - 1
-    if state[phase] != AFTER or not abs(dt - numbers[PERIOD]) <= NEAR * numbers[PERIOD]:
-        kf.predict(context, u, dt, index, state, work)
-        state[phase] = MOVING
-        return
     x = state[:n]
+    P = matrix(state, n, n, n)
     forward = work[:n]
     transition(context, x, u, dt, forward)
+    phase = state.size - 1
+    near = abs(dt - numbers[STEP]) <= NEAR * numbers[STEP]
+    if near and state[phase] == AFTER and numbers[WHOLE] == 1.0:
+        copy(numbers, numbers.size - n * n, P)
+        state[phase] = BEFORE
+    else:
+        last = work.size - 1
+        F = matrix(work, last - n * n, n, n)
+        scratch = matrix(work, n + n * n, 2 * n, n)
+        counted = numbers[STEP] if near else dt
+        constant_jacobian(context, u, counted, F, work[last:], work[n + 3 * n * n :])
+        congruence(F, P, scratch)
+        add_noise(context, x, u, counted, state, P, scratch[:n])
+        state[phase] = MOVING
     for i in range(n):
         x[i] = forward[i]
     wrap_mean(context, x)
-    copy(numbers, numbers.size - n * n, matrix(state, n, n, n))
-    state[phase] = BEFORE
 
 
 @jit
@@ -136,7 +147,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     phase = state.size - 1
     after = numbers.size - 2 * n * n
     if m == ny:
-        K = matrix(numbers, PERIOD + 1, n, ny)
+        K = matrix(numbers, GAIN, n, ny)
     else:
         gain(m, C, U, K)
     for i in range(n):
@@ -168,24 +179,29 @@ def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
 
     period, rate = values["period"], float(np.log(values["inflation"]))
     u = np.array([item.default for item in model.inputs], float)
+    steps = steps_of(model, period)
     F, Q, H = matrices(model, u, tuning.p, tuning.q, period, rate)
     R = np.diag(np.asarray(tuning.r, float))
     if reason := undetectable(model, F, H):
         raise EstimatorError(f"estimator kf-steady does not apply: {reason}")
+    if (mode := unseen(F.T, Q)) is not None:
+        raise EstimatorError(
+            f"estimator kf-steady: {model.name} has no steady gain, as {largest(model, mode)} neither decays nor gets "
+            "process noise, so it is known ever better; raise its Q, or use kf"
+        )
     try:
         before = solve_discrete_are(F.T, H.T, Q, R)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise EstimatorError(
-            f"estimator kf-steady: the Riccati equation of {model.name} has no stabilising solution for readings every "
-            f"{period:g} s ({error}); a state that neither decays nor gets process noise is known ever better: raise "
-            "its Q, or use kf"
+            f"estimator kf-steady: the Riccati equation of {model.name} cannot be solved for readings every "
+            f"{period:g} s: {error}; use kf"
         ) from None
     before = 0.5 * (before + before.T)
     S = H @ before @ H.T + R
     K = np.linalg.solve(S, H @ before).T
     rest = np.eye(model.nx) - K @ H
     after = rest @ before @ rest.T + K @ R @ K.T
-    return np.concatenate((shared(values), [period], K.ravel(), after.ravel(), before.ravel()))
+    return np.concatenate((shared(values), [period / steps, steps == 1], K.ravel(), after.ravel(), before.ravel()))
 
 
 def matrices(
@@ -193,7 +209,7 @@ def matrices(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """F and Q over a period, in steps that the model allows, and H of the only sensor; F includes the inflation."""
     n, m = model.nx, len(model.sensors[0].rows)
-    steps = max(1, int(np.ceil(period / model.max_step)))
+    steps = steps_of(model, period)
     dt = period / steps
     f, h = _plain(model.f), _plain(model.sensors[0].h)
     F = columns(lambda x, out: f(x, u, p, dt, out), n, n)
@@ -224,21 +240,38 @@ def columns(function: Callable, n: int, m: int) -> np.ndarray:
     return J
 
 
-def undetectable(model: StateSpaceModel, F: np.ndarray, H: np.ndarray) -> str | None:
-    """The reason why no gain tames the model: a mode that does not decay and that the sensor does not see.
+def steps_of(model: StateSpaceModel, period: float) -> int:
+    """Steps in which the fold crosses a period."""
+    return max(1, int(np.ceil(period / model.max_step)))
 
-    Source: Anderson & Moore (1979), appendix C (the Popov-Belevitch-Hautus test).
+
+def undetectable(model: StateSpaceModel, F: np.ndarray, H: np.ndarray) -> str | None:
+    """The reason why no gain tames the model: something that does not decay and that the sensor does not see."""
+    if (mode := unseen(F, H)) is None:
+        return None
+    sensor, state = model.sensor_names[0], largest(model, mode)
+    return f"{model.name} is not detectable: {sensor} does not see {state}, which does not decay"
+
+
+def unseen(F: np.ndarray, H: np.ndarray) -> np.ndarray | None:
+    """A mode of F that does not decay and that H does not see, if there is one.
+
+    Source: the Popov-Belevitch-Hautus test; Kailath, Sayed & Hassibi, Linear Estimation (2000), appendix C.
     """
-    n = model.nx
-    values, vectors = np.linalg.eig(F)
-    for value, vector in zip(values, vectors.T, strict=True):
-        if abs(value) >= 1.0 - 1e-9:
+    n = F.shape[0]
+    scale = max(1.0, np.abs(F).max(), np.abs(H).max())
+    # An eigenvalue that is there twice is good to the root of rounding only, 1e-8.
+    for value, mode in zip(*(part.T for part in np.linalg.eig(F)), strict=True):
+        if abs(value) >= 1.0 - 1e-7:
             seen = np.linalg.svd(np.vstack((F - value * np.eye(n), H)), compute_uv=False)[-1]
-            if seen < 1e-9 * max(1.0, np.abs(F).max(), np.abs(H).max()):
-                most = model.state_names[int(np.argmax(np.abs(vector)))]
-                sensor = model.sensor_names[0]
-                return f"{model.name} is not detectable: {sensor} does not see {most}, which does not decay"
+            if seen < 1e-7 * scale:
+                return mode
     return None
+
+
+def largest(model: StateSpaceModel, mode: np.ndarray) -> str:
+    """The state that a mode moves most."""
+    return model.state_names[int(np.argmax(np.abs(mode)))]
 
 
 @lru_cache(maxsize=64)

@@ -37,7 +37,9 @@ def start(context, mean, cov, state):
     U = matrix(state, n, n, n)
     good = root(cov, U, n)
     for i in range(n):
-        state[i] = mean[i] if good else np.nan
+        state[i] = mean[i]
+        for j in range(n):
+            U[i, j] = U[i, j] if good else np.nan
     forget(context, state)
 
 
@@ -89,7 +91,7 @@ def settle(context, forward, U, A, good, state):
     for i in range(n):
         state[i] = forward[i] if good else np.nan
         for j in range(n):
-            U[i, j] = A[i, j] if j >= i else 0.0
+            U[i, j] = (A[i, j] if j >= i else 0.0) if good else np.nan
     wrap_mean(context, state[:n])
 
 
