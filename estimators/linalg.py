@@ -60,7 +60,7 @@ def root(A, U, n):
         whole = pivot
         for i in range(k):
             whole += U[i, k] * U[i, k]
-        floor = 4.0 * n * EPSILON * whole
+        floor = 16.0 * n * EPSILON * whole
         if not (pivot >= -floor and pivot < np.inf):
             return False
         if pivot <= floor:

@@ -128,50 +128,82 @@ def reading_variances(context, sensor, state):
 def weight(kind, at, m, nu, r, S, V, z):
     """The weight w by which a reading counts: as if its noise were N(0, R / w). NaN if S + R (1/w - 1) has no factor.
 
-    With T = S + (1/w - 1) R, the reading's residual after its own update is ε = R/w T⁻¹ ν, and its distance
-    d² = εᵀ R⁻¹ ε. Both weights are found by iterating from w = 1:
-
-    Huber's, w = min(1, k / d), minimises ½ |x - x̂|²_P⁻¹ + ρ_k(d), quadratic near and linear far.
-    Student's t, w = (dof + m) / (dof + d² + tr(R⁻¹ H P⁺ Hᵀ)), is the variational mean of the precision of noise that
-    follows a multivariate t with scale matrix R; there H P⁺ Hᵀ = R/w - R/w T⁻¹ R/w.
-
     nu, r (m,): raw innovation and variances; S (m, m) includes R; V (m, m) and z (2 m,) are scratch.
+    """
+    return huber(at, m, nu, r, S, V, z) if kind == HUBER else student_t(at, m, nu, r, S, V, z)
 
-    Sources: Huber (1964), doi:10.1214/aoms/1177703732, by iteratively reweighted least squares; Piché, Särkkä &
-    Hartikainen (2012), doi:10.1109/MLSP.2012.6349794, algorithm 1.
+
+@jit
+def huber(k, m, nu, r, S, V, z):
+    """Huber's weight w = min(1, k / d), where d is the distance |R^-½ (y - h(x⁺))| that the weighted update leaves.
+
+    It minimises ½ |x - x̂|²_P⁻¹ + ρ_k(d), with ρ_k quadratic up to k and linear beyond. As d = s φ(s) with s = 1 / w
+    and φ = |R^½ (S + (s - 1) R)⁻¹ ν|, that is φ(s) = k: Newton's method on 1/φ, which is nearly straight.
+
+    Sources: Huber (1964), doi:10.1214/aoms/1177703732; Moré & Sorensen (1983), doi:10.1137/0904038, for the equation.
+    """
+    s = 1.0
+    for _ in range(MOST):
+        if not precision_times(s, m, nu, r, S, V, z):
+            return np.nan
+        square = 0.0
+        for i in range(m):
+            square += r[i] * z[i] * z[i]
+            z[i] *= r[i]
+        excess = np.sqrt(square) / k - 1.0
+        if excess <= 1e-12:
+            break
+        solve_transposed(V, m, z)
+        slope = 0.0
+        for i in range(m):
+            slope += z[i] * z[i]
+        s += excess * square / slope
+    return 1.0 / s
+
+
+@jit
+def student_t(dof, m, nu, r, S, V, z):
+    """The mean precision, as a share of R⁻¹, of noise that follows a multivariate t with scale matrix R.
+
+    w = (dof + m) / (dof + tr(R⁻¹ E (y - h(x)) (y - h(x))ᵀ)), the variational solution, iterated from w = 1. With
+    T = S + (1/w - 1) R the residual is R/w T⁻¹ ν, and H P⁺ Hᵀ = R/w - R/w T⁻¹ R/w.
+
+    Source: Piché, Särkkä & Hartikainen (2012), doi:10.1109/MLSP.2012.6349794.
     """
     w = 1.0
     unit = z[m : 2 * m]
     for _ in range(MOST):
+        if not precision_times(1.0 / w, m, nu, r, S, V, z):
+            return np.nan
+        total = 0.0
         for i in range(m):
             for j in range(m):
-                V[i, j] = S[i, j]
-            V[i, i] += (1.0 / w - 1.0) * r[i]
-            z[i] = nu[i]
-        if not cholesky(V, V, m):
-            return np.nan
-        solve_transposed(V, m, z)
-        solve_upper(V, m, z)
-        distance = 0.0
-        for i in range(m):
-            distance += r[i] * z[i] * z[i]
-        distance /= w * w
-        if kind == HUBER:
-            better = 1.0 if distance <= at * at else at / np.sqrt(distance)
-        else:
-            for i in range(m):
-                for j in range(m):
-                    unit[j] = 1.0 if j == i else 0.0
-                solve_transposed(V, m, unit)
-                inverse = 0.0
-                for j in range(m):
-                    inverse += unit[j] * unit[j]
-                distance += 1.0 / w - r[i] * inverse / (w * w)
-            better = (at + m) / (at + distance)
+                unit[j] = 1.0 if j == i else 0.0
+            solve_transposed(V, m, unit)
+            inverse = 0.0
+            for j in range(m):
+                inverse += unit[j] * unit[j]
+            total += 1.0 / w + r[i] * (z[i] * z[i] - inverse) / (w * w)
+        better = (dof + m) / (dof + total)
         if abs(better - w) <= 1e-12 * w:
             return better
         w = better
     return w
+
+
+@jit
+def precision_times(s, m, nu, r, S, V, z):
+    """Fill z with T⁻¹ ν and V with the factor of T = S + (s - 1) R; False if T has none."""
+    for i in range(m):
+        for j in range(m):
+            V[i, j] = S[i, j]
+        V[i, i] += (s - 1.0) * r[i]
+        z[i] = nu[i]
+    if not cholesky(V, V, m):
+        return False
+    solve_transposed(V, m, z)
+    solve_upper(V, m, z)
+    return True
 
 
 @jit
