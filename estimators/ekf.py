@@ -5,15 +5,42 @@ from __future__ import annotations
 import numpy as np
 
 from . import gaussian
-from .context import expect, sensor_rows, transition
+from .context import expect, options, sensor_rows, transition
 from .filter import Estimator, Options
-from .gaussian import admit, compare, correct, describe, moments, no_points, start, state_size, wrap_mean
+from .gaussian import (
+    admit,
+    compare,
+    describe,
+    downdate,
+    gain,
+    joseph,
+    moments,
+    move_mean,
+    no_points,
+    start,
+    state_size,
+    wrap_mean,
+)
 from .jacobians import scratch_size, sensor_jacobian, state_jacobian
-from .jit import jit, matrix
+from .jit import inlined, jit, matrix
 from .linalg import congruence
 from .model import StateSpaceModel
-from .robust import JOSEPH_OPTION, OPTIONS, adapt, add_noise, memory, reading_variances, shared
-from .track import USED
+from .robust import (
+    ADAPT,
+    JOSEPH,
+    JOSEPH_OPTION,
+    NONE,
+    OFF,
+    OPTIONS,
+    ROBUST,
+    adapt,
+    add_noise,
+    memory,
+    reading_variances,
+    reweigh,
+    shared,
+)
+from .track import FAILED, USED
 from .tuning import Tuning
 
 
@@ -50,7 +77,7 @@ def predict(context, u, dt, index, state, work):
     wrap_mean(context, x)
 
 
-@jit
+@inlined
 def linearise(context, sensor, x, u, P, expected, C, S, H, scratch):
     """Fill h(x) (ny,), H = dh/dx (ny, nx), C = P Hᵀ and S = H P Hᵀ."""
     n = x.size
@@ -71,6 +98,19 @@ def linearise(context, sensor, x, u, P, expected, C, S, H, scratch):
             S[k, i] = s
 
 
+@inlined
+def correct(context, y, r, m, nu, U, C, K, H, N, x, P):
+    """x ← x + K ν;  P by the Joseph form, or as P - K S Kᵀ; from the whitened nu, S = Uᵀ U and C = P Hᵀ."""
+    if options(context)[JOSEPH] != 0.0:
+        gain(m, C, U, K)
+        move_mean(m, C, U, nu, x)
+        joseph(y, r, m, C, H, K, P, N)
+    else:
+        move_mean(m, C, U, nu, x)
+        downdate(m, C, U, P)
+    wrap_mean(context, x)
+
+
 @jit
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """x ← x + K ν;  P by the Joseph form, with H = dh/dx at the prediction.
@@ -82,17 +122,20 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     _, m = sensor_rows(context, sensor)
     x = state[:n]
     P = matrix(state, n, n, n)
-    nu, S, U, C, room, at = gaussian.scratch(work, n, m)
+    nu, r, S, U, C, room, at = gaussian.scratch(work, n, m)
     K = matrix(work, at, n, m)
     H = matrix(work, at + n * m, m, n)
     N = matrix(work, at + 2 * n * m, n, n)
     linearise(context, sensor, x, u, P, nu, C, S, H, work[at + 2 * n * m + n * n :])
-    r = reading_variances(context, sensor, state)
+    reading_variances(context, sensor, state, r)
     m = compare(context, sensor, y, r, nu, C, S, H, P, innovation, innovation_std)
-    verdict, r = admit(context, sensor, y, r, m, nu, S, U, room, innovation, score)
+    verdict = admit(context, sensor, m, nu, S, U, score)
+    if verdict == USED and options(context)[ROBUST] != NONE:
+        verdict = USED if reweigh(context, y, r, innovation, m, nu, S, U, room) else FAILED
     if verdict == USED:
-        correct(context, y, r, state, m, nu, U, C, K, H, N)
-        adapt(context, sensor, y, state, innovation, innovation_std, score)
+        correct(context, y, r, m, nu, U, C, K, H, N, x, P)
+        if options(context)[ADAPT] != OFF:
+            adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict
 
 

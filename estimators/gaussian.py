@@ -11,11 +11,11 @@ from __future__ import annotations
 import numpy as np
 
 from . import robust
-from .context import circular_rows, circular_states, options
+from .context import circular_rows, circular_states
 from .filter import Options
-from .jit import flags, floats, ints, jit, matrix
+from .jit import flags, floats, inlined, ints, jit, matrix
 from .linalg import EPSILON, cholesky, mirror, solve_transposed, solve_upper, wrap
-from .robust import JOSEPH, forget, reweigh
+from .robust import forget
 from .track import FAILED, GATED, HELD_OUT, MISSING, USED
 
 LOG_2PI = float(np.log(2.0 * np.pi))
@@ -28,7 +28,7 @@ def state_size(options: Options, nx: int) -> int:
 
 def scratch_size(nx: int, ny: int) -> int:
     """Numbers in the views of `scratch`."""
-    return ny + 2 * ny * ny + nx * ny + robust.scratch_size(ny)
+    return 2 * ny + 2 * ny * ny + nx * ny + robust.scratch_size(ny)
 
 
 def moments(options: Options, state: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray]:
@@ -65,7 +65,7 @@ def describe(context, state, mean, std, cross):
         cross[k] = state[n + pairs[2 * k] * n + pairs[2 * k + 1]]
 
 
-@jit
+@inlined
 def wrap_mean(context, x):
     """Bring the circular states back to ±π."""
     circular = circular_states(context)
@@ -74,21 +74,22 @@ def wrap_mean(context, x):
             x[i] = wrap(x[i])
 
 
-@jit
+@inlined
 def scratch(work, n, m):
-    """What an update works in: ŷ or ν (m,), S and its factor (m, m), C (n, m), room for `reweigh`; where it ends.
+    """What an update works in: ŷ or ν, r (m,), S and its factor (m, m), C (n, m), room for `reweigh`; where it ends.
 
     C is the covariance of state and predicted reading.
     """
-    at = m + 2 * m * m + n * m
-    end = at + m * m + 4 * m
-    S = matrix(work, m, m, m)
-    U = matrix(work, m + m * m, m, m)
-    C = matrix(work, m + 2 * m * m, n, m)
-    return work[:m], S, U, C, work[at:end], end
+    start = work.ctypes.data
+    at = 2 * m + 2 * m * m + n * m
+    S = matrix(work, 2 * m, m, m)
+    U = matrix(work, 2 * m + m * m, m, m)
+    C = matrix(work, 2 * m + 2 * m * m, n, m)
+    room = m * m + 4 * m
+    return floats(start, m), floats(start + 8 * m, m), S, U, C, floats(start + 8 * at, room), at + room
 
 
-@jit
+@inlined
 def compare(context, sensor, y, r, predicted, C, S, H, P, innovation, innovation_std):
     """The innovation and its covariance, over the rows of the reading that are finite.
 
@@ -133,7 +134,7 @@ def compare(context, sensor, y, r, predicted, C, S, H, P, innovation, innovation
     return m
 
 
-@jit
+@inlined
 def factor(S, U, m, n):
     """The Cholesky factor U of S (m, m); False if S is not positive definite, or only rounding makes it so.
 
@@ -148,7 +149,7 @@ def factor(S, U, m, n):
     return True
 
 
-@jit
+@inlined
 def judge(context, sensor, m, nu, U, score):
     """NIS, log-likelihood and verdict of an innovation with covariance Uᵀ U; nu (m,) becomes U⁻ᵀ nu.
 
@@ -173,44 +174,15 @@ def judge(context, sensor, m, nu, U, score):
     return USED if nis < np.inf else FAILED
 
 
-@jit
-def admit(context, sensor, y, r, m, nu, S, U, room, innovation, score):
-    """Judge an innovation nu (m,) of covariance S, and weight it if it is used.
-
-    Returns:
-        The verdict, and the variances r (ny,) to use; U is the factor of S, nu is U⁻ᵀ ν.
-    """
+@inlined
+def admit(context, sensor, m, nu, S, U, score):
+    """Judge an innovation nu (m,) of covariance S: the verdict. U gets the factor of S, nu becomes U⁻ᵀ ν."""
     if m == 0:
-        return MISSING, r
+        return MISSING
     score[1] = m
     if not factor(S, U, m, context.nx):
-        return FAILED, r
-    verdict = judge(context, sensor, m, nu, U, score)
-    if verdict == USED:
-        good, r = reweigh(context, y, r, innovation, m, nu, S, U, room)
-        if not good:
-            return FAILED, r
-    return verdict, r
-
-
-@jit
-def correct(context, y, r, state, m, nu, U, C, K, H, N):
-    """Condition x and P on an innovation that was admitted, with C = cov(x, y).
-
-    With H (m, nx) and the option `joseph`, P is updated by the Joseph form; K (nx, m) and N (nx, nx) are scratch.
-    Otherwise (K, H empty) P ← P - K S Kᵀ.
-    """
-    n = context.nx
-    x = state[:n]
-    P = matrix(state, n, n, n)
-    if H.shape[1] > 0 and options(context)[JOSEPH] != 0.0:
-        gain(m, C, U, K)
-        move_mean(m, C, U, nu, x)
-        joseph(y, r, m, C, H, K, P, N)
-    else:
-        move_mean(m, C, U, nu, x)
-        downdate(m, C, U, P)
-    wrap_mean(context, x)
+        return FAILED
+    return judge(context, sensor, m, nu, U, score)
 
 
 @jit

@@ -6,13 +6,26 @@ import numpy as np
 
 from . import ekf, gaussian
 from .context import options, sensor_rows
-from .ekf import linearise, predict
+from .ekf import correct, linearise, predict
 from .filter import Estimator, Option, Options
-from .gaussian import admit, compare, correct, describe, factor, moments, move_mean, no_points, start, state_size
+from .gaussian import admit, compare, describe, factor, moments, move_mean, no_points, start, state_size
 from .jit import jit, matrix
 from .linalg import solve_transposed
 from .model import StateSpaceModel
-from .robust import JOSEPH_OPTION, OPTIONS, OWN, adapt, memory, reading_variances, shared
+from .robust import (
+    ADAPT,
+    JOSEPH_OPTION,
+    NONE,
+    OFF,
+    OPTIONS,
+    OWN,
+    ROBUST,
+    adapt,
+    memory,
+    reading_variances,
+    reweigh,
+    shared,
+)
 from .track import FAILED, USED
 from .tuning import Tuning
 
@@ -43,7 +56,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     _, ny = sensor_rows(context, sensor)
     x = state[:n]
     P = matrix(state, n, n, n)
-    nu, S, U, C, room, at = gaussian.scratch(work, n, ny)
+    nu, r, S, U, C, room, at = gaussian.scratch(work, n, ny)
     K = matrix(work, at, n, ny)
     H = matrix(work, at + n * ny, ny, n)
     at += 2 * n * ny
@@ -55,9 +68,11 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     aside_std = work[at + ny : at + 2 * ny]
     scratch = work[at + 2 * ny :]
     linearise(context, sensor, x, u, P, nu, C, S, H, scratch)
-    r = reading_variances(context, sensor, state)
+    reading_variances(context, sensor, state, r)
     m = compare(context, sensor, y, r, nu, C, S, H, P, innovation, innovation_std)
-    verdict, r = admit(context, sensor, y, r, m, nu, S, U, room, innovation, score)
+    verdict = admit(context, sensor, m, nu, S, U, score)
+    if verdict == USED and options(context)[ROBUST] != NONE:
+        verdict = USED if reweigh(context, y, r, innovation, m, nu, S, U, room) else FAILED
     if verdict != USED:
         return verdict
     for i in range(n):
@@ -78,8 +93,9 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     for i in range(n):
         x[i] = predicted[i]
     if verdict == USED:
-        correct(context, y, r, state, m, nu, U, C, K, H, N)
-        adapt(context, sensor, y, state, innovation, innovation_std, score)
+        correct(context, y, r, m, nu, U, C, K, H, N, x, P)
+        if options(context)[ADAPT] != OFF:
+            adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict
 
 

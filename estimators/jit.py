@@ -54,6 +54,9 @@ numba.config.LOOP_VECTORIZE = 0
 jit = partial(njit, cache=True, nogil=True, error_model="numpy")
 """Numba's njit as used here: cached, without the GIL, and with IEEE division (zero divisors give inf, no error)."""
 
+inlined = partial(jit, inline="always")
+"""`jit` for helpers that stand inside a filter's step: a call that hands over context and arrays costs 50 to 100 ns."""
+
 
 def address(dispatcher: Any, signature: Any) -> int:
     """Compile `dispatcher` for `signature` (or load it from the cache) and return where its machine code starts.

@@ -7,7 +7,7 @@ from .context import transition
 from .filter import Estimator, Options
 from .gaussian import describe, moments, no_points, start, state_size, wrap_mean
 from .jacobians import state_jacobian
-from .jit import floats, jit, matrix
+from .jit import floats, inlined, jit, matrix
 from .linalg import congruence
 from .model import StateSpaceModel
 from .robust import JOSEPH_OPTION, OPTIONS, add_noise, memory
@@ -18,7 +18,7 @@ def work_size(options: Options, nx: int, ny: int) -> int:
     return ekf.work_size(options, nx, ny) + nx * nx + 1
 
 
-@jit
+@inlined
 def constant_jacobian(context, u, dt, F, last, scratch):
     """Fill F (nx, nx) for this dt, unless it holds it: `last` (1,) is the dt for which it does.
 

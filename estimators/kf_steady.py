@@ -24,13 +24,13 @@ from .context import options, sensor_rows, transition
 from .ekf import linearise
 from .errors import EstimatorError
 from .filter import Estimator, Option, Options
-from .gaussian import compare, describe, factor, gain, joseph, judge, no_points, wrap_mean
+from .gaussian import admit, compare, describe, gain, joseph, no_points, wrap_mean
 from .jit import jit, matrix
 from .kf import constant_jacobian
 from .linalg import congruence
 from .model import StateSpaceModel
 from .robust import INFLATION_OPTION, OWN, add_noise, reading_variances, shared
-from .track import FAILED, MISSING, USED
+from .track import USED
 from .tuning import Tuning
 
 STEP, WHOLE, GAIN = range(OWN, OWN + 3)
@@ -128,19 +128,14 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     _, ny = sensor_rows(context, sensor)
     x = state[:n]
     P = matrix(state, n, n, n)
-    nu, S, U, C, room, at = gaussian.scratch(work, n, ny)
+    nu, r, S, U, C, _, at = gaussian.scratch(work, n, ny)
     K = matrix(work, at, n, ny)
     H = matrix(work, at + n * ny, ny, n)
     N = matrix(work, at + 2 * n * ny, n, n)
     linearise(context, sensor, x, u, P, nu, C, S, H, work[at + 2 * n * ny + n * n :])
-    r = reading_variances(context, sensor, state)
+    reading_variances(context, sensor, state, r)
     m = compare(context, sensor, y, r, nu, C, S, H, P, innovation, innovation_std)
-    if m == 0:
-        return MISSING
-    score[1] = m
-    if not factor(S, U, m, n):
-        return FAILED
-    verdict = judge(context, sensor, m, nu, U, score)
+    verdict = admit(context, sensor, m, nu, S, U, score)
     if verdict != USED:
         return verdict
     numbers = options(context)

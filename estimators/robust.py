@@ -10,7 +10,7 @@ import numpy as np
 
 from .context import add_process_noise, options, sensor_rows, sensor_variances
 from .filter import Option, Options
-from .jit import floats, jit, matrix
+from .jit import floats, inlined, jit, matrix
 from .linalg import cholesky, solve_transposed, solve_upper
 from .model import StateSpaceModel
 
@@ -99,29 +99,38 @@ def noise_scale(context, state):
     return state[state.size - 1] if options(context)[ADAPT] == ADAPT_Q else 1.0
 
 
-@jit
+@inlined
 def add_noise(context, x, u, dt, state, P, scratch):
     """P ← growth·P + scale·Q; scratch is (nx, nx)."""
-    scale = noise_scale(context, state)
-    before = growth(context, dt) / scale
-    if before != 1.0:
-        for i in range(P.shape[0]):
-            for j in range(P.shape[0]):
-                P[i, j] *= before
-    add_process_noise(context, x, u, dt, P, scratch)
-    if scale != 1.0:
-        for i in range(P.shape[0]):
-            for j in range(P.shape[0]):
-                P[i, j] *= scale
+    if options(context)[INFLATION] != 0.0 or options(context)[ADAPT] == ADAPT_Q:
+        scale = noise_scale(context, state)
+        multiply(growth(context, dt) / scale, P)
+        add_process_noise(context, x, u, dt, P, scratch)
+        multiply(scale, P)
+    else:
+        add_process_noise(context, x, u, dt, P, scratch)
 
 
 @jit
-def reading_variances(context, sensor, state):
-    """r (ny,): the variances of one sensor's rows, as adapted."""
-    if options(context)[ADAPT] != ADAPT_R:
-        return sensor_variances(context, sensor)
+def multiply(a, P):
+    """P ← a P."""
+    for i in range(P.shape[0]):
+        for j in range(P.shape[1]):
+            P[i, j] *= a
+
+
+@inlined
+def reading_variances(context, sensor, state, r):
+    """Fill r (ny,) with the variances of one sensor's rows, as adapted."""
     first, count = sensor_rows(context, sensor)
-    return floats(state.ctypes.data + 8 * (state.size - context.n_rows + first), count)
+    if options(context)[ADAPT] == ADAPT_R:
+        first += state.size - context.n_rows
+        for i in range(count):
+            r[i] = state[first + i]
+    else:
+        tuned = floats(context.r, context.n_rows)
+        for i in range(count):
+            r[i] = tuned[first + i]
 
 
 @jit
@@ -207,32 +216,27 @@ def precision_times(s, m, nu, r, S, V, z):
 
 
 @jit
-def reweigh(context, y, r, innovation, m, nu, S, U, scratch):
-    """Weight the noise of a reading; S, its factor U and the whitened nu then belong to the noise that is returned.
+def reweigh(context, y, r, innovation, m, nu, S, U, room):
+    """Weight the noise of a reading: r (ny,) is divided by w; S, its factor U and the whitened nu then belong to it.
 
     Returns:
-        Whether S still has a factor, and the variances r (ny,) to use.
+        Whether S still has a factor.
     """
-    kind = int(options(context)[ROBUST])
-    if kind == NONE:
-        return True, r
-    V = matrix(scratch, 0, m, m)
-    at = m * m
-    raw = scratch[at : at + m]
-    variance = scratch[at + m : at + 2 * m]
+    raw = room[:m]
+    variance = room[m : 2 * m]
     rows(y, innovation, raw)
     rows(y, r, variance)
-    w = weight(kind, options(context)[ROBUST_AT], m, raw, variance, S, V, scratch[at + 2 * m : at + 4 * m])
+    V = matrix(room, 4 * m, m, m)
+    w = weight(options(context)[ROBUST], options(context)[ROBUST_AT], m, raw, variance, S, V, room[2 * m : 4 * m])
     for i in range(m):
         S[i, i] += (1.0 / w - 1.0) * variance[i]
         nu[i] = raw[i]
-    if not cholesky(S, U, m):
-        return False, r
-    solve_transposed(U, m, nu)
-    scaled = floats(scratch.ctypes.data, r.size)
     for i in range(r.size):
-        scaled[i] = r[i] / w
-    return True, scaled
+        r[i] /= w
+    if not cholesky(S, U, m):
+        return False
+    solve_transposed(U, m, nu)
+    return True
 
 
 @jit
@@ -258,8 +262,6 @@ def adapt(context, sensor, y, state, innovation, innovation_std, score):
     for R (there over a window); Bar-Shalom, Li & Kirubarajan (2001), 11.2, for the level of Q.
     """
     kind = options(context)[ADAPT]
-    if kind == OFF:
-        return
     rate = options(context)[ADAPT_RATE]
     bound = options(context)[ADAPT_BOUND]
     if kind == ADAPT_Q:

@@ -13,9 +13,9 @@ from . import robust
 from .context import add_process_noise, circular_rows, options
 from .filter import Options
 from .gaussian import judge, wrap_mean
-from .jit import ints, jit, matrix
+from .jit import inlined, ints, jit, matrix
 from .linalg import EPSILON, remove, root, solve_transposed, triangularise, wrap
-from .robust import NONE, ROBUST, ROBUST_AT, adapt, forget, reading_variances, rows, weight
+from .robust import ADAPT, NONE, OFF, ROBUST, ROBUST_AT, adapt, forget, reading_variances, rows, weight
 from .track import FAILED, MISSING, USED
 
 
@@ -27,7 +27,7 @@ def moments(options: Options, state: np.ndarray, nx: int) -> tuple[np.ndarray, n
 
 def condition_size(nx: int, ny: int, extra: int) -> int:
     """Scratch of `condition` for a spread with `extra` rows beyond nx."""
-    return (nx + extra + ny) * (nx + ny) + 2 * (nx + ny) + ny * ny + robust.scratch_size(ny)
+    return (nx + extra + ny) * (nx + ny) + 2 * nx + 3 * ny + ny * ny + robust.scratch_size(ny)
 
 
 @jit
@@ -65,7 +65,7 @@ def describe(context, state, mean, std, cross):
             cross[c] += U[k, i] * U[k, j]
 
 
-@jit
+@inlined
 def noise_root(context, x, u, dt, state, V, scratch):
     """Fill V (nx, nx) with a factor of Q, as scaled by an adaptation; False if Q is indefinite."""
     n = context.nx
@@ -84,7 +84,7 @@ def noise_root(context, x, u, dt, state, V, scratch):
     return True
 
 
-@jit
+@inlined
 def settle(context, forward, U, A, good, state):
     """Take the mean `forward` and the leading rows of A as the new state; NaN, which is seen, if there is none."""
     n = context.nx
@@ -139,7 +139,7 @@ def triangularise_joint(y, r, m, Y, U, lost, A, scratch):
     return True
 
 
-@jit
+@inlined
 def condition(context, sensor, y, state, expected, Y, lost, work, innovation, innovation_std, score):
     """Condition on a reading whose prediction is `expected` (ny,), and return the verdict.
 
@@ -151,10 +151,15 @@ def condition(context, sensor, y, state, expected, Y, lost, work, innovation, in
     n = context.nx
     x = state[:n]
     U = matrix(state, n, n, n)
-    r = reading_variances(context, sensor, state)
     circular = circular_rows(context, sensor)
-    ny = r.size
+    ny = expected.size
     k = Y.shape[0]
+    at = (k + ny) * (ny + n)
+    scratch = work[at : at + 2 * (ny + n)]
+    at += 2 * (ny + n)
+    r = work[at : at + ny]
+    at += ny
+    reading_variances(context, sensor, state, r)
     m = 0
     for i in range(ny):
         if np.isfinite(y[i]):
@@ -172,9 +177,6 @@ def condition(context, sensor, y, state, expected, Y, lost, work, innovation, in
     nu = expected[:m]
     gone = lost[: min(m, lost.size)]
     A = matrix(work, 0, k + m, m + n)
-    at = (k + ny) * (ny + n)
-    scratch = work[at : at + 2 * (ny + n)]
-    at += 2 * (ny + n)
     if not triangularise_joint(y, r, m, Y, U, gone, A, scratch):
         return FAILED
     row = 0
@@ -200,7 +202,8 @@ def condition(context, sensor, y, state, expected, Y, lost, work, innovation, in
         for j in range(i, n):
             U[i, j] = A[m + i, m + j]
     wrap_mean(context, x)
-    adapt(context, sensor, y, state, innovation, innovation_std, score)
+    if options(context)[ADAPT] != OFF:
+        adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict
 
 
@@ -219,18 +222,15 @@ def reweigh_joint(context, y, r, m, innovation, Y, U, lost, A, S, nu, scratch, r
     variance = room[m : 2 * m]
     rows(y, innovation, raw)
     rows(y, r, variance)
-    kind = options(context)[ROBUST]
-    at = 4 * m
-    V = matrix(room, at, m, m)
-    w = weight(kind, options(context)[ROBUST_AT], m, raw, variance, S, V, room[2 * m : at])
+    V = matrix(room, 4 * m, m, m)
+    w = weight(options(context)[ROBUST], options(context)[ROBUST_AT], m, raw, variance, S, V, room[2 * m : 4 * m])
     if not w > 0.0:
         return False
     for i in range(m):
         nu[i] = raw[i]
-    scaled = room[at : at + r.size]
     for i in range(r.size):
-        scaled[i] = r[i] / w
-    if not triangularise_joint(y, scaled, m, Y, U, lost, A, scratch):
+        r[i] /= w
+    if not triangularise_joint(y, r, m, Y, U, lost, A, scratch):
         return False
     solve_transposed(A, m, nu)
     return True

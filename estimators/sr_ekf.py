@@ -9,7 +9,7 @@ from .ekf import tune
 from .filter import Estimator, Options
 from .gaussian import no_points, state_size
 from .jacobians import scratch_size, sensor_jacobian, state_jacobian
-from .jit import jit, matrix
+from .jit import inlined, jit, matrix
 from .linalg import triangularise
 from .robust import OPTIONS, growth, memory
 from .square_root import condition, condition_size, describe, moments, noise_root, settle, start
@@ -20,7 +20,7 @@ def work_size(options: Options, nx: int, ny: int) -> int:
     return max(nx + 4 * nx * nx, ny + 2 * nx * ny + condition_size(nx, ny, 0)) + scratch_size(nx, ny)
 
 
-@jit
+@inlined
 def advance(context, u, dt, state, forward, F, A, scratch):
     """x ← forward;  U ← triangle of [U Fᵀ; Q^½], in A (2n, n); scratch is (nx, nx)."""
     n = context.nx

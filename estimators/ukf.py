@@ -14,11 +14,24 @@ import numpy as np
 from . import gaussian
 from .context import circular_rows, circular_states, expect, options, sensor_rows, transition
 from .filter import Estimator, Option, Options
-from .gaussian import admit, compare, correct, describe, moments, start, state_size, wrap_mean
-from .jit import jit, matrix
+from .gaussian import admit, compare, describe, downdate, moments, move_mean, start, state_size, wrap_mean
+from .jit import inlined, jit, matrix
 from .linalg import cholesky, mirror, wrap
 from .model import StateSpaceModel
-from .robust import OPTIONS, OWN, adapt, add_noise, memory, reading_variances, shared
+from .robust import (
+    ADAPT,
+    NONE,
+    OFF,
+    OPTIONS,
+    OWN,
+    ROBUST,
+    adapt,
+    add_noise,
+    memory,
+    reading_variances,
+    reweigh,
+    shared,
+)
 from .track import FAILED, USED
 from .tuning import Tuning
 
@@ -57,7 +70,7 @@ def work_size(options: Options, nx: int, ny: int) -> int:
     return gaussian.scratch_size(nx, ny) + nx * nx + (2 * nx + 1) * max(nx, ny) + 2 * nx
 
 
-@jit
+@inlined
 def mean_of(D, w, circular, mean):
     """Turn points D (2n+1, k) into deviations from their weighted mean, which is added up from the central point.
 
@@ -81,7 +94,7 @@ def mean_of(D, w, circular, mean):
         mean[j] += central
 
 
-@jit
+@inlined
 def through_f(context, x, u, dt, U, spread, point, D):
     """Fill D (2n+1, n) with f at x and at x ± spread·U[k]."""
     n = x.size
@@ -95,7 +108,7 @@ def through_f(context, x, u, dt, U, spread, point, D):
         transition(context, point, u, dt, D[1 + n + k])
 
 
-@jit
+@inlined
 def through_h(context, sensor, x, u, U, spread, point, D):
     """Fill D (2n+1, ny) with h at x and at x ± spread·U[k]."""
     n = x.size
@@ -159,7 +172,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     _, m = sensor_rows(context, sensor)
     x = state[:n]
     P = matrix(state, n, n, n)
-    nu, S, V, C, room, at = gaussian.scratch(work, n, m)
+    nu, r, S, V, C, room, at = gaussian.scratch(work, n, m)
     U = matrix(work, at, n, n)
     at += n * n
     D = matrix(work, at, 2 * n + 1, m)
@@ -191,12 +204,17 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
             for j in range(m):
                 C[i, j] += a * (D[1 + k, j] - D[1 + n + k, j])
     nothing = D[:, :0]
-    r = reading_variances(context, sensor, state)
+    reading_variances(context, sensor, state, r)
     m = compare(context, sensor, y, r, nu, C, S, nothing, P, innovation, innovation_std)
-    verdict, r = admit(context, sensor, y, r, m, nu, S, V, room, innovation, score)
+    verdict = admit(context, sensor, m, nu, S, V, score)
+    if verdict == USED and numbers[ROBUST] != NONE:
+        verdict = USED if reweigh(context, y, r, innovation, m, nu, S, V, room) else FAILED
     if verdict == USED:
-        correct(context, y, r, state, m, nu, V, C, nothing, nothing, nothing)
-        adapt(context, sensor, y, state, innovation, innovation_std, score)
+        move_mean(m, C, V, nu, x)
+        wrap_mean(context, x)
+        downdate(m, C, V, P)
+        if numbers[ADAPT] != OFF:
+            adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict
 
 
