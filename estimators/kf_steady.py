@@ -9,7 +9,7 @@ The gain is fixed from the first reading on, so the start is slower than the Kal
 this gain really has: it is carried by the Joseph form until it is within rounding of the steady one, and from then on
 copied, so that a step costs n m multiplications for the gain; a late or lost reading makes it grow as it should.
 
-Source: Anderson & Moore (1979), Optimal Filtering, 4.4.
+Source: Anderson & Moore (1979), Optimal Filtering, chapter 4.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def settled(numbers, at, P):
 def predict(context, u, dt, index, state, work):
     """x ← f(x, u); P steps from the steady one to the steady one, or else as the Kalman filter's.
 
-    Source: Anderson & Moore (1979), Optimal Filtering, 4.4.
+    Source: Anderson & Moore (1979), Optimal Filtering, chapter 4.
     """
     n = context.nx
     numbers = options(context)
@@ -122,7 +122,7 @@ def predict(context, u, dt, index, state, work):
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """x ← x + K ν with the steady gain, or where rows of the reading are missing with the gain of the others.
 
-    Source: Anderson & Moore (1979), Optimal Filtering, 4.4; P by the Joseph form, which holds for any gain.
+    Source: Anderson & Moore (1979), Optimal Filtering, chapter 4; P by the Joseph form, which holds for any gain.
     """
     n = context.nx
     _, ny = sensor_rows(context, sensor)
@@ -301,7 +301,7 @@ KF_STEADY = Estimator(
     assumes="linear, constant f and h; one sensor that reads every `period` seconds",
     model_runs="1",
     fails_when="readings are lost, late, or start far off: the gain stays what it is",
-    source="Anderson & Moore (1979), Optimal Filtering, 4.4",
+    source="Anderson & Moore (1979), Optimal Filtering, chapter 4",
     functions=(start, predict, update, describe),
     state_size=state_size,
     work_size=work_size,

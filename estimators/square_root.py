@@ -105,7 +105,7 @@ def triangularise_joint(y, r, m, Y, U, lost, A, scratch):
 
     Y (k, ny) holds n rows that go with U's, then rows E of the reading alone; `lost` (m,) is a row whose square is
     taken off (a negative weight), or empty. W = S^-½ᵀ C, so x⁺ = x + Wᵀ S^-½ᵀ ν, and U⁺ᵀ U⁺ = P - C S⁻¹ Cᵀ.
-    Rows of U come before those of √R: a tiny √R then keeps its digits (Cox & Higham 1998, doi:10.1007/BF02510929).
+    Rows of U come before those of √R: a tiny √R then keeps its digits.
     """
     n = U.shape[0]
     k = Y.shape[0]
@@ -145,8 +145,8 @@ def condition(context, sensor, y, state, expected, Y, lost, work, innovation, in
 
     Y (k, ny) and lost are those of `triangularise_joint`, for all rows of the reading; they and `expected` are lost.
 
-    Source: the array algorithm of Kailath, Sayed & Hassibi, Linear Estimation (2000), 12.3; for sigma points, whose
-    (D₊ - D₋) take the place of U Hᵀ, Arasaratnam & Haykin (2009), doi:10.1109/TAC.2009.2019800, appendix.
+    Source: the array algorithm of Kailath, Sayed & Hassibi, Linear Estimation (2000), chapter 12; for sigma points,
+    whose (D₊ - D₋) take the place of U Hᵀ, Arasaratnam & Haykin (2009), doi:10.1109/TAC.2009.2019800, appendix.
     """
     n = context.nx
     x = state[:n]

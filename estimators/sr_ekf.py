@@ -42,7 +42,7 @@ def advance(context, u, dt, state, forward, F, A, scratch):
 def predict(context, u, dt, index, state, work):
     """x ← f(x, u);  Uᵀ U ← F Uᵀ U Fᵀ + Q, with F = df/dx at the estimate before the step.
 
-    Source: Kailath, Sayed & Hassibi, Linear Estimation (2000), 12.3.
+    Source: Kailath, Sayed & Hassibi, Linear Estimation (2000), chapter 12.
     """
     n = context.nx
     x = state[:n]
@@ -57,7 +57,7 @@ def predict(context, u, dt, index, state, work):
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """One triangularisation of [U Hᵀ, U; R^½, 0], with H = dh/dx at the prediction.
 
-    Source: Kailath, Sayed & Hassibi, Linear Estimation (2000), 12.3.
+    Source: Kailath, Sayed & Hassibi, Linear Estimation (2000), chapter 12.
     """
     n = context.nx
     _, m = sensor_rows(context, sensor)
@@ -85,7 +85,7 @@ SR_EKF = Estimator(
     assumes="differentiable f and h, nearly straight within the spread of the estimate; any conditioning",
     model_runs="1 and its derivatives (nx by complex step)",
     fails_when="curvature makes it overconfident: it stops listening to the sensors",
-    source="Kailath, Sayed & Hassibi (2000), Linear Estimation, 12.3",
+    source="Kailath, Sayed & Hassibi (2000), Linear Estimation, chapter 12",
     functions=(start, predict, update, describe),
     state_size=state_size,
     work_size=work_size,

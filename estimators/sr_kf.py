@@ -21,7 +21,7 @@ def work_size(options: Options, nx: int, ny: int) -> int:
 def predict(context, u, dt, index, state, work):
     """x ← F x + B u;  Uᵀ U ← F Uᵀ U Fᵀ + Q.
 
-    Source: Kailath, Sayed & Hassibi, Linear Estimation (2000), 12.3.
+    Source: Kailath, Sayed & Hassibi, Linear Estimation (2000), chapter 12.
     """
     n = context.nx
     forward = work[:n]
@@ -40,7 +40,7 @@ SR_KF = Estimator(
     assumes="linear f and h, Gaussian noise; then exact, at any conditioning",
     model_runs="1",
     fails_when="the model is wrong: the NIS leaves its bounds",
-    source="Kailath, Sayed & Hassibi (2000), Linear Estimation, 12.3",
+    source="Kailath, Sayed & Hassibi (2000), Linear Estimation, chapter 12",
     functions=(start, predict, sr_ekf.update, describe),
     state_size=state_size,
     work_size=work_size,

@@ -39,7 +39,7 @@ def predict(context, u, dt, index, state, work):
     """x ← mean of the propagated sigma points;  U ← triangle of their weighted deviations over Q^½.
 
     Where a negative central weight leaves nothing positive definite, the state becomes NaN and the twin reports
-    divergence. Source: van der Merwe & Wan (2001), equations 20 to 22.
+    divergence. Source: van der Merwe & Wan (2001), the time update.
     """
     n = context.nx
     U = matrix(state, n, n, n)
@@ -76,7 +76,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     With D± = h(x ± spread·U[k]) - ŷ and outer weight w, the pair of rows √w D₊, √w D₋ is turned by 45° into
     √(w/2) (D₊ - D₋), which goes with the row U[k] of the state's factor, and √(w/2) (D₊ + D₋), which goes with none.
 
-    Source: van der Merwe & Wan (2001), equations 23 to 28.
+    Source: van der Merwe & Wan (2001), the measurement update.
     """
     n = context.nx
     _, m = sensor_rows(context, sensor)

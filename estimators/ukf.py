@@ -16,7 +16,7 @@ from .context import circular_rows, circular_states, expect, options, sensor_row
 from .filter import Estimator, Option, Options
 from .gaussian import admit, compare, describe, downdate, moments, move_mean, start, state_size, wrap_mean
 from .jit import inlined, jit, matrix
-from .linalg import cholesky, mirror, wrap
+from .linalg import EPSILON, cholesky, mirror, wrap
 from .model import StateSpaceModel
 from .robust import (
     ADAPT,
@@ -163,6 +163,23 @@ def predict(context, u, dt, index, state, work):
 
 
 @jit
+def only_rounding(U, P, D, S, r, w, y):
+    """Whether a reading rests on directions of P that its factor U shows by rounding alone.
+
+    A pivot of a few n ε of P_kk is what subtracting left; its sigma points are then anywhere. That does no harm unless
+    they make more than a hundredth of what the reading is weighed against, S (ny, ny) and r: then no gain is known.
+    """
+    n = P.shape[0]
+    for k in range(n):
+        if U[k, k] * U[k, k] <= 4.0 * n * EPSILON * P[k, k]:
+            for j in range(r.size):
+                d = D[1 + k, j] - D[1 + n + k, j]
+                if np.isfinite(y[j]) and 0.5 * w * d * d > 0.01 * (S[j, j] + r[j]):
+                    return True
+    return False
+
+
+@jit
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """x ← x + C S⁻¹ ν;  P ← P - C S⁻¹ Cᵀ, with C and S from fresh sigma points through h.
 
@@ -205,8 +222,9 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
                 C[i, j] += a * (D[1 + k, j] - D[1 + n + k, j])
     nothing = D[:, :0]
     reading_variances(context, sensor, state, r)
+    drowned = only_rounding(U, P, D, S, r, w, y)
     m = compare(context, sensor, y, r, nu, C, S, nothing, P, innovation, innovation_std)
-    verdict = admit(context, sensor, m, nu, S, V, score)
+    verdict = FAILED if drowned else admit(context, sensor, m, nu, S, V, score)
     if verdict == USED and numbers[ROBUST] != NONE:
         verdict = USED if reweigh(context, y, r, innovation, m, nu, S, V, room) else FAILED
     if verdict == USED:

@@ -201,7 +201,7 @@ def test_the_plain_forms_refuse_it_and_say_so(estimator, options):
     np.testing.assert_array_equal(fold.moments()[1], np.eye(3))
 
 
-@pytest.mark.parametrize("estimator", ["kf", "ekf", "iekf"])
+@pytest.mark.parametrize("estimator", ["kf", "ekf", "iekf", "ukf", "ckf"])
 def test_one_by_one_the_plain_forms_refuse_the_second(estimator):
     """H₂ P H₂ᵀ is nothing but rounding after the first: what R is beside that, no gain can know."""
     fold = folded(estimator, TWINS, one_by_one())
