@@ -195,7 +195,8 @@ class Fold:
         most = model.width * max(1, self.policy.window)
         self._bounds: Bounds = chi_square_bounds(most)
         self._context = self._see()
-        self._state = np.empty(self.estimator.state_size(self.options, model.nx))
+        numbers = self.estimator.state_size(self.options, model.nx) + self.estimator.memory(self.options, model)
+        self._state = np.empty(numbers)
         self._spare = np.empty_like(self._state)
         self._work = np.full(self.estimator.work_size(self.options, model.nx, model.width) + 1, np.nan)
         self._score = np.empty(3)
@@ -223,7 +224,7 @@ class Fold:
             "r": np.ascontiguousarray(tuning.r, float),
             "used": tuning.used.astype(np.int8),
             "gate": gate,
-            "options": np.ascontiguousarray(self.estimator.tune(self.options, model.nx), float),
+            "options": np.ascontiguousarray(self.estimator.tune(self.options, model, tuning), float),
             "pairs": self.pairs,
         }
         values = {**self._compiled.static, **held}

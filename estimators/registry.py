@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from difflib import get_close_matches
 
+from .ckf import CKF
 from .ekf import EKF
 from .errors import EstimatorError
 from .filter import Estimator
+from .iekf import IEKF
 from .kf import KF
+from .kf_steady import KF_STEADY
 from .model import StateSpaceModel
+from .sr_ekf import SR_EKF
+from .sr_kf import SR_KF
+from .sr_ukf import SR_UKF
 from .ukf import UKF
 
-ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in (KF, EKF, UKF)}
+GAUSSIAN = (KF, KF_STEADY, EKF, IEKF, UKF, CKF, SR_KF, SR_EKF, SR_UKF)
+
+ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in GAUSSIAN}
 
 
 def find_entry(name: str) -> Estimator:

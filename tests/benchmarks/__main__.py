@@ -21,6 +21,7 @@ def main() -> None:
     sections: list[Callable[[], None]] = [
         filters.beside_filterpy,
         filters.growing_n,
+        filters.gaussian_family,
         history.growing_history,
         history.refold,
         sources.blf,
