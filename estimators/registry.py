@@ -9,9 +9,10 @@ from .errors import EstimatorError
 from .filter import Estimator
 from .kf import KF
 from .model import StateSpaceModel
+from .pf import PF, PF_REG
 from .ukf import UKF
 
-ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in (KF, EKF, UKF)}
+ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in (KF, EKF, UKF, PF, PF_REG)}
 
 
 def find_estimator(name: str, model: StateSpaceModel) -> Estimator:
