@@ -24,7 +24,6 @@ from .jit import floats, ints, jit, matrix
 from .linalg import wrap
 from .noise import add_noise, semidefinite_root
 from .random import SUBSTEP, key_of, normal
-from .threads import threaded
 
 INDEX, SUBSTEPS, SETTLED, EQUAL, ESS, RECOVERIES, RESAMPLED, _SPARE = range(8)
 """Head of the state: event of the last prediction and how many it had; whether mean and covariance are up to date;
@@ -35,8 +34,8 @@ BLOCK = 1024
 THREADED_FROM = 16_384
 """Members from which threads gain more than they cost."""
 
-MEMBERS, FRACTION, SCHEME, THREADS, EXTRA = range(5)
-"""Positions in the context's options."""
+MEMBERS, FRACTION, SCHEME, THREADS, BLOCK_CODE, EXTRA = range(6)
+"""Positions in the context's options; `EXTRA` is the kernel's width or a proposal."""
 
 PROCESS, START, RESAMPLE, JITTER, RECOVER, PROPOSE = range(6)
 """Streams of randomness; see random.py."""
@@ -51,13 +50,6 @@ OPTIONS = (
 def members(options: Options) -> int:
     """Number of particles."""
     return int(options["particles"])
-
-
-def tune(options: Options, nx: int) -> np.ndarray:
-    """The numbers that the compiled functions read."""
-    n = members(options)
-    threads = n >= THREADED_FROM and threaded()
-    return np.array([n, options["fraction"], round(options["resampling"]), threads, 0.0], float)
 
 
 def blocks_of(n: int) -> int:
@@ -128,37 +120,78 @@ def settled_moments(state, nx):
     return floats(state.ctypes.data + 8 * (HEAD + nx), nx), matrix(state, HEAD + 2 * nx, nx, nx)
 
 
+CHUNK = 64
+"""Members whose deviations are laid out by row before they are summed: long loops, few of them."""
+
+
 @jit
-def add_deviation(w, d, m, sums):
-    """Add w, w² , w d and w d dᵀ (lower triangle) of a deviation d of m numbers to sums[0], [1], [4:4+m], [4+m:]."""
-    sums[0] += w
-    sums[1] += w * w
+def dot(a, b, n):
+    """Sum of the first n products, in four interleaved sums."""
+    s0 = 0.0
+    s1 = 0.0
+    s2 = 0.0
+    s3 = 0.0
+    whole = n - n % 4
+    for i in range(0, whole, 4):
+        s0 += a[i] * b[i]
+        s1 += a[i + 1] * b[i + 1]
+        s2 += a[i + 2] * b[i + 2]
+        s3 += a[i + 3] * b[i + 3]
+    for i in range(whole, n):
+        s0 += a[i] * b[i]
+    return (s0 + s1) + (s2 + s3)
+
+
+@jit
+def add_chunk(D, n, m, sums):
+    """Add n members to the sums: Σw, Σw², and at 4 the m sums Σ w d, then the lower triangle of Σ w d dᵀ.
+
+    D (m + 2, CHUNK) holds the weights in row m and the deviations in the rows above; row m + 1 is scratch.
+    """
+    w = D[m]
+    a = D[m + 1]
+    for i in range(n):
+        sums[0] += w[i]
+    sums[1] += dot(w, w, n)
     for i in range(m):
-        a = w * d[i]
-        sums[4 + i] += a
+        d = D[i]
+        for k in range(n):
+            a[k] = w[k] * d[k]
+        s = 0.0
+        for k in range(n):
+            s += a[k]
+        sums[4 + i] += s
         for j in range(i + 1):
-            sums[4 + m + i * m + j] += a * d[j]
+            sums[4 + m + i * m + j] += dot(a, D[j], n)
 
 
 @jit
-def deviation(state, x, reference, d):
-    """d = x - reference, the circular ones wrapped."""
-    for j in range(reference.size):
-        d[j] = x[j] - reference[j]
-        if state[HEAD + j] != 0.0:
-            d[j] = wrap(d[j])
+def add_members(circles, w, records, reference, D, sums):
+    """Add particles of weights `w`, and their own covariances if they have any, to the sums of the cloud's moments.
 
-
-@jit
-def add_member(state, w, record, reference, d, sums):
-    """Add a particle, and its own covariance if it has one, to the sums of the cloud's moments."""
+    `circles` (nx,) tells the circular states; D (nx + 2, CHUNK) is scratch.
+    """
     nx = reference.size
-    deviation(state, record, reference, d)
-    add_deviation(w, d, nx, sums)
-    if record.size > nx:
-        for i in range(nx):
-            for j in range(i + 1):
-                sums[4 + nx + i * nx + j] += w * record[nx + i * nx + j]
+    own = records.shape[1] > nx
+    for first in range(0, w.size, CHUNK):
+        n = min(CHUNK, w.size - first)
+        for j in range(nx):
+            d = D[j]
+            middle = reference[j]
+            for i in range(n):
+                d[i] = records[first + i, j] - middle
+            if circles[j] != 0.0:
+                for i in range(n):
+                    d[i] = wrap(d[i])
+        for i in range(n):
+            D[nx, i] = w[first + i]
+        add_chunk(D, n, nx, sums)
+        if own:
+            for k in range(n):
+                record = records[first + k]
+                for i in range(nx):
+                    for j in range(i + 1):
+                        sums[4 + nx + i * nx + j] += w[first + k] * record[nx + i * nx + j]
 
 
 @jit
@@ -200,13 +233,15 @@ def cloud_moments(state, nx, n, mean, cov):
             if log_w[i] > log_w[heaviest]:
                 heaviest = i
     sums = np.zeros(4 + nx + nx * nx)
-    d = np.empty(nx)
+    D = np.empty((nx + 2, CHUNK))
+    w = np.empty(BLOCK)
     reference = records[heaviest, :nx].copy()
     top = log_w[heaviest]
-    for i in range(n):
-        w = 1.0 if equal else np.exp(log_w[i] - top)
-        if w > 0.0:
-            add_member(state, w, records[i], reference, d, sums)
+    for first in range(0, n, BLOCK):
+        last = min(n, first + BLOCK)
+        for i in range(first, last):
+            w[i - first] = 1.0 if equal else np.exp(log_w[i] - top)
+        add_members(state[HEAD : HEAD + nx], w[: last - first], records[first:last], reference, D, sums)
     finish_moments(state, sums, reference, mean, cov)
 
 
@@ -243,7 +278,7 @@ def scatter(context, mean, root, key, records):
             records[i, j] = mean[j]
         for j in range(nx, records.shape[1]):
             records[i, j] = 0.0
-        add_noise(root, z, records[i])
+        add_noise(root, z, records[i, :nx])
         wrap_record(circular, records[i])
 
 
@@ -335,20 +370,8 @@ def spread_by(context, root, key, first, records):
     for i in range(records.shape[0]):
         for j in range(nx):
             z[j] = normal(key, np.uint64((first + i) * nx + j))
-        add_noise(root, z, records[i])
+        add_noise(root, z, records[i, :nx])
         wrap_record(circular, records[i])
-
-
-@jit
-def weigh_block(state, joint, w, first, last, top, reference, d, sums):
-    """w = exp(joint - top) of the members `first` to `last`, and their sums."""
-    records = records_of(state, reference.size, joint.size)
-    for k in range(sums.size):
-        sums[k] = 0.0
-    for i in range(first, last):
-        w[i] = np.exp(joint[i] - top)
-        if w[i] > 0.0:
-            add_member(state, w[i], records[i], reference, d, sums)
 
 
 @jit

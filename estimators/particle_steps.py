@@ -7,34 +7,44 @@ a shared part, and a part for each block (see `Shared` and `scratch_numbers`).
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
-from numba import prange
+from numba import prange, types
 
 from .context import (
+    call_f,
+    call_h,
     circular_rows,
     circular_states,
-    expect,
+    context_type,
     has_own_likelihood,
     own_likelihood,
+    parameters,
     sensor_variances,
-    transition,
 )
 from .context import options as numbers
 from .gaussian import LOG_2PI
-from .jit import floats, ints, jit, matrix
+from .jit import F1, address, caller, f64, floats, i64, ints, jit, matrix
 from .linalg import wrap
 from .noise import add_noise, noise_root
 from .particle import (
     BLOCK,
+    BLOCK_CODE,
+    CHUNK,
     EQUAL,
     ESS,
+    EXTRA,
     FRACTION,
+    HEAD,
     MEMBERS,
     RESAMPLED,
     SCHEME,
     SETTLED,
+    THREADED_FROM,
     THREADS,
-    add_deviation,
+    add_chunk,
+    add_members,
     add_up,
     blocks_of,
     finish_moments,
@@ -43,15 +53,18 @@ from .particle import (
     records_of,
     settled_moments,
     spread_by,
-    weigh_block,
     weigh_equally,
     wrap_record,
 )
-from .random import normal
+from .random import ONE, normal
 from .resampling import STRATIFIED, drawn_children, place_children, strata_children
+from .threads import threaded
 
 PROPAGATE, WEIGH, NORMALISE, CHILDREN, COMMIT, JITTER = range(6)
 """Phases: x ~ p(x | x'); p(y | x); weights and moments; children of strata; keep the weights; kernel noise."""
+
+OWN = 16
+"""Phases from here on are a filter's own; its code stands in the option `EXTRA`."""
 
 
 def shared_numbers(nx: int, ny: int) -> int:
@@ -61,9 +74,17 @@ def shared_numbers(nx: int, ny: int) -> int:
 
 
 def block_numbers(nx: int, ny: int) -> int:
-    """Numbers of one block: its sums; x', d, z, e, ŷ; L and its scratch; and where its points begin."""
+    """Numbers of one block: its sums; x', z, ŷ; deviations by row; L and its scratch; where its points begin."""
     k = max(nx, ny)
-    return 4 + k + k * k + 3 * nx + 2 * ny + 2 * nx * nx + 1
+    return 4 + k + k * k + 2 * nx + ny + 2 * nx * nx + (k + 2) * CHUNK + 1
+
+
+def tune(options: dict[str, float], nx: int) -> np.ndarray:
+    """The numbers that the compiled functions read, in the order of `MEMBERS` and the following."""
+    n = members(options)
+    threads = n >= THREADED_FROM and threaded()
+    fraction, scheme = options.get("fraction", 1.0), round(options["resampling"])
+    return np.array([n, fraction, scheme, threads, block_code(), 0.0], float)
 
 
 def work_size(options: dict[str, float], nx: int, ny: int) -> int:
@@ -105,7 +126,7 @@ def shared(context, work, n):
 def block_size(context):
     """Numbers of one block, as in `block_numbers`."""
     nx, ny = context.nx, context.width
-    return sums_size(context) + 3 * nx + 2 * ny + 2 * nx * nx + 1
+    return sums_size(context) + 2 * nx + ny + 2 * nx * nx + (max(nx, ny) + 2) * CHUNK + 1
 
 
 @jit
@@ -133,26 +154,32 @@ def propagate(context, u, dt, key, state, first, last, L, scratch, forward, z):
     records = records_of(state, nx, n)
     log_w = log_weights(state, nx, n)
     circular = circular_states(context)
-    noises = context.n_noises if context.Q == 0 else nx
+    p = parameters(context)
+    f = context.f
+    diagonal = context.Q == 0
+    varies = context.Q_varies != 0
+    noises = context.n_noises if diagonal else nx
     noisy = ints(context.noise_state, context.n_noises)
+    place = np.uint64(first) * np.uint64(noises)
     lost = 0
     for i in range(first, last):
         x = records[i]
-        if context.Q_varies != 0:
+        if varies:
             noise_root(context, x, u, dt, L, scratch)
-        transition(context, x, u, dt, forward)
-        place = np.uint64(i * noises)
-        if context.Q == 0:
+        call_f(f, x, u, p, dt, forward)
+        if diagonal:
             for k in range(noises):
                 j = noisy[k]
-                forward[j] += L[j, j] * normal(key, place + np.uint64(k))
+                forward[j] += L[j, j] * normal(key, place)
+                place += ONE
         else:
             for k in range(noises):
-                z[k] = normal(key, place + np.uint64(k))
+                z[k] = normal(key, place)
+                place += ONE
             add_noise(L, z, forward)
         finite = True
         for j in range(nx):
-            finite = finite and np.isfinite(forward[j])
+            finite &= np.isfinite(forward[j])
         if finite:
             for j in range(nx):
                 x[j] = forward[j]
@@ -164,74 +191,87 @@ def propagate(context, u, dt, key, state, first, last, L, scratch, forward, z):
 
 
 @jit
-def log_density(context, sensor, y, x, u, expected):
-    """log p(y | x) from ŷ = h(x): Gaussian over the finite rows of y, or the sensor's own; -inf if it is not a number.
+def weigh(context, u, sensor, y, state, joint, first, last, expected, D, sums):
+    """joint = log w + log p(y | x), and the sums of the residuals' mean and covariance under the predicted weights.
 
-    Leaves the residual of each finite row in the leading entries of `expected`.
+    p(y | x) is Gaussian over the finite rows of y, or the sensor's own; a density that is no number counts as zero.
     """
+    nx = context.nx
+    records = records_of(state, nx, joint.size)
+    log_w = log_weights(state, nx, joint.size)
+    equal = state[EQUAL] != 0.0
     r = sensor_variances(context, sensor)
     circular = circular_rows(context, sensor)
-    value = 0.0
-    m = 0
-    for row in range(r.size):
-        if np.isfinite(y[row]):
-            e = y[row] - expected[row]
-            if circular[row] != 0:
-                e = wrap(e)
-            expected[m] = e
-            value -= e * e / r[row]
-            m += 1
-    value *= 0.5
-    if has_own_likelihood(context, sensor):
-        value = own_likelihood(context, sensor, y, x, u)
-    return value if value < np.inf else -np.inf
-
-
-@jit
-def log_constant(context, sensor, y):
-    """What the Gaussian density of the finite rows adds to its exponent: -½ Σ log 2πr; 0 if the sensor has its own."""
-    if has_own_likelihood(context, sensor):
-        return 0.0
-    r = sensor_variances(context, sensor)
-    value = 0.0
-    for row in range(r.size):
-        if np.isfinite(y[row]):
-            value -= 0.5 * (LOG_2PI + np.log(r[row]))
-    return value
-
-
-@jit
-def weigh(context, u, sensor, y, state, joint, first, last, expected, sums):
-    """joint = log w + log p(y | x), and the sums of the residual's mean and covariance under the predicted weights."""
-    nx = context.nx
-    n = joint.size
-    records = records_of(state, nx, n)
-    log_w = log_weights(state, nx, n)
-    equal = state[EQUAL] != 0.0
-    constant = log_constant(context, sensor, y)
+    h = ints(context.h, context.n_sensors)[sensor]
+    own = has_own_likelihood(context, sensor)
+    p = parameters(context)
     for k in range(sums.size):
         sums[k] = 0.0
     sums[2] = -np.inf
-    ny = sensor_variances(context, sensor).size
+    ny = r.size
     m = 0
+    constant = 0.0
     for row in range(ny):
         if np.isfinite(y[row]):
             m += 1
+            constant -= 0.5 * (LOG_2PI + np.log(r[row]))
+    top = -np.inf
+    for begin in range(first, last, CHUNK):
+        n = min(CHUNK, last - begin)
+        for i in range(n):
+            x = records[begin + i]
+            call_h(h, x, u, p, expected)
+            for row in range(ny):
+                D[row, i] = y[row] - expected[row]
+            D[m, i] = 0.0
+        for i in range(n):
+            joint[begin + i] = constant
+        k = 0
+        for row in range(ny):
+            if not np.isfinite(y[row]):
+                continue
+            # Row `row` moves up to k ≤ row.
+            d = D[k]
+            weight = 0.5 / r[row]
+            for i in range(n):
+                e = D[row, i]
+                if circular[row] != 0:
+                    e = wrap(e)
+                d[i] = e
+                joint[begin + i] -= weight * e * e
+            k += 1
+        if own:
+            for i in range(n):
+                joint[begin + i] = own_likelihood(context, sensor, y, records[begin + i, :nx], u)
+        for i in range(n):
+            w = 1.0 if equal else np.exp(log_w[begin + i])
+            value = joint[begin + i] + log_w[begin + i]
+            # A density that is no number, or an expectation: the particle is out, and out of the sums.
+            if not -np.inf < value < np.inf:
+                value = -np.inf
+                for k in range(m):
+                    if not np.isfinite(D[k, i]):
+                        w = 0.0
+                        D[k, i] = 0.0
+            joint[begin + i] = value
+            D[m, i] = w
+            if value > top:
+                top = value
+                sums[3] = begin + i
+        add_chunk(D, n, m, sums)
+    sums[2] = top
+
+
+@jit
+def weigh_block(context, state, joint, w, first, last, top, reference, D, sums):
+    """w = exp(joint - top) of the members `first` to `last`, and their sums."""
+    for k in range(sums.size):
+        sums[k] = 0.0
     for i in range(first, last):
-        x = records[i]
-        expect(context, sensor, x[:nx], u, expected[:ny])
-        joint[i] = log_w[i] + constant + log_density(context, sensor, y, x[:nx], u, expected)
-        w = 1.0 if equal else np.exp(log_w[i])
-        finite = w > 0.0
-        for k in range(m):
-            finite = finite and np.isfinite(expected[k])
-        if finite:
-            add_deviation(w, expected, m, sums)
-        if not joint[i] > -np.inf:
-            joint[i] = -np.inf
-        elif joint[i] > sums[2]:
-            sums[2] = joint[i]
-            sums[3] = i
+        w[i] = np.exp(joint[i] - top)
+    nx = context.nx
+    records = records_of(state, nx, joint.size)
+    add_members(state[HEAD : HEAD + nx], w[first:last], records[first:last], reference, D, sums)
 
 
 @jit
@@ -247,19 +287,32 @@ def _block(phase, context, u, dt, sensor, y, key, value, state, work, b):
     sums = floats(work.ctypes.data + 8 * at, size)
     at += size
     forward = floats(work.ctypes.data + 8 * at, nx)
-    d = floats(work.ctypes.data + 8 * (at + nx), nx)
-    z = floats(work.ctypes.data + 8 * (at + 2 * nx), nx)
-    at += 3 * nx
-    expected = floats(work.ctypes.data + 8 * at, 2 * ny)
-    at += 2 * ny
+    z = floats(work.ctypes.data + 8 * (at + nx), nx)
+    at += 2 * nx
+    expected = floats(work.ctypes.data + 8 * at, ny)
+    at += ny
+    D = matrix(work, at, max(nx, ny) + 2, CHUNK)
+    at += (max(nx, ny) + 2) * CHUNK
     if phase == PROPAGATE:
         own = matrix(work, at, nx, nx) if context.Q_varies != 0 else L
         lost = propagate(context, u, dt, key, state, first, last, own, matrix(work, at + nx * nx, nx, nx), forward, z)
         sums[0] = lost
     elif phase == WEIGH:
-        weigh(context, u, sensor, y, state, joint, first, last, expected, sums)
+        weigh(
+            context,
+            u,
+            sensor,
+            y,
+            state,
+            joint,
+            first,
+            last,
+            floats(expected.ctypes.data, sensor_variances(context, sensor).size),
+            D,
+            sums,
+        )
     elif phase == NORMALISE:
-        weigh_block(state, joint, w, first, last, value, reference, d, sums)
+        weigh_block(context, state, joint, w, first, last, value, reference, D, sums)
     elif phase == CHILDREN:
         # The points at which this block begins, and the next one, stand in the last number of their parts.
         at = blocks_start(context, n) + (b + 1) * block_size(context) - 1
@@ -275,10 +328,24 @@ def _block(phase, context, u, dt, sensor, y, key, value, state, work, b):
         spread_by(context, L, key, first, records_of(state, nx, n)[first:last])
 
 
+block_signature = types.void(i64, context_type, F1, f64, i64, F1, types.uint64, f64, F1, F1, i64)
+call_block = caller(block_signature)
+
+
+@lru_cache(maxsize=1)
+def block_code() -> float:
+    """Where the machine code of the phases starts, among the options (an address has 48 bits, a float64 53).
+
+    Called through a pointer it is compiled once, not again into each function that sweeps.
+    """
+    return float(address(_block, block_signature))
+
+
 @jit(parallel=True)
 def _on_threads(phase, context, u, dt, sensor, y, key, value, state, work, blocks):
+    code = int(numbers(context)[BLOCK_CODE if phase < OWN else EXTRA])
     for b in prange(blocks):
-        _block(phase, context, u, dt, sensor, y, key, value, state, work, b)
+        call_block(code, phase, context, u, dt, sensor, y, key, value, state, work, b)
 
 
 @jit
@@ -288,8 +355,9 @@ def sweep(phase, context, u, dt, sensor, y, key, value, state, work):
     if numbers(context)[THREADS] != 0.0:
         _on_threads(phase, context, u, dt, sensor, y, key, value, state, work, blocks)
     else:
+        code = int(numbers(context)[BLOCK_CODE if phase < OWN else EXTRA])
         for b in range(blocks):
-            _block(phase, context, u, dt, sensor, y, key, value, state, work, b)
+            call_block(code, phase, context, u, dt, sensor, y, key, value, state, work, b)
 
 
 @jit

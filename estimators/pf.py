@@ -37,7 +37,6 @@ from .particle import (
     settled_moments,
     sized,
     start,
-    tune,
 )
 from .particle_steps import JITTER as MOVE
 from .particle_steps import (
@@ -50,6 +49,7 @@ from .particle_steps import (
     shared,
     sweep,
     total,
+    tune,
     work_size,
 )
 from .random import key_of
@@ -74,6 +74,16 @@ def predict(context, u, dt, index, state, work):
 
 
 @jit
+def finite_rows(y, rows):
+    """How many of the reading's rows are there."""
+    m = 0
+    for row in range(rows):
+        if np.isfinite(y[row]):
+            m += 1
+    return m
+
+
+@jit
 def predicted(context, sensor, y, sums, S, nu, innovation, innovation_std):
     """Innovation and its covariance from the sums of `weigh`; S and ν hold the finite rows.
 
@@ -81,10 +91,7 @@ def predicted(context, sensor, y, sums, S, nu, innovation, innovation_std):
         The number of finite rows.
     """
     r = sensor_variances(context, sensor)
-    m = 0
-    for row in range(r.size):
-        if np.isfinite(y[row]):
-            m += 1
+    m = finite_rows(y, r.size)
     k = 0
     for row in range(r.size):
         if not np.isfinite(y[row]):
@@ -111,10 +118,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     n = int(numbers(context)[MEMBERS])
     sums, L, _, S_flat, U_flat, nu, _ = shared(context, work, n)
     rows = sensor_variances(context, sensor).size
-    finite = 0
-    for row in range(rows):
-        finite += np.isfinite(y[row])
-    if finite == 0:
+    if finite_rows(y, rows) == 0:
         return MISSING
     sweep(WEIGH, context, u, 0.0, sensor, y, np.uint64(0), 0.0, state, work)
     total(context, work, sums)

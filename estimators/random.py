@@ -21,6 +21,8 @@ import numpy as np
 
 from .jit import jit
 
+ONE = np.uint64(1)
+
 GAMMA = np.uint64(0x9E3779B97F4A7C15)
 """The golden ratio in 64 bits, odd: SplitMix64's step."""
 
@@ -30,7 +32,6 @@ SUBSTEP = 16
 _M1, _M2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _S30, _S27, _S31, _S9, _S12 = (np.uint64(s) for s in (30, 27, 31, 9, 12))
 _LAYER = np.uint64(0xFF)
-_ONE = np.uint64(1)
 _OTHER = np.uint64(0xD1B54A32D192ED03)
 _TO_UNIT = 2.0**-52
 
@@ -69,7 +70,7 @@ def mix(z):
 @jit
 def word(key, i):
     """Number i ≥ 0 of the SplitMix64 sequence that is seeded with `key` (both uint64)."""
-    return mix(key + (i + _ONE) * GAMMA)
+    return mix(key + (i + ONE) * GAMMA)
 
 
 @jit
@@ -97,14 +98,14 @@ def _edge(key, i, layer, position):
             # The tail beyond r; the sign is the position's.
             while True:
                 a = -np.log(unit(word(own, n))) / _R
-                b = -np.log(unit(word(own, n + _ONE)))
+                b = -np.log(unit(word(own, n + ONE)))
                 n += np.uint64(2)
                 if 2.0 * b > a * a:
                     return _R + a if position >= 0 else -(_R + a)
         height = _DENSITY[layer] + unit(word(own, n)) * (_DENSITY[layer + 1] - _DENSITY[layer])
         if height < np.exp(-0.5 * x * x):
             return x
-        bits = word(own, n + _ONE)
+        bits = word(own, n + ONE)
         n += np.uint64(2)
         layer = np.int64(bits & _LAYER)
         position = np.int64(bits) >> 9
@@ -135,7 +136,7 @@ def normals(seed, index, stream, first_member, out):
     for member in range(out.shape[0]):
         for j in range(k):
             out[member, j] = normal(key, i)
-            i += _ONE
+            i += ONE
 
 
 @jit

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from difflib import get_close_matches
 
+from .apf import APF
 from .ekf import EKF
 from .errors import EstimatorError
 from .filter import Estimator
 from .kf import KF
 from .model import StateSpaceModel
 from .pf import PF, PF_REG
+from .pf_ekf import PF_EKF
 from .ukf import UKF
 
-ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in (KF, EKF, UKF, PF, PF_REG)}
+ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in (KF, EKF, UKF, PF, PF_REG, PF_EKF, APF)}
 
 
 def find_estimator(name: str, model: StateSpaceModel) -> Estimator:
