@@ -27,6 +27,7 @@ from .particle import (
     RESAMPLE,
     RESAMPLED,
     describe,
+    modes,
     moments,
     points,
     records_of,
@@ -92,6 +93,7 @@ APF = Estimator(
     work_size=work_size,
     moments=moments,
     points=points,
+    modes=modes,
     options=tuple(option for option in OPTIONS if option.name != "fraction"),
     tune=tune,
 )

@@ -22,6 +22,7 @@ from .context import options as numbers
 from .filter import Option, Options
 from .jit import floats, ints, jit, matrix
 from .linalg import wrap
+from .modes import Mode, modes_of
 from .noise import add_noise, semidefinite_root
 from .random import SUBSTEP, key_of, normal
 
@@ -93,12 +94,20 @@ DRAWN = 2000
 
 
 def points(options: Options, state: np.ndarray, nx: int) -> np.ndarray:
-    """Particles to draw (k, nx), k ≤ `DRAWN`: all of them, or as many picked by weight at even steps."""
+    """Particles to draw (k, nx), k ≤ `DRAWN`, of equal weight: picked by weight at even steps, or all if equal."""
+    n = members(options)
+    drawn = min(n, DRAWN)
+    if state[EQUAL]:
+        at = at_weights(nx) + n
+        return state[at:].reshape(n, -1)[np.arange(drawn) * n // drawn, :nx]
     w, records = cloud(options, state, nx)
-    if len(w) <= DRAWN:
-        return records[w > 0, :nx].copy()
-    picked = np.searchsorted(np.cumsum(w), (np.arange(DRAWN) + 0.5) / DRAWN)
-    return records[np.minimum(picked, len(w) - 1), :nx]
+    picked = np.searchsorted(np.cumsum(w), (np.arange(drawn) + 0.5) / drawn)
+    return records[np.minimum(picked, n - 1), :nx]
+
+
+def modes(options: Options, state: np.ndarray, nx: int) -> list[Mode]:
+    """The peaks of the cloud."""
+    return modes_of(points(options, state, nx), state[HEAD : HEAD + nx] != 0.0)
 
 
 @jit

@@ -223,7 +223,6 @@ def weigh(context, u, sensor, y, state, joint, first, last, expected, D, sums):
             call_h(h, x, u, p, expected)
             for row in range(ny):
                 D[row, i] = y[row] - expected[row]
-            D[m, i] = 0.0
         for i in range(n):
             joint[begin + i] = constant
         k = 0

@@ -29,6 +29,7 @@ from .particle import (
     OPTIONS,
     RESAMPLE,
     describe,
+    modes,
     moments,
     next_substep,
     points,
@@ -174,6 +175,7 @@ PF = Estimator(
     work_size=work_size,
     moments=moments,
     points=points,
+    modes=modes,
     options=OPTIONS,
     tune=tune,
 )
@@ -191,6 +193,7 @@ PF_REG = Estimator(
     work_size=work_size,
     moments=moments,
     points=points,
+    modes=modes,
     options=(*OPTIONS, BANDWIDTH),
     tune=tune_regularised,
 )

@@ -16,7 +16,7 @@ from .context import sensor_variances
 from .filter import Estimator
 from .gaussian import judge
 from .jit import jit, matrix
-from .particle import MEMBERS, OPTIONS, PROPOSE, RESAMPLE, describe, moments, points, recover, sized, start
+from .particle import MEMBERS, OPTIONS, PROPOSE, RESAMPLE, describe, modes, moments, points, recover, sized, start
 from .particle_steps import impoverished, keep, normalise, resample, shared, sweep, total
 from .pf import finite_rows, predicted
 from .proposals import EXPECT, PROPOSE_EKF, predict, tune, work_size
@@ -69,6 +69,7 @@ PF_EKF = Estimator(
     work_size=work_size,
     moments=moments,
     points=points,
+    modes=modes,
     options=OPTIONS,
     tune=tune,
 )
