@@ -5,6 +5,7 @@ roots are candidates. Two candidates are one peak unless the density dips betwee
 unit circle, so a peak at ±π is whole.
 
 Sources: Vedaldi & Soatto (2008), Quick shift and kernel methods for mode seeking, doi:10.1007/978-3-540-88693-8_52;
+Rodriguez & Laio (2014), Clustering by fast search and find of density peaks, doi:10.1126/science.1242072;
 Silverman (1986), Density Estimation, section 4.3.2, for the bandwidth.
 """
 
@@ -92,8 +93,10 @@ def _peaks(places: np.ndarray) -> np.ndarray:
     squares[rank[None, :] >= rank[:, None]] = np.inf
     parent = np.argmin(squares, axis=1)
     jump = squares[np.arange(n), parent]
-    # The longest jumps are the likeliest valleys; in many dimensions nearly every point is far from its neighbours.
-    root = (jump > width**2) & (jump >= np.sort(jump)[-min(n, CANDIDATES)])
+    # Dense and far from anything denser: Rodriguez & Laio (2014). Outliers are far, but not dense.
+    chance = height * np.sqrt(np.where(np.isfinite(jump), jump, jump[np.isfinite(jump)].max(initial=1.0)))
+    root = (jump > width**2) & (chance >= np.sort(chance)[-min(n, CANDIDATES)])
+    root[order[0]] = True
     label = np.empty(n, int)
     tops: list[int] = []
     for i in order:
@@ -110,12 +113,9 @@ def _peaks(places: np.ndarray) -> np.ndarray:
         by_distance = sorted(range(k), key=lambda other: float(((places[tops[other]] - places[top]) ** 2).sum()))
         for other in by_distance:
             between = density(places[top] + steps * (places[tops[other]] - places[top]))
-            if between.min() > DIP * height[top]:
+            if between.min() > DIP * height[top] or not _valley(places, label, k, other):
                 into = joined[other]
                 break
-        else:
-            if by_distance and np.mean(label == k) < LEAST and height[top] < 0.1 * height.max():
-                into = joined[by_distance[0]]
         joined.append(into)
     label = np.array(joined)[label]
     kept = [k for k in dict.fromkeys(joined) if np.mean(label == k) >= LEAST] or [joined[0]]
@@ -123,6 +123,25 @@ def _peaks(places: np.ndarray) -> np.ndarray:
     nearest = np.argmin(_squares(places, centres), axis=1)
     position = {k: i for i, k in enumerate(kept)}
     return np.array([position.get(k, near) for k, near in zip(label, nearest, strict=True)])
+
+
+def _valley(places: np.ndarray, label: np.ndarray, a: int, b: int) -> bool:
+    """Whether two trees stay apart when their points are projected on the line between their means.
+
+    One dimension has points enough for a density, where many dimensions have gaps everywhere.
+    """
+    first, second = places[label == a], places[label == b]
+    line = second.mean(axis=0) - first.mean(axis=0)
+    length = float(np.linalg.norm(line))
+    if length == 0.0:
+        return False
+    s, t = first @ line / length, second @ line / length
+    both = np.concatenate((s, t))
+    width = 1.06 * max(1e-6, min(float(s.std()), float(t.std()))) * len(both) ** -0.2
+    grid = np.linspace(s.mean(), t.mean(), 25)
+    density = np.exp(-0.5 * ((grid[:, None] - both) / width) ** 2).sum(axis=1)
+    lower = min(density[:8].max(), density[-8:].max())
+    return bool(density[8:-8].min() < DIP * lower)
 
 
 def _mode(points: np.ndarray, circular: np.ndarray, weight: float) -> Mode:
