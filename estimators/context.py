@@ -15,6 +15,7 @@ h_signature = types.void(F1, F1, F1, F1)
 h_complex_signature = types.void(C1, F1, F1, C1)
 H_signature = types.void(F1, F1, F1, F2)
 Q_signature = types.void(F1, F1, F1, F1, f64, F2)
+log_likelihood_signature = f64(F1, F1, F1, F1, F1)
 
 call_f = caller(f_signature)
 call_f_complex = caller(f_complex_signature)
@@ -23,6 +24,7 @@ call_h = caller(h_signature)
 call_h_complex = caller(h_complex_signature)
 call_H = caller(H_signature)
 call_Q = caller(Q_signature)
+call_log_likelihood = caller(log_likelihood_signature)
 
 
 class Context(NamedTuple):
@@ -41,10 +43,12 @@ class Context(NamedTuple):
     F: Any
     F_mode: Any
     Q: Any
+    Q_varies: Any
     h: Any
     h_complex: Any
     H: Any
     H_mode: Any
+    log_likelihood: Any
     n_sensors: Any
     row_start: Any
     row_count: Any
@@ -145,3 +149,16 @@ def add_process_noise(context, x, u, dt, P, scratch):
     for i in range(n):
         for j in range(n):
             P[i, j] += scratch[i, j]
+
+
+@jit
+def has_own_likelihood(context, sensor):
+    """Whether the sensor's noise is given by a function of its own instead of r."""
+    return ints(context.log_likelihood, context.n_sensors)[sensor] != 0
+
+
+@jit
+def own_likelihood(context, sensor, y, x, u):
+    """log p(y | x) of a sensor that gives it."""
+    target = ints(context.log_likelihood, context.n_sensors)[sensor]
+    return call_log_likelihood(target, y, x, u, parameters(context), sensor_variances(context, sensor))

@@ -8,8 +8,11 @@ four functions read the context and change nothing else:
     update(context, u, sensor, y, index, state, work, innovation, innovation_std, score) -> verdict
     describe(context, state, mean, std, cross)                       what the track shows of it
 
-`index` numbers the event in the log, so that randomness can be a function of (seed, index, member). `work` is scratch
-that starts as NaN. `score` takes NIS, degrees of freedom and log-likelihood.
+`index` numbers the event in the log, so that randomness can be a function of (seed, index, member). An event far from
+the last is predicted in several calls of the same index (`max_step`): a filter that draws keeps the last index and the
+number of its calls in its state, and makes that number part of the random stream (`particle.next_substep`), so no two
+sub-steps draw the same and a refold draws what the fold drew. `work` is scratch that starts as NaN. `score` takes NIS,
+degrees of freedom and log-likelihood.
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from .context import context_type
 from .errors import EstimatorError
 from .jit import F1, F2, address, caller, f64, i64
 from .model import StateSpaceModel
+from .modes import Mode
 from .tuning import Tuning
 
 start_signature = types.void(context_type, F1, F2, F1)
@@ -82,9 +86,10 @@ class Estimator:
     `applies(model)` gives the reason why the estimator does not fit a model, or None. `options` below are complete
     (see `complete`). `state_size(options, nx)` and `work_size(options, nx, ny)` count float64s; `moments(options,
     state, nx)` gives mean and covariance, `points(options, state, nx)` what to draw beside the mean (sigma points,
-    particles) as (k, nx). `tune(options, model, tuning)` turns the options into the numbers that the compiled functions
-    read; it may raise EstimatorError. `memory(options, model)` counts numbers that the state holds beyond `state_size`.
-    `runs(options, nx)` is `model_runs` as a number: how often a step runs f.
+    particles) as (k, nx), `modes(options, state, nx)` the peaks where there can be several. `tune(options, model,
+    tuning)` turns the options into the numbers that the compiled functions read; it may raise EstimatorError.
+    `memory(options, model)` counts numbers that the state holds beyond `state_size`. `runs(options, nx)` is
+    `model_runs` as a number: how often a step runs f.
     """
 
     name: str
@@ -104,6 +109,7 @@ class Estimator:
     memory: Callable[[Options, StateSpaceModel], int] = lambda options, model: 0
     applies: Callable[[StateSpaceModel], str | None] = lambda model: None
     runs: Callable[[Options, int], float] = lambda options, nx: 1.0
+    modes: Callable[[Options, np.ndarray, int], list[Mode]] | None = None
 
     def complete(self, options: dict[str, float]) -> dict[str, float]:
         """The given options and the defaults of the others.

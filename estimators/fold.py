@@ -21,6 +21,7 @@ from .filter import Code, Estimator, call_describe, call_predict, call_start, ca
 from .jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, jit, jit_brief, matrix
 from .log import INPUT, READING, RESET, TICK, TRUTH, Log
 from .model import StateSpaceModel
+from .modes import Mode
 from .quantiles import chi_square_quantile
 from .registry import find_estimator
 from .track import MISSING, NONE, Track, track_type
@@ -40,8 +41,11 @@ SPARSE_EVERY = 1024
 
 RECENT = 4096
 
-BRIEF = 64
-"""Events that are folded without letting other threads run meanwhile."""
+BRIEF = 2048
+"""Events, times the numbers of a state, that are folded without letting other threads run meanwhile."""
+
+SNAPSHOT_MEMORY = 256 * 2**20
+"""Bytes that the snapshots of a fold may take, half for the recent ones; large states are kept at wider steps."""
 
 
 @jit
@@ -208,6 +212,12 @@ class Fold:
         self._run, self._assess, self._run_brief, self._assess_brief, begin = _compiled()
         begin(self._code, self._context, np.ascontiguousarray(mean), np.ascontiguousarray(cov), self._state)
         self.n = 0
+        # At least one old snapshot (the start) and one recent, however large the state is.
+        self._most = max(1, SNAPSHOT_MEMORY // 2 // self._state.nbytes)
+        self._every = SNAPSHOT_EVERY
+        while RECENT // self._every > self._most:
+            self._every *= 2
+        self._sparse = max(SPARSE_EVERY, self._every)
         self._snapshots: dict[int, tuple[int, np.ndarray, np.ndarray]] = {}
         self._remember()
         self._rows = Track.allocate(log.capacity, model.nx, len(self.pairs), model.width)
@@ -267,6 +277,12 @@ class Fold:
         """What to draw beside the mean, (k, nx): sigma points, particles; none for most filters."""
         return self.estimator.points(self.options, self._state, self.model.nx)
 
+    def modes(self) -> list[Mode]:
+        """The peaks of the estimate, the heaviest first; a Gaussian filter has one."""
+        if self.estimator.modes is not None:
+            return self.estimator.modes(self.options, self._state, self.model.nx)
+        return [Mode(1.0, *self.moments())]
+
     def advance(self, limit: int | None = None) -> int:
         """Fold the events that the log has beyond `n`, at most `limit`; return how many."""
         end = self.log.n if limit is None else min(self.log.n, self.n + limit)
@@ -277,11 +293,11 @@ class Fold:
                 new[: self.n] = old[: self.n]
             self._rows = grown
         log = self.log
-        brief = end - self.n <= BRIEF
+        brief = (end - self.n) * self._state.size <= BRIEF
         run_some = self._run_brief if brief else self._run
         while self.n < end:
             # Far behind the end, only the snapshots that are kept for ever are worth stopping for.
-            stride = SPARSE_EVERY if end - self.n > RECENT else SNAPSHOT_EVERY
+            stride = self._sparse if end - self.n > RECENT else self._every
             boundary = self.n + stride - (log.first + self.n) % stride
             stop = min(end, boundary)
             run_some(
@@ -314,8 +330,14 @@ class Fold:
         at = self.log.first + self.n
         self._snapshots[at] = (int(self._clock[0]), self._u.copy(), self._state.copy())
         old = at - RECENT
-        if old % SPARSE_EVERY and old in self._snapshots and old != self.log.first:
+        if old % self._sparse and old in self._snapshots and old != self.log.first:
             del self._snapshots[old]
+        for_ever = [key for key in self._snapshots if key <= old]
+        if len(for_ever) > self._most + 1:
+            self._sparse *= 2
+            for key in for_ever:
+                if key % self._sparse and key != self.log.first:
+                    del self._snapshots[key]
 
     def rewind(self, index: int) -> None:
         """Go back so that the event at `index` (and all behind it) will be folded again."""

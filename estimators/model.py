@@ -75,13 +75,16 @@ class Row:
 class Sensor:
     """One sensor: the rows that one reading of it holds, and what the model expects it to say.
 
-    h(x, u, p, out) fills `out` (ny,). The optional H(x, u, p, out) fills the Jacobian (ny, nx).
+    h(x, u, p, out) fills `out` (ny,). The optional H(x, u, p, out) fills the Jacobian (ny, nx). A sensor whose noise is
+    not Gaussian gives log_likelihood(y, x, u, p, r) -> log p(y | x), with r (ny,) the rows' variances as they are tuned
+    now; rows of y that are missing are NaN. Particle filters use it; the others use h and r.
     """
 
     name: str
     rows: tuple[Row, ...]
     h: Callable
     H: Callable | None = None
+    log_likelihood: Callable | None = None
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from difflib import get_close_matches
 
+from .apf import APF
 from .ckf import CKF
 from .ekf import EKF
 from .errors import EstimatorError
@@ -12,14 +13,17 @@ from .iekf import IEKF
 from .kf import KF
 from .kf_steady import KF_STEADY
 from .model import StateSpaceModel
+from .pf import PF, PF_REG
+from .pf_ekf import PF_EKF
 from .sr_ekf import SR_EKF
 from .sr_kf import SR_KF
 from .sr_ukf import SR_UKF
 from .ukf import UKF
 
 GAUSSIAN = (KF, KF_STEADY, EKF, IEKF, UKF, CKF, SR_KF, SR_EKF, SR_UKF)
+PARTICLE = (PF, PF_REG, PF_EKF, APF)
 
-ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in GAUSSIAN}
+ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in GAUSSIAN + PARTICLE}
 
 
 def find_entry(name: str) -> Estimator:

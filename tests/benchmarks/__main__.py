@@ -13,7 +13,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 
 def main() -> None:
-    from . import filters, history, sources
+    from . import filters, history, particles_, sources
 
     begun = perf_counter()
     load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
@@ -22,6 +22,8 @@ def main() -> None:
         filters.beside_filterpy,
         filters.growing_n,
         filters.gaussian_family,
+        particles_.beside_particles,
+        particles_.growing_members,
         history.growing_history,
         history.refold,
         sources.blf,

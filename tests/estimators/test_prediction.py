@@ -12,7 +12,8 @@ from estimators.track import MISSING, USED
 from estimators.tuning import Tuning
 
 SECOND = 1_000_000_000
-NAMES = [name for name in ESTIMATORS if name != "kf-steady"]  # the gain of its first readings is another
+# The gain of the first readings of kf-steady is another.
+NAMES = [name for name, entry in ESTIMATORS.items() if entry.family == "Gaussian" and name != "kf-steady"]
 
 
 def growth(x, u, p, dt, out):
