@@ -1,0 +1,155 @@
+"""Eigenvalues and eigenvectors of small symmetric matrices, without LAPACK: the same bits on any number of threads.
+
+Householder reduction to a tridiagonal matrix, then the implicit QL iteration. Eigenvectors are rows, so that every
+inner loop runs along a row.
+
+Sources: Golub & Van Loan, Matrix Computations, 4th ed., algorithms 8.3.1 and 8.3.3; Dubrulle, Martin & Wilkinson (1968),
+The implicit QL algorithm, doi:10.1007/BF02165404.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .jit import jit
+from .simd import add_scaled, rotate
+
+_SWEEPS = 60
+"""Iterations for one eigenvalue; two are usual, so this many mean that a number is not finite."""
+
+
+@jit
+def symmetric_eigen(A, n, values, V, scratch):
+    """Find the eigenvalues and eigenvectors of the leading n rows and columns of symmetric A, which is destroyed.
+
+    Args:
+        A: Symmetric, at least (n, n), rows contiguous.
+        n: Order.
+        values: Gets the eigenvalues (n,), in no particular order.
+        V: Gets the eigenvectors as rows, (n, n): A = Vᵀ diag(values) V.
+        scratch: At least 2 n numbers.
+
+    Returns:
+        False if it does not converge, which only a number that is not finite can cause.
+    """
+    _tridiagonal(A, n, values, V, scratch)
+    return _ql(n, values, scratch, V)
+
+
+@jit
+def _tridiagonal(A, n, d, V, scratch):
+    """A = Vᵀ T V with T tridiagonal: its diagonal in d, T[k, k-1] in scratch[k]; uses scratch[n : 2n]."""
+    e = scratch[:n]
+    w = scratch[n : 2 * n]
+    to_w = w.ctypes.data
+    for i in range(n):
+        for j in range(n):
+            V[i, j] = 0.0
+        V[i, i] = 1.0
+    e[0] = 0.0
+    for k in range(n - 2):
+        # The reflection I - 2 v vᵀ / (vᵀ v) that turns A[k, k+1:] into a multiple of e₁; v stays in that row.
+        size = n - k - 1
+        v = A[k, k + 1 : n]
+        scale = 0.0
+        for j in range(size):
+            scale = max(scale, abs(v[j]))
+        tail = 0.0
+        for j in range(1, size):
+            tail += abs(v[j])
+        if tail == 0.0:
+            e[k + 1] = v[0]
+            continue
+        norm = 0.0
+        for j in range(size):
+            v[j] /= scale
+            norm += v[j] * v[j]
+        length = np.sqrt(norm)
+        if v[0] > 0.0:
+            length = -length
+        e[k + 1] = scale * length
+        # vᵀ v / 2 after the change of v₀.
+        half = norm - v[0] * length
+        v[0] -= length
+        # A ← A - v qᵀ - q vᵀ with q = w - (vᵀ w / (2 half)) v, w = A v / half.
+        for j in range(size):
+            w[j] = 0.0
+        for j in range(size):
+            add_scaled(size, v[j], A[k + 1 + j, k + 1 :].ctypes.data, to_w)
+        dot = 0.0
+        for j in range(size):
+            w[j] /= half
+            dot += v[j] * w[j]
+        dot /= 2.0 * half
+        for j in range(size):
+            w[j] -= dot * v[j]
+        to_v = v.ctypes.data
+        for j in range(size):
+            row = A[k + 1 + j, k + 1 :].ctypes.data
+            add_scaled(size, -v[j], to_w, row)
+            add_scaled(size, -w[j], to_v, row)
+        # V ← (I - v vᵀ / half) V
+        for j in range(n):
+            w[j] = 0.0
+        for j in range(size):
+            add_scaled(n, v[j], V[k + 1 + j].ctypes.data, to_w)
+        for j in range(size):
+            add_scaled(n, -v[j] / half, to_w, V[k + 1 + j].ctypes.data)
+    if n > 1:
+        e[n - 1] = A[n - 2, n - 1]
+    for k in range(n):
+        d[k] = A[k, k]
+
+
+@jit
+def _ql(n, d, e, V):
+    """Diagonalise T (diagonal d, below it e[1:]) by implicit shifts, turning the rows of V along."""
+    for k in range(1, n):
+        e[k - 1] = e[k]
+    e[n - 1] = 0.0
+    for low in range(n):
+        for sweep in range(_SWEEPS + 1):
+            high = low
+            while high < n - 1:
+                size = abs(d[high]) + abs(d[high + 1])
+                if not abs(e[high]) > 2.3e-16 * size:
+                    break
+                high += 1
+            if high == low:
+                break
+            if sweep == _SWEEPS:
+                return False
+            g = (d[low + 1] - d[low]) / (2.0 * e[low])
+            r = np.hypot(g, 1.0)
+            g = d[high] - d[low] + e[low] / (g + (r if g >= 0.0 else -r))
+            s = 1.0
+            c = 1.0
+            p = 0.0
+            early = False
+            for i in range(high - 1, low - 1, -1):
+                f = s * e[i]
+                b = c * e[i]
+                r = np.sqrt(f * f + g * g)
+                e[i + 1] = r
+                if r == 0.0:
+                    d[i + 1] -= p
+                    e[high] = 0.0
+                    early = True
+                    break
+                s = f / r
+                c = g / r
+                g = d[i + 1] - p
+                r = (d[i] - g) * s + 2.0 * c * b
+                p = s * r
+                d[i + 1] = g + p
+                g = c * r - b
+                rotate(n, c, s, V[i].ctypes.data, V[i + 1].ctypes.data)
+            if early:
+                continue
+            d[low] -= p
+            e[low] = g
+            e[high] = 0.0
+    for k in range(n):
+        if not np.isfinite(d[k]):
+            return False
+    return True
