@@ -23,12 +23,13 @@ from .context import (
     f_signature,
     h_complex_signature,
     h_signature,
+    log_likelihood_signature,
     shape_signature,
 )
 from .errors import ModelError
 from .jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step_f, complex_step_h, scratch_size
 from .jit import address, jit
-from .model import LARGE, StateSpaceModel
+from .model import LARGE, Field, StateSpaceModel
 
 
 @dataclass(frozen=True)
@@ -80,17 +81,22 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
             return 0
 
     _probe(model)
+    _probe_likelihoods(model)
     f = code(model.f, f_signature, "f")
     f_dispatcher = kept[-1]
     F = code(model.F, F_signature, "F")
-    Q = code(model.Q, Q_signature, "Q")
-    Q_dispatcher = kept[-1] if model.Q else None
+    diagonal = model.shape is not None or model.nx > LARGE
+    model_Q = _each_cell if isinstance(model.states, Field) and not model.Q and not diagonal else model.Q
+    Q = code(model_Q, Q_signature, "Q")
+    Q_dispatcher = kept[-1] if model_Q else None
     shape = code(model.shape, shape_signature, "shape")
-    h, H, h_dispatchers = [], [], []
+    h, H, h_dispatchers, likelihoods = [], [], [], []
     for sensor in model.sensors:
         h.append(code(sensor.h, h_signature, f"h of sensor {sensor.name}"))
         h_dispatchers.append(kept[-1])
         H.append(code(sensor.H, H_signature, f"H of sensor {sensor.name}"))
+        what = f"log_likelihood of sensor {sensor.name}"
+        likelihoods.append(code(sensor.log_likelihood, log_likelihood_signature, what))
     derivable = model.nx <= LARGE
     f_complex = 0 if model.F or not derivable else complex_code(model.f, f_complex_signature)
     h_complex = [
@@ -98,7 +104,6 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
     ]
 
     acts_on = [model.acts_on(noise.name) for noise in model.noises] if model.Q is None else []
-    diagonal = model.shape is not None or model.nx > LARGE
 
     def q_function(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
         if Q_dispatcher is not None:
@@ -121,12 +126,15 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
             "F_mode": ANALYTIC if F else COMPLEX_STEP if f_complex else CENTRAL,
             "Q": Q,
             "shape": shape,
+            "each_state": int(model.Q is None),
+            "Q_varies": int(_varies(model)),
             "h": np.array(h, np.int64),
             "h_complex": np.array(h_complex, np.int64),
             "H": np.array(H, np.int64),
             "H_mode": np.array(
                 [ANALYTIC if a else COMPLEX_STEP if c else CENTRAL for a, c in zip(H, h_complex, strict=True)], np.int64
             ),
+            "log_likelihood": np.array(likelihoods, np.int64),
             "row_start": np.array(model.row_start, np.int64),
             "row_count": np.array([len(sensor.rows) for sensor in model.sensors], np.int64),
             "circular_x": model.circular,
@@ -143,6 +151,12 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
     if derivable:
         _check_derivatives(compiled)
     return compiled
+
+
+def _each_cell(x, u, p, q, dt, out):
+    """Q of a field whose noise has its name: the same for every cell."""
+    for j in range(x.size):
+        out[j, j] = q[0] * dt
 
 
 def _gist(error: Exception) -> str:
@@ -197,6 +211,51 @@ def _probe(model: StateSpaceModel) -> None:
             )
         if what == "Q" and not np.allclose(out, out.T):
             raise ModelError(f"model {model.name}: Q is not symmetric at the prior; fill both triangles")
+
+
+def _probe_likelihoods(model: StateSpaceModel) -> None:
+    """Run each sensor's own log_likelihood once, at the reading that the prior predicts."""
+    x = np.array([state.mean for state in model.states], float)
+    u = np.array([item.default for item in model.inputs], float)
+    p = np.array([item.value for item in model.parameters], float)
+    for sensor in model.sensors:
+        if sensor.log_likelihood is None:
+            continue
+        y = np.empty(len(sensor.rows))
+        r = np.array([row.variance for row in sensor.rows], float)
+        _python(sensor.h)(x, u, p, y)
+        try:
+            value = float(_python(sensor.log_likelihood)(y, x, u, p, r))
+        except Exception as error:  # noqa: BLE001  the user's own function may raise anything
+            raise ModelError(
+                f"model {model.name}: log_likelihood of sensor {sensor.name} fails at the prior: "
+                f"{type(error).__name__}: {error}; it takes (y, x, u, p, r) and returns a float"
+            ) from None
+        if np.isnan(value) or value == np.inf:
+            raise ModelError(
+                f"model {model.name}: log_likelihood of sensor {sensor.name} is {value} at the prior; it must be a "
+                "finite number, or -inf where the reading is impossible"
+            )
+
+
+def _varies(model: StateSpaceModel) -> bool:
+    """Whether Q depends on the state, judged by its values at the prior and at 32 states spread around it."""
+    if model.Q is None:
+        return False
+    rng = np.random.default_rng(0)
+    u = np.array([item.default for item in model.inputs], float)
+    p = np.array([item.value for item in model.parameters], float)
+    q = np.array([max(noise.variance, 1e-12) for noise in model.noises], float)
+    mean = np.array([state.mean for state in model.states], float)
+    std = np.array([state.std for state in model.states], float)
+    found = []
+    with np.errstate(all="ignore"):
+        for spread in [0.0] + [1.0, 5.0] * 16:
+            out = np.zeros((model.nx, model.nx))
+            x = mean + spread * std * rng.standard_normal(model.nx)
+            _python(model.Q)(x, u, p, q, min(1.0, model.max_step), out)
+            found.append(out)
+    return any(not np.array_equal(found[0], other, equal_nan=True) for other in found[1:])
 
 
 def _check_derivatives(compiled: CompiledModel) -> None:

@@ -16,6 +16,7 @@ h_complex_signature = types.void(C1, F1, F1, C1)
 H_signature = types.void(F1, F1, F1, F2)
 Q_signature = types.void(F1, F1, F1, F1, f64, F2)
 shape_signature = types.void(F1, F1, F1)
+log_likelihood_signature = f64(F1, F1, F1, F1, F1)
 
 call_f = caller(f_signature)
 call_f_complex = caller(f_complex_signature)
@@ -25,6 +26,7 @@ call_h_complex = caller(h_complex_signature)
 call_H = caller(H_signature)
 call_Q = caller(Q_signature)
 call_shape = caller(shape_signature)
+call_log_likelihood = caller(log_likelihood_signature)
 
 
 class Context(NamedTuple):
@@ -43,11 +45,14 @@ class Context(NamedTuple):
     F: Any
     F_mode: Any
     Q: Any
+    Q_varies: Any
+    each_state: Any
     shape: Any
     h: Any
     h_complex: Any
     H: Any
     H_mode: Any
+    log_likelihood: Any
     n_sensors: Any
     row_start: Any
     row_count: Any
@@ -175,3 +180,16 @@ def shown_states(context):
 def shaped(context, z, out):
     """out = L z: white noise z (nx,) correlated in space as the model says."""
     call_shape(context.shape, z, parameters(context), out)
+
+
+@jit
+def has_own_likelihood(context, sensor):
+    """Whether the sensor's noise is given by a function of its own instead of r."""
+    return ints(context.log_likelihood, context.n_sensors)[sensor] != 0
+
+
+@jit
+def own_likelihood(context, sensor, y, x, u):
+    """log p(y | x) of a sensor that gives it."""
+    target = ints(context.log_likelihood, context.n_sensors)[sensor]
+    return call_log_likelihood(target, y, x, u, parameters(context), sensor_variances(context, sensor))

@@ -72,7 +72,8 @@ class Estimator:
     `applies(model)` gives the reason why the estimator does not fit a model, or None. `options` below are complete
     (see `complete`). `state_size(options, nx)` and `work_size(options, nx, ny)` count float64s; `moments(options,
     state, nx)` gives mean and covariance, `points(options, state, nx)` what to draw beside the mean (sigma points,
-    particles) as (k, nx). `tune(options, nx)` turns the options into the numbers that the compiled functions read.
+    particles) as (k, nx). `tune(options, nx)` turns the options into the numbers that the compiled functions read;
+    `prepare(model, options)` computes what depends on the model too, once for a fold, as int64s.
     """
 
     name: str
@@ -89,6 +90,7 @@ class Estimator:
     points: Callable[[Options, np.ndarray, int], np.ndarray]
     options: tuple[Option, ...] = ()
     tune: Callable[[Options, int], np.ndarray] = lambda options, nx: np.zeros(1)
+    prepare: Callable[[StateSpaceModel, Options], np.ndarray] = lambda model, options: np.zeros(1, np.int64)
     applies: Callable[[StateSpaceModel], str | None] = lambda model: None
 
     def complete(self, options: dict[str, float]) -> dict[str, float]:

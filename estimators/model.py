@@ -74,13 +74,16 @@ class Row:
 class Sensor:
     """One sensor: the rows that one reading of it holds, and what the model expects it to say.
 
-    h(x, u, p, out) fills `out` (ny,). The optional H(x, u, p, out) fills the Jacobian (ny, nx).
+    h(x, u, p, out) fills `out` (ny,). The optional H(x, u, p, out) fills the Jacobian (ny, nx). A sensor whose noise is
+    not Gaussian gives log_likelihood(y, x, u, p, r) -> log p(y | x), with r (ny,) the rows' variances as they are tuned
+    now; rows of y that are missing are NaN. Particle filters use it; the others use h and r.
     """
 
     name: str
     rows: tuple[Row, ...]
     h: Callable
     H: Callable | None = None
+    log_likelihood: Callable | None = None
 
 
 @dataclass(frozen=True)
@@ -147,7 +150,7 @@ class StateSpaceModel:
             strays = [noise.name for noise in self.noises if not self.acts_on(noise.name)]
             if strays:
                 raise ModelError(
-                    f"model {self.name}: noise {strays[0]!r} is not a state; name one, or write Q(x, u, p, q, dt, out)"
+                    f"model {self.name}: noise {strays[0]!r} is not a state or field; name one, or write Q(x, u, p, q, dt, out)"
                 )
         elif self.shape is not None or self.nx > LARGE:
             raise ModelError(
@@ -214,9 +217,9 @@ class StateSpaceModel:
         return tuple(self.states[int(j)] for j in self.shown)
 
     def acts_on(self, noise: str) -> range:
-        """The states to which a noise of that name adds; none if there is no such state or field."""
-        if isinstance(self.states, Field) and noise == self.states.name:
-            return range(self.nx)
+        """The states to which a noise of that name adds: one, or the whole field; none if there is none of that name."""
+        if isinstance(self.states, Field):
+            return range(self.nx if noise == self.states.name else 0)
         if noise not in self.state_names:
             return range(0)
         first = self.state_names.index(noise)

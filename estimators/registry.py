@@ -5,13 +5,18 @@ from __future__ import annotations
 from difflib import get_close_matches
 
 from .ekf import EKF
+from .enkf import ENKF
+from .ensrf import ENSRF
 from .errors import EstimatorError
+from .etkf import ETKF
 from .filter import Estimator
 from .kf import KF
+from .letkf import LETKF
 from .model import StateSpaceModel
+from .pf import PF, PF_REG
 from .ukf import UKF
 
-ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in (KF, EKF, UKF)}
+ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in (KF, EKF, UKF, PF, PF_REG, ENKF, ETKF, ENSRF, LETKF)}
 
 
 def find_estimator(name: str, model: StateSpaceModel) -> Estimator:

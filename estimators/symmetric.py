@@ -1,7 +1,7 @@
-"""Eigenvalues and eigenvectors of small symmetric matrices, without LAPACK: the same bits on any number of threads.
+"""Symmetric matrices of dozens to hundreds of rows, without LAPACK: the same bits on any number of threads.
 
-Householder reduction to a tridiagonal matrix, then the implicit QL iteration. Eigenvectors are rows, so that every
-inner loop runs along a row.
+Every inner loop runs along a row, on vector instructions. Eigenvalues come from a Householder reduction to a
+tridiagonal matrix and the implicit QL iteration; eigenvectors are rows.
 
 Sources: Golub & Van Loan, Matrix Computations, 4th ed., algorithms 8.3.1 and 8.3.3; Dubrulle, Martin & Wilkinson (1968),
 The implicit QL algorithm, doi:10.1007/BF02165404.
@@ -16,6 +16,55 @@ from .simd import add_scaled, rotate
 
 _SWEEPS = 60
 """Iterations for one eigenvalue; two are usual, so this many mean that a number is not finite."""
+
+
+@jit
+def gram(Z, count, n, G):
+    """G = Zᵀ Z for the leading `count` rows and n columns of Z, both triangles."""
+    for k in range(n):
+        for j in range(n):
+            G[k, j] = 0.0
+    for i in range(count):
+        row = Z[i].ctypes.data
+        for k in range(n):
+            add_scaled(n, Z[i, k], row, G[k].ctypes.data)
+
+
+@jit
+def factor(A, n, U):
+    """Upper U with Uᵀ U = I + A for the leading n rows of symmetric A; False if I + A is not positive definite.
+
+    Source: Golub & Van Loan, Matrix Computations, 4th ed., algorithm 4.2.2 (outer product form).
+    """
+    for k in range(n):
+        for j in range(n):
+            U[k, j] = A[k, j] if j >= k else 0.0
+        U[k, k] += 1.0
+    for k in range(n):
+        pivot = U[k, k]
+        if not (pivot > 0.0 and pivot < np.inf):
+            return False
+        scale = 1.0 / np.sqrt(pivot)
+        for j in range(k, n):
+            U[k, j] *= scale
+        for i in range(k + 1, n):
+            add_scaled(n - i, -U[k, i], U[k, i:].ctypes.data, U[i, i:].ctypes.data)
+    return True
+
+
+@jit
+def solve_rows(U, n, B, columns):
+    """B ← (Uᵀ U)⁻¹ B for the leading n rows and `columns` columns of B."""
+    for i in range(n):
+        for j in range(columns):
+            B[i, j] /= U[i, i]
+        for k in range(i + 1, n):
+            add_scaled(columns, -U[i, k], B[i].ctypes.data, B[k].ctypes.data)
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            add_scaled(columns, -U[i, k], B[k].ctypes.data, B[i].ctypes.data)
+        for j in range(columns):
+            B[i, j] /= U[i, i]
 
 
 @jit
