@@ -258,9 +258,7 @@ class Fold:
         end = self.log.n if limit is None else min(self.log.n, self.n + limit)
         begun = self.n
         if self.log.capacity > len(self._rows):
-            grown = Track.allocate(
-                self.log.capacity, len(self.model.shown), len(self.pairs), self.model.width
-            )
+            grown = Track.allocate(self.log.capacity, len(self.model.shown), len(self.pairs), self.model.width)
             for new, old in zip(grown, self._rows, strict=True):
                 new[: self.n] = old[: self.n]
             self._rows = grown

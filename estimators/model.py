@@ -121,8 +121,10 @@ class StateSpaceModel:
             if not getattr(self, kind):
                 raise ModelError(f"model {self.name}: {kind} is empty; name at least one")
         field = isinstance(self.states, Field)
-        for kind in ("sensors", "noises", "inputs", "parameters") if field else (
-            "states", "sensors", "noises", "inputs", "parameters"
+        for kind in (
+            ("sensors", "noises", "inputs", "parameters")
+            if field
+            else ("states", "sensors", "noises", "inputs", "parameters")
         ):
             names = [item.name for item in getattr(self, kind)]
             twice = sorted({name for name in names if names.count(name) > 1})

@@ -9,4 +9,6 @@ from .motor_drive import MOTOR_DRIVE
 from .motor_winding import MOTOR_WINDING
 from .road_car import ROAD_CAR
 
-MODELS: dict[str, StateSpaceModel] = {model.name: model for model in (MOTOR_WINDING, MOTOR_DRIVE, ROAD_CAR, LORENZ63, LORENZ96)}
+MODELS: dict[str, StateSpaceModel] = {
+    model.name: model for model in (MOTOR_WINDING, MOTOR_DRIVE, ROAD_CAR, LORENZ63, LORENZ96)
+}
