@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from estimators.diagnostics import HealthPolicy
 from estimators.errors import ConfigError, SourceError
 from estimators.fold import Fold
-from estimators.log import KIND_NAMES, Log
+from estimators.log import KIND_NAMES, Log, truth_of
 from estimators.score import Score, score
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES, Track
 
@@ -163,6 +163,11 @@ def _write(path: Path, twin: Twin, log: Log, track: Track) -> None:
         "channel": events.channel,
     }
     columns |= {f"value_{k}": events.value[:, k] for k in range(model.width)}
+    for k, name in enumerate(model.state_names):
+        rows, values = truth_of(events, k)
+        true = np.full(len(events), np.nan)
+        true[rows] = values
+        columns[f"{name}_true"] = true
     columns |= {name: track.mean[:, k] for k, name in enumerate(model.state_names)}
     columns |= {f"{name}_std": track.std[:, k] for k, name in enumerate(model.state_names)}
     columns |= {f"innovation_{k}": track.innovation[:, k] for k in range(model.width)}

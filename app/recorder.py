@@ -1,15 +1,17 @@
-"""Writes what a running twin concludes into a file, from a thread and a cursor of its own."""
+"""Writes what a running twin concludes into a file, from a thread and with cursors of its own."""
 
 from __future__ import annotations
 
 import threading
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from estimators.errors import NisusError
 
-from .pull import Pull
+from .pull import Cursor, Pull
 from .recording import RecordingFile
 from .rerun_rows import RerunRows
 
@@ -22,6 +24,10 @@ if TYPE_CHECKING:
 
 PERIOD = 0.4
 """Seconds between two writes; with what the operating system has after each, a killed process loses less than this."""
+
+CHARTS = 5.0
+"""Seconds between two writes of what the charts show, which follows from the rows. Each of its many entities costs the
+same for a few rows as for thousands, and holds up the readings meanwhile."""
 
 ROWS = 20_000
 """Rows pulled at once, so that a long history does not hold the engine's lock for long."""
@@ -36,7 +42,7 @@ class Recorder:
         self._wake = threading.Event()
         self._wanted: Path | None = None
         self._stopping = False
-        self._file: RecordingFile | None = None
+        self._open: _Open | None = None
         self.finished: list[Path] = []
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
 
@@ -63,62 +69,76 @@ class Recorder:
             self._thread.join(timeout=10.0)
 
     def _run(self) -> None:
-        cursor: Any = None
-        drawing: Any = None
         while True:
             wanted = self._wanted
             try:
-                if self._file is not None and wanted != self._file.path:
-                    self._pass_on(cursor, drawing)
-                    self._finish(cursor)
-                if self._file is None and wanted is not None:
-                    cursor, drawing = self._begin(wanted)
-                if self._file is not None:
-                    self._pass_on(cursor, drawing)
+                if self._open is not None and wanted != self._open.file.path:
+                    self._finish(self._open)
+                if self._open is None and wanted is not None:
+                    self._open = _Open(self._engine, wanted, self._draw)
+                    self._engine.notices.say(f"recording into {wanted}")
+                if self._open is not None:
+                    self._open.write()
             except NisusError as error:
-                self._fail(str(error), cursor)
+                self._fail(str(error))
             except Exception as error:  # noqa: BLE001  a full disk or a driver's fault must not stop the twin
-                self._fail(f"{type(error).__name__}: {error}", cursor)
-            if self._stopping and self._file is None:
+                self._fail(f"{type(error).__name__}: {error}")
+            if self._stopping and self._open is None:
                 return
-            self._wake.wait(PERIOD if self._file is not None else None)
+            self._wake.wait(PERIOD if self._open is not None else None)
             self._wake.clear()
 
-    def _begin(self, path: Path) -> tuple[Any, Any]:
-        twin = self._engine.twin
-        base = self._engine.base()
-        self._file = RecordingFile(path, name=twin.name, text=twin.text, twin_path=twin.path, base=base)
-        self._engine.notices.say(f"recording into {path}")
-        return self._engine.cursor(), self._draw(self._file.stream)
+    def _finish(self, open_file: _Open) -> None:
+        open_file.write(last=True)
+        self._open = None
+        open_file.release()
+        open_file.file.close()
+        self.finished.append(open_file.file.path)
+        self._engine.notices.say(f"recorded {open_file.file.rows} rows into {open_file.file.path}")
 
-    def _pass_on(self, cursor: Any, drawing: Any) -> None:
-        """Write everything that is there, in pieces."""
-        assert self._file is not None
-        while True:
-            pull: Pull = self._engine.pull(cursor, ROWS)
-            if pull.fresh:
-                tuning, estimator = self._engine.folded_with()
-                self._file.tuning(tuning, estimator, pull.first, pull.revision)
-            self._file.write(pull)
-            drawing(pull)
-            if len(pull.readings) < ROWS:
-                break
-        self._file.flush()
-
-    def _finish(self, cursor: Any) -> None:
-        file, self._file = self._file, None
-        self._engine.release(cursor)
-        if file is not None:
-            file.close()
-            self.finished.append(file.path)
-            self._engine.notices.say(f"recorded {file.rows} rows into {file.path}")
-
-    def _fail(self, text: str, cursor: Any) -> None:
+    def _fail(self, text: str) -> None:
         self._engine.notices.report("recording failed", f"recording failed: {text}", level="error")
         self._wanted = None
-        self._file = None
-        if cursor is not None:
-            self._engine.release(cursor)
+        if self._open is not None:
+            self._open.release()
+            self._open = None
+
+
+class _Open:
+    """A file that is being written, and how far its rows and its charts have come."""
+
+    def __init__(self, engine: Engine, path: Path, draw: Any) -> None:
+        twin = engine.twin
+        self._engine = engine
+        self.file = RecordingFile(path, name=twin.name, text=twin.text, twin_path=twin.path, base=engine.base())
+        self._drawing = draw(self.file.stream)
+        self._rows, self._charts = engine.cursor(), engine.cursor()
+        self._drawn = time.monotonic()
+
+    def write(self, *, last: bool = False) -> None:
+        """Write everything that is there, in pieces; the charts too if their time has come or it is the last time."""
+        for pull in self._pulls(self._rows):
+            if pull.fresh:
+                tuning, estimator = self._engine.folded_with()
+                self.file.tuning(tuning, estimator, pull.first, pull.revision)
+            self.file.write(pull)
+        if last or time.monotonic() - self._drawn >= CHARTS:
+            self._drawn = time.monotonic()
+            for pull in self._pulls(self._charts):
+                self._drawing(pull)
+        self.file.flush()
+
+    def _pulls(self, cursor: Cursor) -> Iterator[Pull]:
+        while True:
+            pull = self._engine.pull(cursor, ROWS)
+            yield pull
+            if len(pull.readings) < ROWS:
+                return
+
+    def release(self) -> None:
+        """Give the cursors back."""
+        self._engine.release(self._rows)
+        self._engine.release(self._charts)
 
 
 def write_recording(path: Path, twin: Twin, log: Log, track: Track) -> None:

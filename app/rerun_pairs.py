@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from estimators.log import TRUTH, Readings
+from estimators.log import Readings, truth_of
 from estimators.model import StateSpaceModel
 from estimators.track import Track
 
@@ -163,15 +163,12 @@ class PairDrawing:
         ]
 
     def _truth(self, rows: RerunRows, readings: Readings, wanted: np.ndarray) -> None:
-        a, b = (
-            np.flatnonzero((readings.kind == TRUTH) & (readings.channel == j) & np.isfinite(readings.value[:, 0]))
-            for j in self._pair
-        )
-        times, in_a, in_b = np.intersect1d(readings.t[a], readings.t[b], return_indices=True)
+        (in_a, a), (in_b, b) = (truth_of(readings, int(j)) for j in self._pair)
+        times, of_a, of_b = np.intersect1d(readings.t[in_a], readings.t[in_b], return_indices=True)
         if not times.size:
             return
         near = np.unique(np.clip(np.searchsorted(times, wanted), 0, times.size - 1))
-        values = np.stack((readings.value[a[in_a], 0], readings.value[b[in_b], 0]), axis=1)[near] / self._scale
+        values = np.stack((a[of_a], b[of_b]), axis=1)[near] / self._scale
         rows.stream.send_columns(
             f"{self._path}/truth",
             indexes=[rows.times(times[near])],

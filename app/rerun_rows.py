@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from estimators.log import READING, TRUTH, Readings
+from estimators.log import READING, Readings, truth_of
 from estimators.track import GATED, HEALTH_NAMES, Track
 
 from .layout import HEALTH_COLORS, TIMELINE, blueprint, observed, pair_name, styles
@@ -195,11 +195,11 @@ class RerunRows:
             )
 
     def _readings(self, readings: Readings, track: Track, width: int) -> None:
-        kind, channel, t = readings.kind, readings.channel, readings.t
-        is_reading = kind == READING
+        channel, t = readings.channel, readings.t
+        is_reading = readings.kind == READING
         for j, name in enumerate(self.model.state_names):
-            mask = (kind == TRUTH) & (channel == j)
-            self._line(f"/truth/{name}", t[mask], readings.value[mask, :1], width)
+            rows, values = truth_of(readings, j)
+            self._line(f"/truth/{name}", t[rows], values[:, None], width)
         for item in self._dots:
             name = self.model.row_names[self.model.row_start[item.sensor] + item.row]
             of_sensor = is_reading & (channel == item.sensor)

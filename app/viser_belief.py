@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from estimators.log import TRUTH
+from estimators.log import truth_of
 from estimators.model import StateSpaceModel
 
 from .viser_camera import fit_cameras
@@ -162,12 +162,12 @@ class BeliefScene:
             handle.points = places - origin
 
     def _true_point(self, history: History, index: list[int]) -> np.ndarray:
-        kind, channel, value = (history.column(name)[-4096:] for name in ("kind", "channel", "value"))
+        events = history.events(slice(-4096, None))
         point = np.full((1, len(index)), np.nan)
         for k, j in enumerate(index):
-            rows = np.flatnonzero((kind == TRUTH) & (channel == j))
-            if rows.size:
-                point[0, k] = value[rows[-1], 0]
+            values = truth_of(events, j)[1]
+            if values.size:
+                point[0, k] = values[-1]
         return point
 
     def _place(self, axes: list[_Axis], states: np.ndarray) -> np.ndarray:

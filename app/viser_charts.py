@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from estimators.log import READING, TRUTH
+from estimators.log import BEFORE, READING, truth_of
 from estimators.model import StateSpaceModel
 from estimators.track import GATED
 
@@ -128,23 +128,31 @@ class Charts:
         """The track of the previous revision, drawn as a thin grey line."""
         self._previous = None if pull is None else (pull.readings.t.copy(), pull.track.mean.copy())
 
+    def clear(self) -> None:
+        """Forget all rows: another revision begins."""
+        self._buckets = Buckets(self._columns, self._buckets.width)
+
     def update(self, history: History, changed: int) -> None:
-        """Bring the decimated columns up to date."""
+        """Bring the decimated columns up to date with the history, of which the rows from `changed` on are new."""
         t = history.column("t")
-        if self.window is None and t.size:
+        if not t.size:
+            return
+        buckets = self._buckets
+        if self.window is None:
             # Everything: buckets double in width when the history has outgrown them.
-            span = int(t[-1] - t[0])
-            if span > self._buckets.width * 2 * BUCKETS or self._buckets.width == 1:
-                self._buckets = Buckets(self._columns, max(1, span // BUCKETS))
-                changed = 0
-        self._buckets.update(t, changed, lambda start, end: self._values(history, start, end))
+            oldest = min(int(t[0]), int(buckets.first[0])) if buckets.first.size else int(t[0])
+            while int(t[-1]) - oldest > buckets.width * 2 * BUCKETS:
+                buckets.coarsen()
+        else:
+            buckets.forget(int(t[-1] - self.window * 1e9))
+        buckets.update(t, changed, lambda start, end: self._values(history, start, end))
 
     def draw(self, history: History) -> None:
         """Send what the charts show now."""
         t = history.column("t")
         if not t.size or history.origin is None:
             return
-        since = int(t[0]) if self.window is None else int(t[-1] - self.window * 1e9)
+        since = BEFORE if self.window is None else int(t[-1] - self.window * 1e9)
         times, values = self._buckets.points(since)
         x = (times - history.origin) * 1e-9
         if x.size == 1:
@@ -157,21 +165,20 @@ class Charts:
         nx = self.model.nx
         rows = slice(start, end)
         mean, std = history.column("mean")[rows], history.column("std")[rows]
-        kind, channel = history.column("kind")[rows], history.column("channel")[rows]
-        value, verdict = history.column("value")[rows], history.column("verdict")[rows]
+        events, verdict = history.events(rows), history.column("verdict")[rows]
         out = np.full((end - start, self._columns), np.nan)
         out[:, :nx] = mean
         out[:, nx : 2 * nx] = mean + 2 * std
         out[:, 2 * nx : 3 * nx] = mean - 2 * std
-        true = np.flatnonzero(kind == TRUTH)
-        out[true, 3 * nx + channel[true]] = value[true, 0]
-        reading, gated = kind == READING, verdict == GATED
+        reading, gated = events.kind == READING, verdict == GATED
         for j in range(nx):
+            true, values = truth_of(events, j)
+            out[true, 3 * nx + j] = values
             for column, (sensor, row) in zip(self._dot_columns[j], self.direct[j], strict=False):
-                mine = reading & (channel == sensor)
-                out[:, column] = np.where(mine & ~gated, value[:, row], np.nan)
+                mine = reading & (events.channel == sensor)
+                out[:, column] = np.where(mine & ~gated, events.value[:, row], np.nan)
                 refused = np.flatnonzero(mine & gated)
-                out[refused, 4 * nx + j * 4 + 3] = value[refused, row]
+                out[refused, 4 * nx + j * 4 + 3] = events.value[refused, row]
         for k, name in enumerate(("nis", "nis_mean", "nis_low", "nis_high")):
             out[:, self._nis + k] = history.column(name)[rows]
         return out

@@ -41,16 +41,18 @@ class Buckets:
         """Bring the buckets up to date with rows of which those from `changed` on are new.
 
         Args:
-            t: Times of all rows, shape (rows,), ascending.
+            t: Times of the rows that are still here, shape (rows,), ascending; older ones are in the buckets only.
             changed: First row that is new or rewritten.
             values: values(start, end) gives the columns of some rows, shape (end - start, columns).
         """
         if not t.size:
-            self._keep(slice(0, 0))
             return
         kept = self.first // self.width
         bucket = int(t[min(changed, t.size - 1)]) // self.width
-        self._keep(slice(int(np.searchsorted(kept, t[0] // self.width)), int(np.searchsorted(kept, bucket))))
+        at = int(np.searchsorted(kept, bucket))
+        # Of a bucket whose first rows are gone, what it knew of them.
+        known = (self.first[at], self.low[at], self.high[at]) if at < kept.size and self.first[at] < t[0] else None
+        self._keep(slice(0, at))
         row = int(np.searchsorted(t, bucket * self.width))
         parts = [(self.first, self.last, self.low, self.high, self.rising)]
         ids = t[row:] // self.width
@@ -68,6 +70,26 @@ class Buckets:
         self.first, self.last, self.low, self.high, self.rising = (
             np.concatenate(column) for column in zip(*parts, strict=True)
         )
+        if known is not None:
+            self.first[at] = known[0]
+            self.low[at], self.high[at] = np.fmin(self.low[at], known[1]), np.fmax(self.high[at], known[2])
+
+    def forget(self, before: int) -> None:
+        """Drop the buckets that end before a time."""
+        self._keep(slice(int(np.searchsorted(self.last, before)), None))
+
+    def coarsen(self) -> None:
+        """Make the buckets twice as wide, without the rows that they came from."""
+        self.width *= 2
+        if not self.first.size:
+            return
+        starts = np.flatnonzero(np.diff(self.first // self.width, prepend=-1))
+        ends = np.append(starts[1:], self.first.size) - 1
+        middle = self.low + self.high
+        # Where two become one, it rises if their middles do.
+        rising = np.where((ends > starts)[:, None], middle[ends] >= middle[starts], self.rising[starts])
+        low, high = np.fmin.reduceat(self.low, starts, axis=0), np.fmax.reduceat(self.high, starts, axis=0)
+        self.first, self.last, self.low, self.high, self.rising = self.first[starts], self.last[ends], low, high, rising
 
     def _keep(self, part: slice) -> None:
         self.first, self.last = self.first[part], self.last[part]

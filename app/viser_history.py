@@ -6,17 +6,20 @@ from typing import Any
 
 import numpy as np
 
+from estimators.log import Readings
+
 _COLUMNS = ("t", "kind", "channel", "value", "mean", "std", "nis", "nis_mean", "nis_low", "nis_high", "verdict")
 
 
 class History:
-    """A sliding copy of the track: the last `span` nanoseconds, and never more than `limit` rows.
+    """A sliding copy of the track: the last `span` nanoseconds, and never more than `2 * limit` rows.
 
     Row i of the arrays is event `base + i` of the log. Rows that a late reading or another revision rewrites are
-    simply pulled again, and overwrite what is here from there on.
+    simply pulled again, and overwrite what is here from there on. What the charts show of older rows they keep
+    themselves.
     """
 
-    def __init__(self, nx: int, width: int, limit: int = 200_000) -> None:
+    def __init__(self, nx: int, width: int, limit: int = 32_768) -> None:
         self.limit = limit
         self.span: int | None = None
         self.base = 0
@@ -25,13 +28,19 @@ class History:
         """Time of the first event ever seen, from which the charts count seconds."""
         shapes = {"value": (width,), "mean": (nx,), "std": (nx,)}
         kinds = {"t": np.int64, "kind": np.int8, "channel": np.int32, "verdict": np.int8}
+        # Filled, not empty: the pages are paid for now, and memory stays flat.
         self._columns = {
-            name: np.zeros((4096, *shapes.get(name, ())), kinds.get(name, np.float64)) for name in _COLUMNS
+            name: np.full((2 * limit, *shapes.get(name, ())), 0, kinds.get(name, np.float64)) for name in _COLUMNS
         }
 
     def column(self, name: str) -> np.ndarray:
         """The valid rows of one column, as a view."""
         return self._columns[name][: self.n]
+
+    def events(self, rows: slice = slice(None)) -> Readings:
+        """Some of the valid rows as events, as views; each as if it had arrived when it was measured."""
+        t, kind, channel, value = (self.column(name)[rows] for name in ("t", "kind", "channel", "value"))
+        return Readings(t, t, kind, channel, value)
 
     def settled(self, name: str, rows: int) -> np.ndarray:
         """The newest rows of a column, only the last one of each time: what all sensors together made of it."""
@@ -44,7 +53,7 @@ class History:
         self.base, self.n = 0, 0
 
     def take(self, pull: Any) -> int:
-        """Write a pull into the arrays.
+        """Write a pull of at most `limit` rows into the arrays.
 
         Returns:
             The first row that changed; all after it did too.
@@ -57,7 +66,8 @@ class History:
         if pull.first == 0 or self.origin is None:
             self.origin = int(pull.readings.t[0])
         start = pull.first - self.base
-        self._reserve(start + count)
+        if start + count > 2 * self.limit:
+            start -= self._drop(start - self.limit)
         for name, column in self._columns.items():
             batch = getattr(pull.readings if name in ("t", "kind", "channel", "value") else pull.track, name)
             column[start : start + count] = batch
@@ -70,23 +80,14 @@ class History:
         Returns:
             How many rows went, by which all row numbers fall.
         """
-        drop = max(0, self.n - self.limit)
-        if self.span is not None and self.n:
-            drop = max(drop, int(np.searchsorted(self.column("t"), self._columns["t"][self.n - 1] - self.span)))
-        if drop * 3 < self.n and self.n <= self.limit:
+        if self.span is None or not self.n:
             return 0
-        for column in self._columns.values():
-            column[: self.n - drop] = column[drop : self.n].copy()
-        self.base += drop
-        self.n -= drop
-        return drop
+        drop = int(np.searchsorted(self.column("t"), self._columns["t"][self.n - 1] - self.span))
+        return self._drop(drop) if drop * 3 >= self.n else 0
 
-    def _reserve(self, rows: int) -> None:
-        capacity = self._columns["t"].shape[0]
-        if rows <= capacity:
-            return
-        capacity = max(rows, 2 * capacity)
-        for name, column in self._columns.items():
-            wider = np.zeros((capacity, *column.shape[1:]), column.dtype)
-            wider[: self.n] = column[: self.n]
-            self._columns[name] = wider
+    def _drop(self, rows: int) -> int:
+        for column in self._columns.values():
+            column[: self.n - rows] = column[rows : self.n].copy()
+        self.base += rows
+        self.n -= rows
+        return rows

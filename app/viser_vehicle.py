@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from estimators.log import READING, TRUTH
+from estimators.log import READING, truth_of
 from estimators.model import StateSpaceModel
 
 from .viser_camera import fit_cameras
@@ -114,13 +114,11 @@ class VehicleScene:
         return np.stack((east[pick], north[pick], np.full(pick.size, height)), axis=1)
 
     def _draw_truth(self, history: History) -> None:
-        kind, channel = history.column("kind"), history.column("channel")
-        rows = [np.flatnonzero((kind == TRUTH) & (channel == j)) for j in (self.east, self.north)]
-        count = min(rows[0].size, rows[1].size)
-        if count:
-            value = history.column("value")
-            east, north = (value[part[-count:], 0] for part in rows)
-            self._truth.points = segments(self._plane(east, north, 0.05))
+        events = history.events()
+        (in_east, east), (in_north, north) = (truth_of(events, j) for j in (self.east, self.north))
+        times, of_east, of_north = np.intersect1d(events.t[in_east], events.t[in_north], return_indices=True)
+        if times.size:
+            self._truth.points = segments(self._plane(east[of_east], north[of_north], 0.05))
 
     def _draw_readings(self, history: History) -> None:
         kind, channel, value = (history.column(name) for name in ("kind", "channel", "value"))

@@ -8,6 +8,7 @@ from typing import Any
 
 import viser
 
+from .notices import Notice
 from .viser_belief import BeliefScene
 from .viser_charts import Charts
 from .viser_guard import guarded_server, unprinted
@@ -24,6 +25,9 @@ SHARE = 0.08
 
 SLOWEST = 2.0
 """Seconds between two frames at most."""
+
+ROWS = 16_384
+"""Rows pulled at once, so that a long history does not hold the engine's lock for long."""
 
 COLUMN = 400
 """Width of the panel's and the charts' column, in pixels."""
@@ -89,21 +93,28 @@ class ViserView:
             window, self._wanted_window = self.charts.windows[self._wanted_window], None
             self.charts.set_window(window)
             self._begin_again(window)
-        pull = self.engine.pull(self._cursor)
-        changed = bool(len(pull.readings)) or pull.fresh or self._redraw
-        if pull.revision != self._revision:
-            self._revision = pull.revision
-            self.charts.set_previous(self.engine.previous())
-            changed = True
+        changed = self._redraw
+        notices: list[Notice] = []
         with self.server.atomic():
+            while True:
+                pull = self.engine.pull(self._cursor, ROWS)
+                notices += pull.notices
+                changed |= bool(len(pull.readings)) or pull.fresh
+                if pull.fresh:
+                    self.charts.clear()
+                first = self.history.take(pull)
+                self.charts.update(self.history, max(0, first - self.history.trim()))
+                if len(pull.readings) < ROWS:
+                    break
+            if pull.revision != self._revision:
+                self._revision = pull.revision
+                self.charts.set_previous(self.engine.previous())
+                changed = True
             if changed:
                 self._redraw = False
-                first = self.history.take(pull)
-                dropped = self.history.trim()
-                self.charts.update(self.history, max(0, first - dropped))
                 self.charts.draw(self.history)
                 self.scene.draw(self.history, self.engine.belief())
-            self.panel.note(pull.notices)
+            self.panel.note(notices)
             self.panel.sync(self.engine.status(), self.history.origin)
 
     def _begin_again(self, window: float | None) -> None:
@@ -112,6 +123,7 @@ class ViserView:
             self.engine.release(self._cursor)
         self._cursor = self.engine.cursor()
         self.history.clear()
+        self.charts.clear()
         self.history.span = None if window is None else int(window * 1e9)
 
     def _choose_window(self, event: viser.GuiEvent) -> None:

@@ -34,7 +34,11 @@ from .model import LARGE, Field, StateSpaceModel
 
 @dataclass(frozen=True)
 class CompiledModel:
-    """A model whose functions are machine code; `f`, `h[k]` and `Q` can be called from Python too."""
+    """A model whose functions are machine code; `f`, `h[k]` and `Q` can be called from Python too.
+
+    A field too large for a matrix Q, or with a shape, has draw(z, p, q, dt) instead, which turns white z (nx,) into
+    noise of the process.
+    """
 
     model: StateSpaceModel
     f: Callable
@@ -42,6 +46,7 @@ class CompiledModel:
     Q: Callable
     static: dict[str, Any] = field(repr=False)
     keep_alive: tuple[Any, ...] = field(repr=False)
+    draw: Callable | None = None
 
 
 def compile_model(model: StateSpaceModel) -> CompiledModel:
@@ -90,6 +95,7 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
     Q = code(model_Q, Q_signature, "Q")
     Q_dispatcher = kept[-1] if model_Q else None
     shape = code(model.shape, shape_signature, "shape")
+    shape_dispatcher = kept[-1] if model.shape else None
     h, H, h_dispatchers, likelihoods = [], [], [], []
     for sensor in model.sensors:
         h.append(code(sensor.h, h_signature, f"h of sensor {sensor.name}"))
@@ -113,12 +119,20 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
             for j in states:
                 out[j, j] += q[k] * dt
 
+    def draw(z, p, q, dt):  # noqa: ANN001, ANN202
+        w = z
+        if shape_dispatcher is not None:
+            w = np.empty_like(z)
+            shape_dispatcher(z, p, w)
+        return sum(np.sqrt(q[k] * dt) * _within(states, w) for k, states in enumerate(acts_on))
+
     compiled = CompiledModel(
         model=model,
         f=f_dispatcher,
         h=tuple(h_dispatchers),
         Q=q_function,
         keep_alive=tuple(kept),
+        draw=draw if diagonal else None,
         static={
             "f": f,
             "f_complex": f_complex,
@@ -151,6 +165,13 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
     if derivable:
         _check_derivatives(compiled)
     return compiled
+
+
+def _within(states: range, w: np.ndarray) -> np.ndarray:
+    """The entries of w (nx,) that a range of states has, and zero elsewhere."""
+    out = np.zeros_like(w)
+    out[states.start : states.stop] = w[states.start : states.stop]
+    return out
 
 
 def _each_cell(x, u, p, q, dt, out):

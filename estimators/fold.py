@@ -18,7 +18,7 @@ from .context import Context, context_type, prior
 from .diagnostics import Bounds, HealthPolicy, assess, assess_signature, chi_square_bounds
 from .errors import EstimatorError
 from .filter import Code, Estimator, call_describe, call_predict, call_start, call_update, code_type
-from .jit import B1, F1, F2, I1, borrowed, borrowed_rows, i64, jit
+from .jit import B1, F1, F2, I1, borrowed, borrowed_rows, i64, jit, jit_brief
 from .log import INPUT, READING, RESET, TICK, TRUTH, Log
 from .model import StateSpaceModel
 from .quantiles import chi_square_quantile
@@ -39,6 +39,9 @@ SPARSE_EVERY = 1024
 """Events between the snapshots kept for ever."""
 
 RECENT = 4096
+
+BRIEF = 64
+"""Events that are folded without letting other threads run meanwhile."""
 
 
 @jit
@@ -129,6 +132,18 @@ def run(code, context, first, start, end, t, kind, channel, value, clock, u, sta
         track.verdict[i] = verdict
 
 
+@jit_brief
+def run_brief(code, context, first, start, end, t, kind, channel, value, clock, u, state, spare, work, score, track):
+    """`run`, with the GIL."""
+    run(code, context, first, start, end, t, kind, channel, value, clock, u, state, spare, work, score, track)
+
+
+@jit_brief
+def assess_brief(first, last, t, track, policy, bounds):
+    """`assess`, with the GIL."""
+    assess(first, last, t, track, policy, bounds)
+
+
 @jit
 def _begin(code, context, mean, cov, state):
     call_start(code.start, context, mean, cov, state)
@@ -188,7 +203,7 @@ class Fold:
         mean, cov = self._held["prior_mean"], self._held["prior_cov"]
         if base is not None:
             mean, cov, self._clock[0], self._u[:] = base
-        self._run, self._assess, begin = _compiled()
+        self._run, self._assess, self._run_brief, self._assess_brief, begin = _compiled()
         begin(self._code, self._context, np.ascontiguousarray(mean), np.ascontiguousarray(cov), self._state)
         self.n = 0
         self._snapshots: dict[int, tuple[int, np.ndarray, np.ndarray]] = {}
@@ -263,12 +278,14 @@ class Fold:
                 new[: self.n] = old[: self.n]
             self._rows = grown
         log = self.log
+        brief = end - self.n <= BRIEF
+        run_some = self._run_brief if brief else self._run
         while self.n < end:
             # Far behind the end, only the snapshots that are kept for ever are worth stopping for.
             stride = SPARSE_EVERY if end - self.n > RECENT else SNAPSHOT_EVERY
             boundary = self.n + stride - (log.first + self.n) % stride
             stop = min(end, boundary)
-            self._run(
+            run_some(
                 self._code,
                 self._context,
                 log.first,
@@ -290,7 +307,8 @@ class Fold:
             if stop == boundary:
                 self._remember()
         if end > begun:
-            self._assess(begun, end, log.t, self._rows, self.policy, self._bounds)
+            assess_some = self._assess_brief if brief else self._assess
+            assess_some(begun, end, log.t, self._rows, self.policy, self._bounds)
         return end - begun
 
     def _remember(self) -> None:
@@ -376,8 +394,10 @@ def fold(
 
 
 @lru_cache(maxsize=1)
-def _compiled() -> tuple[Any, Any, Any]:
-    """The three entry points, compiled for their one signature (or loaded from the cache)."""
-    for function, signature in ((run, run_signature), (assess, assess_signature), (_begin, begin_signature)):
-        function.compile(signature.args)
-    return run, assess, _begin
+def _compiled() -> tuple[Any, ...]:
+    """The entry points, compiled for their one signature (or loaded from the cache)."""
+    runs, assessments = (run, run_brief), (assess, assess_brief)
+    for functions, signature in ((runs, run_signature), (assessments, assess_signature), ((_begin,), begin_signature)):
+        for function in functions:
+            function.compile(signature.args)
+    return run, assess, run_brief, assess_brief, _begin

@@ -54,6 +54,9 @@ numba.config.LOOP_VECTORIZE = 0
 jit = partial(njit, cache=True, nogil=True, error_model="numpy")
 """Numba's njit as used here: cached, without the GIL, and with IEEE division (zero divisors give inf, no error)."""
 
+jit_brief = partial(njit, cache=True, error_model="numpy")
+"""The same with the GIL, for calls of microseconds: giving it up would mean to wait for it again, behind others."""
+
 
 def address(dispatcher: Any, signature: Any) -> int:
     """Compile `dispatcher` for `signature` (or load it from the cache) and return where its machine code starts.

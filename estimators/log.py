@@ -18,8 +18,9 @@ KIND_NAMES = ("reading", "input", "truth", "tick", "reset")
 class Readings(NamedTuple):
     """A batch of events in the order of arrival; columns of one length N.
 
-    `channel` is the sensor's index for a reading, the state's for a truth, else 0. `value` (N, width) holds a
-    reading's rows, all inputs, or one true value in column 0; NaN is a row that is missing or an input that stays.
+    `channel` is the sensor's index for a reading, the first state's for a truth, else 0. `value` (N, width) holds a
+    reading's rows, all inputs, or the true values of the states channel, channel + 1, ...; NaN is a row that is
+    missing, an input that stays, or a state whose truth is not known.
     """
 
     t: np.ndarray
@@ -53,7 +54,15 @@ class Readings(NamedTuple):
         """Batches one after the other."""
         if not batches:
             return Readings.empty(width)
-        return Readings(*(np.concatenate(columns) for columns in zip(*batches, strict=True)))
+        wide = [batch.widened(width) for batch in batches]
+        return Readings(*(np.concatenate(columns) for columns in zip(*wide, strict=True)))
+
+    def widened(self, width: int) -> Readings:
+        """The same events with at least `width` value columns; those that are added know nothing."""
+        missing = width - self.value.shape[1]
+        if missing <= 0:
+            return self
+        return self._replace(value=np.pad(self.value, ((0, 0), (0, missing)), constant_values=np.nan))
 
     def select(self, index: Any) -> Readings:
         """The events that a mask, slice or index array picks."""
@@ -62,6 +71,24 @@ class Readings(NamedTuple):
     def __len__(self) -> int:
         """Number of events (not of columns)."""
         return self.t.size
+
+
+def truth_of(events: Readings, state: int) -> tuple[np.ndarray, np.ndarray]:
+    """What the truth events know of one state.
+
+    Args:
+        events: Any events.
+        state: Index of the state.
+
+    Returns:
+        Indices of the events that know it, ascending, shape (k,), and its finite true values, shape (k,).
+    """
+    channel = events.channel
+    blocks = (events.kind == TRUTH) & (channel <= state) & (channel > state - events.value.shape[1])
+    rows = np.flatnonzero(blocks)
+    values = events.value[rows, state - channel[rows]]
+    known = np.isfinite(values)
+    return rows[known], values[known]
 
 
 class Log:
@@ -100,7 +127,7 @@ class Log:
         """Put a batch where it belongs in time.
 
         Args:
-            batch: Events in the order of arrival, with `width` value columns.
+            batch: Events in the order of arrival, with at most `width` value columns.
             horizon: Nanoseconds; an event older than the newest before it by more than this is dropped as stale.
                 Judged event by event, so the outcome does not depend on how arrivals were cut into batches.
 
@@ -109,6 +136,8 @@ class Log:
         """
         if not len(batch):
             return self.n, 0
+        # Assigned as it is, a single column would be repeated in all, and a true value become that of other states.
+        batch = batch.widened(self.width)
         # A tick says nothing of the asset, so nothing is late because of it.
         said = np.where(batch.kind == TICK, self.newest, batch.t)
         newest = np.maximum(np.maximum.accumulate(said), self.newest)

@@ -21,6 +21,9 @@ from .field import CellNames, Field, State
 LARGE = 1024
 """States beyond which no filter forms an (nx, nx) matrix: priors are diagonal, moments are means and variances."""
 
+TRUTH_BLOCK = 32
+"""Most states for which an event of the log must have room to tell the truth."""
+
 SHOWN = 64
 """States that a track keeps where the model does not say which."""
 
@@ -265,5 +268,8 @@ class StateSpaceModel:
 
     @cached_property
     def width(self) -> int:
-        """Columns that one event of the log needs: the longest of a reading, the inputs, and one truth value."""
-        return max(1, self.nu, *(len(sensor.rows) for sensor in self.sensors))
+        """Columns that one event of the log needs: the longest of a reading, the inputs, and a block of true states.
+
+        A block holds the whole state of a small model, and `TRUTH_BLOCK` states of a large one.
+        """
+        return max(min(self.nx, TRUTH_BLOCK), self.nu, *(len(sensor.rows) for sensor in self.sensors))

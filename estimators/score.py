@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .diagnostics import PROBABILITY, nis_bounds
-from .log import READING, TRUTH, Readings
+from .log import READING, Readings, truth_of
 from .model import StateSpaceModel
 from .quantiles import normal_quantile
 from .track import GATED, HELD_OUT, MISSING, USED, VERDICT_NAMES, Track
@@ -60,14 +60,13 @@ def score(track: Track, events: Readings, model: StateSpaceModel) -> Score:
 
 def _against_truth(track: Track, events: Readings, model: StateSpaceModel) -> dict[str, Fit]:
     fits: dict[str, Fit] = {}
-    truth = events.kind == TRUTH
-    for j, state in enumerate(model.states):
-        rows = truth & (events.channel == j) & np.isfinite(events.value[:, 0])
-        if rows.any():
-            error = track.mean[rows, j] - events.value[rows, 0]
+    for k, (j, state) in enumerate(zip(model.shown, model.shown_states, strict=True)):
+        rows, values = truth_of(events, int(j))
+        if rows.size:
+            error = track.mean[rows, k] - values
             if state.circular:
                 error = (error + np.pi) % (2.0 * np.pi) - np.pi
-            fits[state.name] = _fit(error, track.std[rows, j])
+            fits[state.name] = _fit(error, track.std[rows, k])
     return fits
 
 

@@ -117,7 +117,7 @@ class Encoder:
         return frame
 
     def frames(self, t: int, events: Sequence[tuple[int, int, Sequence[float]]], repeat: int) -> list[can.Message]:
-        """The frames of the events of one time: (kind, index, values), of which inputs are one by one.
+        """The frames of the events of one time: (kind, index, values), inputs and true states one by one.
 
         Args:
             t: Time of the events, ns.

@@ -37,13 +37,17 @@ class _Tables(NamedTuple):
 
 @jit
 def _emit(tables, plan, skip, values, state, source, kind, channel, value, refused, cut):
-    """Write the events of each frame: its inputs as one event, then readings, then truths. Returns how many."""
+    """Write the events of each frame: its inputs as one event, then readings, then true states in blocks.
+
+    Returns how many. A block begins with a state that is known, and takes what follows as far as it reaches.
+    """
     n = 0
+    width = value.shape[1]
     for i in range(plan.size):
         g = plan[i]
         if g < 0 or skip[i] != 0:
             continue
-        input_event = -1
+        input_event = truth_event = -1
         for c in range(tables.group[g], tables.group[g + 1]):
             said = False
             for r in range(tables.row[c], tables.row[c + 1]):
@@ -64,24 +68,33 @@ def _emit(tables, plan, skip, values, state, source, kind, channel, value, refus
                     continue
             if tables.kind[c] == INPUT and input_event >= 0:
                 event = input_event
+            elif tables.kind[c] == TRUTH and truth_event >= 0 and tables.target[c] < channel[truth_event] + width:
+                event = truth_event
             else:
                 event = n
                 source[n] = i
                 kind[n] = tables.kind[c]
                 channel[n] = 0 if tables.kind[c] == INPUT else tables.target[c]
-                for column in range(value.shape[1]):
+                for column in range(width):
                     value[n, column] = np.nan
                 n += 1
                 if tables.kind[c] == INPUT:
                     input_event = event
+                elif tables.kind[c] == TRUTH:
+                    truth_event = event
             if good:
                 for r in range(tables.row[c], tables.row[c + 1]):
                     converted = tables.factor[r] * values[i, tables.slot[r]] + tables.shift[r]
-                    column = tables.target[c] if tables.kind[c] == INPUT else r - tables.row[c]
+                    column = r - tables.row[c]
+                    if tables.kind[c] == INPUT:
+                        column = tables.target[c]
+                    elif tables.kind[c] == TRUTH:
+                        column = tables.target[c] - channel[event]
                     final = tables.scale[r] * converted + tables.offset[r]
                     value[event, column] = final if np.isfinite(final) else np.nan
                 if tables.kind[c] == TRUTH and np.isnan(value[event, 0]):
                     n -= 1
+                    truth_event = -1
     return n
 
 
@@ -113,7 +126,8 @@ class Mapping:
         slot, factors, scale, offset, where_slot, low, high = ([] for _ in range(7))
         for channels, names, units in groups:
             positions = {name: k for k, name in enumerate(names)}
-            for channel in sorted(channels, key=lambda item: order.index(item.kind)):
+            # True states in their order, for the blocks.
+            for channel in sorted(channels, key=lambda c: (order.index(c.kind), c.index if c.kind == TRUTH else 0)):
                 self._channels.append(channel)
                 kind.append(channel.kind)
                 index.append(channel.index)

@@ -62,6 +62,7 @@ class Player:
         channels = list(channels)
         self._encoder = Encoder(databases, channels)
         self._inputs = [channel.index for channel in channels if channel.kind == INPUT]
+        self._truths = [channel.index for channel in channels if channel.kind == TRUTH]
         self._report = report
         self._clock = clock
         self._stop = threading.Event()
@@ -107,7 +108,7 @@ class Player:
                 self._say(t, events)
 
     def _moments(self, batch: Readings) -> list[tuple[int, list[tuple[int, int, Sequence[float]]]]]:
-        """The events of a batch by time; every input is one by itself."""
+        """The events of a batch by time; every input and every true state is one by itself."""
         moments: list[tuple[int, list[tuple[int, int, Sequence[float]]]]] = []
         columns = (batch.t.tolist(), batch.kind.tolist(), batch.channel.tolist(), batch.value.tolist())
         for t, kind, channel, value in zip(*columns, strict=True):
@@ -116,8 +117,11 @@ class Player:
             events = moments[-1][1]
             if kind == INPUT:
                 events += [(INPUT, k, (value[k],)) for k in self._inputs]
-            elif kind in (READING, TRUTH):
-                events.append((kind, channel, value))
+            elif kind == TRUTH:
+                block = range(channel, channel + len(value))
+                events += [(TRUTH, k, (value[k - channel],)) for k in self._truths if k in block]
+            elif kind == READING:
+                events.append((READING, channel, value))
         return moments
 
     def _say(self, t: int, events: list[tuple[int, int, Sequence[float]]]) -> None:

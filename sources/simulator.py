@@ -36,7 +36,7 @@ class Simulator:
     In each step, in this order: x ← f(x, u, p, dt) + w with w ~ N(0, Q); then y = h(x, u, p) + v with v ~ N(0, R) for
     each sensor that is due, drawn even if the reading is lost, so that a loss does not change what follows. Its first
     event is a tick at time zero, where the estimator's prior holds; then, after every step: the inputs if they
-    changed, the readings, and the true value of every state.
+    changed, the readings, and the true states that a track shows, in blocks of the log's width.
     """
 
     live = False
@@ -100,7 +100,8 @@ class Simulator:
         self._spoken = [0] * len(self._plans)
         self._circular = [j for j, state in enumerate(truth.states) if state.circular]
         self._rng = np.random.default_rng(seed)
-        self._factor: tuple[bytes, np.ndarray] = (b"", np.zeros((truth.nx, truth.nx)))
+        self._factor: tuple[bytes, np.ndarray] | None = None
+        self._told = _runs(model.shown, model.width)
         self._k = 0
         self._u = self._inputs(0.0)
         self._begun = False
@@ -161,14 +162,17 @@ class Simulator:
             lost = plan.drop_every is not None and self._spoken[i] % plan.drop_every == plan.drop_every - 1
             self._spoken[i] += 1
             rows.append((t, READING, i, np.full(y.size, np.nan) if lost else y))
-        rows += [(t, TRUTH, j, self._x[j : j + 1].copy()) for j in range(self._x.size)]
+        rows += [(t, TRUTH, first, self._x[first:end].copy()) for first, end in self._told]
 
     def _noise(self) -> np.ndarray:
         """A draw of N(0, Q), as numpy's multivariate_normal makes it, with the factor kept while Q stays."""
-        Q = np.zeros_like(self._factor[1])
-        self._truth.Q(self._x, self._u, self._p, self._q, self._step, Q)
+        truth = self._truth
+        if truth.draw is not None:
+            return truth.draw(self._rng.standard_normal(self._x.size), self._p, self._q, self._step)
+        Q = np.zeros((self._x.size, self._x.size))
+        truth.Q(self._x, self._u, self._p, self._q, self._step, Q)
         key = Q.tobytes()
-        if key != self._factor[0]:
+        if self._factor is None or key != self._factor[0]:
             U, s, _ = np.linalg.svd(Q)
             self._factor = (key, U * np.sqrt(s))
         return self._factor[1] @ self._rng.standard_normal(self._x.size)
@@ -179,3 +183,14 @@ class Simulator:
 
     def close(self) -> None:
         """Nothing to give back."""
+
+
+def _runs(states: np.ndarray, width: int) -> list[tuple[int, int]]:
+    """Runs of consecutive states, at most `width` long, as pairs of first and end."""
+    runs: list[tuple[int, int]] = []
+    for state in states.tolist():
+        if runs and runs[-1][1] == state and state - runs[-1][0] < width:
+            runs[-1] = (runs[-1][0], state + 1)
+        else:
+            runs.append((state, state + 1))
+    return runs

@@ -2,8 +2,9 @@
 
 const SLOWEST = 8000; // ms between two attempts to connect
 const SHARE = 0.5; // part of the time that drawing may take; the panel beside it needs the rest
-
-const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
+const SLOW = 1000; // ms from which on a picture is dear, as where no graphics card draws it
+const SLOW_SHARE = 0.2; // then the twin itself may need the processor
+const LONGEST_REST = 8000; // ms
 
 export class Stream {
   // told(message): JSON messages; changed(state): "live", "waiting", "hidden"
@@ -54,13 +55,24 @@ export class Stream {
     if (typeof data === "string") {
       const message = JSON.parse(data);
       if (message.recording) this.viewer.announce(message.recording);
+      // What the user just asked for is worth a picture at once.
+      const revision = message.status?.revision ?? this.revision;
+      if (revision !== this.revision && this.resting) this.ask(socket);
+      this.revision = revision;
       this.told(message);
       return;
     }
     const took = await this.viewer.feed(new Uint8Array(data));
     this.layout = false;
     this.told({ drawn: true });
-    await pause(Math.min(2000, took * (1 / SHARE - 1)));
+    const share = took < SLOW ? SHARE : SLOW_SHARE;
+    this.resting = setTimeout(() => this.ask(socket), Math.min(LONGEST_REST, took * (1 / share - 1)));
+  }
+
+  // Ask for the next frame.
+  ask(socket) {
+    clearTimeout(this.resting);
+    this.resting = null;
     if (socket.readyState === WebSocket.OPEN) socket.send("drawn");
   }
 

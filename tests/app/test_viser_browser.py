@@ -59,6 +59,8 @@ def page(browser, view):
     page.goto(f"http://127.0.0.1:{view.port}/")
     # The charts are drawn: uPlot found a range for the estimate and holds its sixty seconds.
     page.wait_for_function(f"{CHARTS}.length === 3 && {CHARTS}[0].data[0].length >= 60")
+    # They have the data before they have a size.
+    page.wait_for_function(f"{CHARTS}.every(chart => chart.ctx.canvas.width > 0)")
     yield page
     context.close()
     assert errors == []

@@ -106,6 +106,38 @@ def test_decimation_in_pieces_equals_decimation_at_once():
         np.testing.assert_array_equal(one, other)
 
 
+def test_decimation_outlives_the_rows_it_came_from():
+    """Buckets whose rows are gone stay as they were, and one whose first rows are gone keeps their extremes."""
+    rng = np.random.default_rng(3)
+    t = np.arange(0, 10_000_000_000, 1_000_000)
+    values = rng.normal(size=(t.size, 2))
+    buckets, seen = Buckets(2, 700_000_000), 0
+    for end in range(37, t.size + 37, 37):
+        end, gone = min(end, t.size), max(0, end - 300)
+        buckets.update(
+            t[gone:end], seen - gone, lambda start, stop, gone=gone: values[gone + start : gone + stop]
+        )  # fmt: skip
+        seen = end
+    whole = Buckets(2, 700_000_000)
+    whole.update(t, 0, lambda start, stop: values[start:stop])
+    for name in ("first", "last", "low", "high"):
+        np.testing.assert_array_equal(getattr(buckets, name), getattr(whole, name))
+    buckets.forget(5_000_000_000)
+    assert buckets.last[0] >= 5_000_000_000 and buckets.first.size == (whole.last >= 5_000_000_000).sum()
+
+
+def test_coarser_buckets_are_those_of_twice_the_width():
+    rng = np.random.default_rng(4)
+    t = np.sort(rng.integers(0, 10_000_000_000, 3_000))
+    values = rng.normal(size=(t.size, 2))
+    fine, coarse = Buckets(2, 100_000_000), Buckets(2, 200_000_000)
+    for buckets in (fine, coarse):
+        buckets.update(t, 0, lambda start, stop: values[start:stop])
+    fine.coarsen()
+    for name in ("first", "last", "low", "high"):
+        np.testing.assert_array_equal(getattr(fine, name), getattr(coarse, name))
+
+
 def test_decimation_draws_a_lone_reading_once():
     values = np.full((10, 1), np.nan)
     values[4] = 3.0
@@ -162,6 +194,14 @@ def test_history_slides_and_keeps_the_origin_of_time():
     assert history.n <= 2_000
     assert history.origin == 100
     np.testing.assert_array_equal(history.column("mean")[:, 0] + 100, history.column("t"))
+
+
+def test_history_never_holds_more_than_twice_its_limit():
+    history = History(1, 1, limit=100)
+    for first in range(0, 1_000, 90):
+        history.take(pull(first, range(first, first + 90)))
+        assert 90 <= history.n <= 200
+        np.testing.assert_array_equal(history.column("t"), np.arange(history.base, first + 90))
 
 
 def test_history_starts_over_with_a_fresh_pull():
