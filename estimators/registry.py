@@ -12,7 +12,7 @@ from .etkf import ETKF
 from .filter import Estimator
 from .kf import KF
 from .letkf import LETKF
-from .model import StateSpaceModel
+from .model import LARGE, StateSpaceModel
 from .pf import PF, PF_REG
 from .ukf import UKF
 
@@ -28,7 +28,21 @@ def find_estimator(name: str, model: StateSpaceModel) -> Estimator:
     if name not in ESTIMATORS:
         near = get_close_matches(name, ESTIMATORS, n=3, cutoff=0.4) or list(ESTIMATORS)
         raise EstimatorError(f"estimator {name!r} does not exist; near: {', '.join(near)}")
-    reason = ESTIMATORS[name].applies(model)
+    reason = unfit(ESTIMATORS[name], model)
     if reason:
         raise EstimatorError(f"estimator {name} does not apply: {reason}")
     return ESTIMATORS[name]
+
+
+def unfit(entry: Estimator, model: StateSpaceModel) -> str | None:
+    """Why an estimator does not fit a model, or None: its own reason, or the size of the covariance that it forms."""
+    if entry.family == "ensemble":
+        return entry.applies(model)
+    if model.nx > LARGE:
+        return (
+            f"{entry.name} of {model.nx:,} states needs a {8e-9 * model.nx**2:,.3g} GB covariance, and {model.name} has "
+            f"more than {LARGE:,} states; use an ensemble filter"
+        )
+    if model.shape is not None:
+        return f"{model.name} gives its noise as a shape, not as a matrix; use an ensemble filter"
+    return entry.applies(model)
