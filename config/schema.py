@@ -109,7 +109,7 @@ class TwinSection(Section):
     parameters: dict[str, Number] = {}
     """The model's parameters by name, in their units. Default: the model's values."""
     prior: dict[str, PriorSection] = {}
-    """The belief before the first reading, by state. Default: the model's."""
+    """The belief before the first reading, by state, or of a whole field under its name. Default: the model's."""
     noise: dict[str, LevelSection] = {}
     """Process noise Q by name: how much the model is distrusted. Default: the model's."""
     sensors: dict[str, SensorSection] = {}

@@ -81,10 +81,10 @@ def side_of(options: Options, ny: int) -> int:
 def work_size(options: Options, nx: int, ny: int) -> int:
     """Scratch: what `workspace` hands out, and each crew's own."""
     N, side = members(options), side_of(options, ny)
-    analysis = ny * (3 * N + 6) + 3 * side * (side + 1) + 2 * N * (N + 1) + N
+    analysis = ny * (3 * N + 6) + side * (3 * side + 4) + 2 * N * (N + 1) + N
     crew = max(
         3 * nx + (2 * nx * nx if nx <= LARGE else 0),
-        2 * (N + 2) * WIDE + ny * (N + 4) + 2 * side * side + 6 * (side + N),
+        2 * (N + 2) * WIDE + ny * (N + 4) + 7 * side * side + 32 * (side + N),
     )
     return analysis + crews(N * nx, THREADED_FROM) * crew
 
@@ -172,7 +172,6 @@ def start(context, mean, cov, state):
 def describe(context, state, mean, std, cross):
     """Mean and standard deviation of the states that the track keeps, and the configured covariances."""
     X = ensemble(context, state)
-    N = X.shape[0]
     shown = shown_states(context)
     for k in range(mean.size):
         j = shown[k]
@@ -443,7 +442,7 @@ def workspace(N, ny, side, work):
 
     Returns:
         ZT (ny, N), Z (N, ny), B (ny, N + 1), G, U and V (side, side), W (N, N + 1), T (N, N), d, rows, expected (ny,
-        each), v (ny + N,), where (ny int64s), values (side,), small (2 side,), rest.
+        each), v (ny + N,), where (ny int64s), values (side,), small (3 side,), rest.
     """
     ZT = matrix(work, 0, ny, N)
     Z = matrix(work, ny * N, N, ny)
@@ -463,8 +462,8 @@ def workspace(N, ny, side, work):
     where = ints(work.ctypes.data + 8 * (at + 4 * ny + N), ny)
     at += 5 * ny + N
     values = work[at : at + side]
-    small = work[at + side : at + 3 * side]
-    return ZT, Z, B, G, U, V, W, T, d, rows, expected, v, where, values, small, work[at + 3 * side :]
+    small = work[at + side : at + 4 * side]
+    return ZT, Z, B, G, U, V, W, T, d, rows, expected, v, where, values, small, work[at + 4 * side :]
 
 
 @jit

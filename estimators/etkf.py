@@ -21,7 +21,6 @@ from .context import options as numbers
 from .context import sensor_rows
 from .ensemble import (
     ADD,
-    ADDITIVE,
     CREWS,
     INFLATE,
     INFLATION,
@@ -45,7 +44,6 @@ from .ensemble import (
 )
 from .filter import Estimator, Option
 from .jit import jit
-from .linalg import solve_transposed, solve_upper
 from .random import key_of, normal
 from .simd import add_scaled
 from .symmetric import gram, symmetric_eigen
@@ -66,7 +64,7 @@ def symmetric_transform(m, ZT, Z, d, G, V, values, small, v, B, T):
         G: Scratch (side, side), side = min(m, N).
         V: Scratch (side, side).
         values: Scratch (side,).
-        small: Scratch (2 side,).
+        small: Scratch (3 side,).
         v: Gets √(N - 1) w, (N,).
         B: Scratch (m, at least N).
         T: Gets T (N, N).

@@ -43,76 +43,48 @@ from .filter import Estimator
 from .jit import ints, jit, matrix
 from .localisation import localised, prepare, reached
 from .simd import WIDE, add_scaled
-from .symmetric import gram, symmetric_eigen
+from .symmetric import gram, root_action
 from .track import FAILED, USED
 
 
 @jit
-def local_transform(p, z, d, G, a, V, values, small, t):
+def local_transform(p, z, d, G, a, values, t, g, scratch):
     """Turn the anomalies a (N,) of one state by (I + Z Zᵀ)^(-1/2), of the p rows z near it; return what its mean gains.
 
-    Only the transform's action on one vector is needed: with Zᵀ Z = V Λ Vᵀ and t = Vᵀ Zᵀ a,
-    a ← a - Z V φ(Λ) t and x̄ gains tᵀ (I + Λ)⁻¹ Vᵀ d / √(N - 1); see `symmetric_transform` of etkf.py.
+    Only the transform's action on one vector is needed: with t = Zᵀ a,
+    a ← a - Z φ(Zᵀ Z) t and x̄ gains tᵀ (I + Zᵀ Z)⁻¹ d / √(N - 1); φ as in `symmetric_transform` of etkf.py.
 
     Args:
         p: Rows near the state.
         z: Their whitened anomalies times √taper, (p, N).
-        d: Their whitened innovation times √taper, (p,).
+        d: Their whitened innovation times √taper, (p,); is destroyed.
         G: Holds Zᵀ Z (p, p) if p < N; is destroyed.
         a: Anomalies of the state (N,).
-        V: Scratch (side, side), side = min(p, N).
-        values: Scratch (side,).
-        small: Scratch (2 side,).
-        t: Scratch (p + N,).
+        values: Scratch (side,), side = min(p, N).
+        t: Scratch (side,).
+        g: Scratch (side,).
+        scratch: As `root_action` wants it.
 
     Returns:
         What the mean gains; NaN if a number is not finite.
     """
     N = a.size
-    gain = 0.0
     if p < N:
-        if not symmetric_eigen(G, p, values, V, small):
-            return np.nan
         for k in range(p):
             dot = 0.0
             for i in range(N):
                 dot += z[k, i] * a[i]
             t[k] = dot
-            small[k] = 0.0
+        gain = root_action(G, p, values, t, d, False, scratch)
         for k in range(p):
-            along = 0.0
-            innovation = 0.0
-            for j in range(p):
-                along += V[k, j] * t[j]
-                innovation += V[k, j] * d[j]
-            grown = 1.0 + max(values[k], 0.0)
-            gain += along * innovation / grown
-            add_scaled(p, along / (grown + np.sqrt(grown)), V[k].ctypes.data, small.ctypes.data)
-        for k in range(p):
-            add_scaled(N, -small[k], z[k].ctypes.data, a.ctypes.data)
+            add_scaled(N, -t[k], z[k].ctypes.data, a.ctypes.data)
         return gain / np.sqrt(N - 1.0)
     gram(z, p, N, G)
-    if not symmetric_eigen(G, N, values, V, small):
-        return np.nan
-    g = small[:N]
-    turned = t[:N]
     for i in range(N):
         g[i] = 0.0
-        turned[i] = 0.0
     for k in range(p):
         add_scaled(N, d[k], z[k].ctypes.data, g.ctypes.data)
-    for k in range(N):
-        along = 0.0
-        innovation = 0.0
-        for i in range(N):
-            along += V[k, i] * a[i]
-            innovation += V[k, i] * g[i]
-        grown = 1.0 + max(values[k], 0.0)
-        gain += along * innovation / grown
-        add_scaled(N, along / np.sqrt(grown), V[k].ctypes.data, turned.ctypes.data)
-    for i in range(N):
-        a[i] = turned[i]
-    return gain / np.sqrt(N - 1.0)
+    return root_action(G, N, values, a, g, True, scratch) / np.sqrt(N - 1.0)
 
 
 @jit
@@ -121,22 +93,23 @@ def columns(context, sensor, X, where, ZT, d, C, inflation, crew, crews, scratch
     N, n = X.shape
     ny = where.size
     blocks, starts, entry_rows, tapers = reached(context, sensor)
-    # Scratch: a block; the rows near a state, their innovations, which they are, and the roots of their tapers; the
-    # matrices and vectors of an eigenvalue problem; one state's anomalies.
+    # Scratch: a block; the rows near a state, their innovations, which they are, and the roots of their tapers; a
+    # matrix and vectors of `root_action`; one state's anomalies.
     side = min(ny, N)
     at = (N + 2) * WIDE
     z = matrix(scratch, at, ny, N)
     at += ny * N
-    G = matrix(scratch, at, side, side)
-    V = matrix(scratch, at + side * side, side, side)
-    at += 2 * side * side
     near_d = scratch[at : at + ny]
     near = ints(scratch.ctypes.data + 8 * (at + ny), ny)
-    t = scratch[at + 2 * ny : at + 3 * ny + N]
-    at += 3 * ny + N
+    roots = scratch[at + 2 * ny : at + 3 * ny]
+    at += 3 * ny
     values = scratch[at : at + side]
-    small = scratch[at + side : at + 3 * side]
+    t = scratch[at + side : at + 2 * side]
+    g = scratch[at + 2 * side : at + 3 * side]
     a = scratch[at + 3 * side : at + 3 * side + N]
+    at += 3 * side + N
+    square = at
+    rest = scratch[at + side * side :]
     for e in range(crew * blocks.size // crews, (crew + 1) * blocks.size // crews):
         first, count, width = block_at(blocks[e], n)
         block = matrix(scratch, 0, N + 1, width)
@@ -151,20 +124,22 @@ def columns(context, sensor, X, where, ZT, d, C, inflation, crew, crews, scratch
                     root = np.sqrt(taper)
                     near[p] = k
                     near_d[p] = root * d[k]
-                    t[p] = root
+                    roots[p] = root
                     for i in range(N):
                         z[p, i] = root * ZT[k, i]
                     most = max(most, taper)
                     p += 1
             if p == 0:
                 continue
+            order = min(p, N)
+            G = matrix(scratch, square, order, order)
             if p < N:
                 for k in range(p):
                     for i in range(p):
-                        G[k, i] = t[k] * t[i] * C[near[k], near[i]]
+                        G[k, i] = roots[k] * roots[i] * C[near[k], near[i]]
             for i in range(N):
                 a[i] = block[i, j]
-            gain = local_transform(p, z, near_d, G, a, V, values, small, t)
+            gain = local_transform(p, z, near_d, G, a, values, t, g, rest)
             factor = 1.0 + (inflation - 1.0) * most
             for i in range(N):
                 block[i, j] = factor * a[i]
@@ -217,7 +192,7 @@ LETKF = Estimator(
     name="letkf",
     title="Local ensemble transform Kalman filter",
     family="ensemble",
-    assumes="posterior near Gaussian; what is far apart is independent, and the model says where states and sensors are",
+    assumes="posterior near Gaussian; what is far apart is independent; the model says where states and sensors are",
     model_runs="members",
     fails_when="radius too long for the members (chance covariances) or too short for the physics",
     source="Hunt, Kostelich & Szunyogh (2007), doi:10.1016/j.physd.2006.11.008",

@@ -33,7 +33,7 @@ def crews(numbers: int, threaded_from: int) -> int:
 
 
 def gaspari_cohn(distance: np.ndarray, radius: float) -> np.ndarray:
-    """The taper: 1 at no distance, 5/24 at half the radius, 0 from the radius on; positive definite in three dimensions.
+    """The taper: 1 at no distance, 5/24 at half the radius, 0 from the radius on; positive definite in up to 3 axes.
 
     Source: Gaspari & Cohn (1999), doi:10.1002/qj.49712555417, equation 4.10.
     """
@@ -103,7 +103,7 @@ def prepare(model: StateSpaceModel, options: Options) -> np.ndarray:
 def _by_blocks(
     near: list[np.ndarray], tapers: list[np.ndarray], nx: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Blocks reached, where each one's entries start (one more than blocks), and each entry's row and tapers (WIDE,)."""
+    """Blocks reached, where each one's entries start (one more than blocks), each entry's row and tapers (WIDE,)."""
     wide = nx // WIDE
     blocks, rows, taper = [], [], []
     for row, (states, values) in enumerate(zip(near, tapers, strict=True)):
@@ -116,10 +116,11 @@ def _by_blocks(
         blocks.append(reached)
         rows.append(np.full(reached.size, row, np.int64))
         taper.append(table)
-    block, row, table = np.concatenate(blocks), np.concatenate(rows), np.concatenate(taper)
-    order = np.lexsort((row, block))
-    reached, start = np.unique(block[order], return_index=True)
-    return reached.astype(np.int64), np.append(start, block.size).astype(np.int64), row[order], table[order]
+    by_entry, of_row, table = np.concatenate(blocks), np.concatenate(rows), np.concatenate(taper)
+    order = np.lexsort((of_row, by_entry))
+    found, start = np.unique(by_entry[order], return_index=True)
+    starts = np.append(start, by_entry.size).astype(np.int64)
+    return found.astype(np.int64), starts, of_row[order], table[order]
 
 
 @jit

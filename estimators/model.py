@@ -155,7 +155,8 @@ class StateSpaceModel:
             strays = [noise.name for noise in self.noises if not self.acts_on(noise.name)]
             if strays:
                 raise ModelError(
-                    f"model {self.name}: noise {strays[0]!r} is not a state or field; name one, or write Q(x, u, p, q, dt, out)"
+                    f"model {self.name}: noise {strays[0]!r} is not a state or field; name one, "
+                    "or write Q(x, u, p, q, dt, out)"
                 )
         elif self.shape is not None or self.nx > LARGE:
             raise ModelError(
@@ -222,7 +223,7 @@ class StateSpaceModel:
         return tuple(self.states[int(j)] for j in self.shown)
 
     def acts_on(self, noise: str) -> range:
-        """The states to which a noise of that name adds: one, or the whole field; none if there is none of that name."""
+        """The states to which a noise of that name adds: one, or a whole field; none if there is no such name."""
         if isinstance(self.states, Field):
             return range(self.nx if noise == self.states.name else 0)
         if noise not in self.state_names:

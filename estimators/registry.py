@@ -40,8 +40,8 @@ def unfit(entry: Estimator, model: StateSpaceModel) -> str | None:
         return entry.applies(model)
     if model.nx > LARGE:
         return (
-            f"{entry.name} of {model.nx:,} states needs a {8e-9 * model.nx**2:,.3g} GB covariance, and {model.name} has "
-            f"more than {LARGE:,} states; use an ensemble filter"
+            f"{model.name} is too large: a {entry.name} of {model.nx:,} states needs a {8e-9 * model.nx**2:,.3g} GB "
+            "covariance; use an ensemble filter"
         )
     if model.shape is not None:
         return f"{model.name} gives its noise as a shape, not as a matrix; use an ensemble filter"

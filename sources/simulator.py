@@ -83,8 +83,9 @@ class Simulator:
         self._steps = None if duration is None else round(duration / step)
         self.endless = duration is None
         self.span = None if duration is None else (0, self._time(round(duration / step)))
-        given = dict(initial or {})
-        self._x = np.array([given.get(state.name, state.mean) for state in truth.states], float)
+        self._x = truth.prior_mean.copy()
+        for name, value in dict(initial or {}).items():
+            self._x[truth.state_names.index(name)] = value
         values = dict(truth_parameters or {})
         self._p = np.array([values.get(item.name, item.value) for item in truth.parameters], float)
         variances = dict(truth_noise or {})
@@ -98,7 +99,7 @@ class Simulator:
             for plan, sensor in zip(self._plans, model.sensors, strict=True)
         ]
         self._spoken = [0] * len(self._plans)
-        self._circular = [j for j, state in enumerate(truth.states) if state.circular]
+        self._circular = np.flatnonzero(truth.circular)
         self._rng = np.random.default_rng(seed)
         self._factor: tuple[bytes, np.ndarray] | None = None
         self._told = _runs(model.shown, model.width)

@@ -92,9 +92,7 @@ def thermal_field(rows: int = 200, columns: int = 200, sensors: int = 10) -> Sta
         sensors=(
             Sensor(
                 "thermocouples",
-                tuple(
-                    Row(f"t{i}_{j}", "°C", variance=0.25, position=(i * SPACING, j * SPACING)) for i, j in cells
-                ),
+                tuple(Row(f"t{i}_{j}", "°C", variance=0.25, position=(i * SPACING, j * SPACING)) for i, j in cells),
                 h=thermocouples,
             ),
         ),

@@ -94,9 +94,7 @@ def beside_dapper() -> None:
     ]
     print(f"  {'filter':12s} {'Nisus µs':>9s} {'DAPPER µs':>10s} {'ratio':>7s}   wanted")
     for title, name, options, method in rows:
-        pair = compare(
-            _ours(name, options), _theirs(method, HMM, xx, yy), steps=(CYCLES, THEIR_CYCLES), repetitions=7
-        )
+        pair = compare(_ours(name, options), _theirs(method, HMM, xx, yy), steps=(CYCLES, THEIR_CYCLES), repetitions=7)
         verdict = judged(pair.ratio, 10, at_least=True)
         print(f"  {title:12s} {pair.ours * 1e6:9.1f} {pair.theirs * 1e6:10.0f} {pair.ratio:7.1f}   >= 10   {verdict}")
 

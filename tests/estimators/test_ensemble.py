@@ -1,4 +1,4 @@
-"""Ensemble filters against oracles of their own: Kalman's update of sample moments, dense analyses, the joint Gaussian."""
+"""Ensemble filters against Kalman's update of their sample moments, dense analyses, and the joint Gaussian."""
 
 from dataclasses import replace
 
