@@ -64,7 +64,7 @@ def test_an_insulated_plate_keeps_its_heat_and_relaxes_to_its_mean():
         f(T, u, p, 1.0, out)
         T = out.copy()
     assert T.mean() == pytest.approx(before.mean(), rel=1e-12)
-    assert T.std() < 1e-3 * before.std() * 50
+    assert T.std() < 1e-6 * before.std()  # the slowest mode decays as exp(-0.014 t)
     p[2] = 2.0
     f(before, u, p, 1.0, out)
     warmed = out.copy()
