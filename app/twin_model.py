@@ -6,6 +6,7 @@ import hashlib
 import importlib.util
 import sys
 import traceback
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -16,7 +17,7 @@ from config.problems import nearest
 from config.yaml_lines import Key
 from estimators.errors import ModelError, NisusError
 from estimators.joint import Unknown, joint
-from estimators.model import StateSpaceModel
+from estimators.model import Field, State, StateSpaceModel
 from estimators.models import MODELS
 
 
@@ -113,23 +114,40 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     parameters = tuple(replace(p, value=config.parameters.get(p.name, p.value)) for p in model.parameters)
     unknowns = {name: Unknown(section.std, section.drift) for name, section in config.estimate.items()}
     model = joint(replace(model, parameters=parameters), unknowns)
-    check_names(loaded, ("prior",), config.prior, model.state_names, "state", model)
+    field = isinstance(model.states, Field)
+    known = (model.states.name,) if isinstance(model.states, Field) else model.state_names
+    check_names(loaded, ("prior",), config.prior, known, "field" if field else "state", model)
     check_names(loaded, ("noise",), config.noise, [item.name for item in model.noises], "noise", model)
     check_names(loaded, ("sensors",), config.sensors, model.sensor_names, "sensor", model)
-    states = []
-    for state in model.states:
-        prior = config.prior.get(state.name)
-        mean, std = (prior.mean, prior.std) if prior else (None, None)
-        states.append(replace(state, mean=state.mean if mean is None else mean, std=std or state.std))
     return replace(
         model,
-        states=tuple(states),
+        states=_states(model, loaded),
         noises=tuple(
             replace(noise, variance=config.noise[noise.name].value) if noise.name in config.noise else noise
             for noise in model.noises
         ),
         sensors=tuple(_sensor(sensor, loaded) for sensor in model.sensors),
     )
+
+
+def _states(model: StateSpaceModel, loaded: Loaded) -> Sequence[State]:
+    """The states with the YAML's prior; that of a field is given for all its cells, under the field's name."""
+    given = loaded.config.prior
+    states = model.states
+    if isinstance(states, Field):
+        prior = given.get(states.name)
+        if prior is None:
+            return states
+        means = states.means if prior.mean is None else ()
+        return replace(
+            states, mean=states.mean if prior.mean is None else prior.mean, means=means, std=prior.std or states.std
+        )
+    found = []
+    for state in states:
+        prior = given.get(state.name)
+        mean, std = (prior.mean, prior.std) if prior else (None, None)
+        found.append(replace(state, mean=state.mean if mean is None else mean, std=std or state.std))
+    return tuple(found)
 
 
 def _sensor(sensor: Any, loaded: Loaded) -> Any:

@@ -121,7 +121,7 @@ class TwinSection(Section):
     """Parameters that are moved into the state and estimated with it, by name: {std, drift}. They become the last
     states, which may be named wherever a state may. Default: none."""
     prior: dict[str, PriorSection] = {}
-    """The belief before the first reading, by state. Default: the model's."""
+    """The belief before the first reading, by state, or of a whole field under its name. Default: the model's."""
     noise: dict[str, LevelSection] = {}
     """Process noise Q by name: how much the model is distrusted. Default: the model's."""
     sensors: dict[str, SensorSection] = {}

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from numba import types
 
-from .jit import C1, F1, F2, caller, f64, flags, floats, i64, ints, jit
+from .jit import C1, F1, F2, caller, f64, flags, floats, i64, ints, jit, matrix
 
 f_signature = types.void(F1, F1, F1, f64, F1)
 f_complex_signature = types.void(C1, F1, F1, f64, C1)
@@ -15,6 +15,7 @@ h_signature = types.void(F1, F1, F1, F1)
 h_complex_signature = types.void(C1, F1, F1, C1)
 H_signature = types.void(F1, F1, F1, F2)
 Q_signature = types.void(F1, F1, F1, F1, f64, F2)
+shape_signature = types.void(F1, F1, F1)
 log_likelihood_signature = f64(F1, F1, F1, F1, F1)
 
 call_f = caller(f_signature)
@@ -24,6 +25,7 @@ call_h = caller(h_signature)
 call_h_complex = caller(h_complex_signature)
 call_H = caller(H_signature)
 call_Q = caller(Q_signature)
+call_shape = caller(shape_signature)
 call_log_likelihood = caller(log_likelihood_signature)
 
 
@@ -44,6 +46,8 @@ class Context(NamedTuple):
     F_mode: Any
     Q: Any
     Q_varies: Any
+    each_state: Any
+    shape: Any
     h: Any
     h_complex: Any
     H: Any
@@ -56,9 +60,11 @@ class Context(NamedTuple):
     circular_x: Any
     circular_y: Any
     noise_state: Any
+    noise_states: Any
     max_step: Any
     prior_mean: Any
     prior_cov: Any
+    prior_rows: Any
     p: Any
     q: Any
     r: Any
@@ -69,6 +75,10 @@ class Context(NamedTuple):
     n_options: Any
     pairs: Any
     n_pairs: Any
+    shown: Any
+    n_shown: Any
+    prepared: Any
+    n_prepared: Any
     seed: Any
 
 
@@ -137,10 +147,11 @@ def add_process_noise(context, x, u, dt, P, scratch):
     n = context.nx
     q = process_variances(context)
     if context.Q == 0:
-        state = ints(context.noise_state, context.n_noises)
+        first = ints(context.noise_state, context.n_noises)
+        count = ints(context.noise_states, context.n_noises)
         for k in range(q.size):
-            j = state[k]
-            P[j, j] += q[k] * dt
+            for j in range(first[k], first[k] + count[k]):
+                P[j, j] += q[k] * dt
         return
     for i in range(n):
         for j in range(n):
@@ -149,6 +160,26 @@ def add_process_noise(context, x, u, dt, P, scratch):
     for i in range(n):
         for j in range(n):
             P[i, j] += scratch[i, j]
+
+
+@jit
+def prior(context):
+    """Mean (nx,) and covariance of the prior, (nx, nx), or (1, nx) where it is diagonal."""
+    n = context.nx
+    rows = context.prior_rows
+    return floats(context.prior_mean, n), matrix(floats(context.prior_cov, rows * n), 0, rows, n)
+
+
+@jit
+def shown_states(context):
+    """The index of the state in each of the track's columns."""
+    return ints(context.shown, context.n_shown)
+
+
+@jit
+def shaped(context, z, out):
+    """out = L z: white noise z (nx,) correlated in space as the model says."""
+    call_shape(context.shape, z, parameters(context), out)
 
 
 @jit

@@ -89,7 +89,8 @@ class Estimator:
     particles) as (k, nx), `modes(options, state, nx)` the peaks where there can be several. `tune(options, model,
     tuning)` turns the options into the numbers that the compiled functions read; it may raise EstimatorError.
     `memory(options, model)` counts numbers that the state holds beyond `state_size`. `runs(options, nx)` is
-    `model_runs` as a number: how often a step runs f.
+    `model_runs` as a number: how often a step runs f. `prepare(model, options)` computes what depends on the model
+    too, once for a fold, as int64s.
     """
 
     name: str
@@ -107,6 +108,7 @@ class Estimator:
     options: tuple[Option, ...] = ()
     tune: Callable[[Options, StateSpaceModel, Tuning], np.ndarray] = lambda options, model, tuning: np.zeros(1)
     memory: Callable[[Options, StateSpaceModel], int] = lambda options, model: 0
+    prepare: Callable[[StateSpaceModel, Options], np.ndarray] = lambda model, options: np.zeros(1, np.int64)
     applies: Callable[[StateSpaceModel], str | None] = lambda model: None
     runs: Callable[[Options, int], float] = lambda options, nx: 1.0
     modes: Callable[[Options, np.ndarray, int], list[Mode]] | None = None

@@ -14,11 +14,11 @@ import numpy as np
 from numba import types
 
 from .compiled import compile_model
-from .context import Context, context_type
+from .context import Context, context_type, prior
 from .diagnostics import Bounds, HealthPolicy, assess, assess_signature, chi_square_bounds
 from .errors import EstimatorError
 from .filter import Code, Estimator, call_describe, call_predict, call_start, call_update, code_type
-from .jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, jit, jit_brief, matrix
+from .jit import B1, F1, F2, I1, borrowed, borrowed_rows, i64, jit, jit_brief
 from .log import INPUT, READING, RESET, TICK, TRUTH, Log
 from .model import StateSpaceModel
 from .modes import Mode
@@ -58,8 +58,8 @@ def _advance_to(code, context, u, clock, t, index, state, work):
         return
     dt = (t - clock) * 1e-9
     if dt > LONGEST * context.max_step:
-        prior_cov = matrix(floats(context.prior_cov, context.nx * context.nx), 0, context.nx, context.nx)
-        call_start(code.start, context, floats(context.prior_mean, context.nx), prior_cov, state)
+        prior_mean, prior_cov = prior(context)
+        call_start(code.start, context, prior_mean, prior_cov, state)
         return
     steps = 1 if dt <= context.max_step else int(np.ceil(dt / context.max_step))
     for _ in range(steps):
@@ -73,7 +73,6 @@ def run(code, context, first, start, end, t, kind, channel, value, clock, u, sta
     A tick or a truth is a query: it is answered from a copy of the state, so it never changes the estimate.
     """
     nu = u.size
-    nx = context.nx
     u = borrowed(u)
     state = borrowed(state)
     spare = borrowed(spare)
@@ -118,8 +117,8 @@ def run(code, context, first, start, end, t, kind, channel, value, clock, u, sta
                 )
             call_describe(code.describe, context, state, mean[i], std[i], cross[i])
         elif what == RESET:
-            prior_cov = matrix(floats(context.prior_cov, nx * nx), 0, nx, nx)
-            call_start(code.start, context, floats(context.prior_mean, nx), prior_cov, state)
+            prior_mean, prior_cov = prior(context)
+            call_start(code.start, context, prior_mean, prior_cov, state)
             clock[0] = t[i]
             call_describe(code.describe, context, state, mean[i], std[i], cross[i])
         else:
@@ -220,7 +219,7 @@ class Fold:
         self._sparse = max(SPARSE_EVERY, self._every)
         self._snapshots: dict[int, tuple[int, np.ndarray, np.ndarray]] = {}
         self._remember()
-        self._rows = Track.allocate(log.capacity, model.nx, len(self.pairs), model.width)
+        self._rows = Track.allocate(log.capacity, len(model.shown), len(self.pairs), model.width)
 
     def _see(self) -> Context:
         """The context of this model and tuning; the arrays that it points to are kept in `self._held`."""
@@ -236,6 +235,7 @@ class Fold:
             "gate": gate,
             "options": np.ascontiguousarray(self.estimator.tune(self.options, model, tuning), float),
             "pairs": self.pairs,
+            "prepared": self.estimator.prepare(model, self.options),
         }
         values = {**self._compiled.static, **held}
         self._held = values
@@ -248,6 +248,8 @@ class Fold:
             "n_rows": held["r"].size,
             "n_options": held["options"].size,
             "n_pairs": len(self.pairs),
+            "n_shown": len(model.shown),
+            "n_prepared": held["prepared"].size,
             "width": model.width,
             "seed": tuning.seed,
         }
@@ -270,7 +272,7 @@ class Fold:
         return self._u.copy()
 
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (nx,) and covariance (nx, nx) at `clock`."""
+        """Mean (nx,) and covariance (nx, nx) at `clock`; beyond `LARGE` states the variances (1, nx) instead."""
         return self.estimator.moments(self.options, self._state, self.model.nx)
 
     def points(self) -> np.ndarray:
@@ -288,7 +290,7 @@ class Fold:
         end = self.log.n if limit is None else min(self.log.n, self.n + limit)
         begun = self.n
         if self.log.capacity > len(self._rows):
-            grown = Track.allocate(self.log.capacity, self.model.nx, len(self.pairs), self.model.width)
+            grown = Track.allocate(self.log.capacity, len(self.model.shown), len(self.pairs), self.model.width)
             for new, old in zip(grown, self._rows, strict=True):
                 new[: self.n] = old[: self.n]
             self._rows = grown

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from . import robust
-from .context import circular_rows, circular_states
+from .context import circular_rows, circular_states, shown_states
 from .filter import Options
 from .jit import flags, floats, inlined, ints, jit, matrix
 from .linalg import EPSILON, cholesky, mirror, solve_transposed, solve_upper, wrap
@@ -55,11 +55,13 @@ def start(context, mean, cov, state):
 @jit
 def describe(context, state, mean, std, cross):
     """Mean, standard deviation and the configured covariances."""
-    n = mean.size
-    for i in range(n):
-        mean[i] = state[i]
+    n = context.nx
+    shown = shown_states(context)
+    for k in range(mean.size):
+        i = shown[k]
+        mean[k] = state[i]
         variance = state[n + i * n + i]
-        std[i] = np.sqrt(variance) if variance >= 0.0 else np.nan
+        std[k] = np.sqrt(variance) if variance >= 0.0 else np.nan
     pairs = ints(context.pairs, 2 * context.n_pairs)
     for k in range(cross.size):
         cross[k] = state[n + pairs[2 * k] * n + pairs[2 * k + 1]]

@@ -7,12 +7,16 @@ from difflib import get_close_matches
 from .apf import APF
 from .ckf import CKF
 from .ekf import EKF
+from .enkf import ENKF
+from .ensrf import ENSRF
 from .errors import EstimatorError
+from .etkf import ETKF
 from .filter import Estimator
 from .iekf import IEKF
 from .kf import KF
 from .kf_steady import KF_STEADY
-from .model import StateSpaceModel
+from .letkf import LETKF
+from .model import LARGE, StateSpaceModel
 from .pf import PF, PF_REG
 from .pf_ekf import PF_EKF
 from .sr_ekf import SR_EKF
@@ -22,8 +26,9 @@ from .ukf import UKF
 
 GAUSSIAN = (KF, KF_STEADY, EKF, IEKF, UKF, CKF, SR_KF, SR_EKF, SR_UKF)
 PARTICLE = (PF, PF_REG, PF_EKF, APF)
+ENSEMBLE = (ENKF, ETKF, ENSRF, LETKF)
 
-ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in GAUSSIAN + PARTICLE}
+ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in GAUSSIAN + PARTICLE + ENSEMBLE}
 
 
 def find_entry(name: str) -> Estimator:
@@ -45,7 +50,21 @@ def find_estimator(name: str, model: StateSpaceModel) -> Estimator:
         EstimatorError: If there is none, with near names; or if it does not apply, with the reason.
     """
     entry = find_entry(name)
-    reason = entry.applies(model)
+    reason = unfit(entry, model)
     if reason:
         raise EstimatorError(f"estimator {name} does not apply: {reason}")
     return entry
+
+
+def unfit(entry: Estimator, model: StateSpaceModel) -> str | None:
+    """Why an estimator does not fit a model, or None: its own reason, or the size of the covariance that it forms."""
+    if entry.family == "ensemble":
+        return entry.applies(model)
+    if model.nx > LARGE:
+        return (
+            f"{model.name} is too large: a {entry.name} of {model.nx:,} states needs a {8e-9 * model.nx**2:,.3g} GB "
+            "covariance; use an ensemble filter"
+        )
+    if model.shape is not None:
+        return f"{model.name} gives its noise as a shape, not as a matrix; use an ensemble filter"
+    return entry.applies(model)

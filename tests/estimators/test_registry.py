@@ -8,7 +8,7 @@ from estimators.errors import EstimatorError
 from estimators.fold import Fold
 from estimators.log import READING, Log, Readings
 from estimators.models import MODELS
-from estimators.registry import ESTIMATORS, find_estimator
+from estimators.registry import ESTIMATORS, find_estimator, unfit
 from estimators.tuning import Tuning
 
 
@@ -77,13 +77,13 @@ def test_an_unknown_name_is_told_the_near_ones():
 @pytest.mark.parametrize("model", [m for m in MODELS.values()], ids=lambda m: m.name)
 def test_every_estimator_runs_every_model_it_applies_to(name, model):
     """Readings of exactly what the model expects at its prior: the estimate stays finite and near."""
-    if reason := ESTIMATORS[name].applies(model):
+    if reason := unfit(ESTIMATORS[name], model):
         assert model.name in reason
         return
     from estimators.compiled import compile_model
 
     compiled = compile_model(model)
-    x = np.array([state.mean for state in model.states])
+    x = model.prior_mean
     u = np.array([item.default for item in model.inputs])
     p = np.array([item.value for item in model.parameters])
     log = Log(model.width)
@@ -94,8 +94,13 @@ def test_every_estimator_runs_every_model_it_applies_to(name, model):
     fold = Fold(name, model, Tuning.of(model), log)
     fold.advance()
     mean, cov = fold.moments()
+    std = model.prior_std
+    if ESTIMATORS[name].family not in ("Gaussian", "reference"):
+        # Drawn from the prior: its moments but for chance, and no wider after readings than a few sigma of that.
+        assert np.all(np.abs(mean - x) < 4 * std)
+        assert np.all(np.sqrt(np.diag(cov)) < 2 * std)
+        return
     assert np.all(np.linalg.eigvalsh(cov) > 0)
-    std = np.array([state.std for state in model.states])
     if name != "kf-steady":  # a gain that is not the best one may make a state worse
         assert np.all(np.sqrt(np.diag(cov)) <= std * (1 + 1e-12))
     # The reading is what is expected at the mean, so a linearised filter does not move; sigma points see curvature.
@@ -117,3 +122,10 @@ def test_ukf_points_have_the_moments_of_the_state():
     w[0] = 1 - 2 / total
     np.testing.assert_allclose(w @ points, mean, rtol=1e-13, atol=1e-13)
     np.testing.assert_allclose((points - mean).T @ np.diag(w) @ (points - mean), cov, rtol=1e-12, atol=1e-13)
+
+
+def test_a_large_field_is_for_ensembles_and_the_refusal_has_the_arithmetic():
+    model = MODELS["thermal_field"]
+    with pytest.raises(EstimatorError, match="ukf of 40,000 states needs a 12.8 GB covariance.*use an ensemble filter"):
+        find_estimator("ukf", model)
+    assert find_estimator("etkf", model) is ESTIMATORS["etkf"]
