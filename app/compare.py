@@ -22,7 +22,7 @@ from estimators.errors import ConfigError, NisusError
 from estimators.fold import Fold
 from estimators.log import Log, Readings
 from estimators.model import StateSpaceModel
-from estimators.registry import ESTIMATORS, find_estimator
+from estimators.registry import ESTIMATORS, find_estimator, unfit
 from estimators.score import Fit, Score, score
 
 from .cli import settings
@@ -96,7 +96,7 @@ def _chosen(twin: Twin, wanted: Sequence[str]) -> list[str]:
         for name in wanted:
             find_estimator(name, twin.model)
         return list(dict.fromkeys(wanted))
-    return [name for name, entry in ESTIMATORS.items() if entry.applies(twin.model) is None]
+    return [name for name, entry in ESTIMATORS.items() if unfit(entry, twin.model) is None]
 
 
 def compare(

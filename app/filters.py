@@ -9,7 +9,7 @@ from rich.table import Table
 
 from estimators.filter import Option
 from estimators.log import READING
-from estimators.registry import ESTIMATORS
+from estimators.registry import ESTIMATORS, unfit
 
 from .fold import read_log
 from .twin import Twin, load_twin
@@ -63,12 +63,12 @@ def fitting(twin: Twin) -> Table:
     for title, justify in (("name", "left"), ("memory", "right"), ("model runs a second", "right"), ("", "left")):
         table.add_column(title, justify=justify, overflow="fold")  # type: ignore[arg-type]
     for name, entry in ESTIMATORS.items():
-        reason = entry.applies(twin.model)
+        reason = unfit(entry, twin.model)
         if reason is not None:
             table.add_row(f"[dim]{name}[/]", "", "", f"[dim]no: {reason}[/]")
             continue
         options = entry.complete(dict(twin.options_of(name)))
-        numbers = entry.state_size(options, twin.model.nx)
+        numbers = entry.state_size(options, twin.model.nx) + entry.memory(options, twin.model)
         runs = entry.runs(options, twin.model.nx)
         table.add_row(
             f"[bold]{name}[/]",

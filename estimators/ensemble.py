@@ -32,12 +32,13 @@ from .gaussian import LOG_2PI
 from .jit import flags, floats, ints, jit, matrix
 from .linalg import solve_transposed, solve_upper, wrap
 from .localisation import between_rows, crews
-from .model import LARGE
+from .model import LARGE, StateSpaceModel
 from .noise import add_noise, noise_root, semidefinite_root
 from .random import SUBSTEP, key_of, normal
 from .simd import WIDE, add_scaled
 from .symmetric import factor, gram
 from .track import FAILED, GATED, HELD_OUT, MISSING, USED
+from .tuning import Tuning
 
 INFLATION, ADDITIVE, CREWS, OWN = range(4)
 """Positions in the context's options; a filter's own number stands at the last."""
@@ -62,10 +63,10 @@ def members(options: Options) -> int:
     return int(options["members"])
 
 
-def tune(options: Options, nx: int) -> np.ndarray:
+def tune(options: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     """The numbers that the compiled functions read."""
     own = options.get("rotation", 0.0)
-    return np.array([options["inflation"], options["additive"], crews(members(options) * nx, THREADED_FROM), own])
+    return np.array([options["inflation"], options["additive"], crews(members(options) * model.nx, THREADED_FROM), own])
 
 
 def state_size(options: Options, nx: int) -> int:

@@ -60,7 +60,7 @@ def joint(model: StateSpaceModel, unknowns: Mapping[str, Unknown]) -> StateSpace
     )
     return replace(
         model,
-        states=model.states + tuple(State(m.name, m.unit, m.value, unknowns[m.name].std) for m in moved),
+        states=(*model.states, *(State(m.name, m.unit, m.value, unknowns[m.name].std) for m in moved)),
         parameters=tuple(kept),
         noises=noises,
         f=_step(model.f, *layout),

@@ -17,7 +17,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .context import circular_states
+from .context import circular_states, shown_states
 from .context import options as numbers
 from .filter import Option, Options
 from .jit import floats, ints, jit, matrix
@@ -257,11 +257,14 @@ def cloud_moments(state, nx, n, mean, cov):
 @jit
 def describe(context, state, mean, std, cross):
     """Mean, standard deviation and the configured covariances."""
-    n = mean.size
-    cov = np.empty((n, n))
-    cloud_moments(state, n, int(numbers(context)[MEMBERS]), mean, cov)
-    for i in range(n):
-        std[i] = np.sqrt(cov[i, i])
+    n = context.nx
+    x, cov = np.empty(n), np.empty((n, n))
+    cloud_moments(state, n, int(numbers(context)[MEMBERS]), x, cov)
+    shown = shown_states(context)
+    for k in range(mean.size):
+        i = shown[k]
+        mean[k] = x[i]
+        std[k] = np.sqrt(cov[i, i])
     pairs = ints(context.pairs, 2 * context.n_pairs)
     for k in range(cross.size):
         cross[k] = cov[pairs[2 * k], pairs[2 * k + 1]]

@@ -24,9 +24,11 @@ from .context import (
     sensor_variances,
 )
 from .context import options as numbers
+from .filter import Options
 from .gaussian import LOG_2PI
 from .jit import F1, address, caller, f64, floats, i64, ints, jit, matrix
 from .linalg import wrap
+from .model import StateSpaceModel
 from .noise import add_noise, noise_root
 from .particle import (
     BLOCK,
@@ -59,6 +61,7 @@ from .particle import (
 from .random import ONE, normal
 from .resampling import STRATIFIED, drawn_children, place_children, strata_children
 from .threads import threaded
+from .tuning import Tuning
 
 PROPAGATE, WEIGH, NORMALISE, CHILDREN, COMMIT, JITTER = range(6)
 """Phases: x ~ p(x | x'); p(y | x); weights and moments; children of strata; keep the weights; kernel noise."""
@@ -79,7 +82,7 @@ def block_numbers(nx: int, ny: int) -> int:
     return 4 + k + k * k + 2 * nx + ny + 2 * nx * nx + (k + 2) * CHUNK + 1
 
 
-def tune(options: dict[str, float], nx: int) -> np.ndarray:
+def tune(options: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     """The numbers that the compiled functions read, in the order of `MEMBERS` and the following."""
     n = members(options)
     threads = n >= THREADED_FROM and threaded()

@@ -18,8 +18,9 @@ import numpy as np
 from .context import options as numbers
 from .context import sensor_variances
 from .filter import Estimator, Option, Options
-from .gaussian import judge
+from .gaussian import admit
 from .jit import jit, matrix
+from .model import StateSpaceModel
 from .noise import noise_root, semidefinite_root
 from .particle import (
     EQUAL,
@@ -55,6 +56,7 @@ from .particle_steps import (
 )
 from .random import key_of
 from .track import FAILED, MISSING, USED
+from .tuning import Tuning
 
 
 @jit
@@ -126,7 +128,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     S = matrix(S_flat, 0, rows, rows)
     U = matrix(U_flat, 0, rows, rows)
     m = predicted(context, sensor, y, sums, S, nu, innovation, innovation_std)
-    verdict = judge(context, sensor, m, nu, S, U, score)
+    verdict = admit(context, sensor, m, nu, S, U, score)
     log_sum = normalise(context, u, sensor, y, state, work, sums)
     score[2] = log_sum
     if verdict == USED and log_sum > -np.inf:
@@ -151,12 +153,13 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
 BANDWIDTH = Option("bandwidth", 0.5, 0.01, 2.0, "", "kernel width as a part of the best for a Gaussian cloud")
 
 
-def tune_regularised(options: Options, nx: int) -> np.ndarray:
+def tune_regularised(options: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     """The numbers of the bootstrap filter, and the kernel's width h.
 
     h = bandwidth · (4 / (nx + 2))^(1/(nx+4)) · N^(-1/(nx+4)): Musso, Oudjane & Le Gland (2001), Gaussian kernel.
     """
-    values = tune(options, nx)
+    nx = model.nx
+    values = tune(options, model, tuning)
     power = 1.0 / (nx + 4)
     values[EXTRA] = options["bandwidth"] * (4.0 / (nx + 2)) ** power * values[MEMBERS] ** -power
     return values
@@ -171,6 +174,7 @@ PF = Estimator(
     fails_when="the readings are much sharper than the cloud, or nx is large: few particles carry all the weight",
     source="Gordon, Salmond & Smith (1993), doi:10.1049/ip-f-2.1993.0015",
     functions=(start, predict, update, describe),
+    runs=lambda options, nx: options["particles"],
     state_size=sized(lambda nx: nx),
     work_size=work_size,
     moments=moments,
@@ -189,6 +193,7 @@ PF_REG = Estimator(
     fails_when="the posterior has sharp structure that the kernel smears",
     source="Musso, Oudjane & Le Gland (2001), doi:10.1007/978-1-4757-3437-9_12",
     functions=(start, predict, update, describe),
+    runs=lambda options, nx: options["particles"],
     state_size=sized(lambda nx: nx),
     work_size=work_size,
     moments=moments,

@@ -14,7 +14,7 @@ import numpy as np
 from .context import options as numbers
 from .context import sensor_variances
 from .filter import Estimator
-from .gaussian import judge
+from .gaussian import admit
 from .jit import jit, matrix
 from .particle import MEMBERS, OPTIONS, PROPOSE, RESAMPLE, describe, modes, moments, points, recover, sized, start
 from .particle_steps import impoverished, keep, normalise, resample, shared, sweep, total
@@ -39,7 +39,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     sweep(EXPECT, context, u, 0.0, sensor, y, np.uint64(0), 0.0, state, work)
     total(context, work, sums)
     m = predicted(context, sensor, y, sums, S, nu, innovation, innovation_std)
-    verdict = judge(context, sensor, m, nu, S, matrix(U_flat, 0, rows, rows), score)
+    verdict = admit(context, sensor, m, nu, S, matrix(U_flat, 0, rows, rows), score)
     if verdict == USED:
         key = key_of(context.seed, index, PROPOSE)
         sweep(PROPOSE_EKF, context, u, 0.0, sensor, y, key, 0.0, state, work)

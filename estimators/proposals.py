@@ -23,10 +23,12 @@ from .context import (
     transition,
 )
 from .context import options as numbers
+from .filter import Options
 from .gaussian import LOG_2PI
 from .jacobians import scratch_size, sensor_jacobian, state_jacobian
 from .jit import address, floats, jit, matrix
 from .linalg import cholesky, congruence, solve_transposed, wrap
+from .model import StateSpaceModel
 from .noise import add_noise, semidefinite_root
 from .particle import (
     BLOCK,
@@ -55,6 +57,7 @@ from .particle_steps import (
 from .particle_steps import tune as tune_cloud
 from .particle_steps import work_size as cloud_work_size
 from .random import ONE, normal
+from .tuning import Tuning
 
 MOVE, EXPECT, PROPOSE_EKF, PROPOSE_PRIOR = range(OWN, OWN + 4)
 """Phases: N(x, P) one step on; what it says of the reading; a draw from the EKF's posterior; a draw from N(x, P)."""
@@ -76,9 +79,9 @@ def _own_code() -> float:
     return float(address(_block, block_signature))
 
 
-def tune(options: dict[str, float], nx: int) -> np.ndarray:
+def tune(options: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     """The cloud's numbers, and where the code of the phases above starts."""
-    values = tune_cloud(options, nx)
+    values = tune_cloud(options, model, tuning)
     values[EXTRA] = _own_code()
     return values
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from . import robust
-from .context import add_process_noise, circular_rows, options
+from .context import add_process_noise, circular_rows, options, shown_states
 from .filter import Options
 from .gaussian import judge, wrap_mean
 from .jit import inlined, ints, jit, matrix
@@ -46,16 +46,16 @@ def start(context, mean, cov, state):
 @jit
 def describe(context, state, mean, std, cross):
     """Mean, standard deviation and the configured covariances."""
-    n = mean.size
+    n = context.nx
     U = matrix(state, n, n, n)
-    for i in range(n):
-        mean[i] = state[i]
-        std[i] = 0.0
-    for k in range(n):
-        for i in range(k, n):
-            std[i] += U[k, i] * U[k, i]
-    for i in range(n):
-        std[i] = np.sqrt(std[i])
+    shown = shown_states(context)
+    for k in range(mean.size):
+        i = shown[k]
+        mean[k] = state[i]
+        variance = 0.0
+        for j in range(i + 1):
+            variance += U[j, i] * U[j, i]
+        std[k] = np.sqrt(variance)
     pairs = ints(context.pairs, 2 * context.n_pairs)
     for c in range(cross.size):
         i = pairs[2 * c]

@@ -187,7 +187,8 @@ def test_every_control_submits_its_command(view, engine):
     edit(panel.speed.handle, "max")
     edit(panel.run_buttons, "Pause")
     edit(panel.run_buttons, "Reset")
-    edit(panel._option_folders["ukf"][1]["alpha"].slider, 0.5)
+    view.frame()
+    edit(panel.options.rows["alpha"].slider, 0.5)
     assert engine.commands == [
         SetEstimator("ukf"), SetTuning("gate", 0.9973), UseSensor("winding", False), Speed(np.inf), Pause(True),
         Reset(), SetOption("alpha", 0.5),
@@ -231,7 +232,7 @@ def test_status_moves_the_controls_without_an_echo(view, engine):
     assert (row.slider.value, row.field.value) == (pytest.approx(2.0), "0.1")
     assert view.panel.sensors["winding"].handle.value is False
     assert view.panel.estimator.handle.value == view.panel._titles["ukf"]
-    assert view.panel._option_folders["ukf"][0].visible
+    assert view.panel.options.shown == "ukf" and view.panel.options.folder.visible
     assert tuple(view.panel.run_buttons.options)[0] == "Resume"
     view.coalescer.flush()
     assert len(engine.commands) == count
