@@ -26,9 +26,11 @@ from .particle import (
     PROPOSE,
     RESAMPLE,
     RESAMPLED,
+    SETTLED,
     describe,
     modes,
     moments,
+    next_draw,
     points,
     records_of,
     recover,
@@ -54,9 +56,12 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     sums, _, _, S_flat, U_flat, nu, _ = shared(context, work, n)
     rows = sensor_variances(context, sensor).size
     S = matrix(S_flat, 0, rows, rows)
+    settled = state[SETTLED]
+    index = next_draw(state)
     sweep(EXPECT, context, u, 0.0, sensor, y, np.uint64(0), 0.0, state, work)
     total(context, work, sums)
     m = predicted(context, sensor, y, sums, S, nu, innovation, innovation_std)
+    state[SETTLED] = settled
     verdict = admit(context, sensor, m, nu, S, matrix(U_flat, 0, rows, rows), score)
     log_sum = normalise(context, u, sensor, y, state, work, sums)
     if verdict == USED and log_sum > -np.inf:

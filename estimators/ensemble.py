@@ -1,6 +1,6 @@
 """What the ensemble filters share: members as a flat state, forecasts, and what a reading says of them.
 
-The state is the ensemble X (N, nx), member after member, and two numbers that count the predictions of an event. The
+The state is the ensemble X (N, nx), member after member, and the number of times that something was drawn. The
 covariance P = A Aᵀ / (N - 1) of its anomalies A is never formed: everything about a reading is said in whitened
 anomalies of what the members expect, Z = (h(xᵢ) - ȳ) / √(r (N - 1)), so that S = √R (I + Zᵀ Z) √R.
 
@@ -34,7 +34,7 @@ from .linalg import solve_transposed, solve_upper, wrap
 from .localisation import between_rows, crews
 from .model import LARGE, StateSpaceModel
 from .noise import add_noise, noise_root, semidefinite_root
-from .random import SUBSTEP, key_of, normal
+from .random import key_of, normal
 from .simd import WIDE, add_scaled
 from .symmetric import factor, gram
 from .track import FAILED, GATED, HELD_OUT, MISSING, USED
@@ -46,8 +46,8 @@ INFLATION, ADDITIVE, CREWS, OWN = range(4)
 PROCESS, START, PERTURB, SPREAD, ROTATE = range(5)
 """Streams of randomness; see random.py."""
 
-HEAD = 2
-"""Numbers behind the members: the event of the last prediction, and how many predictions it had."""
+HEAD = 1
+"""Numbers behind the members: how many predictions and analyses have drawn."""
 
 THREADED_FROM = 65_536
 """Numbers in an ensemble from which threads gain more than they cost."""
@@ -139,8 +139,7 @@ def start(context, mean, cov, state):
     """Draw the members from N(mean, cov), cov (nx, nx) or, diagonal, (1, nx); their mean is then made exact."""
     X = ensemble(context, state)
     N, n = X.shape
-    state[N * n] = -1.0
-    state[N * n + 1] = 0.0
+    state[N * n] = 0.0
     key = key_of(context.seed, 0, START)
     z = np.empty(n)
     total = np.zeros(n)
@@ -252,20 +251,20 @@ def _forecast_on_threads(context, u, dt, key, X, crews, scratch, each):
 
 
 @jit
+def next_draw(X, state):
+    """Number this prediction or analysis among all of the state's: the place of its draws; see filter.py."""
+    state[X.size] += 1.0
+    return int(state[X.size])
+
+
+@jit
 def predict(context, u, dt, index, state, work):
     """xᵢ ← f(xᵢ, u) + wᵢ, wᵢ ~ N(0, Q), for every member.
 
     Source: Evensen (2003), doi:10.1007/s10236-003-0036-9, section 3.
     """
     X = ensemble(context, state)
-    N, n = X.shape
-    head = state[N * n :]
-    if head[0] == index:
-        head[1] += 1.0
-    else:
-        head[0] = index
-        head[1] = 0.0
-    key = key_of(context.seed, index, PROCESS + SUBSTEP * int(head[1]))
+    key = key_of(context.seed, next_draw(X, state), PROCESS)
     crews = int(numbers(context)[CREWS])
     if crews > 1:
         _forecast_on_threads(context, u, dt, key, X, crews, work, work.size // crews)

@@ -31,6 +31,7 @@ from .ensemble import (
     find_rows,
     judge,
     moments,
+    next_draw,
     observe,
     points,
     predict,
@@ -92,6 +93,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     verdict = judge(context, sensor, m, ZT, Z, d, rows, G, U, v, score)
     if verdict != USED:
         return verdict
+    index = next_draw(X, state)
     given = numbers(context)
     row_by_row(context, sensor, m, ZT, d, rows, B)
     find_rows(m, rows, where)

@@ -32,6 +32,7 @@ from .ensemble import (
     ensemble,
     judge,
     moments,
+    next_draw,
     observe,
     points,
     predict,
@@ -202,6 +203,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     verdict = judge(context, sensor, m, ZT, Z, d, rows, G, U, v, score)
     if verdict != USED:
         return verdict
+    index = next_draw(X, state)
     if not global_analysis(context, index, m, ZT, Z, d, G, V, values, small, v, B, T, W, X, rest):
         return FAILED
     add_spread(context, index, X, rest)

@@ -9,10 +9,10 @@ four functions read the context and change nothing else:
     describe(context, state, mean, std, cross)                       what the track shows of it
 
 `index` numbers the event in the log, so that randomness can be a function of (seed, index, member). An event far from
-the last is predicted in several calls of the same index (`max_step`): a filter that draws keeps the last index and the
-number of its calls in its state, and makes that number part of the random stream (`particle.next_substep`), so no two
-sub-steps draw the same and a refold draws what the fold drew. `work` is scratch that starts as NaN. `score` takes NIS,
-degrees of freedom and log-likelihood.
+the last is predicted in several calls of the same index (`max_step`), and an inserted query moves the indices behind
+it; so a filter that draws counts its own predictions and updates instead, in its state (`next_draw`): sub-steps differ, queries change no draw, and a refold draws what the fold drew.
+
+`work` is scratch that starts as NaN. `score` takes NIS, degrees of freedom and log-likelihood.
 """
 
 from __future__ import annotations

@@ -24,10 +24,10 @@ from .jit import floats, ints, jit, matrix
 from .linalg import wrap
 from .modes import Mode, modes_of
 from .noise import add_noise, semidefinite_root
-from .random import SUBSTEP, key_of, normal
+from .random import key_of, normal
 
-INDEX, SUBSTEPS, SETTLED, EQUAL, ESS, RECOVERIES, RESAMPLED, _SPARE = range(8)
-"""Head of the state: event of the last prediction and how many it had; whether mean and covariance are up to date;
+DRAWS, SETTLED, EQUAL, ESS, RECOVERIES, RESAMPLED, _SPARE, _SPARE_TOO = range(8)
+"""Head of the state: predictions and updates so far; whether mean and covariance are up to date;
 whether all weights are equal; effective sample size; clouds that had to be recovered; clouds resampled."""
 
 HEAD = 8
@@ -324,26 +324,21 @@ def start(context, mean, cov, state):
     circular = circular_states(context)
     for i in range(HEAD):
         state[i] = 0.0
-    state[INDEX] = -1.0
     for j in range(nx):
         state[HEAD + j] = circular[j]
     restart(context, mean, cov, 0, START, state)
 
 
 @jit
-def next_substep(state, index):
-    """Number this prediction among those of its event, and return its stream of process noise.
+def next_draw(state):
+    """Number this prediction or update among all of the state's, and return the number: the place of its draws.
 
-    An event that is far from the last is predicted in several steps (`max_step`), all with the event's index; the head
-    counts them, so that each draws noise of its own.
+    The count is part of the state, so a rewind takes it back, sub-steps of one event (`max_step`) differ, and queries,
+    which work on a copy, change no draw of the estimate.
     """
-    if state[INDEX] == index:
-        state[SUBSTEPS] += 1.0
-    else:
-        state[INDEX] = index
-        state[SUBSTEPS] = 0.0
+    state[DRAWS] += 1.0
     state[SETTLED] = 0.0
-    return PROCESS + SUBSTEP * int(state[SUBSTEPS])
+    return int(state[DRAWS])
 
 
 @jit

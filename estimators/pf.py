@@ -28,11 +28,13 @@ from .particle import (
     JITTER,
     MEMBERS,
     OPTIONS,
+    PROCESS,
     RESAMPLE,
+    SETTLED,
     describe,
     modes,
     moments,
-    next_substep,
+    next_draw,
     points,
     records_of,
     recover,
@@ -64,11 +66,11 @@ def predict(context, u, dt, index, state, work):
     """x_i ← f(x_i) + w_i, w_i ~ N(0, Q). Source: Gordon, Salmond & Smith (1993), section 2."""
     nx = context.nx
     n = int(numbers(context)[MEMBERS])
-    stream = next_substep(state, index)
+    index = next_draw(state)
     sums, L, spare, _, _, _, _ = shared(context, work, n)
     if context.Q_varies == 0:
         noise_root(context, records_of(state, nx, n)[0], u, dt, L, spare)
-    sweep(PROPAGATE, context, u, dt, 0, u, key_of(context.seed, index, stream), 0.0, state, work)
+    sweep(PROPAGATE, context, u, dt, 0, u, key_of(context.seed, index, PROCESS), 0.0, state, work)
     total(context, work, sums)
     if sums[0] > 0.0:
         state[EQUAL] = 0.0
@@ -123,12 +125,15 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     rows = sensor_variances(context, sensor).size
     if finite_rows(y, rows) == 0:
         return MISSING
+    settled = state[SETTLED]
+    index = next_draw(state)
     sweep(WEIGH, context, u, 0.0, sensor, y, np.uint64(0), 0.0, state, work)
     total(context, work, sums)
     S = matrix(S_flat, 0, rows, rows)
     U = matrix(U_flat, 0, rows, rows)
     m = predicted(context, sensor, y, sums, S, nu, innovation, innovation_std)
     verdict = admit(context, sensor, m, nu, S, U, score)
+    state[SETTLED] = settled
     log_sum = normalise(context, u, sensor, y, state, work, sums)
     score[2] = log_sum
     if verdict == USED and log_sum > -np.inf:

@@ -16,7 +16,21 @@ from .context import sensor_variances
 from .filter import Estimator
 from .gaussian import admit
 from .jit import jit, matrix
-from .particle import MEMBERS, OPTIONS, PROPOSE, RESAMPLE, describe, modes, moments, points, recover, sized, start
+from .particle import (
+    MEMBERS,
+    OPTIONS,
+    PROPOSE,
+    RESAMPLE,
+    SETTLED,
+    describe,
+    modes,
+    moments,
+    next_draw,
+    points,
+    recover,
+    sized,
+    start,
+)
 from .particle_steps import impoverished, keep, normalise, resample, shared, sweep, total
 from .pf import finite_rows, predicted
 from .proposals import EXPECT, PROPOSE_EKF, predict, tune, work_size
@@ -36,9 +50,12 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     sums, _, _, S_flat, U_flat, nu, _ = shared(context, work, n)
     rows = sensor_variances(context, sensor).size
     S = matrix(S_flat, 0, rows, rows)
+    settled = state[SETTLED]
+    index = next_draw(state)
     sweep(EXPECT, context, u, 0.0, sensor, y, np.uint64(0), 0.0, state, work)
     total(context, work, sums)
     m = predicted(context, sensor, y, sums, S, nu, innovation, innovation_std)
+    state[SETTLED] = settled
     verdict = admit(context, sensor, m, nu, S, matrix(U_flat, 0, rows, rows), score)
     if verdict == USED:
         key = key_of(context.seed, index, PROPOSE)

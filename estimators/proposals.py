@@ -38,7 +38,7 @@ from .particle import (
     blocks_of,
     log_weights,
     members,
-    next_substep,
+    next_draw,
     records_of,
     recover,
     wrap_record,
@@ -351,7 +351,7 @@ def _block(phase, context, u, dt, sensor, y, key, value, state, work, b):
 def predict(context, u, dt, index, state, work):
     """N(x, P) of every particle one step on: x ← f(x), P ← F P Fᵀ + Q."""
     n = int(numbers(context)[MEMBERS])
-    next_substep(state, index)
+    index = next_draw(state)
     sums, _, _, _, _, _, _ = shared(context, work, n)
     sweep(MOVE, context, u, dt, 0, u, np.uint64(0), 0.0, state, work)
     total(context, work, sums)

@@ -4,8 +4,7 @@ A key is hashed from (seed, index, stream); the numbers of a key are the sequenc
 which any element is had at once: word i is mix(key + (i + 1) γ). One word makes one normal by a ziggurat of 256 layers
 in 98.9 % of cases; the others draw from a second sequence that belongs to that normal alone.
 
-Streams tell apart what one event draws for different purposes; what an event does several times
-(a prediction in sub-steps) adds `SUBSTEP` times its count to the stream.
+Streams tell apart what one prediction or update draws for different purposes.
 
 Sources: Steele, Lea & Flood (2014), Fast splittable pseudorandom number generators, doi:10.1145/2660193.2660195
 (SplitMix64, with the constants of Vigna's reference code); Marsaglia & Tsang (2000), The ziggurat method for
@@ -25,9 +24,6 @@ ONE = np.uint64(1)
 
 GAMMA = np.uint64(0x9E3779B97F4A7C15)
 """The golden ratio in 64 bits, odd: SplitMix64's step."""
-
-SUBSTEP = 16
-"""Streams of one event are below this; a sub-step k of the event uses stream + SUBSTEP·k."""
 
 _M1, _M2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _S30, _S27, _S31, _S9, _S12 = (np.uint64(s) for s in (30, 27, 31, 9, 12))

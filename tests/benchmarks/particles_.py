@@ -1,4 +1,8 @@
-"""What a step of the particle filters costs, beside the package `particles` where it is installed (extra `bench`)."""
+"""What a step of the particle filters costs, beside the package `particles` where it is installed.
+
+No extra can name it: version 0.4 asks for numpy < 2, though it runs with numpy 2. So:
+`pip install joblib scikit-learn && pip install --no-deps particles`.
+"""
 
 from __future__ import annotations
 
@@ -96,7 +100,7 @@ def beside_particles() -> None:
     """Bootstrap with systematic resampling below half of N, 3 states, one sensor; seconds of the clock."""
     print("bootstrap particle filter, 3 states, against the package particles (pairs A B A B, medians, clock)")
     if _theirs(10) is None:
-        print("  particles is not installed (pip install nisus[bench]); ours alone")
+        print("  particles is not installed (see the head of tests/benchmarks/particles_.py); ours alone")
     threads = numba.get_num_threads()
     for n in (10**5, 10**6):
         theirs = _theirs(n)

@@ -175,6 +175,18 @@ def test_noise_that_depends_on_the_state_is_each_particles_own(name):
     assert abs(track.std[1, 0] ** 2 / (0.25 + 0.3 * 4.25) - 1) < 5 * np.sqrt(3 / 1e5)
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_queries_change_no_draw(name):
+    model = scalar()
+    tuning = Tuning.of(model).with_options({"particles": 200})
+    plain = fold(name, model, tuning, log_of((0, READING, 2.1), (1, READING, 2.4), (2, READING, 2.2)))
+    asked = fold(
+        name, model, tuning,
+        log_of((0, READING, 2.1), (0.5, TICK, 0), (0.9, TICK, 0), (1, READING, 2.4), (2, READING, 2.2)),
+    )  # fmt: skip
+    assert np.array_equal(plain.mean, asked.mean[[0, 3, 4]])
+
+
 def test_the_kernel_widens_the_cloud_by_its_bandwidth():
     model = scalar(noises=(Noise("s", "m²/s", 0.0),))
     log = log_of((0, READING, 2.3), (1, TICK, 0))
