@@ -1,4 +1,4 @@
-"""The command line: `nisus run`, `fold`, `review`, `bus`, `twins`, `schema`, `new`."""
+"""The command line: `nisus run`, `fold`, `compare`, `filters`, `review`, `bus`, `twins`, `schema`, `new`."""
 
 from __future__ import annotations
 
@@ -64,6 +64,36 @@ class Fold:
 
 
 @dataclass(frozen=True)
+class Compare:
+    """Fold every filter that applies over the same log, in parallel, and print what each estimate was worth."""
+
+    twin: Twin
+    """Name of a twin that ships, or path of a YAML file."""
+    estimators: tuple[str, ...] = ()
+    """Only these filters."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable, as for `run`."""
+    log: tuple[Path, ...] = ()
+    """Recordings in place of the twin's own."""
+    duration: float | None = None
+    """Take only so many seconds of the source."""
+    jobs: int | None = None
+    """Processes; default: one a processor."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print one JSON list."""
+    write: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Put the table into the head of the twin's YAML."""
+
+
+@dataclass(frozen=True)
+class Filters:
+    """List the estimators: what they assume, their options, what they cost and when they fail."""
+
+    twin: str | None = None
+    """Name or YAML file of a twin: which of them apply to it, what they cost there, and why the others do not."""
+
+
+@dataclass(frozen=True)
 class Review:
     """Open a recording on the page, with the panel that folds its readings again."""
 
@@ -121,6 +151,8 @@ class New:
 Command = (
     Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Fold, tyro.conf.subcommand("fold")]
+    | Annotated[Compare, tyro.conf.subcommand("compare")]
+    | Annotated[Filters, tyro.conf.subcommand("filters")]
     | Annotated[Review, tyro.conf.subcommand("review")]
     | Annotated[Bus, tyro.conf.subcommand("bus")]
     | Annotated[Twins, tyro.conf.subcommand("twins")]
@@ -156,6 +188,14 @@ def carry_out(command: Command) -> int:
         from .fold import fold_twin
 
         return fold_twin(command)
+    if isinstance(command, Compare):
+        from .compare import compare_twin
+
+        return compare_twin(command)
+    if isinstance(command, Filters):
+        from .filters import show_filters
+
+        return show_filters(command)
     if isinstance(command, Review):
         from .review import review_recording
 

@@ -19,6 +19,7 @@ from estimators.diagnostics import HealthPolicy
 from estimators.errors import ConfigError, EstimatorError, NisusError
 from estimators.fold import SPARSE_EVERY, Fold
 from estimators.log import RESET, TICK, Log, Readings
+from estimators.modes import modes_of
 from estimators.registry import find_estimator
 from estimators.track import HEALTH_NAMES
 
@@ -182,7 +183,11 @@ class Engine:
         """The estimate now."""
         with self._lock:
             mean, cov = self._fold.moments()
-            return Belief(self._fold.clock, mean, cov, self._fold.points())
+            points, clock = self._fold.points(), self._fold.clock
+            model, several = self._fold.model, self._fold.estimator.modes is not None
+        # Clustering takes milliseconds, which the engine's thread must not wait for.
+        modes = modes_of(points, np.array([state.circular for state in model.states])) if several else []
+        return Belief(clock, mean, cov, points, tuple(modes) if len(modes) > 1 else ())
 
     def status(self) -> Status:
         """What a panel shows; found anew at most ten times a second."""
@@ -331,7 +336,7 @@ class Engine:
             self._finished = True
             self.notices.say("the source has ended; the estimate stays")
         elif isinstance(item, commands.SetEstimator):
-            self._retune(item.name, self.tuning.with_options({}))
+            self._retune(item.name, self.tuning.with_options(self.twin.options_of(item.name)))
         elif isinstance(item, commands.SetTuning):
             self._retune(self.estimator, self.tuning.set(item.key, item.value))
         elif isinstance(item, commands.SetOption):

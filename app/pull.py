@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from estimators.log import Readings
+from estimators.modes import Mode
 from estimators.track import Track
 from estimators.tuning import Tuning
 
@@ -41,12 +42,13 @@ class Pull:
 
 @dataclass(frozen=True)
 class Belief:
-    """The estimate now: time (ns), mean (nx,), covariance (nx, nx), and points to draw (k, nx)."""
+    """The estimate now: time (ns), mean (nx,), covariance (nx, nx), points to draw (k, nx), its peaks if several."""
 
     t: int
     mean: np.ndarray
     cov: np.ndarray
     points: np.ndarray
+    modes: tuple[Mode, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +16,7 @@ from config.schema import TwinSection
 from config.yaml_lines import parse
 from estimators.errors import ConfigError, EstimatorError
 from estimators.model import StateSpaceModel
-from estimators.registry import find_estimator
+from estimators.registry import find_entry, find_estimator
 from estimators.tuning import Tuning
 
 from .twin_model import check_named, configure, find_model
@@ -67,10 +68,10 @@ class Twin:
         """One line for the top of the page."""
         return self.config.title or self.model.title
 
-    @property
-    def options(self) -> Mapping[str, float]:
-        """The estimator's options that the YAML gives."""
-        return self.config.estimator.options
+    def options_of(self, estimator: str) -> Mapping[str, float]:
+        """The options that the YAML gives for an estimator."""
+        first = self.config.estimator
+        return {**self.config.filters.get(estimator, {}), **(first.options if estimator == first.name else {})}
 
     def open_source(self, report: Report, *, live: bool = True) -> Source:
         """Open the source.
@@ -133,11 +134,13 @@ def _of_yaml(overrides: Mapping[str, str]) -> dict[str, str]:
 def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[str | os.PathLike[str]] | None) -> Twin:
     config = loaded.config
     model = configure(find_model(loaded, ("model",), config.model), loaded)
-    try:
-        find_estimator(config.estimator.name, model).complete(dict(config.estimator.options))
-    except EstimatorError as error:
-        raise ConfigError(f"{loaded.places.at(('estimator',))}: {error}") from None
-    tuning = Tuning.of(model).with_options(config.estimator.options).set("gate", config.gate)
+    for name, given in config.filters.items():
+        with _placed(loaded, ("filters", name)):
+            find_entry(name).complete(dict(given))
+    options = {**config.filters.get(config.estimator.name, {}), **config.estimator.options}
+    with _placed(loaded, ("estimator",)):
+        find_estimator(config.estimator.name, model).complete(options)
+    tuning = Tuning.of(model).with_options(options).set("gate", config.gate)
     for name, section in config.sensors.items():
         if not section.use:
             tuning = tuning.set(f"use.{name}", False)
@@ -153,6 +156,15 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
         overrides=overrides,
         plan=plan_source(loaded, model, [Path(file) for file in log_files] if log_files else None),
     )
+
+
+@contextmanager
+def _placed(loaded: Loaded, key: tuple[str, ...]) -> Iterator[None]:
+    """What is wrong with an estimator is said of its place in the YAML."""
+    try:
+        yield
+    except EstimatorError as error:
+        raise ConfigError(f"{loaded.places.at(key)}: {error}") from None
 
 
 def _set(tuning: Tuning, key: str, text: str) -> Tuning:

@@ -6,6 +6,7 @@ import hashlib
 import importlib.util
 import sys
 import traceback
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -15,7 +16,8 @@ from config.loader import Loaded, shown_path
 from config.problems import nearest
 from config.yaml_lines import Key
 from estimators.errors import ModelError, NisusError
-from estimators.model import StateSpaceModel
+from estimators.joint import Unknown, joint
+from estimators.model import Field, State, StateSpaceModel
 from estimators.models import MODELS
 
 
@@ -99,12 +101,9 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
         ConfigError: With file and line, if the YAML names what the model lacks or a value breaks its rule.
     """
     config = loaded.config
-    check_names(
-        loaded, ("parameters",), config.parameters, [item.name for item in model.parameters], "parameter", model
-    )
-    check_names(loaded, ("prior",), config.prior, model.state_names, "state", model)
-    check_names(loaded, ("noise",), config.noise, [item.name for item in model.noises], "noise", model)
-    check_names(loaded, ("sensors",), config.sensors, model.sensor_names, "sensor", model)
+    names = [item.name for item in model.parameters]
+    check_names(loaded, ("parameters",), config.parameters, names, "parameter", model)
+    check_names(loaded, ("estimate",), config.estimate, names, "parameter", model)
     for item in model.parameters:
         value = config.parameters.get(item.name, item.value)
         if not item.low <= value <= item.high:
@@ -112,21 +111,43 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
                 ("parameters", item.name),
                 f"is {value:g} {item.unit}; it must lie between {item.low:g} and {item.high:g}",
             )
-    states = []
-    for state in model.states:
-        prior = config.prior.get(state.name)
-        mean, std = (prior.mean, prior.std) if prior else (None, None)
-        states.append(replace(state, mean=state.mean if mean is None else mean, std=std or state.std))
+    parameters = tuple(replace(p, value=config.parameters.get(p.name, p.value)) for p in model.parameters)
+    unknowns = {name: Unknown(section.std, section.drift) for name, section in config.estimate.items()}
+    model = joint(replace(model, parameters=parameters), unknowns)
+    field = isinstance(model.states, Field)
+    known = (model.states.name,) if isinstance(model.states, Field) else model.state_names
+    check_names(loaded, ("prior",), config.prior, known, "field" if field else "state", model)
+    check_names(loaded, ("noise",), config.noise, [item.name for item in model.noises], "noise", model)
+    check_names(loaded, ("sensors",), config.sensors, model.sensor_names, "sensor", model)
     return replace(
         model,
-        states=tuple(states),
-        parameters=tuple(replace(p, value=config.parameters.get(p.name, p.value)) for p in model.parameters),
+        states=_states(model, loaded),
         noises=tuple(
             replace(noise, variance=config.noise[noise.name].value) if noise.name in config.noise else noise
             for noise in model.noises
         ),
         sensors=tuple(_sensor(sensor, loaded) for sensor in model.sensors),
     )
+
+
+def _states(model: StateSpaceModel, loaded: Loaded) -> Sequence[State]:
+    """The states with the YAML's prior; that of a field is given for all its cells, under the field's name."""
+    given = loaded.config.prior
+    states = model.states
+    if isinstance(states, Field):
+        prior = given.get(states.name)
+        if prior is None:
+            return states
+        means = states.means if prior.mean is None else ()
+        return replace(
+            states, mean=states.mean if prior.mean is None else prior.mean, means=means, std=prior.std or states.std
+        )
+    found = []
+    for state in states:
+        prior = given.get(state.name)
+        mean, std = (prior.mean, prior.std) if prior else (None, None)
+        found.append(replace(state, mean=state.mean if mean is None else mean, std=std or state.std))
+    return tuple(found)
 
 
 def _sensor(sensor: Any, loaded: Loaded) -> Any:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from sources.profile import Profile
     from sources.source import Channel, Report, Source
 
-TABLES = (".csv", ".parquet", ".pq")
+TABLES = (".csv", ".parquet", ".pq", ".mat")
 """File endings that `--log` gives to the tables of a merged source."""
 
 

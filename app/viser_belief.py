@@ -9,6 +9,7 @@ import viser
 
 from estimators.log import truth_of
 from estimators.model import StateSpaceModel
+from estimators.modes import Mode
 
 from .viser_camera import fit_cameras
 from .viser_geometry import circle, disc, ellipsoid, round_step, segments, tick_text
@@ -18,6 +19,9 @@ TRAIL = 120
 """Rows of the track that are drawn behind the point."""
 
 TICKS = (-2, -1, 0, 1, 2)
+MODES = 6
+"""Peaks of the estimate that are marked at most."""
+
 HALF = 2.5
 """Half an axis, in ticks."""
 
@@ -85,6 +89,13 @@ class BeliefScene:
         self._mean = api.add_point_cloud(
             "/belief/mean", one + [0.0, 0.0, 0.04 if flat else 0.0], (29, 78, 216), point_size=0.04, **dot
         )
+        self._modes = [
+            (
+                api.add_point_cloud(f"/modes/{k}/mean", one, (190, 24, 93), point_size=0.05, visible=False, **dot),
+                api.add_label(f"/modes/{k}/weight", " ", visible=False, font_screen_scale=0.8, anchor="bottom-left"),
+            )
+            for k in range(MODES)
+        ]
         if flat:
             vertices, faces = disc()
             body = api.add_mesh_simple("/belief/ellipse/disc", vertices, faces, color=(96, 146, 246), opacity=0.25,
@@ -150,7 +161,19 @@ class BeliefScene:
         self._cloud(
             self._points, axes, belief.points[:, index] if len(belief.points) else np.zeros((0, n)), lift, centre
         )
+        self._mark(axes, index, belief.modes, lift)
         self._cloud(self._truth, axes, self._true_point(history, index), lift)
+
+    def _mark(self, axes: list[_Axis], index: list[int], modes: tuple[Mode, ...], lift: np.ndarray) -> None:
+        """Put a dot with its weight at each peak, where there are several."""
+        for k, (dot, label) in enumerate(self._modes):
+            place = self._place(axes, modes[k].mean[None, index])[0] if k < len(modes) else np.full(3, np.nan)
+            shown = bool(np.isfinite(place).all() and (np.abs(place) <= 1.3).all())
+            if shown:
+                dot.points = (place + 2 * lift)[None].astype(np.float32)
+                label.position = tuple(place + 2 * lift)
+                label.text = f"{100 * modes[k].weight:.0f} %"
+            dot.visible = label.visible = shown
 
     def _cloud(
         self, handle: Any, axes: list[_Axis], states: np.ndarray, lift: np.ndarray, origin: np.ndarray | float = 0.0

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import viser
 
-from estimators.filter import Estimator
-from estimators.registry import ESTIMATORS
+from estimators.registry import ESTIMATORS, unfit
 
-from .commands import Pause, Record, Reset, Seek, SetEstimator, SetOption, SetTuning, Speed, Step, UseSensor
+from .commands import Pause, Record, Reset, Seek, SetEstimator, SetTuning, Speed, Step, UseSensor
+from .viser_options import OptionRows
 from .viser_rows import ChoiceRow, Held, NumberRow
 from .viser_status import events_html, note_html, status_html
 from .viser_submit import Coalescer
@@ -57,36 +57,21 @@ class Panel:
 
     def _build_estimator(self, gui: viser.GuiApi, status: Any) -> None:
         model = self._engine.model
-        reasons = {name: entry.applies(model) for name, entry in ESTIMATORS.items()}
+        reasons = {name: unfit(entry, model) for name, entry in ESTIMATORS.items()}
         self._titles = {name: entry.title for name, entry in ESTIMATORS.items() if reasons[name] is None}
         names = {title: name for name, title in self._titles.items()}
         dropdown = gui.add_dropdown(
             "Estimator", tuple(names), initial_value=self._titles[status.estimator], hint="Folds the history again"
         )
         self.estimator = ChoiceRow(dropdown, lambda title: self._engine.submit(SetEstimator(names[title])))
-        refused = [f"{ESTIMATORS[name].title}: {reason}" for name, reason in reasons.items() if reason]
+        self.options = OptionRows(gui, self._coalescer, self._engine.submit, self.complain)
+        refused = [
+            f"<b>{ESTIMATORS[name].title}</b>: {html.escape(reason)}" for name, reason in reasons.items() if reason
+        ]
         if refused:
-            text = html.escape("; ".join(refused))
-            gui.add_html(f'<div style="font-size:0.75em;opacity:0.7;padding:0 0.9em 0.5em">Not here: {text}</div>')
-        self._option_folders = {
-            name: self._options(gui, ESTIMATORS[name], status) for name in self._titles if ESTIMATORS[name].options
-        }
-
-    def _options(self, gui: viser.GuiApi, entry: Estimator, status: Any) -> tuple[Any, dict[str, NumberRow]]:
-        mine = entry.name == status.estimator
-        given = status.options if mine else {}
-        folder = gui.add_folder("Options", expand_by_default=False, visible=mine)
-        with folder:
-            rows = {
-                option.name: NumberRow(
-                    gui, self._coalescer, key=f"{entry.name}.{option.name}", label=option.name, unit=option.unit,
-                    value=float(given.get(option.name, option.default)), configured=option.default,
-                    low=option.low, high=option.high, hint=option.meaning, complain=self.complain,
-                    command=partial(SetOption, option.name),
-                )
-                for option in entry.options
-            }  # fmt: skip
-        return folder, rows
+            with gui.add_folder(f"Not here: {len(refused)}", expand_by_default=False):
+                style = "font-size:0.75em;padding:0 0.9em 0.5em"
+                gui.add_html(f'<div style="{style}">{"<br>".join(refused)}</div>')
 
     def _build_tuning(self, gui: viser.GuiApi, status: Any) -> None:
         configured = {item.key: item.value for item in self._configured.items()}
@@ -150,12 +135,7 @@ class Panel:
     def sync(self, status: Any, origin: int | None) -> None:
         """Show what the engine says; whoever changed it, a browser, the API, or the engine itself."""
         self.estimator.sync(self._titles.get(status.estimator, self.estimator.handle.value))
-        for name, (folder, rows) in self._option_folders.items():
-            if folder.visible != (name == status.estimator):
-                folder.visible = name == status.estimator
-            if name == status.estimator:
-                for option, row in rows.items():
-                    row.sync(float(status.options[option]))
+        self.options.sync(ESTIMATORS[status.estimator], status.options)
         for item in status.tuning.items():
             self.rows[item.key].sync(float(item.value))
         self.gate.sync(self._gate_text(status.tuning.gate))

@@ -145,6 +145,12 @@ class NumberRow:
         if self.field is not None:
             self.field.value = number_text(value)
 
+    def remove(self) -> None:
+        """Take the row off the panel."""
+        for handle in (self.slider, self.field):
+            if handle is not None:
+                handle.remove()
+
     def _place(self, value: float) -> float:
         if not self._logarithmic:
             assert self.slider is not None
@@ -174,3 +180,7 @@ class ChoiceRow:
         """Show the engine's value, unless the user's own is still on its way there."""
         if self._held.shows(value) and self.handle.value != value:
             self.handle.value = value
+
+    def remove(self) -> None:
+        """Take the row off the panel."""
+        self.handle.remove()

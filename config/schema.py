@@ -23,6 +23,15 @@ class PriorSection(Section):
     """Standard deviation of that belief, in the state's unit. Default: the model's."""
 
 
+class UnknownSection(Section):
+    """A parameter of the model that is estimated with the state."""
+
+    std: Positive
+    """Standard deviation of what is believed of it at the start, about its value, in its unit."""
+    drift: NotNegative = 0.0
+    """What one second adds to it: standard deviation of a random walk. Default: 0, an unknown constant."""
+
+
 class SensorSection(SpreadSection):
     """The noise of one sensor as the estimator assumes it, and whether the estimate uses it."""
 
@@ -108,8 +117,11 @@ class TwinSection(Section):
     of a function that returns one, in it (./pump.py:Pump)."""
     parameters: dict[str, Number] = {}
     """The model's parameters by name, in their units. Default: the model's values."""
+    estimate: dict[str, UnknownSection] = {}
+    """Parameters that are moved into the state and estimated with it, by name: {std, drift}. They become the last
+    states, which may be named wherever a state may. Default: none."""
     prior: dict[str, PriorSection] = {}
-    """The belief before the first reading, by state. Default: the model's."""
+    """The belief before the first reading, by state, or of a whole field under its name. Default: the model's."""
     noise: dict[str, LevelSection] = {}
     """Process noise Q by name: how much the model is distrusted. Default: the model's."""
     sensors: dict[str, SensorSection] = {}
@@ -118,6 +130,9 @@ class TwinSection(Section):
         EstimatorSection, BeforeValidator(_estimator, json_schema_input_type=str | EstimatorSection)
     ] = EstimatorSection(name="ekf")
     """The filter that runs first: a name, or {name, options}. Default: ekf."""
+    filters: dict[str, dict[str, Number]] = {}
+    """Options of other filters, by name, for when one is chosen on the page or compared, for example
+    {letkf: {radius: 4}}. Default: the catalogue's."""
     gate: Annotated[float, Field(strict=True, gt=0, lt=1)] | None = None
     """Probability with which a good reading passes the gate, for example 0.9973; readings outside are not used.
     Default: null, no gate."""

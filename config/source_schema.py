@@ -286,7 +286,7 @@ class TimeColumnSection(Section):
 
 
 class TableSection(RecordingSection):
-    """A table: CSV or Parquet."""
+    """A table: CSV, Parquet, or vectors of a MATLAB file (.mat up to version 7) by their names there: meas.Voltage."""
 
     type: Literal["table"]
     """table"""

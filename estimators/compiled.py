@@ -23,16 +23,22 @@ from .context import (
     f_signature,
     h_complex_signature,
     h_signature,
+    log_likelihood_signature,
+    shape_signature,
 )
 from .errors import ModelError
 from .jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step_f, complex_step_h, scratch_size
 from .jit import address, jit
-from .model import StateSpaceModel
+from .model import LARGE, Field, StateSpaceModel
 
 
 @dataclass(frozen=True)
 class CompiledModel:
-    """A model whose functions are machine code; `f`, `h[k]` and `Q` can be called from Python too."""
+    """A model whose functions are machine code; `f`, `h[k]` and `Q` can be called from Python too.
+
+    A field too large for a matrix Q, or with a shape, has draw(z, p, q, dt) instead, which turns white z (nx,) into
+    noise of the process.
+    """
 
     model: StateSpaceModel
     f: Callable
@@ -40,6 +46,7 @@ class CompiledModel:
     Q: Callable
     static: dict[str, Any] = field(repr=False)
     keep_alive: tuple[Any, ...] = field(repr=False)
+    draw: Callable | None = None
 
 
 def compile_model(model: StateSpaceModel) -> CompiledModel:
@@ -79,27 +86,45 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
             return 0
 
     _probe(model)
+    _probe_likelihoods(model)
     f = code(model.f, f_signature, "f")
     f_dispatcher = kept[-1]
     F = code(model.F, F_signature, "F")
-    Q = code(model.Q, Q_signature, "Q")
-    Q_dispatcher = kept[-1] if model.Q else None
-    h, H, h_dispatchers = [], [], []
+    diagonal = model.shape is not None or model.nx > LARGE
+    model_Q = _each_cell if isinstance(model.states, Field) and not model.Q and not diagonal else model.Q
+    Q = code(model_Q, Q_signature, "Q")
+    Q_dispatcher = kept[-1] if model_Q else None
+    shape = code(model.shape, shape_signature, "shape")
+    shape_dispatcher = kept[-1] if model.shape else None
+    h, H, h_dispatchers, likelihoods = [], [], [], []
     for sensor in model.sensors:
         h.append(code(sensor.h, h_signature, f"h of sensor {sensor.name}"))
         h_dispatchers.append(kept[-1])
         H.append(code(sensor.H, H_signature, f"H of sensor {sensor.name}"))
-    f_complex = 0 if model.F else complex_code(model.f, f_complex_signature)
-    h_complex = [0 if sensor.H else complex_code(sensor.h, h_complex_signature) for sensor in model.sensors]
+        what = f"log_likelihood of sensor {sensor.name}"
+        likelihoods.append(code(sensor.log_likelihood, log_likelihood_signature, what))
+    derivable = model.nx <= LARGE
+    f_complex = 0 if model.F or not derivable else complex_code(model.f, f_complex_signature)
+    h_complex = [
+        0 if sensor.H or not derivable else complex_code(sensor.h, h_complex_signature) for sensor in model.sensors
+    ]
 
-    noise_state = [model.state_names.index(noise.name) for noise in model.noises] if model.Q is None else []
+    acts_on = [model.acts_on(noise.name) for noise in model.noises] if model.Q is None else []
 
     def q_function(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
         if Q_dispatcher is not None:
             Q_dispatcher(x, u, p, q, dt, out)
             return
-        for k, j in enumerate(noise_state):
-            out[j, j] += q[k] * dt
+        for k, states in enumerate(acts_on):
+            for j in states:
+                out[j, j] += q[k] * dt
+
+    def draw(z, p, q, dt):  # noqa: ANN001, ANN202
+        w = z
+        if shape_dispatcher is not None:
+            w = np.empty_like(z)
+            shape_dispatcher(z, p, w)
+        return sum(np.sqrt(q[k] * dt) * _within(states, w) for k, states in enumerate(acts_on))
 
     compiled = CompiledModel(
         model=model,
@@ -107,30 +132,52 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
         h=tuple(h_dispatchers),
         Q=q_function,
         keep_alive=tuple(kept),
+        draw=draw if diagonal else None,
         static={
             "f": f,
             "f_complex": f_complex,
             "F": F,
             "F_mode": ANALYTIC if F else COMPLEX_STEP if f_complex else CENTRAL,
             "Q": Q,
+            "shape": shape,
+            "each_state": int(model.Q is None),
+            "Q_varies": int(_varies(model)),
             "h": np.array(h, np.int64),
             "h_complex": np.array(h_complex, np.int64),
             "H": np.array(H, np.int64),
             "H_mode": np.array(
                 [ANALYTIC if a else COMPLEX_STEP if c else CENTRAL for a, c in zip(H, h_complex, strict=True)], np.int64
             ),
+            "log_likelihood": np.array(likelihoods, np.int64),
             "row_start": np.array(model.row_start, np.int64),
             "row_count": np.array([len(sensor.rows) for sensor in model.sensors], np.int64),
-            "circular_x": np.array([state.circular for state in model.states], np.int8),
+            "circular_x": model.circular,
             "circular_y": np.array([row.circular for sensor in model.sensors for row in sensor.rows], np.int8),
             "max_step": float(model.max_step),
-            "noise_state": np.array(noise_state, np.int64),
-            "prior_mean": np.array([state.mean for state in model.states], float),
-            "prior_cov": np.diag([state.std**2 for state in model.states]).astype(float),
+            "noise_state": np.array([states.start for states in acts_on], np.int64),
+            "noise_states": np.array([len(states) for states in acts_on], np.int64),
+            "prior_mean": model.prior_mean,
+            "prior_cov": model.prior_std[None] ** 2 if diagonal else np.diag(model.prior_std**2),
+            "prior_rows": 1 if diagonal else model.nx,
+            "shown": model.shown,
         },
     )
-    _check_derivatives(compiled)
+    if derivable:
+        _check_derivatives(compiled)
     return compiled
+
+
+def _within(states: range, w: np.ndarray) -> np.ndarray:
+    """The entries of w (nx,) that a range of states has, and zero elsewhere."""
+    out = np.zeros_like(w)
+    out[states.start : states.stop] = w[states.start : states.stop]
+    return out
+
+
+def _each_cell(x, u, p, q, dt, out):
+    """Q of a field whose noise has its name: the same for every cell."""
+    for j in range(x.size):
+        out[j, j] = q[0] * dt
 
 
 def _gist(error: Exception) -> str:
@@ -143,7 +190,7 @@ def _gist(error: Exception) -> str:
 
 def _probe(model: StateSpaceModel) -> None:
     """Run the plain functions once with arrays of the declared sizes, where an index that is too large is an error."""
-    x = np.array([state.mean for state in model.states], float)
+    x = model.prior_mean.copy()
     u = np.array([item.default for item in model.inputs], float)
     p = np.array([item.value for item in model.parameters], float)
     q = np.array([noise.variance for noise in model.noises], float)
@@ -153,6 +200,7 @@ def _probe(model: StateSpaceModel) -> None:
         ("f", model.f, (x, u, p, dt), (n,)),
         ("F", model.F, (x, u, p, dt), (n, n)),
         ("Q", model.Q, (x, u, p, q, dt), (n, n)),
+        ("shape", model.shape, (np.random.default_rng(0).standard_normal(n), p), (n,)),
     ]
     for sensor in model.sensors:
         m = len(sensor.rows)
@@ -186,13 +234,58 @@ def _probe(model: StateSpaceModel) -> None:
             raise ModelError(f"model {model.name}: Q is not symmetric at the prior; fill both triangles")
 
 
+def _probe_likelihoods(model: StateSpaceModel) -> None:
+    """Run each sensor's own log_likelihood once, at the reading that the prior predicts."""
+    x = np.array([state.mean for state in model.states], float)
+    u = np.array([item.default for item in model.inputs], float)
+    p = np.array([item.value for item in model.parameters], float)
+    for sensor in model.sensors:
+        if sensor.log_likelihood is None:
+            continue
+        y = np.empty(len(sensor.rows))
+        r = np.array([row.variance for row in sensor.rows], float)
+        _python(sensor.h)(x, u, p, y)
+        try:
+            value = float(_python(sensor.log_likelihood)(y, x, u, p, r))
+        except Exception as error:  # noqa: BLE001  the user's own function may raise anything
+            raise ModelError(
+                f"model {model.name}: log_likelihood of sensor {sensor.name} fails at the prior: "
+                f"{type(error).__name__}: {error}; it takes (y, x, u, p, r) and returns a float"
+            ) from None
+        if np.isnan(value) or value == np.inf:
+            raise ModelError(
+                f"model {model.name}: log_likelihood of sensor {sensor.name} is {value} at the prior; it must be a "
+                "finite number, or -inf where the reading is impossible"
+            )
+
+
+def _varies(model: StateSpaceModel) -> bool:
+    """Whether Q depends on the state, judged by its values at the prior and at 32 states spread around it."""
+    if model.Q is None:
+        return False
+    rng = np.random.default_rng(0)
+    u = np.array([item.default for item in model.inputs], float)
+    p = np.array([item.value for item in model.parameters], float)
+    q = np.array([max(noise.variance, 1e-12) for noise in model.noises], float)
+    mean = np.array([state.mean for state in model.states], float)
+    std = np.array([state.std for state in model.states], float)
+    found = []
+    with np.errstate(all="ignore"):
+        for spread in [0.0] + [1.0, 5.0] * 16:
+            out = np.zeros((model.nx, model.nx))
+            x = mean + spread * std * rng.standard_normal(model.nx)
+            _python(model.Q)(x, u, p, q, min(1.0, model.max_step), out)
+            found.append(out)
+    return any(not np.array_equal(found[0], other, equal_nan=True) for other in found[1:])
+
+
 def _check_derivatives(compiled: CompiledModel) -> None:
     """Compare every analytic or complex-step Jacobian with central differences; demote or refuse what disagrees."""
     model, static = compiled.model, compiled.static
     rng = np.random.default_rng(0)
     u = np.array([item.default for item in model.inputs], float)
     p = np.array([item.value for item in model.parameters], float)
-    std = np.array([state.std for state in model.states])
+    std = model.prior_std
     dt = min(0.1, model.max_step)
     scratch = np.empty(scratch_size(model.nx, model.width))
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from numba import types
 
-from .jit import C1, F1, F2, caller, f64, flags, floats, i64, ints, jit
+from .jit import C1, F1, F2, caller, f64, flags, floats, i64, ints, jit, matrix
 
 f_signature = types.void(F1, F1, F1, f64, F1)
 f_complex_signature = types.void(C1, F1, F1, f64, C1)
@@ -15,6 +15,8 @@ h_signature = types.void(F1, F1, F1, F1)
 h_complex_signature = types.void(C1, F1, F1, C1)
 H_signature = types.void(F1, F1, F1, F2)
 Q_signature = types.void(F1, F1, F1, F1, f64, F2)
+shape_signature = types.void(F1, F1, F1)
+log_likelihood_signature = f64(F1, F1, F1, F1, F1)
 
 call_f = caller(f_signature)
 call_f_complex = caller(f_complex_signature)
@@ -23,6 +25,8 @@ call_h = caller(h_signature)
 call_h_complex = caller(h_complex_signature)
 call_H = caller(H_signature)
 call_Q = caller(Q_signature)
+call_shape = caller(shape_signature)
+call_log_likelihood = caller(log_likelihood_signature)
 
 
 class Context(NamedTuple):
@@ -41,10 +45,14 @@ class Context(NamedTuple):
     F: Any
     F_mode: Any
     Q: Any
+    Q_varies: Any
+    each_state: Any
+    shape: Any
     h: Any
     h_complex: Any
     H: Any
     H_mode: Any
+    log_likelihood: Any
     n_sensors: Any
     row_start: Any
     row_count: Any
@@ -52,9 +60,11 @@ class Context(NamedTuple):
     circular_x: Any
     circular_y: Any
     noise_state: Any
+    noise_states: Any
     max_step: Any
     prior_mean: Any
     prior_cov: Any
+    prior_rows: Any
     p: Any
     q: Any
     r: Any
@@ -65,6 +75,10 @@ class Context(NamedTuple):
     n_options: Any
     pairs: Any
     n_pairs: Any
+    shown: Any
+    n_shown: Any
+    prepared: Any
+    n_prepared: Any
     seed: Any
 
 
@@ -133,10 +147,11 @@ def add_process_noise(context, x, u, dt, P, scratch):
     n = context.nx
     q = process_variances(context)
     if context.Q == 0:
-        state = ints(context.noise_state, context.n_noises)
+        first = ints(context.noise_state, context.n_noises)
+        count = ints(context.noise_states, context.n_noises)
         for k in range(q.size):
-            j = state[k]
-            P[j, j] += q[k] * dt
+            for j in range(first[k], first[k] + count[k]):
+                P[j, j] += q[k] * dt
         return
     for i in range(n):
         for j in range(n):
@@ -145,3 +160,36 @@ def add_process_noise(context, x, u, dt, P, scratch):
     for i in range(n):
         for j in range(n):
             P[i, j] += scratch[i, j]
+
+
+@jit
+def prior(context):
+    """Mean (nx,) and covariance of the prior, (nx, nx), or (1, nx) where it is diagonal."""
+    n = context.nx
+    rows = context.prior_rows
+    return floats(context.prior_mean, n), matrix(floats(context.prior_cov, rows * n), 0, rows, n)
+
+
+@jit
+def shown_states(context):
+    """The index of the state in each of the track's columns."""
+    return ints(context.shown, context.n_shown)
+
+
+@jit
+def shaped(context, z, out):
+    """out = L z: white noise z (nx,) correlated in space as the model says."""
+    call_shape(context.shape, z, parameters(context), out)
+
+
+@jit
+def has_own_likelihood(context, sensor):
+    """Whether the sensor's noise is given by a function of its own instead of r."""
+    return ints(context.log_likelihood, context.n_sensors)[sensor] != 0
+
+
+@jit
+def own_likelihood(context, sensor, y, x, u):
+    """log p(y | x) of a sensor that gives it."""
+    target = ints(context.log_likelihood, context.n_sensors)[sensor]
+    return call_log_likelihood(target, y, x, u, parameters(context), sensor_variances(context, sensor))

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from .context import add_process_noise, expect, sensor_rows, transition
+import numpy as np
+
+from . import gaussian
+from .context import expect, options, sensor_rows, transition
 from .filter import Estimator, Options
 from .gaussian import (
+    admit,
     compare,
     describe,
+    downdate,
     gain,
     joseph,
-    judge,
     moments,
     move_mean,
     no_points,
@@ -18,15 +22,37 @@ from .gaussian import (
     wrap_mean,
 )
 from .jacobians import scratch_size, sensor_jacobian, state_jacobian
-from .jit import jit, matrix
+from .jit import inlined, jit, matrix
 from .linalg import congruence
-from .track import USED
+from .model import StateSpaceModel
+from .robust import (
+    ADAPT,
+    JOSEPH,
+    JOSEPH_OPTION,
+    NONE,
+    OFF,
+    OPTIONS,
+    ROBUST,
+    adapt,
+    add_noise,
+    memory,
+    reading_variances,
+    reweigh,
+    shared,
+)
+from .track import FAILED, USED
+from .tuning import Tuning
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch: x', F and twice the square for the congruence; or ŷ, S, its factor, C, K, H, a square; a Jacobian's."""
-    filters = max(nx + 3 * nx * nx, ny + 2 * ny * ny + 3 * nx * ny + nx * nx)
+    """Scratch: x', F and twice the square for the congruence; or an update's, with K, H, a square; a Jacobian's."""
+    filters = max(nx + 3 * nx * nx, gaussian.scratch_size(nx, ny) + 2 * nx * ny + nx * nx)
     return filters + scratch_size(nx, ny)
+
+
+def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
+    """The shared options alone."""
+    return np.array(shared(values))
 
 
 @jit
@@ -45,9 +71,43 @@ def predict(context, u, dt, index, state, work):
     transition(context, x, u, dt, forward)
     congruence(F, P, scratch)
     # Noise that depends on the state does so where the step began.
-    add_process_noise(context, x, u, dt, P, scratch[:n])
+    add_noise(context, x, u, dt, state, P, scratch[:n])
     for i in range(n):
         x[i] = forward[i]
+    wrap_mean(context, x)
+
+
+@inlined
+def linearise(context, sensor, x, u, P, expected, C, S, H, scratch):
+    """Fill h(x) (ny,), H = dh/dx (ny, nx), C = P Hᵀ and S = H P Hᵀ."""
+    n = x.size
+    m = expected.size
+    sensor_jacobian(context, sensor, x, u, H, scratch)
+    expect(context, sensor, x, u, expected)
+    for i in range(n):
+        for k in range(m):
+            s = 0.0
+            for j in range(n):
+                s += P[i, j] * H[k, j]
+            C[i, k] = s
+    for k in range(m):
+        for i in range(m):
+            s = 0.0
+            for j in range(n):
+                s += H[k, j] * C[j, i]
+            S[k, i] = s
+
+
+@inlined
+def correct(context, y, r, m, nu, U, C, K, H, N, x, P):
+    """x ← x + K ν;  P by the Joseph form, or as P - K S Kᵀ; from the whitened nu, S = Uᵀ U and C = P Hᵀ."""
+    if options(context)[JOSEPH] != 0.0:
+        gain(m, C, U, K)
+        move_mean(m, C, U, nu, x)
+        joseph(y, r, m, C, H, K, P, N)
+    else:
+        move_mean(m, C, U, nu, x)
+        downdate(m, C, U, P)
     wrap_mean(context, x)
 
 
@@ -62,41 +122,20 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     _, m = sensor_rows(context, sensor)
     x = state[:n]
     P = matrix(state, n, n, n)
-    at = 0
-    nu = work[at : at + m]
-    at += m
-    S = matrix(work, at, m, m)
-    at += m * m
-    U = matrix(work, at, m, m)
-    at += m * m
-    C = matrix(work, at, n, m)
-    at += n * m
+    nu, r, S, U, C, room, at = gaussian.scratch(work, n, m)
     K = matrix(work, at, n, m)
-    at += n * m
-    H = matrix(work, at, m, n)
-    at += n * m
-    N = matrix(work, at, n, n)
-    sensor_jacobian(context, sensor, x, u, H, work[at + n * n :])
-    expect(context, sensor, x, u, nu)
-    for i in range(n):
-        for k in range(m):
-            s = 0.0
-            for j in range(n):
-                s += P[i, j] * H[k, j]
-            C[i, k] = s
-    for k in range(m):
-        for i in range(m):
-            s = 0.0
-            for j in range(n):
-                s += H[k, j] * C[j, i]
-            S[k, i] = s
-    m = compare(context, sensor, y, nu, C, S, H, innovation, innovation_std)
-    verdict = judge(context, sensor, m, nu, S, U, score)
+    H = matrix(work, at + n * m, m, n)
+    N = matrix(work, at + 2 * n * m, n, n)
+    linearise(context, sensor, x, u, P, nu, C, S, H, work[at + 2 * n * m + n * n :])
+    reading_variances(context, sensor, state, r)
+    m = compare(context, sensor, y, r, nu, C, S, H, P, innovation, innovation_std)
+    verdict = admit(context, sensor, m, nu, S, U, score)
+    if verdict == USED and options(context)[ROBUST] != NONE:
+        verdict = USED if reweigh(context, y, r, innovation, m, nu, S, U, room) else FAILED
     if verdict == USED:
-        gain(m, C, U, K)
-        move_mean(m, C, U, nu, x)
-        wrap_mean(context, x)
-        joseph(context, sensor, y, m, C, H, K, P, N)
+        correct(context, y, r, m, nu, U, C, K, H, N, x, P)
+        if options(context)[ADAPT] != OFF:
+            adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict
 
 
@@ -109,8 +148,12 @@ EKF = Estimator(
     fails_when="curvature makes it overconfident: it stops listening to the sensors",
     source="Jazwinski (1970), Stochastic Processes and Filtering Theory, theorem 8.1",
     functions=(start, predict, update, describe),
+    runs=lambda options, nx: nx + 1,
     state_size=state_size,
     work_size=work_size,
     moments=moments,
     points=no_points,
+    options=(JOSEPH_OPTION, *OPTIONS),
+    tune=tune,
+    memory=memory,
 )

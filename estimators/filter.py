@@ -8,8 +8,11 @@ four functions read the context and change nothing else:
     update(context, u, sensor, y, index, state, work, innovation, innovation_std, score) -> verdict
     describe(context, state, mean, std, cross)                       what the track shows of it
 
-`index` numbers the event in the log, so that randomness can be a function of (seed, index, member). `work` is scratch
-that starts as NaN. `score` takes NIS, degrees of freedom and log-likelihood.
+`index` numbers the event in the log, so that randomness can be a function of (seed, index, member). An event far from
+the last is predicted in several calls of the same index (`max_step`), and an inserted query moves the indices behind
+it; so a filter that draws counts its own predictions and updates instead, in its state (`next_draw`): sub-steps differ, queries change no draw, and a refold draws what the fold drew.
+
+`work` is scratch that starts as NaN. `score` takes NIS, degrees of freedom and log-likelihood.
 """
 
 from __future__ import annotations
@@ -26,6 +29,8 @@ from .context import context_type
 from .errors import EstimatorError
 from .jit import F1, F2, address, caller, f64, i64
 from .model import StateSpaceModel
+from .modes import Mode
+from .tuning import Tuning
 
 start_signature = types.void(context_type, F1, F2, F1)
 predict_signature = types.void(context_type, F1, f64, i64, F1, F1)
@@ -43,7 +48,10 @@ Options = dict[str, float]
 
 
 class Option(NamedTuple):
-    """One option of an estimator: where its value starts, and the range and unit that a panel offers."""
+    """One option of an estimator: where its value starts, and the range and unit that a panel offers.
+
+    An option with `choices` has the position of one of them as its value.
+    """
 
     name: str
     default: float
@@ -51,6 +59,12 @@ class Option(NamedTuple):
     high: float
     unit: str
     meaning: str
+    choices: tuple[str, ...] = ()
+
+    @staticmethod
+    def choice(name: str, choices: tuple[str, ...], meaning: str, default: int = 0) -> Option:
+        """An option that is one of several words."""
+        return Option(name, float(default), 0.0, len(choices) - 1.0, "", meaning, choices)
 
 
 class Code(NamedTuple):
@@ -72,7 +86,11 @@ class Estimator:
     `applies(model)` gives the reason why the estimator does not fit a model, or None. `options` below are complete
     (see `complete`). `state_size(options, nx)` and `work_size(options, nx, ny)` count float64s; `moments(options,
     state, nx)` gives mean and covariance, `points(options, state, nx)` what to draw beside the mean (sigma points,
-    particles) as (k, nx). `tune(options, nx)` turns the options into the numbers that the compiled functions read.
+    particles) as (k, nx), `modes(options, state, nx)` the peaks where there can be several. `tune(options, model,
+    tuning)` turns the options into the numbers that the compiled functions read; it may raise EstimatorError.
+    `memory(options, model)` counts numbers that the state holds beyond `state_size`. `runs(options, nx)` is
+    `model_runs` as a number: how often a step runs f. `prepare(model, options)` computes what depends on the model
+    too, once for a fold, as int64s.
     """
 
     name: str
@@ -88,8 +106,12 @@ class Estimator:
     moments: Callable[[Options, np.ndarray, int], tuple[np.ndarray, np.ndarray]]
     points: Callable[[Options, np.ndarray, int], np.ndarray]
     options: tuple[Option, ...] = ()
-    tune: Callable[[Options, int], np.ndarray] = lambda options, nx: np.zeros(1)
+    tune: Callable[[Options, StateSpaceModel, Tuning], np.ndarray] = lambda options, model, tuning: np.zeros(1)
+    memory: Callable[[Options, StateSpaceModel], int] = lambda options, model: 0
+    prepare: Callable[[StateSpaceModel, Options], np.ndarray] = lambda model, options: np.zeros(1, np.int64)
     applies: Callable[[StateSpaceModel], str | None] = lambda model: None
+    runs: Callable[[Options, int], float] = lambda options, nx: 1.0
+    modes: Callable[[Options, np.ndarray, int], list[Mode]] | None = None
 
     def complete(self, options: dict[str, float]) -> dict[str, float]:
         """The given options and the defaults of the others.
@@ -110,6 +132,9 @@ class Estimator:
                     f"estimator {self.name}: {name} is {value:g}; it must lie between {option.low:g} and "
                     f"{option.high:g}"
                 )
+            if option.choices and value != int(value):
+                codes = ", ".join(f"{code} ({choice})" for code, choice in enumerate(option.choices))
+                raise EstimatorError(f"estimator {self.name}: {name} is {value:g}; it must be one of {codes}")
         return {option.name: float(options.get(option.name, option.default)) for option in self.options}
 
     def code(self) -> Code:

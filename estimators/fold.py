@@ -14,13 +14,14 @@ import numpy as np
 from numba import types
 
 from .compiled import compile_model
-from .context import Context, context_type
+from .context import Context, context_type, prior
 from .diagnostics import Bounds, HealthPolicy, assess, assess_signature, chi_square_bounds
 from .errors import EstimatorError
 from .filter import Code, Estimator, call_describe, call_predict, call_start, call_update, code_type
-from .jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, jit, jit_brief, matrix
+from .jit import B1, F1, F2, I1, borrowed, borrowed_rows, i64, jit, jit_brief
 from .log import INPUT, READING, RESET, TICK, TRUTH, Log
 from .model import StateSpaceModel
+from .modes import Mode
 from .quantiles import chi_square_quantile
 from .registry import find_estimator
 from .track import MISSING, NONE, Track, track_type
@@ -40,8 +41,11 @@ SPARSE_EVERY = 1024
 
 RECENT = 4096
 
-BRIEF = 64
-"""Events that are folded without letting other threads run meanwhile."""
+BRIEF = 2048
+"""Events, times the numbers of a state, that are folded without letting other threads run meanwhile."""
+
+SNAPSHOT_MEMORY = 256 * 2**20
+"""Bytes that the snapshots of a fold may take, half for the recent ones; large states are kept at wider steps."""
 
 
 @jit
@@ -54,8 +58,8 @@ def _advance_to(code, context, u, clock, t, index, state, work):
         return
     dt = (t - clock) * 1e-9
     if dt > LONGEST * context.max_step:
-        prior_cov = matrix(floats(context.prior_cov, context.nx * context.nx), 0, context.nx, context.nx)
-        call_start(code.start, context, floats(context.prior_mean, context.nx), prior_cov, state)
+        prior_mean, prior_cov = prior(context)
+        call_start(code.start, context, prior_mean, prior_cov, state)
         return
     steps = 1 if dt <= context.max_step else int(np.ceil(dt / context.max_step))
     for _ in range(steps):
@@ -69,7 +73,6 @@ def run(code, context, first, start, end, t, kind, channel, value, clock, u, sta
     A tick or a truth is a query: it is answered from a copy of the state, so it never changes the estimate.
     """
     nu = u.size
-    nx = context.nx
     u = borrowed(u)
     state = borrowed(state)
     spare = borrowed(spare)
@@ -114,8 +117,8 @@ def run(code, context, first, start, end, t, kind, channel, value, clock, u, sta
                 )
             call_describe(code.describe, context, state, mean[i], std[i], cross[i])
         elif what == RESET:
-            prior_cov = matrix(floats(context.prior_cov, nx * nx), 0, nx, nx)
-            call_start(code.start, context, floats(context.prior_mean, nx), prior_cov, state)
+            prior_mean, prior_cov = prior(context)
+            call_start(code.start, context, prior_mean, prior_cov, state)
             clock[0] = t[i]
             call_describe(code.describe, context, state, mean[i], std[i], cross[i])
         else:
@@ -195,7 +198,8 @@ class Fold:
         most = model.width * max(1, self.policy.window)
         self._bounds: Bounds = chi_square_bounds(most)
         self._context = self._see()
-        self._state = np.empty(self.estimator.state_size(self.options, model.nx))
+        numbers = self.estimator.state_size(self.options, model.nx) + self.estimator.memory(self.options, model)
+        self._state = np.empty(numbers)
         self._spare = np.empty_like(self._state)
         self._work = np.full(self.estimator.work_size(self.options, model.nx, model.width) + 1, np.nan)
         self._score = np.empty(3)
@@ -207,9 +211,15 @@ class Fold:
         self._run, self._assess, self._run_brief, self._assess_brief, begin = _compiled()
         begin(self._code, self._context, np.ascontiguousarray(mean), np.ascontiguousarray(cov), self._state)
         self.n = 0
+        # At least one old snapshot (the start) and one recent, however large the state is.
+        self._most = max(1, SNAPSHOT_MEMORY // 2 // self._state.nbytes)
+        self._every = SNAPSHOT_EVERY
+        while RECENT // self._every > self._most:
+            self._every *= 2
+        self._sparse = max(SPARSE_EVERY, self._every)
         self._snapshots: dict[int, tuple[int, np.ndarray, np.ndarray]] = {}
         self._remember()
-        self._rows = Track.allocate(log.capacity, model.nx, len(self.pairs), model.ny)
+        self._rows = Track.allocate(log.capacity, len(model.shown), len(self.pairs), model.ny)
 
     def _see(self) -> Context:
         """The context of this model and tuning; the arrays that it points to are kept in `self._held`."""
@@ -223,8 +233,9 @@ class Fold:
             "r": np.ascontiguousarray(tuning.r, float),
             "used": tuning.used.astype(np.int8),
             "gate": gate,
-            "options": np.ascontiguousarray(self.estimator.tune(self.options, model.nx), float),
+            "options": np.ascontiguousarray(self.estimator.tune(self.options, model, tuning), float),
             "pairs": self.pairs,
+            "prepared": self.estimator.prepare(model, self.options),
         }
         values = {**self._compiled.static, **held}
         self._held = values
@@ -237,6 +248,8 @@ class Fold:
             "n_rows": held["r"].size,
             "n_options": held["options"].size,
             "n_pairs": len(self.pairs),
+            "n_shown": len(model.shown),
+            "n_prepared": held["prepared"].size,
             "width": model.width,
             "seed": tuning.seed,
         }
@@ -259,28 +272,34 @@ class Fold:
         return self._u.copy()
 
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (nx,) and covariance (nx, nx) at `clock`."""
+        """Mean (nx,) and covariance (nx, nx) at `clock`; beyond `LARGE` states the variances (1, nx) instead."""
         return self.estimator.moments(self.options, self._state, self.model.nx)
 
     def points(self) -> np.ndarray:
         """What to draw beside the mean, (k, nx): sigma points, particles; none for most filters."""
         return self.estimator.points(self.options, self._state, self.model.nx)
 
+    def modes(self) -> list[Mode]:
+        """The peaks of the estimate, the heaviest first; a Gaussian filter has one."""
+        if self.estimator.modes is not None:
+            return self.estimator.modes(self.options, self._state, self.model.nx)
+        return [Mode(1.0, *self.moments())]
+
     def advance(self, limit: int | None = None) -> int:
         """Fold the events that the log has beyond `n`, at most `limit`; return how many."""
         end = self.log.n if limit is None else min(self.log.n, self.n + limit)
         begun = self.n
         if self.log.capacity > len(self._rows):
-            grown = Track.allocate(self.log.capacity, self.model.nx, len(self.pairs), self.model.ny)
+            grown = Track.allocate(self.log.capacity, len(self.model.shown), len(self.pairs), self.model.ny)
             for new, old in zip(grown, self._rows, strict=True):
                 new[: self.n] = old[: self.n]
             self._rows = grown
         log = self.log
-        brief = end - self.n <= BRIEF
+        brief = (end - self.n) * self._state.size <= BRIEF
         run_some = self._run_brief if brief else self._run
         while self.n < end:
             # Far behind the end, only the snapshots that are kept for ever are worth stopping for.
-            stride = SPARSE_EVERY if end - self.n > RECENT else SNAPSHOT_EVERY
+            stride = self._sparse if end - self.n > RECENT else self._every
             boundary = self.n + stride - (log.first + self.n) % stride
             stop = min(end, boundary)
             run_some(
@@ -313,8 +332,14 @@ class Fold:
         at = self.log.first + self.n
         self._snapshots[at] = (int(self._clock[0]), self._u.copy(), self._state.copy())
         old = at - RECENT
-        if old % SPARSE_EVERY and old in self._snapshots and old != self.log.first:
+        if old % self._sparse and old in self._snapshots and old != self.log.first:
             del self._snapshots[old]
+        for_ever = [key for key in self._snapshots if key <= old]
+        if len(for_ever) > self._most + 1:
+            self._sparse *= 2
+            for key in for_ever:
+                if key % self._sparse and key != self.log.first:
+                    del self._snapshots[key]
 
     def rewind(self, index: int) -> None:
         """Go back so that the event at `index` (and all behind it) will be folded again."""

@@ -2,16 +2,20 @@
 
 The state is x (nx,) followed by P (nx, nx). The filters differ only in how mean and covariance pass through f and h;
 gate, verdict, NIS and likelihood are here.
+
+Behind P stands what an adaptation remembers (robust.py), if it is on.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from .context import circular_rows, circular_states, sensor_variances
+from . import robust
+from .context import circular_rows, circular_states, shown_states
 from .filter import Options
-from .jit import flags, floats, ints, jit
-from .linalg import cholesky, mirror, solve_transposed, solve_upper, wrap
+from .jit import flags, floats, inlined, ints, jit, matrix
+from .linalg import EPSILON, cholesky, mirror, solve_transposed, solve_upper, wrap
+from .robust import forget
 from .track import FAILED, GATED, HELD_OUT, MISSING, USED
 
 LOG_2PI = float(np.log(2.0 * np.pi))
@@ -20,6 +24,11 @@ LOG_2PI = float(np.log(2.0 * np.pi))
 def state_size(options: Options, nx: int) -> int:
     """Numbers in the state."""
     return nx + nx * nx
+
+
+def scratch_size(nx: int, ny: int) -> int:
+    """Numbers in the views of `scratch`."""
+    return 2 * ny + 2 * ny * ny + nx * ny + robust.scratch_size(ny)
 
 
 def moments(options: Options, state: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray]:
@@ -40,22 +49,25 @@ def start(context, mean, cov, state):
         state[i] = mean[i]
         for j in range(n):
             state[n + i * n + j] = cov[i, j]
+    forget(context, state)
 
 
 @jit
 def describe(context, state, mean, std, cross):
     """Mean, standard deviation and the configured covariances."""
-    n = mean.size
-    for i in range(n):
-        mean[i] = state[i]
+    n = context.nx
+    shown = shown_states(context)
+    for k in range(mean.size):
+        i = shown[k]
+        mean[k] = state[i]
         variance = state[n + i * n + i]
-        std[i] = np.sqrt(variance) if variance >= 0.0 else np.nan
+        std[k] = np.sqrt(variance) if variance >= 0.0 else np.nan
     pairs = ints(context.pairs, 2 * context.n_pairs)
     for k in range(cross.size):
         cross[k] = state[n + pairs[2 * k] * n + pairs[2 * k + 1]]
 
 
-@jit
+@inlined
 def wrap_mean(context, x):
     """Bring the circular states back to ±π."""
     circular = circular_states(context)
@@ -64,19 +76,33 @@ def wrap_mean(context, x):
             x[i] = wrap(x[i])
 
 
-@jit
-def compare(context, sensor, y, predicted, C, S, H, innovation, innovation_std):
+@inlined
+def scratch(work, n, m):
+    """What an update works in: ŷ or ν, r (m,), S and its factor (m, m), C (n, m), room for `reweigh`; where it ends.
+
+    C is the covariance of state and predicted reading.
+    """
+    start = work.ctypes.data
+    at = 2 * m + 2 * m * m + n * m
+    S = matrix(work, 2 * m, m, m)
+    U = matrix(work, 2 * m + m * m, m, m)
+    C = matrix(work, 2 * m + 2 * m * m, n, m)
+    room = m * m + 4 * m
+    return floats(start, m), floats(start + 8 * m, m), S, U, C, floats(start + 8 * at, room), at + room
+
+
+@inlined
+def compare(context, sensor, y, r, predicted, C, S, H, P, innovation, innovation_std):
     """The innovation and its covariance, over the rows of the reading that are finite.
 
     On entry S (ny, ny) holds the spread of the predicted reading, C (nx, ny) its covariance with the state and H
     (ny, nx) the Jacobian (or nothing). On return the leading rows and columns of all three, and of `predicted`, which
     then holds the innovation, belong to the finite rows, and S includes R. `innovation` and `innovation_std` keep the
-    reading's own rows.
+    reading's own rows. An S that is nothing but the rounding of H P Hᵀ becomes NaN, so that the reading fails.
 
     Returns:
         The number of finite rows.
     """
-    r = sensor_variances(context, sensor)
     circular = circular_rows(context, sensor)
     m = 0
     for i in range(r.size):
@@ -86,6 +112,11 @@ def compare(context, sensor, y, predicted, C, S, H, innovation, innovation_std):
         if circular[i] != 0:
             residual = wrap(residual)
         variance = S[i, i] + r[i]
+        terms = 0.0
+        for j in range(H.shape[1]):
+            terms += H[i, j] * H[i, j] * P[j, j]
+        if not variance > 4.0 * (H.shape[1] + r.size) * EPSILON * terms:
+            variance = np.nan
         innovation[i] = residual
         innovation_std[i] = np.sqrt(variance) if variance >= 0.0 else np.nan
         predicted[m] = residual
@@ -105,19 +136,30 @@ def compare(context, sensor, y, predicted, C, S, H, innovation, innovation_std):
     return m
 
 
-@jit
-def judge(context, sensor, m, nu, S, U, score):
-    """NIS, log-likelihood and verdict of an innovation; U gets the Cholesky factor of S, nu becomes U⁻ᵀ nu.
+@inlined
+def factor(S, U, m, n):
+    """The Cholesky factor U of S (m, m); False if S is not positive definite, or only rounding makes it so.
+
+    Forming S from n states leaves errors of a few n ε S_kk in each pivot: a pivot that small says nothing, and a gain
+    from it would be wrong without a sign. The square-root filters do not form S.
+    """
+    if not cholesky(S, U, m):
+        return False
+    for i in range(m):
+        if not U[i, i] * U[i, i] > 4.0 * (n + m) * EPSILON * S[i, i]:
+            return False
+    return True
+
+
+@inlined
+def judge(context, sensor, m, nu, U, score):
+    """NIS, log-likelihood and verdict of an innovation with covariance Uᵀ U; nu (m,) becomes U⁻ᵀ nu.
 
     NIS = νᵀ S⁻¹ ν;  log-likelihood = -½ (NIS + log det S + m log 2π)
 
     Source: Bar-Shalom, Li & Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), 5.4.2.
     """
-    if m == 0:
-        return MISSING
     score[1] = m
-    if not cholesky(S, U, m):
-        return FAILED
     solve_transposed(U, m, nu)
     nis = 0.0
     log_det = 0.0
@@ -130,7 +172,19 @@ def judge(context, sensor, m, nu, S, U, score):
         return HELD_OUT
     if not nis <= floats(context.gate, context.width + 1)[m]:
         return GATED
-    return USED
+    # A reading that far off would leave an estimate that is no number.
+    return USED if nis < np.inf else FAILED
+
+
+@inlined
+def admit(context, sensor, m, nu, S, U, score):
+    """Judge an innovation nu (m,) of covariance S: the verdict. U gets the factor of S, nu becomes U⁻ᵀ ν."""
+    if m == 0:
+        return MISSING
+    score[1] = m
+    if not factor(S, U, m, context.nx):
+        return FAILED
+    return judge(context, sensor, m, nu, U, score)
 
 
 @jit
@@ -153,7 +207,7 @@ def move_mean(m, C, U, nu, x):
 
 
 @jit
-def joseph(context, sensor, y, m, C, H, K, P, N):
+def joseph(y, r, m, C, H, K, P, N):
     """P ← (I - K H) P (I - K H)ᵀ + K R Kᵀ, in O(n² m); C = P Hᵀ, N (nx, nx) is scratch.
 
     Symmetric and positive semidefinite whatever the gain. Source: Bucy & Joseph (1968), Filtering for Stochastic
@@ -170,7 +224,6 @@ def joseph(context, sensor, y, m, C, H, K, P, N):
     for i in range(n):
         for j in range(n):
             P[i, j] = N[i, j]
-    r = sensor_variances(context, sensor)
     for k in range(m):
         for i in range(n):
             s = 0.0

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from . import ekf
-from .context import add_process_noise, transition
+from .context import transition
 from .filter import Estimator, Options
 from .gaussian import describe, moments, no_points, start, state_size, wrap_mean
 from .jacobians import state_jacobian
-from .jit import floats, jit, matrix
+from .jit import floats, inlined, jit, matrix
 from .linalg import congruence
 from .model import StateSpaceModel
+from .robust import JOSEPH_OPTION, OPTIONS, add_noise, memory
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
@@ -17,11 +18,22 @@ def work_size(options: Options, nx: int, ny: int) -> int:
     return ekf.work_size(options, nx, ny) + nx * nx + 1
 
 
+@inlined
+def constant_jacobian(context, u, dt, F, last, scratch):
+    """Fill F (nx, nx) for this dt, unless it holds it: `last` (1,) is the dt for which it does.
+
+    F is the same at every x of a linear model, so it is found once for each dt, unless inputs may change it.
+    """
+    if last[0] != dt or u.size > 0:
+        # At the prior, not at x: differences round differently at each x, and F must not depend on when it was found.
+        state_jacobian(context, floats(context.prior_mean, context.nx), u, dt, F, scratch)
+        last[0] = dt
+
+
 @jit
 def predict(context, u, dt, index, state, work):
     """x ← F x + B u;  P ← F P Fᵀ + Q.
 
-    F is the same at every x of a linear model, so it is found once for each dt, unless inputs may change it.
     Source: Kalman (1960), doi:10.1115/1.3662552.
     """
     n = context.nx
@@ -31,13 +43,10 @@ def predict(context, u, dt, index, state, work):
     scratch = matrix(work, n + n * n, 2 * n, n)
     last = work.size - 1
     F = matrix(work, last - n * n, n, n)
-    if work[last] != dt or u.size > 0:
-        # At the prior, not at x: differences round differently at each x, and F must not depend on when it was found.
-        state_jacobian(context, floats(context.prior_mean, n), u, dt, F, work[n + 3 * n * n :])
-        work[last] = dt
+    constant_jacobian(context, u, dt, F, work[last:], work[n + 3 * n * n :])
     transition(context, x, u, dt, forward)
     congruence(F, P, scratch)
-    add_process_noise(context, x, u, dt, P, scratch[:n])
+    add_noise(context, x, u, dt, state, P, scratch[:n])
     for i in range(n):
         x[i] = forward[i]
     wrap_mean(context, x)
@@ -61,5 +70,8 @@ KF = Estimator(
     work_size=work_size,
     moments=moments,
     points=no_points,
+    options=(JOSEPH_OPTION, *OPTIONS),
+    tune=ekf.tune,
+    memory=memory,
     applies=applies,
 )

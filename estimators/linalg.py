@@ -11,6 +11,8 @@ import numpy as np
 
 from .jit import jit
 
+EPSILON = float(np.finfo(float).eps)
+
 
 @jit
 def cholesky(A, U, n):
@@ -36,6 +38,107 @@ def cholesky(A, U, n):
             a = U[k, i]
             for j in range(i, n):
                 U[i, j] -= a * U[k, j]
+    return True
+
+
+@jit
+def root(A, U, n):
+    """Upper U with Uᵀ U = A for a positive semidefinite A, which may be singular; False if A is indefinite.
+
+    A pivot within rounding of zero gives a row of zeros. A and U may be one; reads the upper triangle only.
+
+    Source: Higham (2002), Accuracy and Stability of Numerical Algorithms, 2nd edition, 10.3.
+    """
+    for i in range(n):
+        for j in range(i):
+            U[i, j] = 0.0
+        for j in range(i, n):
+            U[i, j] = A[i, j]
+    for k in range(n):
+        # What is left of the diagonal entry that the column's Σ U² made up.
+        pivot = U[k, k]
+        whole = pivot
+        for i in range(k):
+            whole += U[i, k] * U[i, k]
+        floor = 16.0 * n * EPSILON * whole
+        if not (pivot >= -floor and pivot < np.inf):
+            return False
+        if pivot <= floor:
+            for j in range(k, n):
+                U[k, j] = 0.0
+            continue
+        scale = 1.0 / np.sqrt(pivot)
+        for j in range(k, n):
+            U[k, j] *= scale
+        for i in range(k + 1, n):
+            a = U[k, i]
+            if a != 0.0:
+                for j in range(i, n):
+                    U[i, j] -= a * U[k, j]
+    return True
+
+
+@jit
+def triangularise(A, w):
+    """Overwrite A (rows ≥ columns) with the upper R of A = Q R, its diagonal ≥ 0; w is scratch of a row's length.
+
+    So Rᵀ R = Aᵀ A without forming either: a sum of covariances whose factors are stacked keeps all its digits.
+
+    Source: Golub & Van Loan, Matrix Computations, 4th ed., algorithm 5.2.1 (Householder).
+    """
+    rows, columns = A.shape
+    for k in range(columns):
+        square = 0.0
+        for i in range(k, rows):
+            square += A[i, k] * A[i, k]
+        if square > 0.0:
+            norm = np.sqrt(square)
+            alpha = -norm if A[k, k] > 0.0 else norm
+            # The reflection I - β v vᵀ takes column k to (α, 0, …), with v = column - α e and β = 2 / vᵀv.
+            v = A[k, k] - alpha
+            beta = 1.0 / (square + norm * abs(A[k, k]))
+            for j in range(k + 1, columns):
+                w[j] = v * A[k, j]
+            for i in range(k + 1, rows):
+                a = A[i, k]
+                if a != 0.0:
+                    for j in range(k + 1, columns):
+                        w[j] += a * A[i, j]
+            for j in range(k + 1, columns):
+                w[j] *= beta
+                A[k, j] -= v * w[j]
+            for i in range(k + 1, rows):
+                a = A[i, k]
+                if a != 0.0:
+                    A[i, k] = 0.0
+                    for j in range(k + 1, columns):
+                        A[i, j] -= a * w[j]
+            A[k, k] = alpha
+        if A[k, k] < 0.0:
+            for j in range(k, columns):
+                A[k, j] = -A[k, j]
+
+
+@jit
+def remove(R, n, v):
+    """Overwrite upper R (leading n rows and columns) with the factor of RᵀR - v vᵀ; False if that is not positive.
+
+    v (n,) is lost. Source: Golub & Van Loan, Matrix Computations, 4th ed., 6.5.4 (hyperbolic rotations, the new row
+    first and the vector from it, which is the stable order).
+    """
+    for k in range(n):
+        if v[k] == 0.0:
+            continue
+        left = (R[k, k] - v[k]) * (R[k, k] + v[k])
+        # Within rounding of zero nothing is known of what is left.
+        if not left > 4.0 * n * EPSILON * R[k, k] * R[k, k]:
+            return False
+        c = np.sqrt(left) / R[k, k]
+        s = v[k] / R[k, k]
+        R[k, k] = c * R[k, k]
+        for j in range(k + 1, n):
+            R[k, j] = (R[k, j] - s * v[j]) / c
+            v[j] = c * v[j] - s * R[k, j]
     return True
 
 

@@ -9,32 +9,33 @@ that every filter calls.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from .errors import ModelError
+from .field import CellNames, Field, State
+
+LARGE = 1024
+"""States beyond which no filter forms an (nx, nx) matrix: priors are diagonal, moments are means and variances."""
 
 TRUTH_BLOCK = 32
 """Most states for which an event of the log must have room to tell the truth."""
 
+SHOWN = 64
+"""States that a track keeps where the model does not say which."""
 
-@dataclass(frozen=True)
-class State:
-    """One entry of x with its prior N(mean, std²); a `circular` one is an angle in radians and wraps to ±π."""
-
-    name: str
-    unit: str
-    mean: float = 0.0
-    std: float = 1.0
-    circular: bool = False
+__all__ = ["LARGE", "Field", "Input", "Noise", "Parameter", "Row", "Sensor", "State", "StateSpaceModel"]
 
 
 @dataclass(frozen=True)
 class Noise:
-    """One source of process noise: `variance` is what it adds in one second, in `unit`."""
+    """One source of process noise: `variance` is what it adds in one second, in `unit`.
+
+    Without the model's Q, `name` is the state that it acts on, or the field on each of whose cells it acts.
+    """
 
     name: str
     unit: str
@@ -63,25 +64,29 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Row:
-    """One entry of a sensor's reading, with the variance of its noise; `circular` as in `State`."""
+    """One entry of a sensor's reading, with the variance of its noise; `circular` and `position` as in `State`."""
 
     name: str
     unit: str
     variance: float
     circular: bool = False
+    position: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True)
 class Sensor:
     """One sensor: the rows that one reading of it holds, and what the model expects it to say.
 
-    h(x, u, p, out) fills `out` (ny,). The optional H(x, u, p, out) fills the Jacobian (ny, nx).
+    h(x, u, p, out) fills `out` (ny,). The optional H(x, u, p, out) fills the Jacobian (ny, nx). A sensor whose noise is
+    not Gaussian gives log_likelihood(y, x, u, p, r) -> log p(y | x), with r (ny,) the rows' variances as they are tuned
+    now; rows of y that are missing are NaN. Particle filters use it; the others use h and r.
     """
 
     name: str
     rows: tuple[Row, ...]
     h: Callable
     H: Callable | None = None
+    log_likelihood: Callable | None = None
 
 
 @dataclass(frozen=True)
@@ -91,12 +96,16 @@ class StateSpaceModel:
     f(x, u, p, dt, out) fills the next state (nx,) after `dt` seconds. Q(x, u, p, q, dt, out) fills the covariance
     (nx, nx) of the noise added in `dt`, where q (nw,) holds the variances of `noises` as they are tuned now; without
     it, q is added to the states of the same names, as q·dt. F(x, u, p, dt, out) fills the Jacobian (nx, nx).
+
+    `states` may be a `Field`, of any size. Beyond `LARGE` states there is no Q; shape(z, p, out) may then fill `out`
+    (nx,) with L z, where L Lᵀ has ones on its diagonal: the noise of the process, √(q·dt) L z, and the spread of the
+    prior, std L z, are correlated in space by it, without a matrix.
     Steps longer than `max_step` seconds are split, so an f that integrates crudely need not integrate far.
     """
 
     name: str
     title: str
-    states: tuple[State, ...]
+    states: Sequence[State]
     sensors: tuple[Sensor, ...]
     noises: tuple[Noise, ...]
     f: Callable
@@ -104,6 +113,7 @@ class StateSpaceModel:
     parameters: tuple[Parameter, ...] = ()
     Q: Callable | None = None
     F: Callable | None = None
+    shape: Callable | None = None
     linear: bool = False
     max_step: float = np.inf
     source: str = ""
@@ -113,12 +123,17 @@ class StateSpaceModel:
         for kind in ("states", "sensors", "noises"):
             if not getattr(self, kind):
                 raise ModelError(f"model {self.name}: {kind} is empty; name at least one")
-        for kind in ("states", "sensors", "noises", "inputs", "parameters"):
+        field = isinstance(self.states, Field)
+        for kind in (
+            ("sensors", "noises", "inputs", "parameters")
+            if field
+            else ("states", "sensors", "noises", "inputs", "parameters")
+        ):
             names = [item.name for item in getattr(self, kind)]
             twice = sorted({name for name in names if names.count(name) > 1})
             if twice:
                 raise ModelError(f"model {self.name}: {kind} names {twice[0]!r} twice; every name must differ")
-        for state in self.states:
+        for state in () if field else self.states:
             if not (state.std > 0 and np.isfinite(state.std) and np.isfinite(state.mean)):
                 raise ModelError(
                     f"model {self.name}: the prior of {state.name} is {state.mean} ± {state.std}; "
@@ -137,11 +152,17 @@ class StateSpaceModel:
                         "it must be positive"
                     )
         if self.Q is None:
-            strays = [noise.name for noise in self.noises if noise.name not in self.state_names]
+            strays = [noise.name for noise in self.noises if not self.acts_on(noise.name)]
             if strays:
                 raise ModelError(
-                    f"model {self.name}: noise {strays[0]!r} is not a state; name one, or write Q(x, u, p, q, dt, out)"
+                    f"model {self.name}: noise {strays[0]!r} is not a state or field; name one, "
+                    "or write Q(x, u, p, q, dt, out)"
                 )
+        elif self.shape is not None or self.nx > LARGE:
+            raise ModelError(
+                f"model {self.name}: Q of {self.nx:,} states would be a matrix of {8e-9 * self.nx**2:.3g} GB; name the "
+                "noise after the field and correlate it with shape(z, p, out), which takes Q's place"
+            )
         if not self.max_step > 0:
             raise ModelError(f"model {self.name}: max_step is {self.max_step} s; it must be positive")
 
@@ -161,9 +182,71 @@ class StateSpaceModel:
         return max(len(sensor.rows) for sensor in self.sensors)
 
     @cached_property
-    def state_names(self) -> tuple[str, ...]:
+    def state_names(self) -> Sequence[str]:
         """Names of the states, in order."""
+        if isinstance(self.states, Field):
+            return CellNames(self.states)
         return tuple(state.name for state in self.states)
+
+    @cached_property
+    def prior_mean(self) -> np.ndarray:
+        """Prior mean of every state, (nx,)."""
+        if isinstance(self.states, Field):
+            return self.states.prior_mean
+        return np.array([state.mean for state in self.states], float)
+
+    @cached_property
+    def prior_std(self) -> np.ndarray:
+        """Prior standard deviation of every state, (nx,)."""
+        if isinstance(self.states, Field):
+            return np.full(self.nx, float(self.states.std))
+        return np.array([state.std for state in self.states], float)
+
+    @cached_property
+    def circular(self) -> np.ndarray:
+        """For each state, whether it is an angle, (nx,) int8."""
+        if isinstance(self.states, Field):
+            return np.zeros(self.nx, np.int8)
+        return np.array([state.circular for state in self.states], np.int8)
+
+    @cached_property
+    def shown(self) -> np.ndarray:
+        """Indices of the states whose estimates a track keeps, a column each: all, or those that a field names."""
+        if isinstance(self.states, Field) and self.states.shown:
+            return np.array(self.states.shown, np.int64)
+        if self.nx <= SHOWN:
+            return np.arange(self.nx)
+        if isinstance(self.states, Field):
+            axes = [np.unique(np.linspace(0, n - 1, 6).round().astype(int)[1:-1]) for n in self.states.shape]
+            cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+            return np.ravel_multi_index(cells.T, self.states.shape)[:SHOWN].astype(np.int64)
+        return np.unique(np.linspace(0, self.nx - 1, SHOWN).round().astype(np.int64))
+
+    @cached_property
+    def shown_states(self) -> tuple[State, ...]:
+        """The states of the track's columns, in order."""
+        return tuple(self.states[int(j)] for j in self.shown)
+
+    def acts_on(self, noise: str) -> range:
+        """The states to which a noise of that name adds: one, or a whole field; none if there is no such name."""
+        if isinstance(self.states, Field):
+            return range(self.nx if noise == self.states.name else 0)
+        if noise not in self.state_names:
+            return range(0)
+        first = self.state_names.index(noise)
+        return range(first, first + 1)
+
+    def positions(self) -> np.ndarray | None:
+        """Where every state is, (nx, axes); None if one of them does not say."""
+        if isinstance(self.states, Field):
+            return self.states.positions()
+        places = [state.position for state in self.states]
+        return None if any(place is None for place in places) else np.array(places, float)
+
+    @property
+    def periods(self) -> tuple[float, ...] | None:
+        """Length after which space repeats along each axis (infinite where it does not); None where nothing does."""
+        return self.states.periods if isinstance(self.states, Field) else None
 
     @cached_property
     def sensor_names(self) -> tuple[str, ...]:

@@ -4,14 +4,43 @@ from __future__ import annotations
 
 from difflib import get_close_matches
 
+from .apf import APF
+from .ckf import CKF
 from .ekf import EKF
+from .enkf import ENKF
+from .ensrf import ENSRF
 from .errors import EstimatorError
+from .etkf import ETKF
 from .filter import Estimator
+from .iekf import IEKF
 from .kf import KF
-from .model import StateSpaceModel
+from .kf_steady import KF_STEADY
+from .letkf import LETKF
+from .model import LARGE, StateSpaceModel
+from .pf import PF, PF_REG
+from .pf_ekf import PF_EKF
+from .sr_ekf import SR_EKF
+from .sr_kf import SR_KF
+from .sr_ukf import SR_UKF
 from .ukf import UKF
 
-ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in (KF, EKF, UKF)}
+GAUSSIAN = (KF, KF_STEADY, EKF, IEKF, UKF, CKF, SR_KF, SR_EKF, SR_UKF)
+PARTICLE = (PF, PF_REG, PF_EKF, APF)
+ENSEMBLE = (ENKF, ETKF, ENSRF, LETKF)
+
+ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in GAUSSIAN + PARTICLE + ENSEMBLE}
+
+
+def find_entry(name: str) -> Estimator:
+    """The entry of that name.
+
+    Raises:
+        EstimatorError: If there is none, with near names.
+    """
+    if name not in ESTIMATORS:
+        near = get_close_matches(name, ESTIMATORS, n=3, cutoff=0.4) or list(ESTIMATORS)
+        raise EstimatorError(f"estimator {name!r} does not exist; near: {', '.join(near)}")
+    return ESTIMATORS[name]
 
 
 def find_estimator(name: str, model: StateSpaceModel) -> Estimator:
@@ -20,10 +49,22 @@ def find_estimator(name: str, model: StateSpaceModel) -> Estimator:
     Raises:
         EstimatorError: If there is none, with near names; or if it does not apply, with the reason.
     """
-    if name not in ESTIMATORS:
-        near = get_close_matches(name, ESTIMATORS, n=3, cutoff=0.4) or list(ESTIMATORS)
-        raise EstimatorError(f"estimator {name!r} does not exist; near: {', '.join(near)}")
-    reason = ESTIMATORS[name].applies(model)
+    entry = find_entry(name)
+    reason = unfit(entry, model)
     if reason:
         raise EstimatorError(f"estimator {name} does not apply: {reason}")
-    return ESTIMATORS[name]
+    return entry
+
+
+def unfit(entry: Estimator, model: StateSpaceModel) -> str | None:
+    """Why an estimator does not fit a model, or None: its own reason, or the size of the covariance that it forms."""
+    if entry.family == "ensemble":
+        return entry.applies(model)
+    if model.nx > LARGE:
+        return (
+            f"{model.name} is too large: a {entry.name} of {model.nx:,} states needs a {8e-9 * model.nx**2:,.3g} GB "
+            "covariance; use an ensemble filter"
+        )
+    if model.shape is not None:
+        return f"{model.name} gives its noise as a shape, not as a matrix; use an ensemble filter"
+    return entry.applies(model)

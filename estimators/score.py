@@ -60,13 +60,13 @@ def score(track: Track, events: Readings, model: StateSpaceModel) -> Score:
 
 def _against_truth(track: Track, events: Readings, model: StateSpaceModel) -> dict[str, Fit]:
     fits: dict[str, Fit] = {}
-    for j, state in enumerate(model.states):
-        rows, values = truth_of(events, j)
+    for k, (j, state) in enumerate(zip(model.shown, model.shown_states, strict=True)):
+        rows, values = truth_of(events, int(j))
         if rows.size:
-            error = track.mean[rows, j] - values
+            error = track.mean[rows, k] - values
             if state.circular:
                 error = (error + np.pi) % (2.0 * np.pi) - np.pi
-            fits[state.name] = _fit(error, track.std[rows, j])
+            fits[state.name] = _fit(error, track.std[rows, k])
     return fits
 
 

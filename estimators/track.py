@@ -10,8 +10,8 @@ from numba import types
 from .jit import B1, F1, F2
 
 NONE, USED, GATED, HELD_OUT, MISSING, FAILED = range(6)
-"""Verdict on an event: not a reading; used; refused by the gate; held out and scored; no finite row; not usable
-because S was not positive definite."""
+"""Verdict on an event: not a reading; used; refused by the gate; held out and scored; no finite row; not usable,
+as S was not positive definite beyond rounding or the NIS no finite number."""
 
 VERDICT_NAMES = ("none", "used", "gated", "held out", "missing", "failed")
 

@@ -11,50 +11,67 @@ from __future__ import annotations
 
 import numpy as np
 
-from .context import (
-    add_process_noise,
-    circular_rows,
-    circular_states,
-    expect,
-    options,
-    sensor_rows,
-    transition,
-)
+from . import gaussian
+from .context import circular_rows, circular_states, expect, options, sensor_rows, transition
 from .filter import Estimator, Option, Options
-from .gaussian import compare, describe, downdate, judge, moments, move_mean, start, state_size, wrap_mean
-from .jit import jit, matrix
-from .linalg import cholesky, mirror, wrap
+from .gaussian import admit, compare, describe, downdate, moments, move_mean, start, state_size, wrap_mean
+from .jit import inlined, jit, matrix
+from .linalg import EPSILON, cholesky, mirror, wrap
+from .model import StateSpaceModel
+from .robust import (
+    ADAPT,
+    NONE,
+    OFF,
+    OPTIONS,
+    OWN,
+    ROBUST,
+    adapt,
+    add_noise,
+    memory,
+    reading_variances,
+    reweigh,
+    shared,
+)
 from .track import FAILED, USED
+from .tuning import Tuning
 
-CENTRAL_COV, OUTER, SPREAD = range(3)
+CENTRAL_COV, OUTER, SPREAD = range(OWN, OWN + 3)
 """Positions in the context's options: the central covariance weight, the outer weight, √(n+λ)."""
 
 
-def tune(values: Options, nx: int) -> np.ndarray:
-    """The weights that alpha, beta and kappa give for nx states."""
-    alpha, beta, kappa = values["alpha"], values["beta"], values["kappa"]
+def weights(alpha: float, beta: float, kappa: float, nx: int) -> list[float]:
+    """Central covariance weight, outer weight and spread that alpha, beta and kappa give for nx states."""
     total = alpha**2 * (nx + kappa)
     central = 1.0 - nx / total
-    return np.array([central + 1.0 - alpha**2 + beta, 0.5 / total, np.sqrt(total)])
+    return [central + 1.0 - alpha**2 + beta, 0.5 / total, float(np.sqrt(total))]
+
+
+def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
+    """The shared options, and the weights."""
+    return np.array(shared(values) + weights(values["alpha"], values["beta"], values["kappa"], model.nx))
+
+
+def sigma_points(x: np.ndarray, P: np.ndarray, spread: float) -> np.ndarray:
+    """The sigma points (2 nx + 1, nx) of a mean and covariance; none where the covariance has no factor."""
+    try:
+        U = np.linalg.cholesky(P).T * spread
+    except np.linalg.LinAlgError:
+        return np.zeros((0, x.size))
+    return np.vstack((x, x + U, x - U))
 
 
 def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
     """The sigma points (2 nx + 1, nx) of a state."""
-    x, P = moments(values, state, nx)
-    try:
-        U = np.linalg.cholesky(P).T * tune(values, nx)[SPREAD]
-    except np.linalg.LinAlgError:
-        return np.zeros((0, nx))
-    return np.vstack((x, x + U, x - U))
+    return sigma_points(*moments(values, state, nx), weights(values["alpha"], values["beta"], values["kappa"], nx)[2])
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch: the factor, deviations of state and reading, mean, point; and ŷ, S, its factor, C."""
-    return nx * nx + (2 * nx + 1) * (nx + ny) + 2 * nx + ny + 2 * ny * ny + nx * ny + ny
+    """Scratch: an update's; the factor, points through f or h, a point and the mean."""
+    return gaussian.scratch_size(nx, ny) + nx * nx + (2 * nx + 1) * max(nx, ny) + 2 * nx
 
 
-@jit
-def _mean_of(D, w, circular, mean):
+@inlined
+def mean_of(D, w, circular, mean):
     """Turn points D (2n+1, k) into deviations from their weighted mean, which is added up from the central point.
 
     The weights sum to 1, so mean = D₀ + w Σ (Dᵢ - D₀): small alpha then costs no digits, and angles do not tear.
@@ -77,6 +94,34 @@ def _mean_of(D, w, circular, mean):
         mean[j] += central
 
 
+@inlined
+def through_f(context, x, u, dt, U, spread, point, D):
+    """Fill D (2n+1, n) with f at x and at x ± spread·U[k]."""
+    n = x.size
+    transition(context, x, u, dt, D[0])
+    for k in range(n):
+        for j in range(n):
+            point[j] = x[j] + spread * U[k, j]
+        transition(context, point, u, dt, D[1 + k])
+        for j in range(n):
+            point[j] = x[j] - spread * U[k, j]
+        transition(context, point, u, dt, D[1 + n + k])
+
+
+@inlined
+def through_h(context, sensor, x, u, U, spread, point, D):
+    """Fill D (2n+1, ny) with h at x and at x ± spread·U[k]."""
+    n = x.size
+    expect(context, sensor, x, u, D[0])
+    for k in range(n):
+        for j in range(n):
+            point[j] = x[j] + spread * U[k, j]
+        expect(context, sensor, point, u, D[1 + k])
+        for j in range(n):
+            point[j] = x[j] - spread * U[k, j]
+        expect(context, sensor, point, u, D[1 + n + k])
+
+
 @jit
 def predict(context, u, dt, index, state, work):
     """x, P ← mean and covariance of the propagated sigma points, plus Q.
@@ -93,24 +138,16 @@ def predict(context, u, dt, index, state, work):
     at += (2 * n + 1) * n
     point = work[at : at + n]
     forward = work[at + n : at + 2 * n]
-    weights = options(context)
-    w = weights[OUTER]
-    spread = weights[SPREAD]
+    numbers = options(context)
+    w = numbers[OUTER]
     if not cholesky(P, U, n):
-        for i in range(state.size):
+        for i in range(n + n * n):
             state[i] = np.nan
         return
-    transition(context, x, u, dt, D[0])
-    for k in range(n):
-        for j in range(n):
-            point[j] = x[j] + spread * U[k, j]
-        transition(context, point, u, dt, D[1 + k])
-        for j in range(n):
-            point[j] = x[j] - spread * U[k, j]
-        transition(context, point, u, dt, D[1 + n + k])
-    _mean_of(D, w, circular_states(context), forward)
+    through_f(context, x, u, dt, U, numbers[SPREAD], point, D)
+    mean_of(D, w, circular_states(context), forward)
     for i in range(n):
-        a = weights[CENTRAL_COV] * D[0, i]
+        a = numbers[CENTRAL_COV] * D[0, i]
         for j in range(i + 1):
             P[i, j] = a * D[0, j]
     for k in range(1, 2 * n + 1):
@@ -119,10 +156,27 @@ def predict(context, u, dt, index, state, work):
             for j in range(i + 1):
                 P[i, j] += a * D[k, j]
     mirror(P)
-    add_process_noise(context, x, u, dt, P, U)
+    add_noise(context, x, u, dt, state, P, U)
     for i in range(n):
         x[i] = forward[i]
     wrap_mean(context, x)
+
+
+@jit
+def only_rounding(U, P, D, S, r, w, y):
+    """Whether a reading rests on directions of P that its factor U shows by rounding alone.
+
+    A pivot of a few n ε of P_kk is what subtracting left; its sigma points are then anywhere. That does no harm unless
+    they make more than a hundredth of what the reading is weighed against, S (ny, ny) and r: then no gain is known.
+    """
+    n = P.shape[0]
+    for k in range(n):
+        if U[k, k] * U[k, k] <= 4.0 * n * EPSILON * P[k, k]:
+            for j in range(r.size):
+                d = D[1 + k, j] - D[1 + n + k, j]
+                if np.isfinite(y[j]) and 0.5 * w * d * d > 0.01 * (S[j, j] + r[j]):
+                    return True
+    return False
 
 
 @jit
@@ -135,41 +189,26 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     _, m = sensor_rows(context, sensor)
     x = state[:n]
     P = matrix(state, n, n, n)
-    U = matrix(work, 0, n, n)
-    at = n * n
+    nu, r, S, V, C, room, at = gaussian.scratch(work, n, m)
+    U = matrix(work, at, n, n)
+    at += n * n
     D = matrix(work, at, 2 * n + 1, m)
     at += (2 * n + 1) * m
-    point = work[at : at + n]
-    at += n
-    nu = work[at : at + m]
-    at += m
-    S = matrix(work, at, m, m)
-    at += m * m
-    V = matrix(work, at, m, m)
-    at += m * m
-    C = matrix(work, at, n, m)
-    weights = options(context)
-    w = weights[OUTER]
-    spread = weights[SPREAD]
+    numbers = options(context)
+    w = numbers[OUTER]
+    spread = numbers[SPREAD]
     if not cholesky(P, U, n):
         return FAILED
-    expect(context, sensor, x, u, D[0])
-    for k in range(n):
-        for j in range(n):
-            point[j] = x[j] + spread * U[k, j]
-        expect(context, sensor, point, u, D[1 + k])
-        for j in range(n):
-            point[j] = x[j] - spread * U[k, j]
-        expect(context, sensor, point, u, D[1 + n + k])
-    _mean_of(D, w, circular_rows(context, sensor), nu)
+    through_h(context, sensor, x, u, U, spread, work[at : at + n], D)
+    mean_of(D, w, circular_rows(context, sensor), nu)
     for i in range(m):
-        a = weights[CENTRAL_COV] * D[0, i]
-        for j in range(m):
+        a = numbers[CENTRAL_COV] * D[0, i]
+        for j in range(i + 1):
             S[i, j] = a * D[0, j]
     for k in range(1, 2 * n + 1):
         for i in range(m):
             a = w * D[k, i]
-            for j in range(m):
+            for j in range(i + 1):
                 S[i, j] += a * D[k, j]
     # The sigma deviations of the state are ± spread·U[k], so C = w·spread Σ U[k] (D₊ₖ - D₋ₖ).
     scale = w * spread
@@ -181,12 +220,19 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
             a = scale * U[k, i]
             for j in range(m):
                 C[i, j] += a * (D[1 + k, j] - D[1 + n + k, j])
-    m = compare(context, sensor, y, nu, C, S, D[:, :0], innovation, innovation_std)
-    verdict = judge(context, sensor, m, nu, S, V, score)
+    nothing = D[:, :0]
+    reading_variances(context, sensor, state, r)
+    drowned = only_rounding(U, P, D, S, r, w, y)
+    m = compare(context, sensor, y, r, nu, C, S, nothing, P, innovation, innovation_std)
+    verdict = FAILED if drowned else admit(context, sensor, m, nu, S, V, score)
+    if verdict == USED and numbers[ROBUST] != NONE:
+        verdict = USED if reweigh(context, y, r, innovation, m, nu, S, V, room) else FAILED
     if verdict == USED:
         move_mean(m, C, V, nu, x)
         wrap_mean(context, x)
         downdate(m, C, V, P)
+        if numbers[ADAPT] != OFF:
+            adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict
 
 
@@ -199,6 +245,7 @@ UKF = Estimator(
     fails_when="P stops being positive definite, or the posterior has several peaks",
     source="Julier & Uhlmann (2004), doi:10.1109/JPROC.2003.823141",
     functions=(start, predict, update, describe),
+    runs=lambda options, nx: 2 * nx + 1,
     state_size=state_size,
     work_size=work_size,
     moments=moments,
@@ -207,6 +254,8 @@ UKF = Estimator(
         Option("alpha", 1.0, 1e-4, 2.0, "", "spread of the sigma points"),
         Option("beta", 2.0, 0.0, 10.0, "", "knowledge of the distribution; 2 is best for a Gaussian"),
         Option("kappa", 0.0, -0.9, 10.0, "", "second spread; nx + kappa must stay positive"),
+        *OPTIONS,
     ),
     tune=tune,
+    memory=memory,
 )

@@ -36,7 +36,7 @@ class Simulator:
     In each step, in this order: x ← f(x, u, p, dt) + w with w ~ N(0, Q); then y = h(x, u, p) + v with v ~ N(0, R) for
     each sensor that is due, drawn even if the reading is lost, so that a loss does not change what follows. Its first
     event is a tick at time zero, where the estimator's prior holds; then, after every step: the inputs if they
-    changed, the readings, and the true states in blocks of the log's width.
+    changed, the readings, and the true states that a track shows, in blocks of the log's width.
     """
 
     live = False
@@ -83,8 +83,9 @@ class Simulator:
         self._steps = None if duration is None else round(duration / step)
         self.endless = duration is None
         self.span = None if duration is None else (0, self._time(round(duration / step)))
-        given = dict(initial or {})
-        self._x = np.array([given.get(state.name, state.mean) for state in truth.states], float)
+        self._x = truth.prior_mean.copy()
+        for name, value in dict(initial or {}).items():
+            self._x[truth.state_names.index(name)] = value
         values = dict(truth_parameters or {})
         self._p = np.array([values.get(item.name, item.value) for item in truth.parameters], float)
         variances = dict(truth_noise or {})
@@ -98,9 +99,10 @@ class Simulator:
             for plan, sensor in zip(self._plans, model.sensors, strict=True)
         ]
         self._spoken = [0] * len(self._plans)
-        self._circular = [j for j, state in enumerate(truth.states) if state.circular]
+        self._circular = np.flatnonzero(truth.circular)
         self._rng = np.random.default_rng(seed)
-        self._factor: tuple[bytes, np.ndarray] = (b"", np.zeros((truth.nx, truth.nx)))
+        self._factor: tuple[bytes, np.ndarray] | None = None
+        self._told = _runs(model.shown, model.width)
         self._k = 0
         self._u = self._inputs(0.0)
         self._begun = False
@@ -161,15 +163,17 @@ class Simulator:
             lost = plan.drop_every is not None and self._spoken[i] % plan.drop_every == plan.drop_every - 1
             self._spoken[i] += 1
             rows.append((t, READING, i, np.full(y.size, np.nan) if lost else y))
-        width = self._model.width
-        rows += [(t, TRUTH, j, self._x[j : j + width].copy()) for j in range(0, self._x.size, width)]
+        rows += [(t, TRUTH, first, self._x[first:end].copy()) for first, end in self._told]
 
     def _noise(self) -> np.ndarray:
         """A draw of N(0, Q), as numpy's multivariate_normal makes it, with the factor kept while Q stays."""
-        Q = np.zeros_like(self._factor[1])
-        self._truth.Q(self._x, self._u, self._p, self._q, self._step, Q)
+        truth = self._truth
+        if truth.draw is not None:
+            return truth.draw(self._rng.standard_normal(self._x.size), self._p, self._q, self._step)
+        Q = np.zeros((self._x.size, self._x.size))
+        truth.Q(self._x, self._u, self._p, self._q, self._step, Q)
         key = Q.tobytes()
-        if key != self._factor[0]:
+        if self._factor is None or key != self._factor[0]:
             U, s, _ = np.linalg.svd(Q)
             self._factor = (key, U * np.sqrt(s))
         return self._factor[1] @ self._rng.standard_normal(self._x.size)
@@ -180,3 +184,14 @@ class Simulator:
 
     def close(self) -> None:
         """Nothing to give back."""
+
+
+def _runs(states: np.ndarray, width: int) -> list[tuple[int, int]]:
+    """Runs of consecutive states, at most `width` long, as pairs of first and end."""
+    runs: list[tuple[int, int]] = []
+    for state in states.tolist():
+        if runs and runs[-1][1] == state and state - runs[-1][0] < width:
+            runs[-1] = (runs[-1][0], state + 1)
+        else:
+            runs.append((state, state + 1))
+    return runs

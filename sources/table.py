@@ -1,4 +1,4 @@
-"""Tables (CSV, Parquet) as recordings: each row is what was known at one time."""
+"""Tables (CSV, Parquet, MATLAB) as recordings: each row is what was known at one time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from estimators.log import Readings
 from .mapping import Mapping
 from .signals import ABSENT, PRESENT
 from .source import Channel, Report, ignore
-from .table_files import check_columns, is_parquet, read_csv, read_parquet
+from .table_files import check_columns, read_table
 from .table_time import UNITS, column_ns
 
 
@@ -68,8 +68,7 @@ class Table:
             def problem(key: str, line: int, text: str, path: Path = path) -> None:
                 self._report(key, f"{path.name}:{line}: {text}")
 
-            read = read_parquet if is_parquet(path) else read_csv
-            for chunk in read(path, self._time, self._columns, problem):
+            for chunk in read_table(path, self._time, self._columns, problem):
                 t, known = column_ns(chunk.time, self._unit)
                 for row in np.flatnonzero(~known):
                     self._report(

@@ -1,4 +1,4 @@
-"""The columns of CSV and Parquet files, a few thousand rows at a time."""
+"""The columns of CSV, Parquet and MATLAB files, a few thousand rows at a time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Problem = Callable[[str, int, str], None]
 class Chunk(NamedTuple):
     """Rows of a table: the raw time column, and the values (n, columns) with masks of what is blank.
 
-    `line` is the line (CSV) or row (Parquet) of each, counted from 1.
+    `line` is the line (CSV) or row (Parquet, MATLAB) of each, counted from 1.
     """
 
     line: np.ndarray
@@ -48,10 +48,33 @@ def check_columns(path: Path, wanted: Sequence[str]) -> None:
         raise SourceError(f"{path}: there is no such file; check the path of the recording")
     if path.stat().st_size == 0:
         raise SourceError(f"{path}: the file is empty; record it again")
-    names = parquet_names(path) if is_parquet(path) else _header(path)[0]
+    names = column_names(path)
     for name in wanted:
         if name not in names:
             raise missing_column(path, name, names)
+
+
+def column_names(path: Path) -> list[str]:
+    """Names of a file's columns."""
+    if is_mat(path):
+        from .table_mat import mat_names
+
+        return mat_names(path)
+    return parquet_names(path) if is_parquet(path) else _header(path)[0]
+
+
+def read_table(path: Path, time: str, columns: Sequence[str], problem: Problem) -> Generator[Chunk, None, None]:
+    """Rows of a table of any kind, by the ending of its name."""
+    if is_mat(path):
+        from .table_mat import read_mat
+
+        return read_mat(path, time, columns, problem)
+    return (read_parquet if is_parquet(path) else read_csv)(path, time, columns, problem)
+
+
+def is_mat(path: Path) -> bool:
+    """Whether the name says that it is a MATLAB file."""
+    return path.suffix.lower() == ".mat"
 
 
 def is_parquet(path: Path) -> bool:

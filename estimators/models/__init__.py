@@ -3,8 +3,25 @@
 from __future__ import annotations
 
 from ..model import StateSpaceModel
+from .battery_cell import BATTERY_CELL
+from .battery_pack import BATTERY_PACK
+from .lorenz63 import LORENZ63
+from .lorenz96 import LORENZ96
 from .motor_drive import MOTOR_DRIVE
 from .motor_winding import MOTOR_WINDING
 from .road_car import ROAD_CAR
+from .thermal_field import THERMAL_FIELD
 
-MODELS: dict[str, StateSpaceModel] = {model.name: model for model in (MOTOR_WINDING, MOTOR_DRIVE, ROAD_CAR)}
+MODELS: dict[str, StateSpaceModel] = {
+    model.name: model
+    for model in (
+        MOTOR_WINDING,
+        MOTOR_DRIVE,
+        ROAD_CAR,
+        BATTERY_CELL,
+        BATTERY_PACK,
+        LORENZ63,
+        LORENZ96,
+        THERMAL_FIELD,
+    )
+}

@@ -91,9 +91,11 @@ class FakeEngine:
     def previous(self):
         return self.before
 
+    modes = ()
+
     def belief(self):
         mean, cov = self.fold.moments()
-        return SimpleNamespace(t=self.state.t, mean=mean, cov=cov, points=self.fold.points())
+        return SimpleNamespace(t=self.state.t, mean=mean, cov=cov, points=self.fold.points(), modes=self.modes)
 
     def _pull(self, first, fresh):
         rows = slice(first, self.log.n)

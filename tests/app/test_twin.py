@@ -301,3 +301,17 @@ def test_a_twin_is_restored_from_its_text_alone() -> None:
     twin = restore_twin(text, "gone.yaml", {"Q.level": "0.3"})
     assert twin.model.sensors[0].rows[0].variance == 0.25 and twin.tuning.get("Q.level") == 0.3
     assert twin.name == "gone" and twin.text == text
+
+
+def test_a_parameter_to_estimate_becomes_a_state_that_the_yaml_may_name() -> None:
+    text = (
+        "model: motor_drive\nparameters: {yoke_coolant: 0.04}\nestimate:\n  yoke_coolant: {std: 0.01, drift: 0.001}\n"
+        "prior: {yoke_coolant: {std: 0.02}}\nview: {pairs: [[yoke, yoke_coolant]]}\n"
+        "source: {type: simulator, duration: 10, initial: {yoke_coolant: 0.05}}\n"
+    )
+    model = twin_of(text).model
+    assert model.states[-1].name == "yoke_coolant"
+    assert (model.states[-1].mean, model.states[-1].std) == (0.04, 0.02)
+    assert model.noises[-1].variance == pytest.approx(1e-6)
+    with pytest.raises(ConfigError, match="motor.yaml:4: .*yoke_coolnt is no parameter of motor_drive; did you mean"):
+        twin_of(text.replace("  yoke_coolant: {std", "  yoke_coolnt: {std"))

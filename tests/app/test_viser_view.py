@@ -22,6 +22,7 @@ from app.viser_view import ViserView
 from config.schema import SceneSection, ViewSection
 from estimators.log import READING, TRUTH, Readings
 from estimators.models import MODELS
+from estimators.modes import Mode
 
 WINDING = MODELS["motor_winding"]
 BROWSER = SimpleNamespace(client_id=0)
@@ -186,7 +187,8 @@ def test_every_control_submits_its_command(view, engine):
     edit(panel.speed.handle, "max")
     edit(panel.run_buttons, "Pause")
     edit(panel.run_buttons, "Reset")
-    edit(panel._option_folders["ukf"][1]["alpha"].slider, 0.5)
+    view.frame()
+    edit(panel.options.rows["alpha"].slider, 0.5)
     assert engine.commands == [
         SetEstimator("ukf"), SetTuning("gate", 0.9973), UseSensor("winding", False), Speed(np.inf), Pause(True),
         Reset(), SetOption("alpha", 0.5),
@@ -230,7 +232,7 @@ def test_status_moves_the_controls_without_an_echo(view, engine):
     assert (row.slider.value, row.field.value) == (pytest.approx(2.0), "0.1")
     assert view.panel.sensors["winding"].handle.value is False
     assert view.panel.estimator.handle.value == view.panel._titles["ukf"]
-    assert view.panel._option_folders["ukf"][0].visible
+    assert view.panel.options.shown == "ukf" and view.panel.options.folder.visible
     assert tuple(view.panel.run_buttons.options)[0] == "Resume"
     view.coalescer.flush()
     assert len(engine.commands) == count
@@ -323,6 +325,23 @@ def test_blocks_of_true_states_are_drawn(engine):
         np.testing.assert_array_equal(view.scene._true_point(view.history, [1, 0]), [[0.4, 154.0]])
     finally:
         view.stop()
+
+
+def test_peaks_are_marked_with_their_weights_while_there_are_several(view, engine):
+    belief = engine.belief()
+    std = np.sqrt(np.diag(belief.cov))
+    engine.modes = tuple(
+        Mode(weight, belief.mean + side * std, belief.cov) for weight, side in ((0.75, 0.5), (0.25, -0.5))
+    )
+    view.scene.draw(view.history, engine.belief())
+    (first, heavy), (second, light), (third, _) = view.scene._modes[:3]
+    assert first.visible and second.visible and not third.visible
+    assert (heavy.text, light.text) == ("75 %", "25 %")
+    place = [axis.place(engine.modes[1].mean[axis.state]) for axis in view.scene.axes]
+    np.testing.assert_allclose(second.points[0, : len(place)], place[:3], atol=0.05)
+    engine.modes = ()
+    view.scene.draw(view.history, engine.belief())
+    assert not (first.visible or second.visible)
 
 
 def test_the_thread_draws_and_stops(engine):

@@ -13,7 +13,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 
 def main() -> None:
-    from . import filters, history, sources
+    from . import ensembles, filters, history, particles_, sources
 
     begun = perf_counter()
     load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
@@ -21,6 +21,12 @@ def main() -> None:
     sections: list[Callable[[], None]] = [
         filters.beside_filterpy,
         filters.growing_n,
+        filters.gaussian_family,
+        particles_.beside_particles,
+        particles_.growing_members,
+        ensembles.beside_dapper,
+        ensembles.thermal_cycles,
+        ensembles.large_states,
         history.growing_history,
         history.refold,
         sources.blf,

@@ -11,6 +11,7 @@ from estimators.fold import Fold
 from estimators.log import READING, Log, Readings
 from estimators.model import StateSpaceModel
 from estimators.models import MODELS
+from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
 
 from . import ring
@@ -38,9 +39,11 @@ def log_of(model: StateSpaceModel, events: int, *, step: float = 1.0) -> Log:
     return log
 
 
-def folding(estimator: str, model: StateSpaceModel, log: Log) -> Callable[[], None]:
+def folding(
+    estimator: str, model: StateSpaceModel, log: Log, options: dict[str, float] | None = None
+) -> Callable[[], None]:
     """A call that folds the whole log again: estimate, NIS, verdict and health of every event."""
-    growing = Fold(estimator, model, Tuning.of(model), log)
+    growing = Fold(estimator, model, Tuning.of(model).with_options(options or {}), log)
     growing.advance()
 
     def again() -> None:
@@ -165,3 +168,29 @@ def growing_n() -> None:
             calls.append(folding(name, model, log_of(model, steps, step=0.1)))
         each = [value / steps for value in medians(calls, 7)]
         print(f"  {n:4d} {m:3d}" + "".join(f"{s * 1e6:11.2f} [{s * 1e9 / n**3:6.2f}]" for s in each))
+
+
+def gaussian_family() -> None:
+    """Every Gaussian filter on the same rings, and what its options cost when they are on."""
+    variants: list[tuple[str, dict[str, float]]] = [
+        *((name, {"period": 0.1} if name == "kf-steady" else {}) for name, entry in ESTIMATORS.items()
+          if entry.family == "Gaussian"),
+        ("ekf", {"joseph": 0}),
+        *((name, option) for name in ("ekf", "ukf") for option in ({"robust": 1}, {"robust": 2}, {"adapt": 1})),
+    ]  # fmt: skip
+    sizes = ((2, 1), (4, 2), (8, 3), (24, 8))
+    print(
+        "A step of each Gaussian filter (ring of n states, every third read; linear for the three Kalman filters): µs"
+    )
+    print(f"  {'filter':24s}" + "".join(f"{f'n={n} m={m}':>12s}" for n, m in sizes))
+    columns = []
+    for n, m in sizes:
+        steps = max(64, 20_000 // n**2)
+        calls = []
+        for name, options in variants:
+            model = ring.ring(n, m, linear=name in ("kf", "kf-steady", "sr-kf"))
+            calls.append(folding(name, model, log_of(model, steps, step=0.1), options))
+        columns.append([value / steps for value in medians(calls, 7)])
+    for row, (name, options) in enumerate(variants):
+        label = " ".join([name, *(f"{key}={value:g}" for key, value in options.items())])
+        print(f"  {label:24s}" + "".join(f"{column[row] * 1e6:12.2f}" for column in columns))

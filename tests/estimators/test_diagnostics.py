@@ -53,7 +53,7 @@ def averages(estimator, tuning, bias=0.0):
 TAIL = 5e-5
 
 
-@pytest.mark.parametrize("estimator", list(ESTIMATORS))
+@pytest.mark.parametrize("estimator", [name for name, entry in ESTIMATORS.items() if entry.family == "Gaussian"])
 def test_a_model_that_fits_is_inside_its_bounds(estimator):
     nis, nees = averages(estimator, Tuning.of(MOTOR))
     assert chi2.ppf(TAIL, RUNS * STEPS) < nis < chi2.ppf(1 - TAIL, RUNS * STEPS)

@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from estimators.linalg import cholesky, congruence, mirror, solve_transposed, solve_upper, wrap
+from estimators.linalg import (
+    cholesky,
+    congruence,
+    mirror,
+    remove,
+    root,
+    solve_transposed,
+    solve_upper,
+    triangularise,
+    wrap,
+)
 
 SIZES = (1, 2, 3, 5, 8, 16, 33)
 # LAPACK's bound for these algorithms is n ε cond(A), relative; the matrices below have a condition of 1e2 to 1e4.
@@ -110,3 +120,64 @@ def test_wrap():
         assert -np.pi <= wrapped < np.pi
         # sin and cos are a second opinion on which angle it is; 50 rad has lost a digit of its fraction of a turn.
         np.testing.assert_allclose([np.sin(wrapped), np.cos(wrapped)], [np.sin(angle), np.cos(angle)], atol=2e-14)
+
+
+@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize("rank", [0, 1, 0.5, 1.0], ids=str)
+def test_root_of_a_singular_matrix(n, rank):
+    """A of rank k < n, as a noise that enters through few states has; cholesky refuses it."""
+    rank = n if rank == 1.0 and isinstance(rank, float) else int(rank * n) if isinstance(rank, float) else rank
+    rng = np.random.default_rng(n)
+    B = rng.normal(0, 1, (n, rank))
+    A = B @ B.T
+    U = np.full((n, n), np.nan)
+    assert root(A, U, n)
+    # Of a pivot that should be zero, some n ε may be left: its root is 1e-8 √n, and it is taken as zero.
+    np.testing.assert_allclose(U.T @ U, A, rtol=0, atol=1e-12 * max(1.0, np.abs(A).max()))
+    assert np.all(U[np.tril_indices(n, -1)] == 0)
+
+
+def test_root_of_a_diagonal_is_exact_and_an_indefinite_matrix_is_refused():
+    U = np.empty((4, 4))
+    assert root(np.diag([4.0, 0.0, 9.0, 0.0]), U, 4)
+    np.testing.assert_array_equal(U, np.diag([2.0, 0.0, 3.0, 0.0]))
+    for A in (np.diag([1.0, -1e-6]), np.array([[1.0, 2.0], [2.0, 1.0]]), np.diag([1.0, np.nan]), np.diag([np.inf, 1])):
+        assert not root(A, np.empty((2, 2)), 2)
+
+
+@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize("extra", [0, 1, 7])
+def test_triangularise(n, extra):
+    rng = np.random.default_rng(n)
+    A = rng.normal(0, 1, (n + extra, n)) * (rng.random((n + extra, n)) < 0.7)
+    A[:, n // 2] *= 1e-6
+    expected = A.T @ A
+    triangularise(A, np.full(n, np.nan))
+    np.testing.assert_array_equal(A[np.tril_indices(n + extra, -1, n)], 0.0)
+    assert np.all(np.diag(A) >= 0)
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert np.all(np.abs(A.T @ A - expected) <= 1e-14 * (n + extra) * scale)
+
+
+def test_triangularise_keeps_the_digits_that_the_product_would_lose():
+    """[1 1; 0 1e-9]: the product's second pivot, 1e-18 beside 1, has no digit left."""
+    A = np.array([[0.6, 0.6], [0.0, 1e-9], [0.8, 0.8]])
+    triangularise(A, np.empty(2))
+    np.testing.assert_allclose(A[0], [1.0, 1.0], rtol=1e-15)
+    np.testing.assert_allclose(A[1, 1], 1e-9, rtol=1e-6)
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_remove_takes_a_square_off(n):
+    rng = np.random.default_rng(n)
+    A, v = spd(rng, n), rng.normal(0, 0.2, n)
+    R = np.linalg.cholesky(A + np.outer(v, v)).T.copy()
+    assert remove(R, n, v.copy())
+    np.testing.assert_allclose(R, np.linalg.cholesky(A).T, rtol=0, atol=TOLERANCE * np.abs(A).max())
+
+
+def test_remove_refuses_what_is_not_there():
+    assert not remove(np.eye(2), 2, np.array([1.0, 0.0]))
+    assert not remove(np.eye(2), 2, np.array([0.8, 0.8]))
+    assert not remove(np.eye(2), 2, np.array([0.0, np.nan]))
+    assert remove(np.eye(2), 2, np.array([0.6, 0.6]))

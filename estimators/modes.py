@@ -1,0 +1,155 @@
+"""The peaks of a cloud of points: where they are, how much of it each holds, how far each spreads.
+
+A kernel density of the whitened points links every point to its nearest neighbour of higher density (quick shift); the
+roots are candidates. Two candidates are one peak unless the density dips between them. Angles enter as points of the
+unit circle, so a peak at ±π is whole.
+
+Sources: Vedaldi & Soatto (2008), Quick shift and kernel methods for mode seeking, doi:10.1007/978-3-540-88693-8_52;
+Rodriguez & Laio (2014), Clustering by fast search and find of density peaks, doi:10.1126/science.1242072;
+Silverman (1986), Density Estimation, section 4.3.2, for the bandwidth.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+SAMPLE = 400
+"""Points that the density is made of: its cost goes with their square."""
+
+DIP = 0.6
+"""Two peaks are one unless the density between them falls below this part of the lower one."""
+
+LEAST = 0.02
+"""A peak with a smaller part of the points is a tail of the nearest one."""
+
+
+CANDIDATES = 12
+"""Peaks that are told from bumps of the density at most."""
+
+
+class Mode(NamedTuple):
+    """One peak: its part of the probability, mean (nx,) and covariance (nx, nx)."""
+
+    weight: float
+    mean: np.ndarray
+    cov: np.ndarray
+
+
+def modes_of(points: np.ndarray, circular: np.ndarray) -> list[Mode]:
+    """The peaks of points of equal weight, the heaviest first.
+
+    Args:
+        points: States, shape (n, nx).
+        circular: For each state whether it is an angle, shape (nx,), bool.
+    """
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return []
+    places = _whitened(points, circular)
+    few = places[np.arange(min(len(places), SAMPLE)) * len(places) // min(len(places), SAMPLE)]
+    label = _peaks(few)
+    if label.max() == 0:
+        return [_mode(points, circular, 1.0)]
+    whole = label[np.argmin(_squares(places, few), axis=1)]
+    parts = [points[whole == k] for k in range(label.max() + 1)]
+    found = [_mode(part, circular, len(part) / len(points)) for part in parts if len(part)]
+    return sorted(found, key=lambda mode: -mode.weight)
+
+
+def _whitened(points: np.ndarray, circular: np.ndarray) -> np.ndarray:
+    """Coordinates in which the cloud has unit covariance, but for directions in which it hardly extends."""
+    columns = []
+    for j in range(points.shape[1]):
+        column = points[:, j]
+        pair = np.column_stack((np.cos(column), np.sin(column))) if circular[j] else column[:, None]
+        pair = pair - pair.mean(axis=0)
+        # One scale for both coordinates of an angle: a short arc must stay an arc.
+        columns.append(pair / max(float(pair.std(axis=0).max()), 1e-300))
+    flat = np.hstack(columns)
+    values, vectors = np.linalg.eigh(flat.T @ flat / len(flat))
+    return flat @ vectors / np.sqrt(np.maximum(values, 0.01))
+
+
+def _squares(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Squared distances of all pairs."""
+    return np.maximum((a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * a @ b.T, 0.0)
+
+
+def _peaks(places: np.ndarray) -> np.ndarray:
+    """For each point the number of its peak, from 0."""
+    n, d = places.shape
+    width = (4.0 / ((d + 2) * n)) ** (1.0 / (d + 4))
+
+    def density(at: np.ndarray) -> np.ndarray:
+        return np.exp(-0.5 * _squares(at, places) / width**2).sum(axis=1)
+
+    squares = _squares(places, places)
+    height = np.exp(-0.5 * squares / width**2).sum(axis=1)
+    order = np.lexsort((np.arange(n), -height))
+    rank = np.empty(n, int)
+    rank[order] = np.arange(n)
+    squares[rank[None, :] >= rank[:, None]] = np.inf
+    parent = np.argmin(squares, axis=1)
+    jump = squares[np.arange(n), parent]
+    # Dense and far from anything denser: Rodriguez & Laio (2014). Outliers are far, but not dense.
+    chance = height * np.sqrt(np.where(np.isfinite(jump), jump, jump[np.isfinite(jump)].max(initial=1.0)))
+    root = (jump > width**2) & (chance >= np.sort(chance)[-min(n, CANDIDATES)])
+    root[order[0]] = True
+    label = np.empty(n, int)
+    tops: list[int] = []
+    for i in order:
+        if root[i]:
+            label[i] = len(tops)
+            tops.append(int(i))
+        else:
+            label[i] = label[parent[i]]
+    # Candidates from the highest down; each joins the first higher one from which no valley parts it.
+    steps = np.linspace(0.0, 1.0, 9)[1:-1, None]
+    joined: list[int] = []
+    for k, top in enumerate(tops):
+        into = k
+        by_distance = sorted(range(k), key=lambda other: float(((places[tops[other]] - places[top]) ** 2).sum()))
+        for other in by_distance:
+            between = density(places[top] + steps * (places[tops[other]] - places[top]))
+            if between.min() > DIP * height[top] or not _valley(places, label, k, other):
+                into = joined[other]
+                break
+        joined.append(into)
+    label = np.array(joined)[label]
+    kept = [k for k in dict.fromkeys(joined) if np.mean(label == k) >= LEAST] or [joined[0]]
+    centres = places[[tops[k] for k in kept]]
+    nearest = np.argmin(_squares(places, centres), axis=1)
+    position = {k: i for i, k in enumerate(kept)}
+    return np.array([position.get(k, near) for k, near in zip(label, nearest, strict=True)])
+
+
+def _valley(places: np.ndarray, label: np.ndarray, a: int, b: int) -> bool:
+    """Whether two trees stay apart when their points are projected on the line between their means.
+
+    One dimension has points enough for a density, where many dimensions have gaps everywhere.
+    """
+    first, second = places[label == a], places[label == b]
+    line = second.mean(axis=0) - first.mean(axis=0)
+    length = float(np.linalg.norm(line))
+    if length == 0.0:
+        return False
+    s, t = first @ line / length, second @ line / length
+    both = np.concatenate((s, t))
+    width = 1.06 * max(1e-6, min(float(s.std()), float(t.std()))) * len(both) ** -0.2
+    grid = np.linspace(s.mean(), t.mean(), 25)
+    density = np.exp(-0.5 * ((grid[:, None] - both) / width) ** 2).sum(axis=1)
+    lower = min(density[:8].max(), density[-8:].max())
+    return bool(density[8:-8].min() < DIP * lower)
+
+
+def _mode(points: np.ndarray, circular: np.ndarray, weight: float) -> Mode:
+    """Mean and covariance of one peak's points; angles about their mean direction."""
+    mean = points.mean(axis=0)
+    for j in np.flatnonzero(circular):
+        mean[j] = np.arctan2(np.sin(points[:, j]).mean(), np.cos(points[:, j]).mean())
+    deviations = points - mean
+    for j in np.flatnonzero(circular):
+        deviations[:, j] = (deviations[:, j] + np.pi) % (2.0 * np.pi) - np.pi
+    return Mode(weight, mean, deviations.T @ deviations / len(points))

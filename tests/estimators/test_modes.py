@@ -1,0 +1,59 @@
+"""Peaks of clouds whose peaks are known."""
+
+import numpy as np
+import pytest
+
+from estimators.modes import modes_of
+
+N = 2000
+
+
+def flat(nx):
+    return np.zeros(nx, bool)
+
+
+@pytest.mark.parametrize("nx", [1, 2, 3, 4])
+def test_a_gaussian_cloud_has_one_peak(nx):
+    rng = np.random.default_rng(nx)
+    for _ in range(5):
+        A = rng.standard_normal((nx, nx))
+        x = rng.standard_normal((N, nx)) @ A.T * 100 + 7
+        (mode,) = modes_of(x, flat(nx))
+        assert mode.weight == 1.0
+        assert np.allclose(mode.mean, x.mean(axis=0)) and np.allclose(mode.cov, np.cov(x.T, bias=True))
+
+
+@pytest.mark.parametrize("part", [0.2, 0.5, 0.7])
+@pytest.mark.parametrize("nx", [1, 2, 3])
+def test_two_peaks_are_told_apart_with_their_weights(nx, part):
+    rng = np.random.default_rng(3)
+    here = rng.random(N) < part
+    x = rng.standard_normal((N, nx))
+    x[:, 0] += np.where(here, 5.0, -5.0)
+    first, second = modes_of(x, flat(nx))
+    # Ten standard deviations apart, so that every point is assigned right but for accidents.
+    assert abs(first.weight - max(here.mean(), 1 - here.mean())) < 0.005
+    assert abs(first.weight + second.weight - 1.0) < 1e-12
+    heavy = here if part > 0.5 or here.mean() > 0.5 else ~here
+    tolerance = 5 / np.sqrt(second.weight * N) + 0.05
+    assert np.all(np.abs(first.mean - x[heavy].mean(axis=0)) < tolerance)
+    assert np.all(np.abs(second.mean - x[~heavy].mean(axis=0)) < tolerance)
+    assert abs(first.cov[0, 0] - 1.0) < 0.3
+
+
+def test_angles_do_not_tear_a_peak():
+    rng = np.random.default_rng(0)
+    x = (np.pi + 0.3 * rng.standard_normal((N, 1)) + np.pi) % (2 * np.pi) - np.pi
+    (mode,) = modes_of(x, np.ones(1, bool))
+    assert abs(abs(mode.mean[0]) - np.pi) < 5 * 0.3 / np.sqrt(N)
+    assert abs(np.sqrt(mode.cov[0, 0]) - 0.3) < 5 * 0.3 / np.sqrt(2 * N)
+
+
+def test_flat_heavy_tailed_and_degenerate_clouds():
+    rng = np.random.default_rng(0)
+    assert len(modes_of(rng.uniform(-1, 1, (N, 2)), flat(2))) == 1
+    assert len(modes_of(rng.standard_t(3, (N, 2)), flat(2))) == 1
+    (point,) = modes_of(np.ones((N, 2)), flat(2))
+    assert np.array_equal(point.mean, [1.0, 1.0]) and np.all(point.cov == 0)
+    assert modes_of(np.full((10, 2), np.nan), flat(2)) == []
+    assert len(modes_of(np.zeros((1, 3)), flat(3))) == 1

@@ -1,0 +1,41 @@
+"""Roots of covariances, the singular ones too."""
+
+import numpy as np
+import pytest
+
+from estimators.noise import semidefinite_root
+
+
+def root(A):
+    L = np.full_like(A, np.nan)
+    return semidefinite_root(A, L), L
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 12])
+@pytest.mark.parametrize("lost", [0, 1, 3])
+def test_a_root_of_any_rank(n, lost):
+    rng = np.random.default_rng(n)
+    B = rng.standard_normal((n, max(0, n - lost)))
+    A = B @ B.T
+    fine, L = root(A)
+    assert fine
+    assert np.array_equal(L, np.tril(L))
+    # Directions whose pivot is below 1e-13 n of the diagonal are dropped: an error of its root at most.
+    assert np.max(np.abs(L @ L.T - A), initial=0) <= 1e-6 * max(np.max(np.abs(A), initial=0), 1e-300)
+
+
+def test_integrated_white_noise_and_zero():
+    dt = 1e-3
+    A = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+    fine, L = root(A)
+    assert fine and np.allclose(L @ L.T, A, rtol=1e-12)
+    fine, L = root(np.zeros((3, 3)))
+    assert fine and np.all(L == 0)
+
+
+@pytest.mark.parametrize(
+    "A", [[[1.0, 0.0], [0.0, -1e-3]], [[0.0, 1.0], [1.0, 0.0]], [[1.0, 2.0], [2.0, 1.0]], [[np.nan, 0.0], [0.0, 1.0]]]
+)
+def test_what_is_no_covariance_is_refused_visibly(A):
+    fine, L = root(np.array(A))
+    assert not fine and np.all(np.isnan(L))
