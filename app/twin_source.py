@@ -144,6 +144,7 @@ class Plan:
                     files,
                     time_column=section.time.column,
                     time_unit=section.time.unit,
+                    time_shift=section.time.shift,
                     channels=channels,
                     width=self.model.width,
                     report=report,

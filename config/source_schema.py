@@ -52,6 +52,9 @@ class ChannelSection(Section):
     where: dict[str, Range] = {}
     """Conditions {name: value} or {name: {min, max}} on values that came along; where one fails, the reading is
     missing. Default: none."""
+    only: dict[str, Range] = {}
+    """Conditions as in `where`, on values that tell of what a row or frame speaks: {anchor: 3}. Where one fails, it says
+    nothing of this channel, not even that a reading is missing. Default: none."""
     convert: Literal["east_north"] | None = None
     """east_north: the two values are latitude and longitude in degrees, and become metres east and north of `origin`.
     Default: null, no conversion."""
@@ -283,6 +286,9 @@ class TimeColumnSection(Section):
     """Its name."""
     unit: Literal["s", "ms", "us", "ns", "min", "h"] = "s"
     """Its unit. Default: s."""
+    shift: Number = 0.0
+    """Seconds added to it: -0.2 where a row tells of the 0.2 s that end with it, so that an input holds for these and not
+    for the next. Default: 0."""
 
 
 class TableSection(RecordingSection):
