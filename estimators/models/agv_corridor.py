@@ -29,9 +29,9 @@ FAR = 60.0
 OUTLINE = (
     (-24.0, -1.5), (-12.0, -1.5), (-12.0, -3.0), (-10.0, -3.0), (-10.0, -1.5), (24.0, -1.5),
     (24.0, 1.5), (12.0, 1.5), (12.0, 3.0), (10.0, 3.0), (10.0, 1.5),
-    (-4.0, 1.5), (-4.0, 2.3), (-5.2, 2.3), (-5.2, 1.5), (-24.0, 1.5),
+    (-4.0, 1.5), (-4.0, 3.0), (-5.2, 3.0), (-5.2, 1.5), (-24.0, 1.5),
 )  # fmt: skip
-"""Corners of the building, m; the niche of depth 0.8 is the door."""
+"""Corners of the building, m; the short niche to the north is the door."""
 
 WALLS = np.array([(*a, *b) for a, b in zip(OUTLINE, OUTLINE[1:] + OUTLINE[:1], strict=True)])
 """East and north of both ends of each wall, (16, 4)."""
@@ -100,11 +100,11 @@ AGV_CORRIDOR = StateSpaceModel(
         State("heading", "rad", std=3.0, circular=True),
     ),
     inputs=(Input("speed", "m/s"), Input("yaw_rate", "rad/s")),
-    noises=(Noise("position", "m²/s", variance=0.002), Noise("heading", "rad²/s", variance=2e-4)),
+    noises=(Noise("position", "m²/s", variance=0.01), Noise("heading", "rad²/s", variance=0.002)),
     sensors=(
         Sensor(
             "scan",
-            tuple(Row(name, "m", variance=0.09) for name in ("ahead", "left", "behind", "right")),
+            tuple(Row(name, "m", variance=0.25) for name in ("ahead", "left", "behind", "right")),
             h=scan,
             H=scan_slopes,
         ),
