@@ -229,10 +229,14 @@ class FaultSection(Section):
             given = getattr(self, key) is not None
             if given and self.kind not in takes:
                 raise PydanticCustomError(
-                    "order", "means nothing to {kind}; leave it out", {"kind": f"a fault of kind {self.kind}", "key": key}
+                    "order",
+                    "means nothing to {kind}; leave it out",
+                    {"kind": f"a fault of kind {self.kind}", "key": key},
                 )
             if self.kind in needs and not given:
-                raise PydanticCustomError("neither", "is of kind {kind} and has no {keys}", {"kind": self.kind, "keys": key})
+                raise PydanticCustomError(
+                    "neither", "is of kind {kind} and has no {keys}", {"kind": self.kind, "keys": key}
+                )
         return self
 
 

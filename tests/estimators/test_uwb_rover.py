@@ -48,8 +48,9 @@ def test_any_number_of_anchors() -> None:
 
 @pytest.mark.parametrize("estimator", ["ekf", "ukf"])
 def test_a_simulated_rover_is_tracked_within_what_the_filter_says(estimator: str) -> None:
-    """The mean of position² / variance, 2 when the filter is right, over 120 s whose errors last for some seconds: about
-    30 independent pairs, so its own standard deviation is 2 / √30, and 4 of these are 1.5."""
+    """The mean of position² / variance, 2 when the filter is right, over 120 s whose errors last for seconds: about
+    30 independent pairs, so its own standard deviation is 2 / √30, and 4 of these are 1.5.
+    """
     prior = {"east": 1.0, "north": 1.0, "heading": 0.2, "yaw_rate_bias": 0.001}
     model = replace(UWB_ROVER, states=tuple(replace(s, std=prior.get(s.name, s.std)) for s in UWB_ROVER.states))
     source = Simulator(
