@@ -43,7 +43,8 @@ def drive(i_d: float = -80.0, i_q: float = 150.0, speed: float = 400.0) -> np.nd
 # Derivatives
 
 
-@pytest.mark.parametrize("name", MODELS)
+# The corridor's beams step at corners: tests/estimators/test_corridor.py.
+@pytest.mark.parametrize("name", [name for name in MODELS if name != "agv_corridor"])
 def test_jacobians_match_central_differences_at_random_states(name: str) -> None:
     model = MODELS[name]
     compiled = compile_model(model)

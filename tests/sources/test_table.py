@@ -192,3 +192,29 @@ def test_what_a_table_lacks_is_one_line(tmp_path, name, content, expected):
         table(tmp_path / name)
     text = str(caught.value)
     assert text.startswith(str(tmp_path / expected)) and "\n" not in text
+
+
+def test_only_picks_the_rows_that_speak_of_a_sensor(tmp_path):
+    """Ranges to one anchor or the other in one column; a row of neither, or whose anchor is blank, says nothing."""
+    path = tmp_path / "ranges.csv"
+    path.write_text("t,range,anchor,ok\n0,1,7,1\n1,2,8,1\n2,3,7,0\n3,4,9,1\n4,5,,1\n5,nan,8,1\n", encoding="utf-8")
+    channels = [
+        Channel(READING, k, f"r{k}", ("range",), only=(Condition("anchor", a, a),), where=(Condition("ok", 1, 1),))
+        for k, a in enumerate((7, 8))
+    ]
+    reports = Reports()
+    got = events(read_all(table(path, channels=channels, report=reports)))
+    expected = [
+        (0, READING, 0, 1.0, NAN),
+        (10**9, READING, 1, 2.0, NAN),
+        (2 * 10**9, READING, 0, NAN, NAN),
+        (5 * 10**9, READING, 1, NAN, NAN),
+    ]
+    np.testing.assert_array_equal(np.array(got), np.array(expected))
+    assert reports.counts == {"condition r0": 1}
+
+
+def test_a_shift_moves_the_clock(tmp_path):
+    path = write(tmp_path, HEADER + "1.5,20,1,2,1,3,7\n")
+    moved = Table([path], time_column="t", time_unit="s", time_shift=-0.2, channels=CHANNELS, width=2)
+    assert set(read_all(moved).t.tolist()) == {1_300_000_000}
