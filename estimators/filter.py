@@ -8,9 +8,9 @@ four functions read the context and change nothing else:
     update(context, u, sensor, y, index, state, work, innovation, innovation_std, score) -> verdict
     describe(context, state, mean, std, cross)                       what the track shows of it
 
-`index` numbers the event in the log, so that randomness can be a function of (seed, index, member). An event far from
-the last is predicted in several calls of the same index (`max_step`), and an inserted query moves the indices behind
-it; so a filter that draws counts its own predictions and updates instead, in its state (`next_draw`): sub-steps differ, queries change no draw, and a refold draws what the fold drew.
+`index` numbers the event in the log. Randomness goes not by it but by a filter's own count of its predictions and
+updates, which is part of the state (`next_draw`): the sub-steps of one event (`max_step`) then differ, queries change
+no draw, and a refold draws what the fold drew.
 
 `work` is scratch that starts as NaN. `score` takes NIS, degrees of freedom and log-likelihood.
 

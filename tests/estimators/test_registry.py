@@ -96,7 +96,7 @@ def test_every_estimator_runs_every_model_it_applies_to(name, model):
     mean, cov = fold.moments()
     std = model.prior_std
     if ESTIMATORS[name].family not in ("Gaussian", "reference"):
-        # Sharp readings leave few of the prior's particles, one perhaps: all is finite, and the mean one of the prior's.
+        # Sharp readings leave few of the prior's particles, one perhaps: the mean is still one of the prior's.
         assert np.all(np.isfinite(cov)) and np.all(np.abs(mean - x) <= 5 * std)
         return
     assert np.all(np.linalg.eigvalsh(cov) > 0)
