@@ -45,10 +45,7 @@ def test_long_gaps_are_split_and_end_at_the_prior_as_in_the_kernel(name, monkeyp
     readings = [Readings.one(int(t), int(t), 0, 1, [0.3, -0.2], 3) for t in times]
     tick = Readings.one(int(times[3]) + 1, 0, TICK, 0, (), 3)
     log = as_log(Readings.concat([*readings, tick], 3))
-    compiled, python = (
-        fold(n, model, Tuning.of(model), as_log(Readings.concat([*readings, tick], 3)))
-        for n in (name, f"{name}-python")
-    )
+    compiled, python = (fold(n, model, Tuning.of(model), log) for n in (name, f"{name}-python"))
     identical(python, compiled)
     # Behind the gap the reading meets the prior again.
     np.testing.assert_array_equal(compiled.innovation_std[5], compiled.innovation_std[0])
