@@ -5,25 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from linear_models import random_linear
-from test_fold import MODEL, as_log, everything, identical
+from test_fold import MODEL, as_log, everything, identical, in_python
 
 from estimators import registry
 from estimators.fold import LONGEST, Fold, fold
 from estimators.log import TICK, Log, Readings
-from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
 
 SECOND = 1_000_000_000
-
-
-def in_python(name):
-    """An entry whose compiled functions the Python loop calls, each with the context behind the view."""
-
-    def behind(function):
-        return lambda view, *rest: function(view.context, *rest)
-
-    entry = ESTIMATORS[name]
-    return replace(entry, name=f"{name}-python", interpreted=True, functions=tuple(map(behind, entry.functions)))
 
 
 @pytest.mark.parametrize("name", ["kf", "ekf", "ukf", "sr-ekf", "enkf", "pf"])
