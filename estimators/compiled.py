@@ -9,12 +9,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numba
 import numpy as np
 
+from .black_box import BlackBox, answered_f, answered_h
 from .context import (
     F_signature,
     H_signature,
@@ -47,6 +48,25 @@ class CompiledModel:
     static: dict[str, Any] = field(repr=False)
     keep_alive: tuple[Any, ...] = field(repr=False)
     draw: Callable | None = None
+    box: BlackBox | None = None
+
+    def f_block(self, X: np.ndarray, u: np.ndarray, p: np.ndarray, dt: float) -> np.ndarray:
+        """f of every state of a block X (N, nx)."""
+        if self.box is not None:
+            return self.box.f(X, u, p, dt)
+        out = np.empty(X.shape)
+        for x, row in zip(np.ascontiguousarray(X), out, strict=True):
+            self.f(x, u, p, dt, row)
+        return out
+
+    def h_block(self, sensor: int, X: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """h (N, ny) of one sensor at every state of a block X (N, nx)."""
+        if self.box is not None:
+            return self.box.h(sensor, X, u, p)
+        out = np.empty((len(X), len(self.model.sensors[sensor].rows)))
+        for x, row in zip(np.ascontiguousarray(X), out, strict=True):
+            self.h[sensor](x, u, p, row)
+        return out
 
 
 def compile_model(model: StateSpaceModel) -> CompiledModel:
@@ -87,8 +107,11 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
 
     _probe(model)
     _probe_likelihoods(model)
-    f = code(model.f, f_signature, "f")
-    f_dispatcher = kept[-1]
+    box = BlackBox(model) if model.black_box else None
+    if box is not None:
+        box.probe()
+    f = code(answered_f if box else model.f, f_signature, "f")
+    f_dispatcher = box.f_of_one if box else kept[-1]
     F = code(model.F, F_signature, "F")
     diagonal = model.shape is not None or model.nx > LARGE
     model_Q = _each_cell if isinstance(model.states, Field) and not model.Q and not diagonal else model.Q
@@ -97,13 +120,13 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
     shape = code(model.shape, shape_signature, "shape")
     shape_dispatcher = kept[-1] if model.shape else None
     h, H, h_dispatchers, likelihoods = [], [], [], []
-    for sensor in model.sensors:
-        h.append(code(sensor.h, h_signature, f"h of sensor {sensor.name}"))
-        h_dispatchers.append(kept[-1])
+    for k, sensor in enumerate(model.sensors):
+        h.append(code(answered_h if box else sensor.h, h_signature, f"h of sensor {sensor.name}"))
+        h_dispatchers.append(partial(box.h_of_one, k) if box else kept[-1])
         H.append(code(sensor.H, H_signature, f"H of sensor {sensor.name}"))
         what = f"log_likelihood of sensor {sensor.name}"
         likelihoods.append(code(sensor.log_likelihood, log_likelihood_signature, what))
-    derivable = model.nx <= LARGE
+    derivable = model.nx <= LARGE and box is None
     f_complex = 0 if model.F or not derivable else complex_code(model.f, f_complex_signature)
     h_complex = [
         0 if sensor.H or not derivable else complex_code(sensor.h, h_complex_signature) for sensor in model.sensors
@@ -133,6 +156,7 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
         Q=q_function,
         keep_alive=tuple(kept),
         draw=draw if diagonal else None,
+        box=box,
         static={
             "f": f,
             "f_complex": f_complex,
@@ -207,7 +231,7 @@ def _probe(model: StateSpaceModel) -> None:
         calls.append((f"h of sensor {sensor.name}", sensor.h, (x, u, p), (m,)))
         calls.append((f"H of sensor {sensor.name}", sensor.H, (x, u, p), (m, n)))
     for what, function, arguments, shape in calls:
-        if function is None:
+        if function is None or (model.black_box and what not in ("Q", "shape")):
             continue
         out = np.full(shape, np.nan)
         if what == "Q":

@@ -26,6 +26,7 @@ from .ensemble import (
     PERTURB,
     RADIUS,
     add_spread,
+    block,
     describe,
     ensemble,
     find_rows,
@@ -152,4 +153,5 @@ ENKF = Estimator(
     options=(MEMBERS, INFLATE, ADD, RADIUS),
     tune=tune,
     prepare=prepare,
+    blocks=block,
 )

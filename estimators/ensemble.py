@@ -74,6 +74,11 @@ def state_size(options: Options, nx: int) -> int:
     return members(options) * nx + HEAD
 
 
+def block(options: Options, state: np.ndarray, nx: int) -> np.ndarray:
+    """A view of the members (N, nx) in a state."""
+    return state[: members(options) * nx].reshape(-1, nx)
+
+
 def side_of(options: Options, ny: int) -> int:
     """Rows of the largest matrix that an analysis factors."""
     return ny if options.get("radius", 0.0) > 0 else min(ny, members(options))

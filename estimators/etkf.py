@@ -28,6 +28,7 @@ from .ensemble import (
     OWN,
     ROTATE,
     add_spread,
+    block,
     describe,
     ensemble,
     judge,
@@ -223,6 +224,7 @@ ETKF = Estimator(
     state_size=state_size,
     work_size=work_size,
     moments=moments,
+    blocks=block,
     points=points,
     options=(
         MEMBERS,

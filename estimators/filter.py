@@ -13,6 +13,8 @@ updates, which is part of the state (`next_draw`): the sub-steps of one event (`
 no draw, and a refold draws what the fold drew.
 
 `work` is scratch that starts as NaN. `score` takes NIS, degrees of freedom and log-likelihood.
+
+The functions of an `interpreted` filter are plain Python, and its context is a `View` (view.py).
 """
 
 from __future__ import annotations
@@ -90,7 +92,8 @@ class Estimator:
     tuning)` turns the options into the numbers that the compiled functions read; it may raise EstimatorError.
     `memory(options, model)` counts numbers that the state holds beyond `state_size`. `runs(options, nx)` is
     `model_runs` as a number: how often a step runs f. `prepare(model, options)` computes what depends on the model
-    too, once for a fold, as int64s.
+    too, once for a fold, as int64s. `blocks(options, state, nx)` is a view of the members (N, nx) in a state, of a
+    compiled filter that runs f and h at these alone and so can be driven on a black box (see driven.py).
     """
 
     name: str
@@ -112,6 +115,8 @@ class Estimator:
     applies: Callable[[StateSpaceModel], str | None] = lambda model: None
     runs: Callable[[Options, int], float] = lambda options, nx: 1.0
     modes: Callable[[Options, np.ndarray, int], list[Mode]] | None = None
+    interpreted: bool = False
+    blocks: Callable[[Options, np.ndarray, int], np.ndarray] | None = None
 
     def complete(self, options: dict[str, float]) -> dict[str, float]:
         """The given options and the defaults of the others.
@@ -138,8 +143,8 @@ class Estimator:
         return {option.name: float(options.get(option.name, option.default)) for option in self.options}
 
     def code(self) -> Code:
-        """Compile the four functions, or load them from the cache."""
-        return _code(self.functions)
+        """Compile the four functions, or load them from the cache; or, if interpreted, the functions themselves."""
+        return Code(*self.functions) if self.interpreted else _code(self.functions)
 
 
 @lru_cache(maxsize=64)

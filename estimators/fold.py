@@ -13,11 +13,14 @@ from typing import Any
 import numpy as np
 from numba import types
 
+from . import fold_python
 from .compiled import compile_model
 from .context import Context, context_type, prior
 from .diagnostics import Bounds, HealthPolicy, assess, assess_signature, chi_square_bounds
+from .driven import driven
 from .errors import EstimatorError
 from .filter import Code, Estimator, call_describe, call_predict, call_start, call_update, code_type
+from .fold_python import LONGEST, UNSET
 from .jit import B1, F1, F2, I1, borrowed, borrowed_rows, i64, jit, jit_brief
 from .log import INPUT, READING, RESET, TICK, TRUTH, Log
 from .model import StateSpaceModel
@@ -26,12 +29,7 @@ from .quantiles import chi_square_quantile
 from .registry import find_estimator
 from .track import MISSING, NONE, Track, track_type
 from .tuning import Tuning
-
-UNSET = np.iinfo(np.int64).min
-"""The clock before the first event, which sets it: the prior holds at that time."""
-
-LONGEST = 10_000
-"""Steps of the model's `max_step` that are predicted in one go; a clock that jumps must not keep the fold busy."""
+from .view import View
 
 SNAPSHOT_EVERY = 64
 """Events between snapshots of the last `RECENT` events, where late readings fall."""
@@ -194,10 +192,10 @@ class Fold:
         self.policy = policy or HealthPolicy()
         self.options = self.estimator.complete(dict(tuning.options))
         self._compiled = compile_model(model)
-        self._code: Code = self.estimator.code()
+        self._code: Code = driven(self.estimator) if model.black_box else self.estimator.code()
         most = model.width * max(1, self.policy.window)
         self._bounds: Bounds = chi_square_bounds(most)
-        self._context = self._see()
+        self._context: Any = self._see()
         numbers = self.estimator.state_size(self.options, model.nx) + self.estimator.memory(self.options, model)
         self._state = np.empty(numbers)
         self._spare = np.empty_like(self._state)
@@ -209,6 +207,10 @@ class Fold:
         if base is not None:
             mean, cov, self._clock[0], self._u[:] = base
         self._run, self._assess, self._run_brief, self._assess_brief, begin = _compiled()
+        if model.black_box or self.estimator.interpreted:
+            self._context = View(self._compiled, self._context, tuning, self.options, self.pairs)
+            self._run = self._run_brief = fold_python.run
+            begin = fold_python.begin
         begin(self._code, self._context, np.ascontiguousarray(mean), np.ascontiguousarray(cov), self._state)
         self.n = 0
         # At least one old snapshot (the start) and one recent, however large the state is.
@@ -286,7 +288,11 @@ class Fold:
         return [Mode(1.0, *self.moments())]
 
     def advance(self, limit: int | None = None) -> int:
-        """Fold the events that the log has beyond `n`, at most `limit`; return how many."""
+        """Fold the events that the log has beyond `n`, at most `limit`; return how many.
+
+        Raises:
+            ModelError: If a black box fails; the fold is then where it last remembered itself, at or before `n`.
+        """
         end = self.log.n if limit is None else min(self.log.n, self.n + limit)
         begun = self.n
         if self.log.capacity > len(self._rows):
@@ -302,24 +308,29 @@ class Fold:
             stride = self._sparse if end - self.n > RECENT else self._every
             boundary = self.n + stride - (log.first + self.n) % stride
             stop = min(end, boundary)
-            run_some(
-                self._code,
-                self._context,
-                log.first,
-                self.n,
-                stop,
-                log.t,
-                log.kind,
-                log.channel,
-                log.value,
-                self._clock,
-                self._u,
-                self._state,
-                self._spare,
-                self._work,
-                self._score,
-                self._rows,
-            )
+            try:
+                run_some(
+                    self._code,
+                    self._context,
+                    log.first,
+                    self.n,
+                    stop,
+                    log.t,
+                    log.kind,
+                    log.channel,
+                    log.value,
+                    self._clock,
+                    self._u,
+                    self._state,
+                    self._spare,
+                    self._work,
+                    self._score,
+                    self._rows,
+                )
+            except BaseException:
+                # A model's own Python failed between two events: back to where the state is known.
+                self._restore(self.n)
+                raise
             self.n = stop
             if stop == boundary:
                 self._remember()
@@ -343,8 +354,10 @@ class Fold:
 
     def rewind(self, index: int) -> None:
         """Go back so that the event at `index` (and all behind it) will be folded again."""
-        if index >= self.n:
-            return
+        if index < self.n:
+            self._restore(index)
+
+    def _restore(self, index: int) -> None:
         limit = self.log.first + index
         at = max(key for key in self._snapshots if key <= limit)
         for key in [key for key in self._snapshots if key > at]:

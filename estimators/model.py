@@ -10,6 +10,7 @@ that every filter calls.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -101,6 +102,11 @@ class StateSpaceModel:
     (nx,) with L z, where L Lᵀ has ones on its diagonal: the noise of the process, √(q·dt) L z, and the spread of the
     prior, std L z, are correlated in space by it, without a matrix.
     Steps longer than `max_step` seconds are split, so an f that integrates crudely need not integrate far.
+
+    A `black_box` is not compiled: f(X, u, p, dt) takes a block of states X (N, nx) and returns the next ones (N, nx), a
+    sensor's h(X, u, p) returns (N, ny). Row i of the result depends on row i alone, and on no chance. `executor` splits
+    the block: "threads" (for an f that gives up the GIL), "processes" (f must be importable by its name), or any
+    concurrent.futures.Executor; None runs it as it is. Q and shape remain functions of one state, which are compiled.
     """
 
     name: str
@@ -117,6 +123,8 @@ class StateSpaceModel:
     linear: bool = False
     max_step: float = np.inf
     source: str = ""
+    black_box: bool = False
+    executor: Executor | str | None = None
 
     def __post_init__(self) -> None:
         """Refuse what no filter could run: nothing to estimate, names used twice, numbers out of range."""
@@ -162,6 +170,19 @@ class StateSpaceModel:
             raise ModelError(
                 f"model {self.name}: Q of {self.nx:,} states would be a matrix of {8e-9 * self.nx**2:.3g} GB; name the "
                 "noise after the field and correlate it with shape(z, p, out), which takes Q's place"
+            )
+        if self.black_box:
+            if self.F is not None or any(s.H is not None or s.log_likelihood is not None for s in self.sensors):
+                raise ModelError(
+                    f"model {self.name}: a black box gives f and h of blocks of states only; leave out F, H and "
+                    "log_likelihood"
+                )
+        elif self.executor is not None:
+            raise ModelError(f"model {self.name}: executor is for a black box; set black_box=True or leave it out")
+        if isinstance(self.executor, str) and self.executor not in ("threads", "processes"):
+            raise ModelError(
+                f"model {self.name}: executor is {self.executor!r}; it must be 'threads', 'processes', or a "
+                "concurrent.futures.Executor"
             )
         if not self.max_step > 0:
             raise ModelError(f"model {self.name}: max_step is {self.max_step} s; it must be positive")

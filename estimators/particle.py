@@ -105,6 +105,12 @@ def points(options: Options, state: np.ndarray, nx: int) -> np.ndarray:
     return records[np.minimum(picked, n - 1), :nx]
 
 
+def block(options: Options, state: np.ndarray, nx: int) -> np.ndarray:
+    """A view of the records (N, record) in a state."""
+    n = members(options)
+    return state[at_weights(nx) + n :].reshape(n, -1)
+
+
 def modes(options: Options, state: np.ndarray, nx: int) -> list[Mode]:
     """The peaks of the cloud."""
     return modes_of(points(options, state, nx), state[HEAD : HEAD + nx] != 0.0)

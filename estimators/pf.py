@@ -31,6 +31,7 @@ from .particle import (
     PROCESS,
     RESAMPLE,
     SETTLED,
+    block,
     describe,
     modes,
     moments,
@@ -186,6 +187,7 @@ PF = Estimator(
     points=points,
     modes=modes,
     options=OPTIONS,
+    blocks=block,
     tune=tune,
 )
 
@@ -205,5 +207,6 @@ PF_REG = Estimator(
     points=points,
     modes=modes,
     options=(*OPTIONS, BANDWIDTH),
+    blocks=block,
     tune=tune_regularised,
 )

@@ -12,6 +12,7 @@ from .ensrf import ENSRF
 from .errors import EstimatorError
 from .etkf import ETKF
 from .filter import Estimator
+from .filterpy_ import FILTERPY_EKF, FILTERPY_ENKF, FILTERPY_KF, FILTERPY_UKF
 from .iekf import IEKF
 from .kf import KF
 from .kf_steady import KF_STEADY
@@ -27,8 +28,9 @@ from .ukf import UKF
 GAUSSIAN = (KF, KF_STEADY, EKF, IEKF, UKF, CKF, SR_KF, SR_EKF, SR_UKF)
 PARTICLE = (PF, PF_REG, PF_EKF, APF)
 ENSEMBLE = (ENKF, ETKF, ENSRF, LETKF)
+REFERENCE = (FILTERPY_KF, FILTERPY_EKF, FILTERPY_UKF, FILTERPY_ENKF)
 
-ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in GAUSSIAN + PARTICLE + ENSEMBLE}
+ESTIMATORS: dict[str, Estimator] = {entry.name: entry for entry in GAUSSIAN + PARTICLE + ENSEMBLE + REFERENCE}
 
 
 def find_entry(name: str) -> Estimator:
@@ -58,6 +60,12 @@ def find_estimator(name: str, model: StateSpaceModel) -> Estimator:
 
 def unfit(entry: Estimator, model: StateSpaceModel) -> str | None:
     """Why an estimator does not fit a model, or None: its own reason, or the size of the covariance that it forms."""
+    if model.black_box and entry.blocks is None and not entry.interpreted:
+        able = ", ".join(e.name for e in ESTIMATORS.values() if e.interpreted or e.blocks is not None)
+        return (
+            f"{model.name} is a black box, whose f and h run on blocks of states and are not compiled; {entry.name} "
+            f"needs compiled ones; use {able}"
+        )
     if entry.family == "ensemble":
         return entry.applies(model)
     if model.nx > LARGE:

@@ -1,5 +1,7 @@
 """The fold is a pure function of its log: pieces, order of arrival, copies and cuts leave every bit as it was."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from linear_models import ROWS, random_linear, random_log
@@ -14,7 +16,11 @@ from estimators.tuning import Tuning
 SECOND = 1_000_000_000
 MATRICES = random_linear(np.random.default_rng(1), 3, 2)
 MODEL = MATRICES.model
-NAMES = [name for name, entry in ESTIMATORS.items() if entry.family == "Gaussian" and entry.applies(MODEL) is None]
+PYTHON = ["filterpy-kf", "ekf-python"]
+"""The other kind of fold: a filter in Python, and a compiled one in Python's loop (see `in_python`)."""
+
+GAUSSIAN = [entry for entry in ESTIMATORS.values() if entry.family == "Gaussian" and entry.applies(MODEL) is None]
+NAMES = [entry.name for entry in GAUSSIAN] + PYTHON
 
 
 def identical(a, b):
@@ -46,9 +52,25 @@ def reading(t, sensor, values, width=MODEL.width):
     return Readings.one(t, t, READING, sensor, values, width)
 
 
+def in_python(name):
+    """An entry whose compiled functions the Python loop calls, each with the context behind the view."""
+
+    def behind(function):
+        return lambda view, *rest: function(view.context, *rest)
+
+    entry = ESTIMATORS[name]
+    return replace(entry, name=f"{name}-python", interpreted=True, functions=tuple(map(behind, entry.functions)))
+
+
 @pytest.fixture(params=NAMES)
-def estimator(request):
+def estimator(request, monkeypatch):
+    if request.param == "ekf-python":
+        monkeypatch.setitem(ESTIMATORS, request.param, in_python("ekf"))
     return request.param
+
+
+QUICK = pytest.mark.parametrize("estimator", [name for name in NAMES if name != "filterpy-kf"], indirect=True)
+"""For thousands of events: FilterPy takes half a millisecond for each."""
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -102,6 +124,7 @@ def test_a_reading_older_than_the_first_event(estimator):
     identical(growing.track, fold(estimator, MODEL, Tuning.of(MODEL), log.copy()))
 
 
+@QUICK
 def test_rewind_far_behind_the_recent_snapshots(estimator):
     events = random_log(np.random.default_rng(5), MATRICES, 2 * RECENT + 500).readings
     log = as_log(events)
@@ -133,6 +156,7 @@ def test_follow_a_log_that_grew_meanwhile(estimator, late):
     identical(beside.track, fold(estimator, MODEL, tuning, log.copy()))
 
 
+@QUICK
 def test_drop_front_and_base_at(estimator):
     events = everything(np.random.default_rng(7), 6000)
     log = as_log(events)
@@ -159,6 +183,7 @@ def test_drop_front_and_base_at(estimator):
         growing.drop_front(1)
 
 
+@QUICK
 def test_follow_over_a_cut(estimator):
     """The live log forgot its oldest events while a copy was refolded."""
     events = everything(np.random.default_rng(8), 5000)
@@ -352,6 +377,7 @@ def test_seed_and_version_do_not_change_a_filter_without_randomness(estimator):
     )
 
 
+@QUICK
 def test_covariance_stays_symmetric_and_positive(estimator):
     """Thousands of precise readings: where P - K S Kᵀ in plain form would lose its sign."""
     rng = np.random.default_rng(13)

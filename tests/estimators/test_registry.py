@@ -95,7 +95,7 @@ def test_every_estimator_runs_every_model_it_applies_to(name, model):
     fold.advance()
     mean, cov = fold.moments()
     std = model.prior_std
-    if ESTIMATORS[name].family not in ("Gaussian", "reference"):
+    if ESTIMATORS[name].family not in ("Gaussian", "reference") or name == "filterpy-enkf":
         # Sharp readings leave few of the prior's particles, one perhaps: the mean is still one of the prior's.
         assert np.all(np.isfinite(cov)) and np.all(np.abs(mean - x) <= 5 * std)
         return
@@ -103,7 +103,7 @@ def test_every_estimator_runs_every_model_it_applies_to(name, model):
     if name != "kf-steady":  # a gain that is not the best one may make a state worse
         assert np.all(np.sqrt(np.diag(cov)) <= std * (1 + 1e-12))
     # The reading is what is expected at the mean, so a linearised filter does not move; sigma points see curvature.
-    if name not in ("ukf", "ckf", "sr-ukf"):
+    if name not in ("ukf", "ckf", "sr-ukf", "filterpy-ukf"):
         np.testing.assert_allclose(mean, x, atol=1e-9)
 
 
