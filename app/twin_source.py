@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from config.loader import Loaded
+from config.problems import nearest
 from config.source_schema import (
     AssetSection,
     CanLogSection,
@@ -19,7 +20,6 @@ from config.source_schema import (
     SimulatorSection,
     TableSection,
 )
-from config.problems import nearest
 from config.yaml_lines import Key, dotted
 from estimators.errors import NisusError, SourceError
 from estimators.log import READING, Readings

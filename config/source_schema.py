@@ -54,8 +54,8 @@ class ChannelSection(Section):
     """Conditions {name: value} or {name: {min, max}} on values that came along; where one fails, the reading is
     missing. Default: none."""
     only: dict[str, Range] = {}
-    """Conditions as in `where`, on values that tell of what a row or frame speaks: {anchor: 3}. Where one fails, it says
-    nothing of this channel, not even that a reading is missing. Default: none."""
+    """Conditions as in `where`, on values that tell of what a row or frame speaks: {anchor: 3}. Where one fails, it
+    says nothing of this channel, not even that a reading is missing. Default: none."""
     convert: Literal["east_north"] | None = None
     """east_north: the two values are latitude and longitude in degrees, and become metres east and north of `origin`.
     Default: null, no conversion."""
@@ -202,8 +202,8 @@ class FaultSection(Section):
     row: Text | None = None
     """The row of the sensor that fails. Default: null, all."""
     kind: Literal["bias", "drift", "stuck", "outliers", "dropout"]
-    """bias: `size` is added. drift: `size` is added for every second since `start`. stuck: the last reading before `start`
-    is repeated. outliers: with probability `rate` a draw of that standard deviation, `size`, is added. dropout: with
+    """bias: `size` is added. drift: `size` is added for every second since `start`. stuck: the last reading before
+    `start` is repeated. outliers: with probability `rate` a draw of that standard deviation, `size`, is added. dropout: with
     probability `rate` a reading is lost."""
     start: NotNegative = 0.0
     """Seconds after the start of the simulation at which it begins. Default: 0."""
@@ -336,8 +336,8 @@ class TimeColumnSection(Section):
     unit: Literal["s", "ms", "us", "ns", "min", "h"] = "s"
     """Its unit. Default: s."""
     shift: Number = 0.0
-    """Seconds added to it: -0.2 where a row tells of the 0.2 s that end with it, so that an input holds for these and not
-    for the next. Default: 0."""
+    """Seconds added to it: -0.2 where a row tells of the 0.2 s that end with it, so that an input holds for these and
+    not for the next. Default: 0."""
 
 
 class TableSection(RecordingSection):
