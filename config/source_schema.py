@@ -203,8 +203,8 @@ class FaultSection(Section):
     """The row of the sensor that fails. Default: null, all."""
     kind: Literal["bias", "drift", "stuck", "outliers", "dropout"]
     """bias: `size` is added. drift: `size` is added for every second since `start`. stuck: the last reading before
-    `start` is repeated. outliers: with probability `rate` a draw of that standard deviation, `size`, is added. dropout: with
-    probability `rate` a reading is lost."""
+    `start` is repeated. outliers: with probability `rate` a draw of that standard deviation, `size`, is added. dropout:
+    with probability `rate` a reading is lost."""
     start: NotNegative = 0.0
     """Seconds after the start of the simulation at which it begins. Default: 0."""
     end: Positive | None = None
