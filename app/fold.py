@@ -170,8 +170,8 @@ def _write(path: Path, twin: Twin, log: Log, track: Track) -> None:
         columns[f"{name}_true"] = true
     columns |= {name: track.mean[:, k] for k, name in enumerate(model.state_names)}
     columns |= {f"{name}_std": track.std[:, k] for k, name in enumerate(model.state_names)}
-    columns |= {f"innovation_{k}": track.innovation[:, k] for k in range(model.width)}
-    columns |= {f"innovation_std_{k}": track.innovation_std[:, k] for k in range(model.width)}
+    columns |= {f"innovation_{k}": track.innovation[:, k] for k in range(model.ny)}
+    columns |= {f"innovation_std_{k}": track.innovation_std[:, k] for k in range(model.ny)}
     for name in ("nis", "nis_mean", "nis_low", "nis_high", "log_likelihood"):
         columns[name] = getattr(track, name)
     columns["verdict"] = np.array(VERDICT_NAMES)[track.verdict]

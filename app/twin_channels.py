@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import inf
 from typing import TYPE_CHECKING, Any
 
 from config.loader import Loaded
-from config.source_schema import ChannelSection, SignalSection
+from config.source_schema import ChannelSection, RangeSection, SignalSection
 from config.yaml_lines import Key
 from estimators.log import INPUT, READING, TRUTH
 from estimators.model import StateSpaceModel
@@ -14,7 +15,7 @@ from estimators.model import StateSpaceModel
 from .twin_model import check_names
 
 if TYPE_CHECKING:
-    from sources.source import Channel
+    from sources.source import Channel, Condition
 
 
 def channels(loaded: Loaded, section: Any, key: Key, model: StateSpaceModel) -> list[tuple[Key, Channel]]:
@@ -43,7 +44,7 @@ def channels(loaded: Loaded, section: Any, key: Key, model: StateSpaceModel) -> 
 def _channel(
     loaded: Loaded, key: Key, item: ChannelSection, kind: int, index: int, name: str, rows: list[tuple[str, str]]
 ) -> Channel:
-    from sources.source import Channel, Condition
+    from sources.source import Channel
 
     names = item.names()
     word = "signals" if isinstance(item, SignalSection) else "columns"
@@ -60,12 +61,19 @@ def _channel(
         model_units=tuple(unit for _, unit in rows),
         scale=_spread(item.scale, len(rows)),
         offset=_spread(item.offset, len(rows)),
-        where=tuple(
-            Condition(signal, -inf if limits.min is None else limits.min, inf if limits.max is None else limits.max)
-            for signal, limits in item.where.items()
-        ),
+        where=_conditions(item.where),
+        only=_conditions(item.only),
         convert=item.convert,
         origin=item.origin,
+    )
+
+
+def _conditions(given: Mapping[str, RangeSection]) -> tuple[Condition, ...]:
+    from sources.source import Condition
+
+    return tuple(
+        Condition(signal, -inf if limits.min is None else limits.min, inf if limits.max is None else limits.max)
+        for signal, limits in given.items()
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ from config.source_schema import (
     SimulatorSection,
     TableSection,
 )
+from config.problems import nearest
 from config.yaml_lines import Key, dotted
 from estimators.errors import NisusError, SourceError
 from estimators.log import READING, Readings
@@ -28,6 +30,7 @@ from .twin_files import failure, find_databases, find_recording
 from .twin_model import check_names, find_model, one_each
 
 if TYPE_CHECKING:
+    from sources.faults import Fault
     from sources.player import Player
     from sources.profile import Profile
     from sources.source import Channel, Report, Source
@@ -90,6 +93,7 @@ class Plan:
             truth_noise={name: level.value for name, level in truth.noise.items()},
             inputs={name: _profile(profiles) for name, profiles in section.inputs.items()},
             sensors=plans,
+            faults=_faults(self.loaded, section, key, self.model),
         )
 
     def player(self, report: Report, *, interface: str | None = None, channel: str | int | None = None) -> Player:
@@ -144,6 +148,7 @@ class Plan:
                     files,
                     time_column=section.time.column,
                     time_unit=section.time.unit,
+                    time_shift=section.time.shift,
                     channels=channels,
                     width=self.model.width,
                     report=report,
@@ -288,6 +293,7 @@ def _check_asset(loaded: Loaded, section: AssetSection, key: Key, model: StateSp
     check_names(loaded, (*key, "initial"), section.initial, model.state_names, "state", model)
     check_names(loaded, (*key, "inputs"), section.inputs, model.input_names, "input", model)
     check_names(loaded, (*key, "sensors"), section.sensors, model.sensor_names, "sensor", model)
+    _faults(loaded, section, key, model)
     if section.truth.model is None:
         _check_truth(loaded, section, key, model)
 
@@ -307,6 +313,31 @@ def _check_same(loaded: Loaded, key: Key, truth: StateSpaceModel, model: StateSp
             raise loaded.error(
                 key, f"has {what.replace('_names', 's')} {', '.join(theirs)}; they must be {', '.join(ours)}"
             )
+
+
+def _faults(loaded: Loaded, section: AssetSection, key: Key, model: StateSpaceModel) -> list[Fault]:
+    from sources.faults import Fault
+
+    for k, item in enumerate(section.faults):
+        place = (*key, "faults", k)
+        if item.sensor not in model.sensor_names:
+            near = nearest(item.sensor, model.sensor_names)
+            raise loaded.error((*place, "sensor"), f"is {item.sensor!r}, no sensor of {model.name}; {near}")
+        rows = [row.name for row in model.sensors[model.sensor_names.index(item.sensor)].rows]
+        if item.row is not None and item.row not in rows:
+            raise loaded.error((*place, "row"), f"is {item.row!r}, no row of {item.sensor}; {nearest(item.row, rows)}")
+    return [
+        Fault(
+            item.sensor,
+            item.kind,
+            item.start,
+            inf if item.end is None else item.end,
+            item.size or 0.0,
+            1.0 if item.rate is None else item.rate,
+            item.row,
+        )
+        for item in section.faults
+    ]
 
 
 def _profile(sections: tuple[ProfileSection, ...]) -> Profile:

@@ -13,8 +13,8 @@ from .commands import Command, SetOption
 from .viser_rows import ChoiceRow, NumberRow
 from .viser_submit import Coalescer
 
-WIDE = 200.0
-"""Ratio of an option's ends from which its slider counts powers of ten."""
+WIDE = 100.0
+"""Upper end of an option from which on it is typed: no slider is fine enough."""
 
 
 class OptionRows:
@@ -64,7 +64,7 @@ class OptionRows:
             )
         return NumberRow(
             self._gui, self._coalescer, key=f"{entry.name}.{option.name}", label=option.name, unit=option.unit,
-            value=value, configured=option.default, low=option.low, high=option.high, hint=option.meaning,
-            logarithmic=option.low > 0.0 and option.high / option.low > WIDE, complain=self._complain,
+            value=value, configured=option.default, low=option.low, hint=option.meaning, complain=self._complain,
+            high=option.high if option.high <= WIDE else float("inf"),
             command=partial(SetOption, option.name),
         )  # fmt: skip

@@ -10,6 +10,7 @@ from pydantic_core import PydanticCustomError
 from .fields import (
     Count,
     LevelSection,
+    NotNegative,
     Number,
     Numbers,
     Positive,
@@ -52,6 +53,9 @@ class ChannelSection(Section):
     where: dict[str, Range] = {}
     """Conditions {name: value} or {name: {min, max}} on values that came along; where one fails, the reading is
     missing. Default: none."""
+    only: dict[str, Range] = {}
+    """Conditions as in `where`, on values that tell of what a row or frame speaks: {anchor: 3}. Where one fails, it says
+    nothing of this channel, not even that a reading is missing. Default: none."""
     convert: Literal["east_north"] | None = None
     """east_north: the two values are latitude and longitude in degrees, and become metres east and north of `origin`.
     Default: null, no conversion."""
@@ -190,6 +194,52 @@ class PlanSection(SpreadSection):
     """One in so many of its readings is lost. Default: null, none."""
 
 
+class FaultSection(Section):
+    """A fault of one simulated sensor; what the estimator assumes of the sensor stays."""
+
+    sensor: Text
+    """The sensor's name."""
+    row: Text | None = None
+    """The row of the sensor that fails. Default: null, all."""
+    kind: Literal["bias", "drift", "stuck", "outliers", "dropout"]
+    """bias: `size` is added. drift: `size` is added for every second since `start`. stuck: the last reading before `start`
+    is repeated. outliers: with probability `rate` a draw of that standard deviation, `size`, is added. dropout: with
+    probability `rate` a reading is lost."""
+    start: NotNegative = 0.0
+    """Seconds after the start of the simulation at which it begins. Default: 0."""
+    end: Positive | None = None
+    """Seconds after the start of the simulation at which it ends. Default: null, never."""
+    size: Number | None = None
+    """How much, in the row's unit (drift: a second). Needed by bias, drift and outliers."""
+    rate: Annotated[float, Field(strict=True, gt=0, le=1)] | None = None
+    """Probability, a reading. Needed by outliers; of a dropout the default is 1."""
+
+    @model_validator(mode="after")
+    def _fits(self) -> FaultSection:
+        if self.end is not None and self.end <= self.start:
+            raise PydanticCustomError(
+                "order", "is {value} s; it must be above start ({other} s)",
+                {"value": self.end, "other": self.start, "key": "end"},
+            )  # fmt: skip
+        for key, takes, needs in (
+            ("size", ("bias", "drift", "outliers"), ("bias", "drift", "outliers")),
+            ("rate", ("outliers", "dropout"), ("outliers",)),
+            ("row", ("bias", "drift", "stuck", "outliers"), ()),
+        ):
+            given = getattr(self, key) is not None
+            if given and self.kind not in takes:
+                raise PydanticCustomError(
+                    "order",
+                    "means nothing to {kind}; leave it out",
+                    {"kind": f"a fault of kind {self.kind}", "key": key},
+                )
+            if self.kind in needs and not given:
+                raise PydanticCustomError(
+                    "neither", "is of kind {kind} and has no {keys}", {"kind": self.kind, "keys": key}
+                )
+        return self
+
+
 class TruthSection(Section):
     """Where the simulated asset differs from the estimator's model."""
 
@@ -218,6 +268,8 @@ class AssetSection(Section):
     """Inputs by name: a number, {steps}, {sine}, or a list of these, which is their sum. Default: the model's."""
     sensors: dict[str, PlanSection] = {}
     """Rates, noise and losses by sensor. Default: every sensor at every step."""
+    faults: tuple[FaultSection, ...] = ()
+    """Faults of sensors, a list of {sensor, kind, start, end, size, rate, row}. Default: none."""
 
 
 class SimulatorSection(AssetSection):
@@ -283,6 +335,9 @@ class TimeColumnSection(Section):
     """Its name."""
     unit: Literal["s", "ms", "us", "ns", "min", "h"] = "s"
     """Its unit. Default: s."""
+    shift: Number = 0.0
+    """Seconds added to it: -0.2 where a row tells of the 0.2 s that end with it, so that an input holds for these and not
+    for the next. Default: 0."""
 
 
 class TableSection(RecordingSection):

@@ -221,7 +221,7 @@ class Fold:
         self._sparse = max(SPARSE_EVERY, self._every)
         self._snapshots: dict[int, tuple[int, np.ndarray, np.ndarray]] = {}
         self._remember()
-        self._rows = Track.allocate(log.capacity, len(model.shown), len(self.pairs), model.width)
+        self._rows = Track.allocate(log.capacity, len(model.shown), len(self.pairs), model.ny)
 
     def _see(self) -> Context:
         """The context of this model and tuning; the arrays that it points to are kept in `self._held`."""
@@ -296,7 +296,7 @@ class Fold:
         end = self.log.n if limit is None else min(self.log.n, self.n + limit)
         begun = self.n
         if self.log.capacity > len(self._rows):
-            grown = Track.allocate(self.log.capacity, len(self.model.shown), len(self.pairs), self.model.width)
+            grown = Track.allocate(self.log.capacity, len(self.model.shown), len(self.pairs), self.model.ny)
             for new, old in zip(grown, self._rows, strict=True):
                 new[: self.n] = old[: self.n]
             self._rows = grown

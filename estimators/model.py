@@ -198,6 +198,11 @@ class StateSpaceModel:
         return len(self.inputs)
 
     @cached_property
+    def ny(self) -> int:
+        """Rows of the longest sensor."""
+        return max(len(sensor.rows) for sensor in self.sensors)
+
+    @cached_property
     def state_names(self) -> Sequence[str]:
         """Names of the states, in order."""
         if isinstance(self.states, Field):
@@ -294,4 +299,4 @@ class StateSpaceModel:
 
         A block holds the whole state of a small model, and `TRUTH_BLOCK` states of a large one.
         """
-        return max(min(self.nx, TRUTH_BLOCK), self.nu, *(len(sensor.rows) for sensor in self.sensors))
+        return max(min(self.nx, TRUTH_BLOCK), self.nu, self.ny)

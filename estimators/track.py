@@ -25,7 +25,7 @@ class Track(NamedTuple):
     """Columns of one length N.
 
     mean, std (N, nx): the estimate after the event, in the units of the states. cross (N, pairs): the covariance of
-    each configured pair of states. innovation, innovation_std (N, width): reading minus prediction and the square
+    each configured pair of states. innovation, innovation_std (N, ny): reading minus prediction and the square
     root of S's diagonal; NaN where there is none. nis: νᵀ S⁻¹ ν, `dof` its degrees of freedom. nis_mean with
     nis_low and nis_high: mean NIS over the last readings, and its 95 % bounds. age: seconds since the last reading that
     was used or gated. consistency: the health that the window's NIS and gate alone would give.
@@ -48,9 +48,9 @@ class Track(NamedTuple):
     health: Any
 
     @staticmethod
-    def allocate(rows: int, nx: int, pairs: int, width: int) -> Track:
+    def allocate(rows: int, nx: int, pairs: int, ny: int) -> Track:
         """Columns for `rows` events, filled with NaN (so that their memory is paid for at once)."""
-        matrix = [np.full((rows, k), np.nan) for k in (nx, nx, pairs, width, width)]
+        matrix = [np.full((rows, k), np.nan) for k in (nx, nx, pairs, ny, ny)]
         vectors = [np.full(rows, np.nan) for _ in range(2)]
         codes = [np.zeros(rows, np.int8) for _ in range(2)]
         windowed = [np.full(rows, np.nan) for _ in range(4)]

@@ -80,6 +80,8 @@ class Encoder:
                 raise SourceError(
                     f"{channel.name}: convert is {channel.convert}; it cannot be encoded, so leave it out"
                 )
+            if channel.only:
+                raise SourceError(f"{channel.name}: only picks frames; it cannot be encoded, so leave it out")
             messages, _, path = find_messages(found, channel)
             message = messages[0]
             if any(signal.multiplexer_ids for signal in message.signals):

@@ -31,6 +31,7 @@ class _Tables(NamedTuple):
     offset: np.ndarray
     where: np.ndarray
     where_slot: np.ndarray
+    selects: np.ndarray
     low: np.ndarray
     high: np.ndarray
 
@@ -57,11 +58,14 @@ def _emit(tables, plan, skip, values, state, source, kind, channel, value, refus
                     cut[c] += 1
             if not said:
                 continue
-            good = True
+            good, meant = True, True
             for w in range(tables.where[c], tables.where[c + 1]):
                 tested = values[i, tables.where_slot[w]]
                 if state[i, tables.where_slot[w]] != PRESENT or not (tables.low[w] <= tested <= tables.high[w]):
                     good = False
+                    meant = meant and tables.selects[w] == 0
+            if not meant:
+                continue
             if not good:
                 refused[c] += 1
                 if tables.kind[c] != READING:
@@ -123,7 +127,7 @@ class Mapping:
         order = (INPUT, READING, TRUTH)
         self._channels: list[Channel] = []
         group, kind, index, row, where = [0], [], [], [0], [0]
-        slot, factors, scale, offset, where_slot, low, high = ([] for _ in range(7))
+        slot, factors, scale, offset, where_slot, selects, low, high = ([] for _ in range(8))
         for channels, names, units in groups:
             positions = {name: k for k, name in enumerate(names)}
             # True states in their order, for the blocks.
@@ -139,8 +143,9 @@ class Mapping:
                     scale.append(1.0 if channel.convert else channel.scale[k])
                     offset.append(0.0 if channel.convert else channel.offset[k])
                 row.append(len(slot))
-                for condition in channel.where:
+                for condition in (*channel.where, *channel.only):
                     where_slot.append(positions[condition.signal])
+                    selects.append(condition in channel.only)
                     low.append(condition.low)
                     high.append(condition.high)
                 where.append(len(where_slot))
@@ -158,6 +163,7 @@ class Mapping:
             offset=np.array(offset, real),
             where=np.array(where, whole),
             where_slot=np.array(where_slot, whole),
+            selects=np.array(selects, whole),
             low=np.array(low, real),
             high=np.array(high, real),
         )

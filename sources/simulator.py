@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TICK, TRUTH, Readings
 from estimators.model import StateSpaceModel
 
+from .faults import Fault, Faults
 from .profile import Constant, Profile
 
 BATCH = 512
@@ -54,6 +55,7 @@ class Simulator:
         truth_noise: Mapping[str, float] | None = None,
         inputs: Mapping[str, Profile] | None = None,
         sensors: Mapping[str, SensorPlan] | None = None,
+        faults: Sequence[Fault] = (),
     ) -> None:
         """Set the asset up.
 
@@ -68,9 +70,10 @@ class Simulator:
             truth_noise: Variances that the asset's noise adds in a second, where they differ.
             inputs: Profiles by name; the others keep their default.
             sensors: Plans by name; a sensor without one speaks at every step.
+            faults: Of sensors, applied in this order.
 
         Raises:
-            SourceError: If a duration or step is not positive.
+            SourceError: If a duration or step is not positive, or a fault does not fit the sensors.
         """
         truth = truth_model or model
         if not step > 0:
@@ -98,6 +101,7 @@ class Simulator:
             np.sqrt(plan.variances if plan.variances is not None else [row.variance for row in sensor.rows])
             for plan, sensor in zip(self._plans, model.sensors, strict=True)
         ]
+        self._faults = Faults(faults, model.sensors, seed)
         self._spoken = [0] * len(self._plans)
         self._circular = np.flatnonzero(truth.circular)
         self._rng = np.random.default_rng(seed)
@@ -160,6 +164,7 @@ class Simulator:
             y = np.empty(self._std[i].size)
             truth.h[i](self._x, self._u, self._p, y)
             y += self._rng.normal(0.0, self._std[i], size=y.size)
+            y = self._faults.spoil(i, self._k * self._step, y)
             lost = plan.drop_every is not None and self._spoken[i] % plan.drop_every == plan.drop_every - 1
             self._spoken[i] += 1
             rows.append((t, READING, i, np.full(y.size, np.nan) if lost else y))

@@ -47,6 +47,7 @@ class Channel:
     `kind` is READING, INPUT or TRUTH and `index` that of the sensor, input or state. `signals` are signals of the CAN
     `message`, or columns of a table, one for each row. A value is converted from its unit to the model's and becomes
     scale * value + offset. `units` None means the DBC's own unit, or the model's where that is empty too.
+    Where a condition of `where` fails the value is missing; where one of `only` fails, nothing was said of the channel.
     With convert "east_north" the two signals are latitude and longitude in degrees and become metres east and north of
     `origin`, which is the first valid fix unless given.
     """
@@ -61,6 +62,7 @@ class Channel:
     scale: tuple[float, ...] = ()
     offset: tuple[float, ...] = ()
     where: tuple[Condition, ...] = ()
+    only: tuple[Condition, ...] = ()
     convert: str | None = None
     origin: tuple[float, float] | None = None
 
@@ -76,7 +78,7 @@ class Channel:
     @property
     def needed(self) -> tuple[str, ...]:
         """The signals and those of the conditions, each once."""
-        return tuple(dict.fromkeys((*self.signals, *(item.signal for item in self.where))))
+        return tuple(dict.fromkeys((*self.signals, *(item.signal for item in (*self.where, *self.only)))))
 
 
 def nearest(name: str, names: Iterable[str]) -> str:

@@ -29,6 +29,7 @@ class Table:
         files: Tables in their order.
         time_column: The column that tells the time: numbers in `time_unit`, or dates in ISO 8601 (UTC without a zone).
         time_unit: s, ms, us, ns, min or h.
+        time_shift: Seconds added to it.
         channels: What feeds the model.
         width: Value columns of an event.
         report: Told of rows without a time and of values that are no numbers, with file and line.
@@ -45,6 +46,7 @@ class Table:
         *,
         time_column: str,
         time_unit: str,
+        time_shift: float = 0.0,
         channels: Iterable[Channel],
         width: int,
         report: Report = ignore,
@@ -56,6 +58,7 @@ class Table:
             raise SourceError(f"table: the time unit is {time_unit!r}; choose from {', '.join(UNITS)}")
         channels = list(channels)
         self._time, self._unit, self._width, self._report = time_column, time_unit, width, report
+        self._shift = round(time_shift * 1e9)
         self._columns = list(dict.fromkeys(name for channel in channels for name in channel.needed))
         for path in self._files:
             check_columns(path, [time_column, *self._columns])
@@ -74,6 +77,7 @@ class Table:
                     self._report(
                         "undated row", f"{path.name}:{chunk.line[row]}: {self._time} is no time; the row is left out"
                     )
+                t = t + self._shift
                 values = chunk.values
                 state = np.where(chunk.blank, ABSENT, PRESENT).astype(np.int8)
                 plan = np.zeros(t.size, np.int64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ..model import StateSpaceModel
+from .agv_corridor import AGV_CORRIDOR
 from .battery_cell import BATTERY_CELL
 from .battery_pack import BATTERY_PACK
 from .lorenz63 import LORENZ63
@@ -11,6 +12,7 @@ from .motor_drive import MOTOR_DRIVE
 from .motor_winding import MOTOR_WINDING
 from .road_car import ROAD_CAR
 from .thermal_field import THERMAL_FIELD
+from .uwb_rover import UWB_ROVER
 
 MODELS: dict[str, StateSpaceModel] = {
     model.name: model
@@ -23,5 +25,7 @@ MODELS: dict[str, StateSpaceModel] = {
         LORENZ63,
         LORENZ96,
         THERMAL_FIELD,
+        AGV_CORRIDOR,
+        UWB_ROVER,
     )
 }

@@ -26,6 +26,7 @@ def twin(history=200_000, horizon=2.0, tick=1000.0):
     time = SimpleNamespace(horizon=horizon, degraded_after=5.0, stale_after=30.0, tick=tick)
     config = SimpleNamespace(time=time, history=history)
     return SimpleNamespace(
+        options_of=lambda estimator: {},
         name="scripted",
         title="scripted",
         text="model: motor_winding\n",

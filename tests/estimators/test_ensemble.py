@@ -101,7 +101,7 @@ def test_enkf_moves_the_mean_as_kalman_does_and_each_member_by_its_own_reading(m
 
 def perturbations(members, m):
     """The filter's own draws for event 0: centred, and scaled to a sample variance of 1 on average."""
-    key = key_of(0, 0, shared.PERTURB)
+    key = np.uint64(key_of(0, 1, shared.PERTURB))  # the first that is drawn
     z = np.array([[normal(key, np.uint64(k * members + i)) for k in range(m)] for i in range(members)])
     return (z - z.mean(0)) * np.sqrt(members / (members - 1))
 

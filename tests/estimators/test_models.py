@@ -43,10 +43,13 @@ def drive(i_d: float = -80.0, i_q: float = 150.0, speed: float = 400.0) -> np.nd
 # Derivatives
 
 
-@pytest.mark.parametrize("name", MODELS)
+# The corridor's beams step at corners: tests/estimators/test_corridor.py.
+@pytest.mark.parametrize("name", [name for name in MODELS if name != "agv_corridor"])
 def test_jacobians_match_central_differences_at_random_states(name: str) -> None:
     model = MODELS[name]
     compiled = compile_model(model)
+    if model.shape is not None:
+        pytest.skip("a field that only ensembles estimate: no filter asks for its derivatives")
     own = model.F is not None
     assert compiled.static["F_mode"] == (ANALYTIC if own else COMPLEX_STEP)
     given = [ANALYTIC if sensor.H is not None else COMPLEX_STEP for sensor in model.sensors]

@@ -138,13 +138,13 @@ def test_another_truth():
 
 
 def test_many_true_states_are_blocks():
-    """75 states in blocks of 32: two that are full and one of 11; state j is j + t."""
+    """60 states in blocks of 32: one that is full and one of 28; state j is j + t."""
 
     def grow(x, u, p, dt, out):
         for j in range(x.size):
             out[j] = x[j] + dt
 
-    names = [f"s{j}" for j in range(75)]
+    names = [f"s{j}" for j in range(60)]
     many = model(
         states=tuple(State(name, "", float(j), 1.0) for j, name in enumerate(names)),
         noises=(Noise("s0", "", 0.0),),
@@ -154,10 +154,10 @@ def test_many_true_states_are_blocks():
     assert many.width == 32
     got = read_all(Simulator(many, seed=0, step=0.5, duration=1.0))
     truth = got.select(got.kind == TRUTH)
-    assert truth.channel.tolist() == [0, 32, 64] * 2
-    assert truth.t.tolist() == [500_000_000] * 3 + [10**9] * 3
-    assert np.isfinite(truth.value).sum(axis=1).tolist() == [32, 32, 11] * 2
-    for j in range(75):
+    assert truth.channel.tolist() == [0, 32] * 2
+    assert truth.t.tolist() == [500_000_000] * 2 + [10**9] * 2
+    assert np.isfinite(truth.value).sum(axis=1).tolist() == [32, 28] * 2
+    for j in range(60):
         rows, values = truth_of(got, j)
         np.testing.assert_allclose(values, j + got.t[rows] * 1e-9, rtol=1e-14, atol=1e-12)
         assert rows.size == 2

@@ -63,7 +63,7 @@ def test_true_states_of_a_row_are_blocks(tmp_path):
     names = {0: "w", 1: "a", 2: "b", 5: "power"}
     channels = [Channel(TRUTH, index, names[index], (names[index],)) for index in (5, 2, 0, 1)]
     channels[1] = Channel(TRUTH, 2, "b", ("b",), where=(Condition("ok", 1, 1),))
-    path = write(tmp_path, "t,w,a,b,ok,power\n0,1,2,3,1,6\n1,,2,3,1,6\n2,1,,3,1,\n3,1,2,3,0,6\n4,,,,1,\n")
+    path = write(tmp_path, "t,w,a,b,ok,power\n0,1,2,3,1,6\n1,,2,3,1,6\n2,1,,3,1,\n3,1,2,3,0,6\n4,,,,1,\n5,nan,2,3,1,\n")
     got = events(read_all(table(path, channels=channels)))
     expected = [
         (0, TRUTH, 0, 1.0, 2.0),
@@ -75,6 +75,7 @@ def test_true_states_of_a_row_are_blocks(tmp_path):
         (2 * 10**9, TRUTH, 2, 3.0, NAN),
         (3 * 10**9, TRUTH, 0, 1.0, 2.0),
         (3 * 10**9, TRUTH, 5, 6.0, NAN),
+        (5 * 10**9, TRUTH, 1, 2.0, 3.0),
     ]
     np.testing.assert_array_equal(np.array(got), np.array(expected))
 
@@ -191,3 +192,29 @@ def test_what_a_table_lacks_is_one_line(tmp_path, name, content, expected):
         table(tmp_path / name)
     text = str(caught.value)
     assert text.startswith(str(tmp_path / expected)) and "\n" not in text
+
+
+def test_only_picks_the_rows_that_speak_of_a_sensor(tmp_path):
+    """Ranges to one anchor or the other in one column; a row of neither, or whose anchor is blank, says nothing."""
+    path = tmp_path / "ranges.csv"
+    path.write_text("t,range,anchor,ok\n0,1,7,1\n1,2,8,1\n2,3,7,0\n3,4,9,1\n4,5,,1\n5,nan,8,1\n", encoding="utf-8")
+    channels = [
+        Channel(READING, k, f"r{k}", ("range",), only=(Condition("anchor", a, a),), where=(Condition("ok", 1, 1),))
+        for k, a in enumerate((7, 8))
+    ]
+    reports = Reports()
+    got = events(read_all(table(path, channels=channels, report=reports)))
+    expected = [
+        (0, READING, 0, 1.0, NAN),
+        (10**9, READING, 1, 2.0, NAN),
+        (2 * 10**9, READING, 0, NAN, NAN),
+        (5 * 10**9, READING, 1, NAN, NAN),
+    ]
+    np.testing.assert_array_equal(np.array(got), np.array(expected))
+    assert reports.counts == {"condition r0": 1}
+
+
+def test_a_shift_moves_the_clock(tmp_path):
+    path = write(tmp_path, HEADER + "1.5,20,1,2,1,3,7\n")
+    moved = Table([path], time_column="t", time_unit="s", time_shift=-0.2, channels=CHANNELS, width=2)
+    assert set(read_all(moved).t.tolist()) == {1_300_000_000}
