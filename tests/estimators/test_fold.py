@@ -19,8 +19,8 @@ MODEL = MATRICES.model
 PYTHON = ["filterpy-kf", "ekf-python"]
 """The other kind of fold: a filter in Python, and a compiled one in Python's loop (see `in_python`)."""
 
-GAUSSIAN = [entry for entry in ESTIMATORS.values() if entry.family == "Gaussian" and entry.applies(MODEL) is None]
-NAMES = [entry.name for entry in GAUSSIAN] + PYTHON
+GAUSSIAN = [name for name, entry in ESTIMATORS.items() if entry.family == "Gaussian" and entry.applies(MODEL) is None]
+NAMES = GAUSSIAN + PYTHON
 
 
 def identical(a, b):
