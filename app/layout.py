@@ -35,7 +35,7 @@ class Observed:
 
 
 def observed(model: StateSpaceModel) -> list[Observed]:
-    """The sensor rows that read one state, give or take a scale near one: ∂h/∂x_j = 1 at the prior, in its unit."""
+    """The sensor rows that read one state, give or take a scale near one: h ≈ x_j and ∂h/∂x_j ≈ 1 at the prior."""
     x = np.array([state.mean for state in model.states])
     u = np.array([item.default for item in model.inputs])
     p = np.array([parameter.value for parameter in model.parameters])
@@ -50,8 +50,13 @@ def observed(model: StateSpaceModel) -> list[Observed]:
             sensor.h(x + step, u, p, there)
             slopes[:, j] = (there - here) / step[j]
         for r, row in enumerate(sensor.rows):
+            # A distance to a wall grows as the vehicle moves, but is not where the vehicle is.
             likely = [
-                j for j, state in enumerate(model.states) if state.unit == row.unit and abs(slopes[r, j] - 1.0) < 0.05
+                j
+                for j, state in enumerate(model.states)
+                if state.unit == row.unit
+                and abs(slopes[r, j] - 1.0) < 0.05
+                and abs(here[r] - x[j]) < 0.05 * max(abs(x[j]), state.std)
             ]
             likely.sort(key=lambda j: model.state_names[j] not in (row.name, sensor.name))
             if likely:

@@ -351,3 +351,12 @@ def test_a_revision_that_begins_between_two_pieces_wins(fed, monkeypatch):
     assert fed.said[-1]["revision"] == 1
     np.testing.assert_array_equal(fed.column("/state/temperature")[1][:, 0], fed.track().track.mean[:, 0])
     assert fed.track().revision == 1
+
+
+def test_dots_stand_over_a_state_only_where_a_sensor_reads_it():
+    assert {(item.sensor, item.row, item.state) for item in observed(MODELS["motor_winding"])} == {(0, 0, 0)}
+    # Its beams grow one for one with the position, and are distances to walls.
+    assert observed(MODELS["agv_corridor"]) == []
+    car = MODELS["road_car"]
+    read = {car.state_names[item.state] for item in observed(car)}
+    assert {"east", "north", "heading", "speed"} <= read
