@@ -136,7 +136,7 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], trac
     ]
     rows += [(key, f"{count}") for key, count in sorted(counts.items())]
     variances = ", ".join(
-        f"{name} {value**2:.5g}" for name, value in zip(twin.model.state_names, track.std[-1], strict=True)
+        f"{twin.model.state_names[j]} {value**2:.5g}" for j, value in zip(twin.model.shown, track.std[-1], strict=True)
     )
     rows += [
         ("final variances", variances),
@@ -163,13 +163,15 @@ def _write(path: Path, twin: Twin, log: Log, track: Track) -> None:
         "channel": events.channel,
     }
     columns |= {f"value_{k}": events.value[:, k] for k in range(model.width)}
-    for k, name in enumerate(model.state_names):
-        rows, values = truth_of(events, k)
+    # The track of a large field keeps some of its states.
+    shown = [model.state_names[j] for j in model.shown]
+    for j, name in zip(model.shown, shown, strict=True):
+        rows, values = truth_of(events, int(j))
         true = np.full(len(events), np.nan)
         true[rows] = values
         columns[f"{name}_true"] = true
-    columns |= {name: track.mean[:, k] for k, name in enumerate(model.state_names)}
-    columns |= {f"{name}_std": track.std[:, k] for k, name in enumerate(model.state_names)}
+    columns |= {name: track.mean[:, k] for k, name in enumerate(shown)}
+    columns |= {f"{name}_std": track.std[:, k] for k, name in enumerate(shown)}
     columns |= {f"innovation_{k}": track.innovation[:, k] for k in range(model.ny)}
     columns |= {f"innovation_std_{k}": track.innovation_std[:, k] for k in range(model.ny)}
     for name in ("nis", "nis_mean", "nis_low", "nis_high", "log_likelihood"):
