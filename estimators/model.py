@@ -147,6 +147,18 @@ class StateSpaceModel:
                     f"model {self.name}: the prior of {state.name} is {state.mean} ± {state.std}; "
                     "both must be finite and the second positive"
                 )
+        for item in self.parameters:
+            if not item.low <= item.high:
+                raise ModelError(
+                    f"model {self.name}: parameter {item.name} ranges from {item.low:g} to {item.high:g}; "
+                    "the first must not be above the second"
+                )
+        for sensor in self.sensors:
+            rows = [row.name for row in sensor.rows]
+            if not rows:
+                raise ModelError(f"model {self.name}: sensor {sensor.name} has no rows; name at least one")
+            if len(set(rows)) < len(rows):
+                raise ModelError(f"model {self.name}: sensor {sensor.name} names a row twice; every name must differ")
         for noise in self.noises:
             if not (noise.variance >= 0 and np.isfinite(noise.variance)):
                 raise ModelError(

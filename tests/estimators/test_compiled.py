@@ -6,7 +6,7 @@ from test_jacobians import F, H, P, U, f, h, model
 
 from estimators.compiled import compile_model
 from estimators.errors import ModelError
-from estimators.model import Noise, State
+from estimators.model import Noise, Parameter, Row, Sensor, State
 
 NOT_COMPILABLE = {"a": 1}
 
@@ -117,6 +117,9 @@ def test_one_clear_line(changes, says):
         ({"noises": (Noise("a", "1", -0.1),)}, "variance -0.1"),
         ({"noises": (Noise("elsewhere", "1", 0.1),)}, "'elsewhere' is not a state"),
         ({"max_step": 0.0}, "max_step is 0.0 s"),
+        ({"parameters": (Parameter("c", "1", 1.0, 2.0, 0.5),)}, "parameter c ranges from 2 to 0.5"),
+        ({"sensors": (Sensor("s", (), wrong_H),)}, "sensor s has no rows"),
+        ({"sensors": (Sensor("s", (Row("r", "1", 1.0), Row("r", "1", 1.0)), wrong_H),)}, "sensor s names a row twice"),
     ],
 )
 def test_declarations_that_no_filter_could_run(changes, says):
