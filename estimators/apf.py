@@ -19,7 +19,7 @@ from .context import options as numbers
 from .context import sensor_variances
 from .filter import Estimator
 from .gaussian import admit
-from .jit import jit, matrix
+from .jit import floats, jit, matrix
 from .particle import (
     MEMBERS,
     OPTIONS,
@@ -42,7 +42,7 @@ from .particle_steps import children_of, keep, normalise, shared, sweep, total
 from .pf import finite_rows, predicted
 from .proposals import EXPECT, PROPOSE_PRIOR, predict, predictive, tune, work_size
 from .random import key_of
-from .resampling import place_children
+from .resampling import copy_children, match_children
 from .track import FAILED, MISSING, USED
 
 
@@ -67,8 +67,10 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     if verdict == USED and log_sum > -np.inf:
         key = key_of(context.seed, index, RESAMPLE)
         children = children_of(context, u, sensor, y, key, sums, state, work)
-        place_children(children, records_of(state, nx, n))
-        place_children(children, matrix(predictive(context, work, n), 0, n, 1))
+        parents = floats(work.ctypes.data, n)
+        count = match_children(children, parents)
+        copy_children(count, children, parents, records_of(state, nx, n))
+        copy_children(count, children, parents, matrix(predictive(context, work, n), 0, n, 1))
         weigh_equally(state, nx, n)
         state[RESAMPLED] += 1.0
         key = key_of(context.seed, index, PROPOSE)

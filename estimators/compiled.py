@@ -15,7 +15,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from .black_box import BlackBox, answered_f, answered_h
+from .black_box import ANSWER, BlackBox, answered_f, answered_h
 from .context import (
     F_signature,
     H_signature,
@@ -30,6 +30,7 @@ from .context import (
 from .errors import ModelError
 from .jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step_f, complex_step_h, scratch_size
 from .jit import address, jit
+from .looped import f_rows_signature, h_rows_signature, looped_f, looped_h
 from .model import LARGE, Field, StateSpaceModel
 
 
@@ -93,6 +94,10 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
         except numba.core.errors.NumbaError as error:
             raise ModelError(f"model {model.name}: {what} cannot be compiled: {_gist(error)}") from None
 
+    def rows_code(dispatcher: Any, signature: Any) -> int:
+        kept.append(dispatcher)
+        return address(dispatcher, signature)
+
     def complex_code(function: Callable, signature: Any) -> int:
         """The same function over complex numbers, or 0 where it is not analytic (comparisons, abs, atan2)."""
         try:
@@ -110,8 +115,10 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
     box = BlackBox(model) if model.black_box else None
     if box is not None:
         box.probe()
-    f = code(answered_f if box else model.f, f_signature, "f")
-    f_dispatcher = box.f_of_one if box else kept[-1]
+    sizes = (model.nx, model.nu, len(model.parameters) + (ANSWER if box else 0))
+    code(answered_f if box else model.f, f_signature, "f")
+    f = rows_code(looped_f(kept[-1], *sizes), f_rows_signature)
+    f_dispatcher = box.f_of_one if box else kept[-2]
     F = code(model.F, F_signature, "F")
     diagonal = model.shape is not None or model.nx > LARGE
     model_Q = _each_cell if isinstance(model.states, Field) and not model.Q and not diagonal else model.Q
@@ -121,8 +128,9 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
     shape_dispatcher = kept[-1] if model.shape else None
     h, H, h_dispatchers, likelihoods = [], [], [], []
     for k, sensor in enumerate(model.sensors):
-        h.append(code(answered_h if box else sensor.h, h_signature, f"h of sensor {sensor.name}"))
+        code(answered_h if box else sensor.h, h_signature, f"h of sensor {sensor.name}")
         h_dispatchers.append(partial(box.h_of_one, k) if box else kept[-1])
+        h.append(rows_code(looped_h(kept[-1], *sizes, len(sensor.rows)), h_rows_signature))
         H.append(code(sensor.H, H_signature, f"H of sensor {sensor.name}"))
         what = f"log_likelihood of sensor {sensor.name}"
         likelihoods.append(code(sensor.log_likelihood, log_likelihood_signature, what))

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from numba import types
 
 from .jit import C1, F1, F2, caller, f64, flags, floats, i64, ints, jit, matrix
+from .looped import call_f_rows, call_h_rows
 
 f_signature = types.void(F1, F1, F1, f64, F1)
 f_complex_signature = types.void(C1, F1, F1, f64, C1)
@@ -18,10 +19,8 @@ Q_signature = types.void(F1, F1, F1, F1, f64, F2)
 shape_signature = types.void(F1, F1, F1)
 log_likelihood_signature = f64(F1, F1, F1, F1, F1)
 
-call_f = caller(f_signature)
 call_f_complex = caller(f_complex_signature)
 call_F = caller(F_signature)
-call_h = caller(h_signature)
 call_h_complex = caller(h_complex_signature)
 call_H = caller(H_signature)
 call_Q = caller(Q_signature)
@@ -132,13 +131,28 @@ def options(context):
 @jit
 def transition(context, x, u, dt, out):
     """out = f(x, u, p, dt)."""
-    call_f(context.f, x, u, parameters(context), dt, out)
+    call_f_rows(context.f, x.ctypes.data, 0, 1, u.ctypes.data, context.p, dt, out.ctypes.data, 0)
+
+
+@jit
+def transition_rows(context, X, stride, n, u, dt, out):
+    """f of n states that begin at the address X, `stride` numbers apart, into rows of `out` (n or more, nx)."""
+    call_f_rows(context.f, X, stride, n, u.ctypes.data, context.p, dt, out.ctypes.data, context.nx)
 
 
 @jit
 def expect(context, sensor, x, u, out):
     """out = h(x, u, p) of one sensor."""
-    call_h(ints(context.h, context.n_sensors)[sensor], x, u, parameters(context), out)
+    h = ints(context.h, context.n_sensors)[sensor]
+    call_h_rows(h, x.ctypes.data, 0, 1, u.ctypes.data, context.p, out.ctypes.data, 0)
+
+
+@jit
+def expect_rows(context, sensor, X, stride, n, u, out):
+    """h of one sensor at n states that begin at the address X, `stride` numbers apart, into rows of `out`."""
+    h = ints(context.h, context.n_sensors)[sensor]
+    _, rows = sensor_rows(context, sensor)
+    call_h_rows(h, X, stride, n, u.ctypes.data, context.p, out.ctypes.data, rows)
 
 
 @jit

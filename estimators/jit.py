@@ -51,6 +51,11 @@ if "NUMBA_CACHE_DIR" not in os.environ:
 # to 30 % less time at n = 2 to 4, and no more at n = 48.
 numba.config.LOOP_VECTORIZE = 0
 
+# OpenMP's threads wait for each other by spinning. On a busy machine the one that spins keeps the core from the one it
+# waits for until its time slice of some milliseconds is over: loops on two threads took 4 times as long as on one. The
+# library reads this when it is loaded, which is when the first parallel function compiles.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 jit = partial(njit, cache=True, nogil=True, error_model="numpy")
 """Numba's njit as used here: cached, without the GIL, and with IEEE division (zero divisors give inf, no error)."""
 

@@ -25,6 +25,7 @@ from .linalg import wrap
 from .modes import Mode, modes_of
 from .noise import add_noise, semidefinite_root
 from .random import key_of, normal
+from .simd import dot, exp_minus, total, weighted
 
 DRAWS, SETTLED, EQUAL, ESS, RECOVERIES, RESAMPLED, _SPARE, _SPARE_TOO = range(8)
 """Head of the state: predictions and updates so far; whether mean and covariance are up to date;
@@ -140,44 +141,21 @@ CHUNK = 64
 
 
 @jit
-def dot(a, b, n):
-    """Sum of the first n products, in four interleaved sums."""
-    s0 = 0.0
-    s1 = 0.0
-    s2 = 0.0
-    s3 = 0.0
-    whole = n - n % 4
-    for i in range(0, whole, 4):
-        s0 += a[i] * b[i]
-        s1 += a[i + 1] * b[i + 1]
-        s2 += a[i + 2] * b[i + 2]
-        s3 += a[i + 3] * b[i + 3]
-    for i in range(whole, n):
-        s0 += a[i] * b[i]
-    return (s0 + s1) + (s2 + s3)
-
-
-@jit
 def add_chunk(D, n, m, sums):
     """Add n members to the sums: Σw, Σw², and at 4 the m sums Σ w d, then the lower triangle of Σ w d dᵀ.
 
     D (m + 2, CHUNK) holds the weights in row m and the deviations in the rows above; row m + 1 is scratch.
     """
-    w = D[m]
-    a = D[m + 1]
-    for i in range(n):
-        sums[0] += w[i]
-    sums[1] += dot(w, w, n)
+    row = D.shape[1] * 8
+    first = D.ctypes.data
+    w = first + m * row
+    a = w + row
+    sums[0] += total(n, w)
+    sums[1] += dot(n, w, w)
     for i in range(m):
-        d = D[i]
-        for k in range(n):
-            a[k] = w[k] * d[k]
-        s = 0.0
-        for k in range(n):
-            s += a[k]
-        sums[4 + i] += s
+        sums[4 + i] += weighted(n, w, first + i * row, a)
         for j in range(i + 1):
-            sums[4 + m + i * m + j] += dot(a, D[j], n)
+            sums[4 + m + i * m + j] += dot(n, a, first + j * row)
 
 
 @jit
@@ -254,8 +232,10 @@ def cloud_moments(state, nx, n, mean, cov):
     top = log_w[heaviest]
     for first in range(0, n, BLOCK):
         last = min(n, first + BLOCK)
-        for i in range(first, last):
-            w[i - first] = 1.0 if equal else np.exp(log_w[i] - top)
+        if equal:
+            w[:] = 1.0
+        else:
+            exp_minus(last - first, log_w[first:].ctypes.data, top, w.ctypes.data)
         add_members(state[HEAD : HEAD + nx], w[: last - first], records[first:last], reference, D, sums)
     finish_moments(state, sums, reference, mean, cov)
 

@@ -13,15 +13,14 @@ import numpy as np
 from numba import prange, types
 
 from .context import (
-    call_f,
-    call_h,
     circular_rows,
     circular_states,
     context_type,
+    expect_rows,
     has_own_likelihood,
     own_likelihood,
-    parameters,
     sensor_variances,
+    transition_rows,
 )
 from .context import options as numbers
 from .filter import Options
@@ -58,8 +57,10 @@ from .particle import (
     weigh_equally,
     wrap_record,
 )
-from .random import ONE, normal
-from .resampling import STRATIFIED, drawn_children, place_children, strata_children
+from .random import fill_normals
+from .resampling import STRATIFIED, copy_children, drawn_children, match_children, strata_children
+from .simd import exp_minus
+from .simd import total as total_of
 from .threads import threaded
 from .tuning import Tuning
 
@@ -77,9 +78,9 @@ def shared_numbers(nx: int, ny: int) -> int:
 
 
 def block_numbers(nx: int, ny: int) -> int:
-    """Numbers of one block: its sums; x', z, ŷ; deviations by row; L and its scratch; where its points begin."""
+    """Numbers of one block: its sums; z, ŷ and deviations of a chunk; L and its scratch; where points begin."""
     k = max(nx, ny)
-    return 4 + k + k * k + 2 * nx + ny + 2 * nx * nx + (k + 2) * CHUNK + 1
+    return 4 + k + k * k + (nx + ny) * CHUNK + 2 * nx * nx + (k + 2) * CHUNK + 1
 
 
 def tune(options: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
@@ -129,7 +130,7 @@ def shared(context, work, n):
 def block_size(context):
     """Numbers of one block, as in `block_numbers`."""
     nx, ny = context.nx, context.width
-    return sums_size(context) + 2 * nx + ny + 2 * nx * nx + (max(nx, ny) + 2) * CHUNK + 1
+    return sums_size(context) + (nx + ny) * CHUNK + 2 * nx * nx + (max(nx, ny) + 2) * CHUNK + 1
 
 
 @jit
@@ -146,8 +147,28 @@ def block_count(n):
 
 
 @jit
-def propagate(context, u, dt, key, state, first, last, L, scratch, forward, z):
+def _settle_finite(forward, records, log_w):
+    """Move the members whose next state is finite; the others weigh nothing. Returns how many were lost."""
+    nx = forward.shape[1]
+    lost = 0
+    for i in range(log_w.size):
+        finite = True
+        for j in range(nx):
+            finite &= np.isfinite(forward[i, j])
+        if finite:
+            for j in range(nx):
+                records[i, j] = forward[i, j]
+        else:
+            log_w[i] = -np.inf
+            lost += 1
+    return lost
+
+
+@jit
+def propagate(context, u, dt, key, state, first, last, L, scratch, D, z):
     """x ← f(x) + L z for the members `first` to `last`; one that leaves the numbers stays put and weighs nothing.
+
+    D and z have room for `CHUNK` states.
 
     Returns:
         How many were lost.
@@ -157,39 +178,38 @@ def propagate(context, u, dt, key, state, first, last, L, scratch, forward, z):
     records = records_of(state, nx, n)
     log_w = log_weights(state, nx, n)
     circular = circular_states(context)
-    p = parameters(context)
-    f = context.f
     diagonal = context.Q == 0
     varies = context.Q_varies != 0
     noises = context.n_noises if diagonal else nx
     noisy = ints(context.noise_state, context.n_noises)
-    place = np.uint64(first) * np.uint64(noises)
+    forward = matrix(D, 0, CHUNK, nx)
+    angles = np.any(circular)
     lost = 0
-    for i in range(first, last):
-        x = records[i]
-        if varies:
-            noise_root(context, x, u, dt, L, scratch)
-        call_f(f, x, u, p, dt, forward)
+    for begin in range(first, last, CHUNK):
+        count = min(CHUNK, last - begin)
+        transition_rows(context, records[begin].ctypes.data, records.shape[1], count, u, dt, forward)
+        fill_normals(key, np.uint64(begin) * np.uint64(noises), count * noises, z)
         if diagonal:
             for k in range(noises):
                 j = noisy[k]
-                forward[j] += L[j, j] * normal(key, place)
-                place += ONE
+                scale = L[j, j]
+                for i in range(count):
+                    forward[i, j] += scale * z[i * noises + k]
         else:
-            for k in range(noises):
-                z[k] = normal(key, place)
-                place += ONE
-            add_noise(L, z, forward)
-        finite = True
-        for j in range(nx):
-            finite &= np.isfinite(forward[j])
-        if finite:
-            for j in range(nx):
-                x[j] = forward[j]
-            wrap_record(circular, x)
+            for i in range(count):
+                if varies:
+                    noise_root(context, records[begin + i], u, dt, L, scratch)
+                add_noise(L, z[i * noises :], forward[i])
+        # One sum says that all are finite, as they are but for accidents.
+        if np.isfinite(total_of(count * nx, forward.ctypes.data)):
+            for i in range(count):
+                for j in range(nx):
+                    records[begin + i, j] = forward[i, j]
         else:
-            log_w[i] = -np.inf
-            lost += 1
+            lost += _settle_finite(forward, records[begin : begin + count], log_w[begin : begin + count])
+        if angles:
+            for i in range(count):
+                wrap_record(circular, records[begin + i])
     return lost
 
 
@@ -205,9 +225,7 @@ def weigh(context, u, sensor, y, state, joint, first, last, expected, D, sums):
     equal = state[EQUAL] != 0.0
     r = sensor_variances(context, sensor)
     circular = circular_rows(context, sensor)
-    h = ints(context.h, context.n_sensors)[sensor]
     own = has_own_likelihood(context, sensor)
-    p = parameters(context)
     for k in range(sums.size):
         sums[k] = 0.0
     sums[2] = -np.inf
@@ -221,11 +239,10 @@ def weigh(context, u, sensor, y, state, joint, first, last, expected, D, sums):
     top = -np.inf
     for begin in range(first, last, CHUNK):
         n = min(CHUNK, last - begin)
-        for i in range(n):
-            x = records[begin + i]
-            call_h(h, x, u, p, expected)
-            for row in range(ny):
-                D[row, i] = y[row] - expected[row]
+        expect_rows(context, sensor, records[begin].ctypes.data, records.shape[1], n, u, expected)
+        for row in range(ny):
+            for i in range(n):
+                D[row, i] = y[row] - expected[i, row]
         for i in range(n):
             joint[begin + i] = constant
         k = 0
@@ -245,8 +262,14 @@ def weigh(context, u, sensor, y, state, joint, first, last, expected, D, sums):
         if own:
             for i in range(n):
                 joint[begin + i] = own_likelihood(context, sensor, y, records[begin + i, :nx], u)
+        # Row m + 1 is free for the weights until the sums are made.
+        if equal:
+            for i in range(n):
+                D[m + 1, i] = 1.0
+        else:
+            exp_minus(n, log_w[begin:].ctypes.data, 0.0, D[m + 1].ctypes.data)
         for i in range(n):
-            w = 1.0 if equal else np.exp(log_w[begin + i])
+            w = D[m + 1, i]
             value = joint[begin + i] + log_w[begin + i]
             # A density that is no number, or an expectation: the particle is out, and out of the sums.
             if not -np.inf < value < np.inf:
@@ -269,8 +292,7 @@ def weigh_block(context, state, joint, w, first, last, top, reference, D, sums):
     """w = exp(joint - top) of the members `first` to `last`, and their sums."""
     for k in range(sums.size):
         sums[k] = 0.0
-    for i in range(first, last):
-        w[i] = np.exp(joint[i] - top)
+    exp_minus(last - first, joint[first:].ctypes.data, top, w[first:].ctypes.data)
     nx = context.nx
     records = records_of(state, nx, joint.size)
     add_members(state[HEAD : HEAD + nx], w[first:last], records[first:last], reference, D, sums)
@@ -288,16 +310,15 @@ def _block(phase, context, u, dt, sensor, y, key, value, state, work, b):
     size = sums_size(context)
     sums = floats(work.ctypes.data + 8 * at, size)
     at += size
-    forward = floats(work.ctypes.data + 8 * at, nx)
-    z = floats(work.ctypes.data + 8 * (at + nx), nx)
-    at += 2 * nx
-    expected = floats(work.ctypes.data + 8 * at, ny)
-    at += ny
+    z = floats(work.ctypes.data + 8 * at, nx * CHUNK)
+    at += nx * CHUNK
+    expected = work.ctypes.data + 8 * at
+    at += CHUNK * ny
     D = matrix(work, at, max(nx, ny) + 2, CHUNK)
     at += (max(nx, ny) + 2) * CHUNK
     if phase == PROPAGATE:
         own = matrix(work, at, nx, nx) if context.Q_varies != 0 else L
-        lost = propagate(context, u, dt, key, state, first, last, own, matrix(work, at + nx * nx, nx, nx), forward, z)
+        lost = propagate(context, u, dt, key, state, first, last, own, matrix(work, at + nx * nx, nx, nx), D, z)
         sums[0] = lost
     elif phase == WEIGH:
         weigh(
@@ -309,7 +330,7 @@ def _block(phase, context, u, dt, sensor, y, key, value, state, work, b):
             joint,
             first,
             last,
-            floats(expected.ctypes.data, sensor_variances(context, sensor).size),
+            matrix(floats(expected, CHUNK * ny), 0, CHUNK, sensor_variances(context, sensor).size),
             D,
             sums,
         )
@@ -431,7 +452,9 @@ def resample(context, u, sensor, y, key, sums, state, work):
     """Let each particle of the weights of `normalise` have its children, of equal weight."""
     nx = context.nx
     n = int(numbers(context)[MEMBERS])
-    place_children(children_of(context, u, sensor, y, key, sums, state, work), records_of(state, nx, n))
+    children = children_of(context, u, sensor, y, key, sums, state, work)
+    parents = floats(work.ctypes.data, n)
+    copy_children(match_children(children, parents), children, parents, records_of(state, nx, n))
     effective = state[ESS]
     weigh_equally(state, nx, n)
     state[ESS] = effective

@@ -121,6 +121,13 @@ def normal(key, i):
 
 
 @jit
+def fill_normals(key, first, n, out):
+    """Fill out (n or more,) with the normals `first` and following of a key."""
+    for i in range(n):
+        out[i] = normal(key, first + np.uint64(i))
+
+
+@jit
 def normals(seed, index, stream, first_member, out):
     """Fill `out` (members, k) with N(0, 1): rows `first_member` and following of the block of (seed, index, stream).
 

@@ -89,19 +89,39 @@ def drawn_children(scheme, key, w, total, children):
 
 
 @jit
-def place_children(children, rows):
-    """Copy each row with several children over rows that have none; rows with one stay where they are.
+def match_children(children, parents):
+    """Match each child beyond a parent's first with a place that becomes free, both in the order of the members.
 
-    Rows are (N, k); the order of the members means nothing, so nothing else need move.
+    On return the first entries of `children` (N,) are the places and those of `parents` (N,) who fills them.
+
+    Returns:
+        How many there are.
     """
-    empty = 0
-    width = rows.shape[1]
+    free = 0
+    extra = 0
     for i in range(children.size):
-        extra = int(children[i]) - 1
-        while extra > 0:
-            while children[empty] != 0.0:
-                empty += 1
-            for j in range(width):
-                rows[empty, j] = rows[i, j]
-            empty += 1
-            extra -= 1
+        count = children[i]
+        # Written always and kept if due: a branch on a random number is guessed wrong half the time. free ≤ i.
+        children[free] = i
+        free += count == 0.0
+        parents[extra] = i
+        extra += count > 1.0
+        while count > 2.0:
+            parents[extra] = i
+            extra += 1
+            count -= 1.0
+    return free
+
+
+@jit
+def copy_children(count, places, parents, rows):
+    """Copy the row of each parent over the row of its place; rows are (N, k).
+
+    The order of the members means nothing, so nothing else need move.
+    """
+    width = rows.shape[1]
+    for k in range(count):
+        row = rows[int(places[k])]
+        parent = rows[int(parents[k])]
+        for j in range(width):
+            row[j] = parent[j]

@@ -9,6 +9,7 @@ All take addresses (`array.ctypes.data`), which is what makes them free of overh
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from llvmlite import ir
@@ -179,3 +180,147 @@ def rotate(typing_context: Any, n: Any, c: Any, s: Any, x: Any, y: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(_i64, _f64, _f64, _i64, _i64), codegen
+
+
+def _sum_of(builder: Any, vector: Any) -> Any:
+    """The numbers of a vector, added in pairs."""
+    numbers = [builder.extract_element(vector, ir.Constant(_I32, k)) for k in range(LANES)]
+    while len(numbers) > 1:
+        numbers = [builder.fadd(a, b) for a, b in zip(numbers[::2], numbers[1::2], strict=True)]
+    return numbers[0]
+
+
+def _summing(builder: Any, n: Any, whole: Any, single: Any) -> Any:
+    """Σ over n numbers, by vectors: total = whole(i, total) for the full ones, then single(i, sum) for the rest."""
+    wide, narrow = cgutils.alloca_once(builder, _VECTOR), cgutils.alloca_once(builder, _F64)
+    builder.store(ir.Constant(_VECTOR, [0.0] * LANES), wide)
+    builder.store(ir.Constant(_F64, 0.0), narrow)
+    _in_vectors(
+        builder,
+        n,
+        lambda i: builder.store(whole(i, builder.load(wide)), wide),
+        lambda i: builder.store(single(i, builder.load(narrow)), narrow),
+    )
+    return builder.fadd(_sum_of(builder, builder.load(wide)), builder.load(narrow))
+
+
+@intrinsic
+def total(typing_context: Any, n: Any, x: Any) -> Any:
+    """Σ x[:n]."""
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        x = _pointer(builder, given[1])
+        return _summing(
+            builder,
+            given[0],
+            lambda i, sums: builder.fadd(sums, _load(builder, x, i)),
+            lambda i, sums: builder.fadd(sums, builder.load(builder.gep(x, [i]))),
+        )
+
+    return _f64(_i64, _i64), codegen
+
+
+@intrinsic
+def dot(typing_context: Any, n: Any, a: Any, b: Any) -> Any:
+    """Σ a[:n] b[:n]."""
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        a, b = _pointer(builder, given[1]), _pointer(builder, given[2])
+        return _summing(
+            builder,
+            given[0],
+            lambda i, total: _multiply_add(builder, _load(builder, a, i), _load(builder, b, i), total),
+            lambda i, total: _multiply_add(
+                builder, builder.load(builder.gep(a, [i])), builder.load(builder.gep(b, [i])), total
+            ),
+        )
+
+    return _f64(_i64, _i64, _i64), codegen
+
+
+@intrinsic
+def weighted(typing_context: Any, n: Any, w: Any, x: Any, out: Any) -> Any:
+    """out[:n] = w[:n] x[:n]; returns Σ out[:n]."""
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        w, x, out = (_pointer(builder, given[k]) for k in (1, 2, 3))
+
+        def whole(i: Any, total: Any) -> Any:
+            value = builder.fmul(_load(builder, w, i), _load(builder, x, i))
+            _store(builder, value, out, i)
+            return builder.fadd(total, value)
+
+        def single(i: Any, total: Any) -> Any:
+            value = builder.fmul(builder.load(builder.gep(w, [i])), builder.load(builder.gep(x, [i])))
+            builder.store(value, builder.gep(out, [i]))
+            return builder.fadd(total, value)
+
+        return _summing(builder, given[0], whole, single)
+
+    return _f64(_i64, _i64, _i64, _i64), codegen
+
+
+_LOWEST = -708.0
+"""e to this is the smallest normal number, nearly; below it `exp_minus` gives 0."""
+
+_HIGHEST = 709.0
+
+_LN2_HIGH, _LN2_LOW = float.fromhex("0x1.62e42fefa3800p-1"), float.fromhex("0x1.ef35793c76730p-45")
+"""ln 2 in two parts; the first has 42 bits, so that its product with an exponent is exact (as in FDLIBM's e_exp.c)."""
+
+_ROUND = 1.5 * 2.0**52
+"""Adding and taking it away rounds to a whole number, which then stands in the low bits."""
+
+
+def _exp(builder: Any, x: Any) -> Any:
+    """e^x for a number or a vector of them, within a unit in the last place; 0 below `_LOWEST`.
+
+    x = k ln 2 + r with |r| ≤ ln 2 / 2, and the Taylor polynomial of degree 13, whose remainder is under 5e-18.
+    """
+    kind = x.type
+    wide = isinstance(kind, ir.VectorType)
+    whole_kind = ir.VectorType(_I64, LANES) if wide else _I64
+
+    def number(value: float) -> Any:
+        return ir.Constant(kind, [value] * LANES if wide else value)
+
+    def whole_number(value: int) -> Any:
+        return ir.Constant(whole_kind, [value] * LANES if wide else value)
+
+    low = builder.fcmp_ordered("<", x, number(_LOWEST))
+    high = builder.fcmp_ordered(">", x, number(_HIGHEST))
+    bounded = builder.select(low, number(_LOWEST), builder.select(high, number(_HIGHEST), x))
+    shifted = _multiply_add(builder, bounded, number(1.4426950408889634), number(_ROUND))
+    k = builder.fsub(shifted, number(_ROUND))
+    r = _multiply_add(builder, k, number(-_LN2_HIGH), bounded)
+    r = _multiply_add(builder, k, number(-_LN2_LOW), r)
+    value = number(1.0 / math.factorial(13))
+    for power in range(12, -1, -1):
+        value = _multiply_add(builder, value, r, number(1.0 / math.factorial(power)))
+    exponent = builder.add(builder.bitcast(shifted, whole_kind), whole_number(1023))
+    power_of_two = builder.bitcast(builder.shl(exponent, whole_number(52)), kind)
+    value = builder.fmul(value, power_of_two)
+    value = builder.select(low, number(0.0), value)
+    return builder.select(high, number(math.inf), value)
+
+
+@intrinsic
+def exp_minus(typing_context: Any, n: Any, x: Any, shift: Any, out: Any) -> Any:
+    """out[:n] = e^(x[:n] - shift), within a unit in the last place; 0 where it is below the normal numbers."""
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        n, shift = given[0], given[2]
+        x, out = _pointer(builder, given[1]), _pointer(builder, given[3])
+        wide = _broadcast(builder, shift)
+
+        def whole(i: Any) -> None:
+            _store(builder, _exp(builder, builder.fsub(_load(builder, x, i), wide)), out, i)
+
+        def single(i: Any) -> None:
+            value = _exp(builder, builder.fsub(builder.load(builder.gep(x, [i])), shift))
+            builder.store(value, builder.gep(out, [i]))
+
+        _in_vectors(builder, n, whole, single)
+        return context.get_dummy_value()
+
+    return types.void(_i64, _i64, _f64, _i64), codegen

@@ -9,8 +9,9 @@ from estimators.resampling import (
     RESIDUAL,
     STRATIFIED,
     SYSTEMATIC,
+    copy_children,
     drawn_children,
-    place_children,
+    match_children,
     strata_children,
 )
 
@@ -84,7 +85,8 @@ def test_children_take_the_places_of_the_childless():
     counts = np.array([0.0, 3.0, 0.0, 1.0, 0.0, 2.0])
     rows = np.arange(12.0).reshape(6, 2)
     before = rows.copy()
-    place_children(counts, rows)
+    parents = np.empty(6)
+    copy_children(match_children(counts, parents), counts, parents, rows)
     kept = sorted(map(tuple, rows.tolist()))
     assert kept == sorted(tuple(before[i].tolist()) for i in (1, 1, 1, 3, 5, 5))
     for i in (1, 3, 5):
