@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from .context import circular_rows, circular_states, options, sensor_rows
+from .context import circular_rows, circular_states, expect_rows, options, sensor_rows, transition_rows
 from .filter import Estimator, Options
 from .gaussian import state_size
 from .jit import jit, matrix
 from .linalg import remove, triangularise
 from .robust import growth, memory
 from .square_root import condition, condition_size, describe, moments, noise_root, settle, start
-from .ukf import CENTRAL_COV, OUTER, SPREAD, UKF, mean_of, through_f, through_h, tune, weights
+from .ukf import CENTRAL_COV, OUTER, SPREAD, UKF, mean_of, spread_points, tune, weights
 
 
 def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
@@ -29,9 +29,9 @@ def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch: the points through f, Q^½ and a square; or ŷ, points through h, what conditioning takes."""
-    predicting = 3 * nx + (3 * nx + 1) * nx + nx * nx
-    return max(predicting, 2 * ny + nx + (4 * nx + 2) * ny + condition_size(nx, ny, nx + 1))
+    """Scratch: sigma points; and the same through f, Q^½ and a square; or ŷ, points through h, conditioning."""
+    predicting = 2 * nx + (3 * nx + 1) * nx + nx * nx
+    return (2 * nx + 1) * nx + max(predicting, 2 * ny + (4 * nx + 2) * ny + condition_size(nx, ny, nx + 1))
 
 
 @jit
@@ -43,14 +43,17 @@ def predict(context, u, dt, index, state, work):
     """
     n = context.nx
     U = matrix(state, n, n, n)
-    point = work[:n]
-    forward = work[n : 2 * n]
-    row = work[2 * n : 3 * n]
+    sigma = matrix(work, 0, 2 * n + 1, n)
+    at = (2 * n + 1) * n
+    forward = work[at : at + n]
+    row = work[at + n : at + 2 * n]
+    at += 2 * n
     # From row 0: the central point, the 2n others, the factor of Q; one after the other, so that all are one matrix.
-    D = matrix(work, 3 * n, 3 * n + 1, n)
-    scratch = matrix(work, 3 * n + (3 * n + 1) * n, n, n)
+    D = matrix(work, at, 3 * n + 1, n)
+    scratch = matrix(work, at + (3 * n + 1) * n, n, n)
     numbers = options(context)
-    through_f(context, state[:n], u, dt, U, numbers[SPREAD], point, D[: 2 * n + 1])
+    spread_points(state[:n], U, numbers[SPREAD], sigma)
+    transition_rows(context, sigma.ctypes.data, n, 2 * n + 1, u, dt, D)
     mean_of(D[: 2 * n + 1], numbers[OUTER], circular_states(context), forward)
     good = noise_root(context, state[:n], u, dt, state, D[2 * n + 1 :], scratch)
     grown = np.sqrt(growth(context, dt))
@@ -81,17 +84,18 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     n = context.nx
     _, m = sensor_rows(context, sensor)
     U = matrix(state, n, n, n)
-    expected = work[:m]
-    lost = work[m : 2 * m]
-    at = 2 * m
-    point = work[at : at + n]
-    at += n
+    sigma = matrix(work, 0, 2 * n + 1, n)
+    at = (2 * n + 1) * n
+    expected = work[at : at + m]
+    lost = work[at + m : at + 2 * m]
+    at += 2 * m
     D = matrix(work, at, 2 * n + 1, m)
     at += (2 * n + 1) * m
     Y = matrix(work, at, 2 * n + 1, m)
     at += (2 * n + 1) * m
     numbers = options(context)
-    through_h(context, sensor, state[:n], u, U, numbers[SPREAD], point, D)
+    spread_points(state[:n], U, numbers[SPREAD], sigma)
+    expect_rows(context, sensor, sigma.ctypes.data, n, 2 * n + 1, u, D)
     mean_of(D, numbers[OUTER], circular_rows(context, sensor), expected)
     w = np.sqrt(0.5 * numbers[OUTER])
     for k in range(n):

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from . import gaussian
-from .context import circular_rows, circular_states, expect, options, sensor_rows, transition
+from .context import circular_rows, circular_states, expect_rows, options, sensor_rows, transition_rows
 from .filter import Estimator, Option, Options
 from .gaussian import admit, compare, describe, downdate, moments, move_mean, start, state_size, wrap_mean
 from .jit import inlined, jit, matrix
@@ -66,8 +66,8 @@ def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch: an update's; the factor, points through f or h, a point and the mean."""
-    return gaussian.scratch_size(nx, ny) + nx * nx + (2 * nx + 1) * max(nx, ny) + 2 * nx
+    """Scratch: an update's; the factor, sigma points, the same through f or h, and the mean."""
+    return gaussian.scratch_size(nx, ny) + nx * nx + (2 * nx + 1) * (nx + max(nx, ny)) + nx
 
 
 @inlined
@@ -95,31 +95,16 @@ def mean_of(D, w, circular, mean):
 
 
 @inlined
-def through_f(context, x, u, dt, U, spread, point, D):
-    """Fill D (2n+1, n) with f at x and at x ± spread·U[k]."""
+def spread_points(x, U, spread, points):
+    """Fill `points` (2n+1, n) with x and x ± spread·U[k]."""
     n = x.size
-    transition(context, x, u, dt, D[0])
+    for j in range(n):
+        points[0, j] = x[j]
     for k in range(n):
         for j in range(n):
-            point[j] = x[j] + spread * U[k, j]
-        transition(context, point, u, dt, D[1 + k])
-        for j in range(n):
-            point[j] = x[j] - spread * U[k, j]
-        transition(context, point, u, dt, D[1 + n + k])
-
-
-@inlined
-def through_h(context, sensor, x, u, U, spread, point, D):
-    """Fill D (2n+1, ny) with h at x and at x ± spread·U[k]."""
-    n = x.size
-    expect(context, sensor, x, u, D[0])
-    for k in range(n):
-        for j in range(n):
-            point[j] = x[j] + spread * U[k, j]
-        expect(context, sensor, point, u, D[1 + k])
-        for j in range(n):
-            point[j] = x[j] - spread * U[k, j]
-        expect(context, sensor, point, u, D[1 + n + k])
+            d = spread * U[k, j]
+            points[1 + k, j] = x[j] + d
+            points[1 + n + k, j] = x[j] - d
 
 
 @jit
@@ -136,15 +121,17 @@ def predict(context, u, dt, index, state, work):
     at = n * n
     D = matrix(work, at, 2 * n + 1, n)
     at += (2 * n + 1) * n
-    point = work[at : at + n]
-    forward = work[at + n : at + 2 * n]
+    sigma = matrix(work, at, 2 * n + 1, n)
+    at += (2 * n + 1) * n
+    forward = work[at : at + n]
     numbers = options(context)
     w = numbers[OUTER]
     if not cholesky(P, U, n):
         for i in range(n + n * n):
             state[i] = np.nan
         return
-    through_f(context, x, u, dt, U, numbers[SPREAD], point, D)
+    spread_points(x, U, numbers[SPREAD], sigma)
+    transition_rows(context, sigma.ctypes.data, n, 2 * n + 1, u, dt, D)
     mean_of(D, w, circular_states(context), forward)
     for i in range(n):
         a = numbers[CENTRAL_COV] * D[0, i]
@@ -199,7 +186,9 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     spread = numbers[SPREAD]
     if not cholesky(P, U, n):
         return FAILED
-    through_h(context, sensor, x, u, U, spread, work[at : at + n], D)
+    sigma = matrix(work, at, 2 * n + 1, n)
+    spread_points(x, U, spread, sigma)
+    expect_rows(context, sensor, sigma.ctypes.data, n, 2 * n + 1, u, D)
     mean_of(D, w, circular_rows(context, sensor), nu)
     for i in range(m):
         a = numbers[CENTRAL_COV] * D[0, i]
