@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from numba import prange
 
+from .context import context_at, place_of
 from .jit import jit, matrix
 from .localisation import localised, reached
 from .simd import (
@@ -188,9 +189,10 @@ def sweep(context, sensor, X, where, ZT, B, serial, inflation, crew, crews, scra
 
 @jit(parallel=True)
 def _sweep_on_threads(context, sensor, X, where, ZT, B, serial, inflation, crews, scratch, each):
+    place = place_of(context)
     for crew in prange(crews):
         own = scratch[crew * each : (crew + 1) * each]
-        sweep(context, sensor, X, where, ZT, B, serial, inflation, crew, crews, own)
+        sweep(context_at(place), sensor, X, where, ZT, B, serial, inflation, crew, crews, own)
 
 
 @jit

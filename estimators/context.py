@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
-from numba import types
+import numpy as np
+from llvmlite import ir
+from numba import from_dtype, types
+from numba.extending import intrinsic
 
 from .jit import C1, F1, F2, caller, f64, flags, floats, i64, ints, jit, matrix
 from .looped import call_f_rows, call_h_rows
@@ -28,60 +31,57 @@ call_shape = caller(shape_signature)
 call_log_likelihood = caller(log_likelihood_signature)
 
 
-class Context(NamedTuple):
-    """All that a compiled filter may know: the model's code and layout, the tuning, the options. Never written to.
+_FIELDS = """
+    nx nu n_parameters n_noises f f_complex F F_mode Q Q_varies each_state shape h h_complex H H_mode
+    log_likelihood n_sensors row_start row_count n_rows circular_x circular_y noise_state noise_states max_step
+    prior_mean prior_cov prior_rows p q r used gate width options n_options pairs n_pairs shown n_shown prepared
+    n_prepared seed
+""".split()
 
-    Plain numbers: sizes, modes, and addresses of code and of arrays, which the functions below turn into views.
-    Passing forty numbers on costs nothing; passing twenty counted arrays costs more than a small filter's step.
+_layout = np.dtype([(name, np.float64 if name == "max_step" else np.int64) for name in _FIELDS])
+
+context_type = from_dtype(_layout)
+"""All that a compiled filter may know: the model's code and layout, the tuning, the options. Never written to.
+
+Plain numbers: sizes, modes, and addresses of code and of arrays, which the functions below turn into views. A record is
+handed over as one address; a tuple would be forty numbers in every call, and counted arrays cost more than a step.
+"""
+
+
+def context_of(**values: float) -> np.void:
+    """A context with these values, which are all that it has.
+
+    Raises:
+        KeyError: If one is missing.
     """
-
-    nx: Any
-    nu: Any
-    n_parameters: Any
-    n_noises: Any
-    f: Any
-    f_complex: Any
-    F: Any
-    F_mode: Any
-    Q: Any
-    Q_varies: Any
-    each_state: Any
-    shape: Any
-    h: Any
-    h_complex: Any
-    H: Any
-    H_mode: Any
-    log_likelihood: Any
-    n_sensors: Any
-    row_start: Any
-    row_count: Any
-    n_rows: Any
-    circular_x: Any
-    circular_y: Any
-    noise_state: Any
-    noise_states: Any
-    max_step: Any
-    prior_mean: Any
-    prior_cov: Any
-    prior_rows: Any
-    p: Any
-    q: Any
-    r: Any
-    used: Any
-    gate: Any
-    width: Any
-    options: Any
-    n_options: Any
-    pairs: Any
-    n_pairs: Any
-    shown: Any
-    n_shown: Any
-    prepared: Any
-    n_prepared: Any
-    seed: Any
+    return np.array([tuple(values[name] for name in _FIELDS)], _layout)[0]
 
 
-context_type = types.NamedTuple(tuple(f64 if name == "max_step" else i64 for name in Context._fields), Context)
+@intrinsic
+def place_of(typing_context: Any, context: Any) -> Any:
+    """The address of a context: a parallel loop takes no records."""
+
+    def codegen(_: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return builder.ptrtoint(given[0], ir.IntType(64))
+
+    return i64(context_type), codegen
+
+
+@intrinsic
+def context_at(typing_context: Any, place: Any) -> Any:
+    """The context at an address."""
+
+    def codegen(lowering: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return builder.inttoptr(given[0], lowering.get_value_type(context_type))
+
+    return context_type(i64), codegen
+
+
+def with_parameters(context: np.void, p: np.ndarray) -> np.void:
+    """The same context with other parameters p, an array that must outlive it."""
+    changed = np.array([context], _layout)
+    changed["p"], changed["n_parameters"] = p.ctypes.data, p.size
+    return changed[0]
 
 
 @jit

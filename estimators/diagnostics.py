@@ -7,9 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from .jit import F1, I1, f64, i64, jit
+from .jit import B1, F1, I1, f64, i64, jit
+from .log import RESET
 from .quantiles import chi_square_quantile
-from .track import DEGRADED, DIVERGED, GATED, STALE, TRACKING, USED, track_type
+from .simd import total as sum_of
+from .track import DEGRADED, DIVERGED, FAILED, GATED, STALE, TRACKING, USED, track_type
 
 PROBABILITY = 0.95
 """Of the bounds that charts and reports show."""
@@ -29,7 +31,7 @@ class HealthPolicy(NamedTuple):
     `window` readings are averaged. Without a reading for `degraded_after` seconds the twin is degraded, after
     `stale_after` stale. It is degraded when the windowed NIS exceeds what chance exceeds once in a thousand windows,
     and diverged when it is `diverged_nis` times what it should be, when the gate refuses more than `diverged_gated` of
-    the window, or when a number is not finite.
+    the window (or they fail), or when a number is not finite. A reset begins a new window.
     """
 
     window: int = 50
@@ -69,30 +71,66 @@ def nis_bounds(dof: int, readings: int) -> tuple[float, float]:
 
 
 @jit
-def assess(first, last, t, track, policy, bounds):
+def judges(verdict):
+    """Whether a reading of this verdict says something of the estimate."""
+    return verdict == USED or verdict == GATED or verdict == FAILED
+
+
+@jit
+def assess(first, last, t, kind, track, policy, bounds):
     """Fill age, windowed NIS, its bounds and health of rows `first` to `last` of a track.
 
     A row looks only at rows before it, so the outcome does not depend on how a fold was cut into pieces. The window
-    changes with a used or gated reading; the other rows have that of the row before.
+    changes with a reading that is used, gated or failed; the other rows have that of the row before. A reset empties
+    it: what the readings said of the estimate before, they do not say of the new one.
     """
-    judged = np.empty(policy.window, np.int64)  # rows of the last readings, a ring; the newest is at `newest`
-    held = 0
-    newest = -1
+    window = policy.window
+    # The window's readings, the oldest first, lie at `begin` to `end`: row, NIS (0 if it was refused), degrees of
+    # freedom (-1 if it was refused). It moves up, and back to the start when it has reached the end.
+    rows = np.empty(2 * window, np.int64)
+    nis = np.empty(2 * window)
+    dofs = np.empty(2 * window, np.int64)
+    begin = window
+    end = window
     row = first - 1
-    while row >= 0 and held < policy.window and first - row < FAR * policy.window:
-        if track.verdict[row] == USED or track.verdict[row] == GATED:
-            held += 1
-            judged[policy.window - held] = row
-            newest = policy.window - 1
+    while row >= 0 and kind[row] != RESET and end - begin < window and first - row < FAR * window:
+        if judges(track.verdict[row]):
+            begin -= 1
+            _keep(begin, row, track, rows, nis, dofs)
         row -= 1
+    dof = 0
+    used = 0
+    for k in range(begin, end):
+        if dofs[k] >= 0:
+            dof += dofs[k]
+            used += 1
     for i in range(first, last):
-        if i == 0 or track.verdict[i] == USED or track.verdict[i] == GATED:
+        reset = kind[i] == RESET
+        judged = judges(track.verdict[i])
+        if i == 0 or reset or judged:
             track.age[i] = 0.0
-            if track.verdict[i] == USED or track.verdict[i] == GATED:
-                newest = (newest + 1) % policy.window
-                judged[newest] = i
-                held = min(held + 1, policy.window)
-            _look_back(i, judged, held, newest, track, policy, bounds)
+            if judged and end == 2 * window:
+                for k in range(begin, end):
+                    rows[k - begin] = rows[k]
+                    nis[k - begin] = nis[k]
+                    dofs[k - begin] = dofs[k]
+                end -= begin
+                begin = 0
+            if judged:
+                _keep(end, i, track, rows, nis, dofs)
+                if dofs[end] >= 0:
+                    dof += dofs[end]
+                    used += 1
+                end += 1
+            # Out goes what is too many, too far back, or from before a reset.
+            while begin < end and (reset or end - begin > window or i - rows[begin] >= FAR * window):
+                if dofs[begin] >= 0:
+                    dof -= dofs[begin]
+                    used -= 1
+                begin += 1
+            # Summed anew each time: a running sum would keep the rounding of an outlier.
+            total = sum_of(end - begin, nis[begin:].ctypes.data)
+            _judge(i, total, dof, used, end - begin - used, track, policy, bounds)
         else:
             track.age[i] = track.age[i - 1] + (t[i] - t[i - 1]) * 1e-9
             track.nis_mean[i] = track.nis_mean[i - 1]
@@ -101,7 +139,7 @@ def assess(first, last, t, track, policy, bounds):
             track.consistency[i] = track.consistency[i - 1]
         finite = True
         for j in range(track.mean.shape[1]):
-            finite = finite and np.isfinite(track.mean[i, j]) and np.isfinite(track.std[i, j])
+            finite &= np.isfinite(track.mean[i, j]) & np.isfinite(track.std[i, j])
         health = track.consistency[i]
         if not finite:
             health = DIVERGED
@@ -113,27 +151,17 @@ def assess(first, last, t, track, policy, bounds):
 
 
 @jit
-def _look_back(i, judged, held, newest, track, policy, bounds):
-    """Mean NIS of the window that ends at row i, its bounds, and what it alone says of the estimate.
+def _keep(k, row, track, rows, nis, dofs):
+    """Write a reading into place k of the window."""
+    used = track.verdict[row] == USED
+    rows[k] = row
+    nis[k] = track.nis[row] if used else 0.0
+    dofs[k] = track.dof[row] if used else -1
 
-    Summed from the newest reading to the oldest, each time anew: a running sum would keep the rounding of an outlier.
-    """
-    total = 0.0
-    dof = 0
-    used = 0
-    gated = 0
-    at = newest
-    for _ in range(held):
-        row = judged[at]
-        if i - row >= FAR * policy.window:
-            break
-        if track.verdict[row] == USED:
-            total += track.nis[row]
-            dof += track.dof[row]
-            used += 1
-        else:
-            gated += 1
-        at = at - 1 if at > 0 else policy.window - 1
+
+@jit
+def _judge(i, total, dof, used, refused, track, policy, bounds):
+    """Mean NIS of the window that ends at row i, its bounds, and what it alone says of the estimate."""
     if used > 0:
         track.nis_mean[i] = total / used
         track.nis_low[i] = bounds.low[dof] / used
@@ -142,11 +170,12 @@ def _look_back(i, judged, held, newest, track, policy, bounds):
         track.nis_mean[i] = np.nan
         track.nis_low[i] = np.nan
         track.nis_high[i] = np.nan
+    judged = used + refused
     track.consistency[i] = TRACKING
-    if used + gated >= FEW and (gated > policy.diverged_gated * (used + gated) or total > policy.diverged_nis * dof):
+    if judged >= FEW and (refused > policy.diverged_gated * judged or total > policy.diverged_nis * dof):
         track.consistency[i] = DIVERGED
     elif used >= FEW and total > bounds.alarm[dof]:
         track.consistency[i] = DEGRADED
 
 
-assess_signature = types.void(i64, i64, I1, track_type, policy_type, bounds_type)
+assess_signature = types.void(i64, i64, I1, B1, track_type, policy_type, bounds_type)

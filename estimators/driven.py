@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from .black_box import ANSWER
+from .context import with_parameters
 from .filter import Code, Estimator
 from .view import View
 
@@ -29,8 +30,7 @@ def driven(entry: Estimator) -> Code:
         """The context in which f, or h, of the members X is known; valid for as long as both arrays are."""
         if "answers" not in view.kept:
             p = np.append(view.p, np.zeros(ANSWER))
-            context = view.context._replace(p=p.ctypes.data, n_parameters=p.size)
-            view.kept["answers"] = p, context
+            view.kept["answers"] = p, with_parameters(view.context, p)
         p, context = view.kept["answers"]
         # Addresses of 48 bits are exact in a float64.
         p[-ANSWER:] = X.ctypes.data, answers.ctypes.data

@@ -18,7 +18,9 @@ from numba import prange
 from .context import (
     circular_rows,
     circular_states,
+    context_at,
     expect,
+    place_of,
     prior,
     process_variances,
     sensor_variances,
@@ -251,8 +253,9 @@ def forecast(context, u, dt, key, X, crew, crews, scratch):
 
 @jit(parallel=True)
 def _forecast_on_threads(context, u, dt, key, X, crews, scratch, each):
+    place = place_of(context)
     for crew in prange(crews):
-        forecast(context, u, dt, key, X, crew, crews, scratch[crew * each : (crew + 1) * each])
+        forecast(context_at(place), u, dt, key, X, crew, crews, scratch[crew * each : (crew + 1) * each])
 
 
 @jit

@@ -15,7 +15,7 @@ from numba import types
 
 from . import fold_python
 from .compiled import compile_model
-from .context import Context, context_type, prior
+from .context import context_of, context_type, prior
 from .diagnostics import Bounds, HealthPolicy, assess, assess_signature, chi_square_bounds
 from .driven import driven
 from .errors import EstimatorError
@@ -141,9 +141,9 @@ def run_brief(code, context, first, start, end, t, kind, channel, value, clock, 
 
 
 @jit_brief
-def assess_brief(first, last, t, track, policy, bounds):
+def assess_brief(first, last, t, kind, track, policy, bounds):
     """`assess`, with the GIL."""
-    assess(first, last, t, track, policy, bounds)
+    assess(first, last, t, kind, track, policy, bounds)
 
 
 @jit
@@ -223,7 +223,7 @@ class Fold:
         self._remember()
         self._rows = Track.allocate(log.capacity, len(model.shown), len(self.pairs), model.ny)
 
-    def _see(self) -> Context:
+    def _see(self) -> np.void:
         """The context of this model and tuning; the arrays that it points to are kept in `self._held`."""
         model, tuning = self.model, self.tuning
         gate = np.full(model.width + 1, np.inf)
@@ -256,7 +256,7 @@ class Fold:
             "seed": tuning.seed,
         }
         plain = {k: v.ctypes.data if isinstance(v, np.ndarray) else v for k, v in values.items()}
-        return Context(**plain, **sizes)
+        return context_of(**plain, **sizes)
 
     @property
     def track(self) -> Track:
@@ -336,7 +336,7 @@ class Fold:
                 self._remember()
         if end > begun:
             assess_some = self._assess_brief if brief else self._assess
-            assess_some(begun, end, log.t, self._rows, self.policy, self._bounds)
+            assess_some(begun, end, log.t, log.kind, self._rows, self.policy, self._bounds)
         return end - begun
 
     def _remember(self) -> None:

@@ -13,8 +13,8 @@ import numpy as np
 from numba import prange
 
 from .blocks import block_at, load, store
+from .context import context_at, place_of, sensor_rows
 from .context import options as numbers
-from .context import sensor_rows
 from .ensemble import (
     ADD,
     CREWS,
@@ -151,9 +151,10 @@ def columns(context, sensor, X, where, ZT, d, C, inflation, crew, crews, scratch
 
 @jit(parallel=True)
 def _columns_on_threads(context, sensor, X, where, ZT, d, C, inflation, crews, scratch, each):
+    place = place_of(context)
     for crew in prange(crews):
         own = scratch[crew * each : (crew + 1) * each]
-        columns(context, sensor, X, where, ZT, d, C, inflation, crew, crews, own)
+        columns(context_at(place), sensor, X, where, ZT, d, C, inflation, crew, crews, own)
 
 
 @jit

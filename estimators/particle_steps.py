@@ -15,10 +15,12 @@ from numba import prange, types
 from .context import (
     circular_rows,
     circular_states,
+    context_at,
     context_type,
     expect_rows,
     has_own_likelihood,
     own_likelihood,
+    place_of,
     sensor_variances,
     transition_rows,
 )
@@ -367,8 +369,9 @@ def block_code() -> float:
 @jit(parallel=True)
 def _on_threads(phase, context, u, dt, sensor, y, key, value, state, work, blocks):
     code = int(numbers(context)[BLOCK_CODE if phase < OWN else EXTRA])
+    place = place_of(context)
     for b in prange(blocks):
-        call_block(code, phase, context, u, dt, sensor, y, key, value, state, work, b)
+        call_block(code, phase, context_at(place), u, dt, sensor, y, key, value, state, work, b)
 
 
 @jit

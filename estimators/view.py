@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from .compiled import CompiledModel
-from .context import Context
 from .filter import Options
 from .gaussian import admit
 from .jacobians import scratch_size, sensor_jacobian, state_jacobian
@@ -27,7 +26,7 @@ class View:
     """A model, a tuning and the options of a filter, for its Python functions; nothing in it changes but `kept`."""
 
     def __init__(
-        self, compiled: CompiledModel, context: Context, tuning: Tuning, options: Options, pairs: np.ndarray
+        self, compiled: CompiledModel, context: np.void, tuning: Tuning, options: Options, pairs: np.ndarray
     ) -> None:
         model = compiled.model
         self.model: StateSpaceModel = model
