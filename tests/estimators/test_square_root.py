@@ -17,6 +17,7 @@ from estimators.track import FAILED, USED
 from estimators.tuning import Tuning
 
 SECOND = 1_000_000_000
+FILTERPY = ["filterpy-kf", "filterpy-ekf", "filterpy-ukf"]
 EVERYTHING = [
     {},
     {"robust": 1, "huber": 0.8},
@@ -201,7 +202,14 @@ def test_the_plain_forms_refuse_it_and_say_so(estimator, options):
     np.testing.assert_array_equal(fold.moments()[1], np.eye(3))
 
 
-@pytest.mark.parametrize("estimator", ["kf", "ekf", "iekf", "ukf", "ckf"])
+@pytest.mark.parametrize("estimator", FILTERPY)
+def test_filterpys_forms_refuse_it_and_say_so(estimator):
+    fold = folded(estimator, TWINS, at_once())
+    assert fold.track.verdict[0] == FAILED
+    np.testing.assert_array_equal(fold.moments()[0], np.zeros(3))
+
+
+@pytest.mark.parametrize("estimator", ["kf", "ekf", "iekf", "ukf", "ckf", *FILTERPY])
 def test_one_by_one_the_plain_forms_refuse_the_second(estimator):
     """H₂ P H₂ᵀ is nothing but rounding after the first: what R is beside that, no gain can know."""
     fold = folded(estimator, TWINS, one_by_one())
