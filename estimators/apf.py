@@ -2,7 +2,8 @@
 
 First stage: particle j is chosen in proportion to λ_j = w_j' p̂_j(y), the density of the reading under its predictive
 Gaussian N(h(f(x_j)), H P H' + R). Second: x_i ~ p(x | x_j'), w_i ∝ p(y | x_i) / p̂_j(y). The likelihood
-Σ_j λ_j · (1/N) Σ_i p(y | x_i) / p̂_j(y) is unbiased.
+Σ_j λ_j · (1/N) Σ_i p(y | x_i) / p̂_j(y) is unbiased for the transition that proposals.py draws from: the model's own
+where one step lies between readings, the EKF's Gaussian over several.
 
 Pitt & Shephard score by p(y | f(x_j)) itself, whose tails are lighter than those of p(y | x), so that weights have no
 bound; with the predictive spread they have one (Johansen & Doucet).

@@ -64,7 +64,7 @@ def chi_square_bounds(most: int) -> Bounds:
 def nis_bounds(dof: int, readings: int) -> tuple[float, float]:
     """95 % bounds of the mean NIS of `readings` readings with `dof` degrees of freedom in all.
 
-    Source: Bar-Shalom, Li & Kirubarajan (2001), 5.4.2, equation 5.4.2-18.
+    Source: Bar-Shalom, Li & Kirubarajan (2001), 5.4.2.
     """
     tail = (1.0 - PROBABILITY) / 2.0
     return float(chi_square_quantile(tail, dof) / readings), float(chi_square_quantile(1.0 - tail, dof) / readings)

@@ -59,7 +59,7 @@ def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
 def predict(context, u, dt, index, state, work):
     """x ← f(x, u);  P ← F P Fᵀ + Q, with F = df/dx at the estimate before the step.
 
-    Source: Jazwinski (1970), Stochastic Processes and Filtering Theory, theorem 8.1.
+    Source: Jazwinski (1970), Stochastic Processes and Filtering Theory, chapter 8.
     """
     n = context.nx
     x = state[:n]
@@ -116,7 +116,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     """x ← x + K ν;  P by the Joseph form, with H = dh/dx at the prediction.
 
     Diverges when h curves strongly within the spread of the prediction: P then shrinks faster than the error.
-    Source: Jazwinski (1970), theorem 8.1.
+    Source: Jazwinski (1970), chapter 8.
     """
     n = context.nx
     _, m = sensor_rows(context, sensor)
@@ -146,7 +146,7 @@ EKF = Estimator(
     assumes="differentiable f and h, nearly straight within the spread of the estimate",
     model_runs="1 and its derivatives (nx by complex step)",
     fails_when="curvature makes it overconfident: it stops listening to the sensors",
-    source="Jazwinski (1970), Stochastic Processes and Filtering Theory, theorem 8.1",
+    source="Jazwinski (1970), Stochastic Processes and Filtering Theory, chapter 8",
     functions=(start, predict, update, describe),
     runs=lambda options, nx: nx + 1,
     state_size=state_size,

@@ -54,18 +54,20 @@ from .track import USED
 
 @jit
 def perturbed_innovations(seed, index, m, ZT, d, B):
-    """B[k, i] = (y + vᵢ - h(xᵢ))ₖ / √rₖ, with vᵢ of mean zero over the members and of expected sample variance r."""
+    """B[k, i] = (y + vᵢ - h(xᵢ))ₖ / √rₖ, with vᵢ of mean zero over the members.
+
+    Their sample variance, Σ v² / (N - 1) like the members' own, is r on average with no further scaling: so the spread
+    of the analysis is (I - K H) P (I - K H)ᵀ + K R Kᵀ on average, which is Kalman's.
+    """
     N = ZT.shape[1]
     key = key_of(seed, index, PERTURB)
-    # Taking the mean away takes 1/N of the variance away.
-    scale = np.sqrt(N / (N - 1.0))
     for k in range(m):
         total = 0.0
         for i in range(N):
             B[k, i] = normal(key, np.uint64(k * N + i))
             total += B[k, i]
         for i in range(N):
-            B[k, i] = d[k] + scale * (B[k, i] - total / N) - np.sqrt(N - 1.0) * ZT[k, i]
+            B[k, i] = d[k] + (B[k, i] - total / N) - np.sqrt(N - 1.0) * ZT[k, i]
 
 
 @jit

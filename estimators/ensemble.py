@@ -269,7 +269,7 @@ def next_draw(X, state):
 def predict(context, u, dt, index, state, work):
     """xᵢ ← f(xᵢ, u) + wᵢ, wᵢ ~ N(0, Q), for every member.
 
-    Source: Evensen (2003), doi:10.1007/s10236-003-0036-9, section 3.
+    Source: Evensen (2003), doi:10.1007/s10236-003-0036-9.
     """
     X = ensemble(context, state)
     key = key_of(context.seed, next_draw(X, state), PROCESS)
@@ -421,7 +421,7 @@ def judge(context, sensor, m, ZT, Z, d, rows, G, U, v, score):
 def add_spread(context, index, X, scratch):
     """Additive inflation: to each pair of members ±s z with z ~ N(0, 1), so that the mean stays.
 
-    Source: Whitaker & Hamill (2012), doi:10.1175/MWR-D-11-00276.1, section 2, with noise in place of archived states.
+    Source: Whitaker & Hamill (2012), doi:10.1175/MWR-D-11-00276.1, with noise in place of archived states.
     """
     share = numbers(context)[ADDITIVE]
     if share == 0.0:

@@ -7,7 +7,7 @@ For one row with variance r, s = C_yy + r and gain K = ρ C_xy / s:
 The rows to come are corrected like states, tapered by their distance from the row at hand. So the sequence of rows is
 found first, among the rows alone; then every state goes through it by itself.
 
-Source: Whitaker & Hamill (2002), doi:10.1175/1520-0493(2002)130<1913:EDAWPO>2.0.CO;2, equations 5 and 13; the rows
+Source: Whitaker & Hamill (2002), doi:10.1175/1520-0493(2002)130<1913:EDAWPO>2.0.CO;2, equation 13 for α; the rows
 first, then the states: Anderson & Collins (2007), doi:10.1175/JTECH2049.1.
 """
 

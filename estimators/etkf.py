@@ -127,7 +127,7 @@ def rotate_members(seed, index, T, W):
     Ω = H diag(1, Q) H, where the reflection H turns the first unit vector into 1/√N and Q is a random rotation of the
     other N - 1 axes, from the orthogonalisation of normal numbers.
 
-    Source: Sakov & Oke (2008), doi:10.1175/2007MWR2021.1, section 5.
+    Source: Sakov & Oke (2008), doi:10.1175/2007MWR2021.1.
     """
     N = T.shape[0]
     key = key_of(seed, index, ROTATE)

@@ -10,6 +10,8 @@ Where FilterPy 2.0 must be handled with care:
   `predict_x` is F x even where f is curved, and is overridden with f.
 - `UnscentedKalmanFilter.update` takes the sigma points of the last predict(), which are stale for a second reading at
   one time: they are drawn anew from x and P.
+- `UnscentedKalmanFilter` takes sigma points from a P that is singular but for rounding and returns a wrong estimate
+  without a word: such a reading fails, as in our own (`only_rounding`).
 - `EnsembleKalmanFilter.update` leaves a P = P - K S Kᵀ that is not its members' covariance: the members' is reported.
   Its perturbations do not have mean zero over the members. It has one Q for all members, here that of their mean.
 - `EnsembleKalmanFilter` draws from NumPy's global generator: its methods run here with a generator of
@@ -36,6 +38,7 @@ from filterpy.kalman import (
 from . import ensemble, gaussian, kf, ukf
 from .filter import Estimator, Option, Options
 from .track import FAILED, MISSING, USED
+from .ukf import only_rounding
 from .view import View, wrapped
 
 PROCESS, START, PERTURB = range(3)
@@ -186,7 +189,12 @@ def update_ukf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any
         filter_ = _unscented(view, view.circular_rows(sensor)[rows])
         filter_.x, filter_.P = x, P
         filter_.sigmas_f = filter_.points_fn.sigma_points(x, P)
-        filter_.update(y[rows], R=R, hx=in_turn(view.h(sensor, filter_.sigmas_f, u)[:, rows]))
+        block = np.ascontiguousarray(view.h(sensor, filter_.sigmas_f, u)[:, rows])
+        filter_.update(y[rows], R=R, hx=in_turn(block))
+        U = np.ascontiguousarray(np.linalg.cholesky(P).T)
+        w = float(filter_.points_fn.Wm[1])
+        if only_rounding(U, P, block, filter_.S - R, np.diag(R).copy(), w, y[rows]):
+            raise ValueError("the sigma points rest on rounding")
         return filter_
 
     return _update(view, sensor, y, step, *rest)

@@ -157,7 +157,8 @@ def judge(context, sensor, m, nu, U, score):
 
     NIS = νᵀ S⁻¹ ν;  log-likelihood = -½ (NIS + log det S + m log 2π)
 
-    Source: Bar-Shalom, Li & Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), 5.4.2.
+    Sources: Bar-Shalom, Li & Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), 5.4.2, for
+    the NIS; Schweppe (1965), doi:10.1109/TIT.1965.1053737, for the likelihood as that of the innovations.
     """
     score[1] = m
     solve_transposed(U, m, nu)

@@ -3,8 +3,9 @@
 At each state the variance of a row is divided by the taper of its distance, so that far rows count less, and rows
 beyond the radius not at all. States are independent of each other, and are worked on by all threads.
 
-Source: Hunt, Kostelich & Szunyogh (2007), doi:10.1016/j.physd.2006.11.008, section 2.3 (steps 4 to 8), with the smooth
-localisation of its section 2.3.3.
+Source: Hunt, Kostelich & Szunyogh (2007), doi:10.1016/j.physd.2006.11.008, with their smooth localisation: R⁻¹ times a
+factor that falls with the distance. Their inflation is of the forecast; here, as in all ensemble filters, it is of the
+analysis.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ def semidefinite_root(A, L):
 
     Cholesky by columns; a pivot of zero leaves its column zero. Reads the lower triangle of A.
 
-    Source: Golub & Van Loan, Matrix Computations, 4th ed., section 4.2.8.
+    Source: Higham (2002), Accuracy and Stability of Numerical Algorithms, 2nd edition, 10.3.
     """
     n = A.shape[0]
     for i in range(n):

@@ -466,5 +466,8 @@ def resample(context, u, sensor, y, key, sums, state, work):
 
 @jit
 def impoverished(context, state):
-    """Whether the effective sample size, 1 / Σ w², has fallen under its part of N. Source: Kong, Liu & Wong (1994)."""
+    """Whether the effective sample size, 1 / Σ w², has fallen under its part of N.
+
+    Source: Kong, Liu & Wong (1994), Sequential imputations, doi:10.1080/01621459.1994.10476469.
+    """
     return state[ESS] < numbers(context)[FRACTION] * numbers(context)[MEMBERS]

@@ -64,7 +64,7 @@ from .tuning import Tuning
 
 @jit
 def predict(context, u, dt, index, state, work):
-    """x_i ← f(x_i) + w_i, w_i ~ N(0, Q). Source: Gordon, Salmond & Smith (1993), section 2."""
+    """x_i ← f(x_i) + w_i, w_i ~ N(0, Q). Source: Gordon, Salmond & Smith (1993)."""
     nx = context.nx
     n = int(numbers(context)[MEMBERS])
     index = next_draw(state)

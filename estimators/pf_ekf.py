@@ -3,8 +3,8 @@
 x_i ~ q = N(x; EKF posterior of particle i),  w_i ∝ w_i' p(y | x_i) p(x_i | x_i') / q(x_i). With a linear sensor and one
 step between readings q is the optimal proposal p(x | x', y), and the weight does not depend on the draw.
 
-Sources: van der Merwe, Doucet, de Freitas & Wan (2000), The unscented particle filter, section 3 (the EKF as
-proposal); Doucet, Godsill & Andrieu (2000), doi:10.1023/A:1008935410038, section II.D.
+Sources: van der Merwe, Doucet, de Freitas & Wan (2000), The unscented particle filter, for the EKF as proposal; Doucet,
+Godsill & Andrieu (2000), doi:10.1023/A:1008935410038, for the optimal proposal and its weight.
 """
 
 from __future__ import annotations

@@ -253,8 +253,11 @@ def _propose(
         x = records[i, :nx]
         P = matrix(records[i], nx, nx, nx)
         correction = 0.0
+        sound = True
         if ekf:
-            _see(context, sensor, u, y, x, P, L, H, HL, S, U, e, expected, scratch)
+            seen = _see(context, sensor, u, y, x, P, L, H, HL, S, U, e, expected, scratch)
+            # Where h or its slope is no number there is no proposal: the particle stays and weighs nothing.
+            sound = -np.inf < seen < np.inf
             # HL becomes U⁻ᵀ H L, `expected` holds U⁻ᵀ e.
             for k in range(finite_rows):
                 for j in range(nx):
@@ -283,13 +286,17 @@ def _propose(
             for a in range(nx):
                 z[a] = normal(key, place)
                 place += ONE
-        add_noise(L, z, x)
-        wrap_record(circular, x)
+        for a in range(nx):
+            sound &= np.isfinite(z[a])
+        value = -np.inf
+        if sound:
+            add_noise(L, z, x)
+            wrap_record(circular, x)
+            value = _log_density(context, sensor, u, y, x, expected)
+            value += log_w[i] + (correction if ekf else -ahead[i])
         for a in range(nx):
             for b in range(nx):
                 P[a, b] = 0.0
-        value = _log_density(context, sensor, u, y, x, expected)
-        value += log_w[i] + (correction if ekf else -ahead[i])
         if not -np.inf < value < np.inf:
             value = -np.inf
         joint[i] = value

@@ -2,8 +2,8 @@
 
 All are unbiased, E[children of i] = N w_i. Systematic and stratified put one point into each of N equal strata of the
 cumulated weights (the same place in each, or a place of its own); residual gives ⌊N w_i⌋ and draws the rest;
-multinomial draws all. Variance falls from the last to the first; systematic is the cheapest, and can in contrived
-orders be the worst.
+multinomial draws all. Stratified and residual never vary more than multinomial; systematic is the cheapest and mostly
+varies least, but in contrived orders can be the worst.
 
 Source: Douc & Cappé (2005), Comparison of resampling schemes for particle filtering, doi:10.1109/ISPA.2005.195385.
 """

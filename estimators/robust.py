@@ -38,8 +38,8 @@ OPTIONS = (
 )
 """Options of every Gaussian filter that has a gain of its own."""
 
-MOST = 100
-"""Iterations of a weight, at most."""
+MOST = 1000
+"""Iterations of a weight, at most: Huber's takes a few, Student's t some tens, or hundreds where two nearly fit."""
 
 
 def shared(values: Options) -> list[float]:

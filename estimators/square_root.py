@@ -146,7 +146,7 @@ def condition(context, sensor, y, state, expected, Y, lost, work, innovation, in
     Y (k, ny) and lost are those of `triangularise_joint`, for all rows of the reading; they and `expected` are lost.
 
     Source: the array algorithm of Kailath, Sayed & Hassibi, Linear Estimation (2000), chapter 12; for sigma points,
-    whose (D₊ - D₋) take the place of U Hᵀ, Arasaratnam & Haykin (2009), doi:10.1109/TAC.2009.2019800, appendix.
+    whose (D₊ - D₋) take the place of U Hᵀ, Arasaratnam, Haykin & Hurd (2010), doi:10.1109/TSP.2010.2056923.
     """
     n = context.nx
     x = state[:n]

@@ -112,7 +112,7 @@ def predict(context, u, dt, index, state, work):
     """x, P ← mean and covariance of the propagated sigma points, plus Q.
 
     Fails when P loses positive definiteness; the state then becomes NaN and the twin reports divergence.
-    Source: Julier & Uhlmann (2004), section IV.
+    Source: Julier & Uhlmann (2004), as above.
     """
     n = context.nx
     x = state[:n]
@@ -170,7 +170,7 @@ def only_rounding(U, P, D, S, r, w, y):
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """x ← x + C S⁻¹ ν;  P ← P - C S⁻¹ Cᵀ, with C and S from fresh sigma points through h.
 
-    Source: Julier & Uhlmann (2004), section IV; sigma points are drawn anew from the prediction, so that they carry Q.
+    Source: Julier & Uhlmann (2004), as above; sigma points are drawn anew from the prediction, so that they carry Q.
     """
     n = context.nx
     _, m = sensor_rows(context, sensor)

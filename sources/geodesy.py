@@ -24,14 +24,15 @@ def east_north(fixes: np.ndarray, origin: tuple[float, float]) -> np.ndarray:
     N = a / √(1 - e² sin²φ);  r = (N cosφ cosλ, N cosφ sinλ, N (1 - e²) sinφ);
     east = -sinλ₀ dx + cosλ₀ dy;  north = -sinφ₀ cosλ₀ dx - sinφ₀ sinλ₀ dy + cosφ₀ dz,  (dx, dy, dz) = r - r₀
 
-    Lengths are true to (d/R)²/2: 12 mm at 1 km... 0.2 m at 40 km. Scaling the angles by the radii of curvature at the
-    origin is true at the origin only: its east is wrong by 0.5 % when 20 km north of it at 56° latitude.
+    A point at the distance d over ground appears short by d (d/R)²/6: 4 μm at 1 km, 0.26 m at 40 km. Scaling the angles
+    by the radii of curvature at the origin is true at the origin only: its east is wrong by 0.5 % when 20 km north of
+    it at 56° latitude.
 
     Args:
         fixes: Latitude and longitude, degrees, shape (n, 2). NaN, or what is no latitude or longitude, gives NaN.
         origin: Latitude and longitude, degrees.
 
-    Source: NIMA TR8350.2 (2000), section 4; Groves (2013), Principles of GNSS, equations 2.112 and 2.158.
+    Source: NIMA TR8350.2 (2000), section 4; Groves (2013), Principles of GNSS, equations 2.112 and 2.150.
     """
     valid = (np.abs(fixes[:, 0]) <= 90) & (np.abs(fixes[:, 1]) <= 180)
     latitude, longitude = np.radians(np.where(valid, fixes.T, np.nan))

@@ -10,7 +10,7 @@ wall: until then the true posterior has two peaks. The prior is one Gaussian ove
 Each wall is a segment of an axis, so a beam's distance to it is a quotient, d = (wall - east) / cos ψ, and its slopes
 are -1 / cos ψ and d tan ψ: the Jacobian is exact wherever a beam does not meet a corner.
 
-Source: Thrun, Burgard & Fox (2005), Probabilistic Robotics, sections 6.3 (beams) and 8.2 (global localisation).
+Source: Thrun, Burgard & Fox (2005), Probabilistic Robotics, sections 6.3 (beams) and 8.3 (particles).
 """
 
 from __future__ import annotations
@@ -112,5 +112,5 @@ AGV_CORRIDOR = StateSpaceModel(
     f=f,
     Q=Q,
     max_step=0.25,
-    source="Thrun, Burgard & Fox (2005), Probabilistic Robotics, sections 6.3 and 8.2; a building of our own",
+    source="Thrun, Burgard & Fox (2005), Probabilistic Robotics, sections 6.3 and 8.3; a building of our own",
 )

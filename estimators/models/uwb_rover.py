@@ -8,7 +8,7 @@ The odometry is an input: either speed and yaw rate, or the speeds of the wheels
 recording does not tell stays zero. Heading ψ is counted from east to the left. A radio that reflects off a wall instead
 of crossing it arrives late, so each anchor has a bias that lasts and is forgotten,
 
-    bias_i' = (reflection - bias_i) / bias_time + w,    variance of bias_i = Q.bias · bias_time / 2 + square of mean
+    bias_i' = (reflection - bias_i) / bias_time + w,    so bias_i settles at reflection ± √(Q.bias · bias_time / 2)
 
 Where the anchors stand are parameters, which the twin's YAML sets, and may move into the state (`estimate`).
 

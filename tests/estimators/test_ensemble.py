@@ -39,7 +39,7 @@ def members_of(fold):
 
 def analysed(name, model, options, sensor, y, seed=0):
     """Members before and after one reading at the time of the prior, and the fold."""
-    tuning = Tuning.of(model).with_options(options)
+    tuning = replace(Tuning.of(model).with_options(options), seed=seed)
     fold = Fold(name, model, tuning, log_of(model.width, (0, 0, READING, sensor, y)))
     before = members_of(fold)
     fold.advance()
@@ -100,10 +100,36 @@ def test_enkf_moves_the_mean_as_kalman_does_and_each_member_by_its_own_reading(m
 
 
 def perturbations(members, m):
-    """The filter's own draws for event 0: centred, and scaled to a sample variance of 1 on average."""
+    """The filter's own draws for event 0, centred: their sample variance, over N - 1, is 1 on average as it is."""
     key = np.uint64(key_of(0, 1, shared.PERTURB))  # the first that is drawn
     z = np.array([[normal(key, np.uint64(k * members + i)) for k in range(m)] for i in range(members)])
-    return (z - z.mean(0)) * np.sqrt(members / (members - 1))
+    return z - z.mean(0)
+
+
+@pytest.mark.parametrize("members", [2, 3])
+def test_enkf_has_kalmans_spread_on_average_however_few_its_members(members):
+    """Of one state and one row: over the draws of v, the sample variance of the analysis is (1 - K) P on average.
+
+    It is that of (1 - K) aᵢ + K (vᵢ - v̄), so over R it has, by Σ (v - v̄)² / R ~ χ²(N - 1), the variance
+    2 K⁴ / (N - 1) + 4 K² (1 - K)² (P / R) / (N - 1); perturbations too large by N / (N - 1) would be off by 9 σ.
+    """
+    r, runs = 0.5, 400
+    model = StateSpaceModel(
+        name="level",
+        title="level",
+        states=(State("x", "m", std=5.0),),
+        noises=(Noise("x", "m²/s", 0.0),),
+        sensors=(Sensor("y", (Row("y", "m", r),), h=first_of),),
+        f=stay,
+    )
+    off, variance = 0.0, 0.0
+    for seed in range(runs):
+        before, after, _ = analysed("enkf", model, {"members": members}, 0, [0.3], seed=seed)
+        P = np.var(before, ddof=1)
+        K = P / (P + r)
+        off += (np.var(after, ddof=1) - (1 - K) * P) / r
+        variance += (2 * K**4 + 4 * K**2 * (1 - K) ** 2 * P / r) / (members - 1)
+    assert abs(off) < 5 * np.sqrt(variance)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -186,6 +212,10 @@ def stay(x, u, p, dt, out):
         out[i] = x[i]
 
 
+def first_of(x, u, p, out):
+    out[0] = x[0]
+
+
 RING = StateSpaceModel(
     name="ring",
     title="ring",
@@ -232,7 +262,7 @@ def dense_ensrf(X, y, v, H, r, to_states, between):
 
 
 def dense_letkf(X, y, v, H, r, to_states, between):
-    """Hunt's equations 20 to 25, state by state, with R divided by the taper."""
+    """As Hunt, Kostelich and Szunyogh write it, state by state, with R divided by the taper."""
     N, n = X.shape
     Yb, d = (X - X.mean(0)) @ H.T, y - X.mean(0) @ H.T
     out = X.copy()

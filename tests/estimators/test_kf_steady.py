@@ -123,7 +123,7 @@ def test_two_rows_an_input_split_steps_and_a_row_that_is_missing():
     rng = np.random.default_rng(3)
     log = Log(2)
     values = rng.normal(0, 1, (300, 2))
-    values[150, 1] = np.nan
+    values[150, 1] = values[170, 0] = np.nan
     for k, value in enumerate(values):
         log.extend(Readings.one(k * SECOND // 4, 0, READING, 0, value, 2))
     steady = folded("kf-steady", log, Tuning.of(TWO_ROWS).with_options({"period": 0.25}), TWO_ROWS)

@@ -64,6 +64,10 @@ def square(x, u, p, out):
     out[0] = x[0] * x[0]
 
 
+def root(x, u, p, out):
+    out[0] = np.sqrt(x[0])
+
+
 def relative(x, u, p, q, dt, out):
     out[0, 0] = q[0] * dt * x[0] * x[0]
 
@@ -244,6 +248,23 @@ def test_a_cloud_that_explains_nothing_fails_visibly_and_recovers(name):
     for column in (run.track.mean, run.track.std, run.moments()[0], run.points()):
         assert np.all(np.isfinite(column))
     assert abs(run.track.mean[-1, 0] - 30.0) < 1.0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_particles_where_the_sensor_says_no_number_are_out(name):
+    """y = √x, of which a sixth of the prior has none: the posterior is that of the others, by quadrature."""
+    model = scalar(states=(State("s", "m", 0.5, 0.5),), sensors=(Sensor("y", (Row("y", "m", 0.04),), h=root),))
+    run = Fold(name, model, Tuning.of(model).with_options({"particles": 20_000}), log_of((0, READING, 0.9)))
+    run.advance()
+    x = np.linspace(0.0, 4.0, 40_001)
+    density = np.exp(-0.5 * ((x - 0.5) / 0.5) ** 2 - 0.5 * ((0.9 - np.sqrt(x)) / 0.2) ** 2)
+    mean = np.average(x, weights=density)
+    std = np.sqrt(np.average((x - mean) ** 2, weights=density))
+    assert run.track.verdict[0] == USED
+    # The effective sample is a third of the cloud.
+    assert abs(run.track.mean[0, 0] - mean) < 5 * std / np.sqrt(20_000 / 3)
+    assert abs(run.track.std[0, 0] / std - 1) < 5 / np.sqrt(2 * 20_000 / 3)
+    assert np.all(np.isfinite(run.points()))
 
 
 def test_no_particles_are_refused():

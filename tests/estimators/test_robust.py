@@ -152,6 +152,31 @@ def test_huber_minimises_its_cost(estimator, y):
     np.testing.assert_allclose(fold.moments()[0], best, atol=1e-6)
 
 
+@pytest.mark.parametrize("y", [(0.5, 0.2), (9.0, -6.0), (np.nan, 40.0)])
+def test_student_t_weighs_all_rows_by_one_precision(estimator, y):
+    """w = (ν + m) / (ν + tr(R⁻¹ E e eᵀ)) with e = y - H x given noise R / w, by matrices, iterated from w = 1."""
+    dof, w = 3.0, 1.0
+    finite = np.isfinite(y)
+    H = np.array([[1.0, 0.5], [-1.0, 1.0]])[finite]
+    r, P, y_ = np.array([0.25, 0.5])[finite], np.diag([4.0, 1.0]), np.array(y)[finite]
+    for _ in range(2000):
+        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(r / w))
+        x, left = K @ y_, P - K @ H @ P
+        e = y_ - H @ x
+        w = (dof + r.size) / (dof + np.sum((e * e + np.diag(H @ left @ H.T)) / r))
+    fold = folded(estimator, PLANE, [y], {"robust": 2, "dof": dof})
+    np.testing.assert_allclose(fold.moments()[0], x, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(fold.moments()[1], left, rtol=0, atol=1e-8)
+
+
+def test_the_level_of_q_follows_the_nis_of_a_row(estimator):
+    """s = 1 + (NIS / m - 1) / N after one reading of m = 2 rows."""
+    fold = folded(estimator, PLANE, [(3.0, -2.0)], {"adapt": 2, "memory": 50})
+    H = np.array([[1.0, 0.5], [-1.0, 1.0]])
+    nis = np.array([3.0, -2.0]) @ np.linalg.solve(H @ np.diag([4.0, 1.0]) @ H.T + np.diag([0.25, 0.5]), [3.0, -2.0])
+    np.testing.assert_allclose(fold._state[-1], 1.0 + (nis / 2 - 1.0) / 50, rtol=1e-12)
+
+
 @pytest.mark.parametrize("robust", [1, 2])
 def test_a_spike_is_nearly_forgotten(estimator, robust):
     """Fifty readings of 1 ± 0.5, one of 1000: the plain filter lurches by 20 m, a robust one by less than 1 m."""
@@ -303,6 +328,15 @@ def test_joseph_and_the_short_form_agree_where_both_hold():
         on, off = (folded(name, model(q=0.04, r=4.0), values, {"joseph": choice}).track for choice in (1, 0))
         np.testing.assert_allclose(on.std, off.std, rtol=1e-12)
         assert not np.array_equal(on.std, off.std)
+
+
+@pytest.mark.parametrize("y", [(9.0, -6.0), (np.nan, 40.0)])
+@pytest.mark.parametrize("robust", [1, 2])
+@pytest.mark.parametrize("name", ["kf", "ekf", "iekf"])
+def test_joseph_takes_the_weighted_noise_too(name, robust, y):
+    on, off = (folded(name, PLANE, [y], {"robust": robust, "joseph": choice}).moments() for choice in (1, 0))
+    for a, b in zip(on, off, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 
 
 def test_a_choice_that_does_not_exist_is_named():

@@ -12,11 +12,12 @@ from test_filterpy import PENDULUM, log  # noqa: F401  the fixture
 from estimators.errors import EstimatorError
 from estimators.fold import Fold
 from estimators.log import READING, Log, Readings
-from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.model import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.track import FAILED, USED
 from estimators.tuning import Tuning
 
 SECOND = 1_000_000_000
+FILTERPY = ["filterpy-kf", "filterpy-ekf", "filterpy-ukf"]
 EVERYTHING = [
     {},
     {"robust": 1, "huber": 0.8},
@@ -201,7 +202,37 @@ def test_the_plain_forms_refuse_it_and_say_so(estimator, options):
     np.testing.assert_array_equal(fold.moments()[1], np.eye(3))
 
 
+def near_twins(x, u, p, out):
+    out[0] = x[0] + x[1] + x[2]
+    out[1] = x[0] + x[1] + (1.0 + p[0]) * x[2]
+
+
 @pytest.mark.parametrize("estimator", ["kf", "ekf", "iekf", "ukf", "ckf"])
+@pytest.mark.parametrize(("apart", "verdict"), [(4e-8, FAILED), (1e-6, USED)])
+def test_a_pivot_that_rounding_could_have_made_is_refused(estimator, apart, verdict):
+    """The second pivot of H Hᵀ is 2/3 δ²: 1e-15, which rounding of 3 makes too, and so has a root; or 7e-13."""
+    model = StateSpaceModel(
+        name="near_twins",
+        title="two sensors that say nearly the same",
+        states=TWINS.states,
+        parameters=(Parameter("apart", "1", apart),),
+        noises=TWINS.noises,
+        sensors=(Sensor("both", rows("y1", "y2"), h=near_twins),),
+        f=keep,
+        linear=True,
+    )
+    fold = folded(estimator, model, at_once())
+    assert fold.track.verdict[0] == verdict
+
+
+@pytest.mark.parametrize("estimator", FILTERPY)
+def test_filterpys_forms_refuse_it_and_say_so(estimator):
+    fold = folded(estimator, TWINS, at_once())
+    assert fold.track.verdict[0] == FAILED
+    np.testing.assert_array_equal(fold.moments()[0], np.zeros(3))
+
+
+@pytest.mark.parametrize("estimator", ["kf", "ekf", "iekf", "ukf", "ckf", *FILTERPY])
 def test_one_by_one_the_plain_forms_refuse_the_second(estimator):
     """H₂ P H₂ᵀ is nothing but rounding after the first: what R is beside that, no gain can know."""
     fold = folded(estimator, TWINS, one_by_one())

@@ -28,6 +28,15 @@ def test_far_from_the_origin_lengths_stay_true():
     assert np.hypot(*(b - a)) == pytest.approx(100.0, rel=1e-5)
 
 
+@pytest.mark.parametrize("metres", [1e3, 40e3])
+def test_distances_are_short_by_a_sixth_of_the_square_of_the_angle(metres):
+    """Along the equator, a circle of radius a: R sin θ instead of R θ."""
+    theta = metres / SEMI_MAJOR
+    (east, north), = east_north(np.array([[0.0, 10.0 + np.degrees(theta)]]), (0.0, 10.0))  # fmt: skip
+    assert east == pytest.approx(SEMI_MAJOR * np.sin(theta), abs=1e-6) and north == pytest.approx(0.0, abs=1e-9)
+    assert metres - east == pytest.approx(metres * theta**2 / 6, rel=1e-3, abs=1e-7)
+
+
 def test_what_is_no_position_is_missing():
     got = east_north(np.array([[91.0, 0.0], [0.0, 181.0], [np.nan, 0.0], [1.0, 1.0]]), (0.0, 0.0))
     assert np.isnan(got[:3]).all() and np.isfinite(got[3]).all()
