@@ -409,9 +409,11 @@ def judge(context, sensor, m, ZT, Z, d, rows, G, U, v, score):
     score[2] = -0.5 * (nis + log_det + m * LOG_2PI)
     if flags(context.used, context.n_sensors)[sensor] == 0:
         return HELD_OUT
-    if not nis <= floats(context.gate, context.width + 1)[m]:
-        return GATED
-    return USED
+    limit = floats(context.gate, context.width + 1)[m]
+    if nis <= limit:
+        # As in gaussian.py: a reading that far off would leave members that are no numbers.
+        return USED if nis < np.inf else FAILED
+    return GATED if limit < np.inf else FAILED
 
 
 @jit

@@ -141,9 +141,9 @@ def run_brief(code, context, first, start, end, t, kind, channel, value, clock, 
 
 
 @jit_brief
-def assess_brief(first, last, t, track, policy, bounds):
+def assess_brief(first, last, t, kind, track, policy, bounds):
     """`assess`, with the GIL."""
-    assess(first, last, t, track, policy, bounds)
+    assess(first, last, t, kind, track, policy, bounds)
 
 
 @jit
@@ -336,7 +336,7 @@ class Fold:
                 self._remember()
         if end > begun:
             assess_some = self._assess_brief if brief else self._assess
-            assess_some(begun, end, log.t, self._rows, self.policy, self._bounds)
+            assess_some(begun, end, log.t, log.kind, self._rows, self.policy, self._bounds)
         return end - begun
 
     def _remember(self) -> None:

@@ -18,6 +18,7 @@ from .context import (
     circular_rows,
     circular_states,
     context_type,
+    expect,
     has_own_likelihood,
     own_likelihood,
     parameters,
@@ -77,9 +78,9 @@ def shared_numbers(nx: int, ny: int) -> int:
 
 
 def block_numbers(nx: int, ny: int) -> int:
-    """Numbers of one block: its sums; x', z, ŷ; deviations by row; L and its scratch; where its points begin."""
+    """Numbers of one block: its sums; x', z, ŷ, ν₀; deviations by row; L and its scratch; where its points begin."""
     k = max(nx, ny)
-    return 4 + k + k * k + 2 * nx + ny + 2 * nx * nx + (k + 2) * CHUNK + 1
+    return 4 + k + k * k + 2 * nx + 2 * ny + 2 * nx * nx + (k + 2) * CHUNK + 1
 
 
 def tune(options: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
@@ -129,7 +130,7 @@ def shared(context, work, n):
 def block_size(context):
     """Numbers of one block, as in `block_numbers`."""
     nx, ny = context.nx, context.width
-    return sums_size(context) + 2 * nx + ny + 2 * nx * nx + (max(nx, ny) + 2) * CHUNK + 1
+    return sums_size(context) + 2 * nx + 2 * ny + 2 * nx * nx + (max(nx, ny) + 2) * CHUNK + 1
 
 
 @jit
@@ -194,10 +195,35 @@ def propagate(context, u, dt, key, state, first, last, L, scratch, forward, z):
 
 
 @jit
-def weigh(context, u, sensor, y, state, joint, first, last, expected, D, sums):
+def first_residual(context, u, sensor, y, x, out):
+    """What a reading leaves over the expectation of a particle x, by row, and 0 where it is no number.
+
+    The residuals' moments are taken about that of the first particle: the spread of the particles then keeps its digits
+    however far off the reading is.
+    """
+    expect(context, sensor, x, u, out)
+    circular = circular_rows(context, sensor)
+    for row in range(out.size):
+        out[row] = y[row] - out[row]
+        if circular[row] != 0:
+            out[row] = wrap(out[row])
+        if not np.isfinite(out[row]):
+            out[row] = 0.0
+
+
+@jit
+def about(residual, reference, circular):
+    """A residual's deviation from a reference; of angles the shorter way."""
+    deviation = residual - reference
+    return wrap(deviation) if circular != 0 else deviation
+
+
+@jit
+def weigh(context, u, sensor, y, state, joint, first, last, expected, reference, D, sums):
     """joint = log w + log p(y | x), and the sums of the residuals' mean and covariance under the predicted weights.
 
-    p(y | x) is Gaussian over the finite rows of y, or the sensor's own; a density that is no number counts as zero.
+    p(y | x) is Gaussian over the finite rows of y, or the sensor's own; a density that is no number counts as zero. The
+    sums are about `first_residual`, for which `reference` (ny,) is scratch.
     """
     nx = context.nx
     records = records_of(state, nx, joint.size)
@@ -212,6 +238,7 @@ def weigh(context, u, sensor, y, state, joint, first, last, expected, D, sums):
         sums[k] = 0.0
     sums[2] = -np.inf
     ny = r.size
+    first_residual(context, u, sensor, y, records[0], reference)
     m = 0
     constant = 0.0
     for row in range(ny):
@@ -239,7 +266,7 @@ def weigh(context, u, sensor, y, state, joint, first, last, expected, D, sums):
                 e = D[row, i]
                 if circular[row] != 0:
                     e = wrap(e)
-                d[i] = e
+                d[i] = about(e, reference[row], circular[row])
                 joint[begin + i] -= weight * e * e
             k += 1
         if own:
@@ -292,7 +319,8 @@ def _block(phase, context, u, dt, sensor, y, key, value, state, work, b):
     z = floats(work.ctypes.data + 8 * (at + nx), nx)
     at += 2 * nx
     expected = floats(work.ctypes.data + 8 * at, ny)
-    at += ny
+    reference_residual = floats(work.ctypes.data + 8 * (at + ny), ny)
+    at += 2 * ny
     D = matrix(work, at, max(nx, ny) + 2, CHUNK)
     at += (max(nx, ny) + 2) * CHUNK
     if phase == PROPAGATE:
@@ -310,6 +338,7 @@ def _block(phase, context, u, dt, sensor, y, key, value, state, work, b):
             first,
             last,
             floats(expected.ctypes.data, sensor_variances(context, sensor).size),
+            floats(reference_residual.ctypes.data, sensor_variances(context, sensor).size),
             D,
             sums,
         )

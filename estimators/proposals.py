@@ -45,10 +45,12 @@ from .particle import (
 )
 from .particle_steps import (
     OWN,
+    about,
     block_count,
     block_signature,
     block_size,
     blocks_start,
+    first_residual,
     shared,
     sums_size,
     sweep,
@@ -64,7 +66,7 @@ MOVE, EXPECT, PROPOSE_EKF, PROPOSE_PRIOR = range(OWN, OWN + 4)
 
 
 def own_numbers(nx: int, ny: int) -> int:
-    """Scratch of a block: F, twice its square, L, C; H, H L, S, U; e, ŷ, ν̃; x', z, ξ; a Jacobian's."""
+    """Scratch of a block: F, twice its square, L, C; H, H L, S, U; e, ŷ, ν₀; x', z, ξ; a Jacobian's."""
     return 5 * nx * nx + 2 * ny * nx + 2 * ny * ny + 3 * ny + 3 * nx + scratch_size(nx, ny)
 
 
@@ -169,8 +171,13 @@ def _see(context, sensor, u, y, x, P, L, H, HL, S, U, e, expected, scratch):
 
 
 @jit
-def _expect(context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S, U, e, expected, scratch, sums):
-    """joint = log w + log N(y; h(x), H P Hᵀ + R), the second kept in `ahead`, and the sums of residuals and S - R."""
+def _expect(
+    context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S, U, e, expected, reference, scratch, sums
+):
+    """joint = log w + log N(y; h(x), H P Hᵀ + R), the second kept in `ahead`, and the sums of residuals and S - R.
+
+    The sums are about `first_residual`, for which `reference` (ny,) is scratch.
+    """
     nx = context.nx
     n = joint.size
     log_w = log_weights(state, nx, n)
@@ -178,6 +185,8 @@ def _expect(context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S
     r = sensor_variances(context, sensor)
     own = has_own_likelihood(context, sensor)
     equal = state[EQUAL] != 0.0
+    circular = circular_rows(context, sensor)
+    first_residual(context, u, sensor, y, records[0, :nx], reference)
     for k in range(sums.size):
         sums[k] = 0.0
     sums[2] = -np.inf
@@ -202,6 +211,7 @@ def _expect(context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S
         for row in range(r.size):
             if np.isfinite(y[row]):
                 S[m, m] -= r[row]
+                e[m] = about(e[m], reference[row], circular[row])
                 m += 1
         for a in range(m):
             sums[4 + a] += w * e[a]
@@ -328,6 +338,7 @@ def _block(phase, context, u, dt, sensor, y, key, value, state, work, b):
     at += ny * ny
     e = floats(work.ctypes.data + 8 * at, m)
     expected = floats(work.ctypes.data + 8 * (at + ny), m)
+    reference = floats(work.ctypes.data + 8 * (at + 2 * ny), m)
     at += 3 * ny
     forward = floats(work.ctypes.data + 8 * at, nx)
     z = floats(work.ctypes.data + 8 * (at + nx), nx)
@@ -339,7 +350,10 @@ def _block(phase, context, u, dt, sensor, y, key, value, state, work, b):
             context, u, dt, log_weights(state, nx, n), records_of(state, nx, n), first, last, F, T, forward, scratch
         )
     elif phase == EXPECT:
-        _expect(context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S, U, e, expected, scratch, sums)
+        _expect(
+            context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S, U, e, expected, reference, scratch,
+            sums,
+        )  # fmt: skip
     else:
         _propose(
             context, sensor, u, y, key, phase == PROPOSE_EKF, state, joint, ahead, first, last, L, C, H, HL, S, U, e,
