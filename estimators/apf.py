@@ -34,6 +34,7 @@ from .particle import (
     points,
     records_of,
     recover,
+    recoveries,
     sized,
     start,
     weigh_equally,
@@ -100,6 +101,7 @@ APF = Estimator(
     moments=moments,
     points=points,
     modes=modes,
+    recoveries=recoveries,
     options=tuple(option for option in OPTIONS if option.name != "fraction"),
     tune=tune,
 )

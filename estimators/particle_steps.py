@@ -78,9 +78,9 @@ def shared_numbers(nx: int, ny: int) -> int:
 
 
 def block_numbers(nx: int, ny: int) -> int:
-    """Numbers of one block: its sums; x', z, ŷ, ν₀; deviations by row; L and its scratch; where its points begin."""
+    """Numbers of one block: its sums; x', z, ŷ; deviations by row; L and its scratch; where its points begin."""
     k = max(nx, ny)
-    return 4 + k + k * k + 2 * nx + 2 * ny + 2 * nx * nx + (k + 2) * CHUNK + 1
+    return 4 + k + k * k + 2 * nx + ny + 2 * nx * nx + (k + 2) * CHUNK + 1
 
 
 def tune(options: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
@@ -130,7 +130,7 @@ def shared(context, work, n):
 def block_size(context):
     """Numbers of one block, as in `block_numbers`."""
     nx, ny = context.nx, context.width
-    return sums_size(context) + 2 * nx + 2 * ny + 2 * nx * nx + (max(nx, ny) + 2) * CHUNK + 1
+    return sums_size(context) + 2 * nx + ny + 2 * nx * nx + (max(nx, ny) + 2) * CHUNK + 1
 
 
 @jit
@@ -219,11 +219,11 @@ def about(residual, reference, circular):
 
 
 @jit
-def weigh(context, u, sensor, y, state, joint, first, last, expected, reference, D, sums):
+def weigh(context, u, sensor, y, state, joint, first, last, expected, D, sums):
     """joint = log w + log p(y | x), and the sums of the residuals' mean and covariance under the predicted weights.
 
     p(y | x) is Gaussian over the finite rows of y, or the sensor's own; a density that is no number counts as zero. The
-    sums are about `first_residual`, for which `reference` (ny,) is scratch.
+    sums are about `first_residual`.
     """
     nx = context.nx
     records = records_of(state, nx, joint.size)
@@ -238,6 +238,7 @@ def weigh(context, u, sensor, y, state, joint, first, last, expected, reference,
         sums[k] = 0.0
     sums[2] = -np.inf
     ny = r.size
+    reference = np.empty(ny)
     first_residual(context, u, sensor, y, records[0], reference)
     m = 0
     constant = 0.0
@@ -319,8 +320,7 @@ def _block(phase, context, u, dt, sensor, y, key, value, state, work, b):
     z = floats(work.ctypes.data + 8 * (at + nx), nx)
     at += 2 * nx
     expected = floats(work.ctypes.data + 8 * at, ny)
-    reference_residual = floats(work.ctypes.data + 8 * (at + ny), ny)
-    at += 2 * ny
+    at += ny
     D = matrix(work, at, max(nx, ny) + 2, CHUNK)
     at += (max(nx, ny) + 2) * CHUNK
     if phase == PROPAGATE:
@@ -338,7 +338,6 @@ def _block(phase, context, u, dt, sensor, y, key, value, state, work, b):
             first,
             last,
             floats(expected.ctypes.data, sensor_variances(context, sensor).size),
-            floats(reference_residual.ctypes.data, sensor_variances(context, sensor).size),
             D,
             sums,
         )

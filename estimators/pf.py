@@ -22,7 +22,7 @@ from .gaussian import admit
 from .jit import jit, matrix
 from .linalg import wrap
 from .model import StateSpaceModel
-from .noise import noise_root, semidefinite_root
+from .noise import belief_root, noise_root
 from .particle import (
     EQUAL,
     EXTRA,
@@ -40,6 +40,7 @@ from .particle import (
     points,
     records_of,
     recover,
+    recoveries,
     settled_moments,
     sized,
     start,
@@ -156,7 +157,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
             resample(context, u, sensor, y, key_of(context.seed, index, RESAMPLE), sums, state, work)
             if numbers(context)[EXTRA] > 0.0:
                 _, cov = settled_moments(state, nx)
-                semidefinite_root(cov, L)
+                belief_root(cov, L)
                 for i in range(nx):
                     for j in range(nx):
                         L[i, j] *= numbers(context)[EXTRA]
@@ -199,6 +200,7 @@ PF = Estimator(
     moments=moments,
     points=points,
     modes=modes,
+    recoveries=recoveries,
     options=OPTIONS,
     blocks=block,
     tune=tune,
@@ -219,6 +221,7 @@ PF_REG = Estimator(
     moments=moments,
     points=points,
     modes=modes,
+    recoveries=recoveries,
     options=(*OPTIONS, BANDWIDTH),
     blocks=block,
     tune=tune_regularised,

@@ -29,6 +29,7 @@ from .particle import (
     points,
     records_of,
     recover,
+    recoveries,
     sized,
     start,
 )
@@ -55,7 +56,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     index = next_draw(state)
     sweep(EXPECT, context, u, 0.0, sensor, y, np.uint64(0), 0.0, state, work)
     total(context, work, sums)
-    x = records_of(state, context.nx, n)[0, :context.nx]
+    x = records_of(state, context.nx, n)[0, : context.nx]
     m = predicted(context, u, sensor, y, x, sums, S, nu, innovation, innovation_std)
     state[SETTLED] = settled
     verdict = admit(context, sensor, m, nu, S, matrix(U_flat, 0, rows, rows), score)
@@ -89,6 +90,7 @@ PF_EKF = Estimator(
     moments=moments,
     points=points,
     modes=modes,
+    recoveries=recoveries,
     options=OPTIONS,
     tune=tune,
 )

@@ -66,7 +66,7 @@ MOVE, EXPECT, PROPOSE_EKF, PROPOSE_PRIOR = range(OWN, OWN + 4)
 
 
 def own_numbers(nx: int, ny: int) -> int:
-    """Scratch of a block: F, twice its square, L, C; H, H L, S, U; e, ŷ, ν₀; x', z, ξ; a Jacobian's."""
+    """Scratch of a block: F, twice its square, L, C; H, H L, S, U; e, ŷ, ν̃; x', z, ξ; a Jacobian's."""
     return 5 * nx * nx + 2 * ny * nx + 2 * ny * ny + 3 * ny + 3 * nx + scratch_size(nx, ny)
 
 
@@ -171,12 +171,10 @@ def _see(context, sensor, u, y, x, P, L, H, HL, S, U, e, expected, scratch):
 
 
 @jit
-def _expect(
-    context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S, U, e, expected, reference, scratch, sums
-):
+def _expect(context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S, U, e, expected, scratch, sums):
     """joint = log w + log N(y; h(x), H P Hᵀ + R), the second kept in `ahead`, and the sums of residuals and S - R.
 
-    The sums are about `first_residual`, for which `reference` (ny,) is scratch.
+    The sums are about `first_residual`.
     """
     nx = context.nx
     n = joint.size
@@ -186,6 +184,7 @@ def _expect(
     own = has_own_likelihood(context, sensor)
     equal = state[EQUAL] != 0.0
     circular = circular_rows(context, sensor)
+    reference = np.empty(r.size)
     first_residual(context, u, sensor, y, records[0, :nx], reference)
     for k in range(sums.size):
         sums[k] = 0.0
@@ -338,7 +337,6 @@ def _block(phase, context, u, dt, sensor, y, key, value, state, work, b):
     at += ny * ny
     e = floats(work.ctypes.data + 8 * at, m)
     expected = floats(work.ctypes.data + 8 * (at + ny), m)
-    reference = floats(work.ctypes.data + 8 * (at + 2 * ny), m)
     at += 3 * ny
     forward = floats(work.ctypes.data + 8 * at, nx)
     z = floats(work.ctypes.data + 8 * (at + nx), nx)
@@ -350,10 +348,7 @@ def _block(phase, context, u, dt, sensor, y, key, value, state, work, b):
             context, u, dt, log_weights(state, nx, n), records_of(state, nx, n), first, last, F, T, forward, scratch
         )
     elif phase == EXPECT:
-        _expect(
-            context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S, U, e, expected, reference, scratch,
-            sums,
-        )  # fmt: skip
+        _expect(context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S, U, e, expected, scratch, sums)
     else:
         _propose(
             context, sensor, u, y, key, phase == PROPOSE_EKF, state, joint, ahead, first, last, L, C, H, HL, S, U, e,

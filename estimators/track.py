@@ -28,7 +28,7 @@ class Track(NamedTuple):
     each configured pair of states. innovation, innovation_std (N, ny): reading minus prediction and the square
     root of S's diagonal; NaN where there is none. nis: νᵀ S⁻¹ ν, `dof` its degrees of freedom. nis_mean with
     nis_low and nis_high: mean NIS over the last readings, and its 95 % bounds. age: seconds since the last reading that
-    was used, gated or failed, or since a reset. consistency: the health that the window's NIS and gate alone would give.
+    was used, gated or failed, or since a reset. consistency: the health that the window alone would give.
     """
 
     mean: Any
