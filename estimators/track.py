@@ -71,4 +71,7 @@ class Track(NamedTuple):
         return int(self.nis.size)
 
 
+# As in log.py: `len` counts rows, not columns.
+Track._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[method-assign, assignment]
+
 track_type = types.NamedTuple((F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, F1, B1, B1), Track)

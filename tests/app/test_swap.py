@@ -1,9 +1,9 @@
 """Any filter that applies to a twin can be swapped for any other while it runs, and the charts are complete after it.
 
-The covering: on the twin to which every filter applies, every ordered pair, as a walk that goes each way between any two
-filters once (an Eulerian circuit, in stages); on each other twin that ships, a walk through all filters that apply to
-it, at another stride on each. Events come before, during and after each swap. The oracle is a cold fold of the whole log with
-that filter: a row looks only at rows before it, so the live track must be its beginning, bit by bit.
+The covering: on the twin to which every filter applies, every ordered pair, as a walk that goes each way between any
+two filters once (an Eulerian circuit, in stages); on each other twin that ships, a walk through all filters that apply
+to it, at another stride on each. Events come before, during and after each swap. The oracle is a cold fold of the whole
+log with that filter: a row looks only at rows before it, so the live track must be its beginning, bit by bit.
 """
 
 import json
@@ -27,14 +27,14 @@ from estimators.log import INPUT, READING, TICK, TRUTH, Log, Readings
 from estimators.registry import ESTIMATORS, unfit
 
 EVERY_FILTER = "motor_winding"
-BEGUN = 60
+BEGUN = 40
 """Events before the first swap."""
 PACE = 3
 """Events that come with each swap: before it, at once after it, and when it is done."""
-STAGE = 70
+STAGE = 60
 """Swaps before an engine with a short history takes over."""
 SMALL = {
-    **{name: {"particles": 40.0} for name, entry in ESTIMATORS.items() if entry.family == "particle"},
+    **{name: {"particles": 20.0} for name, entry in ESTIMATORS.items() if entry.family == "particle"},
     **{name: {"members": 12.0} for name in ("enkf", "etkf", "ensrf", "letkf", "filterpy-enkf")},
     "ukf": {"alpha": 0.5},
     "ekf": {"adapt": 1.0},
