@@ -14,6 +14,7 @@ from . import commands
 from .playback import PLAYBACK, play
 
 if TYPE_CHECKING:
+    from estimators.filter import Estimator
     from estimators.tuning import Tuning
 
     from .engine import Engine
@@ -34,12 +35,24 @@ def retuned(command: Refolding, engine: Any) -> tuple[str, Tuning]:
         find_estimator(estimator, engine.model)
         return estimator, tuning.with_options(engine.options_of(estimator))
     if isinstance(command, commands.SetOption):
-        options = {**tuning.options, command.name: float(command.value)}
-        find_estimator(estimator, engine.model).complete(options)
+        entry = find_estimator(estimator, engine.model)
+        options = {**tuning.options, command.name: _number(entry, command)}
+        entry.complete(options)
         return estimator, tuning.with_options(options)
     if isinstance(command, commands.UseSensor):
         return estimator, tuning.set(f"use.{command.name}", command.used)
     return estimator, tuning.set(command.key, command.value)
+
+
+def _number(entry: Estimator, command: commands.SetOption) -> float:
+    """The value of an option; one of several words may be given as the word."""
+    if not isinstance(command.value, str):
+        return float(command.value)
+    choices = next((option.choices for option in entry.options if option.name == command.name), ())
+    if command.value not in choices:
+        wanted = f"one of {', '.join(choices)}" if choices else "a number"
+        raise ConfigError(f"estimator {entry.name}: {command.name} is {command.value!r}; it must be {wanted}")
+    return float(choices.index(command.value))
 
 
 def obey(command: commands.Command, engine: Engine) -> None:

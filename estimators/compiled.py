@@ -257,6 +257,14 @@ def _probe(model: StateSpaceModel) -> None:
             )
         if what == "Q" and not np.allclose(out, out.T):
             raise ModelError(f"model {model.name}: Q is not symmetric at the prior; fill both triangles")
+        if what == "Q":
+            values = np.linalg.eigvalsh(out)
+            # Rounding leaves the zero eigenvalues of a singular Q at n ε of the largest.
+            if values[0] < -1e-9 * max(values[-1], -values[0]):
+                raise ModelError(
+                    f"model {model.name}: Q has the eigenvalue {values[0]:.3g} at the prior; a covariance must be "
+                    "positive semidefinite"
+                )
 
 
 def _probe_angles(model: StateSpaceModel, h: Sequence[Callable]) -> None:
@@ -280,8 +288,8 @@ def _probe_angles(model: StateSpaceModel, h: Sequence[Callable]) -> None:
                 if abs(change) > 1e-6 * max(1.0, abs(before)):
                     raise ModelError(
                         f"model {model.name}: row {row.name} of sensor {sensor.name} changes by {change:.3g} with a "
-                        f"full turn of {model.state_names[int(j)]}, which is circular; declare the row circular, or let "
-                        "h be periodic"
+                        f"full turn of {model.state_names[int(j)]}, which is circular; declare the row circular, or "
+                        "let h be periodic"
                     )
 
 
