@@ -9,6 +9,7 @@ cuts off what lay behind it.
 
 from __future__ import annotations
 
+import base64
 import json
 import warnings
 from collections.abc import Callable, Iterator
@@ -22,6 +23,7 @@ import rerun as rr
 from rerun.chunk import RrdReader
 
 from estimators.errors import SourceError
+from estimators.fold import Base
 from estimators.log import Readings
 from estimators.model import StateSpaceModel
 from estimators.track import Track
@@ -31,7 +33,6 @@ from .pull import Pull
 
 FORMAT = 1
 TIMELINE = "event"
-Base = tuple[np.ndarray, np.ndarray, int, np.ndarray]
 
 
 def tuning_to_json(tuning: Tuning, estimator: str) -> str:
@@ -66,6 +67,33 @@ def tuning_from_json(text: str, model: StateSpaceModel) -> tuple[Tuning, str]:
     return tuning, values["estimator"]
 
 
+def base_to_json(base: Base | None) -> str:
+    """A base as text; float64s survive exactly."""
+    if base is None:
+        return "null"
+    moments = {"mean": base.mean.tolist(), "cov": base.cov.tolist(), "clock": base.clock, "u": base.u.tolist()}
+    if base.state is None:
+        return json.dumps(moments)
+    state = base64.b64encode(np.ascontiguousarray(base.state, "<f8").tobytes()).decode()
+    return json.dumps({**moments, "estimator": base.estimator, "state": state})
+
+
+def base_from_json(text: str) -> Base | None:
+    """The base that `base_to_json` wrote; older recordings hold moments only."""
+    values = json.loads(text)
+    if values is None:
+        return None
+    state = values.get("state")
+    return Base(
+        np.array(values["mean"]),
+        np.array(values["cov"]),
+        int(values["clock"]),
+        np.array(values["u"], float),
+        values.get("estimator", ""),
+        None if state is None else np.frombuffer(base64.b64decode(state), "<f8").astype(float),
+    )
+
+
 class RecordingFile:
     """An .rrd that is being written, in a stream of its own: no viewer can hold it up."""
 
@@ -91,13 +119,9 @@ class RecordingFile:
         self.stream = rr.RecordingStream(f"nisus_{name}", recording_id=f"{name}-{path.stem}")
         self.stream.set_sinks(rr.FileSink(str(path)))
         self.rows = 0
-        start = None
-        if base is not None:
-            mean, cov, clock, u = base
-            start = {"mean": mean.tolist(), "cov": cov.tolist(), "clock": clock, "u": u.tolist()}
         self.stream.log(
             "/nisus/twin",
-            rr.AnyValues(format=FORMAT, name=name, yaml=text, path=str(twin_path), base=json.dumps(start)),
+            rr.AnyValues(format=FORMAT, name=name, yaml=text, path=str(twin_path), base=base_to_json(base)),
             static=True,
         )
 
@@ -210,16 +234,12 @@ def read_recording(path: Path) -> Recorded:
     readings = _assemble(Readings, log_columns)
     track = _assemble(Track, track_columns)
     rows = min(len(readings), len(track))
-    start = json.loads(str(header["base"]))
-    base: Base | None = None
-    if start is not None:
-        base = (np.array(start["mean"]), np.array(start["cov"]), int(start["clock"]), np.array(start["u"], float))
     return Recorded(
         path=path,
         name=str(header["name"]),
         text=str(header["yaml"]),
         twin_path=Path(str(header["path"])),
-        base=base,
+        base=base_from_json(str(header["base"])),
         tuning=str(tunings[-1]),
         tunings=len(tunings),
         readings=readings.select(slice(0, rows)),

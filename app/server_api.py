@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from estimators.errors import ConfigError
-from estimators.registry import find_estimator
 from estimators.track import HEALTH_NAMES
 
 from . import commands
+from .obey import Refolding, retuned
 
 
 def status_json(engine: Any) -> dict[str, Any]:
@@ -29,6 +29,7 @@ def status_json(engine: Any) -> dict[str, Any]:
         "refolding": status.refolding,
         "t": status.t,
         "health": HEALTH_NAMES[status.health],
+        "since": status.since,
         "nis": _plain(getattr(status, "nis", None)),
         "nis_low": _plain(getattr(status, "nis_low", None)),
         "nis_high": _plain(getattr(status, "nis_high", None)),
@@ -76,15 +77,8 @@ def command_from_json(body: Any, engine: Any) -> commands.Command:
 
 
 def _check(command: commands.Command, engine: Any) -> None:
-    if isinstance(command, commands.SetEstimator):
-        find_estimator(command.name, engine.model)
-    elif isinstance(command, commands.SetTuning):
-        engine.tuning.set(command.key, command.value)
-    elif isinstance(command, commands.UseSensor):
-        engine.tuning.set(f"use.{command.name}", command.used)
-    elif isinstance(command, commands.SetOption):
-        estimator = find_estimator(engine.estimator, engine.model)
-        estimator.complete({**engine.tuning.options, command.name: float(command.value)})
+    if isinstance(command, Refolding):
+        retuned(command, engine)
     elif isinstance(command, commands.Speed) and not command.factor > 0:
         raise ConfigError(f'Speed: factor is {command.factor:g}; it must be positive, or "inf"')
     elif isinstance(command, commands.Record) and engine.recorder is None:

@@ -20,9 +20,9 @@ from .recorder import Recorder
 from .rerun_rows import RerunRows
 
 if TYPE_CHECKING:
+    from estimators.fold import Base
     from sources.source import Source
 
-    from .recording import Base
     from .twin import Twin
 
 SWITCH = 0.0005
