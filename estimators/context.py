@@ -65,6 +65,13 @@ class Context(NamedTuple):
     prior_mean: Any
     prior_cov: Any
     prior_rows: Any
+    linear_states: Any
+    n_linear: Any
+    sampled_states: Any
+    n_sampled: Any
+    jump: Any
+    mode: Any
+    n_modes: Any
     p: Any
     q: Any
     r: Any
@@ -168,6 +175,24 @@ def prior(context):
     n = context.nx
     rows = context.prior_rows
     return floats(context.prior_mean, n), matrix(floats(context.prior_cov, rows * n), 0, rows, n)
+
+
+@jit
+def linear_states(context):
+    """The indices of the states in which the model is linear, given the others."""
+    return ints(context.linear_states, context.n_linear)
+
+
+@jit
+def sampled_states(context):
+    """The indices of all the other states but the mode, if there is one (`context.mode`, or -1)."""
+    return ints(context.sampled_states, context.n_sampled)
+
+
+@jit
+def jump_chances(context, x, u, dt, out):
+    """out = the probability of each next mode (n_modes,), `dt` seconds on."""
+    call_f(context.jump, x, u, parameters(context), dt, out)
 
 
 @jit

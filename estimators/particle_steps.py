@@ -27,6 +27,7 @@ from .context import options as numbers
 from .filter import Options
 from .gaussian import LOG_2PI
 from .jit import F1, address, caller, f64, floats, i64, ints, jit, matrix
+from .jump_draws import jump, jump_key
 from .linalg import wrap
 from .model import StateSpaceModel
 from .noise import add_noise, noise_root
@@ -164,9 +165,13 @@ def propagate(context, u, dt, key, state, first, last, L, scratch, forward, z):
     noises = context.n_noises if diagonal else nx
     noisy = ints(context.noise_state, context.n_noises)
     place = np.uint64(first) * np.uint64(noises)
+    jumps = context.jump != 0
+    chances = np.empty(context.n_modes)
     lost = 0
     for i in range(first, last):
         x = records[i]
+        if jumps:
+            jump(context, x, u, dt, jump_key(key), i, chances)
         if varies:
             noise_root(context, x, u, dt, L, scratch)
         call_f(f, x, u, p, dt, forward)
