@@ -30,6 +30,7 @@ from .context import (
 from .errors import ModelError
 from .jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step_f, complex_step_h, scratch_size
 from .jit import address, jit
+from .jump import check_parts
 from .looped import f_rows_signature, h_rows_signature, looped_f, looped_h
 from .model import LARGE, Field, StateSpaceModel
 
@@ -190,6 +191,13 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
             "noise_states": np.array([len(states) for states in acts_on], np.int64),
             "prior_mean": model.prior_mean,
             "prior_cov": model.prior_std[None] ** 2 if diagonal else np.diag(model.prior_std**2),
+            "linear_states": model.linear_states,
+            "n_linear": len(model.linear_states),
+            "sampled_states": _sampled(model),
+            "n_sampled": _sampled(model).size,
+            "jump": code(model.jump.chances, f_signature, "jump.chances") if model.jump else 0,
+            "mode": model.mode,
+            "n_modes": len(model.jump.modes) if model.jump else 0,
             "prior_rows": 1 if diagonal else model.nx,
             "shown": model.shown,
         },
@@ -197,7 +205,15 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
     _probe_angles(model, compiled.h)
     if derivable:
         _check_derivatives(compiled)
+    check_parts(model)
     return compiled
+
+
+def _sampled(model: StateSpaceModel) -> np.ndarray:
+    """Indices of the states that are neither conditionally linear nor the mode; of a field nobody asks."""
+    if isinstance(model.states, Field):
+        return np.zeros(0, np.int64)
+    return np.array([j for j in range(model.nx) if j != model.mode and j not in model.linear_states], np.int64)
 
 
 def _within(states: range, w: np.ndarray) -> np.ndarray:

@@ -26,6 +26,7 @@ call_f_complex = caller(f_complex_signature)
 call_F = caller(F_signature)
 call_h_complex = caller(h_complex_signature)
 call_H = caller(H_signature)
+call_jump = caller(f_signature)
 call_Q = caller(Q_signature)
 call_shape = caller(shape_signature)
 call_log_likelihood = caller(log_likelihood_signature)
@@ -34,8 +35,8 @@ call_log_likelihood = caller(log_likelihood_signature)
 _FIELDS = """
     nx nu n_parameters n_noises f f_complex F F_mode Q Q_varies each_state shape h h_complex H H_mode
     log_likelihood n_sensors row_start row_count n_rows circular_x circular_y noise_state noise_states max_step
-    prior_mean prior_cov prior_rows p q r used gate width options n_options pairs n_pairs shown n_shown prepared
-    n_prepared seed
+    prior_mean prior_cov prior_rows linear_states n_linear sampled_states n_sampled jump mode n_modes p q r used
+    gate width options n_options pairs n_pairs shown n_shown prepared n_prepared seed
 """.split()
 
 _layout = np.dtype([(name, np.float64 if name == "max_step" else np.int64) for name in _FIELDS])
@@ -182,6 +183,24 @@ def prior(context):
     n = context.nx
     rows = context.prior_rows
     return floats(context.prior_mean, n), matrix(floats(context.prior_cov, rows * n), 0, rows, n)
+
+
+@jit
+def linear_states(context):
+    """The indices of the states in which the model is linear, given the others."""
+    return ints(context.linear_states, context.n_linear)
+
+
+@jit
+def sampled_states(context):
+    """The indices of all the other states but the mode, if there is one (`context.mode`, or -1)."""
+    return ints(context.sampled_states, context.n_sampled)
+
+
+@jit
+def jump_chances(context, x, u, dt, out):
+    """out = the probability of each next mode (n_modes,), `dt` seconds on."""
+    call_jump(context.jump, x, u, parameters(context), dt, out)
 
 
 @jit

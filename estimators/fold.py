@@ -21,6 +21,7 @@ from .driven import driven
 from .errors import EstimatorError
 from .filter import Code, Estimator, call_describe, call_predict, call_start, call_update, code_type
 from .fold_python import LONGEST, UNSET
+from .indicator import indicator
 from .jit import B1, F1, F2, I1, borrowed, borrowed_rows, i64, jit, jit_brief
 from .log import INPUT, READING, RESET, TICK, TRUTH, Log
 from .model import StateSpaceModel
@@ -207,7 +208,8 @@ class Fold:
         self.pairs = np.zeros((0, 2), np.int64) if pairs is None else np.ascontiguousarray(pairs, np.int64)
         self.policy = policy or HealthPolicy()
         self.options = self.estimator.complete(dict(tuning.options))
-        self._compiled = compile_model(model)
+        # Only particles can carry a mode that jumps; the others see it as a number.
+        self._compiled = compile_model(model if self.estimator.family == "particle" else indicator(model))
         self._code: Code = driven(self.estimator) if model.black_box else self.estimator.code()
         most = model.width * max(1, self.policy.window)
         self._bounds: Bounds = chi_square_bounds(most)

@@ -67,6 +67,7 @@ def joint(model: StateSpaceModel, unknowns: Mapping[str, Unknown]) -> StateSpace
         F=None,
         Q=None if model.Q is None else _noise(model.Q, len(model.noises), *layout),
         sensors=tuple(replace(sensor, h=_sensor(sensor.h, *layout), H=None) for sensor in model.sensors),
+        jump=None if model.jump is None else replace(model.jump, chances=_chances(model.jump.chances, *layout)),
         linear=False,
     )
 
@@ -89,8 +90,8 @@ def _parameters(theta, p, place, low, high):
 
 
 @lru_cache(maxsize=256)
-def _compiled(function: Callable) -> Any:
-    """A model's function for the wrappers below to call, with a name by which Numba's cache knows it again.
+def as_inner(function: Callable) -> Any:
+    """A model's function for a wrapper to call, with a name by which Numba's cache knows it again.
 
     The cache tells closures apart by what they hold, and a compiled function by an identifier that is random in every
     process; one made from the source finds the code that another process compiled, and never code of another source.
@@ -106,7 +107,7 @@ def _compiled(function: Callable) -> Any:
 
 @lru_cache(maxsize=64)
 def _step(function: Callable, n: int, place: tuple, low: tuple, high: tuple) -> Callable:
-    inner = _compiled(function)
+    inner = as_inner(function)
 
     def f(x, u, p, dt, out):  # noqa: ANN001, ANN202
         inner(x[:n], u, _parameters(x[n:], p, place, low, high), dt, out[:n])
@@ -116,9 +117,19 @@ def _step(function: Callable, n: int, place: tuple, low: tuple, high: tuple) -> 
     return f
 
 
+@lru_cache(maxsize=64)
+def _chances(function: Callable, n: int, place: tuple, low: tuple, high: tuple) -> Callable:
+    inner = as_inner(function)
+
+    def chances(x, u, p, dt, out):  # noqa: ANN001, ANN202
+        inner(x[:n], u, _parameters(x[n:], p, place, low, high), dt, out)
+
+    return chances
+
+
 @lru_cache(maxsize=256)
 def _sensor(function: Callable, n: int, place: tuple, low: tuple, high: tuple) -> Callable:
-    inner = _compiled(function)
+    inner = as_inner(function)
 
     def h(x, u, p, out):  # noqa: ANN001, ANN202
         inner(x[:n], u, _parameters(x[n:], p, place, low, high), out)
@@ -128,7 +139,7 @@ def _sensor(function: Callable, n: int, place: tuple, low: tuple, high: tuple) -
 
 @lru_cache(maxsize=64)
 def _noise(function: Callable, nw: int, n: int, place: tuple, low: tuple, high: tuple) -> Callable:
-    inner = _compiled(function)
+    inner = as_inner(function)
 
     def Q(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
         inner(x[:n], u, _parameters(x[n:], p, place, low, high), q[:nw], dt, out[:n, :n])

@@ -18,6 +18,7 @@ import numpy as np
 
 from .errors import ModelError
 from .field import CellNames, Field, State
+from .jump import Jump
 
 LARGE = 1024
 """States beyond which no filter forms an (nx, nx) matrix: priors are diagonal, moments are means and variances."""
@@ -28,7 +29,7 @@ TRUTH_BLOCK = 32
 SHOWN = 64
 """States that a track keeps where the model does not say which."""
 
-__all__ = ["LARGE", "Field", "Input", "Noise", "Parameter", "Row", "Sensor", "State", "StateSpaceModel"]
+__all__ = ["LARGE", "Field", "Input", "Jump", "Noise", "Parameter", "Row", "Sensor", "State", "StateSpaceModel"]
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,11 @@ class StateSpaceModel:
     `states` may be a `Field`, of any size. Beyond `LARGE` states there is no Q; shape(z, p, out) may then fill `out`
     (nx,) with L z, where L Lᵀ has ones on its diagonal: the noise of the process, √(q·dt) L z, and the spread of the
     prior, std L z, are correlated in space by it, without a matrix.
+
+    A `jump` makes one state a discrete mode (see jump.py). `conditionally_linear` names states in which f and h are
+    linear once the other states are known, with noise that does not depend on them: `rbpf` carries these by a Kalman
+    filter.
+
     Steps longer than `max_step` seconds are split, so an f that integrates crudely need not integrate far.
 
     A `black_box` is not compiled: f(X, u, p, dt) takes a block of states X (N, nx) and returns the next ones (N, nx), a
@@ -125,6 +131,8 @@ class StateSpaceModel:
     source: str = ""
     black_box: bool = False
     executor: Executor | str | None = None
+    jump: Jump | None = None
+    conditionally_linear: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse what no filter could run: nothing to estimate, names used twice, numbers out of range."""
@@ -196,8 +204,50 @@ class StateSpaceModel:
                 f"model {self.name}: executor is {self.executor!r}; it must be 'threads', 'processes', or a "
                 "concurrent.futures.Executor"
             )
+        self._check_parts()
         if not self.max_step > 0:
             raise ModelError(f"model {self.name}: max_step is {self.max_step} s; it must be positive")
+
+    def _check_parts(self) -> None:
+        """Refuse a mode or a linear part that the states do not have."""
+        if isinstance(self.states, Field) and (self.jump or self.conditionally_linear):
+            raise ModelError(f"model {self.name}: a field has no mode and no linear part; list the states")
+        for name in self.conditionally_linear:
+            if name not in self.state_names or (self.jump and name == self.jump.state):
+                what = "the mode" if name in self.state_names else "no state"
+                raise ModelError(f"model {self.name}: conditionally_linear names {name!r}, {what}")
+        if len(set(self.conditionally_linear)) < len(self.conditionally_linear):
+            raise ModelError(f"model {self.name}: conditionally_linear names a state twice")
+        if self.jump is None:
+            return
+        if self.jump.state not in self.state_names:
+            raise ModelError(f"model {self.name}: jump names {self.jump.state!r}, no state; name one of them")
+        state = self.states[self.mode]
+        last = len(self.jump.modes) - 1
+        if last < 1 or not 0 <= state.mean <= last or state.circular:
+            raise ModelError(
+                f"model {self.name}: the mode {state.name} has {last + 1} values and the prior mean {state.mean:g}; it "
+                f"needs at least 2, a mean between 0 and {max(1, last)}, and is no angle"
+            )
+        if self.Q is None and any(noise.name == state.name for noise in self.noises):
+            raise ModelError(f"model {self.name}: a noise acts on the mode {state.name}, which jumps; leave it out")
+        if self.black_box or self.linear:
+            raise ModelError(f"model {self.name}: a model with a jump is neither linear nor a black box; say neither")
+
+    @cached_property
+    def mode(self) -> int:
+        """Index of the state that is the discrete mode; -1 if none is."""
+        return -1 if self.jump is None else self.state_names.index(self.jump.state)
+
+    @cached_property
+    def linear_states(self) -> np.ndarray:
+        """Indices of the conditionally linear states, rising."""
+        return np.array(sorted(self.state_names.index(name) for name in self.conditionally_linear), np.int64)
+
+    def label(self, state: str) -> str:
+        """What an estimate of that state is called: its name, or, of a mode with two values, a probability."""
+        two = self.jump is not None and state == self.jump.state and len(self.jump.modes) == 2
+        return f"probability of {state}" if two else state
 
     @property
     def nx(self) -> int:

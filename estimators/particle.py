@@ -21,6 +21,7 @@ from .context import circular_states, shown_states
 from .context import options as numbers
 from .filter import Option, Options
 from .jit import floats, ints, jit, matrix
+from .jump_draws import any_mode, jump_key, nearest_mode
 from .linalg import wrap
 from .modes import Mode, modes_of
 from .noise import add_noise, belief_root
@@ -275,6 +276,10 @@ def scatter(context, mean, root, key, records):
     nx = mean.size
     circular = circular_states(context)
     z = np.empty(nx)
+    mode = context.mode
+    variance = 0.0
+    for k in range(mode + 1):
+        variance += root[mode, k] * root[mode, k]
     for i in range(records.shape[0]):
         for j in range(nx):
             z[j] = normal(key, np.uint64(i * nx + j))
@@ -282,6 +287,8 @@ def scatter(context, mean, root, key, records):
         for j in range(nx, records.shape[1]):
             records[i, j] = 0.0
         add_noise(root, z, records[i, :nx])
+        if mode >= 0:
+            records[i, mode] = nearest_mode(context, records[i, mode], mean[mode], np.sqrt(variance))
         wrap_record(circular, records[i])
 
 
@@ -341,8 +348,8 @@ def recover(context, index, state):
     """Widen a cloud in which no particle explains the reading: each moves by a draw from the cloud's own covariance.
 
     The covariance doubles with every such reading, until particles reach what the sensors say; copies of one particle
-    begin at the part `SEED` of the prior's. A cloud without any weight left, all its particles beyond the
-    floating-point numbers, starts again from the prior.
+    begin at the part `SEED` of the prior's; each takes any mode. A cloud without any weight left, all its particles
+    beyond the floating-point numbers, starts again from the prior.
     """
     nx = context.nx
     n = int(numbers(context)[MEMBERS])
@@ -361,20 +368,30 @@ def recover(context, index, state):
         return
     root = np.empty((nx, nx))
     belief_root(cov, root)
-    spread_by(context, root, key_of(context.seed, index, RECOVER), 0, records)
+    key = key_of(context.seed, index, RECOVER)
+    spread_by(context, root, key, 0, records)
+    if context.mode >= 0:
+        for i in range(n):
+            records[i, context.mode] = any_mode(context, jump_key(key), i)
     state[SETTLED] = 0.0
 
 
 @jit
 def spread_by(context, root, key, first, records):
-    """Move each particle by L z, z ~ N(0, I); `first` is the member of the first record."""
+    """Move each particle by L z, z ~ N(0, I), but for its mode; `first` is the member of the first record."""
     nx = root.shape[0]
+    mode = context.mode
+    kept = 0.0
     circular = circular_states(context)
     z = np.empty(nx)
     for i in range(records.shape[0]):
         for j in range(nx):
             z[j] = normal(key, np.uint64((first + i) * nx + j))
+        if mode >= 0:
+            kept = records[i, mode]
         add_noise(root, z, records[i, :nx])
+        if mode >= 0:
+            records[i, mode] = kept
         wrap_record(circular, records[i])
 
 

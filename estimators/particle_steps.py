@@ -29,6 +29,7 @@ from .context import options as numbers
 from .filter import Options
 from .gaussian import LOG_2PI
 from .jit import F1, address, caller, f64, floats, i64, ints, jit, matrix
+from .jump_draws import jump, jump_key
 from .linalg import wrap
 from .model import StateSpaceModel
 from .noise import add_noise, noise_root
@@ -187,9 +188,14 @@ def propagate(context, u, dt, key, state, first, last, L, scratch, D, z):
     noisy = ints(context.noise_state, context.n_noises)
     forward = matrix(D, 0, CHUNK, nx)
     angles = np.any(circular)
+    jumps = context.jump != 0
+    chances = np.empty(context.n_modes)
     lost = 0
     for begin in range(first, last, CHUNK):
         count = min(CHUNK, last - begin)
+        if jumps:
+            for i in range(begin, begin + count):
+                jump(context, records[i], u, dt, jump_key(key), i, chances)
         transition_rows(context, records[begin].ctypes.data, records.shape[1], count, u, dt, forward)
         fill_normals(key, np.uint64(begin) * np.uint64(noises), count * noises, z)
         if diagonal:

@@ -27,6 +27,7 @@ from .filter import Options
 from .gaussian import LOG_2PI
 from .jacobians import scratch_size, sensor_jacobian, state_jacobian
 from .jit import address, floats, jit, matrix
+from .jump_draws import jump, jump_key
 from .linalg import cholesky, congruence, solve_transposed, wrap
 from .model import StateSpaceModel
 from .noise import add_noise, semidefinite_root
@@ -35,6 +36,7 @@ from .particle import (
     EQUAL,
     EXTRA,
     MEMBERS,
+    PROCESS,
     blocks_of,
     log_weights,
     members,
@@ -58,7 +60,7 @@ from .particle_steps import (
 )
 from .particle_steps import tune as tune_cloud
 from .particle_steps import work_size as cloud_work_size
-from .random import ONE, normal
+from .random import ONE, key_of, normal
 from .tuning import Tuning
 
 MOVE, EXPECT, PROPOSE_EKF, PROPOSE_PRIOR = range(OWN, OWN + 4)
@@ -95,13 +97,16 @@ def predictive(context, work, n):
 
 
 @jit
-def _move(context, u, dt, log_w, records, first, last, F, T, forward, scratch):
+def _move(context, u, dt, key, log_w, records, first, last, F, T, forward, scratch):
     """Predict N(x, P) of the members `first` to `last`; return how many left the numbers."""
     nx = context.nx
     circular = circular_states(context)
     lost = 0
+    chances = np.empty(context.n_modes)
     for i in range(first, last):
         x = records[i, :nx]
+        if context.jump != 0:
+            jump(context, x, u, dt, jump_key(key), i, chances)
         P = matrix(records[i], nx, nx, nx)
         certain = True
         for j in range(nx):
@@ -352,7 +357,18 @@ def _block(phase, context, u, dt, sensor, y, key, value, state, work, b):
     scratch = floats(work.ctypes.data + 8 * at, 2 * nx + 2 * most)
     if phase == MOVE:
         sums[0] = _move(
-            context, u, dt, log_weights(state, nx, n), records_of(state, nx, n), first, last, F, T, forward, scratch
+            context,
+            u,
+            dt,
+            key,
+            log_weights(state, nx, n),
+            records_of(state, nx, n),
+            first,
+            last,
+            F,
+            T,
+            forward,
+            scratch,
         )
     elif phase == EXPECT:
         _expect(context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S, U, e, expected, scratch, sums)
@@ -369,7 +385,7 @@ def predict(context, u, dt, index, state, work):
     n = int(numbers(context)[MEMBERS])
     index = next_draw(state)
     sums, _, _, _, _, _, _ = shared(context, work, n)
-    sweep(MOVE, context, u, dt, 0, u, np.uint64(0), 0.0, state, work)
+    sweep(MOVE, context, u, dt, 0, u, key_of(context.seed, index, PROCESS), 0.0, state, work)
     total(context, work, sums)
     if sums[0] > 0.0:
         state[EQUAL] = 0.0

@@ -20,13 +20,14 @@ from .letkf import LETKF
 from .model import LARGE, StateSpaceModel
 from .pf import PF, PF_REG
 from .pf_ekf import PF_EKF
+from .rbpf import RBPF
 from .sr_ekf import SR_EKF
 from .sr_kf import SR_KF
 from .sr_ukf import SR_UKF
 from .ukf import UKF
 
 GAUSSIAN = (KF, KF_STEADY, EKF, IEKF, UKF, CKF, SR_KF, SR_EKF, SR_UKF)
-PARTICLE = (PF, PF_REG, PF_EKF, APF)
+PARTICLE = (PF, PF_REG, PF_EKF, APF, RBPF)
 ENSEMBLE = (ENKF, ETKF, ENSRF, LETKF)
 REFERENCE = (FILTERPY_KF, FILTERPY_EKF, FILTERPY_UKF, FILTERPY_ENKF)
 

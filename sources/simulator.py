@@ -34,10 +34,11 @@ class SensorPlan:
 class Simulator:
     """Gives the events of a simulated asset as fast as it is asked.
 
-    In each step, in this order: x ← f(x, u, p, dt) + w with w ~ N(0, Q); then y = h(x, u, p) + v with v ~ N(0, R) for
-    each sensor that is due, drawn even if the reading is lost, so that a loss does not change what follows. Its first
-    event is a tick at time zero, where the estimator's prior holds; then, after every step: the inputs if they
-    changed, the readings, and the true states that a track shows, in blocks of the log's width.
+    In each step, in this order: the mode jumps, where the model has one; x ← f(x, u, p, dt) + w with w ~ N(0, Q); then
+    y = h(x, u, p) + v with v ~ N(0, R) for each sensor that is due, drawn even if the reading is lost, so that a loss
+    does not change what follows. Its first event is a tick at time zero, where the estimator's prior holds; then, after
+    every step: the inputs if they changed, the readings, and the true states that a track shows, in blocks of the log's
+    width.
     """
 
     live = False
@@ -148,6 +149,7 @@ class Simulator:
         t = self._time(self._k)
         pieces = max(1, int(np.ceil(self._step / truth.model.max_step)))
         for _ in range(pieces):
+            self._jump(self._step / pieces)
             after = np.empty_like(self._x)
             truth.f(self._x, self._u, self._p, self._step / pieces, after)
             self._x = after
@@ -169,6 +171,15 @@ class Simulator:
             self._spoken[i] += 1
             rows.append((t, READING, i, np.full(y.size, np.nan) if lost else y))
         rows += [(t, TRUTH, first, self._x[first:end].copy()) for first, end in self._told]
+
+    def _jump(self, dt: float) -> None:
+        """Draw the next mode as the model says."""
+        jump = self._truth.model.jump
+        if jump is None:
+            return
+        chances = np.empty(len(jump.modes))
+        getattr(jump.chances, "py_func", jump.chances)(self._x.copy(), self._u, self._p, dt, chances)
+        self._x[self._truth.model.mode] = self._rng.choice(chances.size, p=chances)
 
     def _noise(self) -> np.ndarray:
         """A draw of N(0, Q), as numpy's multivariate_normal makes it, with the factor kept while Q stays."""
