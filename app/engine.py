@@ -32,6 +32,7 @@ from .refolder import Refolded, Refolder
 from .tally import Latency, Tally, complaints
 
 if TYPE_CHECKING:
+    from estimators.pictures import Picture
     from estimators.tuning import Tuning
     from sources.source import Source
 
@@ -106,7 +107,10 @@ class Engine:
         self._tally = Tally()
 
     def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
-        return Fold(estimator, self.model, tuning, log, pairs=self.pairs, policy=self._policy, base=base)
+        given = {"pairs": self.pairs, "policy": self._policy, "base": base}
+        if self.model.grid is not None:
+            given["picture"] = self.twin.picture
+        return Fold(estimator, self.model, tuning, log, **given)
 
     # For everybody, from any thread
 
@@ -146,7 +150,7 @@ class Engine:
             log, fold = self._log, self._fold
             fresh = cursor.revision != self._revision
             if fresh:
-                cursor.revision, cursor.next = self._revision, 0
+                cursor.revision, cursor.next, cursor.picture = self._revision, 0, -1
             start = max(cursor.next, log.first)
             end = log.first + fold.n
             if limit is not None:
@@ -159,8 +163,11 @@ class Engine:
                 start,
                 Readings(*(column.copy() for column in readings)),
                 fold.track.select(rows).copy(),
+                pictures=_since(fold, cursor.picture, max(start, end)),
             )
             cursor.next = max(start, end)
+            if pull.pictures:
+                cursor.picture = pull.pictures[-1].index
         lines = self.notices.since(cursor.notice)
         if lines:
             cursor.notice = lines[-1].number + 1
@@ -186,7 +193,7 @@ class Engine:
             points, clock = self._fold.points(), self._fold.clock
             model, several = self._fold.model, self._fold.estimator.modes is not None
         # Clustering takes milliseconds, which the engine's thread must not wait for.
-        modes = modes_of(points, np.array([state.circular for state in model.states])) if several else []
+        modes = modes_of(points, model.circular) if several else []
         return Belief(clock, mean, cov, points, tuple(modes) if len(modes) > 1 else ())
 
     def status(self) -> Status:
@@ -284,6 +291,7 @@ class Engine:
         self._changed_from = absolute if self._changed_from is None else min(self._changed_from, absolute)
         for cursor in self._cursors:
             cursor.next = min(cursor.next, absolute)
+            cursor.picture = min(cursor.picture, absolute)
 
     def _look(self, before: int) -> None:
         """Report what the new rows say: readings that could not be used, and changes of health."""
@@ -334,6 +342,8 @@ class Engine:
             self._restart()
         elif isinstance(item, Finished):
             self._finished = True
+            with self._lock:
+                self._fold.finish()
             self.notices.say("the source has ended; the estimate stays")
         elif isinstance(item, commands.SetEstimator):
             self._retune(item.name, self.tuning.with_options(self.twin.options_of(item.name)))
@@ -415,3 +425,10 @@ class Engine:
                 self._revision += 1
         if stale:
             self._retune(self.estimator, self.tuning)
+
+
+def _since(fold: Fold, index: int, end: int) -> list[Picture]:
+    """The pictures of a fold after event `index`, up to event `end`."""
+    if fold.pictures is None:
+        return []
+    return [picture for picture in fold.pictures.taken if index < picture.index <= end]

@@ -94,6 +94,7 @@ class Plan:
             inputs={name: _profile(profiles) for name, profiles in section.inputs.items()},
             sensors=plans,
             faults=_faults(self.loaded, section, key, self.model),
+            truth_every=truth.every if self.model.grid is not None else None,
         )
 
     def player(self, report: Report, *, interface: str | None = None, channel: str | int | None = None) -> Player:

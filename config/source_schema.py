@@ -249,6 +249,9 @@ class TruthSection(Section):
     """The asset's true parameters. Default: those of the twin, or of `model` if it is given."""
     noise: dict[str, LevelSection] = {}
     """The asset's true process noise. Default: that of the twin, or of `model` if it is given."""
+    every: Count | None = None
+    """Steps between two tellings of every cell of a large field, by which the estimate is scored and its error drawn;
+    the cells that are charted are told at each step. Default: null, never."""
 
 
 class AssetSection(Section):
