@@ -107,10 +107,10 @@ class Engine:
         self._tally = Tally()
 
     def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
-        given = {"pairs": self.pairs, "policy": self._policy, "base": base}
-        if self.model.grid is not None:
-            given["picture"] = self.twin.picture
-        return Fold(estimator, self.model, tuning, log, **given)
+        period = self.twin.picture if self.model.grid is not None else None
+        return Fold(
+            estimator, self.model, tuning, log, pairs=self.pairs, policy=self._policy, base=base, picture=period
+        )
 
     # For everybody, from any thread
 
@@ -167,7 +167,7 @@ class Engine:
             )
             cursor.next = max(start, end)
             if pull.pictures:
-                cursor.picture = pull.pictures[-1].index
+                cursor.picture = pull.pictures[-1].before
         lines = self.notices.since(cursor.notice)
         if lines:
             cursor.notice = lines[-1].number + 1
@@ -431,4 +431,4 @@ def _since(fold: Fold, index: int, end: int) -> list[Picture]:
     """The pictures of a fold after event `index`, up to event `end`."""
     if fold.pictures is None:
         return []
-    return [picture for picture in fold.pictures.taken if index < picture.index <= end]
+    return [picture for picture in fold.pictures.taken if index < picture.before <= end]

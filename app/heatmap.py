@@ -25,24 +25,26 @@ SIGNED = ("#1d4ed8", "#7aa2f0", "#f5f5f5", "#f2a07a", "#b91c1c")
 """Negative, none, positive."""
 
 NOTHING = 255
-"""Index of the colour of what is unknown, which is none."""
+"""Index of the colour of what is unknown: grey."""
 
-QUIET, ODD, FAR, SILENT = (255, 255, 255), (245, 158, 11), (220, 38, 38), (120, 120, 128)
-"""Colours of a sensor whose innovation is below two of its deviations, below three, above; that said nothing."""
+QUIET, ODD, FAR, SILENT, RIM = (255, 255, 255), (245, 158, 11), (220, 38, 38), (120, 120, 128), (51, 65, 85)
+"""Colours of a sensor whose innovation is below two of its deviations, below three, above; that said nothing; and of
+the line around it."""
 
 
 class Kind(NamedTuple):
-    """One picture of a field: its name, its title, its colours from low to high."""
+    """One picture of a field: its name, its title, a shorter one, its colours from low to high."""
 
     name: str
     title: str
+    brief: str
     colors: tuple[str, ...]
 
 
-ESTIMATE = Kind("estimate", "estimate", WARM)
-DEVIATION = Kind("std", "standard deviation", SPREAD)
-ERROR = Kind("error", "estimate − truth", SIGNED)
-TRUE = Kind("truth", "truth", WARM)
+ESTIMATE = Kind("estimate", "estimate", "estimate", WARM)
+DEVIATION = Kind("std", "standard deviation", "std", SPREAD)
+ERROR = Kind("error", "estimate − truth", "error", SIGNED)
+TRUE = Kind("truth", "truth", "truth", WARM)
 
 
 def kinds(truth: bool) -> tuple[Kind, ...]:
@@ -62,7 +64,7 @@ def palette(colors: tuple[str, ...]) -> np.ndarray:
     anchors = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in colors], float)
     at = np.linspace(0, len(colors) - 1, NOTHING)
     columns = [np.interp(at, np.arange(len(colors)), anchors[:, k]) for k in range(3)]
-    return np.vstack((np.stack(columns, axis=1).round(), [[255, 255, 255]])).astype(np.uint8)
+    return np.vstack((np.stack(columns, axis=1).round(), [[205, 205, 210]])).astype(np.uint8)
 
 
 class Scale:
@@ -158,7 +160,7 @@ class Frame:
 
 
 def png(indices: np.ndarray, colors: np.ndarray) -> bytes:
-    """A picture (rows, columns) of colours 0 to 255 as a PNG file with a palette, of which `NOTHING` is transparent."""
+    """A picture (rows, columns) of colours 0 to 255 as a PNG file with a palette."""
     rows, columns = indices.shape
     lines = np.zeros((rows, columns + 1), np.uint8)
     lines[:, 1:] = indices
@@ -171,7 +173,6 @@ def png(indices: np.ndarray, colors: np.ndarray) -> bytes:
             b"\x89PNG\r\n\x1a\n",
             chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, 8, 3, 0, 0, 0)),
             chunk(b"PLTE", colors.astype(np.uint8).tobytes()),
-            chunk(b"tRNS", bytes([255] * NOTHING + [0])),
             chunk(b"IDAT", zlib.compress(lines.tobytes(), 3)),
             chunk(b"IEND", b""),
         )

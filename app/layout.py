@@ -146,12 +146,12 @@ def blueprint(
     if model.grid is not None:
         above = [
             layout_field.pictures(model, root, truth=truth),
-            *_stacked(states, layout_field.CELLS_AT_ONCE, rrb.Horizontal),
-            rrb.Horizontal(*innovations, nis),
+            rrb.Horizontal(*_tabs(states), innovations[0]),
+            rrb.Horizontal(nis, *_tabs(innovations[1:])),
         ]
-        shares = [2.6, 1.4, 1.4, 0.7, 0.9]
+        shares = [2.6, 1.5, 1.5, 0.75, 0.9]
     else:
-        charts = _stacked(states, AT_ONCE, rrb.Vertical)
+        charts = _stacked(states)
         above = [*charts, rrb.Horizontal(*_tabs(innovations), nis)]
         shares = [1.25 * min(len(states), AT_ONCE) / len(charts)] * len(charts) + [1.1, 0.8, 1.5]
     return rrb.Blueprint(
@@ -169,12 +169,12 @@ def _tabs(views: list[Any]) -> list[Any]:
     return views if len(views) < 2 else [rrb.Tabs(*views)]
 
 
-def _stacked(views: list[Any], at_once: int, side: Any) -> list[Any]:
-    """Views one above the other, or by `side` beside it; if they are many, in tabs of as many as one can read at once."""
-    if len(views) <= at_once:
-        return views if side is rrb.Vertical else [side(*views)]
-    groups = [views[k : k + at_once] for k in range(0, len(views), at_once)]
-    return [rrb.Tabs(*(side(*group, name=_group_name(group)) for group in groups))]
+def _stacked(views: list[Any]) -> list[Any]:
+    """Views one above the other; if they are many, in tabs that hold as many as one can read at once."""
+    if len(views) <= AT_ONCE:
+        return views
+    groups = [views[k : k + AT_ONCE] for k in range(0, len(views), AT_ONCE)]
+    return [rrb.Tabs(*(rrb.Vertical(*group, name=_group_name(group)) for group in groups))]
 
 
 def _group_name(views: list[Any]) -> str:

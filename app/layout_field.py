@@ -13,9 +13,6 @@ from estimators.model import StateSpaceModel
 from .heatmap import Frame, kinds
 from .rerun_field import GAP
 
-CELLS_AT_ONCE = 2
-"""Charts of cells shown at the same time; more come in tabs."""
-
 RMSE, SPREAD = (22, 163, 74), (37, 99, 235)
 
 
@@ -24,15 +21,14 @@ def pictures(model: StateSpaceModel, root: str, *, truth: bool) -> rrb.Horizonta
     grid = model.grid
     assert grid is not None
     frame = Frame.of(grid)
-    bar = max(3, round(GAP * frame.width))
     bounds = rrb.VisualBounds2D(
-        x_range=(-0.04 * frame.width, 1.16 * frame.width + 2 * bar), y_range=(-0.06 * frame.height, 1.06 * frame.height)
+        x_range=(-0.04 * frame.width, (1.2 + 2 * GAP) * frame.width),
+        y_range=(-0.06 * frame.height, 1.06 * frame.height),
     )
-    name = grid.name.replace("_", " ")
     views = {
         kind.name: rrb.Spatial2DView(
             origin=f"{root}/field/{kind.name}",
-            name=f"{name}: {kind.title} [{grid.unit}]",
+            name=f"{kind.brief} [{grid.unit}]",
             visual_bounds=bounds,
         )
         for kind in kinds(truth)
@@ -45,11 +41,11 @@ def pictures(model: StateSpaceModel, root: str, *, truth: bool) -> rrb.Horizonta
 def sums(model: StateSpaceModel, chart: Callable[..., Any], *, truth: bool) -> list[Any]:
     """Charts of what all cells, and all rows of each sensor, come to."""
     assert model.grid is not None
-    title = "RMSE and spread of all cells" if truth else "spread of all cells"
+    title = "RMSE, spread of all cells" if truth else "spread of all cells"
     found = [chart(f"{title} [{model.grid.unit}]", ["/field/rmse", "/field/spread"])]
     for sensor in model.sensors:
-        words = sensor.name.replace("_", " ")
-        found.append(chart(f"{words}: innovations / σ, rms and largest", [f"/innovation/{sensor.name}"]))
+        words = f"{sensor.name.replace('_', ' ')}: " if len(model.sensors) > 1 else ""
+        found.append(chart(f"{words}innovations / σ: rms, largest", [f"/innovation/{sensor.name}"]))
     return found
 
 

@@ -153,7 +153,7 @@ def write_recording(path: Path, twin: Twin, log: Log, track: Track, pictures: Se
     file.tuning(twin.tuning, twin.estimator, 0, 0)
     for start in range(0, log.n, ROWS):
         rows = slice(start, min(log.n, start + ROWS))
-        here = [picture for picture in pictures if start < picture.index <= rows.stop]
+        here = [picture for picture in pictures if start < picture.before <= rows.stop]
         pull = Pull(0, start == 0, start, log.readings.select(rows), track.select(rows), pictures=here)
         file.write(pull)
         drawing(pull)

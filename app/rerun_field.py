@@ -12,7 +12,7 @@ from estimators.model import StateSpaceModel
 from estimators.pictures import Picture
 from estimators.track import Track
 
-from .heatmap import Frame, Scale, image_of, kinds, palette, png, positioned, sensor_colors
+from .heatmap import RIM, Frame, Scale, image_of, kinds, palette, png, positioned, sensor_colors
 
 if TYPE_CHECKING:
     from .rerun_rows import RerunRows
@@ -27,8 +27,8 @@ class FieldDrawing:
     def __init__(self, model: StateSpaceModel, *, truth: bool) -> None:
         assert model.grid is not None
         self._model = model
-        self._unit = model.grid.unit
         self._frame = Frame.of(model.grid)
+        self._bar = max(3, round(GAP * self._frame.width))
         self._kinds = kinds(truth)
         self._palettes = {kind.name: palette(kind.colors) for kind in self._kinds}
         self._scales = {kind.name: Scale(kind) for kind in self._kinds}
@@ -39,9 +39,18 @@ class FieldDrawing:
         self._normalised = np.full(len(places), np.nan)
 
     def static(self, rows: RerunRows) -> None:
-        """Log what stays: the charted cells with their names."""
+        """Log what stays: the scale's place, the sensors' rims, the charted cells with their names."""
+        bar = np.linspace(254, 0, self._frame.height).round().astype(np.uint8)[:, None].repeat(self._bar, axis=1)
         names = [state.name.removeprefix(f"{self._model.grid.name}") for state in self._model.shown_states]  # type: ignore[union-attr]
         for kind in self._kinds:
+            beside = rr.Transform3D(translation=[self._frame.width + self._bar, 0.0, 0.0])
+            rows.log_static(f"/field/{kind.name}/bar", beside)
+            image = png(bar, self._palettes[kind.name])
+            rows.log_static(f"/field/{kind.name}/bar", rr.EncodedImage(contents=image, media_type="image/png", opacity=1.0))
+            if len(self._dots):
+                rims = rr.Points2D(self._dots, radii=-3.0, colors=[RIM], draw_order=20.0)
+                rows.log_static(f"/field/{kind.name}/rims", rims)
+                rows.log_static(f"/field/{kind.name}/sensors", rr.Points2D.from_fields(draw_order=30.0))
             rows.log_static(
                 f"/field/{kind.name}/cells",
                 rr.Points2D(
@@ -97,26 +106,23 @@ class FieldDrawing:
     def _draw(self, rows: RerunRows, t: int, name: str, image: np.ndarray) -> None:
         scale, frame = self._scales[name], self._frame
         scale.fit(image)
-        bar = max(3, round(GAP * frame.width))
-        canvas = np.full((frame.height, frame.width + 2 * bar), 255, np.uint8)
-        canvas[:, : frame.width] = frame.enlarge(scale.indices(image))
-        canvas[:, -bar:] = np.linspace(254, 0, frame.height).round().astype(np.uint8)[:, None]
+        canvas = frame.enlarge(scale.indices(image))
         at = [rows.times(np.array([t]))]
         rows.stream.send_columns(
             f"{rows.root}/field/{name}/image",
             indexes=at,
-            columns=rr.EncodedImage.columns(blob=[png(canvas, self._palettes[name])], media_type=["image/png"]),
+            columns=rr.EncodedImage.columns(blob=[png(canvas, self._palettes[name])], media_type=["image/png"], opacity=[1.0]),
         )
         ticks = scale.ticks()
-        positions = np.array([[frame.width + 2.0 * bar, (1.0 - place) * frame.height] for place, _ in ticks])
-        # The first label says the unit.
-        labels = [text if k < len(ticks) - 1 else f"{text} {self._unit}" for k, (_, text) in enumerate(ticks)]
+        # A label stands below its point, in its middle.
+        across, above = frame.width + 2.0 * self._bar + 0.09 * frame.width, 0.035 * frame.height
+        positions = np.array([[across, (1.0 - place) * frame.height - above] for place, _ in ticks])
         rows.stream.send_columns(
             f"{rows.root}/field/{name}/scale",
             indexes=at,
             columns=rr.Points2D.columns(
-                positions=positions.astype(np.float32), labels=labels, colors=[(120, 120, 128)] * len(ticks),
-                radii=np.full(len(ticks), -1.5, np.float32),
+                positions=positions.astype(np.float32), labels=[text for _, text in ticks],
+                colors=[(120, 120, 128)] * len(ticks), radii=np.full(len(ticks), -0.1, np.float32),
             ).partition([len(ticks)]),
         )  # fmt: skip
 

@@ -105,7 +105,7 @@ class RerunFeed:
         readings: list[Readings] = []
         tracks: list[Track] = []
         end = parts[0].first
-        pictures = {picture.index: picture for part in parts for picture in part.pictures}
+        pictures = {picture.before: picture for part in parts for picture in part.pictures}
         for part in parts:
             if part.first < end:
                 readings, tracks = _cut(readings, tracks, part.first - parts[0].first)
@@ -145,7 +145,7 @@ class RerunFeed:
             if before is not None and grey[grey_part].size:
                 rows.previous(grey[grey_part], before.track.select(grey_part))
             begun = pull.first + cut
-            rows.pictures([item for item in pull.pictures if (item.index <= begun) == past], past=past)
+            rows.pictures([item for item in pull.pictures if (item.before <= begun) == past], past=past)
 
         if t.size:
             rows.begin(pull)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from sources.profile import Profile
     from sources.source import Channel, Report, Source
 
-TABLES = (".csv", ".parquet", ".pq", ".mat")
+TABLES = (".csv", ".parquet", ".pq", ".mat", ".npz")
 """File endings that `--log` gives to the tables of a merged source."""
 
 

@@ -43,10 +43,12 @@ def observers(model: StateSpaceModel) -> list[list[tuple[int, int]]]:
 
 
 def line(color: str, width: float, **more: Any) -> dict[str, Any]:
+    """A series that is drawn as a line, over gaps too."""
     return {"stroke": color, "width": width, "auto": False, "spanGaps": True, "points": {"show": False}, **more}
 
 
 def frame_series() -> dict[str, Any]:
+    """A series that is not seen."""
     # uPlot finds no range of a series with NaN. So this invisible one, which has none, spans the range for all.
     return {"label": "range", "stroke": "rgba(0,0,0,0)", "width": 0, "points": {"show": False}}
 
@@ -271,6 +273,7 @@ def _title(name: str, unit: str) -> str:
 
 
 def frame(height: int) -> dict[str, Any]:
+    """Axes, height and margins of a chart."""
     axis = {"font": "11px sans-serif", "ticks": {"size": 4}}
     return {
         "scales": {"x": {"time": False}},

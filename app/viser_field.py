@@ -13,7 +13,7 @@ from estimators.log import READING
 from estimators.model import StateSpaceModel
 from estimators.pictures import Picture
 
-from .heatmap import ESTIMATE, Frame, Scale, image_of, kinds, palette, positioned, sensor_colors
+from .heatmap import ESTIMATE, RIM, Frame, Scale, image_of, kinds, palette, positioned, sensor_colors
 from .viser_camera import fit_cameras
 from .viser_geometry import segments
 
@@ -81,7 +81,7 @@ class FieldScene:
         if len(places):
             where = self._place(frame.pixels(places), 0.006)
             low = where - [0.0, 0.0, 0.002]
-            api.add_point_cloud("/sensors/rims", low, (71, 85, 105), point_size=0.022, **dots)
+            api.add_point_cloud("/sensors/rims", low, RIM, point_size=0.022, **dots)
             self._points = api.add_point_cloud(
                 "/sensors/dots", where, sensor_colors(self._normalised), point_size=0.016, **dots
             )
@@ -120,8 +120,8 @@ class FieldScene:
         """Take note of what a pull brings."""
         if pull.fresh:
             self.numbers.clear()
-        first = pull.pictures[0].index if pull.pictures else np.inf
-        while self.numbers and self.numbers[-1].index >= first:
+        first = pull.pictures[0].before if pull.pictures else np.inf
+        while self.numbers and self.numbers[-1].before >= first:
             self.numbers.pop()
         for picture in pull.pictures:
             self.numbers.append(picture._replace(mean=None, std=None, truth=None))

@@ -1,4 +1,4 @@
-"""A chart of a large field: the spread of all cells, and the root mean square of their errors where the truth is told."""
+"""A chart of a large field: the spread of all cells, and the root mean square of their errors where it is known."""
 
 from __future__ import annotations
 

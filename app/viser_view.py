@@ -65,8 +65,8 @@ class ViserView:
             self.scene.controls(gui)
         below = gui.add_panel()
         with below.add_tab("Charts"):
-            self.charts = Charts(self.server, model, view.window)
             self.field_chart = FieldChart(gui, model.grid, truth=truth) if model.grid is not None else None
+            self.charts = Charts(self.server, model, view.window)
         below.dock_below(gui.main_panel)
         self.charts.window_choice.on_update(self._choose_window)
         if self.charts.state_choice is not None:

@@ -99,7 +99,7 @@ class ViewSection(Section):
     window: Positive = 60.0
     """Seconds that the charts show at first."""
     cells: Annotated[tuple[Text, ...], Field(min_length=1)] | None = None
-    """Cells of a large field whose estimate is kept at every event and charted over time. Default: 16 spread over it."""
+    """Cells of a large field whose estimate is kept at every event and charted. Default: 16 spread over it."""
     picture: Positive | None = None
     """Seconds of the asset's time between two pictures of a large field. Default: a sixtieth of the window."""
     scene: SceneSection = SceneSection()

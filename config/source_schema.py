@@ -344,7 +344,8 @@ class TimeColumnSection(Section):
 
 
 class TableSection(RecordingSection):
-    """A table: CSV, Parquet, or vectors of a MATLAB file (.mat up to version 7) by their names there: meas.Voltage."""
+    """A table: CSV, Parquet, vectors of a MATLAB file (.mat up to version 7) by their names there (meas.Voltage), or
+    arrays of a NumPy archive (.npz) whose first axis is time: speed, or t2m_K[3,5] for a cell of a field."""
 
     type: Literal["table"]
     """table"""
@@ -355,7 +356,8 @@ class TableSection(RecordingSection):
     inputs: dict[str, ColumnSection] = {}
     """Inputs of the model and the columns that feed them."""
     truth: dict[str, ColumnSection] = {}
-    """States whose true value the table tells. They are scored and never used."""
+    """States whose true value the table tells. They are scored and never used. Of a field under its name: the array
+    with a cell for each of its own; cells that a sensor reads are left out."""
 
 
 class MergedSection(Section):

@@ -357,7 +357,7 @@ class Fold:
         """The log has ended: take the picture for which another event would have been waited."""
         if self.pictures is not None and self.n:
             taken = self.pictures.taken
-            if not taken or taken[-1].index < self.log.first + self.n:
+            if not taken or taken[-1].before < self.log.first + self.n:
                 self._take_picture()
 
     def _take_picture(self) -> None:

@@ -23,14 +23,15 @@ MEMORY = 64 * 2**20
 
 
 class Picture(NamedTuple):
-    """A field before event `index` of the log, at the time `t` of the event before.
+    """A field before event `before` of the log, at the time `t` of the event before that.
 
-    `cells` of it have a known true value; of their errors `rmse` is the root mean square and `inside` the share inside
-    the 95 % band (NaN without truth). `spread` is the root mean variance, over the same cells, or all. `mean`, `std`
-    and `truth` (rows, columns) are float32, NaN where unknown; None where they were not kept or told.
+    Where most of the truth was told, `cells` is how many true values were, else 0; of their errors `rmse` is the root
+    mean square and `inside` the share inside the 95 % band (NaN without truth). `spread` is the root mean variance,
+    over the same cells, or all. `mean`, `std` and `truth` (rows, columns) are float32, NaN where unknown; None where
+    they were not kept or told.
     """
 
-    index: int
+    before: int
     t: int
     cells: int
     rmse: float
@@ -59,12 +60,12 @@ class Pictures:
         self._half = normal_quantile(0.975)
 
     def due(self, log: Log, n: int) -> bool:
-        """Whether one is to be taken before the log's event `n`: a time is complete there, and a period or a telling."""
+        """Whether one is to be taken before the log's event `n`: a time ends there, and a period or a telling."""
         if not 0 < n < log.n or log.t[n] == log.t[n - 1]:
             return False
         if self.period is not None and log.t[n] // self.period != log.t[n - 1] // self.period:
             return True
-        return bool(log.kind[n - 1] == TRUTH) and 2 * int(np.isfinite(self._told(log, n)).sum()) > len(self.field)
+        return bool(log.kind[n - 1] == TRUTH) and self._most_of(self._told(log, n))
 
     def next(self, log: Log, n: int, end: int) -> int:
         """The first event after `n` before which one is due; `end` if there is none."""
@@ -80,7 +81,7 @@ class Pictures:
 
     def check(self, log: Log, n: int) -> bool:
         """Whether one is to be taken now, before event `n`; one that should not be there is dropped."""
-        there = bool(self.taken) and self.taken[-1].index == log.first + n
+        there = bool(self.taken) and self.taken[-1].before == log.first + n
         wanted = self.due(log, n)
         if there and not wanted:
             self.taken.pop()
@@ -97,7 +98,7 @@ class Pictures:
         """
         truth = self._told(log, n)
         known = np.isfinite(truth)
-        cells = int(known.sum())
+        cells = int(known.sum()) if self._most_of(truth) else 0
         rmse, inside, spread = np.nan, np.nan, float(np.sqrt(variances.mean()))
         if cells:
             error, variance = (mean - truth)[known], variances[known]
@@ -114,7 +115,7 @@ class Pictures:
                 spread,
                 plane(mean, shape),
                 np.sqrt(plane(variances, shape)),
-                plane(truth, shape) if 2 * cells > truth.size else None,
+                plane(truth, shape) if cells else None,
             )
         )
         kept = [k for k, picture in enumerate(self.taken) if picture.mean is not None]
@@ -124,12 +125,15 @@ class Pictures:
 
     def cut(self, index: int) -> None:
         """Forget those after the absolute index `index`: what went into them will be folded again."""
-        while self.taken and self.taken[-1].index > index:
+        while self.taken and self.taken[-1].before > index:
             self.taken.pop()
 
     def drop_front(self, first: int) -> None:
         """Forget those before the absolute index `first`."""
-        self.taken = [picture for picture in self.taken if picture.index >= first]
+        self.taken = [picture for picture in self.taken if picture.before >= first]
+
+    def _most_of(self, truth: np.ndarray) -> bool:
+        return 2 * int(np.isfinite(truth).sum()) > truth.size
 
     def _told(self, log: Log, n: int) -> np.ndarray:
         """The true values that were told at the time of event n - 1, (nx,), NaN where none was."""

@@ -86,11 +86,8 @@ class Tuning:
     def keys(self) -> list[str]:
         """Every key that `set` takes."""
         rows = [f"R.{name}" for name in self.model.row_names]
-        return (
-            list(dict.fromkeys([item.key for item in self.items()] + rows))
-            + [f"use.{name}" for name in self.model.sensor_names]
-            + ["gate"]
-        )
+        used = [f"use.{name}" for name in self.model.sensor_names]
+        return [*dict.fromkeys([item.key for item in self.items()] + rows), *used, "gate"]
 
     def get(self, key: str) -> float | bool | None:
         """The value under a key."""
