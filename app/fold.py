@@ -20,6 +20,7 @@ from estimators.log import KIND_NAMES, Log, truth_of
 from estimators.pictures import Picture
 from estimators.score import Score, score
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES, Track
+from estimators.tuning import TOGETHER
 
 from .cli import settings
 from .compile import prepare
@@ -133,6 +134,13 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], trac
         inside = "inside" if result.nis_low <= result.nis <= result.nis_high else "OUTSIDE"
         bounds = f"{result.nis_low:.4f} to {result.nis_high:.4f} of {result.nis_readings} readings"
         rows.append(("mean NIS", f"{result.nis:.4f}   {inside} its 95 % bounds {bounds}"))
+    # The many rows of one sensor are one line.
+    together = {}
+    for sensor, start in zip(twin.model.sensors, twin.model.row_start, strict=True):
+        names = [name for name in twin.model.row_names[start : start + len(sensor.rows)] if name in result.held_out]
+        if len(names) >= TOGETHER and len({row.unit for row in sensor.rows}) == 1:
+            together[sensor.name] = names
+    many = {name for names in together.values() for name in names}
     rows += [
         ("log-likelihood", f"{result.log_likelihood:.2f}"),
         ("gated", f"{result.gated}"),
@@ -144,7 +152,17 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], trac
     rows += [
         (f"held out {name}", f"RMSE {fit.rmse:.5g} {row_units[name]}   in the 95 % band: {100 * fit.coverage:.1f} %")
         for name, fit in result.held_out.items()
+        if name not in many
     ]
+    for sensor, names in together.items():
+        fits = [result.held_out[name] for name in names]
+        rmse, inside = np.sqrt(np.mean([fit.rmse**2 for fit in fits])), np.mean([fit.coverage for fit in fits])
+        rows.append(
+            (
+                f"held out {sensor}, {len(names)} rows",
+                f"RMSE {rmse:.5g} {row_units[names[0]]}   in the 95 % band: {100 * inside:.1f} %",
+            )
+        )
     rows += [(key, f"{count}") for key, count in sorted(counts.items())]
     variances = ", ".join(
         f"{twin.model.state_names[j]} {value**2:.5g}" for j, value in zip(twin.model.shown, track.std[-1], strict=True)
