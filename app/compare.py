@@ -132,9 +132,11 @@ def fold_one(name_or_path: str, overrides: dict[str, str], estimator: str, colum
     try:
         fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=policy)
         seconds = _timed(fold) / log.n
+        fold.finish()
     except NisusError as error:
         return Row(estimator, {}, np.nan, np.nan, np.nan, np.nan, np.nan, str(error))
-    return row_of(estimator, score(fold.track, log.readings, twin.model), twin.model, seconds)
+    pictures = fold.pictures.taken if fold.pictures is not None else ()
+    return row_of(estimator, score(fold.track, log.readings, twin.model, pictures), twin.model, seconds)
 
 
 def _timed(fold: Fold) -> float:
@@ -152,7 +154,9 @@ def _timed(fold: Fold) -> float:
 
 def row_of(estimator: str, result: Score, model: StateSpaceModel, seconds: float) -> Row:
     """A score as a row of the table."""
-    fits, units = result.states, {state.name: state.unit for state in model.states}
+    fits, units = result.states, {state.name: state.unit for state in model.shown_states}
+    if result.field is not None and model.grid is not None:
+        fits, units = {model.grid.name: result.field}, {model.grid.name: model.grid.unit}
     if not fits:
         fits = result.held_out
         row_units = [row.unit for sensor in model.sensors for row in sensor.rows]

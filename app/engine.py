@@ -35,6 +35,7 @@ from .tally import Latency, Tally, last_run
 from .watch import Watch
 
 if TYPE_CHECKING:
+    from estimators.pictures import Picture
     from estimators.tuning import Tuning
     from sources.source import Source
 
@@ -106,7 +107,10 @@ class Engine:
         self._tally = Tally()
 
     def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
-        return Fold(estimator, self.model, tuning, log, pairs=self.pairs, policy=self._policy, base=base)
+        period = self.twin.picture if self.model.grid is not None else None
+        return Fold(
+            estimator, self.model, tuning, log, pairs=self.pairs, policy=self._policy, base=base, picture=period
+        )
 
     # For everybody, from any thread
 
@@ -146,7 +150,7 @@ class Engine:
             log, fold = self._log, self._fold
             fresh = cursor.revision != self._revision
             if fresh:
-                cursor.revision, cursor.next = self._revision, 0
+                cursor.revision, cursor.next, cursor.picture = self._revision, 0, -1
             start = max(cursor.next, log.first)
             end = log.first + fold.n
             if limit is not None:
@@ -159,8 +163,11 @@ class Engine:
                 start,
                 Readings(*(column.copy() for column in readings)),
                 fold.track.select(rows).copy(),
+                pictures=_since(fold, cursor.picture, max(start, end)),
             )
             cursor.next = max(start, end)
+            if pull.pictures:
+                cursor.picture = pull.pictures[-1].before
         lines = self.notices.since(cursor.notice)
         if lines:
             cursor.notice = lines[-1].number + 1
@@ -200,7 +207,7 @@ class Engine:
             points, clock = self._fold.points(), self._fold.clock
             model, several = self._fold.model, self._fold.estimator.modes is not None
         # Clustering takes milliseconds, which the engine's thread must not wait for.
-        modes = modes_of(points, np.array([state.circular for state in model.states])) if several else []
+        modes = modes_of(points, model.circular) if several else []
         return Belief(clock, mean, cov, points, tuple(modes) if len(modes) > 1 else ())
 
     def status(self) -> Status:
@@ -298,6 +305,7 @@ class Engine:
         self._requests.changed(absolute)
         for cursor in self._cursors:
             cursor.next = min(cursor.next, absolute)
+            cursor.picture = min(cursor.picture, absolute)
 
     def _forget(self) -> None:
         """Drop the oldest events, up to a snapshot, from which later refolds start."""
@@ -323,6 +331,8 @@ class Engine:
             self._restart()
         elif isinstance(item, Finished):
             self._finished = True
+            with self._lock:
+                self._fold.finish()
             self.notices.say("the source has ended; the estimate stays")
         else:
             obey(item, self)
@@ -400,3 +410,10 @@ class Engine:
         self.notices.say(f"not folded again: {reason}", level="error")
         if ticket == self._requests.newest:
             self.estimator, self.tuning = self._fold.estimator.name, self._fold.tuning
+
+
+def _since(fold: Fold, index: int, end: int) -> list[Picture]:
+    """The pictures of a fold after event `index`, up to event `end`."""
+    if fold.pictures is None:
+        return []
+    return [picture for picture in fold.pictures.taken if index < picture.before <= end]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +17,10 @@ from estimators.diagnostics import HealthPolicy
 from estimators.errors import ConfigError, SourceError
 from estimators.fold import Fold
 from estimators.log import KIND_NAMES, Log, truth_of
+from estimators.pictures import Picture
 from estimators.score import Score, score
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES, Track
+from estimators.tuning import TOGETHER
 
 from .cli import settings
 from .compile import prepare
@@ -71,13 +74,16 @@ def fold_twin(arguments: Arguments) -> int:
     log, counts = read_log(twin, arguments.duration)
     section = twin.config.time
     policy = HealthPolicy(degraded_after=section.degraded_after, stale_after=section.stale_after)
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log, pairs=twin.pairs, policy=policy)
+    period = twin.picture if arguments.out is not None and arguments.out.suffix == ".rrd" else None
+    fold = Fold(twin.estimator, twin.model, twin.tuning, log, pairs=twin.pairs, policy=policy, picture=period)
     begun = time.perf_counter()
     fold.advance()
+    fold.finish()
     seconds = (time.perf_counter() - begun) / log.n
-    result = score(fold.track, log.readings, twin.model)
+    pictures = fold.pictures.taken if fold.pictures is not None else []
+    result = score(fold.track, log.readings, twin.model, pictures)
     if arguments.out is not None:
-        _write(arguments.out, twin, log, fold.track)
+        _write(arguments.out, twin, log, fold.track, pictures)
     if arguments.json:
         print(json.dumps(_as_dict(twin, result, seconds)))
     else:
@@ -93,6 +99,7 @@ def _as_dict(twin: Twin, result: Score, seconds: float) -> dict[str, Any]:
         "twin": twin.name,
         "estimator": twin.estimator,
         "readings": result.readings,
+        **({"field": {"rmse": result.field.rmse, "coverage": result.field.coverage}} if result.field else {}),
         "rmse": {name: number(fit.rmse) for name, fit in result.states.items()},
         "nis": {
             "mean": number(result.nis),
@@ -108,12 +115,17 @@ def _as_dict(twin: Twin, result: Score, seconds: float) -> dict[str, Any]:
 
 
 def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], track: Track) -> None:
-    units = {state.name: state.unit for state in twin.model.states}
+    units = {state.name: state.unit for state in twin.model.shown_states}
+    grid = twin.model.grid
     rows = [
         ("twin", f"{twin.name}: {twin.title}"),
         ("estimator", twin.estimator),
         ("readings", f"{result.readings}"),
     ]
+    if result.field is not None and grid is not None:
+        fit = result.field
+        inside = f"in the 95 % band: {100 * fit.coverage:.1f} %"
+        rows.append((f"RMSE {grid.name}, all told cells", f"{fit.rmse:.5g} {grid.unit}   {inside}"))
     rows += [
         (f"RMSE {name}", f"{fit.rmse:.5g} {units[name]}   in the 95 % band: {100 * fit.coverage:.1f} %")
         for name, fit in result.states.items()
@@ -122,6 +134,13 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], trac
         inside = "inside" if result.nis_low <= result.nis <= result.nis_high else "OUTSIDE"
         bounds = f"{result.nis_low:.4f} to {result.nis_high:.4f} of {result.nis_readings} readings"
         rows.append(("mean NIS", f"{result.nis:.4f}   {inside} its 95 % bounds {bounds}"))
+    # The many rows of one sensor are one line.
+    together = {}
+    for sensor, start in zip(twin.model.sensors, twin.model.row_start, strict=True):
+        names = [name for name in twin.model.row_names[start : start + len(sensor.rows)] if name in result.held_out]
+        if len(names) >= TOGETHER and len({row.unit for row in sensor.rows}) == 1:
+            together[sensor.name] = names
+    many = {name for names in together.values() for name in names}
     rows += [
         ("log-likelihood", f"{result.log_likelihood:.2f}"),
         ("gated", f"{result.gated}"),
@@ -133,7 +152,17 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], trac
     rows += [
         (f"held out {name}", f"RMSE {fit.rmse:.5g} {row_units[name]}   in the 95 % band: {100 * fit.coverage:.1f} %")
         for name, fit in result.held_out.items()
+        if name not in many
     ]
+    for sensor, names in together.items():
+        fits = [result.held_out[name] for name in names]
+        rmse, inside = np.sqrt(np.mean([fit.rmse**2 for fit in fits])), np.mean([fit.coverage for fit in fits])
+        rows.append(
+            (
+                f"held out {sensor}, {len(names)} rows",
+                f"RMSE {rmse:.5g} {row_units[names[0]]}   in the 95 % band: {100 * inside:.1f} %",
+            )
+        )
     rows += [(key, f"{count}") for key, count in sorted(counts.items())]
     variances = ", ".join(
         f"{twin.model.state_names[j]} {value**2:.5g}" for j, value in zip(twin.model.shown, track.std[-1], strict=True)
@@ -148,11 +177,11 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], trac
         print(f"{name:<{width}}  {value}")
 
 
-def _write(path: Path, twin: Twin, log: Log, track: Track) -> None:
+def _write(path: Path, twin: Twin, log: Log, track: Track, pictures: Sequence[Picture]) -> None:
     if path.suffix == ".rrd":
         from .recorder import write_recording
 
-        write_recording(path, twin, log, track)
+        write_recording(path, twin, log, track, pictures)
         return
     events = log.readings
     model = twin.model

@@ -12,6 +12,8 @@ import rerun.blueprint as rrb
 from estimators.model import StateSpaceModel
 from estimators.quantiles import chi_square_quantile
 
+from . import layout_field
+
 ESTIMATE = (37, 99, 235)
 BAND = (147, 187, 253)
 TRUTH = (22, 163, 74)
@@ -35,27 +37,28 @@ class Observed:
 
 
 def observed(model: StateSpaceModel) -> list[Observed]:
-    """The sensor rows that read one state, give or take a scale near one: h ≈ x_j and ∂h/∂x_j ≈ 1 at the prior."""
-    x = np.array([state.mean for state in model.states])
+    """The sensor rows that read one charted state, give or take a scale near one: h ≈ x_j, ∂h/∂x_j ≈ 1 at the prior."""
+    x = np.array(model.prior_mean)
+    charted = list(zip(model.shown.tolist(), model.shown_states, strict=True))
     u = np.array([item.default for item in model.inputs])
     p = np.array([parameter.value for parameter in model.parameters])
     found = []
     for k, sensor in enumerate(model.sensors):
         here, there = np.zeros(len(sensor.rows)), np.zeros(len(sensor.rows))
         sensor.h(x, u, p, here)
-        slopes = np.zeros((len(sensor.rows), model.nx))
-        for j, state in enumerate(model.states):
-            step = np.zeros(model.nx)
-            step[j] = 1e-3 * state.std
-            sensor.h(x + step, u, p, there)
-            slopes[:, j] = (there - here) / step[j]
+        slopes = np.zeros((len(sensor.rows), len(charted)))
+        for column, (j, state) in enumerate(charted):
+            moved = x.copy()
+            moved[j] += 1e-3 * state.std
+            sensor.h(moved, u, p, there)
+            slopes[:, column] = (there - here) / (1e-3 * state.std)
         for r, row in enumerate(sensor.rows):
             # A distance to a wall grows as the vehicle moves, but is not where the vehicle is.
             likely = [
                 j
-                for j, state in enumerate(model.states)
+                for column, (j, state) in enumerate(charted)
                 if state.unit == row.unit
-                and abs(slopes[r, j] - 1.0) < 0.05
+                and abs(slopes[r, column] - 1.0) < 0.05
                 and abs(here[r] - x[j]) < 0.05 * max(abs(x[j]), state.std)
             ]
             likely.sort(key=lambda j: model.state_names[j] not in (row.name, sensor.name))
@@ -85,7 +88,9 @@ def nis_limit(model: StateSpaceModel) -> float:
     return float(chi_square_quantile(0.99, max(len(sensor.rows) for sensor in model.sensors)))
 
 
-def blueprint(model: StateSpaceModel, pairs: np.ndarray, *, window: float, root: str = "") -> rrb.Blueprint:
+def blueprint(
+    model: StateSpaceModel, pairs: np.ndarray, *, window: float, root: str = "", truth: bool = False
+) -> rrb.Blueprint:
     """The layout of the charts.
 
     Args:
@@ -93,6 +98,7 @@ def blueprint(model: StateSpaceModel, pairs: np.ndarray, *, window: float, root:
         pairs: Indices of the states of each ellipse, shape (k, 2).
         window: Seconds that the charts show.
         root: Path before all entities.
+        truth: Whether the truth of a whole large field is told.
     """
     span = rr.TimeRange(
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-window),
@@ -106,19 +112,21 @@ def blueprint(model: StateSpaceModel, pairs: np.ndarray, *, window: float, root:
             plot_legend=rrb.PlotLegend(visible=False), **more,
         )  # fmt: skip
 
-    names = model.state_names
     dots = observed(model)
     states = []
-    for j, state in enumerate(model.states):
+    for j, state in zip(model.shown.tolist(), model.shown_states, strict=True):
         rows = [model.row_names[model.row_start[d.sensor] + d.row] for d in dots if d.state == j]
         over = [f"/{kind}/{row}" for row in rows for kind in ("reading", "refused")]
-        contents = [*over, f"/previous/state/{names[j]}", f"/state/{names[j]}", f"/truth/{names[j]}"]
+        contents = [*over, f"/previous/state/{state.name}", f"/state/{state.name}", f"/truth/{state.name}"]
         states.append(chart(with_unit(state.name, state.unit), contents))
-    innovations = [
-        chart(f"innovation: {row_title(model, k, r)}", [f"/innovation/{model.row_names[model.row_start[k] + r]}"])
-        for k, sensor in enumerate(model.sensors)
-        for r in range(len(sensor.rows))
-    ]
+    if model.grid is not None:
+        innovations = layout_field.sums(model, chart, truth=truth)
+    else:
+        innovations = [
+            chart(f"innovation: {row_title(model, k, r)}", [f"/innovation/{model.row_names[model.row_start[k] + r]}"])
+            for k, sensor in enumerate(model.sensors)
+            for r in range(len(sensor.rows))
+        ]
     nis = chart(
         "NIS, windowed mean in its 95 % bounds",
         ["/nis/reading", "/previous/nis", "/nis/window"],
@@ -130,17 +138,24 @@ def blueprint(model: StateSpaceModel, pairs: np.ndarray, *, window: float, root:
     ellipses = [
         rrb.Spatial2DView(
             origin=f"{root}/pair/{pair_name(model, pair)}",
-            name=" · ".join(with_unit(names[j], model.states[j].unit) for j in pair) + ", 2σ",
+            name=" · ".join(with_unit(model.states[j].name, model.states[j].unit) for j in pair) + ", 2σ",
         )
         for pair in pairs
     ]
     bottom = rrb.Horizontal(*_tabs(ellipses), events, column_shares=[1.0] * (bool(ellipses) + 1))
-    above = _stacked(states)
+    if model.grid is not None:
+        above = [
+            layout_field.pictures(model, root, truth=truth),
+            rrb.Horizontal(*_tabs(states), innovations[0]),
+            rrb.Horizontal(nis, *_tabs(innovations[1:])),
+        ]
+        shares = [2.6, 1.5, 1.5, 0.75, 0.9]
+    else:
+        charts = _stacked(states)
+        above = [*charts, rrb.Horizontal(*_tabs(innovations), nis)]
+        shares = [1.25 * min(len(states), AT_ONCE) / len(charts)] * len(charts) + [1.1, 0.8, 1.5]
     return rrb.Blueprint(
-        rrb.Vertical(
-            *above, rrb.Horizontal(*_tabs(innovations), nis), health, bottom,
-            row_shares=[1.25 * min(len(states), AT_ONCE) / len(above)] * len(above) + [1.1, 0.8, 1.5],
-        ),
+        rrb.Vertical(*above, health, bottom, row_shares=shares),
         rrb.TopPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
@@ -175,17 +190,23 @@ def styles(stream: rr.RecordingStream, model: StateSpaceModel, pairs: np.ndarray
     def band(name: str, color: tuple[int, int, int]) -> rr.SeriesLines:
         return rr.SeriesLines(colors=[color, BAND, BAND], names=[name, "+2σ", "−2σ"], widths=[2.0, 1.0, 1.0])
 
-    for state in model.states:
+    for state in model.shown_states:
         style(f"/state/{state.name}", band("estimate", ESTIMATE))
         style(f"/truth/{state.name}", rr.SeriesLines(colors=[TRUTH], names=["truth"], widths=[1.0]))
         style(f"/previous/state/{state.name}", rr.SeriesLines(colors=[PREVIOUS], names=["previous"], widths=[1.0]))
+    dots = {model.row_names[model.row_start[item.sensor] + item.row] for item in observed(model)}
     for name in model.row_names:
+        if model.grid is not None and name not in dots:
+            continue
         words = name.replace("_", " ")
         # Points are drawn over lines, so they must let them shine through.
         for kind, color, size in (("reading", (*READING, 70), 1.5), ("refused", REFUSED, 3.5)):
             title = words if kind == "reading" else f"{words}, refused"
             style(f"/{kind}/{name}", rr.SeriesPoints(colors=[color], names=[title], marker_sizes=[size]))
-        style(f"/innovation/{name}", band("innovation", READING))
+        if model.grid is None:
+            style(f"/innovation/{name}", band("innovation", READING))
+    if model.grid is not None:
+        layout_field.styles(style, model)
     style("/nis/reading", rr.SeriesPoints(colors=[BAND], names=["NIS of a reading"], marker_sizes=[1.5]))
     style("/nis/window", rr.SeriesLines(
         colors=[ESTIMATE, TRUTH, TRUTH], names=["windowed mean", "95 % low", "95 % high"], widths=[2.0, 1.0, 1.0]

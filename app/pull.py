@@ -9,6 +9,7 @@ import numpy as np
 
 from estimators.log import Readings
 from estimators.modes import Mode
+from estimators.pictures import Picture
 from estimators.track import Track
 from estimators.tuning import Tuning
 
@@ -17,11 +18,15 @@ from .notices import Notice
 
 @dataclass
 class Cursor:
-    """How far one consumer has read. `next` is the absolute index of the next row; a rewritten row moves it back."""
+    """How far one consumer has read. `next` is the absolute index of the next row; a rewritten row moves it back.
+
+    `picture` is the index of the last picture of a large field that was read.
+    """
 
     revision: int = -1
     next: int = 0
     notice: int = 0
+    picture: int = -1
 
 
 @dataclass(frozen=True)
@@ -30,6 +35,7 @@ class Pull:
 
     `fresh`: these rows start anew (another revision, or the first pull): forget what was drawn. `first` is the
     absolute index of the first row; if it is below what was pulled before, a late reading rewrote the rows from there.
+    `pictures` are those of a large field since the cursor; one with an index that was seen before takes its place.
     """
 
     revision: int
@@ -38,6 +44,7 @@ class Pull:
     readings: Readings
     track: Track
     notices: list[Notice] = field(default_factory=list)
+    pictures: list[Picture] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

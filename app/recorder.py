@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from .rerun_rows import RerunRows
 
 if TYPE_CHECKING:
     from estimators.log import Log
+    from estimators.pictures import Picture
     from estimators.track import Track
 
     from .engine import Engine
@@ -141,8 +142,8 @@ class _Open:
         self._engine.release(self._charts)
 
 
-def write_recording(path: Path, twin: Twin, log: Log, track: Track) -> None:
-    """Write a finished fold as a recording, in the same form as a running twin's.
+def write_recording(path: Path, twin: Twin, log: Log, track: Track, pictures: Sequence[Picture] = ()) -> None:
+    """Write a finished fold as a recording, in the same form as a running twin's, with the pictures of a large field.
 
     Raises:
         SourceError: If the file cannot be written.
@@ -152,7 +153,8 @@ def write_recording(path: Path, twin: Twin, log: Log, track: Track) -> None:
     file.tuning(twin.tuning, twin.estimator, 0, 0)
     for start in range(0, log.n, ROWS):
         rows = slice(start, min(log.n, start + ROWS))
-        pull = Pull(0, start == 0, start, log.readings.select(rows), track.select(rows))
+        here = [picture for picture in pictures if start < picture.before <= rows.stop]
+        pull = Pull(0, start == 0, start, log.readings.select(rows), track.select(rows), pictures=here)
         file.write(pull)
         drawing(pull)
     file.close()

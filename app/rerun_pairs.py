@@ -89,6 +89,9 @@ class PairDrawing:
         self._pair = pair
         self._path = path
         self._scale = axis_scales(model, pair)
+        # Of a large field the track keeps some cells.
+        self._columns = np.searchsorted(model.shown, pair, sorter=np.argsort(model.shown))
+        self._columns = np.argsort(model.shown)[self._columns]
         self._last: int | None = None
         self._way = np.zeros((0, 2), np.float32)
         self._way_t = np.zeros(0, np.int64)
@@ -101,7 +104,7 @@ class PairDrawing:
             self._last = None
         else:
             pick = pick[t[pick] >= self._last + step // 2]
-        mean = track.mean[:, self._pair]
+        mean = track.mean[:, self._columns]
         pick = pick[np.isfinite(mean[pick]).all(axis=1)]
         if pick.size:
             self._pictures(rows, t[pick], track.select(pick), past)
@@ -110,8 +113,8 @@ class PairDrawing:
             self._truth(rows, readings, t[pick])
 
     def _pictures(self, rows: RerunRows, t: np.ndarray, track: Track, past: bool) -> None:
-        mean = track.mean[:, self._pair] / self._scale
-        var = (track.std[:, self._pair] / self._scale) ** 2
+        mean = track.mean[:, self._columns] / self._scale
+        var = (track.std[:, self._columns] / self._scale) ** 2
         cross = track.cross[:, self._index] / self._scale.prod()
         points = ellipse_points(mean, var, cross).astype(np.float32)
         at = [rows.times(t)]
@@ -139,7 +142,7 @@ class PairDrawing:
 
     def _labels(self, track: Track) -> list[str]:
         units = [self._model.states[j].unit.replace("1", "") for j in self._pair]
-        means, stds = track.mean[:, self._pair], track.std[:, self._pair]
+        means, stds = track.mean[:, self._columns], track.std[:, self._columns]
         return [
             f"{m[0]:.4g} ± {s[0]:.2g} {units[0]}\n{m[1]:.4g} ± {s[1]:.2g} {units[1]}"
             for m, s in zip(means, stds, strict=True)

@@ -8,9 +8,11 @@ import numpy as np
 import rerun as rr
 
 from estimators.log import READING, Readings, truth_of
+from estimators.pictures import Picture
 from estimators.track import GATED, HEALTH_NAMES, Track
 
 from .layout import HEALTH_COLORS, TIMELINE, blueprint, observed, pair_name, styles
+from .rerun_field import FieldDrawing
 from .rerun_pairs import PairDrawing
 from .rerun_thin import last_of_each_time, thin
 
@@ -48,12 +50,13 @@ class RerunRows:
         self._series = series
         self._layout = layout
         self._dots = observed(self.model)
+        self._tells_field = bool(self.model.grid is not None and engine.twin.tells_field)
         self._calendar: bool | None = None
         self._revisions = 0
         self._begin("")
 
     def _begin(self, root: str) -> None:
-        self._root = root
+        self.root = root
         self._next = 0
         self._newest: int | None = None
         self._oldest: int | None = None
@@ -69,7 +72,11 @@ class RerunRows:
             static=True,
         )
         if self._layout:
-            self.stream.send_blueprint(blueprint(self.model, self.pairs, window=self.window, root=root))
+            layout = blueprint(self.model, self.pairs, window=self.window, root=root, truth=self._tells_field)
+            self.stream.send_blueprint(layout)
+        self._field = FieldDrawing(self.model, truth=self._tells_field) if self.model.grid is not None else None
+        if self._field is not None:
+            self._field.static(self)
         self._ellipses = [
             PairDrawing(self.model, k, pair, f"{root}/pair/{pair_name(self.model, pair)}/up")
             for k, pair in enumerate(self.pairs)
@@ -89,6 +96,7 @@ class RerunRows:
             fresh = self._not_drawn(pull.readings) if rewritten else after
             self._next = pull.first + t.size
             self.rows(pull.readings, pull.track, lines=after, dots=fresh)
+        self.pictures(pull.pictures)
         self.notices(pull.notices)
 
     def begin(self, pull: Any) -> None:
@@ -143,11 +151,16 @@ class RerunRows:
             self._readings(drawn, track.select(dots), width)
             self._remember(drawn)
 
+    def pictures(self, pictures: list[Picture], *, past: bool = False) -> None:
+        """Log the pictures of a large field; `past` as in `rows`."""
+        if self._field is not None:
+            self._field.pictures(self, pictures, current=not past)
+
     def previous(self, t: np.ndarray, track: Track) -> None:
         """Log another revision's rows as the thin grey lines behind this one's."""
         rows = last_of_each_time(t)
         width = self.width(t)
-        for j, name in enumerate(self.model.state_names):
+        for j, name in enumerate(state.name for state in self.model.shown_states):
             self._line(f"/previous/state/{name}", t[rows], track.mean[rows, j, None], width)
         self._line("/previous/nis", t[rows], track.nis_mean[rows, None], width)
 
@@ -157,7 +170,7 @@ class RerunRows:
             return
         times = np.maximum([notice.t for notice in notices], self._oldest)
         self.stream.send_columns(
-            f"{self._root}/events",
+            f"{self.root}/events",
             indexes=[self.times(times.astype(np.int64))],
             columns=rr.TextLog.columns(
                 text=[notice.text for notice in notices], level=[notice.level.upper() for notice in notices]
@@ -172,7 +185,7 @@ class RerunRows:
 
     def _states(self, t: np.ndarray, track: Track, width: int) -> None:
         rows = last_of_each_time(t)
-        for j, name in enumerate(self.model.state_names):
+        for j, name in enumerate(state.name for state in self.model.shown_states):
             mean, twice = track.mean[rows, j], 2.0 * track.std[rows, j]
             self._line(f"/state/{name}", t[rows], np.stack((mean, mean + twice, mean - twice), axis=1), width)
 
@@ -189,7 +202,7 @@ class RerunRows:
             self._health = int(health[-1])
         if changes.size:
             self.stream.send_columns(
-                f"{self._root}/health",
+                f"{self.root}/health",
                 indexes=[self.times(t[changes])],
                 columns=rr.StateChange.columns(state=[HEALTH_NAMES[health[k]] for k in changes]),
             )
@@ -197,16 +210,19 @@ class RerunRows:
     def _readings(self, readings: Readings, track: Track, width: int) -> None:
         channel, t = readings.channel, readings.t
         is_reading = readings.kind == READING
-        for j, name in enumerate(self.model.state_names):
+        for j, state in zip(self.model.shown.tolist(), self.model.shown_states, strict=True):
             rows, values = truth_of(readings, j)
-            self._line(f"/truth/{name}", t[rows], values[:, None], width)
+            self._line(f"/truth/{state.name}", t[rows], values[:, None], width)
         for item in self._dots:
             name = self.model.row_names[self.model.row_start[item.sensor] + item.row]
             of_sensor = is_reading & (channel == item.sensor)
             for path, mask in (("reading", track.verdict != GATED), ("refused", track.verdict == GATED)):
                 rows = of_sensor & mask
                 self._line(f"/{path}/{name}", t[rows], readings.value[rows, item.row, None], width)
-        for k, sensor in enumerate(self.model.sensors):
+        if self._field is not None:
+            self._field.readings(self, readings, track, width)
+            self._field.note(readings, track)
+        for k, sensor in enumerate(() if self._field is not None else self.model.sensors):
             mask = is_reading & (channel == k)
             if not mask.any():
                 continue
@@ -215,6 +231,14 @@ class RerunRows:
                 path = f"/innovation/{self.model.row_names[self.model.row_start[k] + r]}"
                 self._line(path, t[mask], np.stack((nu, twice, -twice), axis=1), width, by_first=True)
         self._line("/nis/reading", t[is_reading], track.nis[is_reading, None], width)
+
+    def log_static(self, path: str, what: Any) -> None:
+        """Log what holds at every time."""
+        self.stream.log(f"{self.root}{path}", what, static=True)
+
+    def line(self, path: str, t: np.ndarray, values: np.ndarray, width: int) -> None:
+        """Log values (n, k) over time, thinned by the extremes of the first column; rows with NaN are left out."""
+        self._line(path, t, values, width, by_first=True)
 
     def _line(self, path: str, t: np.ndarray, values: np.ndarray, width: int, *, by_first: bool = False) -> None:
         """Log values (n, k) that are finite, thinned by their lowest and highest, or by those of the first column."""
@@ -225,7 +249,7 @@ class RerunRows:
         key = values[:, :1] if by_first else values
         rows = thin(t, key.min(axis=1), key.max(axis=1), width)
         self.stream.send_columns(
-            f"{self._root}{path}",
+            f"{self.root}{path}",
             indexes=[self.times(t[rows])],
             columns=rr.Scalars.columns(scalars=np.ascontiguousarray(values[rows])),
         )

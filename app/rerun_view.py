@@ -81,7 +81,7 @@ class RerunFeed:
         self._notices.extend(pull.notices)
         if pull.fresh:
             return self._begin(self._whole(pull))
-        if self._rows is None or not (len(pull.readings) or pull.notices):
+        if self._rows is None or not (len(pull.readings) or pull.notices or pull.pictures):
             return []
         self._rows(pull)
         return self._read()
@@ -105,6 +105,7 @@ class RerunFeed:
         readings: list[Readings] = []
         tracks: list[Track] = []
         end = parts[0].first
+        pictures = {picture.before: picture for part in parts for picture in part.pictures}
         for part in parts:
             if part.first < end:
                 readings, tracks = _cut(readings, tracks, part.first - parts[0].first)
@@ -117,6 +118,7 @@ class RerunFeed:
             first=parts[0].first,
             readings=Readings(*(np.concatenate(column) for column in zip(*readings, strict=True))),
             track=Track(*(np.concatenate(column) for column in zip(*tracks, strict=True))),
+            pictures=[pictures[index] for index in sorted(pictures)],
         )
 
     def _begin(self, pull: Pull) -> list[Message]:
@@ -142,6 +144,8 @@ class RerunFeed:
             rows.rows(pull.readings.select(part), pull.track.select(part), past=past)
             if before is not None and grey[grey_part].size:
                 rows.previous(grey[grey_part], before.track.select(grey_part))
+            begun = pull.first + cut
+            rows.pictures([item for item in pull.pictures if (item.before <= begun) == past], past=past)
 
         if t.size:
             rows.begin(pull)

@@ -13,6 +13,7 @@ import numpy as np
 
 from config.loader import Loaded, load, load_text
 from config.schema import TwinSection
+from config.source_schema import AssetSection
 from config.yaml_lines import parse
 from estimators.errors import ConfigError, EstimatorError
 from estimators.model import StateSpaceModel
@@ -67,6 +68,22 @@ class Twin:
     def title(self) -> str:
         """One line for the top of the page."""
         return self.config.title or self.model.title
+
+    @property
+    def picture(self) -> float | None:
+        """Seconds between two pictures of a large field; None if there is none."""
+        view = self.config.view
+        return (view.picture or view.window / 60.0) if self.model.grid is not None else None
+
+    @property
+    def tells_field(self) -> bool:
+        """Whether the source tells the truth of a whole large field."""
+        grid, source = self.model.grid, self.config.source
+        if grid is None:
+            return False
+        if isinstance(source, AssetSection):
+            return source.truth.every is not None
+        return any(grid.name in getattr(part, "truth", {}) for part in getattr(source, "parts", (source,)))
 
     def options_of(self, estimator: str) -> Mapping[str, float]:
         """The options that the YAML gives for an estimator."""
@@ -190,10 +207,15 @@ def _pairs(loaded: Loaded, model: StateSpaceModel) -> np.ndarray:
     for key in ("axes", "position", "heading"):
         value = getattr(view.scene, key)
         check_named(loaded, ("view", "scene", key), (value,) if isinstance(value, str) else value or (), model)
+    if view.pairs is None and model.grid is not None:
+        return np.zeros((0, 2), int)
     if view.pairs is None:
         return np.array([[0, 1]] if model.nx > 1 else np.zeros((0, 2)), int)
     for k, pair in enumerate(view.pairs):
         check_named(loaded, ("view", "pairs", k), pair, model)
         if pair[0] == pair[1]:
             raise loaded.error(("view", "pairs", k), f"names {pair[0]} twice; an ellipse needs two states")
+        for name in pair:
+            if model.state_names.index(name) not in model.shown:
+                raise loaded.error(("view", "pairs", k), f"names {name}, which is not among view.cells; add it there")
     return np.array([[model.state_names.index(name) for name in pair] for pair in view.pairs], int).reshape(-1, 2)

@@ -10,7 +10,7 @@ from config.loader import Loaded
 from config.source_schema import ChannelSection, RangeSection, SignalSection
 from config.yaml_lines import Key
 from estimators.log import INPUT, READING, TRUTH
-from estimators.model import StateSpaceModel
+from estimators.model import Field, StateSpaceModel
 
 from .twin_model import check_names
 
@@ -26,18 +26,38 @@ def channels(loaded: Loaded, section: Any, key: Key, model: StateSpaceModel) -> 
     """
     rows_of = {sensor.name: [(row.name, row.unit) for row in sensor.rows] for sensor in model.sensors}
     inputs_of = {item.name: [(item.name, item.unit)] for item in model.inputs}
-    states_of = {state.name: [(state.name, state.unit)] for state in model.states}
+    field = model.states if isinstance(model.states, Field) else None
+    states_of = {state.name: [(state.name, state.unit)] for state in model.states} if model.grid is None else {}
     found: list[tuple[Key, Channel]] = []
     for group, kind, known, word in (
         ("sensors", READING, rows_of, "sensor"),
         ("inputs", INPUT, inputs_of, "input"),
         ("truth", TRUTH, states_of, "state"),
     ):
-        given = getattr(section, group)
+        given = dict(getattr(section, group))
+        if kind == TRUTH and field is not None and field.name in given:
+            read = {name for _, item in found for name in item.signals}
+            found += _cells(loaded, (*key, group, field.name), given.pop(field.name), field, read)
         check_names(loaded, (*key, group), given, list(known), word, model)
         for name, item in given.items():
             place = (*key, group, name)
             found.append((place, _channel(loaded, place, item, kind, list(known).index(name), name, known[name])))
+    return found
+
+
+def _cells(
+    loaded: Loaded, key: Key, item: ChannelSection, field: Field, read: set[str]
+) -> list[tuple[Key, Channel]]:
+    """The true values of a whole field from one array; the cells among `read` are no truth."""
+    if isinstance(item, SignalSection) or len(item.names()) != 1:
+        raise loaded.error(key, f"is a field of {len(field)} cells; name one array of a table")
+    found = []
+    for k in range(len(field)):
+        state = field[k]
+        column = f"{item.names()[0]}[{state.name.partition('[')[2]}"
+        if column not in read:
+            cell = item.model_copy(update={"columns": (column,)})
+            found.append((key, _channel(loaded, key, cell, TRUTH, k, state.name, [(state.name, state.unit)])))
     return found
 
 

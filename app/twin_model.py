@@ -132,9 +132,14 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
 
 def _states(model: StateSpaceModel, loaded: Loaded) -> Sequence[State]:
     """The states with the YAML's prior; that of a field is given for all its cells, under the field's name."""
-    given = loaded.config.prior
+    given, cells = loaded.config.prior, loaded.config.view.cells
     states = model.states
+    if cells is not None and model.grid is None:
+        raise loaded.error(("view", "cells"), f"is for large fields; every state of {model.name} is kept; leave it out")
     if isinstance(states, Field):
+        if cells is not None:
+            check_named(loaded, ("view", "cells"), cells, model)
+            states = replace(states, shown=tuple(model.state_names.index(name) for name in cells))
         prior = given.get(states.name)
         if prior is None:
             return states

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from sources.profile import Profile
     from sources.source import Channel, Report, Source
 
-TABLES = (".csv", ".parquet", ".pq", ".mat")
+TABLES = (".csv", ".parquet", ".pq", ".mat", ".npz")
 """File endings that `--log` gives to the tables of a merged source."""
 
 
@@ -94,6 +94,7 @@ class Plan:
             inputs={name: _profile(profiles) for name, profiles in section.inputs.items()},
             sensors=plans,
             faults=_faults(self.loaded, section, key, self.model),
+            truth_every=truth.every if self.model.grid is not None else None,
         )
 
     def player(self, report: Report, *, interface: str | None = None, channel: str | int | None = None) -> Player:

@@ -24,11 +24,10 @@ SHOWN = 6
 
 
 def observers(model: StateSpaceModel) -> list[list[tuple[int, int]]]:
-    """For each state, the sensor rows (sensor, row) that read it directly: h(x) = x_j, whatever x is."""
-    direct: list[list[tuple[int, int]]] = [[] for _ in model.states]
+    """For each charted state, the sensor rows (sensor, row) that read it directly: h(x) = x_j, whatever x is."""
+    direct: list[list[tuple[int, int]]] = [[] for _ in model.shown]
     rng = np.random.default_rng(0)
-    mean = np.array([state.mean for state in model.states])
-    std = np.array([state.std for state in model.states])
+    mean, std = model.prior_mean, model.prior_std
     u = np.array([item.default for item in model.inputs])
     p = np.array([parameter.value for parameter in model.parameters])
     points = mean + std * rng.uniform(0.3, 0.9, (2, model.nx))
@@ -37,16 +36,19 @@ def observers(model: StateSpaceModel) -> list[list[tuple[int, int]]]:
         for x, row in zip(points, out, strict=True):
             sensor.h(x, u, p, row)
         for r in range(len(sensor.rows)):
-            for j in np.flatnonzero(np.all(np.isclose(out[:, r, None], points, rtol=1e-9, atol=1e-12), axis=0)):
+            charted = points[:, model.shown]
+            for j in np.flatnonzero(np.all(np.isclose(out[:, r, None], charted, rtol=1e-9, atol=1e-12), axis=0)):
                 direct[j].append((k, r))
     return direct
 
 
-def _line(color: str, width: float, **more: Any) -> dict[str, Any]:
+def line(color: str, width: float, **more: Any) -> dict[str, Any]:
+    """A series that is drawn as a line, over gaps too."""
     return {"stroke": color, "width": width, "auto": False, "spanGaps": True, "points": {"show": False}, **more}
 
 
-def _frame_series() -> dict[str, Any]:
+def frame_series() -> dict[str, Any]:
+    """A series that is not seen."""
     # uPlot finds no range of a series with NaN. So this invisible one, which has none, spans the range for all.
     return {"label": "range", "stroke": "rgba(0,0,0,0)", "width": 0, "points": {"show": False}}
 
@@ -90,7 +92,7 @@ class Charts:
         self.direct = observers(model)
         self.window: float | None = window
         self._previous: tuple[np.ndarray, np.ndarray] | None = None
-        nx = model.nx
+        nx = len(model.shown)
         self._dot_columns = [[4 * nx + j * 4 + d for d in range(min(3, len(self.direct[j])))] for j in range(nx)]
         self._nis = 8 * nx
         self._columns = 8 * nx + 4
@@ -106,7 +108,7 @@ class Charts:
         self._charts = [self._state_chart(gui, j) for j in self._shown[: SHOWN - 1]]
         self.state_choice = None
         if nx > SHOWN:
-            rest = model.state_names[SHOWN - 1 :]
+            rest = tuple(state.name for state in model.shown_states[SHOWN - 1 :])
             self.state_choice = gui.add_dropdown("State", rest, initial_value=rest[0])
         if nx >= SHOWN:
             self._charts.append(self._state_chart(gui, SHOWN - 1))
@@ -120,8 +122,8 @@ class Charts:
 
     def choose_state(self, name: str) -> None:
         """Show another state in the last chart."""
-        self._shown[-1] = self.model.state_names.index(name)
-        chart, state = self._charts[-1], self.model.states[self._shown[-1]]
+        self._shown[-1] = [state.name for state in self.model.shown_states].index(name)
+        chart, state = self._charts[-1], self.model.shown_states[self._shown[-1]]
         chart.title = _title(state.name, state.unit)
 
     def set_previous(self, pull: Any) -> None:
@@ -162,7 +164,7 @@ class Charts:
         self._nis_chart.data = self._nis_data(x, values)
 
     def _values(self, history: History, start: int, end: int) -> np.ndarray:
-        nx = self.model.nx
+        nx = len(self.model.shown)
         rows = slice(start, end)
         mean, std = history.column("mean")[rows], history.column("std")[rows]
         events, verdict = history.events(rows), history.column("verdict")[rows]
@@ -172,7 +174,7 @@ class Charts:
         out[:, 2 * nx : 3 * nx] = mean - 2 * std
         reading, gated = events.kind == READING, verdict == GATED
         for j in range(nx):
-            true, values = truth_of(events, j)
+            true, values = truth_of(events, int(self.model.shown[j]))
             out[true, 3 * nx + j] = values
             for column, (sensor, row) in zip(self._dot_columns[j], self.direct[j], strict=False):
                 mine = reading & (events.channel == sensor)
@@ -184,7 +186,7 @@ class Charts:
         return out
 
     def _state_data(self, x: np.ndarray, times: np.ndarray, values: np.ndarray, j: int) -> tuple[np.ndarray, ...]:
-        nx = self.model.nx
+        nx = len(self.model.shown)
         previous = np.full(x.size, np.nan)
         if self._previous is not None and self._previous[0].size:
             t, mean = self._previous
@@ -204,43 +206,43 @@ class Charts:
         return x, *columns, self._ranges[-1].series([*columns, np.zeros(x.size)])
 
     def _state_chart(self, gui: viser.GuiApi, j: int) -> viser.GuiUplotHandle:
-        state = self.model.states[j]
-        band = _line("rgba(37,99,235,0)", 0)
+        state = self.model.shown_states[j]
+        band = line("rgba(37,99,235,0)", 0)
         series = [
             {"label": "s"},
             {**band, "label": "+2σ"},
             {**band, "label": "-2σ"},
             *(_dots(color, 4) for color in DOTS),
-            _line(GREY, 1, label="previous"),
-            _line(GREEN, 1.5, label="truth"),
-            _line(BLUE, 1.5, label="mean"),
+            line(GREY, 1, label="previous"),
+            line(GREEN, 1.5, label="truth"),
+            line(BLUE, 1.5, label="mean"),
             _dots(RED, 5),
-            _frame_series(),
+            frame_series(),
         ]
         return gui.add_uplot(
-            _no_data(len(series)),
+            no_data(len(series)),
             tuple(series),  # type: ignore[arg-type]
             title=_title(state.name, state.unit),
             bands=({"series": (1, 2), "fill": "rgba(37,99,235,0.16)"},),
-            **_frame(HEIGHT),
+            **frame(HEIGHT),
         )
 
     def _make_nis_chart(self, gui: viser.GuiApi) -> viser.GuiUplotHandle:
-        edge = _line(GREY, 1, dash=(4, 4))
+        edge = line(GREY, 1, dash=(4, 4))
         series = (
             {"label": "s"},
             {**edge, "label": "high"},
             {**edge, "label": "low"},
-            _line(BLUE, 1.5, label="windowed mean"),
+            line(BLUE, 1.5, label="windowed mean"),
             _dots("#94a3b8", 3),
-            _frame_series(),
+            frame_series(),
         )
         return gui.add_uplot(
-            _no_data(len(series)),
+            no_data(len(series)),
             series,  # type: ignore[arg-type]
             title="NIS: mean of the last readings in its 95 % bounds",
             bands=({"series": (1, 2), "fill": "rgba(22,163,74,0.10)"},),
-            **_frame(HEIGHT),
+            **frame(HEIGHT),
         )
 
     def _key(self) -> str:
@@ -260,7 +262,7 @@ class Charts:
         return f'<div style="font-size:0.75em;padding:0 0.8em 0.3em;font-weight:400">{"".join(parts)}</div>'
 
 
-def _no_data(series: int) -> tuple[np.ndarray, ...]:
+def no_data(series: int) -> tuple[np.ndarray, ...]:
     """Empty axes: all NaN but the times and the range."""
     ends = np.array([0.0, 1.0])
     return ends, *(np.full(2, np.nan) for _ in range(series - 2)), ends
@@ -270,7 +272,8 @@ def _title(name: str, unit: str) -> str:
     return f"{name} [{unit}]" if unit and unit != "1" else name
 
 
-def _frame(height: int) -> dict[str, Any]:
+def frame(height: int) -> dict[str, Any]:
+    """Axes, height and margins of a chart."""
     axis = {"font": "11px sans-serif", "ticks": {"size": 4}}
     return {
         "scales": {"x": {"time": False}},

@@ -11,6 +11,8 @@ import viser
 from .notices import Notice
 from .viser_belief import BeliefScene
 from .viser_charts import Charts
+from .viser_field import FieldScene
+from .viser_field_chart import FieldChart
 from .viser_guard import guarded_server, unprinted
 from .viser_history import History
 from .viser_panel import Panel
@@ -51,8 +53,11 @@ class ViserView:
         gui.main_panel.set_width(COLUMN)
         self.coalescer = Coalescer(engine.submit)
         self.panel = Panel(self.server, engine, self.coalescer)
-        self.scene: VehicleScene | BeliefScene
-        if view.scene.kind == "vehicle":
+        self.scene: VehicleScene | BeliefScene | FieldScene
+        truth = model.grid is not None and engine.twin.tells_field
+        if model.grid is not None:
+            self.scene = FieldScene(self.server, model, truth=truth)
+        elif view.scene.kind == "vehicle":
             self.scene = VehicleScene(self.server, model, view.scene)
         else:
             self.scene = BeliefScene(self.server, model, view.scene.axes)
@@ -60,12 +65,15 @@ class ViserView:
             self.scene.controls(gui)
         below = gui.add_panel()
         with below.add_tab("Charts"):
+            self.field_chart = FieldChart(gui, model.grid, truth=truth) if model.grid is not None else None
             self.charts = Charts(self.server, model, view.window)
         below.dock_below(gui.main_panel)
         self.charts.window_choice.on_update(self._choose_window)
         if self.charts.state_choice is not None:
             self.charts.state_choice.on_update(self._choose_state)
-        self.history = History(model.nx, model.width)
+        limit = 32_768 if model.grid is None else 4096
+        self.history = History(len(model.shown), model.width, limit)
+        self._rows = min(ROWS, limit)
         self._cursor: Any = None
         self._begin_again(view.window)
         self._revision: int | None = None
@@ -97,14 +105,16 @@ class ViserView:
         notices: list[Notice] = []
         with self.server.atomic():
             while True:
-                pull = self.engine.pull(self._cursor, ROWS)
+                pull = self.engine.pull(self._cursor, self._rows)
                 notices += pull.notices
                 changed |= bool(len(pull.readings)) or pull.fresh
                 if pull.fresh:
                     self.charts.clear()
+                if isinstance(self.scene, FieldScene):
+                    self.scene.take(pull)
                 first = self.history.take(pull)
                 self.charts.update(self.history, max(0, first - self.history.trim()))
-                if len(pull.readings) < ROWS:
+                if len(pull.readings) < self._rows:
                     break
             if pull.revision != self._revision:
                 self._revision = pull.revision
@@ -113,7 +123,12 @@ class ViserView:
             if changed:
                 self._redraw = False
                 self.charts.draw(self.history)
-                self.scene.draw(self.history, self.engine.belief())
+                if not isinstance(self.scene, FieldScene):
+                    self.scene.draw(self.history, self.engine.belief())
+                elif self.field_chart is not None:
+                    self.field_chart.draw(self.scene.numbers, self.history, self.charts.window)
+            if isinstance(self.scene, FieldScene):
+                self.scene.draw()
             self.panel.note(notices)
             self.panel.sync(self.engine.status(), self.history.origin)
 

@@ -94,9 +94,14 @@ class ViewSection(Section):
     """What the page draws."""
 
     pairs: tuple[tuple[Text, Text], ...] | None = None
-    """Pairs of states whose joint covariance is drawn as an ellipse. Default: the first two states."""
+    """Pairs of states whose joint covariance is drawn as an ellipse. Default: the first two states; of a large field
+    none."""
     window: Positive = 60.0
     """Seconds that the charts show at first."""
+    cells: Annotated[tuple[Text, ...], Field(min_length=1)] | None = None
+    """Cells of a large field whose estimate is kept at every event and charted. Default: 16 spread over it."""
+    picture: Positive | None = None
+    """Seconds of the asset's time between two pictures of a large field. Default: a sixtieth of the window."""
     scene: SceneSection = SceneSection()
     """The three-dimensional scene. Default: the belief over the first three states."""
 

@@ -249,6 +249,9 @@ class TruthSection(Section):
     """The asset's true parameters. Default: those of the twin, or of `model` if it is given."""
     noise: dict[str, LevelSection] = {}
     """The asset's true process noise. Default: that of the twin, or of `model` if it is given."""
+    every: Count | None = None
+    """Steps between two tellings of every cell of a large field, by which the estimate is scored and its error drawn;
+    the cells that are charted are told at each step. Default: null, never."""
 
 
 class AssetSection(Section):
@@ -341,7 +344,8 @@ class TimeColumnSection(Section):
 
 
 class TableSection(RecordingSection):
-    """A table: CSV, Parquet, or vectors of a MATLAB file (.mat up to version 7) by their names there: meas.Voltage."""
+    """A table: CSV, Parquet, vectors of a MATLAB file (.mat up to version 7) by their names there (meas.Voltage), or
+    arrays of a NumPy archive (.npz) whose first axis is time: speed, or t2m_K[3,5] for a cell of a field."""
 
     type: Literal["table"]
     """table"""
@@ -352,7 +356,8 @@ class TableSection(RecordingSection):
     inputs: dict[str, ColumnSection] = {}
     """Inputs of the model and the columns that feed them."""
     truth: dict[str, ColumnSection] = {}
-    """States whose true value the table tells. They are scored and never used."""
+    """States whose true value the table tells. They are scored and never used. Of a field under its name: the array
+    with a cell for each of its own; cells that a sensor reads are left out."""
 
 
 class MergedSection(Section):

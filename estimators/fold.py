@@ -26,6 +26,7 @@ from .jit import B1, F1, F2, I1, borrowed, borrowed_rows, i64, jit, jit_brief
 from .log import INPUT, READING, RESET, TICK, TRUTH, Log
 from .model import StateSpaceModel
 from .modes import Mode
+from .pictures import Pictures
 from .quantiles import chi_square_quantile
 from .registry import find_estimator
 from .track import MISSING, NONE, Track, track_type
@@ -185,6 +186,7 @@ class Fold:
         pairs: np.ndarray | None = None,
         policy: HealthPolicy | None = None,
         base: Base | None = None,
+        picture: float | None = None,
     ) -> None:
         """Prepare; nothing is folded yet.
 
@@ -198,6 +200,7 @@ class Fold:
             base: Where to start, where events before the log's first were dropped; without it, at the prior. The
                 filter that left it goes on from its whole state, also under another tuning, unless an option changed
                 the size of that; any other filter starts from the mean and covariance.
+            picture: Seconds of the log between two pictures of a large field; None for those that score it only.
 
         Raises:
             EstimatorError: If the estimator does not exist, does not apply, or an option is out of range.
@@ -241,6 +244,8 @@ class Fold:
             self._every *= 2
         self._sparse = max(SPARSE_EVERY, self._every)
         self._snapshots: dict[int, tuple[int, np.ndarray, np.ndarray]] = {}
+        self.pictures = Pictures(model.grid, picture) if model.grid is not None else None
+        self._asked = -1
         self._remember()
         self._rows = Track.allocate(log.capacity, len(model.shown), len(self.pairs), model.ny)
 
@@ -329,29 +334,16 @@ class Fold:
         brief = (end - self.n) * self._state.size <= BRIEF
         run_some = self._run_brief if brief else self._run
         while self.n < end:
+            if self.pictures is not None and self.pictures.check(log, self.n):
+                self._take_picture()
             # Far behind the end, only the snapshots that are kept for ever are worth stopping for.
             stride = self._sparse if end - self.n > RECENT else self._every
             boundary = self.n + stride - (log.first + self.n) % stride
             stop = min(end, boundary)
+            if self.pictures is not None:
+                stop = self.pictures.next(log, self.n, stop)
             try:
-                run_some(
-                    self._code,
-                    self._context,
-                    log.first,
-                    self.n,
-                    stop,
-                    log.t,
-                    log.kind,
-                    log.channel,
-                    log.value,
-                    self._clock,
-                    self._u,
-                    self._state,
-                    self._spare,
-                    self._work,
-                    self._score,
-                    self._rows,
-                )
+                self._run_events(run_some, self.n, stop)
             except BaseException:
                 # A model's own Python failed between two events: back to where the state is known.
                 self._restore(self.n)
@@ -363,6 +355,46 @@ class Fold:
             assess_some = self._assess_brief if brief else self._assess
             assess_some(begun, end, log.t, log.kind, self._rows, self.policy, self._bounds)
         return end - begun
+
+    def _run_events(self, run_some: Any, start: int, stop: int) -> None:
+        log = self.log
+        run_some(
+            self._code,
+            self._context,
+            log.first,
+            start,
+            stop,
+            log.t,
+            log.kind,
+            log.channel,
+            log.value,
+            self._clock,
+            self._u,
+            self._state,
+            self._spare,
+            self._work,
+            self._score,
+            self._rows,
+        )
+        self._asked = stop - 1
+
+    def finish(self) -> None:
+        """The log has ended: take the picture for which another event would have been waited."""
+        if self.pictures is not None and self.n:
+            taken = self.pictures.taken
+            if not taken or taken[-1].before < self.log.first + self.n:
+                self._take_picture()
+
+    def _take_picture(self) -> None:
+        """Of what stands before event `n`; after a query, of what it was answered with."""
+        assert self.pictures is not None
+        last = self.n - 1
+        query = self.log.kind[last] in (TRUTH, TICK)
+        if query and self._asked != last:
+            self._run_events(self._run, last, self.n)
+        state = self._spare if query else self._state
+        mean, cov = self.estimator.moments(self.options, state, self.model.nx)
+        self.pictures.take(self.log, self.n, mean, cov[0] if cov.shape[0] == 1 else np.diag(cov))
 
     def _remember(self) -> None:
         at = self.log.first + self.n
@@ -390,6 +422,9 @@ class Fold:
         clock, u, state = self._snapshots[at]
         self._clock[0], self._u[:], self._state[:] = clock, u, state
         self.n = at - self.log.first
+        self._asked = -1
+        if self.pictures is not None:
+            self.pictures.cut(at)
 
     def base_at(self, index: int) -> tuple[int, Base]:
         """The last snapshot at or before the event `index`: its index, and the base of a fold that starts there."""
@@ -427,6 +462,9 @@ class Fold:
         for column in self._rows:
             column[: self.n - count] = column[count : self.n].copy()
         self.n -= count
+        self._asked = -1
+        if self.pictures is not None:
+            self.pictures.drop_front(self.log.first + count)
         for key in [key for key in self._snapshots if key < self.log.first + count]:
             del self._snapshots[key]
 

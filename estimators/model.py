@@ -292,6 +292,11 @@ class StateSpaceModel:
             return np.zeros(self.nx, np.int8)
         return np.array([state.circular for state in self.states], np.int8)
 
+    @property
+    def grid(self) -> Field | None:
+        """The field, if it has too many cells for each to have a chart; it is then drawn as pictures."""
+        return self.states if isinstance(self.states, Field) and self.nx > SHOWN else None
+
     @cached_property
     def shown(self) -> np.ndarray:
         """Indices of the states whose estimates a track keeps, a column each: all, or those that a field names."""

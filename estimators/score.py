@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from .diagnostics import PROBABILITY, nis_bounds
 from .log import READING, Readings, truth_of
 from .model import StateSpaceModel
+from .pictures import Picture
 from .quantiles import normal_quantile
 from .track import GATED, HELD_OUT, MISSING, USED, VERDICT_NAMES, Track
 
@@ -24,6 +26,7 @@ class Score(NamedTuple):
     """Mean NIS of the used readings with its 95 % bounds, their log-likelihood, counts, and fits.
 
     `states` are fits against the truth, by state; `held_out` fits of the readings of sensors held out, by sensor row.
+    `field` is that of all cells of a large field, over the times at which they were told; None without such.
     """
 
     nis: float
@@ -36,10 +39,14 @@ class Score(NamedTuple):
     missing: int
     states: dict[str, Fit]
     held_out: dict[str, Fit]
+    field: Fit | None = None
 
 
-def score(track: Track, events: Readings, model: StateSpaceModel) -> Score:
-    """Sum a track up. Errors are taken at the truth events, whose rows hold the estimate at that time."""
+def score(track: Track, events: Readings, model: StateSpaceModel, pictures: Sequence[Picture] = ()) -> Score:
+    """Sum a track up. Errors are taken at the truth events, whose rows hold the estimate at that time.
+
+    Of a large field the fold's `pictures` are summed up too; the track knows a few cells only.
+    """
     used = track.verdict == USED
     dof, count = int(track.dof[used].sum()), int(used.sum())
     low, high = nis_bounds(dof, count) if count else (np.nan, np.nan)
@@ -55,7 +62,17 @@ def score(track: Track, events: Readings, model: StateSpaceModel) -> Score:
         missing=int(verdicts[MISSING]),
         states=_against_truth(track, events, model),
         held_out=_held_out(track, events, model),
+        field=_over_field(pictures),
     )
+
+
+def _over_field(pictures: Sequence[Picture]) -> Fit | None:
+    told = [picture for picture in pictures if picture.cells]
+    if not told:
+        return None
+    cells = np.array([picture.cells for picture in told], float)
+    square = np.average([picture.rmse**2 for picture in told], weights=cells)
+    return Fit(float(np.sqrt(square)), float(np.average([picture.inside for picture in told], weights=cells)))
 
 
 def _against_truth(track: Track, events: Readings, model: StateSpaceModel) -> dict[str, Fit]:

@@ -15,6 +15,9 @@ from .model import StateSpaceModel
 
 _versions = count(1)
 
+TOGETHER = 8
+"""Rows of a sensor from which on they share one entry, `R.<sensor>`, in what a panel shows."""
+
 
 class Item(NamedTuple):
     """One entry of a tuning, as a panel shows it."""
@@ -57,17 +60,23 @@ class Tuning:
         )
 
     def items(self) -> list[Item]:
-        """Every numeric entry with its unit and range."""
+        """Every numeric entry with its unit and range; the many rows of one sensor are one entry, their mean."""
         model = self.model
-        rows = [row for sensor in model.sensors for row in sensor.rows]
         items = [
             Item(f"Q.{noise.name}", float(value), noise.unit, 0.0, np.inf)
             for noise, value in zip(model.noises, self.q, strict=True)
         ]
-        items += [
-            Item(f"R.{name}", float(value), _squared(row.unit), 0.0, np.inf)
-            for name, row, value in zip(model.row_names, rows, self.r, strict=True)
-        ]
+        for sensor, start in zip(model.sensors, model.row_start, strict=True):
+            own = slice(start, start + len(sensor.rows))
+            names, values, unit = model.row_names[own], self.r[own], _squared(sensor.rows[0].unit)
+            if len(values) >= TOGETHER and len({row.unit for row in sensor.rows}) == 1:
+                items.append(Item(f"R.{sensor.name}", _mean(values), unit, 0.0, np.inf))
+            else:
+                units = [_squared(row.unit) for row in sensor.rows]
+                items += [
+                    Item(f"R.{name}", float(value), unit, 0.0, np.inf)
+                    for name, value, unit in zip(names, values, units, strict=True)
+                ]
         items += [
             Item(f"p.{parameter.name}", float(value), parameter.unit, parameter.low, parameter.high)
             for parameter, value in zip(model.parameters, self.p, strict=True)
@@ -76,17 +85,19 @@ class Tuning:
 
     def keys(self) -> list[str]:
         """Every key that `set` takes."""
-        return [item.key for item in self.items()] + [f"use.{name}" for name in self.model.sensor_names] + ["gate"]
+        rows = [f"R.{name}" for name in self.model.row_names]
+        used = [f"use.{name}" for name in self.model.sensor_names]
+        return [*dict.fromkeys([item.key for item in self.items()] + rows), *used, "gate"]
 
     def get(self, key: str) -> float | bool | None:
         """The value under a key."""
         if key == "gate":
             return self.gate
         group, index = self._locate(key)
-        return bool(self.used[index]) if group == "used" else float(getattr(self, group)[index])
+        return bool(self.used[index]) if group == "used" else _mean(getattr(self, group)[index])
 
     def set(self, key: str, value: float | bool | None) -> Tuning:
-        """A new tuning with one entry changed.
+        """A new tuning with one entry changed; `R.<sensor>` is that of all rows of the sensor.
 
         Raises:
             ConfigError: If there is no such key, or the value breaks its rule.
@@ -124,7 +135,7 @@ class Tuning:
         """A new tuning with other estimator options."""
         return replace(self, options=dict(options), version=next(_versions))
 
-    def _locate(self, key: str) -> tuple[str, int]:
+    def _locate(self, key: str) -> tuple[str, Any]:
         model = self.model
         groups = {
             "Q": ("q", [noise.name for noise in model.noises]),
@@ -136,8 +147,17 @@ class Tuning:
         if prefix in groups and name in groups[prefix][1]:
             group, names = groups[prefix]
             return group, names.index(name)
+        if prefix == "R" and name in model.sensor_names:
+            k = model.sensor_names.index(name)
+            return "r", slice(model.row_start[k], model.row_start[k] + len(model.sensors[k].rows))
         near = get_close_matches(key, self.keys(), n=3, cutoff=0.4)
         raise ConfigError(f"{key} is no tuning key of {model.name}; near: {', '.join(near or self.keys())}")
+
+
+def _mean(values: Any) -> float:
+    """Their mean; exactly the value that they share."""
+    first = np.ravel(values)[0]
+    return float(first if np.all(values == first) else np.mean(values))
 
 
 def _squared(unit: str) -> str:

@@ -38,7 +38,7 @@ class Simulator:
     y = h(x, u, p) + v with v ~ N(0, R) for each sensor that is due, drawn even if the reading is lost, so that a loss
     does not change what follows. Its first event is a tick at time zero, where the estimator's prior holds; then, after
     every step: the inputs if they changed, the readings, and the true states that a track shows, in blocks of the log's
-    width.
+    width; or, every `truth_every` steps, all states.
     """
 
     live = False
@@ -57,6 +57,7 @@ class Simulator:
         inputs: Mapping[str, Profile] | None = None,
         sensors: Mapping[str, SensorPlan] | None = None,
         faults: Sequence[Fault] = (),
+        truth_every: int | None = None,
     ) -> None:
         """Set the asset up.
 
@@ -72,6 +73,7 @@ class Simulator:
             inputs: Profiles by name; the others keep their default.
             sensors: Plans by name; a sensor without one speaks at every step.
             faults: Of sensors, applied in this order.
+            truth_every: Steps between two tellings of all states of a large field; None for never.
 
         Raises:
             SourceError: If a duration or step is not positive, or a fault does not fit the sensors.
@@ -108,6 +110,8 @@ class Simulator:
         self._rng = np.random.default_rng(seed)
         self._factor: tuple[bytes, np.ndarray] | None = None
         self._told = _runs(model.shown, model.width)
+        self._all_every = truth_every
+        self._all = _runs(np.arange(model.nx), model.width) if truth_every is not None else []
         self._k = 0
         self._u = self._inputs(0.0)
         self._begun = False
@@ -170,7 +174,8 @@ class Simulator:
             lost = plan.drop_every is not None and self._spoken[i] % plan.drop_every == plan.drop_every - 1
             self._spoken[i] += 1
             rows.append((t, READING, i, np.full(y.size, np.nan) if lost else y))
-        rows += [(t, TRUTH, first, self._x[first:end].copy()) for first, end in self._told]
+        told = self._all if self._all_every is not None and self._k % self._all_every == 0 else self._told
+        rows += [(t, TRUTH, first, self._x[first:end].copy()) for first, end in told]
 
     def _jump(self, dt: float) -> None:
         """Draw the next mode as the model says."""

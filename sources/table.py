@@ -1,4 +1,4 @@
-"""Tables (CSV, Parquet, MATLAB) as recordings: each row is what was known at one time."""
+"""Tables (CSV, Parquet, MATLAB, NumPy) as recordings: each row is what was known at one time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The columns of CSV, Parquet and MATLAB files, a few thousand rows at a time."""
+"""The columns of CSV, Parquet, MATLAB and NumPy files, a few thousand rows at a time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Problem = Callable[[str, int, str], None]
 class Chunk(NamedTuple):
     """Rows of a table: the raw time column, and the values (n, columns) with masks of what is blank.
 
-    `line` is the line (CSV) or row (Parquet, MATLAB) of each, counted from 1.
+    `line` is the line (CSV) or row (of the others) of each, counted from 1.
     """
 
     line: np.ndarray
@@ -60,6 +60,10 @@ def column_names(path: Path) -> list[str]:
         from .table_mat import mat_names
 
         return mat_names(path)
+    if is_npz(path):
+        from .table_npz import npz_names
+
+        return npz_names(path)
     return parquet_names(path) if is_parquet(path) else _header(path)[0]
 
 
@@ -69,12 +73,21 @@ def read_table(path: Path, time: str, columns: Sequence[str], problem: Problem) 
         from .table_mat import read_mat
 
         return read_mat(path, time, columns, problem)
+    if is_npz(path):
+        from .table_npz import read_npz
+
+        return read_npz(path, time, columns, problem)
     return (read_parquet if is_parquet(path) else read_csv)(path, time, columns, problem)
 
 
 def is_mat(path: Path) -> bool:
     """Whether the name says that it is a MATLAB file."""
     return path.suffix.lower() == ".mat"
+
+
+def is_npz(path: Path) -> bool:
+    """Whether the name says that it is a NumPy archive."""
+    return path.suffix.lower() == ".npz"
 
 
 def is_parquet(path: Path) -> bool:

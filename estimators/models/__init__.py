@@ -6,12 +6,13 @@ from ..model import StateSpaceModel
 from .agv_corridor import AGV_CORRIDOR
 from .battery_cell import BATTERY_CELL
 from .battery_pack import BATTERY_PACK
+from .field_era5 import FIELD_ERA5
 from .lorenz63 import LORENZ63
 from .lorenz96 import LORENZ96
 from .motor_drive import MOTOR_DRIVE
 from .motor_winding import MOTOR_WINDING
 from .road_car import ROAD_CAR
-from .thermal_field import THERMAL_FIELD
+from .thermal_field import THERMAL_FIELD, THERMAL_FIELD_LARGE
 from .uwb_rover import UWB_ROVER
 
 MODELS: dict[str, StateSpaceModel] = {
@@ -25,6 +26,8 @@ MODELS: dict[str, StateSpaceModel] = {
         LORENZ63,
         LORENZ96,
         THERMAL_FIELD,
+        THERMAL_FIELD_LARGE,
+        FIELD_ERA5,
         AGV_CORRIDOR,
         UWB_ROVER,
     )

@@ -56,7 +56,7 @@ def conduct(T, rows, columns, u, p, dt, out):
             out[i * columns + j] += dt * heating * np.exp(-0.5 * square / (width * width))
 
 
-def thermal_field(rows: int = 200, columns: int = 200, sensors: int = 10) -> StateSpaceModel:
+def thermal_field(rows: int = 200, columns: int = 200, sensors: int = 10, name: str = "") -> StateSpaceModel:
     """The model on a grid of rows × columns, with sensors × sensors thermocouples evenly spread.
 
     `rows` and `columns` from 2 on; `sensors` no more than either.
@@ -74,7 +74,7 @@ def thermal_field(rows: int = 200, columns: int = 200, sensors: int = 10) -> Sta
             out[k] = T[flat[k]]
 
     return StateSpaceModel(
-        name="thermal_field" if (rows, columns) == (200, 200) else f"thermal_field_{rows}x{columns}",
+        name=name or f"thermal_field_{rows}x{columns}",
         title=f"Heated plate, {rows} × {columns} cells",
         states=Field("temperature", "°C", (rows, columns), spacing=SPACING, mean=20.0, std=1.0),
         inputs=(
@@ -103,4 +103,5 @@ def thermal_field(rows: int = 200, columns: int = 200, sensors: int = 10) -> Sta
     )
 
 
-THERMAL_FIELD = thermal_field()
+THERMAL_FIELD = thermal_field(name="thermal_field")
+THERMAL_FIELD_LARGE = thermal_field(1000, 1000, name="thermal_field_large")

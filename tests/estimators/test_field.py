@@ -39,17 +39,17 @@ def test_a_track_shows_all_of_a_small_model_and_probes_of_a_large_one():
     assert "temperature[49,49]" in model.state_names and "temperature[50,0]" not in model.state_names
 
 
-@pytest.mark.parametrize(("rows", "columns", "keep"), [(5, 7, 0.6), (1, 9, 0.9), (4, 1, 0.2)])
-def test_smoothed_noise_has_the_correlation_it_says(rows, columns, keep):
+@pytest.mark.parametrize(("rows", "columns", "down", "across"), [(5, 7, 0.6, 0.3), (1, 9, 0.5, 0.9), (4, 1, 0.2, 0.7)])
+def test_smoothed_noise_has_the_correlation_it_says(rows, columns, down, across):
     """L from the unit vectors; L Lᵀ against the formula, at the edges too."""
     n = rows * columns
     L = np.empty((n, n))
     for k, unit in enumerate(np.eye(n)):
         out = np.empty(n)
-        smooth(unit, rows, columns, keep, out)
+        smooth(unit, rows, columns, down, across, out)
         L[:, k] = out
     i, j = np.divmod(np.arange(n), columns)
-    expected = keep ** (np.abs(i[:, None] - i) + np.abs(j[:, None] - j))
+    expected = down ** np.abs(i[:, None] - i) * across ** np.abs(j[:, None] - j)
     np.testing.assert_allclose(L @ L.T, expected, rtol=0, atol=1e-13)
 
 
