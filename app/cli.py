@@ -83,6 +83,8 @@ class Compare:
     """Take only so many seconds of the source."""
     logs: int = 1
     """So many logs of a simulated twin, with seeds from its own on; figures are mean ± standard deviation over them."""
+    budget: float = 20.0
+    """Seconds of one processor for the folds of one filter; a slower one folds a shorter span, which its row states."""
     jobs: int | None = None
     """Processes; default: one a processor."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False

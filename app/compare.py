@@ -23,7 +23,7 @@ from estimators.log import Readings
 from estimators.registry import ESTIMATORS, find_estimator, unfit
 
 from .cli import settings
-from .compare_fold import Row, fold_row
+from .compare_fold import BUDGET, Row, fold_row
 from .compare_table import caption, table, write_table
 from .compile import prepare
 from .fold import read_log
@@ -70,7 +70,7 @@ def _compare(arguments: Arguments, name: str) -> None:
     rows = []
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(f"{twin.name}: {len(names)} filters over {len(logs[0])} events", total=len(names))
-        for row in compare(name, overrides, names, logs, arguments.jobs):
+        for row in compare(name, overrides, names, logs, arguments.jobs, arguments.budget):
             rows.append(row)
             progress.advance(task)
     rows.sort(key=lambda row: names.index(row.estimator))
@@ -121,7 +121,12 @@ def _chosen(twin: Twin, wanted: Sequence[str]) -> list[str]:
 
 
 def compare(
-    twin: str, overrides: Mapping[str, str], names: Sequence[str], logs: Sequence[Readings], jobs: int | None = None
+    twin: str,
+    overrides: Mapping[str, str],
+    names: Sequence[str],
+    logs: Sequence[Readings],
+    jobs: int | None = None,
+    budget: float = BUDGET,
 ) -> Iterator[Row]:
     """Fold each filter over the logs, in processes of their own; rows come as they are done.
 
@@ -131,6 +136,7 @@ def compare(
         names: Of the filters.
         logs: The events; see `fold_row`.
         jobs: Processes; None for one a processor.
+        budget: Seconds for a filter; see `fold_row`.
     """
     jobs = min(len(names), jobs or os.cpu_count() or 1)
     if jobs == 1:
@@ -138,7 +144,7 @@ def compare(
         threads = numba.get_num_threads()
         numba.set_num_threads(1)
         try:
-            yield from (fold_row(ready, name, logs) for name in names)
+            yield from (fold_row(ready, name, logs, budget) for name in names)
         finally:
             numba.set_num_threads(threads)
         return
@@ -147,7 +153,7 @@ def compare(
     given = (twin, dict(overrides), [tuple(log) for log in logs])
     with ProcessPoolExecutor(jobs, mp_context=context, initializer=_share, initargs=given) as pool:
         # The filters behind in the catalogue are the slow ones.
-        futures = [pool.submit(_fold, name) for name in reversed(names)]
+        futures = [pool.submit(_fold, name, budget) for name in reversed(names)]
         for future in as_completed(futures):
             yield future.result()
 
@@ -158,5 +164,5 @@ def _share(name: str, overrides: dict[str, str], logs: list[tuple[np.ndarray, ..
     numba.set_num_threads(1)  # the processors have a filter each, and a step costs what it costs one
 
 
-def _fold(estimator: str) -> Row:
-    return fold_row(_shared["twin"], estimator, _shared["logs"])
+def _fold(estimator: str, budget: float) -> Row:
+    return fold_row(_shared["twin"], estimator, _shared["logs"], budget)

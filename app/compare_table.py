@@ -72,7 +72,7 @@ def notes(row: Row) -> str:
     said = []
     if row.diverged:
         seeds = f"in {row.diverged} of {row.seeds} " if row.seeds > 1 else ""
-        said.append(f"diverged {seeds}at {row.since:.3g} s, {100 * row.lost:.2g} % of events")
+        said.append(f"diverged {seeds}at {row.since:.4g} s, {100 * row.lost:.2g} % of events")
     if row.span is not None:
         said.append(f"first {row.span:g} s")
     said += [f"{name} {value:g}" for name, value in row.options.items()]

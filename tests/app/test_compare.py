@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import app.compare
-import app.compare_fold
 from app.cli import main
 from app.compare_fold import Figure, Row, fold_row, refold, tidy, within
 from app.compare_table import Cell, read_cell, read_span, read_table, table, write_table
@@ -117,12 +116,11 @@ def test_logs_of_other_seeds_are_those_of_the_simulator(capsys):
     assert "is not simulated" in capsys.readouterr().err
 
 
-def test_a_slow_filter_folds_a_stated_span(monkeypatch):
+def test_a_slow_filter_folds_a_stated_span():
     """A budget of 60 ms is 60 to 600 steps of FilterPy's, and the log of three minutes has 12,953."""
-    monkeypatch.setattr(app.compare_fold, "BUDGET", 0.06)
     twin = load_twin("motor_can")
     events = read_log(twin, None)[0].readings
-    row = fold_row(twin, "filterpy-ekf", [events])
+    row = fold_row(twin, "filterpy-ekf", [events], budget=0.06)
     assert row.span is not None and 0.1 < row.span < 100
     first = within(events, row.span)
     assert first.t[-1] <= events.t[0] + row.span * 1e9 < events.t[len(first)]
