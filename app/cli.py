@@ -65,10 +65,14 @@ class Fold:
 
 @dataclass(frozen=True)
 class Compare:
-    """Fold every filter that applies over the same log, in parallel, and print what each estimate was worth."""
+    """Fold every filter that applies over the same log, in parallel, and print what each estimate was worth.
+
+    A filter that draws its members folds eight times, with another seed each; its figures are mean ± standard
+    deviation of one fold. A step is one event of the log; its cost is that of one processor.
+    """
 
     twin: Twin
-    """Name of a twin that ships, or path of a YAML file."""
+    """Name of a twin that ships, path of a YAML file, or `all`: each that ships."""
     estimators: tuple[str, ...] = ()
     """Only these filters."""
     set: Settings = ()
@@ -77,6 +81,10 @@ class Compare:
     """Recordings in place of the twin's own."""
     duration: float | None = None
     """Take only so many seconds of the source."""
+    logs: int = 1
+    """So many logs of a simulated twin, with seeds from its own on; figures are mean ± standard deviation over them."""
+    budget: float = 20.0
+    """Seconds of one processor for the folds of one filter; a slower one folds a shorter span, which its row states."""
     jobs: int | None = None
     """Processes; default: one a processor."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False

@@ -5,27 +5,26 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
-import re
-import time
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+import numba
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from estimators.diagnostics import HealthPolicy
-from estimators.errors import ConfigError, NisusError
-from estimators.fold import Fold
-from estimators.log import Log, Readings
-from estimators.model import StateSpaceModel
+from config.loader import shipped
+from config.source_schema import SimulatorSection
+from estimators.errors import ConfigError, SourceError
+from estimators.log import Readings
 from estimators.registry import ESTIMATORS, find_estimator, unfit
-from estimators.score import Fit, Score, score
 
 from .cli import settings
+from .compare_fold import BUDGET, Row, fold_row
+from .compare_table import caption, table, write_table
 from .compile import prepare
 from .fold import read_log
 from .twin import Twin, load_twin
@@ -33,61 +32,83 @@ from .twin import Twin, load_twin
 if TYPE_CHECKING:
     from .cli import Compare as Arguments
 
-BEGIN, END = "# nisus compare", "# end of nisus compare"
-"""Lines around the table in a YAML's head."""
+ALL = "all"
+"""In place of a twin's name: each that ships."""
 
-ENOUGH = 0.2
-"""Seconds that a fold is timed for."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """What one filter made of the log.
-
-    `rmse` by unit: the root mean square over the states of that unit whose truth is known, or, where no truth is,
-    over the sensors held out. `coverage` is the share of those errors inside their 95 % band. `failure` says why
-    there are no numbers.
-    """
-
-    estimator: str
-    rmse: dict[str, float]
-    nis: float
-    nis_low: float
-    nis_high: float
-    coverage: float
-    seconds_per_event: float
-    failure: str = ""
+_shared: dict[str, Any] = {}
+"""Of a process that folds: the twin and the logs, which every filter takes."""
 
 
 def compare_twin(arguments: Arguments) -> int:
     """Carry the command out."""
-    twin = load_twin(arguments.twin, log_files=arguments.log or None, overrides=settings(arguments.set))
+    if arguments.twin != ALL:
+        _compare(arguments, arguments.twin)
+        return 0
+    failed = 0
+    for name in shipped():
+        try:
+            _compare(arguments, name)
+        except SourceError as error:  # a recording that is not there
+            print(f"nisus: {error}", file=sys.stderr)
+            failed = 2
+    return failed
+
+
+def _compare(arguments: Arguments, name: str) -> None:
+    overrides = settings(arguments.set)
+    twin = load_twin(name, log_files=arguments.log or None, overrides=overrides)
+    changed = arguments.estimators or arguments.set or arguments.log or arguments.duration or arguments.logs > 1
+    if arguments.write and changed:
+        raise ConfigError(
+            "--write: a twin's table is that of all its filters over its own log; leave the other options out"
+        )
+    if arguments.logs < 1:
+        raise ConfigError(f"--logs {arguments.logs}: must be 1 or more")
     names = _chosen(twin, arguments.estimators)
     prepare(twin)
-    log, _ = read_log(twin, arguments.duration)
+    logs = _logs(twin, overrides, arguments)
     rows = []
     with Progress(console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(f"{len(names)} filters over {log.n} events", total=len(names))
-        for row in compare(arguments.twin, settings(arguments.set), names, log.readings, arguments.jobs):
+        task = progress.add_task(f"{twin.name}: {len(names)} filters over {len(logs[0])} events", total=len(names))
+        for row in compare(name, overrides, names, logs, arguments.jobs, arguments.budget):
             rows.append(row)
             progress.advance(task)
     rows.sort(key=lambda row: names.index(row.estimator))
+    seconds = float(logs[0].t[-1] - logs[0].t[0]) * 1e-9
+    lines = [caption(twin.path.stem, rows, len(logs[0]), seconds, len(logs)), *table(rows)]
     if arguments.json:
         print(json.dumps([_plain(row) for row in rows]))
     else:
-        print("\n".join(table(rows)))
+        print("\n".join(lines))
     if arguments.write:
-        write_table(twin.path, rows)
-    return 0
+        write_table(twin.path, lines)
+
+
+def _logs(twin: Twin, overrides: Mapping[str, str], arguments: Arguments) -> list[Readings]:
+    """The twin's log, or several of its simulator, whose seeds count up from the twin's own."""
+    if arguments.logs == 1:
+        return [read_log(twin, arguments.duration)[0].readings]
+    source = twin.config.source
+    if not isinstance(source, SimulatorSection):
+        raise ConfigError(f"--logs {arguments.logs}: {twin.name} is not simulated; there is one log of it")
+    seeds = range(source.seed, source.seed + arguments.logs)
+    twins = (load_twin(arguments.twin, overrides={**overrides, "source.seed": str(seed)}) for seed in seeds)
+    return [read_log(other, arguments.duration)[0].readings for other in twins]
 
 
 def _plain(row: Row) -> dict[str, Any]:
-    def number(value: Any) -> Any:
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: plain(entry) for name, entry in value.items()}
+        if isinstance(value, (tuple, list)):
+            return [plain(entry) for entry in value]
         return None if isinstance(value, float) and not np.isfinite(value) else value
 
-    values = asdict(row)
-    values["rmse"] = {unit: number(value) for unit, value in row.rmse.items()}
-    return {name: number(value) for name, value in values.items()}
+    figures = {"rmse": {unit: figure.value for unit, figure in row.rmse.items()}}
+    spreads = {"rmse": {unit: figure.spread for unit, figure in row.rmse.items()}}
+    for name in ("nis", "coverage"):
+        figures[name], spreads[name] = getattr(row, name)
+    return plain({**asdict(row), **figures, "spread": spreads})  # type: ignore[no-any-return]
 
 
 def _chosen(twin: Twin, wanted: Sequence[str]) -> list[str]:
@@ -100,122 +121,48 @@ def _chosen(twin: Twin, wanted: Sequence[str]) -> list[str]:
 
 
 def compare(
-    twin: str, overrides: dict[str, str], names: Sequence[str], events: Readings, jobs: int | None = None
+    twin: str,
+    overrides: Mapping[str, str],
+    names: Sequence[str],
+    logs: Sequence[Readings],
+    jobs: int | None = None,
+    budget: float = BUDGET,
 ) -> Iterator[Row]:
-    """Fold each filter over the events, in processes of their own; rows come as they are done.
+    """Fold each filter over the logs, in processes of their own; rows come as they are done.
 
     Args:
         twin: Name or path.
         overrides: See `load_twin`.
         names: Of the filters.
-        events: The log's.
+        logs: The events; see `fold_row`.
         jobs: Processes; None for one a processor.
+        budget: Seconds for a filter; see `fold_row`.
     """
     jobs = min(len(names), jobs or os.cpu_count() or 1)
+    if jobs == 1:
+        ready = load_twin(twin, overrides=overrides)
+        threads = numba.get_num_threads()
+        numba.set_num_threads(1)
+        try:
+            yield from (fold_row(ready, name, logs, budget) for name in names)
+        finally:
+            numba.set_num_threads(threads)
+        return
     # Spawned: the libraries that the filters' threads come from do not survive a fork.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context) as pool:
-        futures = [pool.submit(fold_one, twin, overrides, name, tuple(events)) for name in names]
+    given = (twin, dict(overrides), [tuple(log) for log in logs])
+    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_share, initargs=given) as pool:
+        # The filters behind in the catalogue are the slow ones.
+        futures = [pool.submit(_fold, name, budget) for name in reversed(names)]
         for future in as_completed(futures):
             yield future.result()
 
 
-def fold_one(name_or_path: str, overrides: dict[str, str], estimator: str, columns: tuple[np.ndarray, ...]) -> Row:
-    """Fold one filter over events that are given as columns."""
-    twin = load_twin(name_or_path, overrides=overrides)
-    events = Readings(*columns)
-    log = Log(twin.model.width, max(1, len(events)))
-    log.extend(events)
-    section = twin.config.time
-    policy = HealthPolicy(degraded_after=section.degraded_after, stale_after=section.stale_after)
-    tuning = twin.tuning.with_options(twin.options_of(estimator))
-    try:
-        fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=policy)
-        seconds = _timed(fold) / log.n
-        fold.finish()
-    except NisusError as error:
-        return Row(estimator, {}, np.nan, np.nan, np.nan, np.nan, np.nan, str(error))
-    pictures = fold.pictures.taken if fold.pictures is not None else ()
-    return row_of(estimator, score(fold.track, log.readings, twin.model, pictures), twin.model, seconds)
+def _share(name: str, overrides: dict[str, str], logs: list[tuple[np.ndarray, ...]]) -> None:
+    _shared["twin"] = load_twin(name, overrides=overrides)
+    _shared["logs"] = [Readings(*columns) for columns in logs]
+    numba.set_num_threads(1)  # the processors have a filter each, and a step costs what it costs one
 
 
-def _timed(fold: Fold) -> float:
-    """Fold everything; a short one again and again, as other work disturbs it. The shortest time, s."""
-    begun = time.perf_counter()
-    fold.advance()
-    took = [time.perf_counter() - begun]
-    while sum(took) < ENOUGH:
-        fold.rewind(0)
-        begun = time.perf_counter()
-        fold.advance()
-        took.append(time.perf_counter() - begun)
-    return min(took)
-
-
-def row_of(estimator: str, result: Score, model: StateSpaceModel, seconds: float) -> Row:
-    """A score as a row of the table."""
-    fits, units = result.states, {state.name: state.unit for state in model.shown_states}
-    if result.field is not None and model.grid is not None:
-        fits, units = {model.grid.name: result.field}, {model.grid.name: model.grid.unit}
-    if not fits:
-        fits = result.held_out
-        row_units = [row.unit for sensor in model.sensors for row in sensor.rows]
-        units = dict(zip(model.row_names, row_units, strict=True))
-    groups: dict[str, list[Fit]] = {}
-    for name, fit in fits.items():
-        groups.setdefault(units[name], []).append(fit)
-    return Row(
-        estimator,
-        {unit: float(np.sqrt(np.mean([fit.rmse**2 for fit in group]))) for unit, group in groups.items()},
-        result.nis,
-        result.nis_low,
-        result.nis_high,
-        float(np.mean([fit.coverage for fit in fits.values()])) if fits else np.nan,
-        seconds,
-        "" if np.isfinite(result.nis) else "diverged",
-    )
-
-
-def table(rows: Sequence[Row]) -> list[str]:
-    """The rows as lines of text: filter, RMSE by unit, mean NIS with its 95 % bounds, coverage, cost."""
-    units = list(dict.fromkeys(unit for row in rows for unit in row.rmse))
-    head = ["filter", *(f"RMSE [{unit}]" for unit in units), "mean NIS", "95 % bounds", "in band", "µs/event"]
-    cells = [head]
-    for row in rows:
-        if row.failure:
-            cells.append([row.estimator, row.failure])
-            continue
-        cells.append(
-            [
-                row.estimator,
-                *(f"{row.rmse[unit]:.4g}" if unit in row.rmse else "" for unit in units),
-                f"{row.nis:.3f}",
-                f"{row.nis_low:.3f} - {row.nis_high:.3f}",
-                f"{100 * row.coverage:.1f} %" if np.isfinite(row.coverage) else "",
-                f"{1e6 * row.seconds_per_event:.3g}",
-            ]
-        )
-    widths = [max(len(line[k]) for line in cells if k < len(line) and len(line) > 2) for k in range(len(head))]
-    return ["  ".join(f"{cell:<{widths[k]}}" for k, cell in enumerate(line)).rstrip() for line in cells]
-
-
-def write_table(path: Path, rows: Sequence[Row]) -> None:
-    """Put the table into the head of a YAML, in place of the one that is there.
-
-    Raises:
-        ConfigError: If the file cannot be written.
-    """
-    block = "\n".join([f"{BEGIN} {path.stem}", *(f"# {line}" for line in table(rows)), END]) + "\n"
-    try:
-        text = path.read_text(encoding="utf-8")
-        old = re.compile(rf"^{BEGIN}.*?^{END}\n", re.MULTILINE | re.DOTALL)
-        path.write_text(old.sub(lambda _: block, text, count=1) if old.search(text) else block + text, encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; the table cannot be written") from None
-
-
-def read_table(text: str) -> dict[str, list[str]]:
-    """The cells of the table in a YAML's head, by filter; empty if there is none."""
-    found = re.search(rf"^{BEGIN}.*?\n(.*?)^{END}$", text, re.MULTILINE | re.DOTALL)
-    lines = [line.removeprefix("# ") for line in found[1].splitlines()] if found else []
-    return {cells[0]: cells[1:] for cells in (re.split(r"\s{2,}", line) for line in lines[1:])}
+def _fold(estimator: str, budget: float) -> Row:
+    return fold_row(_shared["twin"], estimator, _shared["logs"], budget)

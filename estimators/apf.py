@@ -99,6 +99,7 @@ APF = Estimator(
     fails_when="the predictive density, linearised, misjudges which particles will explain the reading",
     source="Pitt & Shephard (1999), doi:10.1080/01621459.1999.10474153",
     functions=(start, predict, update, describe),
+    runs=lambda options, nx: 2 * options["particles"],
     state_size=sized(lambda nx: nx + nx * nx),
     work_size=work_size,
     moments=moments,

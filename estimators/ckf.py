@@ -38,6 +38,7 @@ CKF = Estimator(
     fails_when="the points, √nx standard deviations out, leave where the model holds; or several peaks",
     source="Arasaratnam & Haykin (2009), doi:10.1109/TAC.2009.2019800",
     functions=(start, predict, update, describe),
+    runs=lambda options, nx: 2 * nx + 1,
     state_size=state_size,
     work_size=work_size,
     moments=moments,

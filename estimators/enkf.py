@@ -148,6 +148,7 @@ ENKF = Estimator(
     fails_when="few members: chance covariances, and the chance of the perturbations; the spread collapses",
     source="Burgers, van Leeuwen & Evensen (1998), doi:10.1175/1520-0493(1998)126<1719:ASITEK>2.0.CO;2",
     functions=(start, predict, update, describe),
+    runs=lambda options, nx: options["members"],
     state_size=state_size,
     work_size=work_size,
     moments=moments,

@@ -113,6 +113,7 @@ ENSRF = Estimator(
     fails_when="few members of many states without a radius: chance covariances; the spread collapses",
     source="Whitaker & Hamill (2002), doi:10.1175/1520-0493(2002)130<1913:EDAWPO>2.0.CO;2",
     functions=(start, predict, update, describe),
+    runs=lambda options, nx: options["members"],
     state_size=state_size,
     work_size=work_size,
     moments=moments,

@@ -221,6 +221,7 @@ ETKF = Estimator(
     fails_when="few members of many states: chance covariances move what the reading knows nothing of",
     source="Hunt, Kostelich & Szunyogh (2007), doi:10.1016/j.physd.2006.11.008",
     functions=(start, predict, update, describe),
+    runs=lambda options, nx: options["members"],
     state_size=state_size,
     work_size=work_size,
     moments=moments,

@@ -108,6 +108,7 @@ IEKF = Estimator(
     fails_when="Gauss-Newton overshoots or two peaks fit; f's curvature makes it overconfident like the EKF",
     source="Bell & Cathey (1993), doi:10.1109/9.250476",
     functions=(start, predict, update, describe),
+    runs=lambda options, nx: nx + 1,
     state_size=state_size,
     work_size=work_size,
     moments=moments,

@@ -202,6 +202,7 @@ LETKF = Estimator(
     fails_when="radius too long for the members (chance covariances) or too short for the physics",
     source="Hunt, Kostelich & Szunyogh (2007), doi:10.1016/j.physd.2006.11.008",
     functions=(start, predict, update, describe),
+    runs=lambda options, nx: options["members"],
     state_size=state_size,
     work_size=work_size,
     moments=moments,

@@ -85,6 +85,7 @@ PF_EKF = Estimator(
     fails_when="the EKF's posterior of a particle misses where the reading puts it",
     source="van der Merwe, Doucet, de Freitas & Wan (2000), The unscented particle filter",
     functions=(start, predict, update, describe),
+    runs=lambda options, nx: 3 * options["particles"],
     state_size=sized(lambda nx: nx + nx * nx),
     work_size=work_size,
     moments=moments,

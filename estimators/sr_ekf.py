@@ -87,6 +87,7 @@ SR_EKF = Estimator(
     fails_when="curvature makes it overconfident: it stops listening to the sensors",
     source="Kailath, Sayed & Hassibi (2000), Linear Estimation, chapter 12",
     functions=(start, predict, update, describe),
+    runs=lambda options, nx: nx + 1,
     state_size=state_size,
     work_size=work_size,
     moments=moments,

@@ -121,6 +121,7 @@ SR_UKF = Estimator(
     fails_when="a negative central weight outweighs the others, or the posterior has several peaks",
     source="van der Merwe & Wan (2001), doi:10.1109/ICASSP.2001.940586",
     functions=(start, predict, update, describe),
+    runs=lambda options, nx: 2 * nx + 1,
     state_size=state_size,
     work_size=work_size,
     moments=moments,

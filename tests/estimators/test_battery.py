@@ -1,15 +1,18 @@
 """The battery models: the circuit against an integrator and SciPy's PCHIP, and what the twins make of their logs."""
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import PchipInterpolator
 
 from app.fold import read_log
-from app.twin import load_twin
+from app.twin import Twin, load_twin
 from estimators.compiled import compile_model
 from estimators.errors import SourceError
 from estimators.fold import fold
+from estimators.log import Log
 from estimators.models.battery_cell import BATTERY_CELL, NODES, open_circuit
 from estimators.models.battery_pack import BATTERY_PACK, CELLS
 from estimators.score import Score, score
@@ -52,7 +55,9 @@ def test_the_pack_follows_its_differential_equation() -> None:
     rng = np.random.default_rng(4)
     start = np.concatenate([rng.uniform(0.5, 0.95, CELLS), rng.normal(0, 0.02, CELLS), rng.uniform(15, 40, CELLS)])
     f, u = compile_model(BATTERY_PACK).f, np.array([6.0, 22.0])
-    exact = solve_ivp(flows, (0, 300), start, args=(*u, values, capacity, r0), rtol=1e-10, atol=1e-12).y[:, -1]
+    exact = solve_ivp(
+        flows, (0, 300), start, args=(*u, values, capacity, r0), method="DOP853", rtol=1e-10, atol=1e-12
+    ).y[:, -1]
 
     def after(dt: float) -> np.ndarray:
         x, out = start.reshape(3, -1).T.ravel().copy(), np.empty(24)
@@ -137,14 +142,19 @@ def test_slopes_match_complex_step_from_below_empty_to_above_full(model, soc: fl
         np.testing.assert_allclose(own, exact, rtol=1e-11, atol=1e-13)
 
 
-def scored(name: str, estimator: str) -> Score:
+@lru_cache(maxsize=1)
+def recorded(name: str) -> tuple[Twin, Log]:
     twin = load_twin(name)
     try:
-        log, _ = read_log(twin, None)
+        return twin, read_log(twin, None)[0]
     except SourceError as error:
         if "is not there" in str(error):
             absent(str(error))
         raise
+
+
+def scored(name: str, estimator: str) -> Score:
+    twin, log = recorded(name)
     track = fold(estimator, twin.model, twin.tuning, log)
     return score(track, log.readings, twin.model)
 
