@@ -1,4 +1,8 @@
-"""The scene of a twin that moves on a plane: vehicle, its track, position readings, truth, and the 2σ ellipse."""
+"""The scene of a twin that moves on a plane: vehicle, track, walls, position readings, truth, particles, 2σ ellipse.
+
+An estimate with several peaks has its vehicle at the heaviest one, and a dot with its weight at each: at the mean
+between them is nobody.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +20,7 @@ from .viser_geometry import about_z, circle, disc, ellipsoid, segments
 from .viser_history import History
 
 TRAIL = 600
+MODES = 4
 POINTS = 1500
 SOFTNESS = 0.3
 """Part of the way to the vehicle that the view moves in one frame."""
@@ -63,6 +68,19 @@ class VehicleScene:
             receive_shadow=False,
         )  # fmt: skip
         self._rim = api.add_line_segments("/world/rim", circle(), (37, 99, 235), thickness=2, **line)
+        walls = [segments(np.array([(*corner, 0.3) for corner in line])) for line in scene.walls]
+        if walls:
+            api.add_line_segments("/world/walls", np.concatenate(walls), (71, 85, 105), thickness=3, **line)
+        dot = {"point_shape": "circle", "precision": "float32", "point_shading": "flat", "visible": False}
+        one = np.zeros((1, 3), np.float32)
+        self._cloud = api.add_point_cloud("/world/cloud", one, (124, 58, 237), point_size=0.15, **dot)
+        self._modes = [
+            (
+                api.add_point_cloud(f"/world/modes/{k}/mean", one, (190, 24, 93), point_size=0.6, **dot),
+                api.add_label(f"/world/modes/{k}/weight", " ", visible=False, anchor="bottom-left"),
+            )
+            for k in range(MODES)
+        ]
         self._vehicle = api.add_frame("/world/vehicle", show_axes=False)
         api.add_box("/world/vehicle/body", (30, 64, 175), (4.4, 1.8, 0.7), position=(0, 0, 0.65), cast_shadow=False)
         api.add_box(
@@ -85,7 +103,9 @@ class VehicleScene:
         """Send where everything is now."""
         if not history.n or not np.isfinite(belief.mean[[self.east, self.north]]).all():
             return
-        here = belief.mean[[self.east, self.north]]
+        # A mean between two peaks is nowhere.
+        peak = belief.modes[0] if len(belief.modes) > 1 else belief
+        here = peak.mean[[self.east, self.north]]
         if self._anchor is None or np.linalg.norm(here - self._anchor) > 200.0:
             self._anchor = here.copy()
         if self.follow:
@@ -98,10 +118,11 @@ class VehicleScene:
         self._trail.points = segments(self._plane(mean[:, self.east], mean[:, self.north], 0.06))
         self._draw_truth(history)
         self._draw_readings(history)
+        self._draw_cloud(belief)
         self._vehicle.position = (*here, 0.0)
-        self._vehicle.wxyz = about_z(self._direction(belief, mean))
+        self._vehicle.wxyz = about_z(self._direction(peak, mean))
         cov = np.zeros((3, 3))
-        cov[:2, :2] = belief.cov[np.ix_([self.east, self.north], [self.east, self.north])]
+        cov[:2, :2] = peak.cov[np.ix_([self.east, self.north], [self.east, self.north])]
         cov[2, 2] = 2 * cov.max() + 1.0  # the largest, so that the ellipse is the first two axes
         if np.isfinite(cov).all():
             axes, turn = ellipsoid(cov)
@@ -132,9 +153,27 @@ class VehicleScene:
         if len(points):
             self._readings.points = points
 
-    def _direction(self, belief: Any, mean: np.ndarray) -> float:
+    def _draw_cloud(self, belief: Any) -> None:
+        """The points that stand for the belief, and a dot with its weight at each peak, where there are several."""
+        plane = [self.east, self.north]
+        points = belief.points[:, plane] if len(belief.points) else np.zeros((0, 2))
+        points = points[np.isfinite(points).all(axis=1)]
+        self._cloud.visible = bool(len(points))
+        if len(points):
+            self._cloud.points = np.column_stack((points, np.full(len(points), 0.2))).astype(np.float32)
+        several = belief.modes if len(belief.modes) > 1 else ()
+        for k, (dot, label) in enumerate(self._modes):
+            shown = k < len(several) and bool(np.isfinite(several[k].mean[plane]).all())
+            if shown:
+                place = (*several[k].mean[plane], 1.2)
+                dot.points = np.array([place], np.float32)
+                label.position = place
+                label.text = f"{100 * several[k].weight:.0f} %"
+            dot.visible = label.visible = shown
+
+    def _direction(self, peak: Any, mean: np.ndarray) -> float:
         if self.heading is not None:
-            return float(belief.mean[self.heading])
+            return float(peak.mean[self.heading])
         step = mean[-1, [self.east, self.north]] - mean[max(0, len(mean) - 20), [self.east, self.north]]
         if np.hypot(*step) > 1.0:
             self._course = float(np.arctan2(step[1], step[0]))

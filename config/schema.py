@@ -82,6 +82,8 @@ class SceneSection(Section):
     """vehicle: the states of the position to the east and to the north."""
     heading: Text | None = None
     """vehicle: the state of the heading, in radians from east to the left. Default: the direction of travel."""
+    walls: tuple[Annotated[tuple[tuple[float, float], ...], Field(min_length=2)], ...] = ()
+    """vehicle: what it moves among, as lines of points [east, north] in metres. Default: nothing."""
 
     @model_validator(mode="after")
     def _vehicle(self) -> SceneSection:

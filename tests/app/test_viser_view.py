@@ -16,8 +16,10 @@ from viser import _messages
 
 from app.commands import Pause, Record, Reset, Seek, SetEstimator, SetOption, SetTuning, Speed, UseSensor
 from app.viser_guard import HEADER, guarded_server
+from app.viser_history import History
 from app.viser_rows import PATIENCE
 from app.viser_submit import DRAG_INTERVAL, TYPING_PAUSE
+from app.viser_vehicle import VehicleScene
 from app.viser_view import ViserView
 from config.schema import SceneSection, ViewSection
 from estimators.log import READING, TRUTH, Readings
@@ -349,6 +351,28 @@ def test_the_thread_draws_and_stops(engine):
     view.start()
     view.stop()
     assert not view._thread.is_alive()
+
+
+def test_vehicle_scene_stands_at_the_heaviest_peak_among_its_walls():
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    try:
+        walls = (((-5.0, -1.0), (5.0, -1.0), (5.0, 1.0)),)
+        section = SceneSection(kind="vehicle", position=("east", "north"), heading="heading", walls=walls)
+        scene = VehicleScene(server, MODELS["agv_corridor"], section)
+        peaks = (Mode(0.7, np.array([4.0, 0.5, 0.0]), 0.01 * np.eye(3)), Mode(0.3, -np.ones(3), 0.01 * np.eye(3)))
+        cloud = np.array([[4.0, 0.5, 0.0], [-1.0, -1.0, -1.0], [np.nan, 0.0, 0.0]])
+        belief = SimpleNamespace(mean=np.array([2.5, 0.0, -0.3]), cov=np.eye(3), points=cloud, modes=peaks)
+        rows = History(3, 4, 16)
+        rows.n = 1
+        scene.draw(rows, belief)
+        assert tuple(scene._vehicle.position[:2]) == (4.0, 0.5)
+        assert scene._cloud.visible and scene._cloud.points.shape == (2, 3)
+        assert [label.text for _, label in scene._modes if label.visible] == ["70 %", "30 %"]
+        scene.draw(rows, SimpleNamespace(**{**vars(belief), "modes": peaks[:1]}))
+        assert tuple(scene._vehicle.position[:2]) == (2.5, 0.0)
+        assert not any(label.visible for _, label in scene._modes)
+    finally:
+        server.stop()
 
 
 def test_vehicle_scene_keeps_the_vehicle_in_the_middle():
