@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import base64
 import json
+import struct
+import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -33,6 +35,8 @@ from .pull import Pull
 
 FORMAT = 1
 TIMELINE = "event"
+PATIENCE = 5.0
+"""Seconds for a file to take what it is given; Rerun would wait for ever on one that takes no more."""
 
 
 def tuning_to_json(tuning: Tuning, estimator: str) -> str:
@@ -162,11 +166,11 @@ class RecordingFile:
 
     def flush(self) -> None:
         """Hand everything to the operating system."""
-        self.stream.flush()
+        self.stream.flush(timeout_sec=PATIENCE)
 
     def close(self) -> None:
         """Finish the file."""
-        self.stream.flush()
+        self.stream.flush(timeout_sec=PATIENCE)
         self.stream.disconnect()
 
 
@@ -196,35 +200,22 @@ def read_recording(path: Path) -> Recorded:
     """
     if not path.is_file():
         raise SourceError(f"{path}: there is no such recording; check the path")
-    header: dict[str, Any] = {}
-    tunings: list[str] = []
-    notices: list[tuple[int, str, str]] = []
-    events: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
-    tracks: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
+    content = _Content()
     try:
-        with warnings.catch_warnings():
-            # A killed writer leaves no footer; that such a file can still be read is the point.
-            warnings.simplefilter("ignore")
-            reader = RrdReader(str(path))
-        for chunk in reader.stream():
-            if not chunk.entity_path.startswith("/nisus/"):
-                continue
-            batch = chunk.to_record_batch()
-            names = {name: k for k, name in enumerate(batch.schema.names)}
-            if chunk.entity_path == "/nisus/twin":
-                header = {name: _flat(batch.column(k))[0] for name, k in names.items() if not _control(name)}
-            elif chunk.entity_path == "/nisus/notices":
-                parts = (_flat(batch.column(names[name])).tolist() for name in ("t", "level", "text"))
-                notices += zip(*parts, strict=True)
-            elif chunk.entity_path == "/nisus/tuning":
-                tunings += _flat(batch.column(names["json"])).tolist()
-            else:
-                index = batch.column(names[TIMELINE]).to_numpy()
-                columns = {name: _flat(batch.column(k)) for name, k in names.items() if not _control(name)}
-                (events if chunk.entity_path == "/nisus/events" else tracks).append((index, columns))
-    except Exception as error:  # noqa: BLE001  Rerun's reader raises many kinds on a damaged file
-        if not (header and events):
-            raise SourceError(f"{path}: cannot be read ({_line(error)}); is it an .rrd file?") from None
+        content.read(path)
+    except Exception:  # noqa: BLE001  Rerun's reader raises many kinds on a damaged file
+        # Cut in the middle of a message, by a full disk or a power cut: what stands before it is whole.
+        with tempfile.TemporaryDirectory() as folder:
+            whole = Path(folder) / path.name
+            content = _Content()
+            try:
+                copy_whole(path, whole)
+                content.read(whole)
+            except Exception as error:  # noqa: BLE001  as above
+                if not (content.header and content.events):
+                    raise SourceError(f"{path}: cannot be read ({_line(error)}); is it an .rrd file?") from None
+    header, tunings, notices = content.header, content.tunings, content.notices
+    events, tracks = content.events, content.tracks
     if not header or not tunings:
         raise SourceError(f"{path}: holds no recording of Nisus; record one with `nisus run TWIN --record FILE.rrd`")
     if int(header["format"]) != FORMAT:
@@ -248,6 +239,61 @@ def read_recording(path: Path) -> Recorded:
         first=first,
         rows=rows,
     )
+
+
+class _Content:
+    """What the entities under /nisus hold, in the order of the file."""
+
+    def __init__(self) -> None:
+        self.header: dict[str, Any] = {}
+        self.tunings: list[str] = []
+        self.notices: list[tuple[int, str, str]] = []
+        self.events: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
+        self.tracks: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
+
+    def read(self, path: Path) -> None:
+        with warnings.catch_warnings():
+            # A killed writer leaves no footer; that such a file can still be read is the point.
+            warnings.simplefilter("ignore")
+            reader = RrdReader(str(path))
+        for chunk in reader.stream():
+            if not chunk.entity_path.startswith("/nisus/"):
+                continue
+            batch = chunk.to_record_batch()
+            names = {name: k for k, name in enumerate(batch.schema.names)}
+            if chunk.entity_path == "/nisus/twin":
+                self.header = {name: _flat(batch.column(k))[0] for name, k in names.items() if not _control(name)}
+            elif chunk.entity_path == "/nisus/notices":
+                parts = (_flat(batch.column(names[name])).tolist() for name in ("t", "level", "text"))
+                self.notices += zip(*parts, strict=True)
+            elif chunk.entity_path == "/nisus/tuning":
+                self.tunings += _flat(batch.column(names["json"])).tolist()
+            else:
+                index = batch.column(names[TIMELINE]).to_numpy()
+                columns = {name: _flat(batch.column(k)) for name, k in names.items() if not _control(name)}
+                (self.events if chunk.entity_path == "/nisus/events" else self.tracks).append((index, columns))
+
+
+STREAM_HEADER, MESSAGE_HEADER = 12, struct.Struct("<QQ")
+"""Bytes before the first message of an .rrd; and before each: its kind, and how many bytes follow."""
+
+
+def copy_whole(path: Path, to: Path) -> None:
+    """Copy an .rrd up to the last message that is there in full."""
+    size = path.stat().st_size
+    end = STREAM_HEADER
+    with path.open("rb") as file:
+        while end + MESSAGE_HEADER.size <= size:
+            file.seek(end)
+            _, length = MESSAGE_HEADER.unpack(file.read(MESSAGE_HEADER.size))
+            if end + MESSAGE_HEADER.size + length > size:
+                break
+            end += MESSAGE_HEADER.size + length
+        file.seek(0)
+        with to.open("wb") as copy:
+            while end > 0 and (piece := file.read(min(end, 1 << 20))):
+                copy.write(piece)
+                end -= len(piece)
 
 
 def _control(name: str) -> bool:
