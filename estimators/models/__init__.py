@@ -6,6 +6,7 @@ from ..model import StateSpaceModel
 from .agv_corridor import AGV_CORRIDOR
 from .battery_cell import BATTERY_CELL
 from .battery_pack import BATTERY_PACK
+from .gripper_contact import GRIPPER_CONTACT
 from .lorenz63 import LORENZ63
 from .lorenz96 import LORENZ96
 from .motor_drive import MOTOR_DRIVE
@@ -27,5 +28,6 @@ MODELS: dict[str, StateSpaceModel] = {
         THERMAL_FIELD,
         AGV_CORRIDOR,
         UWB_ROVER,
+        GRIPPER_CONTACT,
     )
 }
