@@ -160,13 +160,16 @@ def row_of(estimator: str, result: Score, model: StateSpaceModel, seconds: float
     groups: dict[str, list[Fit]] = {}
     for name, fit in fits.items():
         groups.setdefault(units[name], []).append(fit)
+    # A probability has no band (see `StateSpaceModel.label`).
+    mode = model.jump.state if model.jump else None
+    covered = [fit.coverage for name, fit in fits.items() if name != mode]
     return Row(
         estimator,
         {unit: float(np.sqrt(np.mean([fit.rmse**2 for fit in group]))) for unit, group in groups.items()},
         result.nis,
         result.nis_low,
         result.nis_high,
-        float(np.mean([fit.coverage for fit in fits.values()])) if fits else np.nan,
+        float(np.mean(covered)) if covered else np.nan,
         seconds,
         "" if np.isfinite(result.nis) else "diverged",
     )

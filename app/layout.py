@@ -113,7 +113,7 @@ def blueprint(model: StateSpaceModel, pairs: np.ndarray, *, window: float, root:
         rows = [model.row_names[model.row_start[d.sensor] + d.row] for d in dots if d.state == j]
         over = [f"/{kind}/{row}" for row in rows for kind in ("reading", "refused")]
         contents = [*over, f"/previous/state/{names[j]}", f"/state/{names[j]}", f"/truth/{names[j]}"]
-        states.append(chart(with_unit(state.name, state.unit), contents))
+        states.append(chart(with_unit(model.label(state.name), state.unit), contents))
     innovations = [
         chart(f"innovation: {row_title(model, k, r)}", [f"/innovation/{model.row_names[model.row_start[k] + r]}"])
         for k, sensor in enumerate(model.sensors)
