@@ -168,12 +168,15 @@ def outcome_of(fold: Fold, events: Readings, seconds: float) -> Outcome:
     groups: dict[str, list[Fit]] = {}
     for name, fit in fits.items():
         groups.setdefault(units[name], []).append(fit)
+    # A probability has no band (see `StateSpaceModel.label`).
+    mode = model.jump.state if model.jump else None
+    covered = [fit.coverage for name, fit in fits.items() if name != mode]
     lost = np.flatnonzero(track.health == DIVERGED)
     return Outcome(
         rmse={unit: float(np.sqrt(np.mean([fit.rmse**2 for fit in group]))) for unit, group in groups.items()},
         nis=result.nis,
         nis_bounds=(result.nis_low, result.nis_high),
-        coverage=float(np.mean([fit.coverage for fit in fits.values()])) if fits else np.nan,
+        coverage=float(np.mean(covered)) if covered else np.nan,
         seconds_per_step=seconds,
         since=float((events.t[lost[0]] - events.t[0]) * 1e-9) if lost.size else np.nan,
         lost=lost.size / len(track),

@@ -122,13 +122,16 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], trac
         ("estimator", twin.estimator),
         ("readings", f"{result.readings}"),
     ]
+    model = twin.model
     if result.field is not None and grid is not None:
         fit = result.field
         inside = f"in the 95 % band: {100 * fit.coverage:.1f} %"
         rows.append((f"RMSE {grid.name}, all told cells", f"{fit.rmse:.5g} {grid.unit}   {inside}"))
     rows += [
-        (f"RMSE {name}", f"{fit.rmse:.5g} {units[name]}   in the 95 % band: {100 * fit.coverage:.1f} %")
-        for name, fit in result.states.items()
+        (model.label(name), f"{track.mean[-1, k]:.3f} at the end   Brier score (mean square error): {fit.rmse**2:.5g}")
+        if model.mode >= 0 and name == model.state_names[model.mode]
+        else (f"RMSE {name}", f"{fit.rmse:.5g} {units[name]}   in the 95 % band: {100 * fit.coverage:.1f} %")
+        for k, (name, fit) in enumerate(result.states.items())
     ]
     if result.nis_readings:
         inside = "inside" if result.nis_low <= result.nis <= result.nis_high else "OUTSIDE"

@@ -118,7 +118,7 @@ def blueprint(
         rows = [model.row_names[model.row_start[d.sensor] + d.row] for d in dots if d.state == j]
         over = [f"/{kind}/{row}" for row in rows for kind in ("reading", "refused")]
         contents = [*over, f"/previous/state/{state.name}", f"/state/{state.name}", f"/truth/{state.name}"]
-        states.append(chart(with_unit(state.name, state.unit), contents))
+        states.append(chart(with_unit(model.label(state.name), state.unit), contents))
     if model.grid is not None:
         innovations = layout_field.sums(model, chart, truth=truth)
     else:

@@ -186,7 +186,8 @@ class RerunRows:
     def _states(self, t: np.ndarray, track: Track, width: int) -> None:
         rows = last_of_each_time(t)
         for j, name in enumerate(state.name for state in self.model.shown_states):
-            mean, twice = track.mean[rows, j], 2.0 * track.std[rows, j]
+            # A probability has no band.
+            mean, twice = track.mean[rows, j], 2.0 * track.std[rows, j] * (j != self.model.mode)
             self._line(f"/state/{name}", t[rows], np.stack((mean, mean + twice, mean - twice), axis=1), width)
 
     def _window_nis(self, t: np.ndarray, track: Track, width: int) -> None:

@@ -202,7 +202,7 @@ class BeliefScene:
     def _number(self, k: int, axis: _Axis) -> None:
         state = self.model.states[axis.state]
         unit = f" [{state.unit}]" if state.unit and state.unit != "1" else ""
-        self._titles[k].text = f"{state.name}{unit}"
+        self._titles[k].text = f"{self.model.label(state.name)}{unit}"
         for tick, label in zip(TICKS, self._labels[k], strict=True):
             label.text = tick_text(axis.middle + tick * axis.step, axis.step)
 

@@ -124,7 +124,7 @@ class Charts:
         """Show another state in the last chart."""
         self._shown[-1] = [state.name for state in self.model.shown_states].index(name)
         chart, state = self._charts[-1], self.model.shown_states[self._shown[-1]]
-        chart.title = _title(state.name, state.unit)
+        chart.title = _title(self.model.label(state.name), state.unit)
 
     def set_previous(self, pull: Any) -> None:
         """The track of the previous revision, drawn as a thin grey line."""
@@ -172,6 +172,9 @@ class Charts:
         out[:, :nx] = mean
         out[:, nx : 2 * nx] = mean + 2 * std
         out[:, 2 * nx : 3 * nx] = mean - 2 * std
+        if self.model.mode >= 0:
+            # A probability has no band: the standard deviation of what is 0 or 1 says nothing more.
+            out[:, nx + self.model.mode] = out[:, 2 * nx + self.model.mode] = mean[:, self.model.mode]
         reading, gated = events.kind == READING, verdict == GATED
         for j in range(nx):
             true, values = truth_of(events, int(self.model.shown[j]))
@@ -222,7 +225,7 @@ class Charts:
         return gui.add_uplot(
             no_data(len(series)),
             tuple(series),  # type: ignore[arg-type]
-            title=_title(state.name, state.unit),
+            title=_title(self.model.label(state.name), state.unit),
             bands=({"series": (1, 2), "fill": "rgba(37,99,235,0.16)"},),
             **frame(HEIGHT),
         )

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -17,12 +16,15 @@ from .jit import jit
 from .joint import as_inner
 from .model import StateSpaceModel
 
+LEAST = 1e-6
+"""Variance that the mode keeps: a filter that was certain of it could never change its mind, and some need one."""
+
 
 def indicator(model: StateSpaceModel) -> StateSpaceModel:
     """The model for filters that do not sample: the mode is continuous, with a jump's first two moments.
 
-    m' = Σ k c_k and its noise has the variance Σ k² c_k - m'², where c are the chances, interpolated between those of
-    the two modes next to m. Between the modes f and h are the model's own.
+    m' = Σ k c_k and its noise has the variance Σ k² c_k - m'² (no less than `LEAST`), where c are the chances,
+    interpolated between those of the two modes next to m. Between the modes f and h are the model's own.
     """
     return model if model.jump is None else _indicator(model)
 
@@ -31,46 +33,55 @@ def indicator(model: StateSpaceModel) -> StateSpaceModel:
 def _indicator(model: StateSpaceModel) -> StateSpaceModel:
     if model.jump is None:
         return model
-    jump = as_inner(model.jump.chances)
     j, count = model.mode, len(model.jump.modes)
     acts_on = tuple((k, i) for k, noise in enumerate(model.noises) for i in model.acts_on(noise.name))
     return replace(
         model,
-        f=_step(model.f, jump, j, count),
+        f=_step(model.f, model.jump.chances, j, count),
         F=None,
-        Q=_noise(model.Q, jump, j, count, () if model.Q else acts_on),
+        Q=_noise(model.Q, model.jump.chances, j, count, () if model.Q else acts_on),
         jump=None,
         conditionally_linear=(),
     )
 
 
 @jit
-def _moments(chances, x, u, p, dt, j, count):
-    """Mean and variance of the next mode, for a mode x[j] between the whole numbers; x keeps what it is."""
-    m = x[j]
-    at = min(max(m.real, 0.0), count - 1.0)
-    low = min(int(at), count - 2)
-    part = m - low if m.real == at else m * 0.0 + (at - low)
-    z = x.copy()
-    c = np.empty(count, x.dtype)
-    mean = part * 0.0
-    square = part * 0.0
-    for k in range(2):
-        z[j] = low + k
-        chances(z, u, p, dt, c)
-        share = part if k == 1 else 1.0 - part
-        for i in range(count):
-            mean += share * i * c[i]
-            square += share * i * i * c[i]
+def _between(m, count):
+    """The modes next to m, held between the first and the last: the lower one, and how far m is on from there."""
+    low = 0
+    while low < count - 2 and m.real >= low + 1:
+        low += 1
+    if m.real <= low:
+        return low, 0.0 * m
+    if m.real >= low + 1:
+        return low, 0.0 * m + 1.0
+    return low, m - low
+
+
+@jit
+def _moments(c, part):
+    """Mean and variance of the next mode, from the chances c (2, modes) of two modes, the second's part given."""
+    mean = 0.0 * part
+    square = 0.0 * part
+    for i in range(c.shape[1]):
+        share = (1.0 - part) * c[0, i] + part * c[1, i]
+        mean += share * i
+        square += share * i * i
     return mean, square - mean * mean
 
 
-def _step(function: Callable, chances: Any, j: int, count: int) -> Callable:
-    inner = as_inner(function)
+# Each of the two calls the chances itself: a compiled function that takes another as an argument is not cached.
+def _step(function: Callable, chances: Callable, j: int, count: int) -> Callable:
+    inner, jumping = as_inner(function), as_inner(chances)
 
     def f(x, u, p, dt, out):  # noqa: ANN001, ANN202
-        mean, _ = _moments(chances, x, u, p, dt, j, count)
         z = x.copy()
+        c = np.empty((2, count), x.dtype)
+        low, part = _between(x[j], count)
+        for k in range(2):
+            z[j] = low + k
+            jumping(z, u, p, dt, c[k])
+        mean, _ = _moments(c, part)
         z[j] = mean
         inner(z, u, p, dt, out)
         out[j] = mean
@@ -78,25 +89,28 @@ def _step(function: Callable, chances: Any, j: int, count: int) -> Callable:
     return f
 
 
-def _noise(function: Callable | None, chances: Any, j: int, count: int, acts_on: tuple) -> Callable:
-    inner = _each if function is None else as_inner(function)
+def _noise(function: Callable | None, chances: Callable, j: int, count: int, acts_on: tuple) -> Callable:
     given = function is not None
+    inner, jumping = as_inner(function or _nothing), as_inner(chances)
     pairs = np.array(acts_on, np.int64).reshape(-1, 2)
 
     def Q(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
-        mean, variance = _moments(chances, x, u, p, dt, j, count)
         z = x.copy()
+        c = np.empty((2, count))
+        low, part = _between(x[j], count)
+        for k in range(2):
+            z[j] = low + k
+            jumping(z, u, p, dt, c[k])
+        mean, variance = _moments(c, part)
         z[j] = mean
-        if given:
-            inner(z, u, p, q, dt, out)
-        else:
+        inner(z, u, p, q, dt, out)
+        if not given:
             for k in range(pairs.shape[0]):
                 out[pairs[k, 1], pairs[k, 1]] += q[pairs[k, 0]] * dt
-        out[j, j] = max(variance, 0.0)
+        out[j, j] = max(variance, LEAST)
 
     return Q
 
 
-@jit
-def _each(x, u, p, q, dt, out):
-    """Nothing: the noises of a model without Q are added by name."""
+def _nothing(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
+    """The Q of a model whose noises are added by name."""

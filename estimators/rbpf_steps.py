@@ -29,15 +29,19 @@ from .jit import address, floats, jit, matrix
 from .jump_draws import jump, jump_key
 from .linalg import solve_transposed, wrap
 from .model import StateSpaceModel
-from .particle import BLOCK, EQUAL, EXTRA, MEMBERS, blocks_of, log_weights, members, records_of, wrap_record
+from .particle import BLOCK, EQUAL, EXTRA, MEMBERS, THREADS, blocks_of, log_weights, members, records_of, wrap_record
 from .particle_steps import OWN, block_count, block_signature, block_size, blocks_start, shared, sums_size
 from .particle_steps import tune as tune_cloud
 from .particle_steps import work_size as cloud_work_size
 from .random import ONE, normal
+from .threads import threaded
 from .tuning import Tuning
 
 PREDICT, CONDITION, ADOPT = range(OWN, OWN + 3)
 """Phases: one step on; each particle's own posterior and density of the reading, aside; that posterior made its own."""
+
+THREADED_FROM = 4 * BLOCK
+"""Particles from which threads gain more than they cost: fewer than of `pf`, since each takes ten times as long."""
 
 _ROUNDING = 1e-13
 """A variance below this part of what it was made from is rounding."""
@@ -63,6 +67,7 @@ def tune(options: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray
     """The cloud's numbers, and where the code of the phases above starts."""
     values = tune_cloud(options, model, tuning)
     values[EXTRA] = _own_code()
+    values[THREADS] = members(options) >= THREADED_FROM and threaded()
     return values
 
 

@@ -7,6 +7,7 @@ from .agv_corridor import AGV_CORRIDOR
 from .battery_cell import BATTERY_CELL
 from .battery_pack import BATTERY_PACK
 from .field_era5 import FIELD_ERA5
+from .gripper_contact import GRIPPER_CONTACT
 from .lorenz63 import LORENZ63
 from .lorenz96 import LORENZ96
 from .motor_drive import MOTOR_DRIVE
@@ -30,5 +31,6 @@ MODELS: dict[str, StateSpaceModel] = {
         FIELD_ERA5,
         AGV_CORRIDOR,
         UWB_ROVER,
+        GRIPPER_CONTACT,
     )
 }
