@@ -15,7 +15,7 @@ from .model import StateSpaceModel
 
 _versions = count(1)
 
-TOGETHER = 8
+TOGETHER = 16
 """Rows of a sensor from which on they share one entry, `R.<sensor>`, in what a panel shows."""
 
 

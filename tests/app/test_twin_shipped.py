@@ -27,7 +27,24 @@ def folded(name: str) -> tuple[Readings, Track]:
     return log.readings, fold(twin.estimator, twin.model, twin.tuning, log)
 
 
-@pytest.mark.parametrize("name", shipped())
+HUGE = ("thermal_field_large",)
+"""Twins whose fold takes minutes; their first readings are folded."""
+
+
+def test_a_million_cells_fold() -> None:
+    for name in HUGE:
+        twin = load_twin(name, overrides={"source.duration": "2"})
+        source = twin.open_source(lambda key, text: None)
+        log = Log(twin.model.width)
+        while (batch := source.read(1.0)) is not None:
+            log.extend(batch)
+        tuning = twin.tuning.with_options({"members": 3, "radius": 0.5})
+        track = fold(twin.estimator, twin.model, tuning, log)
+        assert np.sum(track.verdict == USED) == 2
+        assert np.isfinite(track.mean).all() and (track.std > 0).all()
+
+
+@pytest.mark.parametrize("name", [name for name in shipped() if name not in HUGE])
 def test_it_opens_and_folds(name: str) -> None:
     events, track = folded(name)
     readings = events.kind == READING

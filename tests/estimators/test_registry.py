@@ -74,7 +74,7 @@ def test_an_unknown_name_is_told_the_near_ones():
 
 
 @pytest.mark.parametrize("name", list(ESTIMATORS))
-@pytest.mark.parametrize("model", [m for m in MODELS.values()], ids=lambda m: m.name)
+@pytest.mark.parametrize("model", [m for m in MODELS.values() if m.nx < 100_000], ids=lambda m: m.name)
 def test_every_estimator_runs_every_model_it_applies_to(name, model):
     """Readings of exactly what the model expects at its prior: the estimate stays finite and near."""
     if reason := unfit(ESTIMATORS[name], model):

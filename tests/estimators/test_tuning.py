@@ -92,3 +92,21 @@ def test_keys_are_all_settable():
         for key in tuning.keys():
             if key != "gate":
                 assert tuning.set(key, tuning.get(key)).get(key) == tuning.get(key)
+
+
+def test_the_many_rows_of_a_sensor_are_one_entry_and_still_rows():
+    model = MODELS["thermal_field"]
+    tuning = Tuning.of(model)
+    keys = [item.key for item in tuning.items()]
+    assert [key for key in keys if key.startswith("R.")] == ["R.thermocouples"]
+    assert tuning.get("R.thermocouples") == 0.25
+    wide = tuning.set("R.thermocouples", 4.0)
+    assert (wide.r == 4.0).all()
+    one = wide.set("R.thermocouples.t10_30", 9.0)
+    assert (one.r == 4.0).sum() == 99 and one.get("R.thermocouples.t10_30") == 9.0
+    assert one.get("R.thermocouples") == pytest.approx(4.05)
+    assert "R.thermocouples.t10_30" in tuning.keys() and "R.thermocouples" in tuning.keys()
+    with pytest.raises(ConfigError, match="a variance must be positive"):
+        tuning.set("R.thermocouples", 0.0)
+    # Few rows keep an entry each.
+    assert "R.gnss_position.east" in [item.key for item in Tuning.of(MODELS["road_car"]).items()]
