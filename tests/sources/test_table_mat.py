@@ -74,5 +74,5 @@ def test_rows_are_counted_from_one_as_in_matlab(tmp_path, n):
     """Complaints name a row; the last of several chunks has one number a row, as the others."""
     savemat(tmp_path / "d.mat", {"meas": columns(n)})
     chunks = list(read_mat(tmp_path / "d.mat", "meas.t", ["meas.x"], lambda *told: None))
-    assert np.concatenate([chunk.lines for chunk in chunks]).tolist() == list(range(1, n + 1))
-    assert all(len(chunk.lines) == len(chunk.values) for chunk in chunks)
+    assert np.concatenate([chunk.line for chunk in chunks]).tolist() == list(range(1, n + 1))
+    assert all(len(chunk.line) == len(chunk.values) for chunk in chunks)
