@@ -40,3 +40,9 @@ def test_distances_are_short_by_a_sixth_of_the_square_of_the_angle(metres):
 def test_what_is_no_position_is_missing():
     got = east_north(np.array([[91.0, 0.0], [0.0, 181.0], [np.nan, 0.0], [1.0, 1.0]]), (0.0, 0.0))
     assert np.isnan(got[:3]).all() and np.isfinite(got[3]).all()
+
+
+def test_the_ellipsoid_is_wgs84():
+    """Its derived constants as NIMA TR8350.2 gives them: semi-minor axis, first eccentricity squared."""
+    assert SEMI_MAJOR * np.sqrt(1 - ECCENTRICITY2) == pytest.approx(6356752.3142, abs=1e-4)
+    assert ECCENTRICITY2 == pytest.approx(6.69437999014e-3, rel=1e-11)

@@ -9,6 +9,7 @@ from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TRUTH
 from sources.source import Channel
 from sources.table import Table
+from sources.table_mat import read_mat
 
 
 def channels(prefix=""):
@@ -66,3 +67,12 @@ def test_what_a_matlab_file_lacks_is_one_line(tmp_path):
     path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(200))
     with pytest.raises(SourceError, match=r"c\.mat: it is MATLAB 7\.3 \(HDF5\), which is not read; save it with -v7"):
         table(path, "meas.")
+
+
+@pytest.mark.parametrize("n", [5, 9000])
+def test_rows_are_counted_from_one_as_in_matlab(tmp_path, n):
+    """Complaints name a row; the last of several chunks has one number a row, as the others."""
+    savemat(tmp_path / "d.mat", {"meas": columns(n)})
+    chunks = list(read_mat(tmp_path / "d.mat", "meas.t", ["meas.x"], lambda *told: None))
+    assert np.concatenate([chunk.line for chunk in chunks]).tolist() == list(range(1, n + 1))
+    assert all(len(chunk.line) == len(chunk.values) for chunk in chunks)
