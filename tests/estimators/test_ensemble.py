@@ -76,6 +76,12 @@ def test_square_root_filters_are_kalmans_update_of_the_sample_moments(name, memb
     np.testing.assert_allclose(fold.track.std[0], np.sqrt(np.diag(P)), rtol=1e-9)
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_members_start_about_the_priors_mean_exactly(name):
+    fold = Fold(name, MATRICES.model, Tuning.of(MATRICES.model).with_options({"members": 5}), Log(MATRICES.model.width))
+    np.testing.assert_allclose(members_of(fold).mean(0), MATRICES.mean, rtol=0, atol=1e-14)
+
+
 def test_rotation_moves_the_members():
     y = np.array([0.5])
     _, plain, _ = analysed("etkf", MATRICES.model, {"members": 6}, 0, y)

@@ -118,6 +118,32 @@ def test_a_negative_weight_that_outweighs_the_others_fails_visibly(estimator):
     assert np.isnan(fold.track.std[1, 0])  # the health of such a row is `diverged`
 
 
+def itself(x, u, p, out):
+    out[0] = x[0]
+
+
+COMPASS = StateSpaceModel(
+    name="compass",
+    title="compass",
+    states=(State("heading", "rad", mean=3.1, std=0.2, circular=True),),
+    noises=(Noise("heading", "rad²/s", 1e-4),),
+    sensors=(Sensor("bearing", (Row("bearing", "rad", 0.01, circular=True),), h=itself),),
+    f=keep,
+)
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "iekf", "ukf", "ckf", "sr-ekf", "sr-ukf"])
+def test_an_angle_is_corrected_across_the_seam(estimator):
+    """3.1 ± 0.2 and the reading -3.1 ± 0.1, which is 3.183: 4/5 of the way, beyond π."""
+    readings = Log(1)
+    readings.extend(Readings.one(0, 0, READING, 0, -3.1, 1))
+    fold = Fold(estimator, COMPASS, Tuning.of(COMPASS), readings)
+    fold.advance()
+    gap = 2 * np.pi - 6.2
+    np.testing.assert_allclose(fold.track.innovation[0, 0], gap, rtol=1e-12)
+    np.testing.assert_allclose(fold.track.mean[0, 0], 3.1 + 0.8 * gap - 2 * np.pi, rtol=1e-12)
+
+
 def twins(x, u, p, out):
     out[0] = x[0] + x[1] + x[2]
     out[1] = x[0] + x[1] + (1.0 + 1e-9) * x[2]
@@ -223,6 +249,25 @@ def test_a_pivot_that_rounding_could_have_made_is_refused(estimator, apart, verd
     )
     fold = folded(estimator, model, at_once())
     assert fold.track.verdict[0] == verdict
+
+
+@pytest.mark.parametrize("estimator", ["sr-kf", "sr-ekf", "sr-ukf"])
+def test_square_roots_refuse_what_their_own_digits_cannot_tell(estimator):
+    """The same row twice with noise of 1e-20: the second diagonal entry is rounding, 1e-16, beside 1.7."""
+    twice = tuple(Row(name, "1", variance=1e-40) for name in ("y1", "y2"))
+    model = StateSpaceModel(
+        name="same",
+        title="one row twice",
+        states=TWINS.states,
+        parameters=(Parameter("apart", "1", 0.0),),
+        noises=TWINS.noises,
+        sensors=(Sensor("both", twice, h=near_twins),),
+        f=keep,
+        linear=True,
+    )
+    fold = folded(estimator, model, at_once())
+    assert fold.track.verdict[0] == FAILED
+    np.testing.assert_array_equal(fold.track.mean[0], 0.0)
 
 
 @pytest.mark.parametrize("estimator", FILTERPY)

@@ -70,6 +70,19 @@ def test_a_seed_gives_the_same_faults_and_they_touch_nothing_else():
     np.testing.assert_array_equal(short[(t >= 200) & (t < 300)], spoken(wild)[1][(t >= 200) & (t < 300)])
 
 
+def test_each_fault_has_draws_of_its_own_and_of_the_seed():
+    """Two faults of the same kind add up as independent ones do; another seed hits other readings."""
+    fault = Fault(SENSOR, "outliers", size=30.0, rate=0.3)
+
+    def added(seed, *faults):
+        return spoken(run(*faults, seed=seed))[1] - spoken(run(seed=seed))[1]
+
+    first, both = added(3, fault), added(3, fault, fault)
+    # A correlation of N independent pairs has the standard error 1/√N.
+    assert abs(np.corrcoef(first, both - first)[0, 1]) < 4 / np.sqrt(N)
+    assert abs(np.corrcoef(first, added(4, fault))[0, 1]) < 4 / np.sqrt(N)
+
+
 def test_faults_of_one_row_leave_the_others():
     model = MODELS["road_car"]
     plans = {"gnss_position": SensorPlan()}
