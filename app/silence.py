@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from typing import Any
 
+import numpy as np
+
 
 class Silence:
     """How long the source has said nothing, and when to ask."""
@@ -29,8 +31,11 @@ class Silence:
             assert self._newest is not None
             # Counted from the newest reading: a driver's clock need not be this machine's.
             now: int | None = self._newest + int(silent * 1e9)
+        elif getattr(source, "paused", False) or getattr(source, "speed", 1.0) == np.inf:
+            # As fast as possible, the playhead is ahead of what has been read.
+            now = None
         else:
-            now = None if getattr(source, "paused", False) else source.now()
+            now = source.now()
         # The longer the silence, the rarer the question: a night of it must not fill the log.
         apart = max(self._tick, silent / 20)
         return None if now is None or now <= last + apart * 0.9e9 else now

@@ -11,12 +11,13 @@ from viser import GuiEvent
 from app import commands
 from app.compile import prepare
 from app.engine import Engine
+from app.playback import play
 from app.server_api import command_from_json, status_json
 from app.twin import load_twin, restore_twin
 from app.viser_submit import TYPING_PAUSE
 from app.viser_view import ViserView
 from estimators.compiled import compile_model
-from estimators.errors import ModelError, NisusError
+from estimators.errors import ConfigError, ModelError, NisusError
 from estimators.fold import fold
 from estimators.log import READING, Log, Readings
 from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
@@ -243,3 +244,10 @@ def test_an_estimate_that_is_no_number_stays_off_the_page(twin, start):
         assert np.isfinite(rows(engine).track.mean[2]).all()
     finally:
         view.stop()
+
+
+@pytest.mark.parametrize("seconds", [1e300, -1e300, np.inf])
+def test_a_seek_beyond_all_time_is_refused(seconds):
+    source = SimpleNamespace(seek=lambda t: None, span=(0, SECOND))
+    with pytest.raises(ConfigError, match="must lie within 1e\\+09 s"):
+        play(source, commands.Seek(seconds), 0)
