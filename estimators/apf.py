@@ -34,6 +34,7 @@ from .particle import (
     points,
     records_of,
     recover,
+    recoveries,
     sized,
     start,
     weigh_equally,
@@ -60,7 +61,8 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     index = next_draw(state)
     sweep(EXPECT, context, u, 0.0, sensor, y, np.uint64(0), 0.0, state, work)
     total(context, work, sums)
-    m = predicted(context, sensor, y, sums, S, nu, innovation, innovation_std)
+    x = records_of(state, nx, n)[0, :nx]
+    m = predicted(context, u, sensor, y, x, sums, S, nu, innovation, innovation_std)
     state[SETTLED] = settled
     verdict = admit(context, sensor, m, nu, S, matrix(U_flat, 0, rows, rows), score)
     log_sum = normalise(context, u, sensor, y, state, work, sums)
@@ -99,6 +101,7 @@ APF = Estimator(
     moments=moments,
     points=points,
     modes=modes,
+    recoveries=recoveries,
     options=tuple(option for option in OPTIONS if option.name != "fraction"),
     tune=tune,
 )

@@ -33,7 +33,7 @@ from .jit import flags, floats, ints, jit, matrix
 from .linalg import solve_transposed, solve_upper, wrap
 from .localisation import between_rows, crews
 from .model import LARGE, StateSpaceModel
-from .noise import add_noise, noise_root, semidefinite_root
+from .noise import add_noise, belief_root, noise_root
 from .random import key_of, normal
 from .simd import WIDE, add_scaled
 from .symmetric import factor, gram
@@ -152,7 +152,7 @@ def start(context, mean, cov, state):
     side = 1 if diagonal else n
     L = np.empty((side, side))
     if not diagonal:
-        semidefinite_root(cov, L)
+        belief_root(cov, L)
     for i in range(N):
         for j in range(n):
             z[j] = normal(key, np.uint64(i * n + j))
@@ -409,9 +409,11 @@ def judge(context, sensor, m, ZT, Z, d, rows, G, U, v, score):
     score[2] = -0.5 * (nis + log_det + m * LOG_2PI)
     if flags(context.used, context.n_sensors)[sensor] == 0:
         return HELD_OUT
-    if not nis <= floats(context.gate, context.width + 1)[m]:
-        return GATED
-    return USED
+    limit = floats(context.gate, context.width + 1)[m]
+    if nis <= limit:
+        # As in gaussian.py: a reading that far off would leave members that are no numbers.
+        return USED if nis < np.inf else FAILED
+    return GATED if limit < np.inf else FAILED
 
 
 @jit

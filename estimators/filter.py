@@ -88,8 +88,9 @@ class Estimator:
     `applies(model)` gives the reason why the estimator does not fit a model, or None. `options` below are complete
     (see `complete`). `state_size(options, nx)` and `work_size(options, nx, ny)` count float64s; `moments(options,
     state, nx)` gives mean and covariance, `points(options, state, nx)` what to draw beside the mean (sigma points,
-    particles) as (k, nx), `modes(options, state, nx)` the peaks where there can be several. `tune(options, model,
-    tuning)` turns the options into the numbers that the compiled functions read; it may raise EstimatorError.
+    particles) as (k, nx), `modes(options, state, nx)` the peaks where there can be several, `recoveries(state)` how
+    often the filter had to help itself since its start. `tune(options, model, tuning)` turns the options into the
+    numbers that the compiled functions read; it may raise EstimatorError.
     `memory(options, model)` counts numbers that the state holds beyond `state_size`. `runs(options, nx)` is
     `model_runs` as a number: how often a step runs f. `prepare(model, options)` computes what depends on the model
     too, once for a fold, as int64s. `blocks(options, state, nx)` is a view of the members (N, nx) in a state, of a
@@ -115,6 +116,7 @@ class Estimator:
     applies: Callable[[StateSpaceModel], str | None] = lambda model: None
     runs: Callable[[Options, int], float] = lambda options, nx: 1.0
     modes: Callable[[Options, np.ndarray, int], list[Mode]] | None = None
+    recoveries: Callable[[np.ndarray], int] | None = None
     interpreted: bool = False
     blocks: Callable[[Options, np.ndarray, int], np.ndarray] | None = None
 

@@ -25,6 +25,9 @@ LEAST = 0.02
 """A peak with a smaller part of the points is a tail of the nearest one."""
 
 
+ROUNDING = 1e-12
+"""A spread below this part of the values' size is none."""
+
 CANDIDATES = 12
 """Peaks that are told from bumps of the density at most."""
 
@@ -64,9 +67,12 @@ def _whitened(points: np.ndarray, circular: np.ndarray) -> np.ndarray:
     for j in range(points.shape[1]):
         column = points[:, j]
         pair = np.column_stack((np.cos(column), np.sin(column))) if circular[j] else column[:, None]
+        size = float(np.abs(pair).max())
         pair = pair - pair.mean(axis=0)
         # One scale for both coordinates of an angle: a short arc must stay an arc.
-        columns.append(pair / max(float(pair.std(axis=0).max()), 1e-300))
+        spread = float(pair.std(axis=0).max())
+        # Copies of one particle differ from their mean by its rounding alone, which is no spread.
+        columns.append(pair / spread if spread > ROUNDING * size else np.zeros_like(pair))
     flat = np.hstack(columns)
     values, vectors = np.linalg.eigh(flat.T @ flat / len(flat))
     return flat @ vectors / np.sqrt(np.maximum(values, 0.01))

@@ -45,7 +45,8 @@ def semidefinite_root(A, L):
                 s = A[i, j]
                 for k in range(j):
                     s -= L[i, k] * L[j, k]
-                if not abs(s) <= 1e-6 * np.sqrt(A[i, i] * A[j, j]):
+                # The roots apart: the product of two tiny variances would underflow.
+                if not abs(s) <= 1e-6 * np.sqrt(A[i, i]) * np.sqrt(A[j, j]):
                     return _not_semidefinite(L)
             continue
         root = np.sqrt(pivot)
@@ -56,6 +57,15 @@ def semidefinite_root(A, L):
                 s -= L[i, k] * L[j, k]
             L[i, j] = s / root
     return True
+
+
+@jit
+def belief_root(P, L):
+    """Lower L with L Lᵀ = P for the covariance of a belief, or for its diagonal where rounding left it indefinite."""
+    if not semidefinite_root(P, L):
+        for i in range(L.shape[0]):
+            for j in range(L.shape[1]):
+                L[i, j] = np.sqrt(max(P[i, i], 0.0)) if i == j else 0.0
 
 
 @jit

@@ -23,7 +23,7 @@ from .filter import Option, Options
 from .jit import floats, ints, jit, matrix
 from .linalg import wrap
 from .modes import Mode, modes_of
-from .noise import add_noise, semidefinite_root
+from .noise import add_noise, belief_root
 from .random import key_of, normal
 
 DRAWS, SETTLED, EQUAL, ESS, RECOVERIES, RESAMPLED, _SPARE, _SPARE_TOO = range(8)
@@ -114,6 +114,11 @@ def block(options: Options, state: np.ndarray, nx: int) -> np.ndarray:
 def modes(options: Options, state: np.ndarray, nx: int) -> list[Mode]:
     """The peaks of the cloud."""
     return modes_of(points(options, state, nx), state[HEAD : HEAD + nx] != 0.0)
+
+
+def recoveries(state: np.ndarray) -> int:
+    """Clouds that were widened, or drawn anew, since the filter started."""
+    return int(state[RECOVERIES])
 
 
 @jit
@@ -306,7 +311,7 @@ def restart(context, mean, cov, index, stream, state):
     nx = context.nx
     n = int(numbers(context)[MEMBERS])
     root = np.empty((nx, nx))
-    semidefinite_root(cov, root)
+    belief_root(cov, root)
     scatter(context, mean, root, key_of(context.seed, index, stream), records_of(state, nx, n))
     weigh_equally(state, nx, n)
     state[SETTLED] = 0.0
@@ -347,12 +352,17 @@ def next_draw(state):
     return int(state[DRAWS])
 
 
+SEED = 1e-6
+"""Part of the prior's variances from which a cloud without any spread widens."""
+
+
 @jit
 def recover(context, index, state):
     """Widen a cloud in which no particle explains the reading: each moves by a draw from the cloud's own covariance.
 
-    The covariance doubles with every such reading, until particles reach what the sensors say. A cloud without any
-    weight left, all its particles beyond the floating-point numbers, starts again from the prior.
+    The covariance doubles with every such reading, until particles reach what the sensors say; copies of one particle
+    begin at the part `SEED` of the prior's. A cloud without any weight left, all its particles beyond the
+    floating-point numbers, starts again from the prior.
     """
     nx = context.nx
     n = int(numbers(context)[MEMBERS])
@@ -361,15 +371,16 @@ def recover(context, index, state):
     mean = np.empty(nx)
     cov = np.empty((nx, nx))
     cloud_moments(state, nx, n, mean, cov)
+    prior = matrix(floats(context.prior_cov, nx * nx), 0, nx, nx)
     finite = True
     for i in range(nx):
         finite = finite and np.isfinite(mean[i]) and np.isfinite(cov[i, i])
+        cov[i, i] = max(cov[i, i], SEED * prior[i, i])
     if not finite:
-        prior = matrix(floats(context.prior_cov, nx * nx), 0, nx, nx)
         restart(context, floats(context.prior_mean, nx), prior, index, RECOVER, state)
         return
     root = np.empty((nx, nx))
-    semidefinite_root(cov, root)
+    belief_root(cov, root)
     spread_by(context, root, key_of(context.seed, index, RECOVER), 0, records)
     state[SETTLED] = 0.0
 

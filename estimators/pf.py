@@ -15,13 +15,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from .context import circular_rows, sensor_variances
 from .context import options as numbers
-from .context import sensor_variances
 from .filter import Estimator, Option, Options
 from .gaussian import admit
 from .jit import jit, matrix
+from .linalg import wrap
 from .model import StateSpaceModel
-from .noise import noise_root, semidefinite_root
+from .noise import belief_root, noise_root
 from .particle import (
     EQUAL,
     EXTRA,
@@ -39,6 +40,7 @@ from .particle import (
     points,
     records_of,
     recover,
+    recoveries,
     settled_moments,
     sized,
     start,
@@ -47,6 +49,7 @@ from .particle_steps import JITTER as MOVE
 from .particle_steps import (
     PROPAGATE,
     WEIGH,
+    first_residual,
     impoverished,
     keep,
     normalise,
@@ -90,26 +93,36 @@ def finite_rows(y, rows):
 
 
 @jit
-def predicted(context, sensor, y, sums, S, nu, innovation, innovation_std):
-    """Innovation and its covariance from the sums of `weigh`; S and ν hold the finite rows.
+def predicted(context, u, sensor, y, x, sums, S, nu, innovation, innovation_std):
+    """Innovation and its covariance from the sums of `weigh`; S and ν hold the finite rows, x is the first particle.
 
     Returns:
         The number of finite rows.
     """
     r = sensor_variances(context, sensor)
+    circular = circular_rows(context, sensor)
     m = finite_rows(y, r.size)
+    first_residual(context, u, sensor, y, x, innovation[: r.size])
     k = 0
     for row in range(r.size):
         if not np.isfinite(y[row]):
+            innovation[row] = np.nan
             continue
         nu[k] = sums[4 + k] / sums[0]
         for j in range(k + 1):
             S[k, j] = sums[4 + m + k * m + j] / sums[0] - nu[k] * nu[j]
             S[j, k] = S[k, j]
         S[k, k] = max(S[k, k], 0.0) + r[row]
-        innovation[row] = nu[k]
+        innovation[row] += nu[k]
+        if circular[row] != 0:
+            innovation[row] = wrap(innovation[row])
         innovation_std[row] = np.sqrt(S[k, k])
         k += 1
+    k = 0
+    for row in range(r.size):
+        if np.isfinite(y[row]):
+            nu[k] = innovation[row]
+            k += 1
     return m
 
 
@@ -132,7 +145,8 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     total(context, work, sums)
     S = matrix(S_flat, 0, rows, rows)
     U = matrix(U_flat, 0, rows, rows)
-    m = predicted(context, sensor, y, sums, S, nu, innovation, innovation_std)
+    x = records_of(state, nx, n)[0]
+    m = predicted(context, u, sensor, y, x, sums, S, nu, innovation, innovation_std)
     verdict = admit(context, sensor, m, nu, S, U, score)
     state[SETTLED] = settled
     log_sum = normalise(context, u, sensor, y, state, work, sums)
@@ -143,7 +157,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
             resample(context, u, sensor, y, key_of(context.seed, index, RESAMPLE), sums, state, work)
             if numbers(context)[EXTRA] > 0.0:
                 _, cov = settled_moments(state, nx)
-                semidefinite_root(cov, L)
+                belief_root(cov, L)
                 for i in range(nx):
                     for j in range(nx):
                         L[i, j] *= numbers(context)[EXTRA]
@@ -186,6 +200,7 @@ PF = Estimator(
     moments=moments,
     points=points,
     modes=modes,
+    recoveries=recoveries,
     options=OPTIONS,
     blocks=block,
     tune=tune,
@@ -206,6 +221,7 @@ PF_REG = Estimator(
     moments=moments,
     points=points,
     modes=modes,
+    recoveries=recoveries,
     options=(*OPTIONS, BANDWIDTH),
     blocks=block,
     tune=tune_regularised,

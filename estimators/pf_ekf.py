@@ -27,7 +27,9 @@ from .particle import (
     moments,
     next_draw,
     points,
+    records_of,
     recover,
+    recoveries,
     sized,
     start,
 )
@@ -54,7 +56,8 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     index = next_draw(state)
     sweep(EXPECT, context, u, 0.0, sensor, y, np.uint64(0), 0.0, state, work)
     total(context, work, sums)
-    m = predicted(context, sensor, y, sums, S, nu, innovation, innovation_std)
+    x = records_of(state, context.nx, n)[0, : context.nx]
+    m = predicted(context, u, sensor, y, x, sums, S, nu, innovation, innovation_std)
     state[SETTLED] = settled
     verdict = admit(context, sensor, m, nu, S, matrix(U_flat, 0, rows, rows), score)
     if verdict == USED:
@@ -87,6 +90,7 @@ PF_EKF = Estimator(
     moments=moments,
     points=points,
     modes=modes,
+    recoveries=recoveries,
     options=OPTIONS,
     tune=tune,
 )

@@ -45,10 +45,12 @@ from .particle import (
 )
 from .particle_steps import (
     OWN,
+    about,
     block_count,
     block_signature,
     block_size,
     blocks_start,
+    first_residual,
     shared,
     sums_size,
     sweep,
@@ -170,7 +172,10 @@ def _see(context, sensor, u, y, x, P, L, H, HL, S, U, e, expected, scratch):
 
 @jit
 def _expect(context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S, U, e, expected, scratch, sums):
-    """joint = log w + log N(y; h(x), H P Hᵀ + R), the second kept in `ahead`, and the sums of residuals and S - R."""
+    """joint = log w + log N(y; h(x), H P Hᵀ + R), the second kept in `ahead`, and the sums of residuals and S - R.
+
+    The sums are about `first_residual`.
+    """
     nx = context.nx
     n = joint.size
     log_w = log_weights(state, nx, n)
@@ -178,6 +183,9 @@ def _expect(context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S
     r = sensor_variances(context, sensor)
     own = has_own_likelihood(context, sensor)
     equal = state[EQUAL] != 0.0
+    circular = circular_rows(context, sensor)
+    reference = np.empty(r.size)
+    first_residual(context, u, sensor, y, records[0, :nx], reference)
     for k in range(sums.size):
         sums[k] = 0.0
     sums[2] = -np.inf
@@ -202,6 +210,7 @@ def _expect(context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S
         for row in range(r.size):
             if np.isfinite(y[row]):
                 S[m, m] -= r[row]
+                e[m] = about(e[m], reference[row], circular[row])
                 m += 1
         for a in range(m):
             sums[4 + a] += w * e[a]

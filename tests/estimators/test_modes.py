@@ -57,3 +57,10 @@ def test_flat_heavy_tailed_and_degenerate_clouds():
     assert np.array_equal(point.mean, [1.0, 1.0]) and np.all(point.cov == 0)
     assert modes_of(np.full((10, 2), np.nan), flat(2)) == []
     assert len(modes_of(np.zeros((1, 3)), flat(3))) == 1
+
+
+def test_copies_of_one_point_are_one_peak_whatever_their_size():
+    """The mean of equal numbers differs from them by rounding, which is no spread to divide by."""
+    for scale in (1e-250, 0.1, 123.456, 1e9, 1e100):
+        (mode,) = modes_of(np.tile(scale * np.array([1.0, 0.3, -0.7]), (40, 1)), np.array([False, False, True]))
+        assert mode.weight == 1.0 and np.allclose(mode.mean[:2], scale * np.array([1.0, 0.3]), rtol=1e-12, atol=0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimators.noise import semidefinite_root
+from estimators.noise import belief_root, semidefinite_root
 
 
 def root(A):
@@ -39,3 +39,20 @@ def test_integrated_white_noise_and_zero():
 def test_what_is_no_covariance_is_refused_visibly(A):
     fine, L = root(np.array(A))
     assert not fine and np.all(np.isnan(L))
+
+
+def test_variances_near_the_smallest_numbers_have_a_root():
+    """A cloud that resampling made of near-copies of one particle: products of its variances are below all numbers."""
+    v = np.array([8.1e-282, -1.5e-282, -1.5e-284])
+    A = np.outer(v, v) / 1e-281
+    fine, L = root(A)
+    assert fine and np.allclose(L @ L.T, A, rtol=1e-6, atol=0.0)
+
+
+def test_a_belief_that_rounding_made_indefinite_keeps_its_deviations():
+    A = np.array([[4.0, 2.0 + 1e-3], [2.0 + 1e-3, 1.0]])
+    L = np.full((2, 2), np.nan)
+    belief_root(A, L)
+    assert np.array_equal(L, np.diag([2.0, 1.0]))
+    belief_root(np.eye(2) * 9.0, L)
+    assert np.array_equal(L, 3.0 * np.eye(2))

@@ -12,7 +12,7 @@ from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
 from estimators.log import READING, TICK, Log, Readings
 from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
-from estimators.particle import RECOVERIES, members
+from estimators.particle import RECOVERIES, block, members
 from estimators.track import FAILED, USED
 from estimators.tuning import Tuning
 
@@ -244,6 +244,20 @@ def test_a_cloud_that_explains_nothing_fails_visibly_and_recovers(name):
     for column in (run.track.mean, run.track.std, run.moments()[0], run.points()):
         assert np.all(np.isfinite(column))
     assert abs(run.track.mean[-1, 0] - 30.0) < 1.0
+
+
+def test_copies_of_one_particle_widen_too():
+    """No spread is left to double, nor process noise to bring it back; it takes the seed 23 doublings to reach 0.5."""
+    sharp = Sensor("y", (Row("y", "m", 0.04),), h=itself, log_likelihood=within_half)
+    model = scalar(sensors=(sharp,), noises=(Noise("s", "m²/s", 0.0),))
+    log = log_of(*((0.01 * k, READING, 2.0 if k == 0 else 4.0) for k in range(60)))
+    run = Fold("pf", model, Tuning.of(model).with_options({"particles": 20}), log)
+    run.advance(1)
+    block(run.options, run._state, 1)[:] = 2.0
+    run.advance()
+    failed = int((run.track.verdict == FAILED).sum())
+    assert 10 < failed < 40 and np.all(run.track.verdict[1 + failed :] == USED)
+    assert abs(run.track.mean[-1, 0] - 4.0) < 0.5
 
 
 def test_no_particles_are_refused():
