@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from .jit import F1, I1, f64, i64, jit
+from .jit import B1, F1, I1, f64, i64, jit
+from .log import RESET
 from .quantiles import chi_square_quantile
-from .track import DEGRADED, DIVERGED, GATED, STALE, TRACKING, USED, track_type
+from .track import DEGRADED, DIVERGED, FAILED, GATED, STALE, TRACKING, USED, track_type
 
 PROBABILITY = 0.95
 """Of the bounds that charts and reports show."""
@@ -29,7 +30,7 @@ class HealthPolicy(NamedTuple):
     `window` readings are averaged. Without a reading for `degraded_after` seconds the twin is degraded, after
     `stale_after` stale. It is degraded when the windowed NIS exceeds what chance exceeds once in a thousand windows,
     and diverged when it is `diverged_nis` times what it should be, when the gate refuses more than `diverged_gated` of
-    the window, or when a number is not finite.
+    the window (or they fail), or when a number is not finite. A reset begins a new window.
     """
 
     window: int = 50
@@ -69,26 +70,35 @@ def nis_bounds(dof: int, readings: int) -> tuple[float, float]:
 
 
 @jit
-def assess(first, last, t, track, policy, bounds):
+def judges(verdict):
+    """Whether a reading of this verdict says something of the estimate."""
+    return verdict == USED or verdict == GATED or verdict == FAILED
+
+
+@jit
+def assess(first, last, t, kind, track, policy, bounds):
     """Fill age, windowed NIS, its bounds and health of rows `first` to `last` of a track.
 
     A row looks only at rows before it, so the outcome does not depend on how a fold was cut into pieces. The window
-    changes with a used or gated reading; the other rows have that of the row before.
+    changes with a reading that is used, gated or failed; the other rows have that of the row before. A reset empties
+    it: what the readings said of the estimate before, they do not say of the new one.
     """
     judged = np.empty(policy.window, np.int64)  # rows of the last readings, a ring; the newest is at `newest`
     held = 0
     newest = -1
     row = first - 1
-    while row >= 0 and held < policy.window and first - row < FAR * policy.window:
-        if track.verdict[row] == USED or track.verdict[row] == GATED:
+    while row >= 0 and kind[row] != RESET and held < policy.window and first - row < FAR * policy.window:
+        if judges(track.verdict[row]):
             held += 1
             judged[policy.window - held] = row
             newest = policy.window - 1
         row -= 1
     for i in range(first, last):
-        if i == 0 or track.verdict[i] == USED or track.verdict[i] == GATED:
+        if kind[i] == RESET:
+            held = 0
+        if i == 0 or kind[i] == RESET or judges(track.verdict[i]):
             track.age[i] = 0.0
-            if track.verdict[i] == USED or track.verdict[i] == GATED:
+            if judges(track.verdict[i]):
                 newest = (newest + 1) % policy.window
                 judged[newest] = i
                 held = min(held + 1, policy.window)
@@ -121,7 +131,7 @@ def _look_back(i, judged, held, newest, track, policy, bounds):
     total = 0.0
     dof = 0
     used = 0
-    gated = 0
+    refused = 0
     at = newest
     for _ in range(held):
         row = judged[at]
@@ -132,7 +142,7 @@ def _look_back(i, judged, held, newest, track, policy, bounds):
             dof += track.dof[row]
             used += 1
         else:
-            gated += 1
+            refused += 1
         at = at - 1 if at > 0 else policy.window - 1
     if used > 0:
         track.nis_mean[i] = total / used
@@ -143,10 +153,11 @@ def _look_back(i, judged, held, newest, track, policy, bounds):
         track.nis_low[i] = np.nan
         track.nis_high[i] = np.nan
     track.consistency[i] = TRACKING
-    if used + gated >= FEW and (gated > policy.diverged_gated * (used + gated) or total > policy.diverged_nis * dof):
+    judged_all = used + refused
+    if judged_all >= FEW and (refused > policy.diverged_gated * judged_all or total > policy.diverged_nis * dof):
         track.consistency[i] = DIVERGED
     elif used >= FEW and total > bounds.alarm[dof]:
         track.consistency[i] = DEGRADED
 
 
-assess_signature = types.void(i64, i64, I1, track_type, policy_type, bounds_type)
+assess_signature = types.void(i64, i64, I1, B1, track_type, policy_type, bounds_type)

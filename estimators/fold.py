@@ -8,7 +8,7 @@ Same log, same tuning, same seed: the same bits, in whatever pieces the events c
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
@@ -141,9 +141,9 @@ def run_brief(code, context, first, start, end, t, kind, channel, value, clock, 
 
 
 @jit_brief
-def assess_brief(first, last, t, track, policy, bounds):
+def assess_brief(first, last, t, kind, track, policy, bounds):
     """`assess`, with the GIL."""
-    assess(first, last, t, track, policy, bounds)
+    assess(first, last, t, kind, track, policy, bounds)
 
 
 @jit
@@ -154,6 +154,21 @@ def _begin(code, context, mean, cov, state):
 I4 = types.int32[::1]
 begin_signature = types.void(code_type, context_type, F1, F2, F1)
 run_signature = types.void(code_type, context_type, i64, i64, i64, I1, B1, I4, F2, I1, F1, F1, F1, F1, F1, track_type)
+
+
+class Base(NamedTuple):
+    """Where a fold starts whose log has lost its oldest events: clock, inputs, and what the dropped events left.
+
+    mean (nx,) and cov (nx, nx), or the variances (1, nx) of a large state, stand for it in any filter. `state` is all
+    that the filter `estimator` had (modes, members, particles, what an adaptation learned), for that filter alone.
+    """
+
+    mean: np.ndarray
+    cov: np.ndarray
+    clock: int
+    u: np.ndarray
+    estimator: str = ""
+    state: np.ndarray | None = None
 
 
 class Fold:
@@ -168,7 +183,7 @@ class Fold:
         *,
         pairs: np.ndarray | None = None,
         policy: HealthPolicy | None = None,
-        base: tuple[np.ndarray, np.ndarray, int, np.ndarray] | None = None,
+        base: Base | None = None,
     ) -> None:
         """Prepare; nothing is folded yet.
 
@@ -179,8 +194,9 @@ class Fold:
             log: Events; the fold follows it as it grows.
             pairs: Pairs of states whose covariance the track keeps, shape (k, 2).
             policy: When the estimate may be trusted.
-            base: Mean, covariance, clock and inputs before the log's first event, where earlier events were dropped;
-                without it, the prior.
+            base: Where to start, where events before the log's first were dropped; without it, at the prior. The
+                filter that left it goes on from its whole state, also under another tuning, unless an option changed
+                the size of that; any other filter starts from the mean and covariance.
 
         Raises:
             EstimatorError: If the estimator does not exist, does not apply, or an option is out of range.
@@ -205,13 +221,16 @@ class Fold:
         self._u = np.array([item.default for item in model.inputs], float)
         mean, cov = self._held["prior_mean"], self._held["prior_cov"]
         if base is not None:
-            mean, cov, self._clock[0], self._u[:] = base
+            mean, cov, self._clock[0], self._u[:] = base.mean, base.cov, base.clock, base.u
         self._run, self._assess, self._run_brief, self._assess_brief, begin = _compiled()
         if model.black_box or self.estimator.interpreted:
             self._context = View(self._compiled, self._context, tuning, self.options, self.pairs)
             self._run = self._run_brief = fold_python.run
             begin = fold_python.begin
         begin(self._code, self._context, np.ascontiguousarray(mean), np.ascontiguousarray(cov), self._state)
+        left = base.state if base is not None and base.estimator == estimator else None
+        if left is not None and left.size == self._state.size:
+            self._state[:] = left
         self.n = 0
         # At least one old snapshot (the start) and one recent, however large the state is.
         self._most = max(1, SNAPSHOT_MEMORY // 2 // self._state.nbytes)
@@ -281,6 +300,10 @@ class Fold:
         """What to draw beside the mean, (k, nx): sigma points, particles; none for most filters."""
         return self.estimator.points(self.options, self._state, self.model.nx)
 
+    def recoveries(self) -> int:
+        """How often the filter had to help itself since it started, as a cloud of particles that lost the asset."""
+        return 0 if self.estimator.recoveries is None else self.estimator.recoveries(self._state)
+
     def modes(self) -> list[Mode]:
         """The peaks of the estimate, the heaviest first; a Gaussian filter has one."""
         if self.estimator.modes is not None:
@@ -336,7 +359,7 @@ class Fold:
                 self._remember()
         if end > begun:
             assess_some = self._assess_brief if brief else self._assess
-            assess_some(begun, end, log.t, self._rows, self.policy, self._bounds)
+            assess_some(begun, end, log.t, log.kind, self._rows, self.policy, self._bounds)
         return end - begun
 
     def _remember(self) -> None:
@@ -366,12 +389,12 @@ class Fold:
         self._clock[0], self._u[:], self._state[:] = clock, u, state
         self.n = at - self.log.first
 
-    def base_at(self, index: int) -> tuple[int, tuple[np.ndarray, np.ndarray, int, np.ndarray]]:
-        """The last snapshot at or before the event `index`: its index, and what `base` takes to start there."""
+    def base_at(self, index: int) -> tuple[int, Base]:
+        """The last snapshot at or before the event `index`: its index, and the base of a fold that starts there."""
         at = max(key for key in self._snapshots if key <= self.log.first + index)
         clock, u, state = self._snapshots[at]
         mean, cov = self.estimator.moments(self.options, state, self.model.nx)
-        return at - self.log.first, (mean, cov, clock, u.copy())
+        return at - self.log.first, Base(mean, cov, clock, u.copy(), self.estimator.name, state.copy())
 
     def follow(self, log: Log, changed_from: int | None) -> None:
         """Go on with the log of which the present one is an earlier copy.

@@ -73,6 +73,10 @@ class Readings(NamedTuple):
         return self.t.size
 
 
+# What `_replace` builds with; NamedTuple's own counts the columns by `len`, which here is the number of events.
+Readings._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[method-assign, assignment]
+
+
 def truth_of(events: Readings, state: int) -> tuple[np.ndarray, np.ndarray]:
     """What the truth events know of one state.
 

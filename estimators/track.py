@@ -28,7 +28,7 @@ class Track(NamedTuple):
     each configured pair of states. innovation, innovation_std (N, ny): reading minus prediction and the square
     root of S's diagonal; NaN where there is none. nis: νᵀ S⁻¹ ν, `dof` its degrees of freedom. nis_mean with
     nis_low and nis_high: mean NIS over the last readings, and its 95 % bounds. age: seconds since the last reading that
-    was used or gated. consistency: the health that the window's NIS and gate alone would give.
+    was used, gated or failed, or since a reset. consistency: the health that the window alone would give.
     """
 
     mean: Any
@@ -70,5 +70,8 @@ class Track(NamedTuple):
         """Number of rows (not of columns)."""
         return int(self.nis.size)
 
+
+# As in log.py: `len` counts rows, not columns.
+Track._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[method-assign, assignment]
 
 track_type = types.NamedTuple((F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, F1, B1, B1), Track)

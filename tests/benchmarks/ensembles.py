@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from estimators.compiled import compile_model
-from estimators.fold import Fold
+from estimators.fold import Base, Fold
 from estimators.log import READING, Log, Readings
 from estimators.model import StateSpaceModel
 from estimators.models.lorenz96 import LORENZ96
@@ -41,7 +41,7 @@ def _ours(name: str, options: dict[str, float]) -> Callable[[], None]:
     t = (np.arange(CYCLES, dtype=np.int64) + 1) * round(STEP * 1e9)
     log.extend(Readings(t, t, np.full(CYCLES, READING, np.int8), np.zeros(CYCLES, np.int32), readings))
     tuning = Tuning.of(LORENZ96).with_options(options).set("Q.x", 0.0)
-    growing = Fold(name, LORENZ96, tuning, log, base=(truth[0], 0.1 * np.eye(40), 0, np.zeros(0)))
+    growing = Fold(name, LORENZ96, tuning, log, base=Base(truth[0], 0.1 * np.eye(40), 0, np.zeros(0)))
     growing.advance()
 
     def again() -> None:

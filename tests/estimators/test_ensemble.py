@@ -10,7 +10,7 @@ from estimators import ensemble as shared
 from estimators import localisation
 from estimators.compiled import compile_model
 from estimators.errors import EstimatorError
-from estimators.fold import Fold
+from estimators.fold import Base, Fold
 from estimators.localisation import gaspari_cohn
 from estimators.log import READING, TICK, Log, Readings
 from estimators.model import Field, Noise, Row, Sensor, State, StateSpaceModel
@@ -395,7 +395,7 @@ def test_errors_on_lorenz_96_are_the_published_ones(name, options, published):
     """
     first, truth, log = lorenz_run(1300)
     tuning = Tuning.of(LORENZ96).with_options(options).set("Q.x", 0.0)
-    base = (first + 0.3 * np.random.default_rng(0).standard_normal(40), 0.1 * np.eye(40), 0, np.zeros(0))
+    base = Base(first + 0.3 * np.random.default_rng(0).standard_normal(40), 0.1 * np.eye(40), 0, np.zeros(0))
     fold = Fold(name, LORENZ96, tuning, log, base=base)
     fold.advance()
     error = np.sqrt(np.mean((fold.track.mean[1:] - truth) ** 2, axis=1))[300:].mean()

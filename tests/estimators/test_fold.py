@@ -183,6 +183,45 @@ def test_drop_front_and_base_at(estimator):
         growing.drop_front(1)
 
 
+KEEPING = {
+    "pf": {"particles": 60.0}, "pf-reg": {"particles": 60.0}, "apf": {"particles": 60.0}, "enkf": {"members": 9.0},
+    "etkf": {"members": 9.0, "rotation": 1.0}, "ekf": {"adapt": 1.0}, "sr-ukf": {}, "filterpy-enkf": {"members": 9.0},
+}  # fmt: skip
+"""Filters whose mean and covariance are not all that they know."""
+ALONE = ("mean", "std", "cross", "innovation", "innovation_std", "nis", "log_likelihood", "dof", "verdict")
+"""Columns that do not look back over a cut."""
+
+
+@pytest.mark.parametrize("name", KEEPING)
+def test_the_same_filter_goes_on_from_a_cut_with_all_it_knew(name):
+    events = everything(np.random.default_rng(9), 1500)
+    tuning = Tuning.of(MODEL).with_options(KEEPING[name])
+    whole = Fold(name, MODEL, tuning, as_log(events))
+    whole.advance()
+    at, base = whole.base_at(1200)
+    assert 0 < at <= 1200 and base.estimator == name
+
+    def rest(estimator, tuning):
+        log = as_log(events.select(slice(at, None)))
+        log.first = at
+        fold = Fold(estimator, MODEL, tuning, log, base=base)
+        started = fold.moments()
+        fold.advance()
+        return started, fold.track
+
+    _, again = rest(name, tuning)
+    for column in ALONE:
+        np.testing.assert_array_equal(getattr(again, column), getattr(whole.track, column)[at:], err_msg=column)
+    # Another tuning goes on from there too; another filter, or another size, from the moments.
+    (mean, cov), _ = rest(name, tuning.set("R.first", 3.0))
+    np.testing.assert_array_equal(mean, base.mean)
+    np.testing.assert_array_equal(cov, base.cov)
+    for other, options in (("ukf", {}), (name, {key: 2 * value for key, value in KEEPING[name].items()})):
+        if "rotation" not in options:
+            (mean, _), _ = rest(other, Tuning.of(MODEL).with_options(options))
+            np.testing.assert_allclose(mean, base.mean, atol=5.0 * np.sqrt(np.diag(base.cov).max()))
+
+
 @QUICK
 def test_follow_over_a_cut(estimator):
     """The live log forgot its oldest events while a copy was refolded."""

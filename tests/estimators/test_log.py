@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from estimators.log import READING, TICK, TRUTH, Log, Readings, truth_of
+from estimators.track import Track
 
 SECOND = 1_000_000_000
 
@@ -187,3 +188,11 @@ def test_truth_of_is_its_definition(seed):
         assert got[0].tolist() == rows and got[1].tolist() == values
     assert all(len(rows) > 5 for rows, _ in list(known.values())[:states])
     assert truth_of(Readings.empty(2), 0)[1].size == 0
+
+
+def test_columns_can_be_replaced_though_len_counts_events():
+    events = Readings.one(1, 2, READING, 0, [1.0], 2)
+    changed = events._replace(t=np.array([5]))
+    assert changed.t.tolist() == [5] and changed.arrival is events.arrival and len(changed) == 1
+    track = Track.allocate(7, 2, 1, 1)
+    assert len(track._replace(nis=np.zeros(3))) == 3
