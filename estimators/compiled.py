@@ -7,7 +7,7 @@ with the declaration: shapes, finiteness at the prior, and derivatives.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import Any
@@ -186,6 +186,7 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
             "shown": model.shown,
         },
     )
+    _probe_angles(model, compiled.h)
     if derivable:
         _check_derivatives(compiled)
     return compiled
@@ -256,6 +257,40 @@ def _probe(model: StateSpaceModel) -> None:
             )
         if what == "Q" and not np.allclose(out, out.T):
             raise ModelError(f"model {model.name}: Q is not symmetric at the prior; fill both triangles")
+        if what == "Q":
+            values = np.linalg.eigvalsh(out)
+            # Rounding leaves the zero eigenvalues of a singular Q at n ε of the largest.
+            if values[0] < -1e-9 * max(values[-1], -values[0]):
+                raise ModelError(
+                    f"model {model.name}: Q has the eigenvalue {values[0]:.3g} at the prior; a covariance must be "
+                    "positive semidefinite"
+                )
+
+
+def _probe_angles(model: StateSpaceModel, h: Sequence[Callable]) -> None:
+    """Refuse a sensor row that tells a full turn of a circular state, whose filters turn it back to within ±π."""
+    if model.nx > LARGE or not np.any(model.circular):
+        return
+    x = model.prior_mean + 0.3 * model.prior_std
+    u = np.array([item.default for item in model.inputs], float)
+    p = np.array([item.value for item in model.parameters], float)
+    for sensor, expected in zip(model.sensors, h, strict=True):
+        here, there = np.empty(len(sensor.rows)), np.empty(len(sensor.rows))
+        expected(x, u, p, here)
+        for j in np.flatnonzero(model.circular):
+            turned = x.copy()
+            turned[j] += 2.0 * np.pi
+            expected(turned, u, p, there)
+            for row, before, after in zip(sensor.rows, here, there, strict=True):
+                change = after - before
+                if row.circular:
+                    change -= 2.0 * np.pi * np.round(change / (2.0 * np.pi))
+                if abs(change) > 1e-6 * max(1.0, abs(before)):
+                    raise ModelError(
+                        f"model {model.name}: row {row.name} of sensor {sensor.name} changes by {change:.3g} with a "
+                        f"full turn of {model.state_names[int(j)]}, which is circular; declare the row circular, or "
+                        "let h be periodic"
+                    )
 
 
 def _probe_likelihoods(model: StateSpaceModel) -> None:

@@ -10,10 +10,11 @@ import pytest
 
 from app.twin import load_twin
 from estimators.compiled import compile_model
+from estimators.errors import ModelError
 from estimators.fold import fold
 from estimators.jacobians import ANALYTIC, COMPLEX_STEP
 from estimators.log import INPUT, READING, Log, Readings, truth_of
-from estimators.model import StateSpaceModel
+from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.models.motor_drive import COPPER, MOTOR_DRIVE
 from estimators.models.road_car import ROAD_CAR
@@ -360,3 +361,41 @@ def test_drive_s_own_jacobian_is_the_complex_step_of_its_step() -> None:
             exact[:, j] = out.imag / 1e-20
         # Both are exact but for rounding of a few dozen operations on numbers of about one.
         np.testing.assert_allclose(own, exact, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize(("reads", "row_circular", "fine"), [
+    ("angle", False, False), ("angle", True, True), ("sine", False, True), ("twice", True, True), ("half", True, False),
+])  # fmt: skip
+def test_an_angle_read_by_a_row_that_does_not_wrap_is_refused(reads, row_circular, fine):
+    """What a full turn changes, no filter can compare: the state is within ±π whenever h sees it."""
+
+    def f(x, u, p, dt, out):
+        out[0] = x[0]
+
+    h = {"angle": plain_angle, "sine": sine_of_angle, "twice": twice_the_angle, "half": half_the_angle}[reads]
+    model = StateSpaceModel(
+        name="vane", title="", f=f, states=(State("angle", "rad", 0.0, 0.5, circular=True),),
+        noises=(Noise("angle", "rad²/s", 0.1),),
+        sensors=(Sensor("y", (Row("y", "rad", 0.1, circular=row_circular),), h),),
+    )  # fmt: skip
+    if fine:
+        compile_model(model)
+    else:
+        with pytest.raises(ModelError, match="with a full turn of angle, which is circular; declare the row circular"):
+            compile_model(model)
+
+
+def plain_angle(x, u, p, out):
+    out[0] = x[0]
+
+
+def sine_of_angle(x, u, p, out):
+    out[0] = np.sin(x[0])
+
+
+def twice_the_angle(x, u, p, out):
+    out[0] = 2.0 * x[0]
+
+
+def half_the_angle(x, u, p, out):
+    out[0] = 0.5 * x[0]
