@@ -108,7 +108,8 @@ def load_text(text: str, path: Path, overrides: Mapping[str, str] | None = None)
         raise ConfigError(f"{file}:1: the file is empty; a twin needs at least model and source")
     if not isinstance(data, dict):
         raise ConfigError(f"{file}:1: the file is {shown(data)}; it must be a mapping of keys and values")
-    for key, value in (overrides or {}).items():
+    # First what is named as a whole, then what is in it: a filter, then its options.
+    for key, value in sorted((overrides or {}).items(), key=lambda item: item[0].count(".")):
         _override(data, places, key, value)
     try:
         config = TwinSection.model_validate(data)
@@ -131,6 +132,8 @@ def _override(data: dict[str, Any], places: Places, dotted_key: str, text: str) 
     except ConfigError:
         raise ConfigError(f"{option}: the value is not valid YAML; put brackets and colons in quotes") from None
     parts = dotted_key.split(".")
+    if parts[0] == "estimator" and len(parts) > 1 and isinstance(data.get("estimator"), str):
+        data["estimator"] = {"name": data["estimator"]}
     if not all(parts):
         raise ConfigError(f"{option}: the key has an empty part; write it like source.interface")
     key: list[str | int] = []

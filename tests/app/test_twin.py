@@ -315,3 +315,12 @@ def test_a_parameter_to_estimate_becomes_a_state_that_the_yaml_may_name() -> Non
     assert model.noises[-1].variance == pytest.approx(1e-6)
     with pytest.raises(ConfigError, match="motor.yaml:4: .*yoke_coolnt is no parameter of motor_drive; did you mean"):
         twin_of(text.replace("  yoke_coolant: {std", "  yoke_coolnt: {std"))
+
+
+def test_a_filter_given_by_name_takes_options(tmp_path):
+    """`estimator: ekf` in the YAML, or --estimator, and its options each by a --set of their own, in any order."""
+    for name, given in [("battery_panasonic", {}), ("motor_winding", {"estimator": "ekf"}), ("lorenz63", {})]:
+        overrides = {"estimator.options.inflation": "1.25", **given}
+        made = load_twin(name, overrides=overrides)
+        assert made.tuning.options["inflation"] == 1.25
+        assert made.estimator == given.get("estimator", load_twin(name).estimator)
