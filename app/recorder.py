@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -29,6 +31,9 @@ CHARTS = 5.0
 """Seconds between two writes of what the charts show, which follows from the rows. Each of its many entities costs the
 same for a few rows as for thousands, and holds up the readings meanwhile."""
 
+NEARLY_FULL = 2**20
+"""Free bytes under which a disk that takes no more is said to be full."""
+
 ROWS = 20_000
 """Rows pulled at once, so that a long history does not hold the engine's lock for long."""
 
@@ -44,6 +49,7 @@ class Recorder:
         self._stopping = False
         self._open: _Open | None = None
         self.finished: list[Path] = []
+        self.failure = ""
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
 
     @property
@@ -82,7 +88,7 @@ class Recorder:
             except NisusError as error:
                 self._fail(str(error))
             except Exception as error:  # noqa: BLE001  a full disk or a driver's fault must not stop the twin
-                self._fail(f"{type(error).__name__}: {error}")
+                self._fail(self._reason(error))
             if self._stopping and self._open is None:
                 return
             self._wake.wait(PERIOD if self._open is not None else None)
@@ -96,8 +102,19 @@ class Recorder:
         self.finished.append(open_file.file.path)
         self._engine.notices.say(f"recorded {open_file.file.rows} rows into {open_file.file.path}")
 
+    def _reason(self, error: Exception) -> str:
+        # Rerun says only that its writer is gone.
+        if self._open is None:
+            return f"{type(error).__name__}: {error}"
+        path, reason = self._open.file.path, f"it can no longer be written ({error})"
+        with suppress(OSError):
+            if shutil.disk_usage(path.parent).free < NEARLY_FULL:
+                reason = "the disk is full"
+        return f"{path}: {reason}; what was written until then can be reviewed"
+
     def _fail(self, text: str) -> None:
-        self._engine.notices.report("recording failed", f"recording failed: {text}", level="error")
+        self.failure = f"recording failed: {text}"
+        self._engine.notices.report("recording failed", self.failure, level="error")
         self._wanted = None
         if self._open is not None:
             self._open.release()

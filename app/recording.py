@@ -9,7 +9,10 @@ cuts off what lay behind it.
 
 from __future__ import annotations
 
+import base64
 import json
+import struct
+import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -22,6 +25,7 @@ import rerun as rr
 from rerun.chunk import RrdReader
 
 from estimators.errors import SourceError
+from estimators.fold import Base
 from estimators.log import Readings
 from estimators.model import StateSpaceModel
 from estimators.track import Track
@@ -31,7 +35,8 @@ from .pull import Pull
 
 FORMAT = 1
 TIMELINE = "event"
-Base = tuple[np.ndarray, np.ndarray, int, np.ndarray]
+PATIENCE = 5.0
+"""Seconds for a file to take what it is given; Rerun would wait for ever on one that takes no more."""
 
 
 def tuning_to_json(tuning: Tuning, estimator: str) -> str:
@@ -66,6 +71,33 @@ def tuning_from_json(text: str, model: StateSpaceModel) -> tuple[Tuning, str]:
     return tuning, values["estimator"]
 
 
+def base_to_json(base: Base | None) -> str:
+    """A base as text; float64s survive exactly."""
+    if base is None:
+        return "null"
+    moments = {"mean": base.mean.tolist(), "cov": base.cov.tolist(), "clock": base.clock, "u": base.u.tolist()}
+    if base.state is None:
+        return json.dumps(moments)
+    state = base64.b64encode(np.ascontiguousarray(base.state, "<f8").tobytes()).decode()
+    return json.dumps({**moments, "estimator": base.estimator, "state": state})
+
+
+def base_from_json(text: str) -> Base | None:
+    """The base that `base_to_json` wrote; older recordings hold moments only."""
+    values = json.loads(text)
+    if values is None:
+        return None
+    state = values.get("state")
+    return Base(
+        np.array(values["mean"]),
+        np.array(values["cov"]),
+        int(values["clock"]),
+        np.array(values["u"], float),
+        values.get("estimator", ""),
+        None if state is None else np.frombuffer(base64.b64decode(state), "<f8").astype(float),
+    )
+
+
 class RecordingFile:
     """An .rrd that is being written, in a stream of its own: no viewer can hold it up."""
 
@@ -91,13 +123,9 @@ class RecordingFile:
         self.stream = rr.RecordingStream(f"nisus_{name}", recording_id=f"{name}-{path.stem}")
         self.stream.set_sinks(rr.FileSink(str(path)))
         self.rows = 0
-        start = None
-        if base is not None:
-            mean, cov, clock, u = base
-            start = {"mean": mean.tolist(), "cov": cov.tolist(), "clock": clock, "u": u.tolist()}
         self.stream.log(
             "/nisus/twin",
-            rr.AnyValues(format=FORMAT, name=name, yaml=text, path=str(twin_path), base=json.dumps(start)),
+            rr.AnyValues(format=FORMAT, name=name, yaml=text, path=str(twin_path), base=base_to_json(base)),
             static=True,
         )
 
@@ -138,11 +166,11 @@ class RecordingFile:
 
     def flush(self) -> None:
         """Hand everything to the operating system."""
-        self.stream.flush()
+        self.stream.flush(timeout_sec=PATIENCE)
 
     def close(self) -> None:
         """Finish the file."""
-        self.stream.flush()
+        self.stream.flush(timeout_sec=PATIENCE)
         self.stream.disconnect()
 
 
@@ -172,12 +200,58 @@ def read_recording(path: Path) -> Recorded:
     """
     if not path.is_file():
         raise SourceError(f"{path}: there is no such recording; check the path")
-    header: dict[str, Any] = {}
-    tunings: list[str] = []
-    notices: list[tuple[int, str, str]] = []
-    events: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
-    tracks: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
+    content = _Content()
     try:
+        content.read(path)
+    except Exception:  # noqa: BLE001  Rerun's reader raises many kinds on a damaged file
+        # Cut in the middle of a message, by a full disk or a power cut: what stands before it is whole.
+        with tempfile.TemporaryDirectory() as folder:
+            whole = Path(folder) / path.name
+            content = _Content()
+            try:
+                copy_whole(path, whole)
+                content.read(whole)
+            except Exception as error:  # noqa: BLE001  as above
+                if not (content.header and content.events):
+                    raise SourceError(f"{path}: cannot be read ({_line(error)}); is it an .rrd file?") from None
+    header, tunings, notices = content.header, content.tunings, content.notices
+    events, tracks = content.events, content.tracks
+    if not header or not tunings:
+        raise SourceError(f"{path}: holds no recording of Nisus; record one with `nisus run TWIN --record FILE.rrd`")
+    if int(header["format"]) != FORMAT:
+        raise SourceError(f"{path}: has format {header['format']}, this version reads {FORMAT}; use the other")
+    first, log_columns = _latest(events)
+    _, track_columns = _latest(tracks)
+    readings = _assemble(Readings, log_columns)
+    track = _assemble(Track, track_columns)
+    rows = min(len(readings), len(track))
+    return Recorded(
+        path=path,
+        name=str(header["name"]),
+        text=str(header["yaml"]),
+        twin_path=Path(str(header["path"])),
+        base=base_from_json(str(header["base"])),
+        tuning=str(tunings[-1]),
+        tunings=len(tunings),
+        readings=readings.select(slice(0, rows)),
+        track=track.select(slice(0, rows)),
+        notices=notices,
+        first=first,
+        rows=rows,
+    )
+
+
+class _Content:
+    """What the entities under /nisus hold, in the order of the file."""
+
+    def __init__(self) -> None:
+        self.header: dict[str, Any] = {}
+        self.tunings: list[str] = []
+        self.notices: list[tuple[int, str, str]] = []
+        self.events: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
+        self.tracks: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
+
+    def read(self, path: Path) -> None:
         with warnings.catch_warnings():
             # A killed writer leaves no footer; that such a file can still be read is the point.
             warnings.simplefilter("ignore")
@@ -188,46 +262,38 @@ def read_recording(path: Path) -> Recorded:
             batch = chunk.to_record_batch()
             names = {name: k for k, name in enumerate(batch.schema.names)}
             if chunk.entity_path == "/nisus/twin":
-                header = {name: _flat(batch.column(k))[0] for name, k in names.items() if not _control(name)}
+                self.header = {name: _flat(batch.column(k))[0] for name, k in names.items() if not _control(name)}
             elif chunk.entity_path == "/nisus/notices":
                 parts = (_flat(batch.column(names[name])).tolist() for name in ("t", "level", "text"))
-                notices += zip(*parts, strict=True)
+                self.notices += zip(*parts, strict=True)
             elif chunk.entity_path == "/nisus/tuning":
-                tunings += _flat(batch.column(names["json"])).tolist()
+                self.tunings += _flat(batch.column(names["json"])).tolist()
             else:
                 index = batch.column(names[TIMELINE]).to_numpy()
                 columns = {name: _flat(batch.column(k)) for name, k in names.items() if not _control(name)}
-                (events if chunk.entity_path == "/nisus/events" else tracks).append((index, columns))
-    except Exception as error:  # noqa: BLE001  Rerun's reader raises many kinds on a damaged file
-        if not (header and events):
-            raise SourceError(f"{path}: cannot be read ({_line(error)}); is it an .rrd file?") from None
-    if not header or not tunings:
-        raise SourceError(f"{path}: holds no recording of Nisus; record one with `nisus run TWIN --record FILE.rrd`")
-    if int(header["format"]) != FORMAT:
-        raise SourceError(f"{path}: has format {header['format']}, this version reads {FORMAT}; use the other")
-    first, log_columns = _latest(events)
-    _, track_columns = _latest(tracks)
-    readings = _assemble(Readings, log_columns)
-    track = _assemble(Track, track_columns)
-    rows = min(len(readings), len(track))
-    start = json.loads(str(header["base"]))
-    base: Base | None = None
-    if start is not None:
-        base = (np.array(start["mean"]), np.array(start["cov"]), int(start["clock"]), np.array(start["u"], float))
-    return Recorded(
-        path=path,
-        name=str(header["name"]),
-        text=str(header["yaml"]),
-        twin_path=Path(str(header["path"])),
-        base=base,
-        tuning=str(tunings[-1]),
-        tunings=len(tunings),
-        readings=readings.select(slice(0, rows)),
-        track=track.select(slice(0, rows)),
-        notices=notices,
-        first=first,
-        rows=rows,
-    )
+                (self.events if chunk.entity_path == "/nisus/events" else self.tracks).append((index, columns))
+
+
+STREAM_HEADER, MESSAGE_HEADER = 12, struct.Struct("<QQ")
+"""Bytes before the first message of an .rrd; and before each: its kind, and how many bytes follow."""
+
+
+def copy_whole(path: Path, to: Path) -> None:
+    """Copy an .rrd up to the last message that is there in full."""
+    size = path.stat().st_size
+    end = STREAM_HEADER
+    with path.open("rb") as file:
+        while end + MESSAGE_HEADER.size <= size:
+            file.seek(end)
+            _, length = MESSAGE_HEADER.unpack(file.read(MESSAGE_HEADER.size))
+            if end + MESSAGE_HEADER.size + length > size:
+                break
+            end += MESSAGE_HEADER.size + length
+        file.seek(0)
+        with to.open("wb") as copy:
+            while end > 0 and (piece := file.read(min(end, 1 << 20))):
+                copy.write(piece)
+                end -= len(piece)
 
 
 def _control(name: str) -> bool:

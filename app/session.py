@@ -14,15 +14,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from estimators.errors import SourceError
+
 from .commands import Record
 from .engine import Engine
 from .recorder import Recorder
 from .rerun_rows import RerunRows
 
 if TYPE_CHECKING:
+    from estimators.fold import Base
     from sources.source import Source
 
-    from .recording import Base
     from .twin import Twin
 
 SWITCH = 0.0005
@@ -118,7 +120,7 @@ class Session:
         """Run until interrupted, for `duration` seconds, or (`until_finished`) until the source has ended.
 
         Raises:
-            NisusError: If the page cannot be served.
+            NisusError: If the page cannot be served, or, in the end, that `record` could not be written.
         """
         done = threading.Event()
         previous = signal.signal(signal.SIGTERM, lambda *_: done.set())
@@ -141,3 +143,5 @@ class Session:
         finally:
             signal.signal(signal.SIGTERM, previous)
             self.stop()
+        if record is not None and self.recorder.failure:
+            raise SourceError(self.recorder.failure)

@@ -182,25 +182,30 @@ def test_killed_process_loses_less_than_a_second(tmp_path):
     assert_same(refold(recorded), recorded.track)
 
 
-def test_truncated_recording_keeps_what_is_whole(running, tmp_path):
-    source, engine, recorder = running
+def test_truncated_recording_keeps_what_is_whole(tmp_path):
+    """Cut in the middle of a message, as by a full disk: what was whole before it is there."""
+    times = np.arange(1, 1001) * 0.01
+    log = Log(MODEL.width)
+    log.extend(readings(times, np.full(1000, 40.0)))
+    track = fold("kf", MODEL, Tuning.of(MODEL), log, pairs=np.array([[0, 1]]))
     path = tmp_path / "run.rrd"
-    engine.submit(commands.Record(path))
-    wait_for(lambda: recorder.path == path)
+    file = RecordingFile(path, name="scripted", text="model: motor_winding\n", twin_path=Path("x.yaml"), base=None)
+    file.tuning(Tuning.of(MODEL), "kf", 0, 0)
     for start in range(0, 1000, 100):
-        source.put(readings(np.arange(start + 1, start + 101) * 0.01, np.full(100, 40.0)))
-        wait_for(lambda start=start: len(rows(engine).readings) == start + 100)
-    engine.submit(commands.Record(None))
-    wait_for(lambda: recorder.finished == [path])
+        part = slice(start, start + 100)
+        file.write(Pull(0, start == 0, start, log.readings.select(part), track.select(part)))
+        file.flush()
+    file.close()
     whole = path.read_bytes()
     cut = tmp_path / "cut.rrd"
-    cut.write_bytes(whole[: int(len(whole) * 0.6)])
-    try:
+    kept = []
+    for part in np.linspace(0.2, 1.0, 12):
+        cut.write_bytes(whole[: int(len(whole) * part)])
         recorded = read_recording(cut)
-    except SourceError as error:
-        assert "cut.rrd" in str(error)  # too little was left to hold a row
-    else:
-        assert_same(refold(recorded), recorded.track)
+        kept.append(recorded.rows)
+        if recorded.rows:
+            assert_same(refold(recorded), recorded.track)
+    assert kept == sorted(kept) and kept[-1] == 1000 and len(set(kept)) > 5
 
 
 def test_recordings_with_one_true_value_an_event_read_back(tmp_path):
@@ -231,3 +236,19 @@ def test_recordings_with_one_true_value_an_event_read_back(tmp_path):
         score(fold("kf", MODEL, Tuning.of(MODEL), events), events.readings, MODEL).states for events in (log, blocks)
     ]
     assert scores[0] == scores[1] and list(scores[0]) == ["temperature", "rate"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_FSIZE stands in for a full disk")
+def test_a_file_that_takes_no_more_is_one_line_and_keeps_what_it_has(tmp_path):
+    """In a process of its own, whose files may not grow beyond a limit."""
+    path = tmp_path / "full.rrd"
+    limited = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))\n" + CHILD
+    code = limited.replace("while True", "while not engine.notices.counts().get('recording failed')")
+    code += "print('LINE', [line.text for line in engine.notices.since(0) if line.level == 'error'])\n"
+    code = code.format(tests=str(Path(__file__).parent), root=str(Path(__file__).parents[2]), path=str(path))
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    (said,) = [line for line in child.stdout.splitlines() if line.startswith("LINE")]
+    assert f"recording failed: {path}: it can no longer be written" in said and said.count("recording failed") == 1
+    recorded = read_recording(path)
+    assert recorded.rows > 10
+    assert_same(refold(recorded), recorded.track)
