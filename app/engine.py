@@ -9,33 +9,35 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from estimators.diagnostics import HealthPolicy
-from estimators.errors import ConfigError, EstimatorError, NisusError
-from estimators.fold import SPARSE_EVERY, Fold
-from estimators.log import RESET, TICK, Log, Readings
+from estimators.errors import EstimatorError, NisusError
+from estimators.fold import SPARSE_EVERY, Base, Fold
+from estimators.log import TICK, Log, Readings
 from estimators.modes import modes_of
 from estimators.registry import find_estimator
-from estimators.track import HEALTH_NAMES
+from estimators.track import TRACKING
 
 from . import commands
 from .feeder import Feeder, Finished, Restarted
 from .notices import Notices
-from .playback import PLAYBACK, play, playback_status
+from .obey import Remembered, obey
+from .playback import playback_status
 from .pull import Belief, Cursor, Pull, Status
-from .refolder import Refolded, Refolder
-from .tally import Latency, Tally, complaints
+from .refolder import Refolded, Refolder, Requests
+from .silence import Silence
+from .tally import Latency, Tally, last_run
+from .watch import Watch
 
 if TYPE_CHECKING:
     from estimators.tuning import Tuning
     from sources.source import Source
 
-    from .recording import Base
     from .twin import Twin
 
 STATUS_AGE = 0.1
@@ -75,6 +77,7 @@ class Engine:
         self._tick = section.tick
         self._history = max(2 * SPARSE_EVERY, twin.config.history)
         self.estimator, self.tuning = twin.estimator, twin.tuning
+        self._options = Remembered(twin)
         self._lock = threading.Lock()
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._cursors: list[Cursor] = []
@@ -83,17 +86,14 @@ class Engine:
         self._clear(base)
         self._feeder = Feeder(lambda: open_source(self.notices.report), self._inbox, self.notices.report)
         self._refolder = Refolder(self._inbox.put)
-        self._ticket = 0
-        self._answered = 0
-        self._changed_from: int | None = None
+        self._requests = Requests()
         self._previous: Pull | None = None
         self._revision = 0
         self._stopping = threading.Event()
         self._finished = False
-        self._heard = time.monotonic()
-        self._newest_at_heard: int | None = None
+        self._silence = Silence(section.tick)
         self._latency = Latency()
-        self._health = 0
+        self._watch = Watch(self.notices)
         self._status: tuple[float, Status] | None = None
         self.recorder: Any = None
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
@@ -166,6 +166,20 @@ class Engine:
             cursor.notice = lines[-1].number + 1
         return replace(pull, notices=lines)
 
+    @property
+    def source(self) -> Source:
+        """Where the readings come from; it may be opened anew."""
+        return self._feeder.source
+
+    def options_of(self, estimator: str) -> Mapping[str, float]:
+        """The options with which an estimator starts: as it was left, or as the YAML says."""
+        return self._options.of(estimator)
+
+    def span(self) -> tuple[int, int]:
+        """Times of the first and the last event, ns; zeros while there is none."""
+        with self._lock:
+            return (int(self._log.t[0]), int(self._log.t[self._log.n - 1])) if self._log.n else (0, 0)
+
     def base(self) -> Base | None:
         """Where a fold of the present log starts, if its oldest events were dropped; else None, for the prior."""
         return self._base
@@ -203,9 +217,10 @@ class Engine:
                 tuning=self.tuning,
                 options=find_estimator(self.estimator, self.model).complete(dict(self.tuning.options)),
                 revision=self._revision,
-                refolding=self._answered != self._ticket,
+                refolding=self._requests.waiting,
                 t=int(log.t[last]) if last >= 0 else None,
-                health=int(track.health[last]) if last >= 0 else 0,
+                health=int(track.health[last]) if last >= 0 else TRACKING,
+                since=int(log.t[last_run(track.health)]) if last >= 0 else None,
                 counts={
                     **self._tally.count(track.verdict),
                     **self.notices.counts(),
@@ -260,15 +275,14 @@ class Engine:
         if not batches:
             return
         batch = batches[0] if len(batches) == 1 else Readings.concat(batches, self.model.width)
-        self._heard = time.monotonic()
         with self._lock:
             first, stale = self._log.extend(batch, self._horizon)
-            self._newest_at_heard = self._log.newest
+            self._silence.broken(self._log.newest)
             before = min(first, self._fold.n)
             if first < self._fold.n:
                 self._go_back(first)
             self._fold.advance()
-            self._look(before)
+            self._watch.look(self._fold, before)
             if self._log.n > self._history + 3 * SPARSE_EVERY:
                 self._forget()
         if stale:
@@ -281,18 +295,9 @@ class Engine:
         self._fold.rewind(index)
         self._tally.changed(index)
         absolute = self._log.first + index
-        self._changed_from = absolute if self._changed_from is None else min(self._changed_from, absolute)
+        self._requests.changed(absolute)
         for cursor in self._cursors:
             cursor.next = min(cursor.next, absolute)
-
-    def _look(self, before: int) -> None:
-        """Report what the new rows say: readings that could not be used, and changes of health."""
-        track, log = self._fold.track, self._log
-        for key, text in complaints(self.model, log.channel, track, before):
-            self.notices.report(key, text)
-        if len(track) and track.health[-1] != self._health:
-            self._health = int(track.health[-1])
-            self.notices.say(f"health: {HEALTH_NAMES[self._health]}", level="info" if self._health == 0 else "warn")
 
     def _forget(self) -> None:
         """Drop the oldest events, up to a snapshot, from which later refolds start."""
@@ -304,27 +309,11 @@ class Engine:
             self._log.drop_front(count)
 
     def _when_silent(self) -> None:
-        """Nothing arrived: ask what the estimate is now, so that its growing uncertainty shows."""
-        silent = time.monotonic() - self._heard
-        if self._finished or silent < self._tick or not self._log.n:
+        if self._finished or not self._log.n:
             return
-        source = self._feeder.source
-        if source.live:
-            assert self._newest_at_heard is not None
-            # Counted from the newest reading: a driver's clock need not be this machine's.
-            now: int | None = self._newest_at_heard + int(silent * 1e9)
-        else:
-            now = None if getattr(source, "paused", False) else source.now()
-        # The longer the silence, the rarer the question: a night of it must not fill the log.
-        apart = max(self._tick, silent / 20)
-        if now is None or now <= self._log.t[self._log.n - 1] + apart * 0.9e9:
-            return
-        tick = Readings.one(now, time.time_ns(), TICK, 0, [], self.model.width)
-        with self._lock:
-            before = self._fold.n
-            self._log.extend(tick)
-            self._fold.advance()
-            self._look(before)
+        now = self._silence.asks(self._feeder.source, int(self._log.t[self._log.n - 1]))
+        if now is not None:
+            self.insert(Readings.one(now, time.time_ns(), TICK, 0, [], self.model.width))
 
     def _obey(self, item: Any) -> None:
         """Carry one command out, or take a refold or a word from the feeder."""
@@ -335,74 +324,62 @@ class Engine:
         elif isinstance(item, Finished):
             self._finished = True
             self.notices.say("the source has ended; the estimate stays")
-        elif isinstance(item, commands.SetEstimator):
-            self._retune(item.name, self.tuning.with_options(self.twin.options_of(item.name)))
-        elif isinstance(item, commands.SetTuning):
-            self._retune(self.estimator, self.tuning.set(item.key, item.value))
-        elif isinstance(item, commands.SetOption):
-            options = {**self.tuning.options, item.name: float(item.value)}
-            find_estimator(self.estimator, self.model).complete(options)
-            self._retune(self.estimator, self.tuning.with_options(options))
-        elif isinstance(item, commands.UseSensor):
-            self._retune(self.estimator, self.tuning.set(f"use.{item.name}", item.used))
-        elif isinstance(item, commands.Reset):
-            self._reset()
-        elif isinstance(item, commands.Record):
-            if self.recorder is None:
-                raise ConfigError("this session cannot record")
-            self.recorder.record(item.path)
-        elif isinstance(item, PLAYBACK):
-            play(self._feeder.source, item, int(self._log.t[0]) if self._log.n else 0)
+        else:
+            obey(item, self)
 
     def _restart(self) -> None:
-        """The source began again: so does the log. The fold is a new revision of it."""
+        """The source began again: so does the log. The fold is a new revision of it; a refold is asked for again."""
+        wanted = (self.estimator, self.tuning) if self._requests.waiting else None
         with self._lock:
             self._previous = None
+            self.estimator, self.tuning = self._fold.estimator.name, self._fold.tuning
             self._clear(self._first_base)
             self._revision += 1
             self._finished = False
-            self._ticket += 1
-            self._answered = self._ticket
+            self._requests.forget()
+            self._watch.again()
+        if wanted:
+            self.retune(*wanted)
 
-    def _reset(self) -> None:
-        if not self._log.n:
-            return
-        at = int(self._log.t[self._log.n - 1])
-        event = Readings.one(at, time.time_ns(), RESET, 0, [], self.model.width)
+    def insert(self, event: Readings) -> None:
+        """Put an event of our own behind the last one."""
         with self._lock:
+            before = self._fold.n
             self._log.extend(event)
             self._fold.advance()
-        self.notices.say("estimate reset to the prior")
+            self._watch.look(self._fold, before)
 
-    def _retune(self, estimator: str, tuning: Tuning) -> None:
+    def retune(self, estimator: str, tuning: Tuning) -> None:
         """Fold the history again, beside the running fold, over a copy of the log."""
-        find_estimator(estimator, self.model)
+        self._options.leave(self.estimator, self.tuning)
         self.estimator, self.tuning = estimator, tuning
-        self._ticket += 1
-        self._changed_from = None
         log, base = self._log.copy(), self._base
-        self._refolder.request(self._ticket, lambda: self._make_fold(estimator, tuning, log, base))
+        self._refolder.request(self._requests.ask(), lambda: self._make_fold(estimator, tuning, log, base))
         self._status = None
 
     def _adopt(self, done: Refolded) -> None:
         """Swap a finished refold in, after it has caught up with what came meanwhile."""
-        self._answered = max(self._answered, done.ticket)
+        wanted, changed_from = self._requests.answer(done.ticket)
+        if not wanted:
+            return
         if done.fold is None:
-            self.notices.say(f"not folded again: {done.error}", level="error")
-            if done.ticket == self._ticket:
-                self.estimator, self.tuning = self._fold.estimator.name, self._fold.tuning
+            self._refuse(done.ticket, done.error)
             return
         fold = done.fold
         with self._lock:
             old, log = self._fold, self._log
             try:
-                fold.follow(log, self._changed_from)
+                fold.follow(log, changed_from)
             except EstimatorError:
-                # The log was cut or started anew meanwhile: the answer no longer fits, ask again.
+                # The log was cut meanwhile: the answer no longer fits, ask again.
                 stale = True
             else:
                 stale = False
-                fold.advance()
+                try:
+                    fold.advance()
+                except NisusError as error:
+                    self._refuse(done.ticket, str(error))
+                    return
                 self._previous = Pull(
                     self._revision,
                     False,
@@ -413,5 +390,13 @@ class Engine:
                 self._fold = fold
                 self._tally.again()
                 self._revision += 1
+                self._watch.again()
+                self._watch.look(fold, fold.n)
         if stale:
-            self._retune(self.estimator, self.tuning)
+            self.retune(self.estimator, self.tuning)
+
+    def _refuse(self, ticket: int, reason: str) -> None:
+        """A refold failed: what runs goes on, and is what the panel shows."""
+        self.notices.say(f"not folded again: {reason}", level="error")
+        if ticket == self._requests.newest:
+            self.estimator, self.tuning = self._fold.estimator.name, self._fold.tuning

@@ -47,10 +47,10 @@ class Notices:
             self._last[key] = (self._clock(), self._counts[key])
             self._add(level, text if more < 1 else f"{text} ({more} more before)")
 
-    def say(self, text: str, level: str = "info") -> None:
-        """Add a line."""
+    def say(self, text: str, level: str = "info", t: int | None = None) -> None:
+        """Add a line, of what happened now or at `t`."""
         with self._lock:
-            self._add(level, text)
+            self._add(level, text, t)
 
     def restore(self, lines: Iterable[tuple[int, str, str]]) -> None:
         """Add lines (t, level, text) of an earlier run."""

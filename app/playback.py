@@ -8,6 +8,9 @@ from estimators.errors import ConfigError
 
 from . import commands
 
+LONGEST = 1e9
+"""Seconds that a seek may go, 32 years; times are int64 nanoseconds."""
+
 PLAYBACK = (commands.Pause, commands.Speed, commands.Step, commands.Seek)
 
 
@@ -38,5 +41,7 @@ def play(source: Any, command: Any, first: int) -> None:
     elif isinstance(command, commands.Step):
         source.step()
     else:
+        if not abs(command.seconds) <= LONGEST:
+            raise ConfigError(f"seek is {command.seconds:g} s; it must lie within {LONGEST:g} s")
         span = getattr(source, "span", None)
         source.seek((span[0] if span else first) + round(command.seconds * 1e9))

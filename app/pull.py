@@ -55,7 +55,8 @@ class Belief:
 class Status:
     """The state of the running twin, for panels and the API.
 
-    `t` is the time of the last event (ns), `latency_ms` the 99th percentile from a reading's arrival to its row.
+    `t` is the time of the last event (ns), `since` that of the first from which on the health is what it is now,
+    `latency_ms` the 99th percentile from a reading's arrival to its row.
     """
 
     estimator: str
@@ -65,6 +66,7 @@ class Status:
     refolding: bool
     t: int | None
     health: int
+    since: int | None
     counts: dict[str, int]
     nis: float
     nis_low: float

@@ -23,6 +23,43 @@ class Refolded:
     error: str
 
 
+class Requests:
+    """The refolds that were asked for, and from which event on the log has changed since each was."""
+
+    def __init__(self) -> None:
+        self.newest = 0
+        self._answered = 0
+        self._open: dict[int, int | None] = {}
+
+    @property
+    def waiting(self) -> bool:
+        """Whether the newest has no answer yet."""
+        return self._answered != self.newest
+
+    def ask(self) -> int:
+        """Another one, over the log as it is now; its ticket."""
+        self.newest += 1
+        self._open[self.newest] = None
+        return self.newest
+
+    def changed(self, index: int) -> None:
+        """The log changed from an event (its absolute index) on."""
+        for ticket, known in self._open.items():
+            self._open[ticket] = index if known is None else min(known, index)
+
+    def answer(self, ticket: int) -> tuple[bool, int | None]:
+        """A refold is done: whether its log is still the present one, and from where on that has changed."""
+        wanted, changed = ticket in self._open, self._open.get(ticket)
+        self._answered = max(self._answered, ticket)
+        self._open = {number: index for number, index in self._open.items() if number > ticket}
+        return wanted, changed
+
+    def forget(self) -> None:
+        """The log begins anew: no answer fits it."""
+        self._answered = self.newest
+        self._open.clear()
+
+
 class Refolder:
     """One thread, one fold at a time; of the requests that come meanwhile only the latest counts."""
 

@@ -162,7 +162,7 @@ class PageServer:
             return PlainTextResponse("Nisus: Content-Type must be application/json.\n", 415)
         try:
             command = command_from_json(await request.json(), self._engine)
-        except (NisusError, ValueError) as error:
+        except (NisusError, ValueError, RecursionError) as error:
             return JSONResponse({"error": str(error)}, 400)
         self._engine.submit(command)
         return JSONResponse({"submitted": type(command).__name__}, 202)

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from estimators.errors import ConfigError
-from estimators.registry import find_estimator
 from estimators.track import HEALTH_NAMES
 
 from . import commands
+from .obey import Refolding, retuned
+from .playback import LONGEST
 
 
 def status_json(engine: Any) -> dict[str, Any]:
@@ -29,6 +30,7 @@ def status_json(engine: Any) -> dict[str, Any]:
         "refolding": status.refolding,
         "t": status.t,
         "health": HEALTH_NAMES[status.health],
+        "since": status.since,
         "nis": _plain(getattr(status, "nis", None)),
         "nis_low": _plain(getattr(status, "nis_low", None)),
         "nis_high": _plain(getattr(status, "nis_high", None)),
@@ -60,10 +62,10 @@ def command_from_json(body: Any, engine: Any) -> commands.Command:
             refuse it: better said to who asked than shown later as an event.
     """
     known = {kind.__name__: kind for kind in typing.get_args(commands.Command)}
-    if not isinstance(body, dict) or body.get("command") not in known:
-        name = body.get("command") if isinstance(body, dict) else body
+    name = body.get("command") if isinstance(body, dict) else body
+    if not isinstance(body, dict) or not isinstance(name, str) or name not in known:
         raise ConfigError(f"command: {name!r} is not known; one of {', '.join(known)}")
-    kind = known[body["command"]]
+    kind = known[name]
     hints = typing.get_type_hints(kind)
     given = {key: value for key, value in body.items() if key != "command"}
     names = [item.name for item in dataclasses.fields(kind)]
@@ -76,17 +78,12 @@ def command_from_json(body: Any, engine: Any) -> commands.Command:
 
 
 def _check(command: commands.Command, engine: Any) -> None:
-    if isinstance(command, commands.SetEstimator):
-        find_estimator(command.name, engine.model)
-    elif isinstance(command, commands.SetTuning):
-        engine.tuning.set(command.key, command.value)
-    elif isinstance(command, commands.UseSensor):
-        engine.tuning.set(f"use.{command.name}", command.used)
-    elif isinstance(command, commands.SetOption):
-        estimator = find_estimator(engine.estimator, engine.model)
-        estimator.complete({**engine.tuning.options, command.name: float(command.value)})
+    if isinstance(command, Refolding):
+        retuned(command, engine)
     elif isinstance(command, commands.Speed) and not command.factor > 0:
         raise ConfigError(f'Speed: factor is {command.factor:g}; it must be positive, or "inf"')
+    elif isinstance(command, commands.Seek) and not abs(command.seconds) <= LONGEST:
+        raise ConfigError(f"Seek: seconds is {command.seconds:g}; it must lie within {LONGEST:g} s")
     elif isinstance(command, commands.Record) and engine.recorder is None:
         raise ConfigError("Record: this session cannot record")
     if isinstance(command, (commands.Pause, commands.Speed, commands.Step, commands.Seek)):

@@ -59,6 +59,18 @@ def complaints(model: StateSpaceModel, channel: np.ndarray, track: Track, first:
             yield f"{VERDICT_NAMES[code]} {sensor}", f"{sensor}: reading {what}{nis}"
 
 
+def last_run(codes: np.ndarray) -> int:
+    """The first of the equal codes at the end of an array that is not empty."""
+    end = len(codes)
+    while end > 0:
+        start = max(0, end - UNSETTLED)
+        others = np.flatnonzero(codes[start:end] != codes[-1])
+        if others.size:
+            return start + int(others[-1]) + 1
+        end = start
+    return 0
+
+
 class Latency:
     """The last times from arrival to row."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 from typing import Any
 
-from estimators.track import HEALTH_NAMES
+from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
 
 COLORS = {"tracking": "#16a34a", "degraded": "#d97706", "diverged": "#dc2626", "stale": "#6b7280"}
 LEVELS = {"info": "#6b7280", "warn": "#d97706", "error": "#dc2626"}
@@ -14,7 +14,12 @@ COUNTED = ("readings", "gated", "missing", "stale")
 
 def status_html(status: Any, origin: int | None) -> str:
     """Health, revision and counts in two lines that keep their places while the numbers run."""
-    health = HEALTH_NAMES[status.health] if isinstance(status.health, int) else str(status.health)
+    health = HEALTH_NAMES[status.health]
+    lasting = status.health != TRACKING and status.since is not None and origin is not None
+    since = f" since {(status.since - origin) * 1e-9:.1f} s" if lasting else ""
+    remedy = ""
+    if status.health == DIVERGED:
+        remedy = "<div>The readings contradict the estimate. <b>Reset</b> begins anew from the prior.</div>"
     at = "" if status.t is None or origin is None else f"{(status.t - origin) * 1e-9:.1f} s"
     state = "ended" if status.finished else "paused" if status.paused else ""
     fold = "⟳ refolding" if status.refolding else f"revision {status.revision}"
@@ -33,8 +38,8 @@ def status_html(status: Any, origin: int | None) -> str:
         '<div style="padding:0.2em 1.4em 0.6em 0.9em;font-size:0.8em;line-height:1.6;'
         'font-variant-numeric:tabular-nums">'
         '<div style="display:flex;justify-content:space-between;gap:0.5em">'
-        f'<b style="color:{COLORS.get(health, "#6b7280")}">● {html.escape(health)}</b>'
-        f"<span>{state}</span><span>{fold}</span><span>{at}</span></div><div>{cells}</div></div>"
+        f'<b style="color:{COLORS.get(health, "#6b7280")}">● {health}{since}</b>'
+        f"<span>{state}</span><span>{fold}</span><span>{at}</span></div><div>{cells}</div>{remedy}</div>"
     )
 
 

@@ -142,6 +142,9 @@ class ViserView:
             now = time.monotonic()
             if now >= due:
                 begun = time.thread_time()
-                self.frame()
+                try:
+                    self.frame()
+                except Exception as error:  # noqa: BLE001  a picture that cannot be drawn must not end the others
+                    self.engine.notices.report("view error", f"view error: {type(error).__name__}: {error}", "error")
                 # This thread's own work counts, not the time it waited for its turn.
                 due = now + min(SLOWEST, max(FRAME, (time.thread_time() - begun) / SHARE))

@@ -56,11 +56,14 @@ if (settings.viser) {
 
 // The header
 
+const spell = (seconds) => (seconds < 120 ? `${Math.floor(seconds)} s` : `${Math.floor(seconds / 60)} min`);
+
 function show(status) {
   document.title = `${status.twin} · Nisus`;
   $("twin").textContent = status.twin;
   $("title").textContent = status.title;
-  $("health").textContent = status.health;
+  const lasting = status.health !== "tracking" && status.since !== null;
+  $("health").textContent = lasting ? `${status.health} for ${spell((status.t - status.since) / 1e9)}` : status.health;
   $("health").dataset.health = status.health;
   $("estimator").textContent = status.estimator.toUpperCase();
   $("revision").textContent = status.refolding ? `${status.revision} …` : status.revision;

@@ -252,3 +252,82 @@ def test_silence_predicts_and_health_degrades(started):
     track = everything(engine).track
     assert np.all(np.diff(track.std[:, 0]) > 0)
     assert isinstance(everything(engine).readings, Readings)
+
+
+def by_hand(times, values):
+    """An engine without threads, that has taken these readings."""
+    engine = Engine(twin(), lambda report: Scripted())
+    engine._accept([readings(times, values)])
+    return engine
+
+
+def refolded(engine):
+    """What the refolder makes of the newest request."""
+    ticket, make = engine._refolder._pending
+    return engine._refolder._fold(ticket, make)
+
+
+def test_a_late_reading_between_two_requests_reaches_the_first_ones_answer():
+    times, values = series(100)
+    engine = by_hand(np.delete(times, 60), np.delete(values, 60))
+    engine.retune("kf", engine.tuning.set("Q.rate", 0.1))
+    first = refolded(engine)
+    engine._accept([readings(times[[60]], values[[60]])])
+    engine.retune("kf", engine.tuning.set("Q.rate", 0.2))
+    engine._adopt(first)
+    assert_same(everything(engine).track, reference(times, values, "kf", Tuning.of(MODEL).set("Q.rate", 0.1)))
+    assert engine.status().refolding
+    engine._adopt(refolded(engine))
+    assert_same(everything(engine).track, reference(times, values, "kf", Tuning.of(MODEL).set("Q.rate", 0.2)))
+
+
+def test_a_source_that_begins_again_during_a_refold_gets_no_rows_of_the_old_log():
+    times, values = series(300)
+    engine = by_hand(times[:200], values[:200])
+    engine.retune("ukf", engine.tuning)
+    old = refolded(engine)
+    engine._restart()
+    engine._accept([readings(times[200:], values[200:])])
+    engine._adopt(old)
+    engine._status = None
+    assert_same(everything(engine).track, reference(times[200:], values[200:]))
+    assert engine.status().estimator == "ukf" and engine.status().refolding, "what was asked for is asked for again"
+    engine._adopt(refolded(engine))
+    assert_same(everything(engine).track, reference(times[200:], values[200:], "ukf"))
+
+
+def test_a_refold_that_fails_after_a_late_reading_leaves_what_runs():
+    times, values = series(100)
+    engine = by_hand(times, values)
+    engine.retune("kf", engine.tuning.set("Q.rate", 0.1))
+    good = refolded(engine)
+    engine.retune("enkf", engine.tuning.with_options({"radius": 5.0}))
+    bad = refolded(engine)
+    engine._adopt(good)
+    engine._adopt(bad)
+    status = engine.status()
+    assert (status.estimator, status.tuning.get("Q.rate"), status.refolding) == ("kf", 0.1, False)
+    (text,) = [line.text for line in engine.notices.since(0) if line.level == "error"]
+    assert text.startswith("not folded again: ") and "position" in text and "\n" not in text
+
+
+@pytest.mark.parametrize("name", ["pf", "enkf"])
+def test_the_same_filter_keeps_its_members_when_a_cut_history_is_folded_again(started, name):
+    times, values = series(7000)
+    made = twin(history=2048)
+    made.estimator = name
+    made.tuning = made.tuning.with_options({"particles": 30.0} if name == "pf" else {"members": 8.0})
+    source = Scripted()
+    engine = Engine(made, lambda report: source)
+    engine.start()
+    try:
+        for start in range(0, 7000, 500):
+            source.put(readings(times[start : start + 500], values[start : start + 500]))
+        wait_for(lambda: engine.status().counts["readings"] == 7000)
+        seen = everything(engine)
+        assert seen.first > 0
+        engine.submit(commands.SetTuning("Q.rate", Tuning.of(MODEL).get("Q.rate")))
+        wait_for(lambda: everything(engine).revision == 1)
+        np.testing.assert_array_equal(everything(engine).track.mean, seen.track.mean)
+    finally:
+        engine.stop()

@@ -3,12 +3,17 @@
 import numpy as np
 import pytest
 from fake_engine import FakeEngine, events
+from scripted import Scripted, readings
+from served import shown_twin
+from test_reset import JUMP, RESET_AT, asset, stubborn
 
 from app.commands import SetEstimator, SetTuning
+from app.engine import Engine
 from app.viser_guard import HEADER
 from app.viser_view import ViserView
 from estimators.log import READING, TRUTH, Readings
 from estimators.models import MODELS
+from estimators.track import TRACKING
 
 pytestmark = pytest.mark.browser
 
@@ -142,3 +147,32 @@ def test_two_browsers_show_the_same(page, browser, view, engine):
         one.wait_for_function("[...document.querySelectorAll('input')].some(input => input.value === '0.25')")
     other.close()
     assert engine.commands == [SetTuning("R.winding", 0.25)]
+
+
+def test_a_lost_filter_says_since_when_and_is_reset_by_hand(browser):
+    made, plain = stubborn("kf"), shown_twin()
+    made.config = plain.config
+    source = Scripted()
+    engine = Engine(made, lambda report: source)
+    view = ViserView(engine, secret="s3cret")
+    engine.start()
+    view.start()
+    context = browser.new_context(viewport={"width": 900, "height": 1000}, extra_http_headers={HEADER: "s3cret"})
+    try:
+        t, y = asset(RESET_AT + 10)
+        source.put(readings(t[:RESET_AT], y[:RESET_AT]))
+        page = context.new_page()
+        page.set_default_timeout(60_000)
+        page.goto(f"http://127.0.0.1:{view.port}/")
+        # The 26th refused reading is more than half of the last fifty.
+        page.get_by_text(f"diverged since {JUMP + 25}.0 s").wait_for()
+        page.get_by_role("button", name="Reset").click()
+        page.get_by_text("tracking", exact=False).first.wait_for()
+        source.put(readings(t[RESET_AT:], y[RESET_AT:]))
+        until(page, lambda: engine.status().counts["used"] >= JUMP + 10)
+        assert engine.status().health == TRACKING
+        assert page.get_by_text("begins anew from the prior").count() <= 1
+    finally:
+        context.close()
+        view.stop()
+        engine.stop()

@@ -1,0 +1,40 @@
+"""What new rows mean for people: readings that could not be used, clouds that were lost, changes of health."""
+
+from __future__ import annotations
+
+from estimators.fold import Fold
+from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
+
+from .notices import Notices
+from .tally import complaints, last_run
+
+
+class Watch:
+    """Reports the rows of a fold as they come."""
+
+    def __init__(self, notices: Notices) -> None:
+        self._notices = notices
+        self._health = TRACKING
+        self._recoveries = 0
+
+    def again(self) -> None:
+        """Another fold begins, whose recoveries are counted from none."""
+        self._recoveries = 0
+
+    def look(self, fold: Fold, before: int) -> None:
+        """Report the rows from `before` on."""
+        track, log = fold.track, fold.log
+        for key, text in complaints(fold.model, log.channel, track, before):
+            self._notices.report(key, text)
+        count, known = fold.recoveries(), self._recoveries
+        self._recoveries = count
+        if count > known:
+            name = fold.estimator.name
+            text = f"{name}: no particle explained a reading; the cloud was widened, {count} time(s) so far"
+            self._notices.report("recovered", text)
+        if len(track) and track.health[-1] != self._health:
+            self._health = int(track.health[-1])
+            more = "; Reset begins anew from the prior" if self._health == DIVERGED else ""
+            level = "info" if self._health == TRACKING else "warn"
+            since = int(log.t[last_run(track.health)])
+            self._notices.say(f"health: {HEALTH_NAMES[self._health]}{more}", level=level, t=since)
