@@ -138,7 +138,10 @@ class BeliefScene:
         if not (np.isfinite(mean).all() and np.isfinite(cov).all()):
             return
         for k, axis in enumerate(axes):
-            if axis.fit(float(mean[k]), 2 * float(np.sqrt(max(cov[k, k], 0.0)))):
+            # A mode's axis always shows all of its values.
+            last = 0.0 if axis.state != self.model.mode or self.model.jump is None else len(self.model.jump.modes) - 1.0
+            middle, reach = (last / 2, 0.55 * last) if last else (mean[k], 2 * np.sqrt(max(cov[k, k], 0.0)))
+            if axis.fit(float(middle), float(reach)):
                 self._number(k, axis)
         scale = np.array([HALF * axis.step for axis in axes])
         full = np.zeros((3, 3))

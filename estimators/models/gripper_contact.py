@@ -23,7 +23,7 @@ import numpy as np
 
 from ..model import Input, Jump, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 
-DEPTH, SPEED, SURFACE, OFFSET, CONTACT = range(5)
+CONTACT, DEPTH, SPEED, SURFACE, OFFSET = range(5)
 MASS, DAMPING, STIFFNESS, RATE, ROUGHNESS = range(5)
 PUSH, SLIP, DRIFT = range(3)
 
@@ -104,11 +104,11 @@ GRIPPER_CONTACT = StateSpaceModel(
     name="gripper_contact",
     title="Gripper, finger and object touching or not",
     states=(
+        State("contact", "1", mean=0.02, std=0.14),
         State("depth", "mm", mean=-20.0, std=5.0),
         State("speed", "mm/s", std=5.0),
         State("surface", "mm", mean=40.0, std=5.0),
         State("offset", "N", std=0.3),
-        State("contact", "1", mean=0.02, std=0.14),
     ),
     inputs=(Input("drive", "N"),),
     parameters=(

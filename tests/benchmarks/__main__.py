@@ -24,6 +24,7 @@ def main() -> None:
         filters.gaussian_family,
         particles_.beside_particles,
         particles_.growing_members,
+        particles_.rao_blackwellised,
         ensembles.beside_dapper,
         ensembles.thermal_cycles,
         ensembles.large_states,

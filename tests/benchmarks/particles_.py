@@ -16,6 +16,7 @@ import numpy as np
 from estimators.fold import Fold
 from estimators.log import READING, Log, Readings
 from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.models.gripper_contact import GRIPPER_CONTACT
 from estimators.tuning import Tuning
 
 from .timing import judged
@@ -53,11 +54,13 @@ def _readings() -> np.ndarray:
     return y
 
 
-def _ours(name: str, n: int) -> Callable[[], object]:
-    log = Log(MODEL.width)
+def _ours(name: str, n: int, model: StateSpaceModel = MODEL, middle: float = 0.0) -> Callable[[], object]:
+    log = Log(model.width)
+    step = min(1.0, model.max_step)
     for k, value in enumerate(_readings()):
-        log.extend(Readings.one((k + 1) * SECOND, 0, READING, 0, value, MODEL.width))
-    growing = Fold(name, MODEL, Tuning.of(MODEL).with_options({"particles": n}), log)
+        t = round((k + 1) * step * SECOND)
+        log.extend(Readings.one(t, 0, READING, 0, middle + value, model.width))
+    growing = Fold(name, model, Tuning.of(model).with_options({"particles": n}), log)
     growing.advance()
 
     def again() -> None:
@@ -124,5 +127,16 @@ def growing_members() -> None:
         costs = []
         for n in (1_000, 10_000, 100_000):
             call = _ours(name, n)
+            costs.append(f"N = {n:,d}: {median(_wall(call) for _ in range(5)) / n * 1e9:6.0f}")
+        print(f"  {name:7s} {'   '.join(costs)}")
+
+
+def rao_blackwellised() -> None:
+    """`rbpf` beside `pf` on the gripper: a Kalman filter of three states a particle against five states sampled."""
+    print("cost a particle and step on gripper_contact, ns (clock), as N grows")
+    for name in ("pf", "rbpf"):
+        costs = []
+        for n in (500, 5_000, 50_000):
+            call = _ours(name, n, GRIPPER_CONTACT, 20.0)
             costs.append(f"N = {n:,d}: {median(_wall(call) for _ in range(5)) / n * 1e9:6.0f}")
         print(f"  {name:7s} {'   '.join(costs)}")
