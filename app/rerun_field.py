@@ -46,7 +46,9 @@ class FieldDrawing:
             beside = rr.Transform3D(translation=[self._frame.width + self._bar, 0.0, 0.0])
             rows.log_static(f"/field/{kind.name}/bar", beside)
             image = png(bar, self._palettes[kind.name])
-            rows.log_static(f"/field/{kind.name}/bar", rr.EncodedImage(contents=image, media_type="image/png", opacity=1.0))
+            rows.log_static(
+                f"/field/{kind.name}/bar", rr.EncodedImage(contents=image, media_type="image/png", opacity=1.0)
+            )
             if len(self._dots):
                 rims = rr.Points2D(self._dots, radii=-3.0, colors=[RIM], draw_order=20.0)
                 rows.log_static(f"/field/{kind.name}/rims", rims)
@@ -111,7 +113,9 @@ class FieldDrawing:
         rows.stream.send_columns(
             f"{rows.root}/field/{name}/image",
             indexes=at,
-            columns=rr.EncodedImage.columns(blob=[png(canvas, self._palettes[name])], media_type=["image/png"], opacity=[1.0]),
+            columns=rr.EncodedImage.columns(
+                blob=[png(canvas, self._palettes[name])], media_type=["image/png"], opacity=[1.0]
+            ),
         )
         ticks = scale.ticks()
         # A label stands below its point, in its middle.

@@ -45,9 +45,7 @@ def channels(loaded: Loaded, section: Any, key: Key, model: StateSpaceModel) -> 
     return found
 
 
-def _cells(
-    loaded: Loaded, key: Key, item: ChannelSection, field: Field, read: set[str]
-) -> list[tuple[Key, Channel]]:
+def _cells(loaded: Loaded, key: Key, item: ChannelSection, field: Field, read: set[str]) -> list[tuple[Key, Channel]]:
     """The true values of a whole field from one array; the cells among `read` are no truth."""
     if isinstance(item, SignalSection) or len(item.names()) != 1:
         raise loaded.error(key, f"is a field of {len(field)} cells; name one array of a table")
