@@ -157,15 +157,12 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], trac
         for name, fit in result.held_out.items()
         if name not in many
     ]
-    for sensor, names in together.items():
-        fits = [result.held_out[name] for name in names]
-        rmse, inside = np.sqrt(np.mean([fit.rmse**2 for fit in fits])), np.mean([fit.coverage for fit in fits])
-        rows.append(
-            (
-                f"held out {sensor}, {len(names)} rows",
-                f"RMSE {rmse:.5g} {row_units[names[0]]}   in the 95 % band: {100 * inside:.1f} %",
-            )
-        )
+    for sensor_name, own in together.items():
+        fits = [result.held_out[name] for name in own]
+        rmse = float(np.sqrt(np.mean([fit.rmse**2 for fit in fits])))
+        share = 100 * float(np.mean([fit.coverage for fit in fits]))
+        text = f"RMSE {rmse:.5g} {row_units[own[0]]}   in the 95 % band: {share:.1f} %"
+        rows.append((f"held out {sensor_name}, {len(own)} rows", text))
     rows += [(key, f"{count}") for key, count in sorted(counts.items())]
     variances = ", ".join(
         f"{twin.model.state_names[j]} {value**2:.5g}" for j, value in zip(twin.model.shown, track.std[-1], strict=True)

@@ -344,8 +344,10 @@ class TimeColumnSection(Section):
 
 
 class TableSection(RecordingSection):
-    """A table: CSV, Parquet, vectors of a MATLAB file (.mat up to version 7) by their names there (meas.Voltage), or
-    arrays of a NumPy archive (.npz) whose first axis is time: speed, or t2m_K[3,5] for a cell of a field.
+    """A table: CSV, Parquet, MATLAB (.mat up to version 7) or NumPy (.npz).
+
+    Columns of a MATLAB file are its vectors by their names there: meas.Voltage. Those of a NumPy archive are its arrays
+    whose first axis is time: speed, or t2m_K[3,5] for a cell of a field.
     """
 
     type: Literal["table"]

@@ -1,4 +1,4 @@
-"""Air temperature at 2 m over the British Isles on a grid of a quarter of a degree, by persistence and its honest noise.
+"""Air temperature at 2 m over the British Isles, on a grid of a quarter of a degree: persistence with honest noise.
 
     T' = C + (T - C) exp(-dt / τ) + w
 

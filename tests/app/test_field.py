@@ -149,7 +149,9 @@ def entities(data, tmp_path):
         names = batch.schema.names
         for row in range(batch.num_rows):
             t = batch.column(names.index("time"))[row].value if "time" in names else None
-            found.setdefault(chunk.entity_path, []).append((t, {name: batch.column(k)[row] for k, name in enumerate(names)}))
+            found.setdefault(chunk.entity_path, []).append(
+                (t, {name: batch.column(k)[row] for k, name in enumerate(names)})
+            )
     return found
 
 
@@ -231,7 +233,11 @@ def test_a_recording_reviews_to_the_same_pictures(running, twin, batches, tmp_pa
     rows = drawn["/field/estimate/image"]
     assert [t // 10**9 for t, _ in rows] == [seconds(picture) for picture in seen.pictures]
     told = [picture for picture in seen.pictures if picture.truth is not None]
-    assert [t // 10**9 for t, _ in drawn["/field/error/image"]] == [seconds(picture) for picture in told] == [5, 10, 15, 20]
+    assert (
+        [t // 10**9 for t, _ in drawn["/field/error/image"]]
+        == [seconds(picture) for picture in told]
+        == [5, 10, 15, 20]
+    )
     picture = np.asarray(Image.open(io.BytesIO(blob_of(rows[-1][1]))).convert("RGB")).astype(int)
     frame = Frame.of(twin.model.grid)
     assert picture.shape == (frame.height, frame.width, 3)
@@ -318,7 +324,11 @@ def test_only_charted_cells_are_looked_for_among_what_sensors_read(twin):
 @pytest.mark.parametrize(
     ("old", "new", "error"),
     [
-        ('cells: ["temperature[2,3]"', 'cells: ["temperature[8,3]"', r"plate.yaml:16: view.cells names 'temperature\[8,3\]'"),
+        (
+            'cells: ["temperature[2,3]"',
+            'cells: ["temperature[8,3]"',
+            r"plate.yaml:16: view.cells names 'temperature\[8,3\]'",
+        ),
         ("window: 12", 'pairs: [["temperature[2,3]", "temperature[1,1]"]]', "which is not among view.cells; add it"),
         ("every: 5", "every: 0", "truth.every is 0"),
     ],
@@ -363,7 +373,9 @@ def test_a_scale_has_round_numbers_and_moves_seldom():
 def test_png_is_what_others_read():
     indices = np.arange(60, dtype=np.uint8).reshape(5, 12)
     colors = palette(WARM)
-    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(png(indices, colors))).convert("RGB")), colors[indices])
+    np.testing.assert_array_equal(
+        np.asarray(Image.open(io.BytesIO(png(indices, colors))).convert("RGB")), colors[indices]
+    )
 
 
 def test_a_frame_keeps_distances_in_shape():
