@@ -148,6 +148,8 @@ def compare(
         finally:
             numba.set_num_threads(threads)
         return
+    # Read when a process loads NumPy: threads that spin beside a small matrix would count as the filter's cost.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Spawned: the libraries that the filters' threads come from do not survive a fork.
     context = multiprocessing.get_context("spawn")
     given = (twin, dict(overrides), [tuple(log) for log in logs])

@@ -148,6 +148,10 @@ def _timed(
             spent = time.process_time() - begun
             # What the rest of the budget allows, judged by what was folded; not more than that again.
             limit = max(1, int(fold.n * min(1.0, budget / spent - 1.0)))
+        t = log.t
+        # A span ends between two times, and has a length.
+        while fold.n < log.n and (t[fold.n] == t[fold.n - 1] or t[fold.n - 1] == t[0]):
+            fold.advance(1)
         took.append(time.process_time() - begun)
     return fold, min(took) / fold.n
 

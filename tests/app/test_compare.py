@@ -127,6 +127,16 @@ def test_a_slow_filter_folds_a_stated_span():
     assert row.nis.value == refold(twin, "filterpy-ekf", first).nis
 
 
+@pytest.mark.parametrize("budget", [1e-9, 1e-3, 2e-3, 4e-3])
+def test_a_span_ends_between_two_times(budget):
+    """Wherever the budget ends among events of one time: the log has five at each step, of which three are readings."""
+    twin = load_twin("motor_joint", overrides={"source.duration": "60"})
+    events = read_log(twin, None)[0].readings
+    row = fold_row(twin, "filterpy-ekf", [events], budget=budget)
+    assert row.span is not None and row.span >= 0.5
+    assert row.nis.value == refold(twin, "filterpy-ekf", within(events, row.span)).nis
+
+
 @pytest.mark.parametrize(("seconds", "lower"), [(0.6, 0.5), (1.0, 1.0), (4.99, 2.0), (70.0, 50.0), (1999.0, 1000.0)])
 def test_spans_are_round(seconds, lower):
     assert tidy(seconds) == pytest.approx(lower, rel=1e-12)
