@@ -1,5 +1,7 @@
 """The catalogue: every entry is complete, and refuses what it cannot do with the reason."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_filterpy import PENDULUM
@@ -10,6 +12,10 @@ from estimators.log import READING, Log, Readings
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS, find_estimator, unfit
 from estimators.tuning import Tuning
+
+WINDING = MODELS["motor_winding"]
+ANYBODYS = replace(WINDING, conditionally_linear=WINDING.state_names)
+"""A model that every estimator takes."""
 
 
 @pytest.mark.parametrize("name", list(ESTIMATORS))
@@ -28,7 +34,7 @@ def test_entries_are_complete(name):
 def test_sizes_are_enough(name):
     """The state and scratch that an entry asks for hold what its functions write; what follows stays as it was."""
     entry = ESTIMATORS[name]
-    model = MODELS["motor_winding"]
+    model = ANYBODYS
     log = Log(1)
     for k in range(5):
         log.extend(Readings.one(k * 10**9, 0, READING, 0, 36.0 + k, 1))
@@ -57,7 +63,7 @@ def test_options_are_checked(name):
             assert (option.low, option.high) == (0.0, len(option.choices) - 1.0)
             with pytest.raises(EstimatorError, match=f"{option.name} is 0.5; it must be one of 0 .{option.choices[0]}"):
                 entry.complete({option.name: 0.5})
-    model = MODELS["motor_winding"]
+    model = ANYBODYS
     with pytest.raises(EstimatorError, match="no option"):
         Fold(name, model, Tuning.of(model).with_options({"wings": 2.0}), Log(1))
 
@@ -108,7 +114,7 @@ def test_every_estimator_runs_every_model_it_applies_to(name, model):
 
 
 def test_ukf_points_have_the_moments_of_the_state():
-    model = MODELS["motor_winding"]
+    model = WINDING
     log = Log(1)
     log.extend(Readings.one(0, 0, READING, 0, 36.0, 1))
     fold = Fold("ukf", model, Tuning.of(model).with_options({"alpha": 0.7, "kappa": 1.0}), log)
