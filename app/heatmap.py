@@ -1,9 +1,7 @@
-"""Pictures of a field: values to colours, a scale with round numbers beside them, small PNG files."""
+"""Pictures of a field: values to colours, a scale with round numbers beside them."""
 
 from __future__ import annotations
 
-import struct
-import zlib
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -157,26 +155,6 @@ class Frame:
         down = cells[:, -2] if cells.shape[1] > 1 else np.zeros(len(cells))
         scale = np.array([self.wide, self.tall]) / self.reduced
         return (np.stack((cells[:, -1], down), axis=1) + 0.5) * scale
-
-
-def png(indices: np.ndarray, colors: np.ndarray) -> bytes:
-    """A picture (rows, columns) of colours 0 to 255 as a PNG file with a palette."""
-    rows, columns = indices.shape
-    lines = np.zeros((rows, columns + 1), np.uint8)
-    lines[:, 1:] = indices
-
-    def chunk(name: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
-    return b"".join(
-        (
-            b"\x89PNG\r\n\x1a\n",
-            chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, 8, 3, 0, 0, 0)),
-            chunk(b"PLTE", colors.astype(np.uint8).tobytes()),
-            chunk(b"IDAT", zlib.compress(lines.tobytes(), 3)),
-            chunk(b"IEND", b""),
-        )
-    )
 
 
 def positioned(model: StateSpaceModel) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from estimators.model import StateSpaceModel
 from estimators.pictures import Picture
 from estimators.track import Track
 
-from .heatmap import RIM, Frame, Scale, image_of, kinds, palette, png, positioned, sensor_colors
+from .heatmap import RIM, Frame, Scale, image_of, kinds, palette, positioned, sensor_colors
 
 if TYPE_CHECKING:
     from .rerun_rows import RerunRows
@@ -45,10 +45,18 @@ class FieldDrawing:
         for kind in self._kinds:
             beside = rr.Transform3D(translation=[self._frame.width + self._bar, 0.0, 0.0])
             rows.log_static(f"/field/{kind.name}/bar", beside)
-            image = png(bar, self._palettes[kind.name])
+            colors = self._palettes[kind.name]
+            rows.log_static(f"/field/{kind.name}/bar", rr.Image(colors[bar], opacity=1.0))
+            # A picture is one byte a pixel, and the colours belong to it. (An encoded image would be drawn faded
+            # until it is decoded, at every change.)
             rows.log_static(
-                f"/field/{kind.name}/bar", rr.EncodedImage(contents=image, media_type="image/png", opacity=1.0)
+                f"/field/{kind.name}",
+                rr.AnnotationContext([rr.AnnotationInfo(id=k, color=color) for k, color in enumerate(colors.tolist())]),
             )
+            size = rr.components.ImageFormat(
+                width=self._frame.width, height=self._frame.height, channel_datatype=rr.ChannelDatatype.U8
+            )
+            rows.log_static(f"/field/{kind.name}/image", rr.SegmentationImage.from_fields(format=size, opacity=1.0))
             if len(self._dots):
                 rims = rr.Points2D(self._dots, radii=-3.0, colors=[RIM], draw_order=20.0)
                 rows.log_static(f"/field/{kind.name}/rims", rims)
@@ -113,9 +121,7 @@ class FieldDrawing:
         rows.stream.send_columns(
             f"{rows.root}/field/{name}/image",
             indexes=at,
-            columns=rr.EncodedImage.columns(
-                blob=[png(canvas, self._palettes[name])], media_type=["image/png"], opacity=[1.0]
-            ),
+            columns=rr.SegmentationImage.columns(buffer=[canvas.tobytes()]),
         )
         ticks = scale.ticks()
         # A label stands below its point, in its middle.
