@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from .jit import B1, F1, I1, f64, i64, jit
+from .jit import B1, F1, I1, f64, i64, inlined, jit
 from .log import RESET
 from .quantiles import chi_square_quantile
 from .simd import total as sum_of
@@ -70,10 +70,38 @@ def nis_bounds(dof: int, readings: int) -> tuple[float, float]:
     return float(chi_square_quantile(tail, dof) / readings), float(chi_square_quantile(1.0 - tail, dof) / readings)
 
 
-@jit
+@inlined
 def judges(verdict):
     """Whether a reading of this verdict says something of the estimate."""
     return verdict == USED or verdict == GATED or verdict == FAILED
+
+
+@inlined
+def _keep(k, row, track, rows, nis, dofs):
+    """Write a reading into place k of the window."""
+    used = track.verdict[row] == USED
+    rows[k] = row
+    nis[k] = track.nis[row] if used else 0.0
+    dofs[k] = track.dof[row] if used else -1
+
+
+@inlined
+def _judge(i, total, dof, used, refused, track, policy, bounds):
+    """Mean NIS of the window that ends at row i, its bounds, and what it alone says of the estimate."""
+    if used > 0:
+        track.nis_mean[i] = total / used
+        track.nis_low[i] = bounds.low[dof] / used
+        track.nis_high[i] = bounds.high[dof] / used
+    else:
+        track.nis_mean[i] = np.nan
+        track.nis_low[i] = np.nan
+        track.nis_high[i] = np.nan
+    judged = used + refused
+    track.consistency[i] = TRACKING
+    if judged >= FEW and (refused > policy.diverged_gated * judged or total > policy.diverged_nis * dof):
+        track.consistency[i] = DIVERGED
+    elif used >= FEW and total > bounds.alarm[dof]:
+        track.consistency[i] = DEGRADED
 
 
 @jit
@@ -148,34 +176,6 @@ def assess(first, last, t, kind, track, policy, bounds):
         elif track.age[i] > policy.degraded_after and health == TRACKING:
             health = DEGRADED
         track.health[i] = health
-
-
-@jit
-def _keep(k, row, track, rows, nis, dofs):
-    """Write a reading into place k of the window."""
-    used = track.verdict[row] == USED
-    rows[k] = row
-    nis[k] = track.nis[row] if used else 0.0
-    dofs[k] = track.dof[row] if used else -1
-
-
-@jit
-def _judge(i, total, dof, used, refused, track, policy, bounds):
-    """Mean NIS of the window that ends at row i, its bounds, and what it alone says of the estimate."""
-    if used > 0:
-        track.nis_mean[i] = total / used
-        track.nis_low[i] = bounds.low[dof] / used
-        track.nis_high[i] = bounds.high[dof] / used
-    else:
-        track.nis_mean[i] = np.nan
-        track.nis_low[i] = np.nan
-        track.nis_high[i] = np.nan
-    judged = used + refused
-    track.consistency[i] = TRACKING
-    if judged >= FEW and (refused > policy.diverged_gated * judged or total > policy.diverged_nis * dof):
-        track.consistency[i] = DIVERGED
-    elif used >= FEW and total > bounds.alarm[dof]:
-        track.consistency[i] = DEGRADED
 
 
 assess_signature = types.void(i64, i64, I1, B1, track_type, policy_type, bounds_type)

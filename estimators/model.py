@@ -241,7 +241,9 @@ class StateSpaceModel:
 
     @cached_property
     def linear_states(self) -> np.ndarray:
-        """Indices of the conditionally linear states, rising."""
+        """Indices of the conditionally linear states, rising; of a linear model all."""
+        if self.linear and not self.conditionally_linear and not isinstance(self.states, Field):
+            return np.arange(self.nx)
         return np.array(sorted(self.state_names.index(name) for name in self.conditionally_linear), np.int64)
 
     def label(self, state: str) -> str:

@@ -258,10 +258,10 @@ def modes(options: Options, state: np.ndarray, nx: int) -> list[Mode]:
 
 def applies(model: StateSpaceModel) -> str | None:
     """Only a model that says what is linear, or has a mode, leaves something to a Kalman filter a particle."""
-    if not model.conditionally_linear:
+    if not len(model.linear_states):
         return (
             f"rbpf needs states that are linear once the others are known; {model.name} names none in "
-            "conditionally_linear" + ("; use kf, which is exact" if model.linear else "; use pf")
+            "conditionally_linear; use pf"
         )
     own = [sensor.name for sensor in model.sensors if sensor.log_likelihood is not None]
     if own:
