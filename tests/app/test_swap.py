@@ -27,6 +27,9 @@ from estimators.log import INPUT, READING, TICK, TRUTH, Log, Readings
 from estimators.registry import ESTIMATORS, unfit
 
 EVERY_FILTER = "motor_winding"
+HUGE = ("thermal_field_large",)
+"""A million cells, of which thermal_field is a piece: a walk through its filters takes minutes."""
+
 BEGUN = 40
 """Events before the first swap."""
 PACE = 3
@@ -174,7 +177,8 @@ class Running:
             np.testing.assert_array_equal(column, given)
         for column, a, b in zip(pull.track._fields, pull.track, self.fold(name), strict=True):
             np.testing.assert_array_equal(a, b[: self.given], err_msg=f"{name}: {column}")
-        options = ESTIMATORS[name].complete(SMALL.get(name, {}))
+        options = ESTIMATORS[name].complete(dict(self.twin.options_of(name)))
+        assert options.items() >= SMALL.get(name, {}).items()
         assert (status.estimator, status.options, self.engine.folded_with()[1]) == (name, options, name)
         self.view.frame()
         panel, charts = self.view.panel, self.view.charts
@@ -186,13 +190,16 @@ class Running:
             x, high, low, mean = chart.data[0], chart.data[1], chart.data[2], chart.data[8]
             assert (x[0], x[-1]) == (0.0, pytest.approx(seconds[-1])) and np.isfinite([x, high, low, mean]).all()
             # A chart keeps the extremes of each stretch of time, so those of the whole are the track's.
-            expected, band = pull.track.mean[:, j], 2.0 * pull.track.std[:, j]
+            # A probability has no band.
+            expected, band = pull.track.mean[:, j], 2.0 * pull.track.std[:, j] * (j != self.twin.model.mode)
             assert (mean.min(), mean.max()) == (expected.min(), expected.max())
             assert (low.min(), high.max()) == ((expected - band).min(), (expected + band).max())
         assert "engine error" not in status.counts, [line.text for line in self.engine.notices.since(0)]
 
     def check_rerun(self, tmp_path):
         """The right side has, under the newest recording, each row once."""
+        if self.twin.model.grid is not None:
+            return  # pictures and a few cells: test_field_views.py
         pieces, revision = [], None
         while messages := self.feed.next():
             for message in messages:
@@ -201,7 +208,7 @@ class Running:
                 else:
                     pieces, revision = [], json.loads(message)["revision"]
         pull, file = self.rows(), tmp_path / "piece.rrd"
-        state = rr.escape_entity_path_part(self.twin.model.state_names[0])
+        state = rr.escape_entity_path_part(self.twin.model.shown_states[0].name)
         times, means = [], []
         for piece in pieces:
             file.write_bytes(piece)
@@ -265,7 +272,7 @@ def test_every_filter_gives_way_to_every_other(stage, run, tmp_path):
     walk_along(run(small_twin(EVERY_FILTER, walk[0]), len(walk)), walk, tmp_path)
 
 
-@pytest.mark.parametrize(("stride", "name"), list(enumerate(sorted(set(shipped()) - {EVERY_FILTER}), start=1)))
+@pytest.mark.parametrize(("stride", "name"), list(enumerate(sorted(set(shipped()) - {EVERY_FILTER, *HUGE}), start=1)))
 def test_every_filter_of_every_twin(stride, name, run, tmp_path):
     twin = small_twin(name)
     names = applicable(twin.model)
