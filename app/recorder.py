@@ -119,6 +119,7 @@ class Recorder:
         self._wanted = None
         if self._open is not None:
             self._open.release()
+            self._open.file.abandon()
             self._open = None
 
 

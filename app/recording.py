@@ -9,7 +9,9 @@ cuts off what lay behind it.
 
 from __future__ import annotations
 
+import atexit
 import base64
+import ctypes
 import json
 import struct
 import tempfile
@@ -167,6 +169,15 @@ class RecordingFile:
     def flush(self) -> None:
         """Hand everything to the operating system."""
         self.stream.flush(timeout_sec=PATIENCE)
+
+    def abandon(self) -> None:
+        """Leave a file that takes no more as it is.
+
+        Rerun waits without end for what cannot be written, when the stream is dropped and when the process ends. So
+        the stream is never dropped, and the process does not ask.
+        """
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(self.stream))
+        atexit.unregister(rr.rerun_shutdown)
 
     def close(self) -> None:
         """Finish the file."""
