@@ -330,9 +330,9 @@ class Engine:
         elif isinstance(item, Restarted):
             self._restart()
         elif isinstance(item, Finished):
-            self._finished = True
             with self._lock:
                 self._fold.finish()
+            self._finished = True
             self.notices.say("the source has ended; the estimate stays")
         else:
             obey(item, self)
