@@ -9,7 +9,7 @@ from llvmlite import ir
 from numba import from_dtype, types
 from numba.extending import intrinsic
 
-from .jit import C1, F1, F2, caller, f64, flags, floats, i64, ints, jit, matrix
+from .jit import C1, F1, F2, caller, f64, flags, floats, i64, inlined, ints, jit, matrix
 from .looped import call_f_rows, call_h_rows
 
 f_signature = types.void(F1, F1, F1, f64, F1)
@@ -137,8 +137,8 @@ def transition(context, x, u, dt, out):
 
 @jit
 def transition_rows(context, X, stride, n, u, dt, out):
-    """f of n states that begin at the address X, `stride` numbers apart, into rows of `out` (n or more, nx)."""
-    call_f_rows(context.f, X, stride, n, u.ctypes.data, context.p, dt, out.ctypes.data, context.nx)
+    """f of n states that begin at the address X, `stride` numbers apart, into rows of `out` (n or more, nx or more)."""
+    call_f_rows(context.f, X, stride, n, u.ctypes.data, context.p, dt, out.ctypes.data, out.shape[1])
 
 
 @jit
@@ -152,26 +152,31 @@ def expect(context, sensor, x, u, out):
 def expect_rows(context, sensor, X, stride, n, u, out):
     """h of one sensor at n states that begin at the address X, `stride` numbers apart, into rows of `out`."""
     h = ints(context.h, context.n_sensors)[sensor]
-    _, rows = sensor_rows(context, sensor)
-    call_h_rows(h, X, stride, n, u.ctypes.data, context.p, out.ctypes.data, rows)
+    call_h_rows(h, X, stride, n, u.ctypes.data, context.p, out.ctypes.data, out.shape[1])
 
 
-@jit
+@inlined
 def add_process_noise(context, x, u, dt, P, scratch):
     """Add Q(x, u, p, q, dt) to P (nx, nx), or q·dt on the diagonal where the model gives no Q."""
-    n = context.nx
-    q = process_variances(context)
     if context.Q == 0:
         first = ints(context.noise_state, context.n_noises)
         count = ints(context.noise_states, context.n_noises)
+        q = process_variances(context)
         for k in range(q.size):
             for j in range(first[k], first[k] + count[k]):
                 P[j, j] += q[k] * dt
-        return
+    else:
+        add_given_noise(context, x, u, dt, P, scratch)
+
+
+@jit
+def add_given_noise(context, x, u, dt, P, scratch):
+    """Add the model's own Q(x, u, p, q, dt) to P."""
+    n = context.nx
     for i in range(n):
         for j in range(n):
             scratch[i, j] = 0.0
-    call_Q(context.Q, x, u, parameters(context), q, dt, scratch)
+    call_Q(context.Q, x, u, parameters(context), process_variances(context), dt, scratch)
     for i in range(n):
         for j in range(n):
             P[i, j] += scratch[i, j]

@@ -193,7 +193,8 @@ def update_ukf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any
         filter_.update(y[rows], R=R, hx=in_turn(block))
         U = np.ascontiguousarray(np.linalg.cholesky(P).T)
         w = float(filter_.points_fn.Wm[1])
-        if only_rounding(U, P, block, filter_.S - R, np.diag(R).copy(), w, y[rows]):
+        across = block[1 : x.size + 1] - block[x.size + 1 :]
+        if only_rounding(U, P, across, filter_.S - R, np.diag(R).copy(), w, y[rows]):
             raise ValueError("the sigma points rest on rounding")
         return filter_
 

@@ -220,7 +220,7 @@ class Fold:
         numbers = self.estimator.state_size(self.options, model.nx) + self.estimator.memory(self.options, model)
         self._state = np.empty(numbers)
         self._spare = np.empty_like(self._state)
-        self._work = np.full(self.estimator.work_size(self.options, model.nx, model.width) + 1, np.nan)
+        self._work = _scratch(self.estimator.work_size(self.options, model.nx, model.width) + 1)
         self._score = np.empty(3)
         self._clock = np.array([UNSET])
         self._u = np.array([item.default for item in model.inputs], float)
@@ -490,6 +490,13 @@ def fold(
     growing = Fold(estimator, model, tuning, log, pairs=pairs, policy=policy)
     growing.advance()
     return growing.track
+
+
+def _scratch(size: int) -> np.ndarray:
+    """`size` numbers that begin at a cache line, so that vectors at multiples of their length lie across none."""
+    numbers = np.full(size + 8, np.nan)
+    first = -numbers.ctypes.data % 64 // 8
+    return numbers[first : first + size]
 
 
 @lru_cache(maxsize=1)

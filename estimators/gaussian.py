@@ -188,7 +188,7 @@ def admit(context, sensor, m, nu, S, U, score):
     return judge(context, sensor, m, nu, U, score)
 
 
-@jit
+@inlined
 def gain(m, C, U, K):
     """K = C S⁻¹ for the leading m columns, with S = Uᵀ U."""
     for i in range(C.shape[0]):
@@ -198,7 +198,7 @@ def gain(m, C, U, K):
         solve_upper(U, m, K[i])
 
 
-@jit
+@inlined
 def move_mean(m, C, U, nu, x):
     """x += C U⁻¹ ν̃, where ν̃ = U⁻ᵀ ν is the whitened innovation."""
     solve_upper(U, m, nu)
@@ -207,7 +207,7 @@ def move_mean(m, C, U, nu, x):
             x[i] += C[i, j] * nu[j]
 
 
-@jit
+@inlined
 def joseph(y, r, m, C, H, K, P, N):
     """P ← (I - K H) P (I - K H)ᵀ + K R Kᵀ, in O(n² m); C = P Hᵀ, N (nx, nx) is scratch.
 
@@ -248,12 +248,18 @@ def joseph(y, r, m, C, H, K, P, N):
     mirror(P)
 
 
-@jit
+@inlined
 def downdate(m, C, U, P):
     """P ← P - K S Kᵀ, as P - W Wᵀ with W = C U⁻¹; C becomes W."""
     n = P.shape[0]
-    for i in range(n):
-        solve_transposed(U, m, C[i])
+    for k in range(m):
+        for j in range(k):
+            a = U[j, k]
+            for i in range(n):
+                C[i, k] -= a * C[i, j]
+        inverse = 1.0 / U[k, k]
+        for i in range(n):
+            C[i, k] *= inverse
     for i in range(n):
         for k in range(m):
             a = C[i, k]

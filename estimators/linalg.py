@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from .jit import jit
+from .jit import inlined, jit
 
 EPSILON = float(np.finfo(float).eps)
 
 
-@jit
+@inlined
 def cholesky(A, U, n):
     """Upper U with Uᵀ U = A for the leading n rows; False if A is not positive definite. A and U may be one.
 
@@ -31,13 +31,15 @@ def cholesky(A, U, n):
         pivot = U[k, k]
         if not (pivot > 0.0 and pivot < np.inf):
             return False
+        # The next pivot waits for a division only; the root is off its way.
+        inverse = 1.0 / pivot
+        for i in range(k + 1, n):
+            a = U[k, i] * inverse
+            for j in range(i, n):
+                U[i, j] -= a * U[k, j]
         scale = 1.0 / np.sqrt(pivot)
         for j in range(k, n):
             U[k, j] *= scale
-        for i in range(k + 1, n):
-            a = U[k, i]
-            for j in range(i, n):
-                U[i, j] -= a * U[k, j]
     return True
 
 
@@ -142,7 +144,7 @@ def remove(R, n, v):
     return True
 
 
-@jit
+@inlined
 def solve_transposed(U, m, b):
     """Overwrite b (m,) with U⁻ᵀ b for the leading m rows of upper U (forward substitution)."""
     for i in range(m):
@@ -151,7 +153,7 @@ def solve_transposed(U, m, b):
             b[j] -= U[i, j] * b[i]
 
 
-@jit
+@inlined
 def solve_upper(U, m, b):
     """Overwrite b (m,) with U⁻¹ b for the leading m rows of upper U (back substitution)."""
     for i in range(m - 1, -1, -1):
@@ -185,7 +187,7 @@ def congruence(F, P, T):
     mirror(P)
 
 
-@jit
+@inlined
 def mirror(P):
     """Copy the lower triangle of P onto the upper."""
     for i in range(P.shape[0]):

@@ -50,7 +50,7 @@ def _store(builder: Any, value: Any, pointer: Any, index: Any) -> None:
 
 
 def _broadcast(builder: Any, value: Any) -> Any:
-    undefined = ir.Constant(_VECTOR, ir.Undefined)
+    undefined = ir.Constant(ir.VectorType(value.type, LANES), ir.Undefined)
     one = builder.insert_element(undefined, value, ir.Constant(_I32, 0))
     return builder.shuffle_vector(one, undefined, ir.Constant(ir.VectorType(_I32, LANES), [0] * LANES))
 
@@ -324,3 +324,92 @@ def exp_minus(typing_context: Any, n: Any, x: Any, shift: Any, out: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(_i64, _i64, _f64, _i64), codegen
+
+
+@intrinsic
+def centre(typing_context: Any, rows: Any, k: Any, width: Any, x: Any, w: Any, mean: Any) -> Any:
+    """Rows of k numbers, `width` apart (whole vectors), become deviations from mean = x₀ + w Σ_r (x_r - x₀).
+
+    What stands behind the k numbers becomes zero: left alone, it would shrink from call to call to subnormal numbers,
+    which take a hundred times as long.
+    """
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        rows, k, width = given[:3]
+        x, mean = _pointer(builder, given[3]), _pointer(builder, given[5])
+        weight = _broadcast(builder, given[4])
+        nothing = ir.Constant(_VECTOR, [0.0] * LANES)
+        lanes = ir.Constant(ir.VectorType(_I64, LANES), list(range(LANES)))
+        sums = cgutils.alloca_once(builder, _VECTOR)
+
+        def others(body: Any) -> None:
+            with cgutils.for_range_slice(builder, _count(1), rows, _count(1), intp=_I64) as (r, _):
+                body(builder.gep(x, [builder.mul(r, width)]))
+
+        with cgutils.for_range_slice(builder, _count(0), width, _count(LANES), intp=_I64) as (at, _):
+            own = builder.icmp_signed("<", lanes, _broadcast(builder, builder.sub(k, at)))
+
+            def load(row: Any) -> Any:
+                return builder.select(own, _load(builder, row, at), nothing)
+
+            central = load(x)
+            builder.store(nothing, sums)
+
+            def add(row: Any) -> None:
+                builder.store(builder.fadd(builder.load(sums), builder.fsub(load(row), central)), sums)
+
+            others(add)
+            shift = builder.fmul(weight, builder.load(sums))
+            _store(builder, builder.fadd(central, shift), mean, at)
+
+            def deviate(row: Any) -> None:
+                _store(builder, builder.fsub(builder.fsub(load(row), central), shift), row, at)
+
+            others(deviate)
+            _store(builder, builder.fsub(nothing, shift), x, at)
+        return context.get_dummy_value()
+
+    return types.void(_i64, _i64, _i64, _i64, _f64, _i64), codegen
+
+
+@intrinsic
+def product(
+    typing_context: Any,
+    n: Any,
+    rows: Any,
+    a: Any,
+    a_width: Any,
+    b: Any,
+    b_width: Any,
+    first: Any,
+    w: Any,
+    out: Any,
+) -> Any:
+    """out (n, b_width) = first a₀ᵀ b₀ + w Σ_r a_rᵀ b_r over the rows a_r (n or more) and b_r (whole vectors).
+
+    Where a is b it is symmetric to the last bit.
+    """
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        n, rows, a_width, b_width = given[0], given[1], given[3], given[5]
+        a, b, out = (_pointer(builder, given[k]) for k in (2, 4, 8))
+        first, weight = _broadcast(builder, given[6]), _broadcast(builder, given[7])
+        sums = cgutils.alloca_once(builder, _VECTOR)
+
+        def entry(row: Any, i: Any) -> Any:
+            return _broadcast(builder, builder.load(builder.gep(row, [i])))
+
+        with cgutils.for_range(builder, n) as loop:
+            i = loop.index
+            with cgutils.for_range_slice(builder, _count(0), b_width, _count(LANES), intp=_I64) as (at, _):
+                builder.store(ir.Constant(_VECTOR, [0.0] * LANES), sums)
+                with cgutils.for_range_slice(builder, _count(1), rows, _count(1), intp=_I64) as (r, _):
+                    own = entry(builder.gep(a, [builder.mul(r, a_width)]), i)
+                    row = builder.gep(b, [builder.mul(r, b_width)])
+                    builder.store(_multiply_add(builder, own, _load(builder, row, at), builder.load(sums)), sums)
+                zeroth = builder.fmul(first, builder.fmul(entry(a, i), _load(builder, b, at)))
+                whole = builder.fadd(builder.fmul(weight, builder.load(sums)), zeroth)
+                _store(builder, whole, builder.gep(out, [builder.mul(i, b_width)]), at)
+        return context.get_dummy_value()
+
+    return types.void(_i64, _i64, _i64, _i64, _i64, _i64, _f64, _f64, _i64), codegen

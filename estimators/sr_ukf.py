@@ -17,8 +17,9 @@ from .gaussian import state_size
 from .jit import jit, matrix
 from .linalg import remove, triangularise
 from .robust import growth, memory
+from .sigma_points import deviations, padded, spread_points
 from .square_root import condition, condition_size, describe, moments, noise_root, settle, start
-from .ukf import CENTRAL_COV, OUTER, SPREAD, UKF, mean_of, spread_points, tune, weights
+from .ukf import CENTRAL_COV, OUTER, SPREAD, UKF, tune, weights
 
 
 def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
@@ -30,8 +31,9 @@ def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
 
 def work_size(options: Options, nx: int, ny: int) -> int:
     """Scratch: sigma points; and the same through f, Q^½ and a square; or ŷ, points through h, conditioning."""
-    predicting = 2 * nx + (3 * nx + 1) * nx + nx * nx
-    return (2 * nx + 1) * nx + max(predicting, 2 * ny + (4 * nx + 2) * ny + condition_size(nx, ny, nx + 1))
+    n, m, points = padded(nx), padded(ny), 2 * nx + 1
+    predicting = points * n + n + nx + (3 * nx + 1) * nx + nx * nx
+    return points * n + max(predicting, points * m + m + ny + points * ny + condition_size(nx, ny, nx + 1))
 
 
 @jit
@@ -43,28 +45,31 @@ def predict(context, u, dt, index, state, work):
     """
     n = context.nx
     U = matrix(state, n, n, n)
-    sigma = matrix(work, 0, 2 * n + 1, n)
-    at = (2 * n + 1) * n
-    forward = work[at : at + n]
-    row = work[at + n : at + 2 * n]
-    at += 2 * n
+    sigma = matrix(work, 0, 2 * n + 1, padded(n))
+    at = sigma.size
+    moved = matrix(work, at, 2 * n + 1, padded(n))
+    at += moved.size
+    forward = work[at : at + padded(n)]
+    at += forward.size
+    row = work[at : at + n]
+    at += n
     # From row 0: the central point, the 2n others, the factor of Q; one after the other, so that all are one matrix.
     D = matrix(work, at, 3 * n + 1, n)
     scratch = matrix(work, at + (3 * n + 1) * n, n, n)
     numbers = options(context)
     spread_points(state[:n], U, numbers[SPREAD], sigma)
-    transition_rows(context, sigma.ctypes.data, n, 2 * n + 1, u, dt, D)
-    mean_of(D[: 2 * n + 1], numbers[OUTER], circular_states(context), forward)
+    transition_rows(context, sigma.ctypes.data, sigma.shape[1], 2 * n + 1, u, dt, moved)
+    deviations(moved, numbers[OUTER], circular_states(context), forward)
     good = noise_root(context, state[:n], u, dt, state, D[2 * n + 1 :], scratch)
     grown = np.sqrt(growth(context, dt))
     w = grown * np.sqrt(numbers[OUTER])
     for i in range(1, 2 * n + 1):
         for j in range(n):
-            D[i, j] *= w
+            D[i, j] = w * moved[i, j]
     central = numbers[CENTRAL_COV]
     w = grown * np.sqrt(abs(central))
     for j in range(n):
-        row[j] = w * D[0, j]
+        row[j] = w * moved[0, j]
         D[0, j] = row[j] if central > 0.0 else 0.0
     triangularise(D, scratch[0])
     if central < 0.0 and good:
@@ -84,19 +89,20 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     n = context.nx
     _, m = sensor_rows(context, sensor)
     U = matrix(state, n, n, n)
-    sigma = matrix(work, 0, 2 * n + 1, n)
-    at = (2 * n + 1) * n
-    expected = work[at : at + m]
-    lost = work[at + m : at + 2 * m]
-    at += 2 * m
-    D = matrix(work, at, 2 * n + 1, m)
-    at += (2 * n + 1) * m
+    sigma = matrix(work, 0, 2 * n + 1, padded(n))
+    at = sigma.size
+    D = matrix(work, at, 2 * n + 1, padded(m))
+    at += D.size
+    expected = work[at : at + padded(m)]
+    at += expected.size
+    lost = work[at : at + m]
+    at += m
     Y = matrix(work, at, 2 * n + 1, m)
-    at += (2 * n + 1) * m
+    at += Y.size
     numbers = options(context)
     spread_points(state[:n], U, numbers[SPREAD], sigma)
-    expect_rows(context, sensor, sigma.ctypes.data, n, 2 * n + 1, u, D)
-    mean_of(D, numbers[OUTER], circular_rows(context, sensor), expected)
+    expect_rows(context, sensor, sigma.ctypes.data, sigma.shape[1], 2 * n + 1, u, D)
+    deviations(D, numbers[OUTER], circular_rows(context, sensor), expected)
     w = np.sqrt(0.5 * numbers[OUTER])
     for k in range(n):
         for j in range(m):
@@ -109,7 +115,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         Y[2 * n, j] = lost[j] if central > 0.0 else 0.0
     if central >= 0.0:
         lost = lost[:0]
-    return condition(context, sensor, y, state, expected, Y, lost, work[at:], innovation, innovation_std, score)
+    return condition(context, sensor, y, state, expected[:m], Y, lost, work[at:], innovation, innovation_std, score)
 
 
 SR_UKF = Estimator(

@@ -15,8 +15,8 @@ from . import gaussian
 from .context import circular_rows, circular_states, expect_rows, options, sensor_rows, transition_rows
 from .filter import Estimator, Option, Options
 from .gaussian import admit, compare, describe, downdate, moments, move_mean, start, state_size, wrap_mean
-from .jit import inlined, jit, matrix
-from .linalg import EPSILON, cholesky, mirror, wrap
+from .jit import jit, matrix
+from .linalg import EPSILON, cholesky
 from .model import StateSpaceModel
 from .robust import (
     ADAPT,
@@ -32,6 +32,7 @@ from .robust import (
     reweigh,
     shared,
 )
+from .sigma_points import covariance, cross_covariance, deviations, padded, spread_points
 from .track import FAILED, USED
 from .tuning import Tuning
 
@@ -66,45 +67,9 @@ def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch: an update's; the factor, sigma points, the same through f or h, and the mean."""
-    return gaussian.scratch_size(nx, ny) + nx * nx + (2 * nx + 1) * (nx + max(nx, ny)) + nx
-
-
-@inlined
-def mean_of(D, w, circular, mean):
-    """Turn points D (2n+1, k) into deviations from their weighted mean, which is added up from the central point.
-
-    The weights sum to 1, so mean = D₀ + w Σ (Dᵢ - D₀): small alpha then costs no digits, and angles do not tear.
-    """
-    k = mean.size
-    for j in range(k):
-        mean[j] = 0.0
-    for i in range(1, D.shape[0]):
-        for j in range(k):
-            D[i, j] -= D[0, j]
-            if circular[j] != 0:
-                D[i, j] = wrap(D[i, j])
-            mean[j] += D[i, j]
-    for j in range(k):
-        mean[j] *= w
-        central = D[0, j]
-        D[0, j] = 0.0
-        for i in range(D.shape[0]):
-            D[i, j] -= mean[j]
-        mean[j] += central
-
-
-@inlined
-def spread_points(x, U, spread, points):
-    """Fill `points` (2n+1, n) with x and x ± spread·U[k]."""
-    n = x.size
-    for j in range(n):
-        points[0, j] = x[j]
-    for k in range(n):
-        for j in range(n):
-            d = spread * U[k, j]
-            points[1 + k, j] = x[j] + d
-            points[1 + n + k, j] = x[j] - d
+    """Scratch: an update's; the factor, sigma points, the same through f or h, their mean and covariance."""
+    n, m = padded(nx), padded(ny)
+    return gaussian.scratch_size(nx, ny) + nx * nx + (2 * nx + 1) * (n + max(n, m)) + max(n, (1 + nx + ny) * m)
 
 
 @jit
@@ -115,34 +80,29 @@ def predict(context, u, dt, index, state, work):
     Source: Julier & Uhlmann (2004), as above.
     """
     n = context.nx
+    width = padded(n)
     x = state[:n]
     P = matrix(state, n, n, n)
-    U = matrix(work, 0, n, n)
-    at = n * n
-    D = matrix(work, at, 2 * n + 1, n)
-    at += (2 * n + 1) * n
-    sigma = matrix(work, at, 2 * n + 1, n)
-    at += (2 * n + 1) * n
-    forward = work[at : at + n]
+    D = matrix(work, 0, 2 * n + 1, width)
+    at = D.size
+    sigma = matrix(work, at, 2 * n + 1, width)
+    spread = matrix(work, at, n, width)
+    at += sigma.size
+    forward = work[at : at + width]
+    U = matrix(work, at + width, n, n)
     numbers = options(context)
-    w = numbers[OUTER]
     if not cholesky(P, U, n):
         for i in range(n + n * n):
             state[i] = np.nan
         return
     spread_points(x, U, numbers[SPREAD], sigma)
-    transition_rows(context, sigma.ctypes.data, n, 2 * n + 1, u, dt, D)
-    mean_of(D, w, circular_states(context), forward)
+    transition_rows(context, sigma.ctypes.data, width, 2 * n + 1, u, dt, D)
+    deviations(D, numbers[OUTER], circular_states(context), forward)
+    # The covariance takes the place of the points, which have done their work.
+    covariance(D, numbers[CENTRAL_COV], numbers[OUTER], spread)
     for i in range(n):
-        a = numbers[CENTRAL_COV] * D[0, i]
-        for j in range(i + 1):
-            P[i, j] = a * D[0, j]
-    for k in range(1, 2 * n + 1):
-        for i in range(n):
-            a = w * D[k, i]
-            for j in range(i + 1):
-                P[i, j] += a * D[k, j]
-    mirror(P)
+        for j in range(n):
+            P[i, j] = spread[i, j]
     add_noise(context, x, u, dt, state, P, U)
     for i in range(n):
         x[i] = forward[i]
@@ -150,17 +110,18 @@ def predict(context, u, dt, index, state, work):
 
 
 @jit
-def only_rounding(U, P, D, S, r, w, y):
+def only_rounding(U, P, across, S, r, w, y):
     """Whether a reading rests on directions of P that its factor U shows by rounding alone.
 
     A pivot of a few n ε of P_kk is what subtracting left; its sigma points are then anywhere. That does no harm unless
     they make more than a hundredth of what the reading is weighed against, S (ny, ny) and r: then no gain is known.
+    across (nx, ny): the differences between opposite points' readings.
     """
     n = P.shape[0]
     for k in range(n):
         if U[k, k] * U[k, k] <= 4.0 * n * EPSILON * P[k, k]:
             for j in range(r.size):
-                d = D[1 + k, j] - D[1 + n + k, j]
+                d = across[k, j]
                 if np.isfinite(y[j]) and 0.5 * w * d * d > 0.01 * (S[j, j] + r[j]):
                     return True
     return False
@@ -176,42 +137,38 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     _, m = sensor_rows(context, sensor)
     x = state[:n]
     P = matrix(state, n, n, n)
-    nu, r, S, V, C, room, at = gaussian.scratch(work, n, m)
+    D = matrix(work, 0, 2 * n + 1, padded(m))
+    at = D.size
+    mean = work[at : at + D.shape[1]]
+    at += mean.size
+    S = matrix(work, at, m, D.shape[1])
+    at += S.size
+    C = matrix(work, at, n, D.shape[1])
+    at += C.size
+    sigma = matrix(work, at, 2 * n + 1, padded(n))
+    at += sigma.size
     U = matrix(work, at, n, n)
-    at += n * n
-    D = matrix(work, at, 2 * n + 1, m)
-    at += (2 * n + 1) * m
+    nu, r, _, V, _, room, _ = gaussian.scratch(work[at + n * n :], n, m)
     numbers = options(context)
     w = numbers[OUTER]
     spread = numbers[SPREAD]
     if not cholesky(P, U, n):
         return FAILED
-    sigma = matrix(work, at, 2 * n + 1, n)
     spread_points(x, U, spread, sigma)
-    expect_rows(context, sensor, sigma.ctypes.data, n, 2 * n + 1, u, D)
-    mean_of(D, w, circular_rows(context, sensor), nu)
+    expect_rows(context, sensor, sigma.ctypes.data, sigma.shape[1], 2 * n + 1, u, D)
+    deviations(D, w, circular_rows(context, sensor), mean)
+    covariance(D, numbers[CENTRAL_COV], w, S)
     for i in range(m):
-        a = numbers[CENTRAL_COV] * D[0, i]
-        for j in range(i + 1):
-            S[i, j] = a * D[0, j]
-    for k in range(1, 2 * n + 1):
-        for i in range(m):
-            a = w * D[k, i]
-            for j in range(i + 1):
-                S[i, j] += a * D[k, j]
+        nu[i] = mean[i]
     # The sigma deviations of the state are ± spread·U[k], so C = w·spread Σ U[k] (D₊ₖ - D₋ₖ).
-    scale = w * spread
-    for i in range(n):
-        for j in range(m):
-            C[i, j] = 0.0
+    across = D[1 : n + 1]
     for k in range(n):
-        for i in range(k, n):
-            a = scale * U[k, i]
-            for j in range(m):
-                C[i, j] += a * (D[1 + k, j] - D[1 + n + k, j])
+        for j in range(m):
+            across[k, j] -= D[1 + n + k, j]
+    cross_covariance(U, across, w * spread, C)
     nothing = D[:, :0]
     reading_variances(context, sensor, state, r)
-    drowned = only_rounding(U, P, D, S, r, w, y)
+    drowned = only_rounding(U, P, across, S, r, w, y)
     m = compare(context, sensor, y, r, nu, C, S, nothing, P, innovation, innovation_std)
     verdict = FAILED if drowned else admit(context, sensor, m, nu, S, V, score)
     if verdict == USED and numbers[ROBUST] != NONE:
