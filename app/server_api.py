@@ -109,8 +109,14 @@ def _converted(command: str, name: str, value: Any, hint: Any) -> Any:
         if kind in (bool, str) and isinstance(value, kind):
             return value
         if kind is float and not isinstance(value, bool) and (isinstance(value, (int, float)) or value == "inf"):
-            if not math.isnan(float(value)):
-                return float(value)
+            try:
+                number = float(value)
+            except OverflowError:
+                raise ConfigError(
+                    f"{command}: {name} has {len(str(value))} digits; it must be a finite number"
+                ) from None
+            if not math.isnan(number):
+                return number
         if kind is Path and isinstance(value, str):
             return _recording(f"{command}: {name} is {value!r}", value)
     wanted = " or ".join({"float": "a number", "bool": "true or false", "NoneType": "null", "str": "a text",
