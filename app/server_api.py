@@ -112,9 +112,7 @@ def _converted(command: str, name: str, value: Any, hint: Any) -> Any:
             try:
                 number = float(value)
             except OverflowError:
-                raise ConfigError(
-                    f"{command}: {name} has {len(str(value))} digits; it must be a finite number"
-                ) from None
+                raise ConfigError(f"{command}: {name} is too large; it must be a finite number") from None
             if not math.isnan(number):
                 return number
         if kind is Path and isinstance(value, str):
