@@ -11,6 +11,7 @@ from estimators.log import BEFORE, READING, truth_of
 from estimators.model import StateSpaceModel
 from estimators.track import GATED
 
+from .observed import observed
 from .viser_decimate import Buckets, bridge
 from .viser_history import History
 
@@ -21,25 +22,6 @@ BUCKETS = 300
 HEIGHT = 118
 SHOWN = 6
 """States that have a chart of their own; of more, the last chart shows the one chosen."""
-
-
-def observers(model: StateSpaceModel) -> list[list[tuple[int, int]]]:
-    """For each charted state, the sensor rows (sensor, row) that read it directly: h(x) = x_j, whatever x is."""
-    direct: list[list[tuple[int, int]]] = [[] for _ in model.shown]
-    rng = np.random.default_rng(0)
-    mean, std = model.prior_mean, model.prior_std
-    u = np.array([item.default for item in model.inputs])
-    p = np.array([parameter.value for parameter in model.parameters])
-    points = mean + std * rng.uniform(0.3, 0.9, (2, model.nx))
-    for k, sensor in enumerate(model.sensors):
-        out = np.full((2, len(sensor.rows)), np.nan)
-        for x, row in zip(points, out, strict=True):
-            sensor.h(x, u, p, row)
-        for r in range(len(sensor.rows)):
-            charted = points[:, model.shown]
-            for j in np.flatnonzero(np.all(np.isclose(out[:, r, None], charted, rtol=1e-9, atol=1e-12), axis=0)):
-                direct[j].append((k, r))
-    return direct
 
 
 def line(color: str, width: float, **more: Any) -> dict[str, Any]:
@@ -89,7 +71,8 @@ class Charts:
 
     def __init__(self, server: viser.ViserServer, model: StateSpaceModel, window: float) -> None:
         self.model = model
-        self.direct = observers(model)
+        dots = observed(model)
+        self.direct = [[(dot.sensor, dot.row) for dot in dots if dot.state == j] for j in model.shown]
         self.window: float | None = window
         self._previous: tuple[np.ndarray, np.ndarray] | None = None
         nx = len(model.shown)
