@@ -40,8 +40,8 @@ def observed(model: StateSpaceModel) -> list[Observed]:
     found = []
     for k, sensor in enumerate(model.sensors):
         values, there = np.full((len(points), len(sensor.rows)), np.nan), np.zeros(len(sensor.rows))
-        for x, row in zip(points, values, strict=True):
-            sensor.h(x, u, p, row)
+        for x, out in zip(points, values, strict=True):
+            sensor.h(x, u, p, out)
         slopes = np.zeros((len(sensor.rows), len(charted)))
         for column, (j, state) in enumerate(charted):
             moved = points[0].copy()
