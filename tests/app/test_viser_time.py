@@ -16,7 +16,7 @@ DAY = 86400.0
 
 @pytest.mark.parametrize(
     ("span", "unit"),
-    [(0.0, "s"), (10.0, "s"), (179.0, "s"), (180.0, "min"), (3600.0, "min"), (10_800.0, "h"), (DAY, "h"), (3 * DAY, "d")],
+    [(0.0, "s"), (179.0, "s"), (180.0, "min"), (3600.0, "min"), (10_800.0, "h"), (DAY, "h"), (3 * DAY, "d")],
 )  # fmt: skip
 def test_the_unit_suits_the_span(span, unit):
     assert unit_for(span).name == unit
