@@ -25,7 +25,7 @@ def recorded_twin(recorded: Recorded) -> Twin:
 
     twin = restore_twin(recorded.text, recorded.twin_path)
     tuning, estimator = tuning_from_json(recorded.tuning, twin.model)
-    return replace(twin, tuning=tuning, estimator=estimator)
+    return replace(twin, tuning=tuning, estimator=estimator, recorded=True)
 
 
 def open_review(path: Path, page: Page | None) -> tuple[Session, Recorded]:

@@ -15,6 +15,7 @@ import viser
 from estimators.registry import ESTIMATORS, unfit
 
 from .commands import Pause, Record, Reset, Seek, SetEstimator, SetTuning, Speed, Step, UseSensor
+from .viser_began import BeganRows
 from .viser_options import OptionRows
 from .viser_rows import ChoiceRow, Held, NumberRow
 from .viser_status import events_html, note_html, status_html
@@ -44,6 +45,7 @@ class Panel:
         tabs = gui.add_tab_group()
         self.rows: dict[str, NumberRow] = {}
         with tabs.add_tab("Tune"):
+            self.began = BeganRows(gui, engine)
             self._build_estimator(gui, status)
             self._build_tuning(gui, status)
         with tabs.add_tab("Sensors"):
@@ -135,6 +137,7 @@ class Panel:
 
     def sync(self, status: Any, origin: int | None, unit: Unit = SECONDS) -> None:
         """Show what the engine says; whoever changed it, a browser, the API, or the engine itself."""
+        self.began.sync(status)
         self.estimator.sync(self._titles.get(status.estimator, self.estimator.handle.value))
         self.options.sync(ESTIMATORS[status.estimator], status.options)
         for item in status.tuning.items():
