@@ -52,7 +52,7 @@ def began_html(twin: Any, found: dict[str, Any]) -> str:
         text = f"<b>Turned since {'the recording' if twin.recorded else 'the start'}.</b> As {word}: "
         text += f"{'; '.join(parts)}{more}."
     elif twin.recorded:
-        text = f"<b>As recorded</b>: {title}, with all that stands below."
+        text = f"<b>As recorded</b>: {title} and the settings below."
     else:
         return ""
     return f'<div style="font-size:0.8em;padding:0 0.9em 0.5em;overflow-wrap:anywhere">{text}</div>'

@@ -62,7 +62,7 @@ function show(status) {
   document.title = `${status.twin} · Nisus`;
   $("twin").textContent = status.twin;
   const turned = Object.keys(status.turned).length > 0;
-  const recorded = status.began_as === "recorded" ? (turned ? " · recorded, turned since" : " · as recorded") : "";
+  const recorded = status.began_as === "recorded" ? (turned ? " · recorded, turned" : " · as recorded") : "";
   $("title").textContent = status.title + recorded;
   const lasting = status.health !== "tracking" && status.since !== null;
   $("health").textContent = lasting ? `${status.health} for ${spell((status.t - status.since) / 1e9)}` : status.health;
