@@ -13,6 +13,7 @@ from estimators.errors import ConfigError
 from estimators.track import HEALTH_NAMES
 
 from . import commands
+from .began import began_as, turned
 from .obey import Refolding, retuned
 from .playback import LONGEST
 
@@ -26,6 +27,8 @@ def status_json(engine: Any) -> dict[str, Any]:
         "estimator": status.estimator,
         "options": _plain(dict(status.options)),
         "tuning": {key: _plain(value) for key, value, *_ in status.tuning.items()},
+        "began_as": began_as(engine.twin),
+        "turned": _plain(turned(engine.twin, status.estimator, status.tuning)),
         "revision": status.revision,
         "refolding": status.refolding,
         "t": status.t,
