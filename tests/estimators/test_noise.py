@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from estimators.noise import belief_root, semidefinite_root
+from estimators.compiled import compile_model
+from estimators.models import MODELS
+from estimators.noise import add_noise, belief_root, noise_root, semidefinite_root
 
 
 def root(A):
@@ -34,7 +36,15 @@ def test_integrated_white_noise_and_zero():
 
 
 @pytest.mark.parametrize(
-    "A", [[[1.0, 0.0], [0.0, -1e-3]], [[0.0, 1.0], [1.0, 0.0]], [[1.0, 2.0], [2.0, 1.0]], [[np.nan, 0.0], [0.0, 1.0]]]
+    "A",
+    [
+        [[1.0, 0.0], [0.0, -1e-3]],
+        [[0.0, 1.0], [1.0, 0.0]],
+        [[1.0, 2.0], [2.0, 1.0]],
+        [[np.nan, 0.0], [0.0, 1.0]],
+        # The second has no variance but the first one's, of which the third knows nothing: eigenvalue -0.005.
+        [[1.0, 1.0, 0.0], [1.0, 1.0, 0.1], [0.0, 0.1, 1.0]],
+    ],
 )
 def test_what_is_no_covariance_is_refused_visibly(A):
     fine, L = root(np.array(A))
