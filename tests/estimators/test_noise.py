@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from estimators.compiled import compile_model
-from estimators.models import MODELS
-from estimators.noise import add_noise, belief_root, noise_root, semidefinite_root
+from estimators.noise import add_noise, belief_root, semidefinite_root
 
 
 def root(A):
@@ -66,3 +64,10 @@ def test_a_belief_that_rounding_made_indefinite_keeps_its_deviations():
     assert np.array_equal(L, np.diag([2.0, 1.0]))
     belief_root(np.eye(2) * 9.0, L)
     assert np.array_equal(L, 3.0 * np.eye(2))
+
+
+def test_noise_is_added_through_the_whole_lower_triangle():
+    L = np.array([[2.0, 9.0, 9.0], [3.0, 5.0, 9.0], [-1.0, 4.0, 7.0]])
+    x = np.array([10.0, 20.0, 30.0])
+    add_noise(L, np.array([1.0, 10.0, 100.0]), x)
+    np.testing.assert_array_equal(x, [12.0, 73.0, 769.0])
