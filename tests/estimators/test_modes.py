@@ -59,6 +59,18 @@ def test_a_light_peak_far_away_is_kept(part, seed):
         assert np.allclose(mode.mean[:2], x[here, :2].mean(axis=0), atol=5 * 2.0 / np.sqrt(here.sum()) / 10)
 
 
+def test_a_few_points_far_away_are_found_among_the_bumps_of_the_many():
+    """12 to 16 points of 400, ten deviations away: ranked below the dense middle of the others, but far."""
+    found = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        here = rng.random(N) < 0.04
+        x = rng.standard_normal((N, 3))
+        x[:, 0] += np.where(here, 5.0, -5.0)
+        found += len(modes_of(x, flat(3))) == 2
+    assert found >= 9  # their density is so thin that a sample may miss it: 11 of these
+
+
 def test_copies_of_a_particle_beside_a_cloud_are_a_peak():
     rng = np.random.default_rng(2)
     x = rng.standard_normal((N, 2)) + [10.0, 0.0]
