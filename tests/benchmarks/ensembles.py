@@ -143,7 +143,13 @@ def growing_ensembles() -> None:
     rows = (
         ("etkf", {}, "n N²", lambda n, members, m: n * members**2),
         ("ensrf", {"radius": 0.5}, "n N m, within the radius", lambda n, members, m: n * members * m),
-        ("letkf", {"radius": 0.5}, "n N² m, within the radius", lambda n, members, m: n * members**2 * m),
+        # Each cell solves for the fewer of N and the rows within the radius: 78 of 100 at n = 10,000, 20 and 5 beyond.
+        (
+            "letkf",
+            {"radius": 0.5},
+            "n, k³ with k the smaller of N and the rows within the radius",
+            lambda n, members, m: n,
+        ),
     )
     cases = [(side, 40, 10) for side in (100, 200, 400)] + [(200, N, 10) for N in (10, 20, 80)]
     cases += [(200, 40, sensors) for sensors in (5, 20)]
