@@ -190,7 +190,10 @@ def test_filters_lists_all_and_says_why_not(capsys):
     # Nine sigma points thirty times a second; twenty numbers of eight bytes.
     assert re.search(r"ukf .*20 × 8 B = 160 B .*9 × 30 = 27\d", fitting)
     # 200 members in its YAML; the auxiliary filter propagates its 2000 particles twice.
-    assert re.search(r"letkf .* 200 × 30 = 6,00\d", fitting) and re.search(r"apf .* 4,000 × 30 = 1\.2", fitting)
+    assert re.search(r"letkf .* 200 × 30 = 6,00\d", fitting) and re.search(
+        r"apf .* 4,000 × 30 = 120,\d{3} .* yes", fitting
+    )
+    assert "applies" in fitting and not re.search(r"\de\+", fitting)
 
 
 def test_options_of_other_filters_are_checked_where_they_stand(tmp_path, capsys):
