@@ -38,11 +38,12 @@ def find_entry(name: str) -> Estimator:
     """The entry of that name.
 
     Raises:
-        EstimatorError: If there is none, with near names.
+        EstimatorError: If there is none, with near names, or all.
     """
     if name not in ESTIMATORS:
-        near = get_close_matches(name, ESTIMATORS, n=3, cutoff=0.4) or list(ESTIMATORS)
-        raise EstimatorError(f"estimator {name!r} does not exist; near: {', '.join(near)}")
+        near = get_close_matches(name, ESTIMATORS, n=3, cutoff=0.4)
+        rule = f"near: {', '.join(near)}" if near else f"it must be one of {', '.join(ESTIMATORS)}"
+        raise EstimatorError(f"estimator {name!r} does not exist; {rule}")
     return ESTIMATORS[name]
 
 
