@@ -11,6 +11,7 @@ from estimators.filter import Option
 from estimators.log import READING
 from estimators.registry import ESTIMATORS, unfit
 
+from .compile import attend
 from .fold import read_log
 from .twin import Twin, load_twin
 
@@ -86,7 +87,7 @@ def fitting(twin: Twin) -> Table:
 
 def reading_rate(twin: Twin) -> float:
     """Readings a second of the twin's source, by its first minute."""
-    log, _ = read_log(twin, SAMPLE)
+    log, _ = attend(twin.model, lambda: read_log(twin, SAMPLE), "reading the source's first minute")
     events = log.readings
     times = events.t[events.kind == READING]
     return float((times.size - 1) / (times[-1] - times[0]) * 1e9) if times.size > 1 and times[-1] > times[0] else 0.0
