@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, get_args
 
 import tyro
 
@@ -156,30 +158,22 @@ class New:
     """Where to."""
 
 
-Command = (
-    Annotated[Run, tyro.conf.subcommand("run")]
-    | Annotated[Fold, tyro.conf.subcommand("fold")]
-    | Annotated[Compare, tyro.conf.subcommand("compare")]
-    | Annotated[Filters, tyro.conf.subcommand("filters")]
-    | Annotated[Review, tyro.conf.subcommand("review")]
-    | Annotated[Bus, tyro.conf.subcommand("bus")]
-    | Annotated[Twins, tyro.conf.subcommand("twins")]
-    | Annotated[Schema, tyro.conf.subcommand("schema")]
-    | Annotated[New, tyro.conf.subcommand("new")]
-)
+Command = Run | Fold | Compare | Filters | Review | Bus | Twins | Schema | New
+COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in get_args(Command)}
 
 
 def settings(given: Sequence[str], estimator: str | None = None) -> dict[str, str]:
     """The KEY=VALUE pairs of `--set`, and `--estimator` as one more.
 
     Raises:
-        ConfigError: If one has no `=`.
+        ConfigError: If one has no `=`, or no key before it.
     """
     pairs: dict[str, str] = {}
     for text in given:
         key, equals, value = text.partition("=")
         if not equals or not key.strip():
-            raise ConfigError(f"--set {text}: has no value; write KEY=VALUE, for example --set R.winding=9")
+            lacks = "key" if equals else "value"
+            raise ConfigError(f"--set {text}: has no {lacks}; write KEY=VALUE, for example --set R.winding=9")
         pairs[key.strip()] = value.strip()
     if estimator is not None:
         pairs["estimator"] = estimator
@@ -234,12 +228,23 @@ def carry_out(command: Command) -> int:
     return 0
 
 
+def parse(arguments: Sequence[str]) -> Command:
+    """The command that the words say; leaves with tyro's explanation if they say none.
+
+    That of a subcommand that is there gets its words alone, so that only its own options are suggested.
+    """
+    if arguments and arguments[0] in COMMANDS:
+        name = arguments[0]
+        return tyro.cli(COMMANDS[name], args=arguments[1:], prog=f"nisus {name}")  # type: ignore[no-any-return]
+    named = [Annotated[command, tyro.conf.subcommand(name)] for name, command in COMMANDS.items()]
+    union: Any = functools.reduce(operator.or_, named)
+    return tyro.cli(union, args=arguments, prog="nisus", description=__doc__)  # type: ignore[no-any-return]
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point: 0 when all went well, 2 with one line on standard error when it did not."""
     try:
-        return carry_out(
-            tyro.cli(Command, args=arguments, prog="nisus", description=__doc__)  # type: ignore[call-overload]
-        )
+        return carry_out(parse(sys.argv[1:] if arguments is None else arguments))
     except NisusError as error:
         print(f"nisus: {error}", file=sys.stderr)
         return 2

@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress
 
 from config.loader import shipped
 from config.source_schema import SimulatorSection
@@ -27,6 +25,7 @@ from .compare_fold import BUDGET, Row, fold_row
 from .compare_table import caption, table, write_table
 from .compile import prepare
 from .fold import read_log
+from .progress import progress
 from .twin import Twin, load_twin
 
 if TYPE_CHECKING:
@@ -68,11 +67,10 @@ def _compare(arguments: Arguments, name: str) -> None:
     prepare(twin)
     logs = _logs(twin, overrides, arguments)
     rows = []
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(f"{twin.name}: {len(names)} filters over {len(logs[0])} events", total=len(names))
+    with progress(f"{twin.name}, {len(logs[0])} events", len(names), "filters") as advance:
         for row in compare(name, overrides, names, logs, arguments.jobs, arguments.budget):
             rows.append(row)
-            progress.advance(task)
+            advance()
     rows.sort(key=lambda row: names.index(row.estimator))
     seconds = float(logs[0].t[-1] - logs[0].t[0]) * 1e-9
     lines = [caption(twin.path.stem, rows, len(logs[0]), seconds, len(logs)), *table(rows)]

@@ -11,6 +11,7 @@ from estimators.filter import Option
 from estimators.log import READING
 from estimators.registry import ESTIMATORS, unfit
 
+from .compile import attend
 from .fold import read_log
 from .twin import Twin, load_twin
 
@@ -59,8 +60,13 @@ def option_text(option: Option) -> str:
 def fitting(twin: Twin) -> Table:
     """Which estimators apply to a twin, with what they cost there, and why the others do not."""
     rate = reading_rate(twin)
-    table = Table(title=f"{twin.name}: {twin.model.nx} states, {rate:.3g} readings a second")
-    for title, justify in (("name", "left"), ("memory", "right"), ("model runs a second", "right"), ("", "left")):
+    table = Table(title=f"{twin.name}: {twin.model.nx:,} states, {rate:.3g} readings a second")
+    for title, justify in (
+        ("name", "left"),
+        ("memory", "right"),
+        ("model runs a second", "right"),
+        ("applies", "left"),
+    ):
         table.add_column(title, justify=justify, overflow="fold")  # type: ignore[arg-type]
     for name, entry in ESTIMATORS.items():
         reason = unfit(entry, twin.model)
@@ -73,18 +79,23 @@ def fitting(twin: Twin) -> Table:
         table.add_row(
             f"[bold]{name}[/]",
             f"{numbers:,} × 8 B = {bytes_text(8 * numbers)}",
-            f"{runs:,.4g} × {rate:.3g} = {runs * rate:,.4g}",
-            "first" if name == twin.estimator else "",
+            f"{count_text(runs)} × {rate:.3g} = {count_text(runs * rate)}",
+            "yes, and runs first" if name == twin.estimator else "yes",
         )
     return table
 
 
 def reading_rate(twin: Twin) -> float:
     """Readings a second of the twin's source, by its first minute."""
-    log, _ = read_log(twin, SAMPLE)
+    log, _ = attend(twin.model, lambda: read_log(twin, SAMPLE), "reading the source's first minute")
     events = log.readings
     times = events.t[events.kind == READING]
     return float((times.size - 1) / (times[-1] - times[0]) * 1e9) if times.size > 1 and times[-1] > times[0] else 0.0
+
+
+def count_text(count: float) -> str:
+    """A number of runs: whole from a hundred on, three digits below."""
+    return f"{count:,.0f}" if count >= 100.0 else f"{count:.3g}"
 
 
 def bytes_text(count: float) -> str:

@@ -35,6 +35,12 @@ if TYPE_CHECKING:
     from sources.profile import Profile
     from sources.source import Channel, Report, Source
 
+MOST_EVENTS = 1e8
+"""That a simulation may make; it makes some ten thousand a second."""
+
+WITHOUT_END = 100.0
+"""Seconds within which one without end may make that many."""
+
 TABLES = (".csv", ".parquet", ".pq", ".mat", ".npz")
 """File endings that `--log` gives to the tables of a merged source."""
 
@@ -295,8 +301,33 @@ def _check_asset(loaded: Loaded, section: AssetSection, key: Key, model: StateSp
     check_names(loaded, (*key, "inputs"), section.inputs, model.input_names, "input", model)
     check_names(loaded, (*key, "sensors"), section.sensors, model.sensor_names, "sensor", model)
     _faults(loaded, section, key, model)
+    _check_length(loaded, section, key, model)
     if section.truth.model is None:
         _check_truth(loaded, section, key, model)
+
+
+def _check_length(loaded: Loaded, section: AssetSection, key: Key, model: StateSpaceModel) -> None:
+    """Refuse a simulation that would not end, or not get on, in a person's time."""
+    step, duration = section.step, section.duration
+    seconds = max(WITHOUT_END, step) if duration is None else max(duration, step)
+    plans = [section.sensors.get(sensor.name) for sensor in model.sensors]
+    readings = sum(1.0 / (plan.every if plan else 1) for plan in plans)
+    runs = max(1.0, step / model.max_step)
+    count = seconds / step * max(runs, readings)
+    if count <= MOST_EVENTS:
+        return
+    other = dotted((*key, "duration"))
+    if duration is None:
+        name, value, remedy = "step", step, "shorten it" if runs > readings else "lengthen it"
+    elif step < 1.0 / duration:
+        name, value, remedy = "step", step, f"lengthen it, or shorten {other}"
+    else:
+        name, value, remedy = "duration", duration, f"shorten it, or lengthen {dotted((*key, 'step'))}"
+    raise loaded.error(
+        (*key, name),
+        f"is {value:g} s; the simulator would make {count:.3g} {'steps of f' if runs > readings else 'events'} in "
+        f"{seconds:g} s, and may make {MOST_EVENTS:.0e}; {remedy}",
+    )
 
 
 def _check_truth(loaded: Loaded, section: AssetSection, key: Key, model: StateSpaceModel) -> None:

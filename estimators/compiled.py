@@ -7,7 +7,7 @@ with the declaration: shapes, finiteness at the prior, and derivatives.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import Any
@@ -33,6 +33,7 @@ from .jit import address, jit
 from .jump import check_parts
 from .looped import f_rows_signature, h_rows_signature, looped_f, looped_h
 from .model import LARGE, Field, StateSpaceModel
+from .probe import plain, probe, probe_angles, probe_likelihoods, uncompilable
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
             kept.append(dispatcher)
             return address(dispatcher, signature)
         except numba.core.errors.NumbaError as error:
-            raise ModelError(f"model {model.name}: {what} cannot be compiled: {_gist(error)}") from None
+            raise uncompilable(model, what, function, error) from None
 
     def rows_code(dispatcher: Any, signature: Any) -> int:
         kept.append(dispatcher)
@@ -111,8 +112,8 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
             del error
             return 0
 
-    _probe(model)
-    _probe_likelihoods(model)
+    probe(model)
+    probe_likelihoods(model)
     box = BlackBox(model) if model.black_box else None
     if box is not None:
         box.probe()
@@ -202,7 +203,7 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
             "shown": model.shown,
         },
     )
-    _probe_angles(model, compiled.h)
+    probe_angles(model, compiled.h)
     if derivable:
         _check_derivatives(compiled)
     check_parts(model)
@@ -229,119 +230,6 @@ def _each_cell(x, u, p, q, dt, out):
         out[j, j] = q[0] * dt
 
 
-def _gist(error: Exception) -> str:
-    """The line of Numba's long message that says what went wrong, and where."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    where = next((line for line in reversed(lines) if line.startswith("File ")), "")
-    rows = [line for line in lines if not line.startswith(("Failed in", "File ", "During:", "^", "[1]", "[2]"))]
-    return f"{rows[0] if rows else lines[0]} ({where})" if where else (rows[0] if rows else str(error))
-
-
-def _probe(model: StateSpaceModel) -> None:
-    """Run the plain functions once with arrays of the declared sizes, where an index that is too large is an error."""
-    x = model.prior_mean.copy()
-    u = np.array([item.default for item in model.inputs], float)
-    p = np.array([item.value for item in model.parameters], float)
-    q = np.array([noise.variance for noise in model.noises], float)
-    dt = min(1.0, model.max_step)
-    n = model.nx
-    calls: list[tuple[str, Callable | None, tuple, tuple[int, ...]]] = [
-        ("f", model.f, (x, u, p, dt), (n,)),
-        ("F", model.F, (x, u, p, dt), (n, n)),
-        ("Q", model.Q, (x, u, p, q, dt), (n, n)),
-        ("shape", model.shape, (np.random.default_rng(0).standard_normal(n), p), (n,)),
-    ]
-    for sensor in model.sensors:
-        m = len(sensor.rows)
-        calls.append((f"h of sensor {sensor.name}", sensor.h, (x, u, p), (m,)))
-        calls.append((f"H of sensor {sensor.name}", sensor.H, (x, u, p), (m, n)))
-    for what, function, arguments, shape in calls:
-        if function is None or (model.black_box and what not in ("Q", "shape")):
-            continue
-        out = np.full(shape, np.nan)
-        if what == "Q":
-            out[:] = 0.0
-        copies = tuple(item.copy() if isinstance(item, np.ndarray) else item for item in arguments)
-        try:
-            with np.errstate(all="ignore"):
-                getattr(function, "py_func", function)(*copies, out)
-        except Exception as error:  # noqa: BLE001  the user's own function may raise anything
-            raise ModelError(
-                f"model {model.name}: {what} fails at the prior with {n} states, {u.size} inputs and {p.size} "
-                f"parameters: {type(error).__name__}: {error}; check it against the declared sizes"
-            ) from None
-        if not all(np.array_equal(copy, item) for copy, item in zip(copies, arguments, strict=True)):
-            raise ModelError(
-                f"model {model.name}: {what} writes to its arguments, which are the filter's own; it may fill out only"
-            )
-        if not np.all(np.isfinite(out)):
-            raise ModelError(
-                f"model {model.name}: {what} leaves {int(np.sum(~np.isfinite(out)))} of {out.size} entries of out "
-                f"(shape {shape}) unset or not finite at the prior; it must fill them all"
-            )
-        if what == "Q" and not np.allclose(out, out.T):
-            raise ModelError(f"model {model.name}: Q is not symmetric at the prior; fill both triangles")
-        if what == "Q":
-            values = np.linalg.eigvalsh(out)
-            # Rounding leaves the zero eigenvalues of a singular Q at n ε of the largest.
-            if values[0] < -1e-9 * max(values[-1], -values[0]):
-                raise ModelError(
-                    f"model {model.name}: Q has the eigenvalue {values[0]:.3g} at the prior; a covariance must be "
-                    "positive semidefinite"
-                )
-
-
-def _probe_angles(model: StateSpaceModel, h: Sequence[Callable]) -> None:
-    """Refuse a sensor row that tells a full turn of a circular state, whose filters turn it back to within ±π."""
-    if model.nx > LARGE or not np.any(model.circular):
-        return
-    x = model.prior_mean + 0.3 * model.prior_std
-    u = np.array([item.default for item in model.inputs], float)
-    p = np.array([item.value for item in model.parameters], float)
-    for sensor, expected in zip(model.sensors, h, strict=True):
-        here, there = np.empty(len(sensor.rows)), np.empty(len(sensor.rows))
-        expected(x, u, p, here)
-        for j in np.flatnonzero(model.circular):
-            turned = x.copy()
-            turned[j] += 2.0 * np.pi
-            expected(turned, u, p, there)
-            for row, before, after in zip(sensor.rows, here, there, strict=True):
-                change = after - before
-                if row.circular:
-                    change -= 2.0 * np.pi * np.round(change / (2.0 * np.pi))
-                if abs(change) > 1e-6 * max(1.0, abs(before)):
-                    raise ModelError(
-                        f"model {model.name}: row {row.name} of sensor {sensor.name} changes by {change:.3g} with a "
-                        f"full turn of {model.state_names[int(j)]}, which is circular; declare the row circular, or "
-                        "let h be periodic"
-                    )
-
-
-def _probe_likelihoods(model: StateSpaceModel) -> None:
-    """Run each sensor's own log_likelihood once, at the reading that the prior predicts."""
-    x = np.array([state.mean for state in model.states], float)
-    u = np.array([item.default for item in model.inputs], float)
-    p = np.array([item.value for item in model.parameters], float)
-    for sensor in model.sensors:
-        if sensor.log_likelihood is None:
-            continue
-        y = np.empty(len(sensor.rows))
-        r = np.array([row.variance for row in sensor.rows], float)
-        _python(sensor.h)(x, u, p, y)
-        try:
-            value = float(_python(sensor.log_likelihood)(y, x, u, p, r))
-        except Exception as error:  # noqa: BLE001  the user's own function may raise anything
-            raise ModelError(
-                f"model {model.name}: log_likelihood of sensor {sensor.name} fails at the prior: "
-                f"{type(error).__name__}: {error}; it takes (y, x, u, p, r) and returns a float"
-            ) from None
-        if np.isnan(value) or value == np.inf:
-            raise ModelError(
-                f"model {model.name}: log_likelihood of sensor {sensor.name} is {value} at the prior; it must be a "
-                "finite number, or -inf where the reading is impossible"
-            )
-
-
 def _varies(model: StateSpaceModel) -> bool:
     """Whether Q depends on the state, judged by its values at the prior and at 32 states spread around it."""
     if model.Q is None:
@@ -357,7 +245,7 @@ def _varies(model: StateSpaceModel) -> bool:
         for spread in [0.0] + [1.0, 5.0] * 16:
             out = np.zeros((model.nx, model.nx))
             x = mean + spread * std * rng.standard_normal(model.nx)
-            _python(model.Q)(x, u, p, q, min(1.0, model.max_step), out)
+            plain(model.Q)(x, u, p, q, min(1.0, model.max_step), out)
             found.append(out)
     return any(not np.array_equal(found[0], other, equal_nan=True) for other in found[1:])
 
@@ -404,7 +292,7 @@ def _check_derivatives(compiled: CompiledModel) -> None:
 
     tolerance = 1e-4  # central differences with a step of 1e-5 are good to about 1e-8; a wrong formula is off by more
     if static["F_mode"] == ANALYTIC:
-        error = disagree(lambda x, J: _python(model.F)(x, u, p, dt, J), f, model.nx)
+        error = disagree(lambda x, J: plain(model.F)(x, u, p, dt, J), f, model.nx)
         if error > tolerance:
             raise ModelError(f"model {model.name}: F differs from central differences of f by {error:.2g} (relative)")
     elif static["F_mode"] == COMPLEX_STEP:
@@ -418,7 +306,7 @@ def _check_derivatives(compiled: CompiledModel) -> None:
         rows = len(sensor.rows)
         mode = static["H_mode"][k]
         if mode == ANALYTIC:
-            error = disagree(lambda x, J, s=sensor: _python(s.H)(x, u, p, J), h, rows)
+            error = disagree(lambda x, J, s=sensor: plain(s.H)(x, u, p, J), h, rows)
             if error > tolerance:
                 raise ModelError(
                     f"model {model.name}: H of sensor {sensor.name} differs from central differences of h "
@@ -428,7 +316,3 @@ def _check_derivatives(compiled: CompiledModel) -> None:
             target = int(static["h_complex"][k])
             if disagree(lambda x, J, a=target: complex_step_h(a, x, u, p, J, scratch), h, rows) > tolerance:
                 static["H_mode"][k] = CENTRAL
-
-
-def _python(function: Any) -> Callable:
-    return getattr(function, "py_func", function)

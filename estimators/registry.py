@@ -38,11 +38,12 @@ def find_entry(name: str) -> Estimator:
     """The entry of that name.
 
     Raises:
-        EstimatorError: If there is none, with near names.
+        EstimatorError: If there is none, with near names, or all.
     """
     if name not in ESTIMATORS:
-        near = get_close_matches(name, ESTIMATORS, n=3, cutoff=0.4) or list(ESTIMATORS)
-        raise EstimatorError(f"estimator {name!r} does not exist; near: {', '.join(near)}")
+        near = get_close_matches(name, ESTIMATORS, n=3, cutoff=0.4)
+        rule = f"near: {', '.join(near)}" if near else f"it must be one of {', '.join(ESTIMATORS)}"
+        raise EstimatorError(f"estimator {name!r} does not exist; {rule}")
     return ESTIMATORS[name]
 
 
@@ -60,7 +61,7 @@ def find_estimator(name: str, model: StateSpaceModel) -> Estimator:
 
 
 def unfit(entry: Estimator, model: StateSpaceModel) -> str | None:
-    """Why an estimator does not fit a model, or None: its own reason, or the size of the covariance that it forms."""
+    """Why an estimator does not fit a model, or None: its own reason, or the size of what it carries."""
     if model.black_box and entry.blocks is None and not entry.interpreted:
         able = ", ".join(e.name for e in ESTIMATORS.values() if e.interpreted or e.blocks is not None)
         return (
@@ -70,10 +71,18 @@ def unfit(entry: Estimator, model: StateSpaceModel) -> str | None:
     if entry.family == "ensemble":
         return entry.applies(model)
     if model.nx > LARGE:
-        return (
-            f"{model.name} is too large: a {entry.name} of {model.nx:,} states needs a {8e-9 * model.nx**2:,.3g} GB "
-            "covariance; use an ensemble filter"
-        )
+        needs = f"{_gigabytes(model.nx**2)} covariance"
+        if entry.family == "particle":
+            options = entry.complete({})
+            size = entry.state_size(options, model.nx) + entry.memory(options, model)
+            needs = f"{_gigabytes(size)} state, {options['particles']:,.0f} particles and their covariance"
+        return f"{model.name} is too large: {entry.name} of {model.nx:,} states needs a {needs}; use an ensemble filter"
     if model.shape is not None:
         return f"{model.name} gives its noise as a shape, not as a matrix; use an ensemble filter"
     return entry.applies(model)
+
+
+def _gigabytes(numbers: int) -> str:
+    """What so many float64s take."""
+    size = 8e-9 * numbers
+    return f"{size:,.0f} GB" if size >= 1000.0 else f"{size:.3g} GB"

@@ -153,7 +153,8 @@ class Tuning:
             k = model.sensor_names.index(name)
             return "r", slice(model.row_start[k], model.row_start[k] + len(model.sensors[k].rows))
         near = get_close_matches(key, self.keys(), n=3, cutoff=0.4)
-        raise ConfigError(f"{key} is no tuning key of {model.name}; near: {', '.join(near or self.keys())}")
+        rule = f"near: {', '.join(near)}" if near else f"it must be one of {', '.join(self.keys())}"
+        raise ConfigError(f"{key} is no tuning key of {model.name}; {rule}")
 
 
 def _mean(values: Any) -> float:

@@ -180,6 +180,36 @@ def test_compare_refuses(arguments, why, capsys):
     assert why in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("option", "near"),
+    [("--durations", "--duration"), ("--seeds", None)],  # `nisus run` has --speed, which is nearer to --seeds
+)
+def test_an_unknown_option_is_told_near_ones_of_the_same_command(option, near, capsys):
+    with pytest.raises(SystemExit):
+        main(["compare", "lorenz63", option, "2"])
+    said = capsys.readouterr().err
+    assert f"Unrecognized options: {option}, 2" in said and "nisus compare --help" in said
+    assert "--speed" not in said
+    assert ("Perhaps you meant" in said) == (near is not None)
+    assert near is None or f"    {near} " in said
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ("=3", "--set =3: has no key; write KEY=VALUE"),
+        ("gate", "--set gate: has no value; write KEY=VALUE"),
+        ("estimator=zzz", f"'zzz' does not exist; it must be one of {', '.join(ESTIMATORS)}\n"),
+        ("zzz=1", "zzz is no tuning key of lorenz63; it must be one of "),
+        ("p.sgma=1", "near: p.sigma"),
+    ],
+)
+def test_a_setting_that_is_none_is_told_what_it_might_be(given, why, capsys):
+    assert main(["fold", "lorenz63", "--set", given]) == 2
+    said = capsys.readouterr().err
+    assert why in said and said.count("\n") == 1
+
+
 def test_filters_lists_all_and_says_why_not(capsys):
     assert main(["filters"]) == 0
     listed = capsys.readouterr().out
@@ -190,7 +220,10 @@ def test_filters_lists_all_and_says_why_not(capsys):
     # Nine sigma points thirty times a second; twenty numbers of eight bytes.
     assert re.search(r"ukf .*20 × 8 B = 160 B .*9 × 30 = 27\d", fitting)
     # 200 members in its YAML; the auxiliary filter propagates its 2000 particles twice.
-    assert re.search(r"letkf .* 200 × 30 = 6,00\d", fitting) and re.search(r"apf .* 4,000 × 30 = 1\.2", fitting)
+    assert re.search(r"letkf .* 200 × 30 = 6,00\d", fitting) and re.search(
+        r"apf .* 4,000 × 30 = 120,\d{3} .* yes", fitting
+    )
+    assert "applies" in fitting and not re.search(r"\de\+", fitting)
 
 
 def test_options_of_other_filters_are_checked_where_they_stand(tmp_path, capsys):

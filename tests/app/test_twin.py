@@ -292,7 +292,7 @@ def test_a_model_whose_shapes_disagree_is_refused_when_compiled() -> None:
     twin = twin_of("model: ./pump.py:Pump\nsource: {type: simulator}\n")
     with pytest.raises(ModelError) as caught:
         compile_model(twin.model)
-    assert str(caught.value).startswith("model pump: ") and "\n" not in str(caught.value)
+    assert str(caught.value).startswith("pump.py:5: model pump: ") and "\n" not in str(caught.value)
 
 
 def test_a_twin_is_restored_from_its_text_alone() -> None:

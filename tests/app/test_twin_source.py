@@ -7,6 +7,7 @@ import pytest
 from app.twin import Twin, load_twin
 from estimators.errors import ConfigError, NisusError, SourceError
 from estimators.log import INPUT, READING, TRUTH, Readings
+from estimators.models import MODELS
 
 DBC = """\
 VERSION ""
@@ -252,6 +253,44 @@ source:
     winding = readings.select(readings.channel == 0)
     exact = truth.select((truth.channel == 0) & np.isin(truth.t, winding.t))
     np.testing.assert_allclose(winding.value[:, 0], exact.value[:, 0], atol=1e-7)
+
+
+LENGTHY = """\
+model: motor_drive
+source:
+  type: simulator
+  step: STEP
+  duration: DURATION
+"""
+
+
+@pytest.mark.parametrize(
+    ("step", "duration", "expected"),
+    [
+        # motor_drive has three sensors.
+        ("1e-12", "600", "motor.yaml:4: source.step is 1e-12 s; the simulator would make 1.8e+15 events in 600 s, and may "
+            "make 1e+08; lengthen it, or shorten source.duration"),
+        ("0.5", "1e15", "motor.yaml:5: source.duration is 1e+15 s; the simulator would make 6e+15 events in 1e+15 s, and "
+            "may make 1e+08; shorten it, or lengthen source.step"),
+        ("1e-7", "null", "motor.yaml:4: source.step is 1e-07 s; the simulator would make 3e+09 events in 100 s, and may "
+            "make 1e+08; lengthen it"),
+        ("1e10", "null", "motor.yaml:4: source.step is 1e+10 s; the simulator would make RUNS steps of f in 1e+10 s, and "
+            "may make 1e+08; shorten it"),
+    ],
+)  # fmt: skip
+def test_a_simulation_that_would_never_end_is_one_line(step: str, duration: str, expected: str) -> None:
+    runs = f"{1e10 / MODELS['motor_drive'].max_step:.3g}"
+    text = LENGTHY.replace("STEP", step).replace("DURATION", duration)
+    with pytest.raises(ConfigError) as caught:
+        twin_of(text)
+    assert str(caught.value) == expected.replace("RUNS", runs)
+
+
+def test_a_long_simulation_may_be_as_long_as_said() -> None:
+    # 3 sensors · 2 a second: 1e8 events take 16.7 million seconds.
+    twin_of(LENGTHY.replace("STEP", "0.5").replace("DURATION", "16600000"))
+    with pytest.raises(ConfigError):
+        twin_of(LENGTHY.replace("STEP", "0.5").replace("DURATION", "16700000"))
 
 
 BUS = """\

@@ -54,6 +54,14 @@ def uses_python(x, u, p, dt, out):
         out[i] = x[i] * getattr(NOT_COMPILABLE, "get")("a")  # noqa: B009
 
 
+def misspelt(x, u, p, dt, out):
+    out[0] = np.sqqrt(x[0])
+
+
+def returns_too_many(x, u, p, dt, out):
+    out[:] = np.zeros(4)
+
+
 def too_few_arguments(x, out):
     out[0] = x[0]
 
@@ -84,8 +92,10 @@ def writes_to_x(x, u, p, dt, out):
         ({"f": reads_too_far}, ("f fails at the prior", "3 states", "IndexError")),
         ({"f": writes_too_far}, ("f fails at the prior", "IndexError")),
         ({"f": reads_a_parameter_too_far}, ("f fails at the prior", "2 parameters", "IndexError")),
-        ({"f": raises}, ("f fails at the prior", "ValueError", "no such state")),
-        ({"f": too_few_arguments}, ("f fails at the prior", "TypeError", "argument")),
+        ({"f": raises}, ("f fails at the prior", "ValueError: no such state; it may not fail at x = [")),
+        ({"f": misspelt}, ("f fails at the prior", "sqqrt", "correct the name")),
+        ({"f": returns_too_many}, ("f fails at the prior", "ValueError", "declared sizes: 3 states")),
+        ({"f": too_few_arguments}, ("f fails at the prior", "TypeError", "argument", "it takes (x, u, p, dt, out)")),
         ({"f": uses_python}, ("f cannot be compiled",)),
         ({"h": h_writes_too_far}, ("h of sensor s fails at the prior", "IndexError")),
         ({"Q": lopsided_Q}, ("Q is not symmetric",)),
@@ -96,7 +106,7 @@ def test_one_clear_line(changes, says):
     with pytest.raises(ModelError) as refused:
         compile_model(model(**changes))
     text = str(refused.value)
-    assert text.startswith("model curved: ")
+    assert "model curved: " in text
     assert "\n" not in text
     assert len(text) < 400
     for part in says:
@@ -104,6 +114,30 @@ def test_one_clear_line(changes, says):
     # No trace of Numba's or NumPy's own error behind it.
     assert refused.value.__cause__ is None
     assert refused.value.__context__ is None or refused.value.__suppress_context__
+
+
+def deeper(x, u, p, dt, out):
+    out[0] = x[0]
+    raises(x, u, p, dt, out)
+
+
+@pytest.mark.parametrize(
+    ("function", "culprit", "line"),
+    [
+        (raises, raises, 1),  # the line that fails, not the first one
+        (deeper, raises, 1),  # in whatever function of the file it is
+        (too_few_arguments, too_few_arguments, 0),  # it never begins
+        (leaves_out, leaves_out, 0),
+        (uses_python, uses_python, 2),  # as Numba says
+    ],
+)
+def test_it_is_said_of_the_line_in_the_models_file(function, culprit, line, monkeypatch, tmp_path):
+    code = culprit.__code__
+    place = f"{code.co_filename}:{code.co_firstlineno + line}: model curved: f "
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ModelError) as refused:
+        compile_model(model(f=function))
+    assert str(refused.value).startswith(place)
 
 
 @pytest.mark.parametrize(

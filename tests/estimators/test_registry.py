@@ -133,4 +133,11 @@ def test_a_large_field_is_for_ensembles_and_the_refusal_has_the_arithmetic():
     model = MODELS["thermal_field"]
     with pytest.raises(EstimatorError, match="ukf of 40,000 states needs a 12.8 GB covariance.*use an ensemble filter"):
         find_estimator("ukf", model)
+    # 2000 · 40,000 numbers of particles are 0.64 GB, the covariance that sums them up 12.8 GB.
+    with pytest.raises(
+        EstimatorError, match="pf of 40,000 states needs a 13.4 GB state, 2,000 particles and their cov"
+    ):
+        find_estimator("pf", model)
+    with pytest.raises(EstimatorError, match="pf-ekf of 40,000 states needs a 25,6.. GB state"):  # one covariance each
+        find_estimator("pf-ekf", model)
     assert find_estimator("etkf", model) is ESTIMATORS["etkf"]

@@ -1,0 +1,79 @@
+"""A function of a model that does not return is named; one that does is not, however often it is called."""
+
+import threading
+
+import pytest
+
+from app.compile import CALL_PATIENCE, CallWatch, attend
+from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
+
+ENTERED, LEAVE = threading.Event(), threading.Event()
+
+
+def waits(x, u, p, dt, out):
+    ENTERED.set()
+    LEAVE.wait()
+
+
+def h(x, u, p, out):
+    out[0] = x[0]
+
+
+MODEL = StateSpaceModel(
+    name="slow",
+    title="A model whose f waits",
+    states=(State("x", "1"),),
+    noises=(Noise("x", "1", 1.0),),
+    sensors=(Sensor("s", (Row("r", "1", 1.0),), h),),
+    f=waits,
+)
+
+
+def call():
+    """A call of f that has begun, and its thread."""
+    ENTERED.clear()
+    LEAVE.clear()
+    thread = threading.Thread(target=waits, args=(None,) * 5, daemon=True)
+    thread.start()
+    ENTERED.wait()
+    return thread
+
+
+def test_a_call_that_does_not_return_is_named_once():
+    now = 0.0
+    watch = CallWatch(MODEL, clock=lambda: now)
+    thread = call()
+    try:
+        assert watch.look() is None
+        now = CALL_PATIENCE - 0.1
+        assert watch.look() is None
+        now = CALL_PATIENCE
+        line = watch.look()
+        assert line is not None and "\n" not in line
+        place, rest = line.split(": ", 1)
+        assert place.endswith(f"test_compile.py:{waits.__code__.co_firstlineno + 2}")  # where it waits
+        assert rest.startswith("f of the model slow has not returned for 10 s; ") and "Ctrl-C" in rest
+        now = 100.0
+        assert watch.look() is None
+    finally:
+        LEAVE.set()
+        thread.join()
+
+
+def test_calls_that_return_are_not():
+    now = 0.0
+    watch = CallWatch(MODEL, clock=lambda: now)
+    for _ in range(3):  # each of them looked at twice, and longer than the patience in sum
+        thread = call()
+        assert watch.look() is None
+        now += 0.6 * CALL_PATIENCE
+        assert watch.look() is None
+        LEAVE.set()
+        thread.join()
+    assert watch.look() is None
+
+
+def test_attended_work_gives_what_it_gives():
+    assert attend(MODEL, lambda: 3, "doing") == 3
+    with pytest.raises(ZeroDivisionError):
+        attend(MODEL, lambda: 1 / 0, "doing")
