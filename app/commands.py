@@ -42,6 +42,11 @@ class UseSensor:
 
 
 @dataclass(frozen=True)
+class Restore:
+    """Back to the estimator and the tuning that the session began with: as recorded in a review, else as configured."""
+
+
+@dataclass(frozen=True)
 class Reset:
     """Forget the estimate: back to the model's prior at the present time."""
 
@@ -79,5 +84,5 @@ class Record:
     path: Path | None
 
 
-Command = SetEstimator | SetTuning | SetOption | UseSensor | Reset | Pause | Speed | Step | Seek | Record
+Command = SetEstimator | SetTuning | SetOption | UseSensor | Restore | Reset | Pause | Speed | Step | Seek | Record
 """Any of them."""

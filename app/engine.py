@@ -104,7 +104,7 @@ class Engine:
         self._log = Log(self.model.width, self._history + 4 * SPARSE_EVERY)
         self._base = base
         self._fold = self._make_fold(self.estimator, self.tuning, self._log, base)
-        self._tally = Tally()
+        self._tally = Tally(self.model)
 
     def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
         period = self.twin.picture if self.model.grid is not None else None
@@ -229,8 +229,8 @@ class Engine:
                 health=int(track.health[last]) if last >= 0 else TRACKING,
                 since=int(log.t[last_run(track.health)]) if last >= 0 else None,
                 counts={
-                    **self._tally.count(track.verdict),
                     **self.notices.counts(),
+                    **self._tally.count(track.verdict, log.channel),
                 },
                 nis=float(track.nis_mean[last]) if last >= 0 else np.nan,
                 nis_low=float(track.nis_low[last]) if last >= 0 else np.nan,
@@ -312,7 +312,7 @@ class Engine:
         count = (self._log.n - self._history) // SPARSE_EVERY * SPARSE_EVERY
         count, self._base = self._fold.base_at(count)
         if count:
-            self._tally.forget(self._fold.track.verdict[:count])
+            self._tally.forget(self._fold.track.verdict[:count], self._log.channel[:count])
             self._fold.drop_front(count)
             self._log.drop_front(count)
 

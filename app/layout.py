@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from estimators.model import StateSpaceModel
 from estimators.quantiles import chi_square_quantile
 
 from . import layout_field
+from .observed import observed
 
 ESTIMATE = (37, 99, 235)
 BAND = (147, 187, 253)
@@ -25,46 +25,6 @@ AT_ONCE = 3
 """Charts of states that are shown at the same time; more come in tabs, which cost nothing while they are hidden."""
 
 HEALTH_COLORS = (0x16A34AFF, 0xF59E0BFF, 0xDC2626FF, 0x9CA3AFFF)
-
-
-@dataclass(frozen=True)
-class Observed:
-    """One row of a sensor, drawn as dots over the state that it reads."""
-
-    sensor: int
-    row: int
-    state: int
-
-
-def observed(model: StateSpaceModel) -> list[Observed]:
-    """The sensor rows that read one charted state, give or take a scale near one: h ≈ x_j, ∂h/∂x_j ≈ 1 at the prior."""
-    x = np.array(model.prior_mean)
-    charted = list(zip(model.shown.tolist(), model.shown_states, strict=True))
-    u = np.array([item.default for item in model.inputs])
-    p = np.array([parameter.value for parameter in model.parameters])
-    found = []
-    for k, sensor in enumerate(model.sensors):
-        here, there = np.zeros(len(sensor.rows)), np.zeros(len(sensor.rows))
-        sensor.h(x, u, p, here)
-        slopes = np.zeros((len(sensor.rows), len(charted)))
-        for column, (j, state) in enumerate(charted):
-            moved = x.copy()
-            moved[j] += 1e-3 * state.std
-            sensor.h(moved, u, p, there)
-            slopes[:, column] = (there - here) / (1e-3 * state.std)
-        for r, row in enumerate(sensor.rows):
-            # A distance to a wall grows as the vehicle moves, but is not where the vehicle is.
-            likely = [
-                j
-                for column, (j, state) in enumerate(charted)
-                if state.unit == row.unit
-                and abs(slopes[r, column] - 1.0) < 0.05
-                and abs(here[r] - x[j]) < 0.05 * max(abs(x[j]), state.std)
-            ]
-            likely.sort(key=lambda j: model.state_names[j] not in (row.name, sensor.name))
-            if likely:
-                found.append(Observed(k, r, likely[0]))
-    return found
 
 
 def with_unit(name: str, unit: str) -> str:

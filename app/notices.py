@@ -32,14 +32,20 @@ class Notices:
         self._clock = clock
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
+        self._elsewhere: set[str] = set()
         self._lines: deque[Notice] = deque(maxlen=KEPT)
         self._next = 0
         self._last: dict[str, tuple[float, int]] = {}
 
-    def report(self, key: str, text: str, level: str = "warn") -> None:
-        """Count under `key`, and add a line unless one of that key came within the last second."""
+    def report(self, key: str, text: str, level: str = "warn", *, counted: bool = True) -> None:
+        """Count under `key`, and add a line unless one of that key came within the last second.
+
+        Not `counted`: what is reported can be counted better elsewhere, and `counts` leaves the key out.
+        """
         with self._lock:
             self._counts[key] += 1
+            if not counted:
+                self._elsewhere.add(key)
             when, at_count = self._last.get(key, (-SECONDS_APART, 0))
             if self._clock() - when < SECONDS_APART:
                 return
@@ -70,4 +76,4 @@ class Notices:
     def counts(self) -> dict[str, int]:
         """The counters."""
         with self._lock:
-            return dict(self._counts)
+            return {key: count for key, count in self._counts.items() if key not in self._elsewhere}

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from .engine import Engine
 
-Refolding = commands.SetEstimator | commands.SetTuning | commands.SetOption | commands.UseSensor
+Refolding = commands.SetEstimator | commands.SetTuning | commands.SetOption | commands.UseSensor | commands.Restore
 """Commands that fold the history again."""
 
 
@@ -29,6 +29,8 @@ def retuned(command: Refolding, engine: Any) -> tuple[str, Tuning]:
     Raises:
         NisusError: If the engine would refuse them, with the reason.
     """
+    if isinstance(command, commands.Restore):
+        return engine.twin.estimator, engine.twin.tuning
     estimator, tuning = engine.estimator, engine.tuning
     if isinstance(command, commands.SetEstimator):
         estimator = command.name

@@ -11,7 +11,8 @@ from estimators.log import READING, Readings, truth_of
 from estimators.pictures import Picture
 from estimators.track import GATED, HEALTH_NAMES, Track
 
-from .layout import HEALTH_COLORS, TIMELINE, blueprint, observed, pair_name, styles
+from .layout import HEALTH_COLORS, TIMELINE, blueprint, pair_name, styles
+from .observed import observed
 from .rerun_field import FieldDrawing
 from .rerun_pairs import PairDrawing
 from .rerun_thin import last_of_each_time, thin

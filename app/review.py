@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .compile import prepare
-from .recording import read_recording, tuning_from_json
+from .recorded import read_recording
+from .recording import tuning_from_json
 from .session import Page, Session
 from .twin import Twin, restore_twin
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from .cli import Review
-    from .recording import Recorded
+    from .recorded import Recorded
 
 
 def recorded_twin(recorded: Recorded) -> Twin:
@@ -25,7 +26,7 @@ def recorded_twin(recorded: Recorded) -> Twin:
 
     twin = restore_twin(recorded.text, recorded.twin_path)
     tuning, estimator = tuning_from_json(recorded.tuning, twin.model)
-    return replace(twin, tuning=tuning, estimator=estimator)
+    return replace(twin, tuning=tuning, estimator=estimator, recorded=True)
 
 
 def open_review(path: Path, page: Page | None) -> tuple[Session, Recorded]:

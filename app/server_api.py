@@ -13,6 +13,7 @@ from estimators.errors import ConfigError
 from estimators.track import HEALTH_NAMES
 
 from . import commands
+from .began import began_as, turned
 from .obey import Refolding, retuned
 from .playback import LONGEST
 
@@ -26,6 +27,8 @@ def status_json(engine: Any) -> dict[str, Any]:
         "estimator": status.estimator,
         "options": _plain(dict(status.options)),
         "tuning": {key: _plain(value) for key, value, *_ in status.tuning.items()},
+        "began_as": began_as(engine.twin),
+        "turned": _plain(turned(engine.twin, status.estimator, status.tuning)),
         "revision": status.revision,
         "refolding": status.refolding,
         "t": status.t,
@@ -109,8 +112,12 @@ def _converted(command: str, name: str, value: Any, hint: Any) -> Any:
         if kind in (bool, str) and isinstance(value, kind):
             return value
         if kind is float and not isinstance(value, bool) and (isinstance(value, (int, float)) or value == "inf"):
-            if not math.isnan(float(value)):
-                return float(value)
+            try:
+                number = float(value)
+            except OverflowError:
+                raise ConfigError(f"{command}: {name} is too large; it must be a finite number") from None
+            if not math.isnan(number):
+                return number
         if kind is Path and isinstance(value, str):
             return _recording(f"{command}: {name} is {value!r}", value)
     wanted = " or ".join({"float": "a number", "bool": "true or false", "NoneType": "null", "str": "a text",

@@ -18,10 +18,11 @@ LATENCIES = 4096
 
 
 class Tally:
-    """Rows by verdict since the start; those that are settled are counted once."""
+    """Rows by verdict, of each sensor, since the start; those that are settled are counted once."""
 
-    def __init__(self) -> None:
-        self._forgotten = np.zeros(len(VERDICT_NAMES), np.int64)
+    def __init__(self, model: StateSpaceModel) -> None:
+        self._sensors = model.sensor_names
+        self._forgotten = np.zeros((len(self._sensors), len(VERDICT_NAMES)), np.int64)
         self.again()
 
     def again(self) -> None:
@@ -33,19 +34,31 @@ class Tally:
         if index < self._settled:
             self.again()
 
-    def forget(self, verdicts: np.ndarray) -> None:
-        """The oldest rows, with these verdicts, are dropped."""
-        self._forgotten = self._forgotten + np.bincount(verdicts, minlength=len(VERDICT_NAMES))
+    def forget(self, verdict: np.ndarray, channel: np.ndarray) -> None:
+        """The oldest rows, with these verdicts and channels, are dropped."""
+        self._forgotten = self._forgotten + self._of(verdict, channel)
         self.again()
 
-    def count(self, verdict: np.ndarray) -> dict[str, int]:
-        """Readings in all and by verdict, given the verdicts of all rows."""
+    def count(self, verdict: np.ndarray, channel: np.ndarray) -> dict[str, int]:
+        """Readings in all and by verdict, given the verdicts and channels of all rows; and what went wrong where."""
         settled = max(self._settled, len(verdict) - UNSETTLED)
-        self._counts += np.bincount(verdict[self._settled : settled], minlength=len(VERDICT_NAMES))
+        self._counts += self._of(verdict[self._settled : settled], channel[self._settled : settled])
         self._settled = settled
-        totals = self._counts + np.bincount(verdict[settled:], minlength=len(VERDICT_NAMES))
-        names = zip(VERDICT_NAMES[1:], totals[1:], strict=True)
-        return {"readings": int(totals[1:].sum()), **{name: int(count) for name, count in names}}
+        each = self._counts + self._of(verdict[settled:], channel[settled : len(verdict)])
+        totals = each.sum(axis=0)
+        counts = {"readings": int(totals[1:].sum())}
+        counts |= {name: int(count) for name, count in zip(VERDICT_NAMES[1:], totals[1:], strict=True)}
+        if len(self._sensors) > 1:
+            for code in (GATED, MISSING, FAILED):
+                for sensor in np.flatnonzero(each[:, code]):
+                    counts[f"{VERDICT_NAMES[code]} {self._sensors[sensor]}"] = int(each[sensor, code])
+        return counts
+
+    def _of(self, verdict: np.ndarray, channel: np.ndarray) -> np.ndarray:
+        """How many rows have each verdict (columns), by sensor (rows); those without a reading have verdict 0."""
+        kinds = len(VERDICT_NAMES)
+        flat = np.where(verdict == 0, 0, channel * kinds + verdict)
+        return np.bincount(flat, minlength=len(self._sensors) * kinds).reshape(-1, kinds)
 
 
 def complaints(model: StateSpaceModel, channel: np.ndarray, track: Track, first: int) -> Iterator[tuple[str, str]]:

@@ -33,7 +33,7 @@ class Twin:
     """A model set up as its YAML says, the first tuning, and what it takes to open the source.
 
     `pairs` (k, 2) holds the indices of the states whose ellipses are drawn. `overrides` are the command line's
-    changes to the YAML, which `text` holds as it was read.
+    changes to the YAML, which `text` holds as it was read. `recorded` says that tuning and estimator are a recording's.
     """
 
     loaded: Loaded
@@ -43,6 +43,7 @@ class Twin:
     pairs: np.ndarray
     overrides: Mapping[str, str]
     plan: Plan
+    recorded: bool = False
 
     @property
     def config(self) -> TwinSection:

@@ -11,35 +11,20 @@ from estimators.log import BEFORE, READING, truth_of
 from estimators.model import StateSpaceModel
 from estimators.track import GATED
 
+from .observed import observed
 from .viser_decimate import Buckets, bridge
 from .viser_history import History
+from .viser_time import Unit, unit_for, window_name
 
 BLUE, GREEN, GREY, RED = "#2563eb", "#16a34a", "#9ca3af", "#dc2626"
 DOTS = ("#f59e0b", "#8b5cf6", "#0891b2")
-WINDOWS = {"10 s": 10.0, "30 s": 30.0, "60 s": 60.0, "300 s": 300.0, "all": None}
+WINDOWS = (10.0, 30.0, 60.0, 300.0)
+"""Seconds that the charts can show, beside the twin's own window and everything."""
+
 BUCKETS = 300
-HEIGHT = 118
+HEIGHT = 130
 SHOWN = 6
 """States that have a chart of their own; of more, the last chart shows the one chosen."""
-
-
-def observers(model: StateSpaceModel) -> list[list[tuple[int, int]]]:
-    """For each charted state, the sensor rows (sensor, row) that read it directly: h(x) = x_j, whatever x is."""
-    direct: list[list[tuple[int, int]]] = [[] for _ in model.shown]
-    rng = np.random.default_rng(0)
-    mean, std = model.prior_mean, model.prior_std
-    u = np.array([item.default for item in model.inputs])
-    p = np.array([parameter.value for parameter in model.parameters])
-    points = mean + std * rng.uniform(0.3, 0.9, (2, model.nx))
-    for k, sensor in enumerate(model.sensors):
-        out = np.full((2, len(sensor.rows)), np.nan)
-        for x, row in zip(points, out, strict=True):
-            sensor.h(x, u, p, row)
-        for r in range(len(sensor.rows)):
-            charted = points[:, model.shown]
-            for j in np.flatnonzero(np.all(np.isclose(out[:, r, None], charted, rtol=1e-9, atol=1e-12), axis=0)):
-                direct[j].append((k, r))
-    return direct
 
 
 def line(color: str, width: float, **more: Any) -> dict[str, Any]:
@@ -89,7 +74,8 @@ class Charts:
 
     def __init__(self, server: viser.ViserServer, model: StateSpaceModel, window: float) -> None:
         self.model = model
-        self.direct = observers(model)
+        dots = observed(model)
+        self.direct = [[(dot.sensor, dot.row) for dot in dots if dot.state == j] for j in model.shown]
         self.window: float | None = window
         self._previous: tuple[np.ndarray, np.ndarray] | None = None
         nx = len(model.shown)
@@ -99,11 +85,11 @@ class Charts:
         self._buckets = Buckets(self._columns, 1)
         self._shown = list(range(min(nx, SHOWN)))
         self._ranges = [Range() for _ in range(nx + 1)]
-        options = {name: value for name, value in WINDOWS.items() if value is None or value != window}
-        self.windows = {f"{window:g} s": window, **options}
-        self.windows = dict(sorted(self.windows.items(), key=lambda item: item[1] or np.inf))
+        self.unit = unit_for(window)
+        self.windows: dict[str, float | None] = {window_name(value): value for value in sorted({window, *WINDOWS})}
+        self.windows["all"] = None
         gui = server.gui
-        self.window_choice = gui.add_dropdown("Window", tuple(self.windows), initial_value=f"{window:g} s")
+        self.window_choice = gui.add_dropdown("Window", tuple(self.windows), initial_value=window_name(window))
         self.key = gui.add_html(self._key())
         self._charts = [self._state_chart(gui, j) for j in self._shown[: SHOWN - 1]]
         self.state_choice = None
@@ -156,12 +142,22 @@ class Charts:
             return
         since = BEFORE if self.window is None else int(t[-1] - self.window * 1e9)
         times, values = self._buckets.points(since)
-        x = (times - history.origin) * 1e-9
+        x = self._in_unit(times, history.origin)
         if x.size == 1:
             x, times, values = np.repeat(x, 2), np.repeat(times, 2), np.repeat(values, 2, axis=0)
         for chart, j in zip(self._charts, self._shown, strict=True):
             chart.data = self._state_data(x, times, values, j)
         self._nis_chart.data = self._nis_data(x, values)
+
+    def _in_unit(self, times: np.ndarray, origin: int) -> np.ndarray:
+        """Times as the axes have them, in the unit that suits what is shown."""
+        span = self.window if self.window is not None else float(times[-1] - times[0]) * 1e-9
+        unit = unit_for(span, self.unit)
+        if unit != self.unit:
+            self.unit = unit
+            for chart in (*self._charts, self._nis_chart):
+                chart.axes = axes(unit)
+        return (times - origin) * (1e-9 / unit.seconds)
 
     def _values(self, history: History, start: int, end: int) -> np.ndarray:
         nx = len(self.model.shown)
@@ -212,7 +208,7 @@ class Charts:
         state = self.model.shown_states[j]
         band = line("rgba(37,99,235,0)", 0)
         series = [
-            {"label": "s"},
+            {"label": "time"},
             {**band, "label": "+2σ"},
             {**band, "label": "-2σ"},
             *(_dots(color, 4) for color in DOTS),
@@ -227,13 +223,13 @@ class Charts:
             tuple(series),  # type: ignore[arg-type]
             title=_title(self.model.label(state.name), state.unit),
             bands=({"series": (1, 2), "fill": "rgba(37,99,235,0.16)"},),
-            **frame(HEIGHT),
+            **frame(HEIGHT, self.unit),
         )
 
     def _make_nis_chart(self, gui: viser.GuiApi) -> viser.GuiUplotHandle:
         edge = line(GREY, 1, dash=(4, 4))
         series = (
-            {"label": "s"},
+            {"label": "time"},
             {**edge, "label": "high"},
             {**edge, "label": "low"},
             line(BLUE, 1.5, label="windowed mean"),
@@ -245,7 +241,7 @@ class Charts:
             series,  # type: ignore[arg-type]
             title="NIS: mean of the last readings in its 95 % bounds",
             bands=({"series": (1, 2), "fill": "rgba(22,163,74,0.10)"},),
-            **frame(HEIGHT),
+            **frame(HEIGHT, self.unit),
         )
 
     def _key(self) -> str:
@@ -275,12 +271,18 @@ def _title(name: str, unit: str) -> str:
     return f"{name} [{unit}]" if unit and unit != "1" else name
 
 
-def frame(height: int) -> dict[str, Any]:
-    """Axes, height and margins of a chart."""
+def axes(unit: Unit) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Time below, in a unit, and values to the left."""
     axis = {"font": "11px sans-serif", "ticks": {"size": 4}}
+    below = {"size": 22, "label": unit.name, "labelSize": 12, "labelGap": -2, "labelFont": "11px sans-serif"}
+    return {**axis, **below}, {**axis, "size": 52}
+
+
+def frame(height: int, unit: Unit) -> dict[str, Any]:
+    """Axes, height and margins of a chart."""
     return {
         "scales": {"x": {"time": False}},
-        "axes": ({**axis, "size": 24}, {**axis, "size": 52}),
+        "axes": axes(unit),
         "legend": {"show": False},
         "height": height,
         "padding": (4, 14, 0, 0),

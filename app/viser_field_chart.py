@@ -10,26 +10,27 @@ import viser
 from estimators.field import Field
 from estimators.pictures import Picture
 
-from .viser_charts import BLUE, GREEN, HEIGHT, Range, frame, frame_series, line, no_data
+from .viser_charts import BLUE, GREEN, HEIGHT, Range, axes, frame, frame_series, line, no_data
 from .viser_history import History
+from .viser_time import Unit
 
 
 class FieldChart:
     """Spread against error: an honest filter's lines lie on each other."""
 
-    def __init__(self, gui: viser.GuiApi, field: Field, *, truth: bool) -> None:
-        self._range = Range()
-        series = ({"label": "s"}, line(GREEN, 1.5, label="RMSE"), line(BLUE, 1.5, label="spread"), frame_series())
+    def __init__(self, gui: viser.GuiApi, field: Field, unit: Unit, *, truth: bool) -> None:
+        self._range, self._unit = Range(), unit
+        series = ({"label": "time"}, line(GREEN, 1.5, label="RMSE"), line(BLUE, 1.5, label="spread"), frame_series())
         what = "RMSE (green) and spread (blue) of all cells" if truth else "spread of all cells"
         self._chart = gui.add_uplot(
             no_data(len(series)),
             series,  # type: ignore[arg-type]
             title=f"{what} [{field.unit}]",
-            **frame(HEIGHT),
+            **frame(HEIGHT, unit),
         )
 
-    def draw(self, pictures: Iterable[Picture], history: History, window: float | None) -> None:
-        """Send the numbers of the pictures in the last `window` seconds."""
+    def draw(self, pictures: Iterable[Picture], history: History, window: float | None, unit: Unit) -> None:
+        """Send the numbers of the pictures in the last `window` seconds, over time in a unit."""
         t = history.column("t")
         if not t.size or history.origin is None:
             return
@@ -37,7 +38,9 @@ class FieldChart:
         chosen = [picture for picture in pictures if picture.t >= since]
         if len(chosen) < 2:
             return
-        x = (np.array([picture.t for picture in chosen]) - history.origin) * 1e-9
+        if unit != self._unit:
+            self._unit, self._chart.axes = unit, axes(unit)
+        x = (np.array([picture.t for picture in chosen]) - history.origin) * (1e-9 / unit.seconds)
         rmse, spread = (np.array([getattr(picture, name) for picture in chosen]) for name in ("rmse", "spread"))
         ends = self._range.series([rmse, spread, np.zeros(len(chosen))])
         self._chart.data = (x, rmse, spread, ends)

@@ -15,10 +15,12 @@ import viser
 from estimators.registry import ESTIMATORS, unfit
 
 from .commands import Pause, Record, Reset, Seek, SetEstimator, SetTuning, Speed, Step, UseSensor
+from .viser_began import BeganRows
 from .viser_options import OptionRows
 from .viser_rows import ChoiceRow, Held, NumberRow
 from .viser_status import events_html, note_html, status_html
 from .viser_submit import Coalescer
+from .viser_time import SECONDS, Unit
 
 SPEEDS = {"0.1×": 0.1, "0.25×": 0.25, "0.5×": 0.5, "1×": 1.0, "2×": 2.0, "5×": 5.0, "10×": 10.0, "max": np.inf}
 GATES = {"off": None, "95 %": 0.95, "99 %": 0.99, "99.73 %": 0.9973, "99.99 %": 0.9999}
@@ -32,7 +34,7 @@ class Panel:
         self._engine, self._coalescer = engine, coalescer
         self._configured = engine.twin.tuning
         self._events: deque[Any] = deque(maxlen=8)
-        self._events_changed = True
+        self._events_changed, self._unit = True, SECONDS
         self._shown: dict[str, str] = {}
         gui = server.gui
         self.status = gui.add_html("")
@@ -43,6 +45,7 @@ class Panel:
         tabs = gui.add_tab_group()
         self.rows: dict[str, NumberRow] = {}
         with tabs.add_tab("Tune"):
+            self.began = BeganRows(gui, engine)
             self._build_estimator(gui, status)
             self._build_tuning(gui, status)
         with tabs.add_tab("Sensors"):
@@ -132,8 +135,9 @@ class Panel:
             self._events.extend(notices)
             self._events_changed = True
 
-    def sync(self, status: Any, origin: int | None) -> None:
+    def sync(self, status: Any, origin: int | None, unit: Unit = SECONDS) -> None:
         """Show what the engine says; whoever changed it, a browser, the API, or the engine itself."""
+        self.began.sync(status)
         self.estimator.sync(self._titles.get(status.estimator, self.estimator.handle.value))
         self.options.sync(ESTIMATORS[status.estimator], status.options)
         for item in status.tuning.items():
@@ -149,10 +153,10 @@ class Panel:
         text = "not recording" if recording is None else f"● recording {Path(recording).name}"
         style = "padding:0 0.9em 0.5em;font-size:0.8em;overflow-wrap:anywhere"
         self._show(self._record_state, "record", f'<div style="{style}">{html.escape(text)}</div>')
-        self._show(self.status, "status", status_html(status, origin))
-        if self._events_changed:
-            self._events_changed = False
-            self._show(self._events_list, "events", events_html(list(self._events), origin))
+        self._show(self.status, "status", status_html(status, origin, unit))
+        if self._events_changed or unit != self._unit:
+            self._events_changed, self._unit = False, unit
+            self._show(self._events_list, "events", events_html(list(self._events), origin, unit))
 
     def _sync_play(self, status: Any) -> None:
         labels = _buttons(status)

@@ -7,20 +7,22 @@ from typing import Any
 
 from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
 
+from .viser_time import SECONDS, Unit
+
 COLORS = {"tracking": "#16a34a", "degraded": "#d97706", "diverged": "#dc2626", "stale": "#6b7280"}
 LEVELS = {"info": "#6b7280", "warn": "#d97706", "error": "#dc2626"}
 COUNTED = ("readings", "gated", "missing", "stale")
 
 
-def status_html(status: Any, origin: int | None) -> str:
-    """Health, revision and counts in two lines that keep their places while the numbers run."""
+def status_html(status: Any, origin: int | None, unit: Unit = SECONDS) -> str:
+    """Health, revision and counts in two lines that keep their places while the numbers run; times as in the charts."""
     health = HEALTH_NAMES[status.health]
     lasting = status.health != TRACKING and status.since is not None and origin is not None
-    since = f" since {(status.since - origin) * 1e-9:.1f} s" if lasting else ""
+    since = f" since {unit.text((status.since - origin) * 1e-9)}" if lasting else ""
     remedy = ""
     if status.health == DIVERGED:
         remedy = "<div>The readings contradict the estimate. <b>Reset</b> begins anew from the prior.</div>"
-    at = "" if status.t is None or origin is None else f"{(status.t - origin) * 1e-9:.1f} s"
+    at = "" if status.t is None or origin is None else unit.text((status.t - origin) * 1e-9)
     state = "ended" if status.finished else "paused" if status.paused else ""
     fold = "⟳ refolding" if status.refolding else f"revision {status.revision}"
     latency = status.latency_ms
@@ -43,14 +45,14 @@ def status_html(status: Any, origin: int | None) -> str:
     )
 
 
-def events_html(notices: list[Any], origin: int | None) -> str:
+def events_html(notices: list[Any], origin: int | None, unit: Unit = SECONDS) -> str:
     """The last events, newest first."""
     style = "padding:0.2em 0.9em 0.6em;font-size:0.8em;line-height:1.5;overflow-wrap:anywhere"
     if not notices:
         return f'<div style="{style};opacity:0.65">Nothing to report.</div>'
     lines = []
     for notice in reversed(notices):
-        at = "" if origin is None or notice.t is None else f"{(notice.t - origin) * 1e-9:.1f} s"
+        at = "" if origin is None or notice.t is None else unit.text((notice.t - origin) * 1e-9)
         color = LEVELS.get(str(notice.level).lower(), LEVELS["info"])
         lines.append(
             f'<div style="border-left:3px solid {color};padding-left:0.5em;margin-bottom:0.35em">'

@@ -14,8 +14,8 @@ import viser
 from estimators.log import READING, truth_of
 from estimators.model import StateSpaceModel
 
+from .observed import observed
 from .viser_camera import fit_cameras
-from .viser_charts import observers
 from .viser_geometry import about_z, circle, disc, ellipsoid, segments
 from .viser_history import History
 
@@ -37,12 +37,12 @@ class VehicleScene:
         names = model.state_names
         self.east, self.north = (names.index(name) for name in scene.position)
         self.heading = names.index(scene.heading) if scene.heading else None
-        direct = observers(model)
+        dots = observed(model)
         self._fixes = [
-            (sensor, row, row_n)
-            for sensor, row in direct[self.east]
-            for sensor_n, row_n in direct[self.north]
-            if sensor == sensor_n
+            (dot.sensor, dot.row, other.row)
+            for dot in dots
+            for other in dots
+            if dot.sensor == other.sensor and (dot.state, other.state) == (self.east, self.north)
         ]
         self.follow = True
         self._anchor: np.ndarray | None = None

@@ -17,6 +17,7 @@ from .viser_guard import guarded_server, unprinted
 from .viser_history import History
 from .viser_panel import Panel
 from .viser_submit import Coalescer
+from .viser_time import unit_for
 from .viser_vehicle import VehicleScene
 
 FRAME = 0.1
@@ -65,7 +66,8 @@ class ViserView:
             self.scene.controls(gui)
         below = gui.add_panel()
         with below.add_tab("Charts"):
-            self.field_chart = FieldChart(gui, model.grid, truth=truth) if model.grid is not None else None
+            unit = unit_for(view.window)
+            self.field_chart = FieldChart(gui, model.grid, unit, truth=truth) if model.grid is not None else None
             self.charts = Charts(self.server, model, view.window)
         below.dock_below(gui.main_panel)
         self.charts.window_choice.on_update(self._choose_window)
@@ -126,11 +128,11 @@ class ViserView:
                 if not isinstance(self.scene, FieldScene):
                     self.scene.draw(self.history, self.engine.belief())
                 elif self.field_chart is not None:
-                    self.field_chart.draw(self.scene.numbers, self.history, self.charts.window)
+                    self.field_chart.draw(self.scene.numbers, self.history, self.charts.window, self.charts.unit)
             if isinstance(self.scene, FieldScene):
                 self.scene.draw()
             self.panel.note(notices)
-            self.panel.sync(self.engine.status(), self.history.origin)
+            self.panel.sync(self.engine.status(), self.history.origin, self.charts.unit)
 
     def _begin_again(self, window: float | None) -> None:
         """Pull the history from its start, to keep as much of it as the window shows."""

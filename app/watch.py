@@ -25,7 +25,7 @@ class Watch:
         """Report the rows from `before` on."""
         track, log = fold.track, fold.log
         for key, text in complaints(fold.model, log.channel, track, before):
-            self._notices.report(key, text)
+            self._notices.report(key, text, counted=False)
         count, known = fold.recoveries(), self._recoveries
         self._recoveries = count
         if count > known:

@@ -127,6 +127,8 @@ def _rule(kind: str, context: dict[str, Any], text: str) -> str:
         return "it must be positive" if context["gt"] == 0 else f"it must be above {context['gt']:g}"
     if kind == "greater_than_equal":
         return "it must be zero or positive" if context["ge"] == 0 else f"it must be {context['ge']:g} or more"
+    if kind == "less_than_equal":
+        return f"it must be {context['le']:g} at most"
     if kind == "less_than":
         return f"it must be below {context['lt']:g}"
     if kind == "literal_error":

@@ -18,6 +18,8 @@ from numba.core import cgutils
 from numba.experimental.function_type import _get_jit_address
 from numba.extending import intrinsic
 
+from .threads import threaded
+
 F1 = types.float64[::1]
 F2 = types.Array(types.float64, 2, "C")
 C1 = types.complex128[::1]
@@ -53,7 +55,7 @@ numba.config.LOOP_VECTORIZE = 0
 
 # OpenMP's threads wait for each other by spinning. On a busy machine the one that spins keeps the core from the one it
 # waits for until its time slice of some milliseconds is over: loops on two threads took 4 times as long as on one. The
-# library reads this when it is loaded, which is when the first parallel function compiles.
+# library reads this when it is loaded, which `threaded` does.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 jit = partial(njit, cache=True, nogil=True, error_model="numpy")
@@ -69,8 +71,10 @@ inlined = partial(jit, inline="always")
 def address(dispatcher: Any, signature: Any) -> int:
     """Compile `dispatcher` for `signature` (or load it from the cache) and return where its machine code starts.
 
-    The dispatcher must be kept alive for as long as the address is used.
+    The dispatcher must be kept alive for as long as the address is used. Threads are loaded first: code from the cache
+    may call for them.
     """
+    threaded()
     dispatcher.compile(signature.args)
     return int(_get_jit_address(dispatcher, signature))
 

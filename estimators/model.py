@@ -26,6 +26,9 @@ LARGE = 1024
 TRUTH_BLOCK = 32
 """Most states for which an event of the log must have room to tell the truth."""
 
+LARGEST = 1e50
+"""Beyond any physical quantity in any unit; its fourth power, which covariances multiply up to, is still a number."""
+
 SHOWN = 64
 """States that a track keeps where the model does not say which."""
 
@@ -150,10 +153,10 @@ class StateSpaceModel:
             if twice:
                 raise ModelError(f"model {self.name}: {kind} names {twice[0]!r} twice; every name must differ")
         for state in () if field else self.states:
-            if not (state.std > 0 and np.isfinite(state.std) and np.isfinite(state.mean)):
+            if not (0.0 < state.std <= LARGEST and abs(state.mean) <= LARGEST):
                 raise ModelError(
                     f"model {self.name}: the prior of {state.name} is {state.mean} ± {state.std}; "
-                    "both must be finite and the second positive"
+                    f"both must be finite, {LARGEST:g} at most, and the second positive"
                 )
         for item in self.parameters:
             if not item.low <= item.high:

@@ -86,7 +86,8 @@ def _squares(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _peaks(places: np.ndarray) -> np.ndarray:
     """For each point the number of its peak, from 0."""
     n, d = places.shape
-    width = (4.0 / ((d + 2) * n)) ** (1.0 / (d + 4))
+    # Copies of a particle are no further evidence of where the density lies.
+    width = (4.0 / ((d + 2) * len(np.unique(places, axis=0)))) ** (1.0 / (d + 4))
 
     def density(at: np.ndarray) -> np.ndarray:
         return np.exp(-0.5 * _squares(at, places) / width**2).sum(axis=1)
@@ -101,7 +102,8 @@ def _peaks(places: np.ndarray) -> np.ndarray:
     jump = squares[np.arange(n), parent]
     # Dense and far from anything denser: Rodriguez & Laio (2014). Outliers are far, but not dense.
     chance = height * np.sqrt(np.where(np.isfinite(jump), jump, jump[np.isfinite(jump)].max(initial=1.0)))
-    root = (jump > width**2) & (chance >= np.sort(chance)[-min(n, CANDIDATES)])
+    far = jump > width**2
+    root = far & (chance >= np.sort(chance[far])[-min(int(far.sum()), CANDIDATES)])
     root[order[0]] = True
     label = np.empty(n, int)
     tops: list[int] = []
@@ -111,6 +113,12 @@ def _peaks(places: np.ndarray) -> np.ndarray:
             tops.append(int(i))
         else:
             label[i] = label[parent[i]]
+    # Of too few points nothing can be told: from the lowest up, such a tree hangs on its top's denser neighbour.
+    for k in range(len(tops) - 1, 0, -1):
+        if np.mean(label == k) < LEAST:
+            label[label == k] = label[parent[tops[k]]]
+    trees, label = np.unique(label, return_inverse=True)
+    tops = [tops[k] for k in trees]
     # Candidates from the highest down; each joins the first higher one from which no valley parts it.
     steps = np.linspace(0.0, 1.0, 9)[1:-1, None]
     joined: list[int] = []
@@ -143,7 +151,9 @@ def _valley(places: np.ndarray, label: np.ndarray, a: int, b: int) -> bool:
         return False
     s, t = first @ line / length, second @ line / length
     both = np.concatenate((s, t))
-    width = 1.06 * max(1e-6, min(float(s.std()), float(t.std()))) * len(both) ** -0.2
+    # The narrower one's width, but one that still shows the wider one: copies of one particle have none of their own.
+    narrow, wide = sorted((float(s.std()), float(t.std())))
+    width = 1.06 * max(1e-6, narrow, 0.1 * wide) * len(both) ** -0.2
     grid = np.linspace(s.mean(), t.mean(), 25)
     density = np.exp(-0.5 * ((grid[:, None] - both) / width) ** 2).sum(axis=1)
     lower = min(density[:8].max(), density[-8:].max())

@@ -153,6 +153,63 @@ def add_scaled(typing_context: Any, n: Any, a: Any, x: Any, y: Any) -> Any:
 
 
 @intrinsic
+def add_both_scaled(typing_context: Any, n: Any, a: Any, x: Any, b: Any, y: Any, z: Any) -> Any:
+    """z[:n] += a x[:n], then z[:n] += b y[:n]."""
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        n, a, b = given[0], given[1], given[3]
+        x, y, z = (_pointer(builder, given[k]) for k in (2, 4, 5))
+        wide_a, wide_b = _broadcast(builder, a), _broadcast(builder, b)
+
+        def whole(i: Any) -> None:
+            one = _multiply_add(builder, wide_a, _load(builder, x, i), _load(builder, z, i))
+            _store(builder, _multiply_add(builder, wide_b, _load(builder, y, i), one), z, i)
+
+        def single(i: Any) -> None:
+            at = builder.gep(z, [i])
+            one = _multiply_add(builder, a, builder.load(builder.gep(x, [i])), builder.load(at))
+            builder.store(_multiply_add(builder, b, builder.load(builder.gep(y, [i])), one), at)
+
+        _in_vectors(builder, n, whole, single)
+        return context.get_dummy_value()
+
+    return types.void(_i64, _f64, _i64, _f64, _i64, _i64), codegen
+
+
+@intrinsic
+def combine(typing_context: Any, count: Any, weights: Any, apart: Any, x: Any, stride: Any, n: Any, out: Any) -> Any:
+    """out[:n] = Σ_k weights[k·apart] x[k·stride :][:n], k < count."""
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        count, apart, stride, n = given[0], given[2], given[4], given[5]
+        w, x, out = (_pointer(builder, given[k]) for k in (1, 3, 6))
+
+        def summed(i: Any, zero: Any, load: Any, spread: Any) -> Any:
+            sums = cgutils.alloca_once(builder, zero.type)
+            builder.store(zero, sums)
+            with cgutils.for_range(builder, count) as loop:
+                weight = builder.load(builder.gep(w, [builder.mul(loop.index, apart)]))
+                row = builder.gep(x, [builder.mul(loop.index, stride)])
+                builder.store(_multiply_add(builder, spread(weight), load(row), builder.load(sums)), sums)
+            return builder.load(sums)
+
+        def whole(i: Any) -> None:
+            zero = ir.Constant(_VECTOR, [0.0] * LANES)
+            added = summed(i, zero, lambda row: _load(builder, row, i), lambda weight: _broadcast(builder, weight))
+            _store(builder, added, out, i)
+
+        def single(i: Any) -> None:
+            zero = ir.Constant(_F64, 0.0)
+            added = summed(i, zero, lambda row: builder.load(builder.gep(row, [i])), lambda weight: weight)
+            builder.store(added, builder.gep(out, [i]))
+
+        _in_vectors(builder, n, whole, single)
+        return context.get_dummy_value()
+
+    return types.void(_i64, _i64, _i64, _i64, _i64, _i64, _i64), codegen
+
+
+@intrinsic
 def rotate(typing_context: Any, n: Any, c: Any, s: Any, x: Any, y: Any) -> Any:
     """x[:n], y[:n] = c x - s y, s x + c y."""
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from .jit import jit, matrix
-from .simd import add_scaled, rotate
+from .simd import add_both_scaled, add_scaled, combine, rotate
 
 _SWEEPS = 60
 """Iterations for one eigenvalue; two are usual, so this many mean that a number is not finite."""
@@ -21,13 +21,9 @@ _SWEEPS = 60
 @jit
 def gram(Z, count, n, G):
     """G = Zᵀ Z for the leading `count` rows and n columns of Z, both triangles."""
+    rows, apart = Z.ctypes.data, Z.shape[1]
     for k in range(n):
-        for j in range(n):
-            G[k, j] = 0.0
-    for i in range(count):
-        row = Z[i].ctypes.data
-        for k in range(n):
-            add_scaled(n, Z[i, k], row, G[k].ctypes.data)
+        combine(count, rows + 8 * k, apart, rows, apart, n, G[k].ctypes.data)
 
 
 @jit
@@ -81,7 +77,7 @@ def root_action(A, n, d, b, g, inverse_root, scratch):
         b: A vector (n,).
         g: Another; gets Q g.
         inverse_root: Whether f(λ) = 1/√(1+λ), or else f(λ) = 1 / (1 + λ + √(1+λ)).
-        scratch: At least 3 n + 3 (2 n² + 8 n) numbers.
+        scratch: At least 5 n + 3 (2 n² + 8 n) numbers.
 
     Returns:
         bᵀ (I + A)⁻¹ g of the b given; NaN if a number is not finite.
@@ -92,17 +88,19 @@ def root_action(A, n, d, b, g, inverse_root, scratch):
         if half[k] != 0.0:
             _reflect(A[k, k + 1 : n], half[k], b[k + 1 : n])
             _reflect(A[k, k + 1 : n], half[k], g[k + 1 : n])
-    turns = scratch[3 * n : 3 * n + 3 * (2 * n * n + 8 * n)]
-    count = _ql(n, d, scratch, turns, matrix(scratch, 0, 0, 0))
+    pairs = matrix(scratch, 3 * n, n, 2)
+    turns = scratch[5 * n : 5 * n + 3 * (2 * n * n + 8 * n)]
+    for k in range(n):
+        pairs[k, 0] = b[k]
+        pairs[k, 1] = g[k]
+    count = _ql(n, d, scratch, turns, pairs)
     if count < 0:
         return np.nan
-    for at in range(0, count, 3):
-        c, s, i = turns[at], turns[at + 1], int(turns[at + 2])
-        b[i], b[i + 1] = c * b[i] - s * b[i + 1], s * b[i] + c * b[i + 1]
-        g[i], g[i + 1] = c * g[i] - s * g[i + 1], s * g[i] + c * g[i + 1]
     product = 0.0
     for k in range(n):
         grown = 1.0 + max(d[k], 0.0)
+        b[k] = pairs[k, 0]
+        g[k] = pairs[k, 1]
         product += b[k] * g[k] / grown
         b[k] /= np.sqrt(grown) if inverse_root else grown + np.sqrt(grown)
     for at in range(count - 3, -1, -3):
@@ -196,10 +194,7 @@ def _tridiagonal(A, n, d, halves, scratch):
         halves[k] = half
         v[0] -= length
         # A ← A - v qᵀ - q vᵀ with q = w - (vᵀ w / (2 half)) v, w = A v / half.
-        for j in range(size):
-            w[j] = 0.0
-        for j in range(size):
-            add_scaled(size, v[j], A[k + 1 + j, k + 1 :].ctypes.data, to_w)
+        combine(size, v.ctypes.data, 1, A[k + 1, k + 1 :].ctypes.data, A.shape[1], size, to_w)
         dot = 0.0
         for j in range(size):
             w[j] /= half
@@ -209,9 +204,7 @@ def _tridiagonal(A, n, d, halves, scratch):
             w[j] -= dot * v[j]
         to_v = v.ctypes.data
         for j in range(size):
-            row = A[k + 1 + j, k + 1 :].ctypes.data
-            add_scaled(size, -v[j], to_w, row)
-            add_scaled(size, -w[j], to_v, row)
+            add_both_scaled(size, -v[j], to_w, -w[j], to_v, A[k + 1 + j, k + 1 :].ctypes.data)
     if n > 1:
         e[n - 1] = A[n - 2, n - 1]
     for k in range(n):
@@ -222,13 +215,13 @@ def _tridiagonal(A, n, d, halves, scratch):
 def _ql(n, d, e, turns, V):
     """Diagonalise T (diagonal d, below it e[1:]) by implicit shifts.
 
-    The rows of V are turned along, if it has any; else the rotations are written to `turns`, as c, s and row.
+    The rows of V are turned along. The rotations are written to `turns` as c, s and row, unless it is empty.
 
     Returns:
         How many numbers were written; -1 if it does not converge.
     """
     written = 0
-    with_rows = V.shape[0] > 0
+    columns = V.shape[1]
     for k in range(1, n):
         e[k - 1] = e[k]
     e[n - 1] = 0.0
@@ -268,9 +261,8 @@ def _ql(n, d, e, turns, V):
                 p = s * r
                 d[i + 1] = g + p
                 g = c * r - b
-                if with_rows:
-                    rotate(n, c, s, V[i].ctypes.data, V[i + 1].ctypes.data)
-                else:
+                rotate(columns, c, s, V[i].ctypes.data, V[i + 1].ctypes.data)
+                if turns.size > 0:
                     if written + 3 > turns.size:
                         return -1
                     turns[written] = c

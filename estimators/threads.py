@@ -14,6 +14,8 @@ def threaded() -> bool:
 
     Its third layer, `workqueue`, aborts the process when two folds use it at the same time; then, and on one core, the
     loops run on the caller's thread. The results are the same bits either way.
+
+    The call also loads the layer, which machine code from the cache needs: without it LLVM ends the process.
     """
     from numba.np.ufunc.parallel import _launch_threads
 
@@ -23,5 +25,6 @@ def threaded() -> bool:
         _launch_threads()
     except ValueError:
         numba.config.THREADING_LAYER = "default"
+        _launch_threads()
         return False
     return numba.threading_layer() in ("omp", "tbb") and numba.config.NUMBA_NUM_THREADS > 1

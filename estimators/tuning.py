@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .errors import ConfigError
-from .model import StateSpaceModel
+from .model import LARGEST, StateSpaceModel
 
 _versions = count(1)
 
@@ -115,6 +115,8 @@ class Tuning:
             number = float(value) if value is not None else np.nan
             if not np.isfinite(number):
                 raise ConfigError(f"{key} is {value}; it must be a finite number")
+            if abs(number) > LARGEST:
+                raise ConfigError(f"{key} is {value}; it must be {LARGEST:g} at most")
             if group == "q" and number < 0:
                 raise ConfigError(f"{key} is {number:g}; a variance must be zero or positive")
             if group == "r" and number <= 0:

@@ -61,7 +61,9 @@ const spell = (seconds) => (seconds < 120 ? `${Math.floor(seconds)} s` : `${Math
 function show(status) {
   document.title = `${status.twin} · Nisus`;
   $("twin").textContent = status.twin;
-  $("title").textContent = status.title;
+  const turned = Object.keys(status.turned).length > 0;
+  const recorded = status.began_as === "recorded" ? (turned ? " · recorded, turned" : " · as recorded") : "";
+  $("title").textContent = status.title + recorded;
   const lasting = status.health !== "tracking" && status.since !== null;
   $("health").textContent = lasting ? `${status.health} for ${spell((status.t - status.since) / 1e9)}` : status.health;
   $("health").dataset.health = status.health;

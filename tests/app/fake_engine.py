@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from app.commands import Pause, Record, SetEstimator, SetOption, SetTuning, Speed, UseSensor
+from app.commands import Pause, Record, Restore, SetEstimator, SetOption, SetTuning, Speed, UseSensor
 from config.schema import ViewSection
 from estimators.fold import Fold
 from estimators.log import Log, Readings
@@ -21,7 +21,13 @@ class FakeEngine:
         tuning = Tuning.of(model)
         config = SimpleNamespace(view=view or ViewSection())
         self.twin = SimpleNamespace(
-            model=model, name=model.name, title=model.title, tuning=tuning, config=config, estimator=estimator
+            model=model,
+            name=model.name,
+            title=model.title,
+            tuning=tuning,
+            config=config,
+            estimator=estimator,
+            recorded=False,
         )
         self.commands = []
         self.carry_out = carry_out
@@ -48,7 +54,9 @@ class FakeEngine:
         if not self.carry_out:
             return
         state = self.state
-        if isinstance(command, SetEstimator):
+        if isinstance(command, Restore):
+            state.estimator, state.tuning = self.twin.estimator, self.twin.tuning
+        elif isinstance(command, SetEstimator):
             state.estimator = command.name
             state.tuning = state.tuning.with_options({})
         elif isinstance(command, SetTuning):
@@ -63,7 +71,7 @@ class FakeEngine:
             state.speed = command.factor
         elif isinstance(command, Record):
             state.recording = command.path
-        if isinstance(command, (SetEstimator, SetTuning, UseSensor, SetOption)):
+        if isinstance(command, (Restore, SetEstimator, SetTuning, UseSensor, SetOption)):
             self.before = self._pull(0, True)
             self.fold = Fold(state.estimator, self.model, state.tuning, self.log)
             self.fold.advance()

@@ -34,6 +34,7 @@ def twin(history=200_000, horizon=2.0, tick=1000.0):
         model=MODEL,
         tuning=Tuning.of(MODEL),
         estimator="kf",
+        recorded=False,
         pairs=np.array([[0, 1]]),
         config=config,
     )

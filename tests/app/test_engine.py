@@ -6,8 +6,9 @@ from scripted import MODEL, SECOND, Scripted, readings, twin, wait_for
 
 from app import commands
 from app.engine import Engine
+from app.twin import load_twin
 from estimators.fold import fold
-from estimators.log import Log, Readings
+from estimators.log import READING, Log, Readings
 from estimators.tuning import Tuning
 
 
@@ -329,5 +330,37 @@ def test_the_same_filter_keeps_its_members_when_a_cut_history_is_folded_again(st
         engine.submit(commands.SetTuning("Q.rate", Tuning.of(MODEL).get("Q.rate")))
         wait_for(lambda: everything(engine).revision == 1)
         np.testing.assert_array_equal(everything(engine).track.mean, seen.track.mean)
+    finally:
+        engine.stop()
+
+
+def test_what_went_wrong_is_counted_by_sensor_however_often_it_is_folded():
+    """A late reading and a retuning fold the same rows again; a batch of two is one complaint."""
+    made = load_twin("gripper_contact")
+    source = Scripted()
+    engine = Engine(made, lambda report: source)
+    engine.start()
+    model = made.model
+    force, position = (model.sensor_names.index(name) for name in ("force", "position"))
+
+    def batch(*readings):
+        t = np.array([round(second * SECOND) for second, _, _ in readings])
+        channel = np.array([sensor for _, sensor, _ in readings], np.int32)
+        value = np.full((t.size, model.width), np.nan)
+        value[:, 0] = [y for _, _, y in readings]
+        return Readings(t, t.copy(), np.full(t.size, READING, np.int8), channel, value)
+
+    try:
+        source.put(batch((0.01, force, np.nan), (0.02, force, np.nan), (0.03, position, np.nan), (0.04, force, 1e9)))
+        source.put(batch((0.05, force, np.nan), (0.06, position, 0.0)))
+        wait_for(lambda: rows(engine) == 6)
+        source.put(batch((0.015, position, np.nan)))
+        wait_for(lambda: rows(engine) == 7)
+        engine.submit(commands.SetTuning("R.position", 1e-6))
+        wait_for(lambda: engine.status().revision > 0 and not engine.status().refolding)
+        wait_for(lambda: engine.status().counts["readings"] == 7)
+        counts = engine.status().counts
+        assert counts["missing"] == 5 and counts["missing force"] == 3 and counts["missing position"] == 2
+        assert counts["gated"] == counts["gated force"] == 1 and "gated position" not in counts
     finally:
         engine.stop()

@@ -10,9 +10,9 @@ from scripted import Scripted, wait_for
 from app import commands, viser_field
 from app.engine import Engine
 from app.heatmap import ERROR, FAR, NOTHING, ODD, QUIET, SILENT, Frame, Scale, sensor_colors
-from app.layout import observed
+from app.observed import observed
+from app.recorded import read_recording
 from app.recorder import Recorder
-from app.recording import read_recording
 from app.rerun_rows import RerunRows
 from app.rerun_view import RerunFeed
 from app.review import open_review

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scripted import wait_for
 
-from app.recording import read_recording
+from app.recorded import read_recording
 from app.review import open_review
 from app.run import live_source
 from app.session import Page, Session

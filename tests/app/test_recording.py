@@ -13,8 +13,9 @@ from scripted import MODEL, SECOND, Scripted, readings, twin, wait_for
 from app import commands
 from app.engine import Engine
 from app.pull import Pull
+from app.recorded import read_recording
 from app.recorder import Recorder
-from app.recording import RecordingFile, read_recording, tuning_from_json
+from app.recording import RecordingFile, tuning_from_json
 from estimators.errors import SourceError
 from estimators.fold import Fold, fold
 from estimators.log import TRUTH, Log, Readings

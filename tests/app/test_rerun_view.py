@@ -11,13 +11,12 @@ from scripted import Scripted, readings, twin, wait_for
 
 from app import commands, rerun_view
 from app.engine import Engine
-from app.layout import observed, pair_name
+from app.layout import pair_name
 from app.rerun_pairs import ASIDE, BELOW, PANE, anchors, axis_scales, ellipse_points
 from app.rerun_rows import CALENDAR
 from app.rerun_thin import last_of_each_time, thin
 from app.rerun_view import AHEAD, RerunFeed
 from estimators.log import READING, TRUTH, Readings
-from estimators.models import MODELS
 
 WINDOW = 10.0
 
@@ -328,23 +327,6 @@ def test_ellipses_are_two_sigma():
     np.testing.assert_allclose(distance, 4.0, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "name, expected",
-    [
-        ("motor_winding", {"winding": "temperature"}),
-        ("motor_drive", {"winding": "winding", "tooth": "tooth", "yoke": "yoke"}),
-        ("road_car", {"gnss_position.east": "east", "gnss_position.north": "north", "wheel_speed": "speed"}),
-    ],
-)
-def test_readings_are_drawn_over_the_state_that_they_read(name, expected):
-    model = MODELS[name]
-    found = {
-        model.row_names[model.row_start[item.sensor] + item.row]: model.state_names[item.state]
-        for item in observed(model)
-    }
-    assert expected.items() <= found.items()
-
-
 def test_closing_gives_the_cursor_back(fed):
     other = RerunFeed(fed.engine)
     count = len(fed.engine._cursors)
@@ -371,12 +353,3 @@ def test_a_revision_that_begins_between_two_pieces_wins(fed, monkeypatch):
     assert fed.said[-1]["revision"] == 1
     np.testing.assert_array_equal(fed.column("/state/temperature")[1][:, 0], fed.track().track.mean[:, 0])
     assert fed.track().revision == 1
-
-
-def test_dots_stand_over_a_state_only_where_a_sensor_reads_it():
-    assert {(item.sensor, item.row, item.state) for item in observed(MODELS["motor_winding"])} == {(0, 0, 0)}
-    # Its beams grow one for one with the position, and are distances to walls.
-    assert observed(MODELS["agv_corridor"]) == []
-    car = MODELS["road_car"]
-    read = {car.state_names[item.state] for item in observed(car)}
-    assert {"east", "north", "heading", "speed"} <= read

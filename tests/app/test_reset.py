@@ -6,8 +6,9 @@ from scripted import MODEL, SECOND, Scripted, readings, twin, wait_for
 
 from app import commands
 from app.engine import Engine
+from app.recorded import read_recording
 from app.recorder import Recorder
-from app.recording import read_recording, tuning_from_json
+from app.recording import tuning_from_json
 from app.server_api import command_from_json, status_json
 from app.tally import last_run
 from app.twin import load_twin

@@ -10,7 +10,7 @@ import pytest
 from scripted import wait_for
 
 from app.commands import Record
-from app.recording import read_recording
+from app.recorded import read_recording
 from app.run import live_source
 from app.session import Page, Session
 from app.twin import load_twin

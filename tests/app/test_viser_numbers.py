@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from app.viser_camera import vertical_angle
-from app.viser_charts import Range, observers
+from app.viser_charts import Range
 from app.viser_decimate import Buckets, bridge
 from app.viser_geometry import ellipsoid, quaternion, round_step, segments, tick_text
 from app.viser_history import History
-from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
 
 
 def rotation_of(q):
@@ -209,20 +208,3 @@ def test_history_starts_over_with_a_fresh_pull():
     history.take(pull(0, range(100)))
     history.take(pull(40, range(40, 60), fresh=True))
     assert (history.base, history.n) == (40, 20)
-
-
-def f(x, u, p, dt, out):
-    out[:] = x
-
-
-def h_direct(x, u, p, out):
-    out[0] = x[1]
-    out[1] = x[0] + x[1]
-
-
-def test_observers_are_the_rows_that_read_a_state():
-    model = StateSpaceModel(
-        name="m", title="m", states=(State("a", "m"), State("b", "m")), noises=(Noise("a", "m²/s", 1.0),), f=f,
-        sensors=(Sensor("s", (Row("r0", "m", 1.0), Row("r1", "m", 1.0)), h_direct),),
-    )  # fmt: skip
-    assert observers(model) == [[], [(0, 0)]]

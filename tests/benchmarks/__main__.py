@@ -20,13 +20,17 @@ def main() -> None:
     print(f"{platform.machine()}, {os.cpu_count()} cores{load}, Python {platform.python_version()}")
     sections: list[Callable[[], None]] = [
         filters.beside_filterpy,
+        filters.step_alone,
+        filters.beside_stone_soup,
         filters.growing_n,
+        filters.growing_m,
         filters.gaussian_family,
         particles_.beside_particles,
         particles_.growing_members,
         particles_.rao_blackwellised,
         ensembles.beside_dapper,
         ensembles.thermal_cycles,
+        ensembles.growing_ensembles,
         ensembles.large_states,
         history.growing_history,
         history.refold,

@@ -137,6 +137,32 @@ def large_states() -> None:
         print(f"  {title:22s} {clock:8.2f} {cpu:7.2f} {memory:7.2f}   <= {bound} s {verdict[0]}; <= 1.3 {verdict[1]}")
 
 
+def growing_ensembles() -> None:
+    """An analysis against n, N and m, each doubled or quadrupled while the others stay."""
+    print("One analysis of a field: ms of the processor, and ns by the expected order in brackets")
+    rows = (
+        ("etkf", {}, "n N²", lambda n, members, m: n * members**2),
+        ("ensrf", {"radius": 0.5}, "n N m, within the radius", lambda n, members, m: n * members * m),
+        # Each cell solves for the fewer of N and the rows within the radius: 78 of 100 at n = 10,000, 20 and 5 beyond.
+        (
+            "letkf",
+            {"radius": 0.5},
+            "n, k³ with k the smaller of N and the rows within the radius",
+            lambda n, members, m: n,
+        ),
+    )
+    cases = [(side, 40, 10) for side in (100, 200, 400)] + [(200, N, 10) for N in (10, 20, 80)]
+    cases += [(200, 40, sensors) for sensors in (5, 20)]
+    for name, options, order, count in rows:
+        print(f"  {name}, expected {order}")
+        for side, members, sensors in cases:
+            model = thermal_field(side, side, sensors)
+            _, cpu, _ = analysis(model, name, {"members": members, **options}, 2 if name == "letkf" else 3)
+            n, m = side * side, sensors * sensors
+            share = cpu * 1e9 / count(n, members, m)
+            print(f"    n = {n:6d}, N = {members:2d}, m = {m:3d}: {cpu * 1e3:8.1f} [{share:7.3f}]")
+
+
 def thermal_cycles() -> None:
     """Cycles a second with 40,000 cells and 40 members: forecast with noise, and analysis of 100 thermocouples."""
     model, cycles = thermal_field(), 12

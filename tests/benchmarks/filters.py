@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from datetime import datetime, timedelta
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 
+from estimators.filter import call_predict, call_update
 from estimators.fold import Fold
+from estimators.jit import borrowed, floats, jit
 from estimators.log import READING, Log, Readings
 from estimators.model import StateSpaceModel
 from estimators.models import MODELS
@@ -126,7 +129,7 @@ def beside_filterpy() -> None:
             ),
             STEPS,
             THEIR_STEPS,
-            80.0,
+            100.0,
         ),
         (
             "UKF  n=24 m=8",
@@ -143,7 +146,7 @@ def beside_filterpy() -> None:
             ),
             STEPS // 16,
             THEIR_STEPS // 4,
-            10.0,
+            15.0,
         ),
     ]
     print("A step: predict and update, with NIS, verdict and health on our side; processor time, medians, interleaved")
@@ -152,6 +155,76 @@ def beside_filterpy() -> None:
         pair = compare(ours, theirs, steps=(our_steps, their_steps), repetitions=REPETITIONS)
         verdict = f">= {bound:3.0f}   {judged(pair.ratio, bound, at_least=True)}" if bound else "   -"
         print(f"  {name:15s} {pair.ours * 1e6:9.3f} {pair.theirs * 1e6:12.1f} {pair.ratio:7.1f}   {verdict}")
+
+
+def alone(estimator: str, model: StateSpaceModel) -> Callable[[], None]:
+    """Predictions and updates as the fold calls them, but nothing else: no estimate, health or log is written."""
+    log = log_of(model, STEPS, step=0.1)
+    fold = Fold(estimator, model, Tuning.of(model), log)
+    fold.advance()
+    places = (fold._u, fold._state, fold._work, fold._score, log.value, *np.empty((2, model.width)))
+
+    def steps() -> None:
+        _steps(fold._code.predict, fold._code.update, fold._context, STEPS, *places)
+
+    return steps
+
+
+@jit
+def _steps(predict, update, context, n, u, state, work, score, value, innovation, innovation_std):
+    # What the fold does too: counted arrays cost more than the filter.
+    u, state, work, score = borrowed(u), borrowed(state), borrowed(work), borrowed(score)
+    innovation, innovation_std = borrowed(innovation), borrowed(innovation_std)
+    for k in range(n):
+        y = floats(value[k].ctypes.data, value.shape[1])
+        call_predict(predict, context, u, 0.1, k, state, work)
+        call_update(update, context, u, 0, y, k, state, work, innovation, innovation_std, score)
+
+
+def step_alone() -> None:
+    """A step of the unscented filter as the issue of speed is usually put: prediction and update alone."""
+    calls = [alone("ukf", ring.ring(4, 2)), folding("ukf", ring.ring(4, 2), log_of(ring.ring(4, 2), STEPS, step=0.1))]
+    step, whole = (value / STEPS * 1e6 for value in medians(calls, REPETITIONS))
+    print(f"UKF n=4 m=2: predict and update {step:.2f} µs   <= 1   {judged(step, 1.0, at_least=False)}")
+    print(f"             with estimate, NIS bounds, health and history {whole:.2f} µs")
+
+
+def beside_stone_soup() -> None:
+    """Kalman and unscented filters of Stone Soup on the motor: a prediction and an update of one state object."""
+    try:
+        from stonesoup.models.measurement.linear import LinearGaussian
+        from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
+        from stonesoup.predictor.kalman import KalmanPredictor, UnscentedKalmanPredictor
+        from stonesoup.types.detection import Detection
+        from stonesoup.types.hypothesis import SingleHypothesis
+        from stonesoup.types.state import GaussianState
+        from stonesoup.updater.kalman import KalmanUpdater, UnscentedKalmanUpdater
+    except ImportError:
+        print("Stone Soup is not installed: pip install nisus[bench]")
+        return
+    moving = CombinedLinearGaussianTransitionModel([ConstantVelocity(0.001)])
+    reading = LinearGaussian(2, (0,), np.array([[4.0]]))
+    begun = datetime(2026, 1, 1)
+    detections = [Detection([[36.0]], timestamp=begun + timedelta(seconds=k + 1)) for k in range(THEIR_STEPS)]
+
+    def theirs(predictor, updater):
+        def steps() -> None:
+            belief = GaussianState([[35.0], [0.0]], np.diag([25.0, 1.0]), timestamp=begun)
+            for detection in detections:
+                ahead = predictor.predict(belief, timestamp=detection.timestamp)
+                belief = updater.update(SingleHypothesis(ahead, detection))
+
+        return steps
+
+    motor = MODELS["motor_winding"]
+    print("A step beside Stone Soup's, n=2 m=1; processor time, medians, interleaved")
+    for name, predictor, updater in (
+        ("kf", KalmanPredictor(moving), KalmanUpdater(reading)),
+        ("ukf", UnscentedKalmanPredictor(moving), UnscentedKalmanUpdater(reading)),
+    ):
+        ours = folding(name, motor, log_of(motor, STEPS))
+        pair = compare(ours, theirs(predictor, updater), steps=(STEPS, THEIR_STEPS), repetitions=7)
+        print(f"  {name:4s} {pair.ours * 1e6:7.3f} µs, theirs {pair.theirs * 1e6:7.0f} µs, ratio {pair.ratio:6.0f}")
 
 
 def growing_n() -> None:
@@ -168,6 +241,16 @@ def growing_n() -> None:
             calls.append(folding(name, model, log_of(model, steps, step=0.1)))
         each = [value / steps for value in medians(calls, 7)]
         print(f"  {n:4d} {m:3d}" + "".join(f"{s * 1e6:11.2f} [{s * 1e9 / n**3:6.2f}]" for s in each))
+
+
+def growing_m() -> None:
+    """The cost of m at n = 24: as n² m where the covariance's update rules, as m³ in the factor of S."""
+    sizes = (1, 2, 4, 8)
+    print("A step against m (ring of 24 states): µs; expected: a part that does not depend on m, and one as n² m")
+    for name in ("kf", "ekf", "ukf"):
+        models = [ring.ring(24, m, linear=name == "kf") for m in sizes]
+        each = [value / 256 * 1e6 for value in medians([folding(name, a, log_of(a, 256, step=0.1)) for a in models], 7)]
+        print(f"  {name:4s} " + "   ".join(f"m = {m}: {value:6.2f}" for m, value in zip(sizes, each, strict=True)))
 
 
 def gaussian_family() -> None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from app import commands
 from app.compile import prepare
-from app.recording import read_recording
+from app.recorded import read_recording
 from app.run import live_source
 from app.session import Page, Session
 from app.twin import load_twin

@@ -15,14 +15,15 @@ STD, Q, R = 0.5, 0.01, 0.04
 def f(x, u, p, dt, out):
     n = x.size
     for i in range(n):
-        flow = x[(i + n - 1) % n] - 2.0 * x[i] + x[(i + 1) % n]
+        flow = x[i - 1 if i > 0 else n - 1] - 2.0 * x[i] + x[i + 1 if i < n - 1 else 0]
         out[i] = x[i] + dt * (0.5 * flow - 0.1 * x[i] * x[i] * x[i])
 
 
 def f_linear(x, u, p, dt, out):
     n = x.size
     for i in range(n):
-        out[i] = x[i] + dt * 0.5 * (x[(i + n - 1) % n] - 2.0 * x[i] + x[(i + 1) % n])
+        flow = x[i - 1 if i > 0 else n - 1] - 2.0 * x[i] + x[i + 1 if i < n - 1 else 0]
+        out[i] = x[i] + dt * 0.5 * flow
 
 
 def h(x, u, p, out):

@@ -50,6 +50,7 @@ def test_values_are_read_and_defaults_filled_in() -> None:
     [
         ("    std: 2", "    sdt: 2", "motor.yaml:6: sensors.winding.sdt is not known; did you mean std?"),
         ("    std: 2", "    std: -0.1", "motor.yaml:6: sensors.winding.std is -0.1; it must be positive"),
+        ("    std: 2", "    std: 1e200", "motor.yaml:6: sensors.winding.std is 1e+200; it must be 1e+50 at most"),
         ("    std: 2", "    variance: 0", "motor.yaml:6: sensors.winding.variance is 0; it must be positive"),
         ("    std: 2", "    std: [1, -1]", "motor.yaml:6: sensors.winding.std[1] is -1; it must be positive"),
         ("    std: 2", "    std: .nan", "motor.yaml:6: sensors.winding.std is nan; it must be a finite number"),

@@ -143,6 +143,8 @@ def test_root_of_a_diagonal_is_exact_and_an_indefinite_matrix_is_refused():
     np.testing.assert_array_equal(U, np.diag([2.0, 0.0, 3.0, 0.0]))
     for A in (np.diag([1.0, -1e-6]), np.array([[1.0, 2.0], [2.0, 1.0]]), np.diag([1.0, np.nan]), np.diag([np.inf, 1])):
         assert not root(A, np.empty((2, 2)), 2)
+    # An eigenvalue of -1e-9, where 16 n ε is 7e-15.
+    assert not root(np.array([[1.0, 1.0 + 1e-9], [1.0 + 1e-9, 1.0]]), np.empty((2, 2)), 2)
 
 
 @pytest.mark.parametrize("n", SIZES)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimators.noise import belief_root, semidefinite_root
+from estimators.noise import add_noise, belief_root, semidefinite_root
 
 
 def root(A):
@@ -34,7 +34,15 @@ def test_integrated_white_noise_and_zero():
 
 
 @pytest.mark.parametrize(
-    "A", [[[1.0, 0.0], [0.0, -1e-3]], [[0.0, 1.0], [1.0, 0.0]], [[1.0, 2.0], [2.0, 1.0]], [[np.nan, 0.0], [0.0, 1.0]]]
+    "A",
+    [
+        [[1.0, 0.0], [0.0, -1e-3]],
+        [[0.0, 1.0], [1.0, 0.0]],
+        [[1.0, 2.0], [2.0, 1.0]],
+        [[np.nan, 0.0], [0.0, 1.0]],
+        # The second has no variance but the first one's, of which the third knows nothing: eigenvalue -0.005.
+        [[1.0, 1.0, 0.0], [1.0, 1.0, 0.1], [0.0, 0.1, 1.0]],
+    ],
 )
 def test_what_is_no_covariance_is_refused_visibly(A):
     fine, L = root(np.array(A))
@@ -56,3 +64,10 @@ def test_a_belief_that_rounding_made_indefinite_keeps_its_deviations():
     assert np.array_equal(L, np.diag([2.0, 1.0]))
     belief_root(np.eye(2) * 9.0, L)
     assert np.array_equal(L, 3.0 * np.eye(2))
+
+
+def test_noise_is_added_through_the_whole_lower_triangle():
+    L = np.array([[2.0, 9.0, 9.0], [3.0, 5.0, 9.0], [-1.0, 4.0, 7.0]])
+    x = np.array([10.0, 20.0, 30.0])
+    add_noise(L, np.array([1.0, 10.0, 100.0]), x)
+    np.testing.assert_array_equal(x, [12.0, 73.0, 769.0])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from estimators.random import _edge, key_of, mix, normals, uniform, word
+from estimators.random import _DENSITY, _SCALE, _edge, fill_normals, key_of, mix, normals, uniform, unit, word
 
 N = 200_000
 
@@ -55,6 +55,28 @@ def test_the_rare_path_alone_draws_the_tail():
     law = stats.truncnorm(3.6541528853610088, np.inf)
     # A position at the far end of the base strip is always in the tail.
     assert stats.kstest(draws, law.cdf).pvalue > 1e-3
+    left = [_edge(np.uint64(5), np.uint64(i), 0, 1 - (1 << 54)) for i in range(3000)]
+    assert np.array_equal(left, -draws)
+
+
+@pytest.mark.parametrize("layer", [1, 2, 40, 150, 254])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_wedge_keeps_what_lies_under_the_density(layer, sign):
+    """A point between the rectangle's edge and the layer's: kept with the part of the layer's height that is below."""
+    edges = np.sqrt(-2.0 * np.log(_DENSITY[[layer + 1, layer]]))
+    position = sign * int(edges @ [0.5, 0.5] / _SCALE[layer])
+    x = abs(position) * _SCALE[layer]
+    part = (np.exp(-0.5 * x * x) - _DENSITY[layer]) / (_DENSITY[layer + 1] - _DENSITY[layer])
+    n = 4000
+    kept = sum(_edge(np.uint64(layer), np.uint64(i), layer, position) == sign * x for i in range(n))
+    assert abs(kept - part * n) < 5 * np.sqrt(part * (1 - part) * n)
+
+
+def test_units_are_the_middles_of_their_cells():
+    """Of 2⁵² cells of (0, 1), so that a logarithm of either end is finite."""
+    assert unit(np.uint64(0)) == 2.0**-53
+    assert unit(np.uint64(2**64 - 1)) == 1.0 - 2.0**-53
+    assert unit(np.uint64(2**63)) == 0.5 + 2.0**-53
 
 
 @pytest.mark.parametrize("other", [{"seed": 2}, {"index": 3}, {"stream": 4}, {"stream": 19}])
@@ -77,6 +99,16 @@ def test_uniforms_over_events_are_uniform():
     assert stats.kstest(u, "uniform").pvalue > 1e-3
     assert abs(np.corrcoef(u[1:], u[:-1])[0, 1]) < 5 / np.sqrt(u.size)
     assert 0 < u.min() and u.max() < 1
+    for other in ({"seed": 10}, {"stream": 2}):
+        seed, stream = other.get("seed", 9), other.get("stream", 1)
+        v = np.array([uniform(seed, i, stream) for i in range(u.size)])
+        assert abs(np.corrcoef(u, v)[0, 1]) < 5 / np.sqrt(u.size)
+
+
+def test_a_run_of_a_key_is_the_blocks_numbers():
+    out = np.full(12, np.nan)
+    fill_normals(key_of(1, 2, 3), np.uint64(5), 10, out)
+    assert np.array_equal(out[:10], block(members=20).ravel()[5:15]) and np.all(np.isnan(out[10:]))
 
 
 @pytest.mark.parametrize("cuts", [(1, 2), (64, 999), (500, 501)])

@@ -91,3 +91,23 @@ def test_children_take_the_places_of_the_childless():
     assert kept == sorted(tuple(before[i].tolist()) for i in (1, 1, 1, 3, 5, 5))
     for i in (1, 3, 5):
         assert np.array_equal(rows[i], before[i])
+
+
+@pytest.mark.parametrize("scheme", (SYSTEMATIC, STRATIFIED, RESIDUAL))
+def test_whole_shares_leave_nothing_to_chance(scheme):
+    """Weights of c/N: every stratum of the cumulated weights belongs to one particle, and nothing is left to draw."""
+    counts = np.random.default_rng(1).multinomial(N, np.full(12, 1 / 12)).astype(float)
+    w = np.concatenate((counts, np.zeros(N - 12)))
+    for draw in range(20):
+        assert np.array_equal(children(scheme, w, draw), w)
+
+
+@pytest.mark.parametrize("scheme", (SYSTEMATIC, STRATIFIED))
+def test_a_run_ends_where_its_neighbour_begins_whatever_its_own_sum(scheme):
+    """Rounding, here as large as half a point: a run has the points between the ends it was given, none below zero."""
+    for draw in range(20):
+        key, out = np.uint64(key_of(3, draw, scheme)), np.empty(2)
+        strata_children(scheme, key, np.array([1.5, 2.0]), 0.0, 4.0, 1.0, out)
+        assert out.sum() == 4 and 1 <= out[0] <= 2
+        strata_children(scheme, key, np.array([4.5, 0.0]), 0.0, 4.0, 1.0, out)
+        assert np.array_equal(out, [4.0, 0.0])

@@ -5,6 +5,7 @@ import pytest
 from can_tools import read_all, same
 
 from estimators.errors import SourceError
+from estimators.jump import Jump
 from estimators.log import INPUT, READING, TICK, TRUTH, truth_of
 from estimators.model import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
@@ -186,3 +187,84 @@ def test_what_is_out_of_range_is_refused():
         winding(step=0.0)
     with pytest.raises(SourceError, match="duration is -1"):
         winding(duration=-1.0)
+
+
+def unmoved(x, u, p, dt, out):
+    for j in range(x.size):
+        out[j] = x[j]
+
+
+def true_states(source):
+    got = read_all(source)
+    return np.array([truth_of(got, j)[1] for j in range(2)]).T
+
+
+def test_noise_that_is_correlated_and_depends_on_the_state_has_its_covariance():
+    """Steps of half a second, x' = x/2 + w, whose Q = C dt doubles where x[0] is positive.
+
+    A product of two normals has the variance C_ii C_jj + C_ij²; the mean of n is right to 5 of its standard errors.
+    """
+    C = np.array([[4.0, 1.5], [1.5, 1.0]])
+
+    def halve(x, u, p, dt, out):
+        out[0] = 0.5 * x[0]
+        out[1] = 0.5 * x[1]
+
+    def Q(x, u, p, q, dt, out):
+        scale = dt * (2.0 if x[0] > 0.0 else 1.0)
+        out[0, 0], out[0, 1], out[1, 0], out[1, 1] = 4.0 * scale, 1.5 * scale, 1.5 * scale, scale
+
+    x = true_states(Simulator(model(f=halve, Q=Q), seed=1, step=0.5, duration=4000.5))
+    at, steps = x[:-1], x[1:] - 0.5 * x[:-1]
+    up = at[:, 0] > 0
+    assert min(up.sum(), (~up).sum()) > 3000
+    for here, factor in ((up, 1.0), (~up, 0.5)):
+        found = steps[here].T @ steps[here] / here.sum()
+        error = np.sqrt((np.outer(np.diag(C), np.diag(C)) + C**2) / here.sum()) * factor
+        assert np.all(np.abs(found - factor * C) < 5 * error)
+
+
+def test_a_true_angle_stays_within_a_turn():
+    def turn(x, u, p, dt, out):
+        out[0] = x[0] + 2.0 * dt
+        out[1] = x[1]
+
+    states = (State("a", "rad", 1.0, 1.0, circular=True), State("b", "", 1.0, 1.0))
+    compass = model(f=turn, states=states, sensors=(Sensor("one", (Row("one", "", 1.0),), one),))
+    x = true_states(Simulator(compass, seed=0, step=1.0, duration=50.0))[:, 0]
+    assert np.all((x >= -np.pi) & (x < np.pi))
+    np.testing.assert_allclose(np.exp(1j * x), np.exp(1j * (1.0 + 2.0 * np.arange(1, 51))), atol=1e-13)
+
+
+def test_the_mode_jumps_as_the_model_says_in_each_piece():
+    """From each of three modes surely to the next, four times a step: one onwards."""
+
+    def onwards(x, u, p, dt, out):
+        for j in range(3):
+            out[j] = 0.0
+        mode = int(x[1])
+        out[(mode + 1) % 3] = 4.0 * dt
+        out[mode] = 1.0 - 4.0 * dt
+
+    states = (State("a", "", 1.0, 1.0), State("b", "", 1.0, 1.0))
+    jumping = model(f=unmoved, states=states, noises=(Noise("a", "", 0.0),), max_step=0.25,
+                    jump=Jump("b", ("x", "y", "z"), onwards))  # fmt: skip
+    mode = true_states(Simulator(jumping, seed=0, step=1.0, duration=6.0, initial={"b": 0.0}))[:, 1]
+    assert mode.tolist() == [1, 2, 0, 1, 2, 0]
+
+
+def test_steps_that_are_no_binary_fraction_are_at_their_nanosecond():
+    """3 · 0.3 is 0.8999…, and 2.7 / 0.3 is 8.99…: neither loses what it falls short of."""
+    source = Simulator(model(), seed=0, step=0.3, duration=2.7, sensors=QUIET)
+    got = read_all(source)
+    assert np.unique(got.t).tolist() == [k * 300_000_000 for k in range(10)]
+    assert source.span == (0, 2_700_000_000)
+
+
+def test_steps_are_split_as_the_truth_asks_the_last_piece_no_longer_than_the_others():
+    """A truth of at most 0.2 s in steps of 0.5 s: three pieces of a sixth, whatever the estimator's model allows."""
+    source = Simulator(model(), seed=0, step=0.5, duration=0.5, truth_model=model(max_step=0.2), sensors=QUIET)
+    b = 1.0
+    for _ in range(3):
+        b -= 0.5 / 3 * b * b
+    assert read_all(source).value[-1, 1] == pytest.approx(b, rel=1e-12)

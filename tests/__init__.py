@@ -1,0 +1,1 @@
+"""A package, because peers of the benchmarks install a `tests` of their own, which Python would find in its place."""

@@ -1,0 +1,110 @@
+"""A large field in headless Chromium: the map that is drawn is the estimate, before and after another filter."""
+
+import io
+
+import numpy as np
+import pytest
+from scripted import Scripted, wait_for
+from test_field_views import PLATE, SHAPE
+
+from app.engine import Engine
+from app.twin import load_twin
+from app.viser_guard import HEADER
+from app.viser_view import ViserView
+
+pytestmark = pytest.mark.browser
+
+FLAGS = (
+    "--headless=new --no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-background-networking "
+    "--disable-component-update --disable-sync --no-first-run --disable-quic"
+).split()
+PATIENCE = 60.0
+
+
+@pytest.fixture
+def engine(tmp_path):
+    (tmp_path / "plate.py").write_text(
+        f"from estimators.models.thermal_field import thermal_field\nPlate = thermal_field{(*SHAPE, 2)}\n"
+    )
+    (tmp_path / "plate.yaml").write_text(PLATE)
+    twin = load_twin(tmp_path / "plate.yaml")
+    recorded, source = twin.open_source(lambda key, text: None), Scripted()
+    engine = Engine(twin, lambda report: source)
+    engine.start()
+    while (batch := recorded.read(0.0)) is not None:
+        source.put(batch)
+    source.put(None)
+    wait_for(lambda: engine.status().finished)
+    yield engine
+    engine.stop()
+
+
+@pytest.fixture
+def page(chromium, engine):
+    sync_api = pytest.importorskip("playwright.sync_api")
+    view = ViserView(engine, secret="s3cret")
+    view.start()
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+        page = browser.new_page(viewport={"width": 900, "height": 700}, extra_http_headers={HEADER: "s3cret"})
+        page.set_default_timeout(PATIENCE * 1000)
+        errors = []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(f"http://127.0.0.1:{view.port}/")
+        yield page
+        browser.close()
+    view.stop()
+    assert errors == []
+
+
+def estimate(engine):
+    """The newest picture's means, (rows, columns)."""
+    cursor = engine.cursor()
+    pull = engine.pull(cursor)
+    engine.release(cursor)
+    return next(picture.mean for picture in reversed(pull.pictures) if picture.mean is not None)
+
+
+def cells(page):
+    """The colours (rows, columns, 3) on the screen in the middle of each cell; None if there is no map."""
+    from PIL import Image
+
+    colours = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(float)
+    # Left of the panel, and below what Viser says about its own drawing.
+    colours = colours[150:, :480]
+    coloured = np.ptp(colours, axis=2) > 40
+    wide = np.flatnonzero(coloured.mean(axis=0) > 0.2)
+    if not wide.size:
+        return None
+    # The map is the first of the two runs of columns; the scale stands beside it.
+    columns = np.split(wide, np.flatnonzero(np.diff(wide) > 1) + 1)[0]
+    rows = np.flatnonzero(coloured[:, columns].mean(axis=1) > 0.5)
+    if columns.size < 100 or rows.size < 50:
+        return None
+    x = columns[0] + columns.size * (np.arange(SHAPE[1]) + 0.5) / SHAPE[1]
+    y = rows[0] + rows.size * (np.arange(SHAPE[0]) + 0.5) / SHAPE[0]
+    # A third of a cell's side around its middle: in some of them stands the dot of a sensor.
+    off = np.round(np.linspace(-1 / 6, 1 / 6, 9) * columns.size / SHAPE[1])
+    at = np.ix_(range(SHAPE[0]), range(SHAPE[1]))
+    patches = np.stack([colours[np.int64(y + dy)[at[0]], np.int64(x + dx)[at[1]]] for dy in off for dx in off])
+    return np.median(patches, axis=0)
+
+
+def likeness(page, engine):
+    """Rank correlation of how bright a cell is with its estimate: the palette grows brighter from cold to warm."""
+    found = cells(page)
+    if found is None:
+        return 0.0
+    bright = found @ [0.299, 0.587, 0.114]
+    ranks = [np.argsort(np.argsort(values.ravel())) for values in (bright, estimate(engine))]
+    return float(np.corrcoef(ranks)[0, 1])
+
+
+def test_the_map_is_drawn_and_still_is_with_another_filter(page, engine):
+    wait_for(lambda: likeness(page, engine) > 0.95, PATIENCE)
+    before = cells(page), estimate(engine)
+    page.get_by_role("combobox", name="Estimator").click()
+    page.get_by_role("option", name="Ensemble transform Kalman filter", exact=True).click()
+    page.get_by_text("revision 1").wait_for()
+    assert not np.array_equal(estimate(engine), before[1])
+    wait_for(lambda: likeness(page, engine) > 0.95 and not np.array_equal(cells(page), before[0]), PATIENCE)
