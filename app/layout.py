@@ -90,7 +90,8 @@ def blueprint(
     nis = chart(
         "NIS, windowed mean in its 95 % bounds",
         ["/nis/reading", "/previous/nis", "/nis/window"],
-        axis_y=rrb.ScalarAxis(range=(0.0, nis_limit(model)), zoom_lock=True),
+        # From a little below zero, whose label would stand on that of the time.
+        axis_y=rrb.ScalarAxis(range=(-0.08 * nis_limit(model), nis_limit(model)), zoom_lock=True),
     )
     health = rrb.StateTimelineView(origin=f"{root}/health", name="health", time_view=axis)
     columns = rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["LogLevel", "Body"])

@@ -28,6 +28,12 @@ TRAIL = 100
 PICTURES = 400
 """Ellipses in one window of the charts, or in a longer history that is drawn at once."""
 
+PANE = 2.5
+"""Width of the picture over its height, about."""
+
+ASIDE, BELOW = 0.2, 0.4
+"""Shares of the picture's width and height that the numbers take, on either side of their point and below it."""
+
 _STRIP = rr.components.LineStrip2DBatch._ARROW_DATATYPE
 _POINT = _STRIP.value_type
 _angle = np.linspace(0.0, 2.0 * np.pi, CORNERS)
@@ -53,6 +59,29 @@ def ellipse_points(mean: np.ndarray, var: np.ndarray, cross: np.ndarray) -> np.n
     x = l11[:, None] * _circle[:, 0]
     y = l21[:, None] * _circle[:, 0] + l22[:, None] * _circle[:, 1]
     return mean[:, None, :] + 2.0 * np.stack((x, y), axis=2)
+
+
+def anchors(mean: np.ndarray, ellipses: np.ndarray, ways: list[np.ndarray]) -> np.ndarray:
+    """Where the numbers stand: at the mean, but no nearer to the picture's edge than they are wide and high.
+
+    The view shows what is drawn and cuts the numbers off where it ends.
+
+    Args:
+        mean: Shape (n, 2).
+        ellipses: Shape (n, CORNERS, 2).
+        ways: n lines of shape (k, 2).
+
+    Returns:
+        Shape (n, 2).
+    """
+    low = np.stack([np.minimum(e.min(0), way.min(0)) for e, way in zip(ellipses, ways, strict=True)])
+    high = np.stack([np.maximum(e.max(0), way.max(0)) for e, way in zip(ellipses, ways, strict=True)])
+    middle, size = 0.5 * (low + high), high - low
+    # The view has one scale for both axes: the longer one fills it.
+    height = np.maximum(size[:, 1], size[:, 0] / PANE)
+    edge = np.stack(((0.5 - ASIDE) * PANE * height, (0.5 - BELOW) * height), axis=1)
+    x = np.clip(mean[:, 0], middle[:, 0] - edge[:, 0], middle[:, 0] + edge[:, 0])
+    return np.stack((x, np.maximum(mean[:, 1], middle[:, 1] - edge[:, 1])), axis=1)
 
 
 def strips(lines: list[np.ndarray]) -> pa.Array:
@@ -129,11 +158,18 @@ class PairDrawing:
             f"{self._path}/mean",
             indexes=at,
             columns=rr.Points2D.columns(
-                positions=mean.astype(np.float32), colors=[ESTIMATE] * t.size, labels=self._labels(track),
-                radii=np.full(t.size, -3.0, np.float32),
+                positions=mean.astype(np.float32), colors=[ESTIMATE] * t.size, radii=np.full(t.size, -3.0, np.float32)
             ).partition(count),
         )  # fmt: skip
         way = self._trail(rows, t, mean.astype(np.float32), past)
+        stream.send_columns(
+            f"{self._path}/numbers",
+            indexes=at,
+            columns=rr.Points2D.columns(
+                positions=anchors(mean, points, way).astype(np.float32), colors=[ESTIMATE] * t.size,
+                labels=self._labels(track), radii=np.full(t.size, -0.01, np.float32),
+            ).partition(count),
+        )  # fmt: skip
         stream.send_columns(
             f"{self._path}/way",
             indexes=at,

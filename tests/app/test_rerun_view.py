@@ -12,7 +12,7 @@ from scripted import Scripted, readings, twin, wait_for
 from app import commands, rerun_view
 from app.engine import Engine
 from app.layout import pair_name
-from app.rerun_pairs import axis_scales, ellipse_points
+from app.rerun_pairs import ASIDE, BELOW, PANE, anchors, axis_scales, ellipse_points
 from app.rerun_rows import CALENDAR
 from app.rerun_thin import last_of_each_time, thin
 from app.rerun_view import AHEAD, RerunFeed
@@ -134,6 +134,26 @@ def test_bytes_hold_the_rows_of_the_track(fed):
     _, values = fed.column("/nis/window")
     assert np.all((values[:, 1] < values[:, 2])[1:])
     assert fed.column("/health", "StateChange:state")[1].ravel().tolist() == ["tracking"]
+
+
+@pytest.mark.parametrize("wide", [100.0, 4.0, 0.04])
+def test_the_numbers_stand_inside_the_picture_and_at_the_mean_where_they_fit(wide):
+    # A way `wide` by 4, seen by a pane whose one scale is that of its fuller side.
+    way = np.array([[0.0, 0.0], [wide, 4.0], [wide, 0.0]])
+    height = max(4.0, wide / PANE)
+    view = np.array([PANE * height, height])
+    middle = np.array([0.5 * wide, 2.0])
+    means = np.array([[0.0, 4.0], [wide, 0.0], [0.0, 0.0], middle + [0.0, 0.05 * height]])
+    ellipses = ellipse_points(means, np.full((4, 2), 1e-12), np.zeros(4))
+    stand = anchors(means, ellipses, [way] * 4)
+    share = (stand - middle) / view + 0.5  # from the lower left corner
+    assert np.all((share[:, 0] >= ASIDE - 1e-6) & (share[:, 0] <= 1.0 - ASIDE + 1e-6))
+    assert np.all(share[:, 1] >= BELOW - 1e-6)
+    np.testing.assert_allclose(stand[3], means[3], rtol=1e-12)
+    # No farther from the mean than it must be: along each axis at the mean, or at the limit.
+    limits = middle + (np.array([[ASIDE, BELOW], [1.0 - ASIDE, BELOW]])[:, None] - 0.5) * view
+    at_limit = np.isclose(stand, limits[0], atol=1e-5) | np.isclose(stand, limits[1], atol=1e-5)
+    assert np.all(np.isclose(stand, means) | at_limit)
 
 
 def test_nothing_new_is_no_message_and_new_rows_are_sent_once(fed):
