@@ -1,5 +1,8 @@
 """The errors that Nisus raises, each with one line that a user can act on."""
 
+LARGEST = 1e50
+"""Beyond any physical quantity in any unit; its fourth power, which covariances multiply up to, is still a number."""
+
 
 class NisusError(Exception):
     """Anything that Nisus refuses: the text names the value, the rule and the remedy."""

@@ -16,7 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
-from .errors import ModelError
+from .errors import LARGEST, ModelError
 from .field import CellNames, Field, State
 from .jump import Jump
 
@@ -25,9 +25,6 @@ LARGE = 1024
 
 TRUTH_BLOCK = 32
 """Most states for which an event of the log must have room to tell the truth."""
-
-LARGEST = 1e50
-"""Beyond any physical quantity in any unit; its fourth power, which covariances multiply up to, is still a number."""
 
 SHOWN = 64
 """States that a track keeps where the model does not say which."""

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .errors import ConfigError
-from .model import LARGEST, StateSpaceModel
+from .errors import LARGEST, ConfigError
+from .model import StateSpaceModel
 
 _versions = count(1)
 
