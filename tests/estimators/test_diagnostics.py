@@ -1,5 +1,7 @@
 """Diagnostics must be able to fail: inside their bounds for a model that fits, outside for one that does not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -245,7 +247,9 @@ def test_a_gate_that_refuses_most_is_divergence():
 
 
 def test_an_estimate_that_is_not_finite_is_divergence():
-    track = fold("kf", COMPASS, Tuning.of(COMPASS).set("Q.heading", 1e308), history([-3.1, -3.1, -3.1], step=1e6))
+    # Far beyond what a tuning may be set to.
+    tuning = replace(Tuning.of(COMPASS), q=np.array([1e308]))
+    track = fold("kf", COMPASS, tuning, history([-3.1, -3.1, -3.1], step=1e6))
     assert track.health[-1] == DIVERGED
     assert not np.isfinite(track.std[-1, 0]) or not np.isfinite(track.mean[-1, 0])
 
