@@ -19,7 +19,7 @@ from estimators.fold import Fold
 from estimators.log import KIND_NAMES, Log, truth_of
 from estimators.pictures import Picture
 from estimators.score import Score, score
-from estimators.track import HEALTH_NAMES, VERDICT_NAMES, Track
+from estimators.track import FAILED, HEALTH_NAMES, VERDICT_NAMES, Track
 from estimators.tuning import TOGETHER
 
 from .cli import settings
@@ -149,6 +149,9 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], trac
         ("gated", f"{result.gated}"),
         ("missing", f"{result.missing}"),
     ]
+    failed = int(np.sum(track.verdict == FAILED))
+    if failed:
+        rows.append(("failed", f"{failed}: no estimate, or none with this reading, is a number"))
     row_units = dict(
         zip(twin.model.row_names, [row.unit for sensor in twin.model.sensors for row in sensor.rows], strict=True)
     )

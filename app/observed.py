@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimators.model import StateSpaceModel
+from estimators.model import Sensor, StateSpaceModel
 
 NEAR, AWAY = 0.05, 0.2
 """How far a row may be from its state, as a share: where the prior has its mean (a wheel's scale), and elsewhere, where
@@ -41,12 +41,12 @@ def observed(model: StateSpaceModel) -> list[Observed]:
     for k, sensor in enumerate(model.sensors):
         values, there = np.full((len(points), len(sensor.rows)), np.nan), np.zeros(len(sensor.rows))
         for x, out in zip(points, values, strict=True):
-            sensor.h(x, u, p, out)
+            _expect(model, sensor, x, u, p, out)
         slopes = np.zeros((len(sensor.rows), len(charted)))
         for column, (j, state) in enumerate(charted):
             moved = points[0].copy()
             moved[j] += STEP * state.std
-            sensor.h(moved, u, p, there)
+            _expect(model, sensor, moved, u, p, there)
             slopes[:, column] = (there - values[0]) / (STEP * state.std)
         for r, row in enumerate(sensor.rows):
             # A distance to a wall grows as the vehicle moves, but is not where the vehicle is; and a sum of two states
@@ -62,3 +62,16 @@ def observed(model: StateSpaceModel) -> list[Observed]:
             if likely:
                 found.append(Observed(k, r, likely[0]))
     return found
+
+
+def _expect(
+    model: StateSpaceModel, sensor: Sensor, x: np.ndarray, u: np.ndarray, p: np.ndarray, out: np.ndarray
+) -> None:
+    """Fill `out` with h(x, u, p); NaN, which is near nothing, where Python raises and machine code would not."""
+    try:
+        if model.black_box:
+            out[:] = sensor.h(x[np.newaxis], u, p)[0]
+        else:
+            sensor.h(x, u, p, out)
+    except Exception:
+        out[:] = np.nan

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -34,12 +35,18 @@ def live_source(twin: Twin, speed: float) -> Callable[[Callable[[str, str], None
     return open_source
 
 
+SAID = 5
+"""Failures that a run without a page tells at its end; it has no list of events."""
+
+
 def run_twin(arguments: Run) -> int:
     """Carry the command out."""
     if not arguments.speed > 0 or math.isnan(arguments.speed):
         raise ConfigError(f"--speed {arguments.speed:g}: must be positive, or inf for as fast as possible")
     if arguments.record is not None and arguments.record.suffix != ".rrd":
         raise ConfigError(f"--record {arguments.record}: must end in .rrd")
+    if arguments.record is not None and arguments.record.exists():
+        raise ConfigError(f"--record {arguments.record}: is there already; choose another name, or remove it")
     twin = load_twin(
         arguments.twin, log_files=arguments.log or None, overrides=settings(arguments.set, arguments.estimator)
     )
@@ -50,4 +57,7 @@ def run_twin(arguments: Run) -> int:
     if arguments.headless:
         status = session.engine.status()
         print(", ".join(f"{name} {count}" for name, count in status.counts.items() if count or name == "readings"))
+        failures = {notice.text: None for notice in session.engine.notices.since(0) if notice.level == "error"}
+        for text in list(failures)[:SAID]:
+            print(f"nisus: {text}", file=sys.stderr)
     return 0

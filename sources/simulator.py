@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimators.compiled import compile_model
-from estimators.errors import SourceError
+from estimators.errors import NisusError, SourceError
 from estimators.log import INPUT, READING, TICK, TRUTH, Readings
 from estimators.model import StateSpaceModel
 
@@ -131,7 +131,15 @@ class Simulator:
             if self._u.size:
                 rows.append((0, INPUT, 0, self._u))
         while len(rows) < BATCH and (self._steps is None or self._k < self._steps):
-            self._advance(rows)
+            try:
+                self._advance(rows)
+            except NisusError:
+                raise
+            except Exception as error:
+                raise SourceError(
+                    f"the simulator's model {self._model.name} fails at {self._k * self._step:g} s: "
+                    f"{type(error).__name__}: {error}; it may not fail where the asset goes"
+                ) from error
         if not rows:
             return None
         value = np.full((len(rows), self._model.width), np.nan)

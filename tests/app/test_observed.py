@@ -1,5 +1,7 @@
 """Which sensor rows are drawn over which states."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -60,3 +62,33 @@ def test_a_row_that_only_looks_like_a_state_at_the_prior_mean_is_not_one():
     )  # fmt: skip
     # At the mean, zero, a + b is a and b, with a slope of one; r2 has a scale and a lever like a real sensor.
     assert [(dot.row, dot.state) for dot in observed(model)] == [(0, 1), (2, 1)]
+
+
+def identity_of_a_block(X, u, p, dt):
+    return X.copy()
+
+
+def first_of_a_block(X, u, p):
+    return X[:, :1]
+
+
+def raises_beyond_the_mean(x, u, p, out):
+    out[0] = x[0] + 0.0 * math.sqrt(0.01 - x[0])
+    out[1] = 1.0
+
+
+def test_a_black_box_is_asked_for_blocks():
+    model = StateSpaceModel(
+        name="m", title="m", states=(State("a", "m"), State("b", "m")), noises=(Noise("a", "m²/s", 1.0),),
+        f=identity_of_a_block, sensors=(Sensor("s", (Row("a", "m", 1.0),), first_of_a_block),), black_box=True,
+    )  # fmt: skip
+    assert [(item.sensor, item.row, item.state) for item in observed(model)] == [(0, 0, 0)]
+
+
+def test_a_sensor_that_raises_near_the_prior_has_no_dots():
+    """Machine code gives NaN there, and the twin runs."""
+    model = StateSpaceModel(
+        name="m", title="m", states=(State("a", "m"),), noises=(Noise("a", "m²/s", 1.0),), f=f,
+        sensors=(Sensor("s", (Row("a", "m", 1.0), Row("b", "m", 1.0)), raises_beyond_the_mean),),
+    )  # fmt: skip
+    assert observed(model) == []

@@ -11,6 +11,7 @@ import pytest
 from scripted import MODEL, SECOND, Scripted, readings, twin, wait_for
 
 from app import commands
+from app.cli import main
 from app.engine import Engine
 from app.pull import Pull
 from app.recorded import read_recording
@@ -253,3 +254,11 @@ def test_a_file_that_takes_no_more_is_one_line_and_keeps_what_it_has(tmp_path):
     recorded = read_recording(path)
     assert recorded.rows > 10
     assert_same(refold(recorded), recorded.track)
+
+
+def test_a_recording_that_is_there_is_not_written_over(tmp_path, capsys):
+    there = tmp_path / "yesterday.rrd"
+    there.write_bytes(b"yesterday")
+    assert main(["run", "motor_winding", "--headless", "--record", str(there)]) == 2
+    assert "is there already; choose another name, or remove it" in capsys.readouterr().err
+    assert there.read_bytes() == b"yesterday"

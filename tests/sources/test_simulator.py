@@ -268,3 +268,23 @@ def test_steps_are_split_as_the_truth_asks_the_last_piece_no_longer_than_the_oth
     for _ in range(3):
         b -= 0.5 / 3 * b * b
     assert read_all(source).value[-1, 1] == pytest.approx(b, rel=1e-12)
+
+
+def raises_above_one(x, u, p, dt, out):
+    if x[0] > 1.0:
+        raise ValueError("too high")
+    out[0] = x[0] + dt
+
+
+def reads_it(x, u, p, out):
+    out[0] = x[0]
+
+
+def test_a_model_that_raises_on_the_way_is_one_line():
+    model = StateSpaceModel(
+        name="rising", title="rising", states=(State("a", "m"),), noises=(Noise("a", "m²/s", 0.0),),
+        f=raises_above_one, sensors=(Sensor("s", (Row("a", "m", 1.0),), reads_it),),
+    )  # fmt: skip
+    source = Simulator(model, seed=1, step=0.5, duration=10.0)
+    with pytest.raises(SourceError, match=r"model rising fails at 2 s: ValueError: too high; it may not fail where"):
+        read_all(source)
