@@ -66,6 +66,12 @@ def too_few_arguments(x, out):
     out[0] = x[0]
 
 
+def tiny_lopsided_Q(x, u, p, q, dt, out):
+    for i in range(3):
+        out[i, i] = 1e-9
+    out[0, 1] = 1e-10
+
+
 def lopsided_Q(x, u, p, q, dt, out):
     out[0, 1] = q[0] * dt
 
@@ -99,6 +105,7 @@ def writes_to_x(x, u, p, dt, out):
         ({"f": uses_python}, ("f cannot be compiled",)),
         ({"h": h_writes_too_far}, ("h of sensor s fails at the prior", "IndexError")),
         ({"Q": lopsided_Q}, ("Q is not symmetric",)),
+        ({"Q": tiny_lopsided_Q}, ("Q is not symmetric",)),
     ],
     ids=lambda item: None if isinstance(item, tuple) else next(iter(item.values())).__name__,
 )
