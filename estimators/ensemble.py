@@ -31,6 +31,7 @@ from .context import (
 from .context import options as numbers
 from .filter import Option, Options
 from .gaussian import LOG_2PI
+from .inverse_root import scratch_of
 from .jit import flags, floats, ints, jit, matrix
 from .linalg import solve_transposed, solve_upper, wrap
 from .localisation import between_rows, crews
@@ -92,7 +93,7 @@ def work_size(options: Options, nx: int, ny: int) -> int:
     analysis = ny * (3 * N + 6) + side * (3 * side + 4) + 2 * N * (N + 1) + N
     crew = max(
         3 * nx + (2 * nx * nx if nx <= LARGE else 0),
-        2 * (N + 2) * WIDE + ny * (N + 4) + 7 * side * side + 32 * (side + N),
+        2 * (N + 2) * WIDE + ny * (N + 4) + side * side + scratch_of(side) + 5 * (side + N),
     )
     return analysis + crews(N * nx, THREADED_FROM) * crew
 

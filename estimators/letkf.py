@@ -43,10 +43,11 @@ from .ensemble import (
 )
 from .etkf import global_analysis
 from .filter import Estimator
+from .inverse_root import root_action
 from .jit import ints, jit, matrix
 from .localisation import localised, prepare, reached
-from .simd import WIDE, add_scaled
-from .symmetric import gram, root_action
+from .simd import WIDE, add_scaled, combine, dot
+from .symmetric import gram
 from .track import FAILED, USED
 
 
@@ -74,10 +75,7 @@ def local_transform(p, z, d, G, a, values, t, g, scratch):
     N = a.size
     if p < N:
         for k in range(p):
-            dot = 0.0
-            for i in range(N):
-                dot += z[k, i] * a[i]
-            t[k] = dot
+            t[k] = dot(N, z[k].ctypes.data, a.ctypes.data)
         gain = root_action(G, p, values, t, d, False, scratch)
         for k in range(p):
             add_scaled(N, -t[k], z[k].ctypes.data, a.ctypes.data)
@@ -128,8 +126,7 @@ def columns(context, sensor, X, where, ZT, d, C, inflation, crew, crews, scratch
                     near[p] = k
                     near_d[p] = root * d[k]
                     roots[p] = root
-                    for i in range(N):
-                        z[p, i] = root * ZT[k, i]
+                    combine(1, roots[p:].ctypes.data, 1, ZT[k].ctypes.data, N, N, z[p].ctypes.data)
                     most = max(most, taper)
                     p += 1
             if p == 0:

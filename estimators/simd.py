@@ -153,30 +153,6 @@ def add_scaled(typing_context: Any, n: Any, a: Any, x: Any, y: Any) -> Any:
 
 
 @intrinsic
-def add_both_scaled(typing_context: Any, n: Any, a: Any, x: Any, b: Any, y: Any, z: Any) -> Any:
-    """z[:n] += a x[:n], then z[:n] += b y[:n]."""
-
-    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        n, a, b = given[0], given[1], given[3]
-        x, y, z = (_pointer(builder, given[k]) for k in (2, 4, 5))
-        wide_a, wide_b = _broadcast(builder, a), _broadcast(builder, b)
-
-        def whole(i: Any) -> None:
-            one = _multiply_add(builder, wide_a, _load(builder, x, i), _load(builder, z, i))
-            _store(builder, _multiply_add(builder, wide_b, _load(builder, y, i), one), z, i)
-
-        def single(i: Any) -> None:
-            at = builder.gep(z, [i])
-            one = _multiply_add(builder, a, builder.load(builder.gep(x, [i])), builder.load(at))
-            builder.store(_multiply_add(builder, b, builder.load(builder.gep(y, [i])), one), at)
-
-        _in_vectors(builder, n, whole, single)
-        return context.get_dummy_value()
-
-    return types.void(_i64, _f64, _i64, _f64, _i64, _i64), codegen
-
-
-@intrinsic
 def combine(typing_context: Any, count: Any, weights: Any, apart: Any, x: Any, stride: Any, n: Any, out: Any) -> Any:
     """out[:n] = Σ_k weights[k·apart] x[k·stride :][:n], k < count."""
 
@@ -207,6 +183,110 @@ def combine(typing_context: Any, count: Any, weights: Any, apart: Any, x: Any, s
         return context.get_dummy_value()
 
     return types.void(_i64, _i64, _i64, _i64, _i64, _i64, _i64), codegen
+
+
+@intrinsic
+def combine_four(
+    typing_context: Any,
+    count: Any,
+    weights: Any,
+    apart: Any,
+    x: Any,
+    stride: Any,
+    n: Any,
+    out: Any,
+    width: Any,
+) -> Any:
+    """out[i·width :][:n] = Σ_k weights[k·apart + i] x[k·stride :][:n], k < count, for i < 4; the bits of `combine`."""
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        count, apart, stride, n, width = (given[k] for k in (0, 2, 4, 5, 7))
+        w, x, out = (_pointer(builder, given[k]) for k in (1, 3, 6))
+
+        def summed(kind: Any, load: Any, spread: Any, store: Any) -> None:
+            sums = [cgutils.alloca_once(builder, kind) for _ in range(4)]
+            for one in sums:
+                builder.store(ir.Constant(kind, [0.0] * LANES if isinstance(kind, ir.VectorType) else 0.0), one)
+            with cgutils.for_range(builder, count) as loop:
+                weight = builder.gep(w, [builder.mul(loop.index, apart)])
+                value = load(builder.gep(x, [builder.mul(loop.index, stride)]))
+                for i, one in enumerate(sums):
+                    own = spread(builder.load(builder.gep(weight, [_count(i)])))
+                    builder.store(_multiply_add(builder, own, value, builder.load(one)), one)
+            for i, one in enumerate(sums):
+                store(builder.load(one), builder.gep(out, [builder.mul(width, _count(i))]))
+
+        def whole(at: Any) -> None:
+            summed(
+                _VECTOR,
+                lambda row: _load(builder, row, at),
+                lambda weight: _broadcast(builder, weight),
+                lambda value, row: _store(builder, value, row, at),
+            )
+
+        def single(at: Any) -> None:
+            summed(
+                _F64,
+                lambda row: builder.load(builder.gep(row, [at])),
+                lambda weight: weight,
+                lambda value, row: builder.store(value, builder.gep(row, [at])),
+            )
+
+        _in_vectors(builder, n, whole, single)
+        return context.get_dummy_value()
+
+    return types.void(_i64, _i64, _i64, _i64, _i64, _i64, _i64, _i64), codegen
+
+
+@intrinsic
+def add_outer(
+    typing_context: Any,
+    rows: Any,
+    n: Any,
+    a: Any,
+    left: Any,
+    x: Any,
+    right: Any,
+    y: Any,
+    z: Any,
+    stride: Any,
+) -> Any:
+    """z[k·stride :][:n] += a (left[k] x[:n] + right[k] y[:n]) for k < rows."""
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        rows, n, a, stride = (given[k] for k in (0, 1, 2, 8))
+        left, x, right, y, z = (_pointer(builder, given[k]) for k in (3, 4, 5, 6, 7))
+
+        def added(own_x: Any, own_y: Any, load: Any, spread: Any, store: Any) -> None:
+            own_x, own_y = builder.fmul(spread(a), own_x), builder.fmul(spread(a), own_y)
+            with cgutils.for_range(builder, rows) as loop:
+                row = builder.gep(z, [builder.mul(loop.index, stride)])
+                one, other = (spread(builder.load(builder.gep(side, [loop.index]))) for side in (left, right))
+                first = _multiply_add(builder, one, own_x, load(row))
+                store(_multiply_add(builder, other, own_y, first), row)
+
+        def whole(i: Any) -> None:
+            added(
+                _load(builder, x, i),
+                _load(builder, y, i),
+                lambda row: _load(builder, row, i),
+                lambda number: _broadcast(builder, number),
+                lambda value, row: _store(builder, value, row, i),
+            )
+
+        def single(i: Any) -> None:
+            added(
+                builder.load(builder.gep(x, [i])),
+                builder.load(builder.gep(y, [i])),
+                lambda row: builder.load(builder.gep(row, [i])),
+                lambda number: number,
+                lambda value, row: builder.store(value, builder.gep(row, [i])),
+            )
+
+        _in_vectors(builder, n, whole, single)
+        return context.get_dummy_value()
+
+    return types.void(_i64, _i64, _f64, _i64, _i64, _i64, _i64, _i64, _i64), codegen
 
 
 @intrinsic
@@ -315,6 +395,72 @@ def weighted(typing_context: Any, n: Any, w: Any, x: Any, out: Any) -> Any:
         return _summing(builder, given[0], whole, single)
 
     return _f64(_i64, _i64, _i64, _i64), codegen
+
+
+@intrinsic
+def resolve(
+    typing_context: Any,
+    n: Any,
+    d: Any,
+    e: Any,
+    b: Any,
+    blocks: Any,
+    shifts: Any,
+    weights: Any,
+    scratch: Any,
+    out: Any,
+) -> Any:
+    """out[:n] = Σ_k weights[k] (T + shifts[k] I)⁻¹ b, T tridiagonal with diagonal d[:n], and e[1:n] beside it.
+
+    By elimination without exchanges, which is stable where all T + shifts[k] I are positive definite; `LANES` shifts at
+    a time, which is what `blocks` counts. e[0] must be 0. `scratch` holds (3 n + 1) LANES numbers.
+    """
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        n, blocks = given[0], given[4]
+        d, e, b, shifts, weights, factors, out = (_pointer(builder, given[k]) for k in (1, 2, 3, 5, 6, 7, 8))
+        lanes = _count(LANES)
+        values = builder.gep(factors, [builder.mul(builder.add(n, _count(1)), lanes)])
+        sums = builder.gep(values, [builder.mul(n, lanes)])
+        nothing, one = (ir.Constant(_VECTOR, [number] * LANES) for number in (0.0, 1.0))
+        inverse, y = cgutils.alloca_once(builder, _VECTOR), cgutils.alloca_once(builder, _VECTOR)
+
+        def entry(pointer: Any, i: Any) -> Any:
+            return _broadcast(builder, builder.load(builder.gep(pointer, [i])))
+
+        with cgutils.for_range(builder, n) as loop:
+            _store(builder, nothing, sums, builder.mul(loop.index, lanes))
+        _store(builder, nothing, factors, builder.mul(n, lanes))
+        with cgutils.for_range(builder, blocks) as block:
+            at = builder.mul(block.index, lanes)
+            shift, weight = _load(builder, shifts, at), _load(builder, weights, at)
+            builder.store(nothing, inverse)
+            builder.store(nothing, y)
+            with cgutils.for_range(builder, n) as loop:
+                i, to = loop.index, builder.mul(loop.index, lanes)
+                beside = entry(e, i)
+                factor = builder.fmul(beside, builder.load(inverse))
+                minus = builder.fneg(factor)
+                pivot = _multiply_add(builder, minus, beside, builder.fadd(entry(d, i), shift))
+                value = _multiply_add(builder, minus, builder.load(y), builder.fmul(weight, entry(b, i)))
+                inverted = builder.fdiv(one, pivot)
+                builder.store(inverted, inverse)
+                builder.store(value, y)
+                _store(builder, factor, factors, to)
+                _store(builder, builder.fmul(value, inverted), values, to)
+            builder.store(nothing, y)
+            with cgutils.for_range(builder, n) as loop:
+                to = builder.mul(builder.sub(builder.sub(n, _count(1)), loop.index), lanes)
+                factor = builder.fneg(_load(builder, factors, builder.add(to, lanes)))
+                x = _multiply_add(builder, factor, builder.load(y), _load(builder, values, to))
+                builder.store(x, y)
+                _store(builder, builder.fadd(_load(builder, sums, to), x), sums, to)
+        with cgutils.for_range(builder, n) as loop:
+            total = _sum_of(builder, _load(builder, sums, builder.mul(loop.index, lanes)))
+            builder.store(total, builder.gep(out, [loop.index]))
+        return context.get_dummy_value()
+
+    return types.void(_i64, _i64, _i64, _i64, _i64, _i64, _i64, _i64, _i64), codegen
 
 
 _LOWEST = -708.0

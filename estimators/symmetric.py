@@ -11,19 +11,32 @@ from __future__ import annotations
 
 import numpy as np
 
-from .jit import jit, matrix
-from .simd import add_both_scaled, add_scaled, combine, rotate
+from .jit import jit
+from .simd import LANES, add_outer, add_scaled, combine, combine_four, dot, rotate
 
 _SWEEPS = 60
 """Iterations for one eigenvalue; two are usual, so this many mean that a number is not finite."""
+
+_NOTHING = 1e-300
+"""Below this a sum of squares may have lost its numbers to underflow: a row that small is zero."""
 
 
 @jit
 def gram(Z, count, n, G):
     """G = Zᵀ Z for the leading `count` rows and n columns of Z, both triangles."""
-    rows, apart = Z.ctypes.data, Z.shape[1]
-    for k in range(n):
-        combine(count, rows + 8 * k, apart, rows, apart, n, G[k].ctypes.data)
+    rows, apart, width = Z.ctypes.data, Z.shape[1], G.shape[1]
+    fours = n // 4 * 4
+    for k in range(0, fours, 4):
+        # From the vector on that holds the diagonal; what is left of it is copied.
+        first = k // LANES * LANES
+        to = G[k, first:].ctypes.data
+        combine_four(count, rows + 8 * k, apart, rows + 8 * first, apart, n - first, to, width)
+    for k in range(fours, n):
+        first = k // LANES * LANES
+        combine(count, rows + 8 * k, apart, rows + 8 * first, apart, n - first, G[k, first:].ctypes.data)
+    for k in range(LANES, n):
+        for j in range(k // LANES * LANES):
+            G[k, j] = G[j, k]
 
 
 @jit
@@ -64,66 +77,6 @@ def solve_rows(U, n, B, columns):
 
 
 @jit
-def root_action(A, n, d, b, g, inverse_root, scratch):
-    """b ← f(A) b for symmetric positive semidefinite A, without its eigenvectors: in half the time of finding them.
-
-    The reduction to a diagonal matrix, A = Qᵀ Λ Q, is a product of reflections and rotations; they turn b and g as they
-    are found, and are undone on f(Λ) Q b in the reverse order.
-
-    Args:
-        A: Symmetric (n, n), rows contiguous; is destroyed.
-        n: Order.
-        d: Gets the eigenvalues (n,).
-        b: A vector (n,).
-        g: Another; gets Q g.
-        inverse_root: Whether f(λ) = 1/√(1+λ), or else f(λ) = 1 / (1 + λ + √(1+λ)).
-        scratch: At least 5 n + 3 (2 n² + 8 n) numbers.
-
-    Returns:
-        bᵀ (I + A)⁻¹ g of the b given; NaN if a number is not finite.
-    """
-    half = scratch[2 * n : 3 * n]
-    _tridiagonal(A, n, d, half, scratch)
-    for k in range(n - 2):
-        if half[k] != 0.0:
-            _reflect(A[k, k + 1 : n], half[k], b[k + 1 : n])
-            _reflect(A[k, k + 1 : n], half[k], g[k + 1 : n])
-    pairs = matrix(scratch, 3 * n, n, 2)
-    turns = scratch[5 * n : 5 * n + 3 * (2 * n * n + 8 * n)]
-    for k in range(n):
-        pairs[k, 0] = b[k]
-        pairs[k, 1] = g[k]
-    count = _ql(n, d, scratch, turns, pairs)
-    if count < 0:
-        return np.nan
-    product = 0.0
-    for k in range(n):
-        grown = 1.0 + max(d[k], 0.0)
-        b[k] = pairs[k, 0]
-        g[k] = pairs[k, 1]
-        product += b[k] * g[k] / grown
-        b[k] /= np.sqrt(grown) if inverse_root else grown + np.sqrt(grown)
-    for at in range(count - 3, -1, -3):
-        c, s, i = turns[at], turns[at + 1], int(turns[at + 2])
-        b[i], b[i + 1] = c * b[i] + s * b[i + 1], c * b[i + 1] - s * b[i]
-    for k in range(n - 3, -1, -1):
-        if half[k] != 0.0:
-            _reflect(A[k, k + 1 : n], half[k], b[k + 1 : n])
-    return product
-
-
-@jit
-def _reflect(v, half, x):
-    """x ← (I - v vᵀ / half) x."""
-    dot = 0.0
-    for j in range(v.size):
-        dot += v[j] * x[j]
-    dot /= half
-    for j in range(v.size):
-        x[j] -= dot * v[j]
-
-
-@jit
 def symmetric_eigen(A, n, values, V, scratch):
     """Find the eigenvalues and eigenvectors of the leading n rows and columns of symmetric A, which is destroyed.
 
@@ -138,7 +91,7 @@ def symmetric_eigen(A, n, values, V, scratch):
         False if it does not converge, which only a number that is not finite can cause.
     """
     halves = scratch[2 * n : 3 * n]
-    _tridiagonal(A, n, values, halves, scratch)
+    tridiagonal(A, n, values, halves, scratch)
     for i in range(n):
         for j in range(n):
             V[i, j] = 0.0
@@ -154,73 +107,74 @@ def symmetric_eigen(A, n, values, V, scratch):
             add_scaled(n, A[k, j], V[j].ctypes.data, w.ctypes.data)
         for j in range(k + 1, n):
             add_scaled(n, -A[k, j] / halves[k], w.ctypes.data, V[j].ctypes.data)
-    return _ql(n, values, scratch, scratch[:0], V) >= 0
+    return _ql(n, values, scratch, V)
 
 
 @jit
-def _tridiagonal(A, n, d, halves, scratch):
-    """Reduce A to a tridiagonal T: its diagonal goes to d, T[k, k-1] to scratch[k]; uses scratch[n : 2n].
+def tridiagonal(A, n, d, halves, scratch):
+    """Reduce the leading n rows and columns of symmetric A to a tridiagonal T = H A Hᵀ.
 
-    T = H A Hᵀ with H = … H₁ H₀ and Hₖ = I - v vᵀ / halves[k]; v stays in A[k, k+1:]. Where halves[k] is 0, Hₖ = I.
+    H = … H₁ H₀ with Hₖ = I - v vᵀ / halves[k]; where halves[k] is 0, Hₖ = I.
+
+    Args:
+        A: Symmetric, at least (n, n), rows contiguous; gets v in A[k, k+1:], and zeros before it from the place where
+            a vector begins, so that whole vectors can be worked on.
+        n: Order.
+        d: Gets the diagonal of T (n,).
+        halves: Gets vᵀ v / 2, (n,).
+        scratch: At least 2 n numbers; gets T[k, k-1] in scratch[k].
     """
     e = scratch[:n]
-    w = scratch[n : 2 * n]
-    to_w = w.ctypes.data
+    to_w = scratch[n : 2 * n].ctypes.data
     e[0] = 0.0
     for k in range(n - 2):
-        # The reflection I - 2 v vᵀ / (vᵀ v) that turns A[k, k+1:] into a multiple of e₁; v stays in that row.
-        size = n - k - 1
-        v = A[k, k + 1 : n]
-        scale = 0.0
-        for j in range(size):
-            scale = max(scale, abs(v[j]))
-        tail = 0.0
-        for j in range(1, size):
-            tail += abs(v[j])
-        if tail == 0.0:
-            e[k + 1] = v[0]
+        d[k] = A[k, k]
+        first = begin(k)
+        size = n - first
+        for j in range(first, k + 1):
+            A[k, j] = 0.0
+        row, u = A[k, first:].ctypes.data, k + 1 - first
+        head = A[k, k + 1]
+        A[k, k + 1] = 0.0
+        tail = dot(size, row, row)
+        if tail < _NOTHING:
+            e[k + 1] = head
             halves[k] = 0.0
             continue
-        norm = 0.0
-        for j in range(size):
-            v[j] /= scale
-            norm += v[j] * v[j]
-        length = np.sqrt(norm)
-        if v[0] > 0.0:
+        # The reflection I - 2 v vᵀ / (vᵀ v) that turns A[k, k+1:] into a multiple of e₁.
+        length = np.sqrt(head * head + tail)
+        if head > 0.0:
             length = -length
-        e[k + 1] = scale * length
+        e[k + 1] = length
         # vᵀ v / 2 after the change of v₀.
-        half = norm - v[0] * length
+        half = length * (length - head)
         halves[k] = half
-        v[0] -= length
-        # A ← A - v qᵀ - q vᵀ with q = w - (vᵀ w / (2 half)) v, w = A v / half.
-        combine(size, v.ctypes.data, 1, A[k + 1, k + 1 :].ctypes.data, A.shape[1], size, to_w)
-        dot = 0.0
-        for j in range(size):
-            w[j] /= half
-            dot += v[j] * w[j]
-        dot /= 2.0 * half
-        for j in range(size):
-            w[j] -= dot * v[j]
-        to_v = v.ctypes.data
-        for j in range(size):
-            add_both_scaled(size, -v[j], to_w, -w[j], to_v, A[k + 1 + j, k + 1 :].ctypes.data)
+        A[k, k + 1] = head - length
+        # A ← A - (v qᵀ + q vᵀ) / half with q = w - (vᵀ w / (2 half)) v, w = A v. Before column k + 1 the same sums apply
+        # the reflection from one side, to what is not looked at again.
+        below = A[k + 1, first:].ctypes.data
+        combine(size - u, row + 8 * u, 1, below, A.shape[1], size, to_w)
+        add_scaled(size, -dot(size, row, to_w) / (2.0 * half), row, to_w)
+        add_outer(size - u, size, -1.0 / half, row + 8 * u, to_w, to_w + 8 * u, row, below, A.shape[1])
+    for k in range(max(n - 2, 0), n):
+        d[k] = A[k, k]
     if n > 1:
         e[n - 1] = A[n - 2, n - 1]
-    for k in range(n):
-        d[k] = A[k, k]
 
 
 @jit
-def _ql(n, d, e, turns, V):
-    """Diagonalise T (diagonal d, below it e[1:]) by implicit shifts.
+def begin(k):
+    """Where the vector begins that holds column k + 1."""
+    return (k + 1) // LANES * LANES
 
-    The rows of V are turned along. The rotations are written to `turns` as c, s and row, unless it is empty.
+
+@jit
+def _ql(n, d, e, V):
+    """Diagonalise T (diagonal d, below it e[1:]) by implicit shifts, and turn the rows of V along.
 
     Returns:
-        How many numbers were written; -1 if it does not converge.
+        False if it does not converge.
     """
-    written = 0
     columns = V.shape[1]
     for k in range(1, n):
         e[k - 1] = e[k]
@@ -236,7 +190,7 @@ def _ql(n, d, e, turns, V):
             if high == low:
                 break
             if sweep == _SWEEPS:
-                return -1
+                return False
             g = (d[low + 1] - d[low]) / (2.0 * e[low])
             r = np.hypot(g, 1.0)
             g = d[high] - d[low] + e[low] / (g + (r if g >= 0.0 else -r))
@@ -262,13 +216,6 @@ def _ql(n, d, e, turns, V):
                 d[i + 1] = g + p
                 g = c * r - b
                 rotate(columns, c, s, V[i].ctypes.data, V[i + 1].ctypes.data)
-                if turns.size > 0:
-                    if written + 3 > turns.size:
-                        return -1
-                    turns[written] = c
-                    turns[written + 1] = s
-                    turns[written + 2] = i
-                    written += 3
             if early:
                 continue
             d[low] -= p
@@ -276,5 +223,5 @@ def _ql(n, d, e, turns, V):
             e[high] = 0.0
     for k in range(n):
         if not np.isfinite(d[k]):
-            return -1
-    return written
+            return False
+    return True
