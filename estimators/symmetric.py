@@ -150,8 +150,8 @@ def tridiagonal(A, n, d, halves, scratch):
         half = length * (length - head)
         halves[k] = half
         A[k, k + 1] = head - length
-        # A ← A - (v qᵀ + q vᵀ) / half with q = w - (vᵀ w / (2 half)) v, w = A v. Before column k + 1 the same sums apply
-        # the reflection from one side, to what is not looked at again.
+        # A ← A - (v qᵀ + q vᵀ) / half with q = w - (vᵀ w / (2 half)) v, w = A v. Before column k + 1 the same sums
+        # apply the reflection from one side, to what is not looked at again.
         below = A[k + 1, first:].ctypes.data
         combine(size - u, row + 8 * u, 1, below, A.shape[1], size, to_w)
         add_scaled(size, -dot(size, row, to_w) / (2.0 * half), row, to_w)
