@@ -54,7 +54,8 @@ def catalogue() -> Table:
 def option_text(option: Option) -> str:
     """One option with its default, range and unit."""
     unit = f" {option.unit}" if option.unit else ""
-    return f"{option.name} {option.default:g}{unit} ({option.low:g} to {option.high:g}): {option.meaning}"
+    whole = ", whole" if option.whole else ""
+    return f"{option.name} {option.default:g}{unit} ({option.low:g} to {option.high:g}{whole}): {option.meaning}"
 
 
 def fitting(twin: Twin) -> Table:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from estimators.errors import ConfigError
 from estimators.log import RESET, Readings
-from estimators.registry import find_estimator
+from estimators.registry import checked, find_estimator
 
 from . import commands
 from .playback import PLAYBACK, play
@@ -33,13 +33,14 @@ def retuned(command: Refolding, engine: Any) -> tuple[str, Tuning]:
         return engine.twin.estimator, engine.twin.tuning
     estimator, tuning = engine.estimator, engine.tuning
     if isinstance(command, commands.SetEstimator):
-        estimator = command.name
-        find_estimator(estimator, engine.model)
-        return estimator, tuning.with_options(engine.options_of(estimator))
+        entry = find_estimator(command.name, engine.model)
+        options = engine.options_of(entry.name)
+        checked(entry, engine.model, options)
+        return entry.name, tuning.with_options(options)
     if isinstance(command, commands.SetOption):
         entry = find_estimator(estimator, engine.model)
         options = {**tuning.options, command.name: _number(entry, command)}
-        entry.complete(options)
+        checked(entry, engine.model, options)
         return estimator, tuning.with_options(options)
     if isinstance(command, commands.UseSensor):
         return estimator, tuning.set(f"use.{command.name}", command.used)

@@ -17,7 +17,7 @@ from config.source_schema import AssetSection
 from config.yaml_lines import parse
 from estimators.errors import ConfigError, EstimatorError
 from estimators.model import StateSpaceModel
-from estimators.registry import find_entry, find_estimator
+from estimators.registry import checked, find_entry, find_estimator
 from estimators.tuning import Tuning
 
 from .twin_model import check_named, configure, find_model
@@ -153,11 +153,12 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
     config = loaded.config
     model = configure(find_model(loaded, ("model",), config.model), loaded)
     for name, given in config.filters.items():
-        with _placed(loaded, ("filters", name)):
-            find_entry(name).complete(dict(given))
-    options = {**config.filters.get(config.estimator.name, {}), **config.estimator.options}
+        _check_options(loaded, ("filters", name), name, given, model)
+    first = config.estimator
     with _placed(loaded, ("estimator",)):
-        find_estimator(config.estimator.name, model).complete(options)
+        find_estimator(first.name, model)
+    _check_options(loaded, ("estimator", "options"), first.name, first.options, model)
+    options = {**config.filters.get(first.name, {}), **first.options}
     tuning = Tuning.of(model).with_options(options).set("gate", config.gate)
     for name, section in config.sensors.items():
         if not section.use:
@@ -169,11 +170,22 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
         loaded=loaded,
         model=model,
         tuning=tuning,
-        estimator=config.estimator.name,
+        estimator=first.name,
         pairs=_pairs(loaded, model),
         overrides=overrides,
         plan=plan_source(loaded, model, [Path(file) for file in log_files] if log_files else None),
     )
+
+
+def _check_options(
+    loaded: Loaded, key: tuple[str, ...], name: str, given: Mapping[str, float], model: StateSpaceModel
+) -> None:
+    """Refuse options, given under `key`, that the estimator of that name cannot run with; each has its own line."""
+    with _placed(loaded, key):
+        entry = find_entry(name)
+    for option, value in given.items():
+        with _placed(loaded, (*key, option)):
+            checked(entry, model, {option: value})
 
 
 @contextmanager

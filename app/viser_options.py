@@ -65,6 +65,6 @@ class OptionRows:
         return NumberRow(
             self._gui, self._coalescer, key=f"{entry.name}.{option.name}", label=option.name, unit=option.unit,
             value=value, configured=option.default, low=option.low, hint=option.meaning, complain=self._complain,
-            high=option.high if option.high <= WIDE else float("inf"),
+            high=option.high if option.high <= WIDE else float("inf"), whole=option.whole,
             command=partial(SetOption, option.name),
         )  # fmt: skip

@@ -48,9 +48,9 @@ def _same(a: Any, b: Any) -> bool:
     return a == b
 
 
-def number_text(value: float) -> str:
-    """A number as the field shows it: four digits, no more."""
-    return f"{value:.4g}"
+def number_text(value: float, whole: bool = False) -> str:
+    """A number as the field shows it: four digits, no more; all of them of a count."""
+    return f"{value:.0f}" if whole else f"{value:.4g}"
 
 
 class NumberRow:
@@ -70,6 +70,7 @@ class NumberRow:
         low: float = 0.0,
         high: float = np.inf,
         logarithmic: bool = False,
+        whole: bool = False,
         hint: str | None = None,
         complain: Callable[[str], None] = lambda text: None,
         clock: Callable[[], float] = time.monotonic,
@@ -80,6 +81,7 @@ class NumberRow:
         self._value = value
         self._base = configured
         self._logarithmic = logarithmic and configured > 0
+        self._whole = whole
         self.slider: viser.GuiSliderHandle[float] | None = None
         self.field: viser.GuiTextHandle | None = None
         name = label.replace("_", " ")
@@ -89,14 +91,14 @@ class NumberRow:
                 name, -float(DECADES), float(DECADES), 0.01, self._place(value), marks=((0.0, ""),), hint=note
             )
         elif np.isfinite([low, high]).all() and high > low:
-            step = 10.0 ** np.floor(np.log10((high - low) / 200))
+            step = 1.0 if whole else 10.0 ** np.floor(np.log10((high - low) / 200))
             shown = f"{name} [{unit}]" if unit and unit != "1" else name
             self.slider = gui.add_slider(
                 shown, low, high, float(step), float(np.clip(value, low, high)), marks=(), hint=hint
             )
         if self._logarithmic or self.slider is None:
             under = unit if self.slider is not None else f"{name} [{unit}]" if unit and unit != "1" else name
-            self.field = gui.add_text(under or " ", number_text(value), hint=hint)
+            self.field = gui.add_text(under or " ", number_text(value, whole), hint=hint)
             self.field.on_update(self.typed)
         if self.slider is not None:
             self.slider.on_update(self.dragged)
@@ -111,7 +113,7 @@ class NumberRow:
         self._value = value
         self._held.edited(value)
         if self.field is not None:
-            self.field.value = number_text(value)
+            self.field.value = number_text(value, self._whole)
         self._complain("")
         self._coalescer.dragged(self.key, self._command(value))
 
@@ -143,7 +145,7 @@ class NumberRow:
         if self.slider is not None:
             self.slider.value = self._place(value)
         if self.field is not None:
-            self.field.value = number_text(value)
+            self.field.value = number_text(value, self._whole)
 
     def remove(self) -> None:
         """Take the row off the panel."""

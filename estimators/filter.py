@@ -52,7 +52,8 @@ Options = dict[str, float]
 class Option(NamedTuple):
     """One option of an estimator: where its value starts, and the range and unit that a panel offers.
 
-    An option with `choices` has the position of one of them as its value.
+    An option whose default is an int is a count: its value must be a whole number. One with `choices` has the position
+    of one of them as its value.
     """
 
     name: str
@@ -62,6 +63,11 @@ class Option(NamedTuple):
     unit: str
     meaning: str
     choices: tuple[str, ...] = ()
+
+    @property
+    def whole(self) -> bool:
+        """Whether its value must be a whole number."""
+        return isinstance(self.default, int)
 
     @staticmethod
     def choice(name: str, choices: tuple[str, ...], meaning: str, default: int = 0) -> Option:
@@ -124,7 +130,7 @@ class Estimator:
         """The given options and the defaults of the others.
 
         Raises:
-            EstimatorError: If an option is unknown or out of its range.
+            EstimatorError: If an option is unknown, out of its range, or a fraction where it is a count.
         """
         known = {option.name: option for option in self.options}
         for name, value in options.items():
@@ -138,6 +144,10 @@ class Estimator:
                 raise EstimatorError(
                     f"estimator {self.name}: {name} is {value:g}; it must lie between {option.low:g} and "
                     f"{option.high:g}"
+                )
+            if option.whole and value != int(value):
+                raise EstimatorError(
+                    f"estimator {self.name}: {name} is {value:g}; it must be a whole number, such as {int(value)}"
                 )
             if option.choices and value != int(value):
                 codes = ", ".join(f"{code} ({choice})" for code, choice in enumerate(option.choices))

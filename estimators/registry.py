@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from difflib import get_close_matches
 
 from .apf import APF
@@ -11,7 +12,7 @@ from .enkf import ENKF
 from .ensrf import ENSRF
 from .errors import EstimatorError
 from .etkf import ETKF
-from .filter import Estimator
+from .filter import Estimator, Options
 from .filterpy_ import FILTERPY_EKF, FILTERPY_ENKF, FILTERPY_KF, FILTERPY_UKF
 from .iekf import IEKF
 from .kf import KF
@@ -20,6 +21,7 @@ from .letkf import LETKF
 from .model import LARGE, StateSpaceModel
 from .pf import PF, PF_REG
 from .pf_ekf import PF_EKF
+from .placed import check_placed
 from .rbpf import RBPF
 from .sr_ekf import SR_EKF
 from .sr_kf import SR_KF
@@ -58,6 +60,20 @@ def find_estimator(name: str, model: StateSpaceModel) -> Estimator:
     if reason:
         raise EstimatorError(f"estimator {name} does not apply: {reason}")
     return entry
+
+
+def checked(entry: Estimator, model: StateSpaceModel, options: Mapping[str, float]) -> Options:
+    """The options, completed, if the estimator can run with them on the model; nothing is compiled for the answer.
+
+    Raises:
+        EstimatorError: If one is unknown, breaks its rule, or asks for what the model does not say.
+    """
+    values = entry.complete(dict(options))
+    try:
+        check_placed(model, values.get("radius", 0.0))
+    except EstimatorError as error:
+        raise EstimatorError(f"estimator {entry.name}: {error}") from None
+    return values
 
 
 def unfit(entry: Estimator, model: StateSpaceModel) -> str | None:

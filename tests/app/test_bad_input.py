@@ -31,7 +31,9 @@ BAD = {
     "no particles": ("pf", "particles", 0.0, "particles is 0; it must lie between 2 and"),
     "no members": ("etkf", "members", 0.0, "members is 0; it must lie between 2 and"),
     "no spread of sigma points": ("ukf", "alpha", 0.0, "alpha is 0; it must lie between"),
-    "a radius without positions": ("ensrf", "radius", 5.0, "position"),
+    "a fraction of members": ("etkf", "members", 2.5, "members is 2.5; it must be a whole number"),
+    "a fraction of particles": ("pf", "particles", 99.5, "particles is 99.5; it must be a whole number"),
+    "a radius without positions": ("ensrf", "radius", 5.0, "does not say where its states are; give them positions"),
     "no such option": ("ekf", "particles", 9.0, "has no option 'particles'"),
 }
 PATH = ROOT / "config" / "twins" / "motor_winding.yaml"
@@ -76,43 +78,29 @@ def one_line(text, expected):
 @pytest.mark.parametrize("case", BAD)
 def test_an_option_that_cannot_be_is_one_line_and_changes_nothing(case, way, start):
     name, option, value, expected = BAD[case]
-    if way in ("yaml", "set"):
-        text = PATH.read_text()
-        given = f"estimator: {{name: {name}, options: {{{option}: {value}}}}}"
+    if way in ("yaml", "filters", "set"):
         with pytest.raises(NisusError) as caught:
-            if way == "yaml":
-                prepare(restore_twin(text.replace("estimator: kf", f"{given} "), PATH))
+            if way == "set":
+                overrides = {"estimator": name, f"estimator.options.{option}": str(value)}
+                place = f"--set estimator.options.{option}={value}: "
+                load_twin("motor_winding", overrides=overrides)
             else:
-                prepare(load_twin("motor_winding", overrides={f"estimator.options.{option}": str(value)} | {
-                    "estimator": name}))  # fmt: skip
+                text, line = with_option(way, name, option, value)
+                place = f"motor_winding.yaml:{line}: "
+                restore_twin(text, PATH)
+        one_line(str(caught.value), expected)
+        assert place in str(caught.value)
+        return
+    source, engine = start(load_twin("motor_winding", overrides={"estimator": name}))
+    if way == "api":
+        with pytest.raises(NisusError) as caught:
+            command_from_json({"command": "SetOption", "name": option, "value": value}, engine)
         one_line(str(caught.value), expected)
         return
-    if way == "filters":
-        overrides = {f"filters.{name}.{option}": str(value)}
-        if case != "a radius without positions":
-            with pytest.raises(NisusError) as caught:
-                load_twin("motor_winding", overrides=overrides)
-            one_line(str(caught.value), expected)
-            return
-        source, engine = start(load_twin("motor_winding", overrides=overrides))
-        command = commands.SetEstimator(name)
-    else:
-        source, engine = start(load_twin("motor_winding", overrides={"estimator": name}))
-        command = commands.SetOption(option, value)
     source.put(reading(engine.model, 1.0, [40.0]))
     wait_for(lambda: len(rows(engine).readings) == 1)
     estimator, options = engine.status().estimator, engine.status().options
-    if way == "page":
-        from_the_page(engine, option, value)
-    elif way == "api":
-        body = {"command": "SetOption", "name": option, "value": value}
-        try:
-            engine.submit(command_from_json(body, engine))
-        except NisusError as refusal:
-            one_line(str(refusal), expected)
-            return
-    else:
-        engine.submit(command)
+    from_the_page(engine, option, value)
     wait_for(lambda: errors(engine))
     (text,) = errors(engine)
     one_line(text, expected)
@@ -123,6 +111,15 @@ def test_an_option_that_cannot_be_is_one_line_and_changes_nothing(case, way, sta
     source.put(reading(engine.model, 2.0, [41.0]))
     wait_for(lambda: len(rows(engine).readings) == 2)
     assert rows(engine).track.verdict[1] == USED
+
+
+def with_option(way, name, option, value):
+    """The twin's YAML with one option of a filter, of the first one or of another, and the line where it stands."""
+    head, tail = PATH.read_text().split("\nestimator: kf")
+    first = f"\nestimator:\n  name: {name}\n  options:\n    {option}: {value}"
+    other = f"\nestimator: kf\nfilters:\n  {name}:\n    {option}: {value}"
+    head += first if way == "yaml" else other
+    return head + tail[tail.index("\ngate:") :], head.count("\n") + 1
 
 
 def from_the_page(engine, option, value):

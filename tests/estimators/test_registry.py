@@ -10,7 +10,7 @@ from estimators.errors import EstimatorError
 from estimators.fold import Fold
 from estimators.log import READING, Log, Readings
 from estimators.models import MODELS
-from estimators.registry import ESTIMATORS, find_estimator, unfit
+from estimators.registry import ESTIMATORS, checked, find_estimator, unfit
 from estimators.tuning import Tuning
 
 WINDING = MODELS["motor_winding"]
@@ -63,9 +63,32 @@ def test_options_are_checked(name):
             assert (option.low, option.high) == (0.0, len(option.choices) - 1.0)
             with pytest.raises(EstimatorError, match=f"{option.name} is 0.5; it must be one of 0 .{option.choices[0]}"):
                 entry.complete({option.name: 0.5})
+        elif option.whole:
+            with pytest.raises(EstimatorError, match=rf"{option.name} is .*\.5; it must be a whole number, such as"):
+                entry.complete({option.name: option.low + 0.5})
+        else:
+            middle = 0.5 * (option.low + option.high)
+            assert entry.complete({option.name: middle})[option.name] == middle
     model = ANYBODYS
     with pytest.raises(EstimatorError, match="no option"):
         Fold(name, model, Tuning.of(model).with_options({"wings": 2.0}), Log(1))
+
+
+def test_what_is_counted_is_whole_and_what_is_measured_is_not():
+    whole = {option.name for entry in ESTIMATORS.values() for option in entry.options if option.whole}
+    assert whole == {"members", "particles", "resampling", "rotation"}
+
+
+def test_a_radius_is_refused_where_the_model_says_no_positions():
+    letkf = ESTIMATORS["letkf"]
+    model = MODELS["lorenz96"]
+    assert checked(letkf, model, {"radius": 4.0})["radius"] == 4.0
+    assert checked(letkf, WINDING, {"radius": 0.0})["radius"] == 0.0
+    with pytest.raises(EstimatorError, match="letkf: radius is 4, but model motor_winding .* where its states are"):
+        checked(letkf, WINDING, {"radius": 4.0})
+    blind = replace(model.sensors[0], rows=tuple(replace(row, position=None) for row in model.sensors[0].rows))
+    with pytest.raises(EstimatorError, match="does not say where its sensor rows are; give them positions"):
+        checked(letkf, replace(model, sensors=(blind, *model.sensors[1:])), {"radius": 4.0})
 
 
 def test_kf_refuses_a_nonlinear_model_and_names_what_to_use():
