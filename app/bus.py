@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import sys
 import threading
 import time
 from collections import Counter
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from estimators.errors import ConfigError
 
 from .cli import settings
+from .complain import complain
 from .twin import Twin, load_twin
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def play_bus(arguments: Bus) -> int:
     def report(key: str, text: str) -> None:
         counts[key] += 1
         if counts[key] == 1:
-            print(f"nisus: {text}", file=sys.stderr)
+            complain(text)
 
     player = twin.plan.player(report, interface=arguments.interface, channel=channel)
     logger = None

@@ -15,6 +15,8 @@ import tyro
 
 from estimators.errors import ConfigError, NisusError
 
+from .complain import complain
+
 Twin = Annotated[str, tyro.conf.Positional]
 Settings = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
@@ -246,14 +248,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return carry_out(parse(sys.argv[1:] if arguments is None else arguments))
     except NisusError as error:
-        print(f"nisus: {error}", file=sys.stderr)
+        complain(error)
         return 2
     except BrokenPipeError:
         # Whoever read the output has had enough of it (`| head`). Python's own flush at exit must not fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        print(f"nisus: {error.filename or ''}: {error.strerror or error}", file=sys.stderr)
+        complain(f"{error.filename or ''}: {error.strerror or error}")
         return 2
     except KeyboardInterrupt:
         return 130

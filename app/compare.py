@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
@@ -24,6 +23,7 @@ from .cli import settings
 from .compare_fold import BUDGET, Row, fold_row
 from .compare_table import caption, table, write_table
 from .compile import prepare
+from .complain import complain
 from .fold import read_log
 from .progress import progress
 from .twin import Twin, load_twin
@@ -48,7 +48,7 @@ def compare_twin(arguments: Arguments) -> int:
         try:
             _compare(arguments, name)
         except SourceError as error:  # a recording that is not there
-            print(f"nisus: {error}", file=sys.stderr)
+            complain(error)
             failed = 2
     return failed
 

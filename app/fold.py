@@ -24,6 +24,7 @@ from estimators.tuning import TOGETHER
 
 from .cli import settings
 from .compile import prepare
+from .remarks import remarking
 from .twin import Twin, load_twin
 
 if TYPE_CHECKING:
@@ -37,13 +38,11 @@ def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
         SourceError: If the source cannot be opened, has no end, or says nothing.
     """
     counts: Counter[str] = Counter()
-    lines: dict[str, str] = {}
 
-    def report(key: str, text: str) -> None:
+    def count(key: str, text: str) -> None:
         counts[key] += 1
-        lines.setdefault(key, text)
 
-    source = twin.open_source(report, live=False)
+    source = twin.open_source(remarking(count), live=False)
     if duration is None and getattr(source, "endless", False):
         source.close()
         raise SourceError(f"{twin.name}: its source has no end; give --duration SECONDS")
@@ -59,7 +58,9 @@ def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
     finally:
         source.close()
     if not log.n:
-        raise SourceError(f"{twin.name}: its source said nothing that a sensor needs; check the channel maps")
+        files = ", ".join(map(str, twin.plan.log_files or ()))
+        place = f"--log {files}" if files else twin.loaded.places.at(("source",))
+        raise SourceError(f"{place}: the source said nothing that a sensor needs; check the channel maps")
     return log, +counts
 
 

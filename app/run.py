@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -11,6 +10,8 @@ from estimators.errors import ConfigError
 
 from .cli import settings
 from .compile import prepare
+from .complain import complain
+from .remarks import remarking
 from .session import Page, Session
 from .twin import Twin, load_twin
 
@@ -26,6 +27,7 @@ def live_source(twin: Twin, speed: float) -> Callable[[Callable[[str, str], None
     def open_source(report: Callable[[str, str], None]) -> Source:
         from sources.pacer import Pacer
 
+        report = remarking(report)
         source = twin.open_source(report)
         if source.live:
             return source
@@ -59,5 +61,5 @@ def run_twin(arguments: Run) -> int:
         print(", ".join(f"{name} {count}" for name, count in status.counts.items() if count or name == "readings"))
         failures = {notice.text: None for notice in session.engine.notices.since(0) if notice.level == "error"}
         for text in list(failures)[:SAID]:
-            print(f"nisus: {text}", file=sys.stderr)
+            complain(text)
     return 0

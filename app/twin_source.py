@@ -159,6 +159,7 @@ class Plan:
                     channels=channels,
                     width=self.model.width,
                     report=report,
+                    horizon=self.loaded.config.time.horizon,
                 ),
             )
         from sources.can_log import CanLog

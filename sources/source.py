@@ -81,6 +81,20 @@ class Channel:
         return tuple(dict.fromkeys((*self.signals, *(item.signal for item in (*self.where, *self.only)))))
 
 
+MOST = 60
+"""Letters of a text from a file that a message shows."""
+
+
+def quoted(text: str) -> str:
+    """A text from a file as a message shows it: cut, in quotes, and with what is no letter escaped."""
+    return repr(text if len(text) <= MOST else text[: MOST - 3] + "...")
+
+
+def plain(name: str) -> str:
+    """A name from a file as a message shows it: as it is, unless it is long or holds what is no letter."""
+    return name if len(name) <= MOST and name.isprintable() else quoted(name)
+
+
 def nearest(name: str, names: Iterable[str]) -> str:
     """What to offer in place of a name that is not among `names`: the near ones, or all if they are few."""
     names = list(names)
@@ -89,8 +103,8 @@ def nearest(name: str, names: Iterable[str]) -> str:
         lower = name.lower()
         near = [item for item in names if lower in item.lower() or (len(item) > 2 and item.lower() in lower)][:3]
     if near:
-        return f"did you mean {' or '.join(near)}?"
-    shown = ", ".join(names[:12])
+        return f"did you mean {' or '.join(map(plain, near))}?"
+    shown = ", ".join(map(plain, names[:12]))
     return f"choose from {shown}{', ...' if len(names) > 12 else ''}" if names else "there are none to choose from"
 
 

@@ -15,6 +15,7 @@ from .mapping import Mapping
 from .signals import ABSENT, PRESENT
 from .source import Channel, Report, ignore
 from .table_files import check_columns, read_table
+from .table_order import Order
 from .table_time import UNITS, column_ns
 
 
@@ -32,7 +33,9 @@ class Table:
         time_shift: Seconds added to it.
         channels: What feeds the model.
         width: Value columns of an event.
-        report: Told of rows without a time and of values that are no numbers, with file and line.
+        report: Told of rows without a time and of values that are no numbers, with file and line; and once of times
+            that run backwards or stand still.
+        horizon: Seconds by which a row may be older than one before it; None for any.
 
     Raises:
         SourceError: If a file or column is missing, or a unit does not convert.
@@ -50,6 +53,7 @@ class Table:
         channels: Iterable[Channel],
         width: int,
         report: Report = ignore,
+        horizon: float | None = None,
     ) -> None:
         self._files = [Path(file) for file in files]
         if not self._files:
@@ -63,6 +67,7 @@ class Table:
         for path in self._files:
             check_columns(path, [time_column, *self._columns])
         self._mapping = Mapping([(channels, self._columns, [None] * len(self._columns))], width=width, report=report)
+        self._order = Order(time_column, time_unit, None if horizon is None else round(horizon * 1e9), report)
         self._batches = self._all()
 
     def _all(self) -> Generator[Readings, None, None]:
@@ -78,6 +83,7 @@ class Table:
                         "undated row", f"{path.name}:{chunk.line[row]}: {self._time} is no time; the row is left out"
                     )
                 t = t + self._shift
+                self._order.look(path.name, chunk.line[known], t[known])
                 values = chunk.values
                 state = np.where(chunk.blank, ABSENT, PRESENT).astype(np.int8)
                 plan = np.zeros(t.size, np.int64)

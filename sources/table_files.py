@@ -11,9 +11,12 @@ import numpy as np
 
 from estimators.errors import SourceError
 
-from .source import nearest
+from .source import nearest, quoted
 
 CHUNK = 4096
+
+LONGEST = 2**20
+"""Letters in a line of column names."""
 
 UNREADABLE = "unreadable value"
 
@@ -39,7 +42,7 @@ def missing_column(path: Path, name: str, names: Sequence[str]) -> SourceError:
 
 
 def check_columns(path: Path, wanted: Sequence[str]) -> None:
-    """Refuse a file that lacks a column, or that is no table at all.
+    """Refuse a file that lacks a column, or rows, or that is no table at all.
 
     Raises:
         SourceError: Naming the file, the column and those that are near.
@@ -52,6 +55,8 @@ def check_columns(path: Path, wanted: Sequence[str]) -> None:
     for name in wanted:
         if name not in names:
             raise missing_column(path, name, names)
+    if path.suffix.lower() == ".csv" and not _has_rows(path):
+        raise SourceError(f"{path}: it has a header and no rows; record it again")
 
 
 def column_names(path: Path) -> list[str]:
@@ -111,10 +116,28 @@ def parquet_names(path: Path) -> list[str]:
         raise SourceError(f"{path}: it cannot be read as Parquet ({gist}); check that it is whole") from None
 
 
+def _has_rows(path: Path) -> bool:
+    """Whether anything follows the first line of a CSV."""
+    with path.open("rb") as file:
+        file.readline()
+        return any(line.strip() for line in file)
+
+
 def _header(path: Path) -> tuple[list[str], str]:
-    """Names in the first line of a CSV, and the mark between them."""
+    """Names in the first line of a CSV, and the mark between them.
+
+    Raises:
+        SourceError: If it begins with bytes that no text has.
+    """
+    with path.open("rb") as binary:
+        head = binary.read(CHUNK)
+    if any(byte < 9 or 13 < byte < 32 for byte in head):
+        raise SourceError(
+            f"{path}:1: it begins with {head[:20]!r} and is no text; give a CSV in UTF-8, or name the file by what it "
+            "is (.parquet, .mat, .npz)"
+        )
     with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
-        first = file.readline()
+        first = file.readline(LONGEST)
     mark = max(",;\t", key=first.count)
     names = next(csv.reader([first], delimiter=mark), [])
     return [name.strip() for name in names], mark
@@ -175,7 +198,9 @@ def _numbers(
             if not cell.strip():
                 blank[k] = True
             elif cell.strip().lower() not in ("na", "n/a", "null", "none"):
-                problem(UNREADABLE, lines[k], f"{name} is {cell.strip()!r}, which is no number; the value is missing")
+                problem(
+                    UNREADABLE, lines[k], f"{name} is {quoted(cell.strip())}, which is no number; the value is missing"
+                )
 
 
 def read_parquet(path: Path, time: str, columns: Sequence[str], problem: Problem) -> Generator[Chunk, None, None]:

@@ -9,7 +9,6 @@ from scripted import SECOND, Scripted, wait_for
 from viser import GuiEvent
 
 from app import commands
-from app.compile import prepare
 from app.engine import Engine
 from app.playback import play
 from app.server_api import command_from_json, status_json

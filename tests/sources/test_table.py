@@ -109,6 +109,40 @@ def test_rows_without_a_time_or_with_missing_cells_are_left_out_and_counted(tmp_
     assert reports.texts["truncated file"] == "drive.csv:5: the last line has 3 cells, not 7"
 
 
+@pytest.mark.parametrize("rest", ["", "\n", "\r\n", "\n \n\n"])
+def test_a_header_without_rows_is_named(tmp_path, rest):
+    path = write(tmp_path, HEADER.rstrip() + rest)
+    with pytest.raises(SourceError) as caught:
+        table(path)
+    assert str(caught.value) == f"{path}: it has a header and no rows; record it again"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 40, "t,x\n0,1\n".encode("utf-16"), b"t,\x1b[31mx\n0,1\n"],
+    ids=["picture", "utf-16", "colours"],
+)
+def test_a_file_that_is_no_text_is_told_in_letters_and_briefly(tmp_path, content):
+    path = tmp_path / "drive.csv"
+    path.write_bytes(content)
+    with pytest.raises(SourceError) as caught:
+        table(path)
+    text = str(caught.value)
+    assert text.startswith(f"{path}:1: it begins with {content[:20]!r} and is no text; give a CSV in UTF-8")
+    assert text.isprintable() and len(text) < len(str(path)) + 250
+
+
+def test_what_is_quoted_from_a_file_is_escaped_and_cut(tmp_path):
+    path = write(tmp_path, HEADER.replace("temp", "n" * 500 + "\x9b31m") + "0,1,1,1,1,1,1\n")
+    with pytest.raises(SourceError, match="there is no column 'temp'; choose from t, 'nnn.*[.]{3}', a, b") as caught:
+        table(path)
+    assert str(caught.value).isprintable() and len(str(caught.value)) < len(str(path)) + 200
+    reports = Reports()
+    read_all(table(write(tmp_path, HEADER + f"0,\x9b31m{'9' * 500}x,1,2,1,3,7\n"), report=reports))
+    text = reports.texts["unreadable value"]
+    assert text.startswith("drive.csv:2: temp is '\\x9b31m999") and text.isprintable() and len(text) < 150
+
+
 X = (Channel(READING, 0, "x", ("x",)),)
 
 
