@@ -44,7 +44,7 @@ def attend(model: StateSpaceModel, work: Callable[[], Any], doing: str, done: st
     Args:
         model: Whose function is named on standard error if it does not return.
         work: What to do.
-        doing: What a terminal shows meanwhile, if it takes long.
+        doing: What is shown meanwhile, if it takes long.
         done: What is said behind it then.
 
     Returns:
@@ -69,6 +69,8 @@ def attend(model: StateSpaceModel, work: Callable[[], Any], doing: str, done: st
     if thread.is_alive():
         console = Console(file=sys.stderr)
         watch = CallWatch(model)
+        if not console.is_terminal:  # where the status below shows nothing
+            console.print(f"{doing} ...", highlight=False, soft_wrap=True)
         with console.status(doing) as status:
             while thread.is_alive():
                 thread.join(0.5)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .compile import prepare
+from .port import check_port
 from .recorded import read_recording
 from .recording import tuning_from_json
 from .session import Page, Session
@@ -33,8 +34,10 @@ def open_review(path: Path, page: Page | None) -> tuple[Session, Recorded]:
     """A session over the recorded readings: the same engine, the same fold.
 
     Raises:
-        NisusError: If the recording cannot be read, or its model is not there.
+        NisusError: If the recording cannot be read, its model is not there, or the page's port is in use.
     """
+    if page is not None:
+        check_port(page.port)
     recorded = read_recording(path)
     twin = recorded_twin(recorded)
     prepare(twin)

@@ -11,6 +11,7 @@ from estimators.errors import ConfigError
 from .cli import settings
 from .compile import prepare
 from .complain import complain
+from .port import check_port
 from .remarks import remarking
 from .session import Page, Session
 from .twin import Twin, load_twin
@@ -52,8 +53,10 @@ def run_twin(arguments: Run) -> int:
     twin = load_twin(
         arguments.twin, log_files=arguments.log or None, overrides=settings(arguments.set, arguments.estimator)
     )
-    prepare(twin)
     page = None if arguments.headless else Page(arguments.port, not arguments.no_browser)
+    if page is not None:
+        check_port(page.port)
+    prepare(twin)
     session = Session(twin, live_source(twin, arguments.speed), page=page)
     session.run(record=arguments.record, duration=arguments.duration, until_finished=arguments.headless)
     if arguments.headless:

@@ -6,8 +6,6 @@ import asyncio
 import contextlib
 import gzip
 import json
-import os
-import socket
 import sys
 import threading
 import time
@@ -25,8 +23,9 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from estimators.errors import ConfigError, NisusError
+from estimators.errors import NisusError
 
+from .port import listen
 from .rerun_view import RerunFeed
 from .server_api import command_from_json, status_json
 from .server_gate import Gate, user_token
@@ -83,7 +82,7 @@ class PageServer:
         self._engine = engine
         self._review = review
         self._boot = uuid.uuid4().hex
-        self._socket = _listen(port)
+        self._socket = listen(port)
         self.port: int = self._socket.getsockname()[1]
         self._token = user_token()
         self._assets: Future[Path] = Future()
@@ -285,19 +284,3 @@ class _WithHeaders:
             await send(message)
 
         await self._application(scope, receive, send_more)
-
-
-def _listen(port: int) -> socket.socket:
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    try:
-        if os.name == "posix":
-            # Else a port that was just given up stays taken for a minute.
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind(("127.0.0.1", port))
-        listener.listen(128)
-    except (OSError, OverflowError) as error:
-        listener.close()
-        reason = getattr(error, "strerror", None) or "is no port"
-        raise ConfigError(f"port {port}: {reason}; choose another with --port") from None
-    listener.setblocking(False)
-    return listener

@@ -1,9 +1,13 @@
 """A function of a model that does not return is named; one that does is not, however often it is called."""
 
+import io
+import sys
 import threading
+import time
 
 import pytest
 
+import app.compile
 from app.compile import CALL_PATIENCE, CallWatch, attend
 from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
 
@@ -77,3 +81,28 @@ def test_attended_work_gives_what_it_gives():
     assert attend(MODEL, lambda: 3, "doing") == 3
     with pytest.raises(ZeroDivisionError):
         attend(MODEL, lambda: 1 / 0, "doing")
+
+
+class Pipe(io.StringIO):
+    """Output that somebody reads at the other end, as far as it was flushed."""
+
+    read = ""
+
+    def flush(self):
+        self.read = self.getvalue()
+
+
+def test_where_output_is_redirected_it_says_what_it_does_before_it_is_done(monkeypatch):
+    pipe = Pipe()
+    monkeypatch.setattr(sys, "stderr", pipe)
+    monkeypatch.setattr(app.compile, "PATIENCE", 0.0)
+
+    def work():
+        end = time.monotonic() + 10.0
+        while not pipe.read and time.monotonic() < end:
+            time.sleep(0.001)
+        return pipe.read
+
+    assert attend(MODEL, work, "compiling filters, once", "compiled filters, once") == "compiling filters, once ...\n"
+    before, after = pipe.read.splitlines()
+    assert after.startswith("compiled filters, once: ")
