@@ -22,7 +22,7 @@ from estimators.fold import Base
 from estimators.log import Readings
 from estimators.track import Track
 
-from .recording import FORMAT, TIMELINE, base_from_json
+from .recording import FORMAT, PREFIX, TIMELINE, base_from_json
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,13 @@ def read_recording(path: Path) -> Recorded:
                 content.read(whole)
             except Exception as error:  # noqa: BLE001  as above
                 if not (content.header and content.events):
-                    raise SourceError(f"{path}: cannot be read ({_line(error)}); is it an .rrd file?") from None
+                    text = _cut_short(path) or f"cannot be read ({_line(error)}); is it an .rrd file?"
+                    raise SourceError(f"{path}: {text}") from None
     header, tunings, notices = content.header, content.tunings, content.notices
     events, tracks = content.events, content.tracks
     if not header or not tunings:
-        raise SourceError(f"{path}: holds no recording of Nisus; record one with `nisus run TWIN --record FILE.rrd`")
+        text = _cut_short(path) or "holds no recording of Nisus; record one with `nisus run TWIN --record FILE.rrd`"
+        raise SourceError(f"{path}: {text}")
     if int(header["format"]) != FORMAT:
         raise SourceError(f"{path}: has format {header['format']}, this version reads {FORMAT}; use the other")
     first, log_columns = _latest(events)
@@ -145,6 +147,33 @@ def copy_whole(path: Path, to: Path) -> None:
             while end > 0 and (piece := file.read(min(end, 1 << 20))):
                 copy.write(piece)
                 end -= len(piece)
+
+
+BEGIN, END = b"RRF2", b"RRF2FOOT"
+"""What an .rrd begins with, and what stands in the last bytes of one that was finished."""
+
+
+def _cut_short(path: Path) -> str | None:
+    """What is missing of an .rrd that was not finished, and may be ours; None if it was, or is another program's."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(STREAM_HEADER + MESSAGE_HEADER.size)
+        _, length = (
+            MESSAGE_HEADER.unpack(head[STREAM_HEADER:])
+            if len(head) == STREAM_HEADER + MESSAGE_HEADER.size
+            else (0, size)
+        )
+        # The first message names the program; Rerun writes it in plain letters.
+        name = file.read(min(length, size))
+        file.seek(max(0, size - 4 * len(END)))
+        whole = END in file.read()
+    if not head.startswith(BEGIN) or whole:
+        return None
+    if len(name) < length:
+        return f"is cut short: {size:,} bytes do not say what it records; look for another copy"
+    if PREFIX.encode() not in name:
+        return None
+    return f"is a recording of Nisus, cut short before its first row: {size:,} bytes are there; look for another copy"
 
 
 def _control(name: str) -> bool:

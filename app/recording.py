@@ -26,6 +26,8 @@ from estimators.tuning import Tuning
 from .pull import Pull
 
 FORMAT = 1
+PREFIX = "nisus_"
+"""Of the name under which a recording is known to Rerun; the twin's follows."""
 TIMELINE = "event"
 PATIENCE = 5.0
 """Seconds for a file to take what it is given; Rerun would wait for ever on one that takes no more."""
@@ -112,7 +114,7 @@ class RecordingFile:
             path.open("wb").close()
         except OSError as error:
             raise SourceError(f"recording {path}: {error.strerror}; choose a place that can be written") from None
-        self.stream = rr.RecordingStream(f"nisus_{name}", recording_id=f"{name}-{path.stem}")
+        self.stream = rr.RecordingStream(f"{PREFIX}{name}", recording_id=f"{name}-{path.stem}")
         self.stream.set_sinks(rr.FileSink(str(path)))
         self.rows = 0
         self.stream.log(

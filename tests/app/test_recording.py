@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rerun as rr
 from scripted import MODEL, SECOND, Scripted, readings, twin, wait_for
 
 from app import commands
@@ -208,6 +209,33 @@ def test_truncated_recording_keeps_what_is_whole(tmp_path):
         if recorded.rows:
             assert_same(refold(recorded), recorded.track)
     assert kept == sorted(kept) and kept[-1] == 1000 and len(set(kept)) > 5
+
+
+def test_a_recording_cut_before_its_first_row_is_told_from_another_programs(tmp_path):
+    """Whatever its length, and also without its end; another program's is that, cut or whole."""
+    path, cut = tmp_path / "run.rrd", tmp_path / "cut.rrd"
+    RecordingFile(path, name="scripted", text="model: motor_winding\n", twin_path=Path("x.yaml"), base=None).close()
+    stream = rr.RecordingStream("another", recording_id="its")
+    stream.set_sinks(rr.FileSink(str(tmp_path / "other.rrd")))
+    stream.log("words", rr.TextLog("hello"))
+    stream.disconnect()
+    ours, other = path.read_bytes(), (tmp_path / "other.rrd").read_bytes()
+
+    def message(content):
+        cut.write_bytes(content)
+        with pytest.raises(SourceError) as caught:
+            read_recording(cut)
+        assert "\n" not in str(caught.value)
+        return str(caught.value).removeprefix(f"{cut}: ")
+
+    named = ours.index(b"nisus_scripted") + 60
+    for length in [*np.linspace(named, len(ours) - 40, 9).astype(int).tolist(), len(ours) - 40]:
+        expected = f"is a recording of Nisus, cut short before its first row: {length:,} bytes are there; "
+        assert message(ours[:length]).startswith(expected)
+    for length in (4, 11, 12, 27, 28, 60):
+        assert message(ours[:length]).startswith(f"is cut short: {length} bytes do not say what it records; ")
+    for content in (other, other[:-40], other[:1000], ours):  # the last is whole, and never began
+        assert message(content).startswith("holds no recording of Nisus; record one with")
 
 
 def test_recordings_with_one_true_value_an_event_read_back(tmp_path):
