@@ -157,17 +157,15 @@ def _cut_short(path: Path) -> str | None:
     """What is missing of an .rrd that was not finished, and may be ours; None if it was, or is another program's."""
     size = path.stat().st_size
     with path.open("rb") as file:
-        head = file.read(STREAM_HEADER + MESSAGE_HEADER.size)
-        _, length = (
-            MESSAGE_HEADER.unpack(head[STREAM_HEADER:])
-            if len(head) == STREAM_HEADER + MESSAGE_HEADER.size
-            else (0, size)
-        )
+        rerun = file.read(len(BEGIN)) == BEGIN
+        file.seek(STREAM_HEADER)
+        message = file.read(MESSAGE_HEADER.size)
+        length = MESSAGE_HEADER.unpack(message)[1] if len(message) == MESSAGE_HEADER.size else size
         # The first message names the program; Rerun writes it in plain letters.
         name = file.read(min(length, size))
         file.seek(max(0, size - 4 * len(END)))
         whole = END in file.read()
-    if not head.startswith(BEGIN) or whole:
+    if whole or not rerun:
         return None
     if len(name) < length:
         return f"is cut short: {size:,} bytes do not say what it records; look for another copy"
