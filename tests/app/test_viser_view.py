@@ -240,6 +240,17 @@ def test_status_moves_the_controls_without_an_echo(view, engine):
     assert len(engine.commands) == count
 
 
+def test_a_count_is_whole_on_its_slider_and_in_its_field(view, engine):
+    engine.submit(SetEstimator("pf"))
+    view.frame()
+    rows = view.panel.options.rows
+    assert rows["resampling"].slider.step == 1.0 and rows["fraction"].slider.step < 0.1
+    assert rows["particles"].field.value == "2000"
+    engine.submit(SetOption("particles", 12345.0))
+    view.frame()
+    assert rows["particles"].field.value == "12345"
+
+
 def test_slow_engine_does_not_snap_the_slider_back(view, engine, clock):
     engine.carry_out = False
     row = view.panel.rows["Q.rate"]
