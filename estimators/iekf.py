@@ -114,7 +114,7 @@ IEKF = Estimator(
     moments=moments,
     points=no_points,
     options=(
-        Option("iterations", 3.0, 1.0, 20.0, "", "linearisations of a reading, rounded down; 1 is the EKF"),
+        Option("iterations", 3, 1, 20, "", "linearisations of a reading; 1 is the EKF"),
         JOSEPH_OPTION,
         *OPTIONS,
     ),

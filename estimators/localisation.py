@@ -16,6 +16,7 @@ from .errors import EstimatorError
 from .filter import Options
 from .jit import floats, ints, jit, matrix
 from .model import StateSpaceModel
+from .placed import check_placed
 from .simd import LANES, WIDE
 from .threads import threaded
 
@@ -62,14 +63,10 @@ def prepare(model: StateSpaceModel, options: Options) -> np.ndarray:
     radius = options.get("radius", 0.0)
     if not radius > 0:
         return np.zeros(1, np.int64)
+    check_placed(model, radius)
     places = model.positions()
+    assert places is not None
     rows = [[row.position for row in sensor.rows] for sensor in model.sensors]
-    if places is None or any(place is None for sensor in rows for place in sensor):
-        what = "states" if places is None else "sensor rows"
-        raise EstimatorError(
-            f"radius is {radius:g}, but model {model.name} does not say where its {what} are; "
-            "give them positions, or set radius to 0"
-        )
     from scipy.spatial import cKDTree
 
     periods = np.array(model.periods or (np.inf,) * places.shape[1])
