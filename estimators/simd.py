@@ -17,8 +17,17 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from .jit import jit
+
 LANES = 8
 """Numbers in a vector."""
+
+
+@jit
+def padded(n):
+    """How wide a row of n numbers is that takes whole vectors."""
+    return (n + LANES - 1) // LANES * LANES
+
 
 WIDE = 32
 """Columns that `combine_wide` and `spread_wide` do at a time: four vectors, which stay in registers."""
@@ -47,6 +56,28 @@ def _load(builder: Any, pointer: Any, index: Any) -> Any:
 
 def _store(builder: Any, value: Any, pointer: Any, index: Any) -> None:
     builder.store(value, _at(builder, pointer, index), align=8)
+
+
+def _first_lanes(builder: Any, count: Any) -> Any:
+    """The mask of a vector's first `count` numbers (all of them where there are more)."""
+    lanes = ir.Constant(ir.VectorType(_I64, LANES), list(range(LANES)))
+    return builder.icmp_signed("<", lanes, _broadcast(builder, count))
+
+
+def _load_first(builder: Any, pointer: Any, index: Any, mask: Any) -> Any:
+    """A vector of which only the masked numbers are read; the others are 0."""
+    at = _at(builder, pointer, index)
+    kind = ir.FunctionType(_VECTOR, [at.type, _I32, mask.type, _VECTOR])
+    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.masked.load.v{LANES}f64.p0v{LANES}f64")
+    return builder.call(function, [at, ir.Constant(_I32, 8), mask, ir.Constant(_VECTOR, [0.0] * LANES)])
+
+
+def _store_first(builder: Any, value: Any, pointer: Any, index: Any, mask: Any) -> None:
+    """Write the masked numbers of a vector."""
+    at = _at(builder, pointer, index)
+    kind = ir.FunctionType(ir.VoidType(), [_VECTOR, at.type, _I32, mask.type])
+    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.masked.store.v{LANES}f64.p0v{LANES}f64")
+    builder.call(function, [value, at, ir.Constant(_I32, 8), mask])
 
 
 def _broadcast(builder: Any, value: Any) -> Any:
@@ -587,32 +618,144 @@ def product(
     first: Any,
     w: Any,
     out: Any,
+    columns: Any,
 ) -> Any:
-    """out (n, b_width) = first a₀ᵀ b₀ + w Σ_r a_rᵀ b_r over the rows a_r (n or more) and b_r (whole vectors).
+    """out (n, columns) = first a₀ᵀ b₀ + w Σ_r a_rᵀ b_r over the rows a_r (n or more) and b_r (whole vectors).
 
     Where a is b it is symmetric to the last bit.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        n, rows, a_width, b_width = given[0], given[1], given[3], given[5]
+        n, rows, a_width, b_width, columns = (given[k] for k in (0, 1, 3, 5, 9))
         a, b, out = (_pointer(builder, given[k]) for k in (2, 4, 8))
         first, weight = _broadcast(builder, given[6]), _broadcast(builder, given[7])
-        sums = cgutils.alloca_once(builder, _VECTOR)
+        sums = [cgutils.alloca_once(builder, _VECTOR) for _ in range(4)]
 
-        def entry(row: Any, i: Any) -> Any:
-            return _broadcast(builder, builder.load(builder.gep(row, [i])))
+        def entries(row: Any, i: Any, count: int) -> list[Any]:
+            return [
+                _broadcast(builder, builder.load(builder.gep(row, [builder.add(i, _count(k))]))) for k in range(count)
+            ]
 
-        with cgutils.for_range(builder, n) as loop:
-            i = loop.index
-            with cgutils.for_range_slice(builder, _count(0), b_width, _count(LANES), intp=_I64) as (at, _):
-                builder.store(ir.Constant(_VECTOR, [0.0] * LANES), sums)
-                with cgutils.for_range_slice(builder, _count(1), rows, _count(1), intp=_I64) as (r, _):
-                    own = entry(builder.gep(a, [builder.mul(r, a_width)]), i)
-                    row = builder.gep(b, [builder.mul(r, b_width)])
-                    builder.store(_multiply_add(builder, own, _load(builder, row, at), builder.load(sums)), sums)
-                zeroth = builder.fmul(first, builder.fmul(entry(a, i), _load(builder, b, at)))
-                whole = builder.fadd(builder.fmul(weight, builder.load(sums)), zeroth)
-                _store(builder, whole, builder.gep(out, [builder.mul(i, b_width)]), at)
+        def tile(i: Any, at: Any, count: int) -> None:
+            """Rows i, …, i + count - 1 of one vector's columns."""
+            mine = sums[:count]
+            for one in mine:
+                builder.store(ir.Constant(_VECTOR, [0.0] * LANES), one)
+            with cgutils.for_range_slice(builder, _count(1), rows, _count(1), intp=_I64) as (r, _):
+                row = _load(builder, builder.gep(b, [builder.mul(r, b_width)]), at)
+                own = entries(builder.gep(a, [builder.mul(r, a_width)]), i, count)
+                for one, entry in zip(mine, own, strict=True):
+                    builder.store(_multiply_add(builder, entry, row, builder.load(one)), one)
+            zeroth = builder.fmul(first, _load(builder, b, at))
+            mask = _first_lanes(builder, builder.sub(columns, at))
+            for k, (one, entry) in enumerate(zip(mine, entries(a, i, count), strict=True)):
+                whole = builder.fadd(builder.fmul(weight, builder.load(one)), builder.fmul(entry, zeroth))
+                to = builder.gep(out, [builder.mul(builder.add(i, _count(k)), columns)])
+                _store_first(builder, whole, to, at, mask)
+
+        begin = _count(0)
+        for count in (4, 2, 1):
+            end = builder.and_(n, _count(-count))
+            with cgutils.for_range_slice(builder, begin, end, _count(count), intp=_I64) as (i, _):
+                with cgutils.for_range_slice(builder, _count(0), b_width, _count(LANES), intp=_I64) as (at, _):
+                    tile(i, at, count)
+            begin = end
         return context.get_dummy_value()
 
-    return types.void(_i64, _i64, _i64, _i64, _i64, _i64, _f64, _f64, _i64), codegen
+    return types.void(_i64, _i64, _i64, _i64, _i64, _i64, _f64, _f64, _i64, _i64), codegen
+
+
+@intrinsic
+def subtract_squares(typing_context: Any, n: Any, rows: Any, w: Any, width: Any, p: Any) -> Any:
+    """P (n, n) -= Σ_k w_kᵀ w_k over rows w_k, `width` apart (whole vectors); what is symmetric stays so, bit by bit."""
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        n, rows, width = given[0], given[1], given[3]
+        w, p = _pointer(builder, given[2]), _pointer(builder, given[4])
+        left = cgutils.alloca_once(builder, _VECTOR)
+        with cgutils.for_range_slice(builder, _count(0), width, _count(LANES), intp=_I64) as (at, _):
+            own = _first_lanes(builder, builder.sub(n, at))
+            with cgutils.for_range(builder, n) as loop:
+                to = builder.gep(p, [builder.mul(loop.index, n)])
+                builder.store(_load_first(builder, to, at, own), left)
+                with cgutils.for_range(builder, rows) as inner:
+                    row = builder.gep(w, [builder.mul(inner.index, width)])
+                    factor = _broadcast(builder, builder.fneg(builder.load(builder.gep(row, [loop.index]))))
+                    builder.store(_multiply_add(builder, factor, _load(builder, row, at), builder.load(left)), left)
+                _store_first(builder, builder.load(left), to, at, own)
+        return context.get_dummy_value()
+
+    return types.void(_i64, _i64, _i64, _i64, _i64), codegen
+
+
+@intrinsic
+def factor_rows(typing_context: Any, n: Any, a: Any, u: Any, width: Any) -> Any:
+    """Upper U with Uᵀ U = A (n, n), its rows `width` apart (whole vectors): 1, or 0 if A is not positive definite.
+
+    Source: Golub & Van Loan, Matrix Computations, 4th ed., algorithm 4.2.2 (outer product form).
+    """
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        n, width = given[0], given[3]
+        a, u = (_pointer(builder, given[k]) for k in (1, 2))
+        good = cgutils.alloca_once(builder, _I64)
+        builder.store(_count(1), good)
+        one, nothing = ir.Constant(_F64, 1.0), ir.Constant(_VECTOR, [0.0] * LANES)
+        root = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_F64, [_F64]), "llvm.sqrt.f64")
+
+        def columns(first: Any) -> Any:
+            return cgutils.for_range_slice(builder, first, width, _count(LANES), intp=_I64)
+
+        with cgutils.for_range(builder, n) as loop, columns(_count(0)) as (at, _):
+            row = builder.gep(a, [builder.mul(loop.index, n)])
+            value = _load_first(builder, row, at, _first_lanes(builder, builder.sub(n, at)))
+            _store(builder, value, builder.gep(u, [builder.mul(loop.index, width)]), at)
+        with cgutils.for_range(builder, n) as loop:
+            k = loop.index
+            row = builder.gep(u, [builder.mul(k, width)])
+            pivot = builder.load(builder.gep(row, [k]))
+            positive = builder.fcmp_ordered(">", pivot, ir.Constant(_F64, 0.0))
+            finite = builder.fcmp_ordered("<", pivot, ir.Constant(_F64, math.inf))
+            both = builder.zext(builder.and_(positive, finite), _I64)
+            builder.store(builder.and_(builder.load(good), both), good)
+            # The next pivot waits for a division only; the root is off its way.
+            inverse = builder.fneg(builder.fdiv(one, pivot))
+            scale = _broadcast(builder, builder.fdiv(one, builder.call(root, [pivot])))
+            begin = builder.and_(k, _count(-LANES))
+            with cgutils.for_range_slice(builder, builder.add(k, _count(1)), n, _count(1), intp=_I64) as (i, _):
+                factor = _broadcast(builder, builder.fmul(builder.load(builder.gep(row, [i])), inverse))
+                other = builder.gep(u, [builder.mul(i, width)])
+                with columns(begin) as (at, _):
+                    value = _multiply_add(builder, factor, _load(builder, row, at), _load(builder, other, at))
+                    _store(builder, value, other, at)
+            with columns(_count(0)) as (at, _):
+                # What elimination left of zeros is cleared.
+                left = _first_lanes(builder, builder.sub(k, at))
+                _store(builder, builder.select(left, nothing, builder.fmul(scale, _load(builder, row, at))), row, at)
+        return builder.load(good)
+
+    return _i64(_i64, _i64, _i64, _i64), codegen
+
+
+@intrinsic
+def around(typing_context: Any, n: Any, x: Any, u: Any, apart: Any, spread: Any, points: Any, width: Any) -> Any:
+    """points (2n + 1, width) = x, x + spread u_k, x - spread u_k with rows u_k (n,) that are `apart`."""
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        n, apart, width = given[0], given[3], given[6]
+        x, u, points = (_pointer(builder, given[k]) for k in (1, 2, 5))
+        spread = _broadcast(builder, given[4])
+        half = builder.mul(n, width)
+        with cgutils.for_range_slice(builder, _count(0), width, _count(LANES), intp=_I64) as (at, _):
+            own = _first_lanes(builder, builder.sub(n, at))
+            centre = _load_first(builder, x, at, own)
+            _store(builder, centre, points, at)
+            with cgutils.for_range(builder, n) as loop:
+                row = builder.gep(u, [builder.mul(loop.index, apart)])
+                d = builder.fmul(spread, _load_first(builder, row, at, own))
+                to = builder.add(builder.mul(builder.add(loop.index, _count(1)), width), at)
+                _store(builder, builder.fadd(centre, d), points, to)
+                _store(builder, builder.fsub(centre, d), points, builder.add(to, half))
+        return context.get_dummy_value()
+
+    return types.void(_i64, _i64, _i64, _i64, _f64, _i64, _i64), codegen
