@@ -16,8 +16,9 @@ from .filter import Options
 from .jit import flags, floats, inlined, ints, jit, matrix
 from .linalg import EPSILON, cholesky, mirror, solve_transposed, solve_upper, wrap
 from .robust import forget
-from .simd import padded, subtract_squares
+from .simd_rows import subtract_squares
 from .track import FAILED, GATED, HELD_OUT, MISSING, USED
+from .vectors import padded
 
 LOG_2PI = float(np.log(2.0 * np.pi))
 

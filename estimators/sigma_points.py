@@ -9,7 +9,7 @@ import numpy as np
 
 from .jit import inlined
 from .linalg import wrap
-from .simd import around, centre, factor_rows, product
+from .simd_rows import around, centre, factor_rows, product
 
 
 @inlined

@@ -33,9 +33,9 @@ from .robust import (
     shared,
 )
 from .sigma_points import covariance, cross_covariance, deviations, factor, spread_points
-from .simd import padded
 from .track import FAILED, USED
 from .tuning import Tuning
+from .vectors import padded
 
 CENTRAL_COV, OUTER, SPREAD = range(OWN, OWN + 3)
 """Positions in the context's options: the central covariance weight, the outer weight, √(n+λ)."""
