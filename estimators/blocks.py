@@ -11,15 +11,8 @@ from numba import prange
 from .context import context_at, place_of
 from .jit import jit, matrix
 from .localisation import localised, reached
-from .simd import (
-    LANES,
-    WIDE,
-    add_scaled,
-    combine_narrow,
-    combine_wide,
-    spread_narrow,
-    spread_wide,
-)
+from .simd import WIDE, add_scaled, combine_narrow, combine_wide, spread_narrow, spread_wide
+from .vectors import LANES
 
 
 @jit

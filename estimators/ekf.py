@@ -99,7 +99,7 @@ def linearise(context, sensor, x, u, P, expected, C, S, H, scratch):
 
 
 @inlined
-def correct(context, y, r, m, nu, U, C, K, H, N, x, P):
+def correct(context, y, r, m, nu, U, C, W, K, H, N, x, P):
     """x ← x + K ν;  P by the Joseph form, or as P - K S Kᵀ; from the whitened nu, S = Uᵀ U and C = P Hᵀ."""
     if options(context)[JOSEPH] != 0.0:
         gain(m, C, U, K)
@@ -107,7 +107,7 @@ def correct(context, y, r, m, nu, U, C, K, H, N, x, P):
         joseph(y, r, m, C, H, K, P, N)
     else:
         move_mean(m, C, U, nu, x)
-        downdate(m, C, U, P)
+        downdate(m, C, U, P, W)
     wrap_mean(context, x)
 
 
@@ -122,7 +122,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     _, m = sensor_rows(context, sensor)
     x = state[:n]
     P = matrix(state, n, n, n)
-    nu, r, S, U, C, room, at = gaussian.scratch(work, n, m)
+    nu, r, S, U, C, W, room, at = gaussian.scratch(work, n, m)
     K = matrix(work, at, n, m)
     H = matrix(work, at + n * m, m, n)
     N = matrix(work, at + 2 * n * m, n, n)
@@ -133,7 +133,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     if verdict == USED and options(context)[ROBUST] != NONE:
         verdict = USED if reweigh(context, y, r, innovation, m, nu, S, U, room) else FAILED
     if verdict == USED:
-        correct(context, y, r, m, nu, U, C, K, H, N, x, P)
+        correct(context, y, r, m, nu, U, C, W, K, H, N, x, P)
         if options(context)[ADAPT] != OFF:
             adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict

@@ -16,7 +16,9 @@ from .filter import Options
 from .jit import flags, floats, inlined, ints, jit, matrix
 from .linalg import EPSILON, cholesky, mirror, solve_transposed, solve_upper, wrap
 from .robust import forget
+from .simd_rows import subtract_squares
 from .track import FAILED, GATED, HELD_OUT, MISSING, USED
+from .vectors import padded
 
 LOG_2PI = float(np.log(2.0 * np.pi))
 
@@ -28,7 +30,7 @@ def state_size(options: Options, nx: int) -> int:
 
 def scratch_size(nx: int, ny: int) -> int:
     """Numbers in the views of `scratch`."""
-    return 2 * ny + 2 * ny * ny + nx * ny + robust.scratch_size(ny)
+    return 2 * ny + 2 * ny * ny + nx * ny + ny * padded(nx) + robust.scratch_size(ny)
 
 
 def moments(options: Options, state: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray]:
@@ -78,17 +80,18 @@ def wrap_mean(context, x):
 
 @inlined
 def scratch(work, n, m):
-    """What an update works in: ŷ or ν, r (m,), S and its factor (m, m), C (n, m), room for `reweigh`; where it ends.
+    """What an update works in: ŷ or ν, r (m,), S and its factor (m, m), C (n, m), W, room for `reweigh`; where it ends.
 
-    C is the covariance of state and predicted reading.
+    C is the covariance of state and predicted reading, W (m, padded n) is for `downdate`.
     """
-    start = work.ctypes.data
-    at = 2 * m + 2 * m * m + n * m
-    S = matrix(work, 2 * m, m, m)
-    U = matrix(work, 2 * m + m * m, m, m)
-    C = matrix(work, 2 * m + 2 * m * m, n, m)
+    W = matrix(work, 0, m, padded(n))
+    start = work.ctypes.data + 8 * W.size
+    S = matrix(work, W.size + 2 * m, m, m)
+    U = matrix(work, W.size + 2 * m + m * m, m, m)
+    C = matrix(work, W.size + 2 * m + 2 * m * m, n, m)
+    at = W.size + 2 * m + 2 * m * m + n * m
     room = m * m + 4 * m
-    return floats(start, m), floats(start + 8 * m, m), S, U, C, floats(start + 8 * at, room), at + room
+    return floats(start, m), floats(start + 8 * m, m), S, U, C, W, work[at : at + room], at + room
 
 
 @inlined
@@ -120,18 +123,19 @@ def compare(context, sensor, y, r, predicted, C, S, H, P, innovation, innovation
         innovation[i] = residual
         innovation_std[i] = np.sqrt(variance) if variance >= 0.0 else np.nan
         predicted[m] = residual
-        # Row i moves up to m ≤ i: what it overwrites has been read.
-        column = 0
-        for j in range(i + 1):
-            if np.isfinite(y[j]):
-                S[m, column] = S[i, j]
-                S[column, m] = S[i, j]
-                column += 1
+        if m < i:
+            # Row i moves up: what it overwrites has been read.
+            column = 0
+            for j in range(i):
+                if np.isfinite(y[j]):
+                    S[m, column] = S[i, j]
+                    S[column, m] = S[i, j]
+                    column += 1
+            for j in range(C.shape[0]):
+                C[j, m] = C[j, i]
+            for j in range(H.shape[1]):
+                H[m, j] = H[i, j]
         S[m, m] = variance
-        for j in range(C.shape[0]):
-            C[j, m] = C[j, i]
-        for j in range(H.shape[1]):
-            H[m, j] = H[i, j]
         m += 1
     return m
 
@@ -249,20 +253,14 @@ def joseph(y, r, m, C, H, K, P, N):
 
 
 @inlined
-def downdate(m, C, U, P):
-    """P ← P - K S Kᵀ, as P - W Wᵀ with W = C U⁻¹; C becomes W."""
+def downdate(m, C, U, P, W):
+    """P ← P - K S Kᵀ, as P - Wᵀ W with W = U⁻ᵀ Cᵀ, in scratch of (m or more, nx in whole vectors)."""
     n = P.shape[0]
     for k in range(m):
-        for j in range(k):
-            a = U[j, k]
-            for i in range(n):
-                C[i, k] -= a * C[i, j]
         inverse = 1.0 / U[k, k]
         for i in range(n):
-            C[i, k] *= inverse
-    for i in range(n):
-        for k in range(m):
-            a = C[i, k]
-            for j in range(i + 1):
-                P[i, j] -= a * C[j, k]
-    mirror(P)
+            s = C[i, k]
+            for j in range(k):
+                s -= U[j, k] * W[j, i]
+            W[k, i] = s * inverse
+    subtract_squares(n, m, W.ctypes.data, W.shape[1], P.ctypes.data)

@@ -56,7 +56,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     _, ny = sensor_rows(context, sensor)
     x = state[:n]
     P = matrix(state, n, n, n)
-    nu, r, S, U, C, room, at = gaussian.scratch(work, n, ny)
+    nu, r, S, U, C, W, room, at = gaussian.scratch(work, n, ny)
     K = matrix(work, at, n, ny)
     H = matrix(work, at + n * ny, ny, n)
     at += 2 * n * ny
@@ -93,7 +93,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     for i in range(n):
         x[i] = predicted[i]
     if verdict == USED:
-        correct(context, y, r, m, nu, U, C, K, H, N, x, P)
+        correct(context, y, r, m, nu, U, C, W, K, H, N, x, P)
         if options(context)[ADAPT] != OFF:
             adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict

@@ -15,12 +15,22 @@ Digital Library of Mathematical Functions, 22.2 and 20.2).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
 from scipy.special import ellipk, ellipkm1
 
+from . import vectors
 from .jit import jit
-from .simd import LANES, add_scaled, dot, resolve
+from .simd import add_scaled, dot
 from .symmetric import begin, tridiagonal
+from .vectors import LANES
+
+_i64 = types.int64
 
 _BLOCKS = 18
 """The finest rule has this many vectors of resolvents; it is good up to `_UP_TO[-1]`."""
@@ -71,6 +81,72 @@ _NO_SHIFT, _ONE = np.zeros(LANES), np.eye(LANES)[0]
 def scratch_of(n: int) -> int:
     """Numbers of scratch that `root_action` takes at order n."""
     return n * (4 + 3 * LANES) + LANES
+
+
+@intrinsic
+def resolve(
+    typing_context: Any,
+    n: Any,
+    d: Any,
+    e: Any,
+    b: Any,
+    blocks: Any,
+    shifts: Any,
+    weights: Any,
+    scratch: Any,
+    out: Any,
+) -> Any:
+    """out[:n] = Σ_k weights[k] (T + shifts[k] I)⁻¹ b, T tridiagonal with diagonal d[:n], and e[1:n] beside it.
+
+    By elimination without exchanges, which is stable where all T + shifts[k] I are positive definite; `LANES` shifts at
+    a time, which is what `blocks` counts. e[0] must be 0. `scratch` holds (3 n + 1) LANES numbers.
+    """
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        n, blocks = given[0], given[4]
+        d, e, b, shifts, weights, factors, out = (vectors.pointer(builder, given[k]) for k in (1, 2, 3, 5, 6, 7, 8))
+        lanes = vectors.constant(LANES)
+        values = builder.gep(factors, [builder.mul(builder.add(n, vectors.constant(1)), lanes)])
+        sums = builder.gep(values, [builder.mul(n, lanes)])
+        nothing, one = (ir.Constant(vectors.VECTOR, [number] * LANES) for number in (0.0, 1.0))
+        inverse, y = cgutils.alloca_once(builder, vectors.VECTOR), cgutils.alloca_once(builder, vectors.VECTOR)
+
+        def entry(pointer: Any, i: Any) -> Any:
+            return vectors.broadcast(builder, builder.load(builder.gep(pointer, [i])))
+
+        with cgutils.for_range(builder, n) as loop:
+            vectors.store(builder, nothing, sums, builder.mul(loop.index, lanes))
+        vectors.store(builder, nothing, factors, builder.mul(n, lanes))
+        with cgutils.for_range(builder, blocks) as block:
+            at = builder.mul(block.index, lanes)
+            shift, weight = vectors.load(builder, shifts, at), vectors.load(builder, weights, at)
+            builder.store(nothing, inverse)
+            builder.store(nothing, y)
+            with cgutils.for_range(builder, n) as loop:
+                i, to = loop.index, builder.mul(loop.index, lanes)
+                beside = entry(e, i)
+                factor = builder.fmul(beside, builder.load(inverse))
+                minus = builder.fneg(factor)
+                pivot = vectors.multiply_add(builder, minus, beside, builder.fadd(entry(d, i), shift))
+                value = vectors.multiply_add(builder, minus, builder.load(y), builder.fmul(weight, entry(b, i)))
+                inverted = builder.fdiv(one, pivot)
+                builder.store(inverted, inverse)
+                builder.store(value, y)
+                vectors.store(builder, factor, factors, to)
+                vectors.store(builder, builder.fmul(value, inverted), values, to)
+            builder.store(nothing, y)
+            with cgutils.for_range(builder, n) as loop:
+                to = builder.mul(builder.sub(builder.sub(n, vectors.constant(1)), loop.index), lanes)
+                factor = builder.fneg(vectors.load(builder, factors, builder.add(to, lanes)))
+                x = vectors.multiply_add(builder, factor, builder.load(y), vectors.load(builder, values, to))
+                builder.store(x, y)
+                vectors.store(builder, builder.fadd(vectors.load(builder, sums, to), x), sums, to)
+        with cgutils.for_range(builder, n) as loop:
+            total = vectors.sum_of(builder, vectors.load(builder, sums, builder.mul(loop.index, lanes)))
+            builder.store(total, builder.gep(out, [loop.index]))
+        return context.get_dummy_value()
+
+    return types.void(_i64, _i64, _i64, _i64, _i64, _i64, _i64, _i64, _i64), codegen
 
 
 @jit

@@ -34,14 +34,15 @@ i64 = types.int64
 def cache_folder() -> Path:
     """Where machine code is kept: per user, and apart for each version of the sources.
 
-    Numba looks only at the file of the function it compiles, not at those that the function calls; so the sources of
-    this folder that hold compiled functions are part of the path, and an edit to any of them compiles all anew.
+    Numba looks only at the file of the function it compiles, not at those that the function calls, or takes a constant
+    from; so the sources of this folder that have to do with compiling are part of the path, and an edit to any of them
+    compiles all anew.
     """
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     digest = hashlib.sha256(numba.__version__.encode())
     for path in sorted(Path(__file__).parent.glob("*.py")):
         source = path.read_bytes()
-        if b"@jit" in source or path.name in ("jit.py", "context.py"):
+        if b"jit" in source or b"intrinsic" in source or path.name in ("log.py", "model.py"):
             digest.update(source)
     return base / "nisus" / "numba" / digest.hexdigest()[:16]
 

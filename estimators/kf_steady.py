@@ -128,7 +128,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     _, ny = sensor_rows(context, sensor)
     x = state[:n]
     P = matrix(state, n, n, n)
-    nu, r, S, U, C, _, at = gaussian.scratch(work, n, ny)
+    nu, r, S, U, C, _, _, at = gaussian.scratch(work, n, ny)
     K = matrix(work, at, n, ny)
     H = matrix(work, at + n * ny, ny, n)
     N = matrix(work, at + 2 * n * ny, n, n)

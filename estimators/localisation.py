@@ -17,8 +17,9 @@ from .filter import Options
 from .jit import floats, ints, jit, matrix
 from .model import StateSpaceModel
 from .placed import check_placed
-from .simd import LANES, WIDE
+from .simd import WIDE
 from .threads import threaded
+from .vectors import LANES
 
 _FIELDS = 6
 """Numbers a sensor in the table: how many blocks, and where they, their rows' starts, rows, tapers and the tapers

@@ -26,7 +26,8 @@ from .linalg import wrap
 from .modes import Mode, modes_of
 from .noise import add_noise, belief_root
 from .random import key_of, normal
-from .simd import dot, exp_minus, total, weighted
+from .simd import dot, total, weighted
+from .simd_exp import exp_minus
 
 DRAWS, SETTLED, EQUAL, ESS, RECOVERIES, RESAMPLED, _SPARE, _SPARE_TOO = range(8)
 """Head of the state: predictions and updates so far; whether mean and covariance are up to date;

@@ -63,8 +63,8 @@ from .particle import (
 )
 from .random import fill_normals
 from .resampling import STRATIFIED, copy_children, drawn_children, match_children, strata_children
-from .simd import exp_minus
 from .simd import total as total_of
+from .simd_exp import exp_minus
 from .threads import threaded
 from .tuning import Tuning
 

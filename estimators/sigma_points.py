@@ -7,28 +7,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from .jit import inlined, jit
+from .jit import inlined
 from .linalg import wrap
-from .simd import LANES, centre, product
+from .simd_rows import around, centre, factor_rows, product
 
 
-@jit
-def padded(k):
-    """How wide a row of k numbers is."""
-    return (k + LANES - 1) // LANES * LANES
+@inlined
+def factor(P, U):
+    """Upper U (n, padded n) with Uᵀ U = P (n, n); False if P is not positive definite."""
+    return factor_rows(P.shape[0], P.ctypes.data, U.ctypes.data, U.shape[1]) != 0
 
 
 @inlined
 def spread_points(x, U, spread, points):
     """Fill `points` (2n+1, padded n) with x and x ± spread·U[k]."""
-    n = x.size
-    for j in range(n):
-        points[0, j] = x[j]
-    for k in range(n):
-        for j in range(n):
-            d = spread * U[k, j]
-            points[1 + k, j] = x[j] + d
-            points[1 + n + k, j] = x[j] - d
+    around(x.size, x.ctypes.data, U.ctypes.data, U.shape[1], spread, points.ctypes.data, points.shape[1])
 
 
 @inlined
@@ -48,13 +41,14 @@ def deviations(D, w, circular, mean):
 
 @inlined
 def covariance(D, first, w, P):
-    """P (k, padded k) = first D₀ᵀ D₀ + w Σ Dᵢᵀ Dᵢ."""
+    """P (k, k) = first D₀ᵀ D₀ + w Σ Dᵢᵀ Dᵢ, from deviations D (2n+1, padded k)."""
     rows, width = D.shape
-    product(P.shape[0], rows, D.ctypes.data, width, D.ctypes.data, width, first, w, P.ctypes.data)
+    k = P.shape[0]
+    product(k, rows, D.ctypes.data, width, D.ctypes.data, width, first, w, P.ctypes.data, k)
 
 
 @inlined
 def cross_covariance(U, across, w, C):
-    """C (n, padded m) = w Σ U[k]ᵀ across[k], with the differences `across` (n, padded m) between opposite points."""
-    n, width = C.shape
-    product(n, n, U.ctypes.data, n, across.ctypes.data, width, w, w, C.ctypes.data)
+    """C (n, m) = w Σ U[k]ᵀ across[k], with differences `across` (n, padded m) between opposite points."""
+    n, m = C.shape
+    product(n, n, U.ctypes.data, U.shape[1], across.ctypes.data, across.shape[1], w, w, C.ctypes.data, m)

@@ -9,7 +9,6 @@ All take addresses (`array.ctypes.data`), which is what makes them free of overh
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from llvmlite import ir
@@ -17,79 +16,47 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-LANES = 8
-"""Numbers in a vector."""
+from . import vectors
+from .vectors import LANES
 
 WIDE = 32
 """Columns that `combine_wide` and `spread_wide` do at a time: four vectors, which stay in registers."""
 
-_I32, _I64, _F64 = ir.IntType(32), ir.IntType(64), ir.DoubleType()
-_VECTOR = ir.VectorType(_F64, LANES)
 _i64, _f64 = types.int64, types.float64
 
 
-def _count(number: int) -> Any:
-    return ir.Constant(_I64, number)
-
-
-def _pointer(builder: Any, address: Any) -> Any:
-    return builder.inttoptr(address, _F64.as_pointer())
-
-
-def _at(builder: Any, pointer: Any, index: Any) -> Any:
-    """The address of the vector that begins at pointer[index]; it need not be aligned to more than a number."""
-    return builder.bitcast(builder.gep(pointer, [index]), _VECTOR.as_pointer())
-
-
-def _load(builder: Any, pointer: Any, index: Any) -> Any:
-    return builder.load(_at(builder, pointer, index), align=8)
-
-
-def _store(builder: Any, value: Any, pointer: Any, index: Any) -> None:
-    builder.store(value, _at(builder, pointer, index), align=8)
-
-
-def _broadcast(builder: Any, value: Any) -> Any:
-    undefined = ir.Constant(ir.VectorType(value.type, LANES), ir.Undefined)
-    one = builder.insert_element(undefined, value, ir.Constant(_I32, 0))
-    return builder.shuffle_vector(one, undefined, ir.Constant(ir.VectorType(_I32, LANES), [0] * LANES))
-
-
-def _multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
-    kind = c.type
-    name = "llvm.fmuladd.f64" if kind == _F64 else f"llvm.fmuladd.v{LANES}f64"
-    function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind] * 3), name)
-    return builder.call(function, [a, b, c])
-
-
-def _combining(vectors: int) -> Any:
+def _combining(width: int) -> Any:
     @intrinsic
     def combine(typing_context: Any, weights: Any, count: Any, x: Any, stride: Any, out: Any) -> Any:
         """out[:] = Σ_k weights[k] x[k·stride :], k < count (at least 1), over all the columns of a block."""
 
         def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            w, x, out = (_pointer(builder, given[k]) for k in (0, 2, 4))
+            w, x, out = (vectors.pointer(builder, given[k]) for k in (0, 2, 4))
             count, stride = given[1], given[3]
             before = builder.block
             loop, done = builder.append_basic_block("loop"), builder.append_basic_block("done")
             builder.branch(loop)
             builder.position_at_end(loop)
-            k = builder.phi(_I64)
-            k.add_incoming(_count(0), before)
-            sums = [builder.phi(_VECTOR) for _ in range(vectors)]
-            weight = _broadcast(builder, builder.load(builder.gep(w, [k])))
+            k = builder.phi(vectors.I64)
+            k.add_incoming(vectors.constant(0), before)
+            sums = [builder.phi(vectors.VECTOR) for _ in range(width)]
+            weight = vectors.broadcast(builder, builder.load(builder.gep(w, [k])))
             row = builder.gep(x, [builder.mul(k, stride)])
             added = []
             for v, total in enumerate(sums):
-                total.add_incoming(ir.Constant(_VECTOR, [0.0] * LANES), before)
-                added.append(_multiply_add(builder, weight, _load(builder, row, _count(v * LANES)), total))
+                total.add_incoming(vectors.ZERO, before)
+                added.append(
+                    vectors.multiply_add(
+                        builder, weight, vectors.load(builder, row, vectors.constant(v * LANES)), total
+                    )
+                )
                 total.add_incoming(added[-1], loop)
-            following = builder.add(k, _count(1))
+            following = builder.add(k, vectors.constant(1))
             k.add_incoming(following, loop)
             builder.cbranch(builder.icmp_signed("<", following, count), loop, done)
             builder.position_at_end(done)
             for v, total in enumerate(added):
-                _store(builder, total, out, _count(v * LANES))
+                vectors.store(builder, total, out, vectors.constant(v * LANES))
             return context.get_dummy_value()
 
         return types.void(_i64, _i64, _i64, _i64, _i64), codegen
@@ -97,20 +64,22 @@ def _combining(vectors: int) -> Any:
     return combine
 
 
-def _spreading(vectors: int) -> Any:
+def _spreading(width: int) -> Any:
     @intrinsic
     def spread(typing_context: Any, weights: Any, count: Any, x: Any, out: Any, stride: Any) -> Any:
         """out[k·stride :] += weights[k] x[:], k < count, over all the columns of a block."""
 
         def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            w, x, out = (_pointer(builder, given[k]) for k in (0, 2, 3))
-            values = [_load(builder, x, _count(v * LANES)) for v in range(vectors)]
+            w, x, out = (vectors.pointer(builder, given[k]) for k in (0, 2, 3))
+            values = [vectors.load(builder, x, vectors.constant(v * LANES)) for v in range(width)]
             with cgutils.for_range(builder, given[1]) as loop:
-                weight = _broadcast(builder, builder.load(builder.gep(w, [loop.index])))
+                weight = vectors.broadcast(builder, builder.load(builder.gep(w, [loop.index])))
                 row = builder.gep(out, [builder.mul(loop.index, given[4])])
                 for v, value in enumerate(values):
-                    at = _count(v * LANES)
-                    _store(builder, _multiply_add(builder, weight, value, _load(builder, row, at)), row, at)
+                    at = vectors.constant(v * LANES)
+                    vectors.store(
+                        builder, vectors.multiply_add(builder, weight, value, vectors.load(builder, row, at)), row, at
+                    )
             return context.get_dummy_value()
 
         return types.void(_i64, _i64, _i64, _i64, _i64), codegen
@@ -122,31 +91,28 @@ combine_wide, combine_narrow = _combining(WIDE // LANES), _combining(1)
 spread_wide, spread_narrow = _spreading(WIDE // LANES), _spreading(1)
 
 
-def _in_vectors(builder: Any, n: Any, whole: Any, single: Any) -> None:
-    """whole(i) for each full vector of n numbers, then single(i) for each number of the rest."""
-    full = builder.and_(n, _count(-LANES))
-    for begin, end, step, body in ((_count(0), full, LANES, whole), (full, n, 1, single)):
-        with cgutils.for_range_slice(builder, begin, end, _count(step), intp=_I64) as (i, _):
-            body(i)
-
-
 @intrinsic
 def add_scaled(typing_context: Any, n: Any, a: Any, x: Any, y: Any) -> Any:
     """y[:n] += a x[:n]."""
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         n, a = given[0], given[1]
-        x, y = _pointer(builder, given[2]), _pointer(builder, given[3])
-        wide = _broadcast(builder, a)
+        x, y = vectors.pointer(builder, given[2]), vectors.pointer(builder, given[3])
+        wide = vectors.broadcast(builder, a)
 
         def whole(i: Any) -> None:
-            _store(builder, _multiply_add(builder, wide, _load(builder, x, i), _load(builder, y, i)), y, i)
+            vectors.store(
+                builder,
+                vectors.multiply_add(builder, wide, vectors.load(builder, x, i), vectors.load(builder, y, i)),
+                y,
+                i,
+            )
 
         def single(i: Any) -> None:
             at = builder.gep(y, [i])
-            builder.store(_multiply_add(builder, a, builder.load(builder.gep(x, [i])), builder.load(at)), at)
+            builder.store(vectors.multiply_add(builder, a, builder.load(builder.gep(x, [i])), builder.load(at)), at)
 
-        _in_vectors(builder, n, whole, single)
+        vectors.in_vectors(builder, n, whole, single)
         return context.get_dummy_value()
 
     return types.void(_i64, _f64, _i64, _i64), codegen
@@ -158,7 +124,7 @@ def combine(typing_context: Any, count: Any, weights: Any, apart: Any, x: Any, s
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         count, apart, stride, n = given[0], given[2], given[4], given[5]
-        w, x, out = (_pointer(builder, given[k]) for k in (1, 3, 6))
+        w, x, out = (vectors.pointer(builder, given[k]) for k in (1, 3, 6))
 
         def summed(i: Any, zero: Any, load: Any, spread: Any) -> Any:
             sums = cgutils.alloca_once(builder, zero.type)
@@ -166,20 +132,22 @@ def combine(typing_context: Any, count: Any, weights: Any, apart: Any, x: Any, s
             with cgutils.for_range(builder, count) as loop:
                 weight = builder.load(builder.gep(w, [builder.mul(loop.index, apart)]))
                 row = builder.gep(x, [builder.mul(loop.index, stride)])
-                builder.store(_multiply_add(builder, spread(weight), load(row), builder.load(sums)), sums)
+                builder.store(vectors.multiply_add(builder, spread(weight), load(row), builder.load(sums)), sums)
             return builder.load(sums)
 
         def whole(i: Any) -> None:
-            zero = ir.Constant(_VECTOR, [0.0] * LANES)
-            added = summed(i, zero, lambda row: _load(builder, row, i), lambda weight: _broadcast(builder, weight))
-            _store(builder, added, out, i)
+            zero = vectors.ZERO
+            added = summed(
+                i, zero, lambda row: vectors.load(builder, row, i), lambda weight: vectors.broadcast(builder, weight)
+            )
+            vectors.store(builder, added, out, i)
 
         def single(i: Any) -> None:
-            zero = ir.Constant(_F64, 0.0)
+            zero = ir.Constant(vectors.F64, 0.0)
             added = summed(i, zero, lambda row: builder.load(builder.gep(row, [i])), lambda weight: weight)
             builder.store(added, builder.gep(out, [i]))
 
-        _in_vectors(builder, n, whole, single)
+        vectors.in_vectors(builder, n, whole, single)
         return context.get_dummy_value()
 
     return types.void(_i64, _i64, _i64, _i64, _i64, _i64, _i64), codegen
@@ -201,7 +169,7 @@ def combine_four(
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         count, apart, stride, n, width = (given[k] for k in (0, 2, 4, 5, 7))
-        w, x, out = (_pointer(builder, given[k]) for k in (1, 3, 6))
+        w, x, out = (vectors.pointer(builder, given[k]) for k in (1, 3, 6))
 
         def summed(kind: Any, load: Any, spread: Any, store: Any) -> None:
             sums = [cgutils.alloca_once(builder, kind) for _ in range(4)]
@@ -211,28 +179,28 @@ def combine_four(
                 weight = builder.gep(w, [builder.mul(loop.index, apart)])
                 value = load(builder.gep(x, [builder.mul(loop.index, stride)]))
                 for i, one in enumerate(sums):
-                    own = spread(builder.load(builder.gep(weight, [_count(i)])))
-                    builder.store(_multiply_add(builder, own, value, builder.load(one)), one)
+                    own = spread(builder.load(builder.gep(weight, [vectors.constant(i)])))
+                    builder.store(vectors.multiply_add(builder, own, value, builder.load(one)), one)
             for i, one in enumerate(sums):
-                store(builder.load(one), builder.gep(out, [builder.mul(width, _count(i))]))
+                store(builder.load(one), builder.gep(out, [builder.mul(width, vectors.constant(i))]))
 
         def whole(at: Any) -> None:
             summed(
-                _VECTOR,
-                lambda row: _load(builder, row, at),
-                lambda weight: _broadcast(builder, weight),
-                lambda value, row: _store(builder, value, row, at),
+                vectors.VECTOR,
+                lambda row: vectors.load(builder, row, at),
+                lambda weight: vectors.broadcast(builder, weight),
+                lambda value, row: vectors.store(builder, value, row, at),
             )
 
         def single(at: Any) -> None:
             summed(
-                _F64,
+                vectors.F64,
                 lambda row: builder.load(builder.gep(row, [at])),
                 lambda weight: weight,
                 lambda value, row: builder.store(value, builder.gep(row, [at])),
             )
 
-        _in_vectors(builder, n, whole, single)
+        vectors.in_vectors(builder, n, whole, single)
         return context.get_dummy_value()
 
     return types.void(_i64, _i64, _i64, _i64, _i64, _i64, _i64, _i64), codegen
@@ -255,23 +223,23 @@ def add_outer(
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         rows, n, a, stride = (given[k] for k in (0, 1, 2, 8))
-        left, x, right, y, z = (_pointer(builder, given[k]) for k in (3, 4, 5, 6, 7))
+        left, x, right, y, z = (vectors.pointer(builder, given[k]) for k in (3, 4, 5, 6, 7))
 
         def added(own_x: Any, own_y: Any, load: Any, spread: Any, store: Any) -> None:
             own_x, own_y = builder.fmul(spread(a), own_x), builder.fmul(spread(a), own_y)
             with cgutils.for_range(builder, rows) as loop:
                 row = builder.gep(z, [builder.mul(loop.index, stride)])
                 one, other = (spread(builder.load(builder.gep(side, [loop.index]))) for side in (left, right))
-                first = _multiply_add(builder, one, own_x, load(row))
-                store(_multiply_add(builder, other, own_y, first), row)
+                first = vectors.multiply_add(builder, one, own_x, load(row))
+                store(vectors.multiply_add(builder, other, own_y, first), row)
 
         def whole(i: Any) -> None:
             added(
-                _load(builder, x, i),
-                _load(builder, y, i),
-                lambda row: _load(builder, row, i),
-                lambda number: _broadcast(builder, number),
-                lambda value, row: _store(builder, value, row, i),
+                vectors.load(builder, x, i),
+                vectors.load(builder, y, i),
+                lambda row: vectors.load(builder, row, i),
+                lambda number: vectors.broadcast(builder, number),
+                lambda value, row: vectors.store(builder, value, row, i),
             )
 
         def single(i: Any) -> None:
@@ -283,7 +251,7 @@ def add_outer(
                 lambda value, row: builder.store(value, builder.gep(row, [i])),
             )
 
-        _in_vectors(builder, n, whole, single)
+        vectors.in_vectors(builder, n, whole, single)
         return context.get_dummy_value()
 
     return types.void(_i64, _i64, _f64, _i64, _i64, _i64, _i64, _i64, _i64), codegen
@@ -295,17 +263,17 @@ def rotate(typing_context: Any, n: Any, c: Any, s: Any, x: Any, y: Any) -> Any:
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         n, c, s = given[:3]
-        x, y = _pointer(builder, given[3]), _pointer(builder, given[4])
-        wide_c, wide_s = _broadcast(builder, c), _broadcast(builder, s)
+        x, y = vectors.pointer(builder, given[3]), vectors.pointer(builder, given[4])
+        wide_c, wide_s = vectors.broadcast(builder, c), vectors.broadcast(builder, s)
 
         def turned(c: Any, s: Any, a: Any, b: Any) -> tuple[Any, Any]:
-            left = _multiply_add(builder, c, a, builder.fneg(builder.fmul(s, b)))
-            return left, _multiply_add(builder, s, a, builder.fmul(c, b))
+            left = vectors.multiply_add(builder, c, a, builder.fneg(builder.fmul(s, b)))
+            return left, vectors.multiply_add(builder, s, a, builder.fmul(c, b))
 
         def whole(i: Any) -> None:
-            left, right = turned(wide_c, wide_s, _load(builder, x, i), _load(builder, y, i))
-            _store(builder, left, x, i)
-            _store(builder, right, y, i)
+            left, right = turned(wide_c, wide_s, vectors.load(builder, x, i), vectors.load(builder, y, i))
+            vectors.store(builder, left, x, i)
+            vectors.store(builder, right, y, i)
 
         def single(i: Any) -> None:
             at_x, at_y = builder.gep(x, [i]), builder.gep(y, [i])
@@ -313,32 +281,24 @@ def rotate(typing_context: Any, n: Any, c: Any, s: Any, x: Any, y: Any) -> Any:
             builder.store(left, at_x)
             builder.store(right, at_y)
 
-        _in_vectors(builder, n, whole, single)
+        vectors.in_vectors(builder, n, whole, single)
         return context.get_dummy_value()
 
     return types.void(_i64, _f64, _f64, _i64, _i64), codegen
 
 
-def _sum_of(builder: Any, vector: Any) -> Any:
-    """The numbers of a vector, added in pairs."""
-    numbers = [builder.extract_element(vector, ir.Constant(_I32, k)) for k in range(LANES)]
-    while len(numbers) > 1:
-        numbers = [builder.fadd(a, b) for a, b in zip(numbers[::2], numbers[1::2], strict=True)]
-    return numbers[0]
-
-
 def _summing(builder: Any, n: Any, whole: Any, single: Any) -> Any:
     """Σ over n numbers, by vectors: total = whole(i, total) for the full ones, then single(i, sum) for the rest."""
-    wide, narrow = cgutils.alloca_once(builder, _VECTOR), cgutils.alloca_once(builder, _F64)
-    builder.store(ir.Constant(_VECTOR, [0.0] * LANES), wide)
-    builder.store(ir.Constant(_F64, 0.0), narrow)
-    _in_vectors(
+    wide, narrow = cgutils.alloca_once(builder, vectors.VECTOR), cgutils.alloca_once(builder, vectors.F64)
+    builder.store(vectors.ZERO, wide)
+    builder.store(ir.Constant(vectors.F64, 0.0), narrow)
+    vectors.in_vectors(
         builder,
         n,
         lambda i: builder.store(whole(i, builder.load(wide)), wide),
         lambda i: builder.store(single(i, builder.load(narrow)), narrow),
     )
-    return builder.fadd(_sum_of(builder, builder.load(wide)), builder.load(narrow))
+    return builder.fadd(vectors.sum_of(builder, builder.load(wide)), builder.load(narrow))
 
 
 @intrinsic
@@ -346,11 +306,11 @@ def total(typing_context: Any, n: Any, x: Any) -> Any:
     """Σ x[:n]."""
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        x = _pointer(builder, given[1])
+        x = vectors.pointer(builder, given[1])
         return _summing(
             builder,
             given[0],
-            lambda i, sums: builder.fadd(sums, _load(builder, x, i)),
+            lambda i, sums: builder.fadd(sums, vectors.load(builder, x, i)),
             lambda i, sums: builder.fadd(sums, builder.load(builder.gep(x, [i]))),
         )
 
@@ -362,12 +322,14 @@ def dot(typing_context: Any, n: Any, a: Any, b: Any) -> Any:
     """Σ a[:n] b[:n]."""
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        a, b = _pointer(builder, given[1]), _pointer(builder, given[2])
+        a, b = vectors.pointer(builder, given[1]), vectors.pointer(builder, given[2])
         return _summing(
             builder,
             given[0],
-            lambda i, total: _multiply_add(builder, _load(builder, a, i), _load(builder, b, i), total),
-            lambda i, total: _multiply_add(
+            lambda i, total: vectors.multiply_add(
+                builder, vectors.load(builder, a, i), vectors.load(builder, b, i), total
+            ),
+            lambda i, total: vectors.multiply_add(
                 builder, builder.load(builder.gep(a, [i])), builder.load(builder.gep(b, [i])), total
             ),
         )
@@ -380,11 +342,11 @@ def weighted(typing_context: Any, n: Any, w: Any, x: Any, out: Any) -> Any:
     """out[:n] = w[:n] x[:n]; returns Σ out[:n]."""
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        w, x, out = (_pointer(builder, given[k]) for k in (1, 2, 3))
+        w, x, out = (vectors.pointer(builder, given[k]) for k in (1, 2, 3))
 
         def whole(i: Any, total: Any) -> Any:
-            value = builder.fmul(_load(builder, w, i), _load(builder, x, i))
-            _store(builder, value, out, i)
+            value = builder.fmul(vectors.load(builder, w, i), vectors.load(builder, x, i))
+            vectors.store(builder, value, out, i)
             return builder.fadd(total, value)
 
         def single(i: Any, total: Any) -> Any:
@@ -395,224 +357,3 @@ def weighted(typing_context: Any, n: Any, w: Any, x: Any, out: Any) -> Any:
         return _summing(builder, given[0], whole, single)
 
     return _f64(_i64, _i64, _i64, _i64), codegen
-
-
-@intrinsic
-def resolve(
-    typing_context: Any,
-    n: Any,
-    d: Any,
-    e: Any,
-    b: Any,
-    blocks: Any,
-    shifts: Any,
-    weights: Any,
-    scratch: Any,
-    out: Any,
-) -> Any:
-    """out[:n] = Σ_k weights[k] (T + shifts[k] I)⁻¹ b, T tridiagonal with diagonal d[:n], and e[1:n] beside it.
-
-    By elimination without exchanges, which is stable where all T + shifts[k] I are positive definite; `LANES` shifts at
-    a time, which is what `blocks` counts. e[0] must be 0. `scratch` holds (3 n + 1) LANES numbers.
-    """
-
-    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        n, blocks = given[0], given[4]
-        d, e, b, shifts, weights, factors, out = (_pointer(builder, given[k]) for k in (1, 2, 3, 5, 6, 7, 8))
-        lanes = _count(LANES)
-        values = builder.gep(factors, [builder.mul(builder.add(n, _count(1)), lanes)])
-        sums = builder.gep(values, [builder.mul(n, lanes)])
-        nothing, one = (ir.Constant(_VECTOR, [number] * LANES) for number in (0.0, 1.0))
-        inverse, y = cgutils.alloca_once(builder, _VECTOR), cgutils.alloca_once(builder, _VECTOR)
-
-        def entry(pointer: Any, i: Any) -> Any:
-            return _broadcast(builder, builder.load(builder.gep(pointer, [i])))
-
-        with cgutils.for_range(builder, n) as loop:
-            _store(builder, nothing, sums, builder.mul(loop.index, lanes))
-        _store(builder, nothing, factors, builder.mul(n, lanes))
-        with cgutils.for_range(builder, blocks) as block:
-            at = builder.mul(block.index, lanes)
-            shift, weight = _load(builder, shifts, at), _load(builder, weights, at)
-            builder.store(nothing, inverse)
-            builder.store(nothing, y)
-            with cgutils.for_range(builder, n) as loop:
-                i, to = loop.index, builder.mul(loop.index, lanes)
-                beside = entry(e, i)
-                factor = builder.fmul(beside, builder.load(inverse))
-                minus = builder.fneg(factor)
-                pivot = _multiply_add(builder, minus, beside, builder.fadd(entry(d, i), shift))
-                value = _multiply_add(builder, minus, builder.load(y), builder.fmul(weight, entry(b, i)))
-                inverted = builder.fdiv(one, pivot)
-                builder.store(inverted, inverse)
-                builder.store(value, y)
-                _store(builder, factor, factors, to)
-                _store(builder, builder.fmul(value, inverted), values, to)
-            builder.store(nothing, y)
-            with cgutils.for_range(builder, n) as loop:
-                to = builder.mul(builder.sub(builder.sub(n, _count(1)), loop.index), lanes)
-                factor = builder.fneg(_load(builder, factors, builder.add(to, lanes)))
-                x = _multiply_add(builder, factor, builder.load(y), _load(builder, values, to))
-                builder.store(x, y)
-                _store(builder, builder.fadd(_load(builder, sums, to), x), sums, to)
-        with cgutils.for_range(builder, n) as loop:
-            total = _sum_of(builder, _load(builder, sums, builder.mul(loop.index, lanes)))
-            builder.store(total, builder.gep(out, [loop.index]))
-        return context.get_dummy_value()
-
-    return types.void(_i64, _i64, _i64, _i64, _i64, _i64, _i64, _i64, _i64), codegen
-
-
-_LOWEST = -708.0
-"""e to this is the smallest normal number, nearly; below it `exp_minus` gives 0."""
-
-_HIGHEST = 709.0
-
-_LN2_HIGH, _LN2_LOW = float.fromhex("0x1.62e42fefa3800p-1"), float.fromhex("0x1.ef35793c76730p-45")
-"""ln 2 in two parts; the first has 42 bits, so that its product with an exponent is exact (as in FDLIBM's e_exp.c)."""
-
-_ROUND = 1.5 * 2.0**52
-"""Adding and taking it away rounds to a whole number, which then stands in the low bits."""
-
-
-def _exp(builder: Any, x: Any) -> Any:
-    """e^x for a number or a vector of them, within a unit in the last place; 0 below `_LOWEST`.
-
-    x = k ln 2 + r with |r| ≤ ln 2 / 2, and the Taylor polynomial of degree 13, whose remainder is under 5e-18.
-    """
-    kind = x.type
-    wide = isinstance(kind, ir.VectorType)
-    whole_kind = ir.VectorType(_I64, LANES) if wide else _I64
-
-    def number(value: float) -> Any:
-        return ir.Constant(kind, [value] * LANES if wide else value)
-
-    def whole_number(value: int) -> Any:
-        return ir.Constant(whole_kind, [value] * LANES if wide else value)
-
-    low = builder.fcmp_ordered("<", x, number(_LOWEST))
-    high = builder.fcmp_ordered(">", x, number(_HIGHEST))
-    bounded = builder.select(low, number(_LOWEST), builder.select(high, number(_HIGHEST), x))
-    shifted = _multiply_add(builder, bounded, number(1.4426950408889634), number(_ROUND))
-    k = builder.fsub(shifted, number(_ROUND))
-    r = _multiply_add(builder, k, number(-_LN2_HIGH), bounded)
-    r = _multiply_add(builder, k, number(-_LN2_LOW), r)
-    value = number(1.0 / math.factorial(13))
-    for power in range(12, -1, -1):
-        value = _multiply_add(builder, value, r, number(1.0 / math.factorial(power)))
-    exponent = builder.add(builder.bitcast(shifted, whole_kind), whole_number(1023))
-    power_of_two = builder.bitcast(builder.shl(exponent, whole_number(52)), kind)
-    value = builder.fmul(value, power_of_two)
-    value = builder.select(low, number(0.0), value)
-    return builder.select(high, number(math.inf), value)
-
-
-@intrinsic
-def exp_minus(typing_context: Any, n: Any, x: Any, shift: Any, out: Any) -> Any:
-    """out[:n] = e^(x[:n] - shift), within a unit in the last place; 0 where it is below the normal numbers."""
-
-    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        n, shift = given[0], given[2]
-        x, out = _pointer(builder, given[1]), _pointer(builder, given[3])
-        wide = _broadcast(builder, shift)
-
-        def whole(i: Any) -> None:
-            _store(builder, _exp(builder, builder.fsub(_load(builder, x, i), wide)), out, i)
-
-        def single(i: Any) -> None:
-            value = _exp(builder, builder.fsub(builder.load(builder.gep(x, [i])), shift))
-            builder.store(value, builder.gep(out, [i]))
-
-        _in_vectors(builder, n, whole, single)
-        return context.get_dummy_value()
-
-    return types.void(_i64, _i64, _f64, _i64), codegen
-
-
-@intrinsic
-def centre(typing_context: Any, rows: Any, k: Any, width: Any, x: Any, w: Any, mean: Any) -> Any:
-    """Rows of k numbers, `width` apart (whole vectors), become deviations from mean = x₀ + w Σ_r (x_r - x₀).
-
-    What stands behind the k numbers becomes zero: left alone, it would shrink from call to call to subnormal numbers,
-    which take a hundred times as long.
-    """
-
-    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        rows, k, width = given[:3]
-        x, mean = _pointer(builder, given[3]), _pointer(builder, given[5])
-        weight = _broadcast(builder, given[4])
-        nothing = ir.Constant(_VECTOR, [0.0] * LANES)
-        lanes = ir.Constant(ir.VectorType(_I64, LANES), list(range(LANES)))
-        sums = cgutils.alloca_once(builder, _VECTOR)
-
-        def others(body: Any) -> None:
-            with cgutils.for_range_slice(builder, _count(1), rows, _count(1), intp=_I64) as (r, _):
-                body(builder.gep(x, [builder.mul(r, width)]))
-
-        with cgutils.for_range_slice(builder, _count(0), width, _count(LANES), intp=_I64) as (at, _):
-            own = builder.icmp_signed("<", lanes, _broadcast(builder, builder.sub(k, at)))
-
-            def load(row: Any) -> Any:
-                return builder.select(own, _load(builder, row, at), nothing)
-
-            central = load(x)
-            builder.store(nothing, sums)
-
-            def add(row: Any) -> None:
-                builder.store(builder.fadd(builder.load(sums), builder.fsub(load(row), central)), sums)
-
-            others(add)
-            shift = builder.fmul(weight, builder.load(sums))
-            _store(builder, builder.fadd(central, shift), mean, at)
-
-            def deviate(row: Any) -> None:
-                _store(builder, builder.fsub(builder.fsub(load(row), central), shift), row, at)
-
-            others(deviate)
-            _store(builder, builder.fsub(nothing, shift), x, at)
-        return context.get_dummy_value()
-
-    return types.void(_i64, _i64, _i64, _i64, _f64, _i64), codegen
-
-
-@intrinsic
-def product(
-    typing_context: Any,
-    n: Any,
-    rows: Any,
-    a: Any,
-    a_width: Any,
-    b: Any,
-    b_width: Any,
-    first: Any,
-    w: Any,
-    out: Any,
-) -> Any:
-    """out (n, b_width) = first a₀ᵀ b₀ + w Σ_r a_rᵀ b_r over the rows a_r (n or more) and b_r (whole vectors).
-
-    Where a is b it is symmetric to the last bit.
-    """
-
-    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        n, rows, a_width, b_width = given[0], given[1], given[3], given[5]
-        a, b, out = (_pointer(builder, given[k]) for k in (2, 4, 8))
-        first, weight = _broadcast(builder, given[6]), _broadcast(builder, given[7])
-        sums = cgutils.alloca_once(builder, _VECTOR)
-
-        def entry(row: Any, i: Any) -> Any:
-            return _broadcast(builder, builder.load(builder.gep(row, [i])))
-
-        with cgutils.for_range(builder, n) as loop:
-            i = loop.index
-            with cgutils.for_range_slice(builder, _count(0), b_width, _count(LANES), intp=_I64) as (at, _):
-                builder.store(ir.Constant(_VECTOR, [0.0] * LANES), sums)
-                with cgutils.for_range_slice(builder, _count(1), rows, _count(1), intp=_I64) as (r, _):
-                    own = entry(builder.gep(a, [builder.mul(r, a_width)]), i)
-                    row = builder.gep(b, [builder.mul(r, b_width)])
-                    builder.store(_multiply_add(builder, own, _load(builder, row, at), builder.load(sums)), sums)
-                zeroth = builder.fmul(first, builder.fmul(entry(a, i), _load(builder, b, at)))
-                whole = builder.fadd(builder.fmul(weight, builder.load(sums)), zeroth)
-                _store(builder, whole, builder.gep(out, [builder.mul(i, b_width)]), at)
-        return context.get_dummy_value()
-
-    return types.void(_i64, _i64, _i64, _i64, _i64, _i64, _f64, _f64, _i64), codegen

@@ -17,9 +17,10 @@ from .gaussian import state_size
 from .jit import jit, matrix
 from .linalg import remove, triangularise
 from .robust import growth, memory
-from .sigma_points import deviations, padded, spread_points
+from .sigma_points import deviations, spread_points
 from .square_root import condition, condition_size, describe, moments, noise_root, settle, start
 from .ukf import CENTRAL_COV, OUTER, SPREAD, UKF, tune, weights
+from .vectors import padded
 
 
 def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:

@@ -12,7 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from .jit import jit
-from .simd import LANES, add_outer, add_scaled, combine, combine_four, dot, rotate
+from .simd import add_outer, add_scaled, combine, combine_four, dot, rotate
+from .vectors import LANES
 
 _SWEEPS = 60
 """Iterations for one eigenvalue; two are usual, so this many mean that a number is not finite."""

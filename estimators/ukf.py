@@ -16,7 +16,7 @@ from .context import circular_rows, circular_states, expect_rows, options, senso
 from .filter import Estimator, Option, Options
 from .gaussian import admit, compare, describe, downdate, moments, move_mean, start, state_size, wrap_mean
 from .jit import jit, matrix
-from .linalg import EPSILON, cholesky
+from .linalg import EPSILON
 from .model import StateSpaceModel
 from .robust import (
     ADAPT,
@@ -32,9 +32,10 @@ from .robust import (
     reweigh,
     shared,
 )
-from .sigma_points import covariance, cross_covariance, deviations, padded, spread_points
+from .sigma_points import covariance, cross_covariance, deviations, factor, spread_points
 from .track import FAILED, USED
 from .tuning import Tuning
+from .vectors import padded
 
 CENTRAL_COV, OUTER, SPREAD = range(OWN, OWN + 3)
 """Positions in the context's options: the central covariance weight, the outer weight, √(n+λ)."""
@@ -69,7 +70,7 @@ def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
 def work_size(options: Options, nx: int, ny: int) -> int:
     """Scratch: an update's; the factor, sigma points, the same through f or h, their mean and covariance."""
     n, m = padded(nx), padded(ny)
-    return gaussian.scratch_size(nx, ny) + nx * nx + (2 * nx + 1) * (n + max(n, m)) + max(n, (1 + nx + ny) * m)
+    return gaussian.scratch_size(nx, ny) + nx * n + (2 * nx + 1) * (n + max(n, m)) + max(n, m)
 
 
 @jit
@@ -86,24 +87,19 @@ def predict(context, u, dt, index, state, work):
     D = matrix(work, 0, 2 * n + 1, width)
     at = D.size
     sigma = matrix(work, at, 2 * n + 1, width)
-    spread = matrix(work, at, n, width)
     at += sigma.size
     forward = work[at : at + width]
-    U = matrix(work, at + width, n, n)
+    U = matrix(work, at + width, n, width)
     numbers = options(context)
-    if not cholesky(P, U, n):
+    if not factor(P, U):
         for i in range(n + n * n):
             state[i] = np.nan
         return
     spread_points(x, U, numbers[SPREAD], sigma)
     transition_rows(context, sigma.ctypes.data, width, 2 * n + 1, u, dt, D)
     deviations(D, numbers[OUTER], circular_states(context), forward)
-    # The covariance takes the place of the points, which have done their work.
-    covariance(D, numbers[CENTRAL_COV], numbers[OUTER], spread)
-    for i in range(n):
-        for j in range(n):
-            P[i, j] = spread[i, j]
-    add_noise(context, x, u, dt, state, P, U)
+    covariance(D, numbers[CENTRAL_COV], numbers[OUTER], P)
+    add_noise(context, x, u, dt, state, P, matrix(work, at + width, n, n))
     for i in range(n):
         x[i] = forward[i]
     wrap_mean(context, x)
@@ -141,18 +137,14 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     at = D.size
     mean = work[at : at + D.shape[1]]
     at += mean.size
-    S = matrix(work, at, m, D.shape[1])
-    at += S.size
-    C = matrix(work, at, n, D.shape[1])
-    at += C.size
     sigma = matrix(work, at, 2 * n + 1, padded(n))
     at += sigma.size
-    U = matrix(work, at, n, n)
-    nu, r, _, V, _, room, _ = gaussian.scratch(work[at + n * n :], n, m)
+    U = matrix(work, at, n, padded(n))
+    nu, r, S, V, C, W, room, _ = gaussian.scratch(work[at + U.size :], n, m)
     numbers = options(context)
     w = numbers[OUTER]
     spread = numbers[SPREAD]
-    if not cholesky(P, U, n):
+    if not factor(P, U):
         return FAILED
     spread_points(x, U, spread, sigma)
     expect_rows(context, sensor, sigma.ctypes.data, sigma.shape[1], 2 * n + 1, u, D)
@@ -176,7 +168,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     if verdict == USED:
         move_mean(m, C, V, nu, x)
         wrap_mean(context, x)
-        downdate(m, C, V, P)
+        downdate(m, C, V, P, W)
         if numbers[ADAPT] != OFF:
             adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict

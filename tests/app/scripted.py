@@ -66,7 +66,7 @@ class Scripted:
         pass
 
 
-def wait_for(condition, seconds=20.0):
+def wait_for(condition, seconds=60.0):
     """Poll until a condition holds; what another thread does has no event to wait on."""
     import time
 

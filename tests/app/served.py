@@ -17,7 +17,7 @@ from websockets.sync.server import serve
 from app.viser_guard import HEADER
 
 SECRET = "the secret between the servers"
-PATIENCE = 20.0
+PATIENCE = 60.0
 
 
 def shown_twin(**options):

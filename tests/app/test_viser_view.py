@@ -88,7 +88,7 @@ def server():
 
 
 def get(port, path="/", **headers):
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
     connection.request("GET", path, headers=headers)
     response = connection.getresponse()
     body = response.read()
@@ -108,7 +108,7 @@ def test_upgrade_without_the_secret_is_refused_on_the_wire(server):
     """A raw socket: neither a missing header nor a header given twice opens a WebSocket."""
     key = base64.b64encode(os.urandom(16)).decode()
     for extra in ("", f"{HEADER}: wrong\r\n", f"{HEADER}: s3cret\r\n{HEADER}: wrong\r\n"):
-        with socket.create_connection(("127.0.0.1", server.get_port()), timeout=10) as raw:
+        with socket.create_connection(("127.0.0.1", server.get_port()), timeout=30) as raw:
             raw.sendall(
                 f"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n{extra}"
                 f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n"

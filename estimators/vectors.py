@@ -1,0 +1,114 @@
+"""What the vector instructions of this package are spelled with: LLVM's, on vectors of `LANES` numbers.
+
+The compiler splits them where the processor's vectors are shorter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from llvmlite import ir
+from numba.core import cgutils
+
+from .jit import jit
+
+LANES = 8
+"""Numbers in a vector."""
+
+I32, I64, F64 = ir.IntType(32), ir.IntType(64), ir.DoubleType()
+VECTOR = ir.VectorType(F64, LANES)
+ZERO = ir.Constant(VECTOR, [0.0] * LANES)
+
+
+@jit
+def padded(n):
+    """How wide a row of n numbers is that takes whole vectors."""
+    return (n + LANES - 1) // LANES * LANES
+
+
+def constant(number: int) -> Any:
+    """A whole number."""
+    return ir.Constant(I64, number)
+
+
+def pointer(builder: Any, address: Any) -> Any:
+    """The numbers that begin at an address."""
+    return builder.inttoptr(address, F64.as_pointer())
+
+
+def at(builder: Any, base: Any, index: Any) -> Any:
+    """The address of the vector that begins at base[index]; it need not be aligned to more than a number."""
+    return builder.bitcast(builder.gep(base, [index]), VECTOR.as_pointer())
+
+
+def load(builder: Any, base: Any, index: Any) -> Any:
+    """The vector that begins at base[index]."""
+    return builder.load(at(builder, base, index), align=8)
+
+
+def store(builder: Any, value: Any, base: Any, index: Any) -> None:
+    """Write a vector to base[index] and behind."""
+    builder.store(value, at(builder, base, index), align=8)
+
+
+def first(builder: Any, count: Any) -> Any:
+    """The mask of a vector's first `count` numbers (all of them where there are more)."""
+    lanes = ir.Constant(ir.VectorType(I64, LANES), list(range(LANES)))
+    return builder.icmp_signed("<", lanes, broadcast(builder, count))
+
+
+def load_first(builder: Any, base: Any, index: Any, mask: Any) -> Any:
+    """A vector of which only the masked numbers are read; the others are 0."""
+    place = at(builder, base, index)
+    kind = ir.FunctionType(VECTOR, [place.type, I32, mask.type, VECTOR])
+    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.masked.load.v{LANES}f64.p0v{LANES}f64")
+    return builder.call(function, [place, ir.Constant(I32, 8), mask, ZERO])
+
+
+def store_first(builder: Any, value: Any, base: Any, index: Any, mask: Any) -> None:
+    """Write the masked numbers of a vector."""
+    place = at(builder, base, index)
+    kind = ir.FunctionType(ir.VoidType(), [VECTOR, place.type, I32, mask.type])
+    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.masked.store.v{LANES}f64.p0v{LANES}f64")
+    builder.call(function, [value, place, ir.Constant(I32, 8), mask])
+
+
+def broadcast(builder: Any, value: Any) -> Any:
+    """A vector of one number."""
+    undefined = ir.Constant(ir.VectorType(value.type, LANES), ir.Undefined)
+    one = builder.insert_element(undefined, value, ir.Constant(I32, 0))
+    return builder.shuffle_vector(one, undefined, ir.Constant(ir.VectorType(I32, LANES), [0] * LANES))
+
+
+def multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
+    """a b + c, of numbers or of vectors."""
+    kind = c.type
+    name = "llvm.fmuladd.f64" if kind == F64 else f"llvm.fmuladd.v{LANES}f64"
+    function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind] * 3), name)
+    return builder.call(function, [a, b, c])
+
+
+@contextmanager
+def steps(builder: Any, begin: Any, end: Any, step: int = 1) -> Iterator[Any]:
+    """A loop from `begin` up to `end`, which it does not reach."""
+    first = constant(begin) if isinstance(begin, int) else begin
+    with cgutils.for_range_slice(builder, first, end, constant(step), intp=I64) as (index, _):
+        yield index
+
+
+def in_vectors(builder: Any, n: Any, whole: Any, single: Any) -> None:
+    """whole(i) for each full vector of n numbers, then single(i) for each number of the rest."""
+    full = builder.and_(n, constant(-LANES))
+    for begin, end, step, body in ((constant(0), full, LANES, whole), (full, n, 1, single)):
+        with steps(builder, begin, end, step) as i:
+            body(i)
+
+
+def sum_of(builder: Any, vector: Any) -> Any:
+    """The numbers of a vector, added in pairs."""
+    numbers = [builder.extract_element(vector, ir.Constant(I32, k)) for k in range(LANES)]
+    while len(numbers) > 1:
+        numbers = [builder.fadd(a, b) for a, b in zip(numbers[::2], numbers[1::2], strict=True)]
+    return numbers[0]
