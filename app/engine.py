@@ -293,7 +293,7 @@ class Engine:
             if self._log.n > self._history + 3 * SPARSE_EVERY:
                 self._forget()
         if stale:
-            self.notices.report("stale", f"{stale} reading(s) later than the horizon dropped")
+            self.notices.report("stale", f"{stale} reading(s) later than the horizon dropped", times=stale)
         if self._feeder.live:
             self._latency.note(batch)
 

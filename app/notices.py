@@ -37,19 +37,20 @@ class Notices:
         self._next = 0
         self._last: dict[str, tuple[float, int]] = {}
 
-    def report(self, key: str, text: str, level: str = "warn", *, counted: bool = True) -> None:
+    def report(self, key: str, text: str, level: str = "warn", *, counted: bool = True, times: int = 1) -> None:
         """Count under `key`, and add a line unless one of that key came within the last second.
 
-        Not `counted`: what is reported can be counted better elsewhere, and `counts` leaves the key out.
+        Not `counted`: what is reported can be counted better elsewhere, and `counts` leaves the key out. One line may
+        tell of several `times`.
         """
         with self._lock:
-            self._counts[key] += 1
+            self._counts[key] += times
             if not counted:
                 self._elsewhere.add(key)
             when, at_count = self._last.get(key, (-SECONDS_APART, 0))
             if self._clock() - when < SECONDS_APART:
                 return
-            more = self._counts[key] - at_count - 1
+            more = self._counts[key] - at_count - times
             self._last[key] = (self._clock(), self._counts[key])
             self._add(level, text if more < 1 else f"{text} ({more} more before)")
 

@@ -89,12 +89,12 @@ def test_cursor_is_taken_back_by_a_late_reading(started):
     np.testing.assert_array_equal(again.readings.t, np.array([2.5, 3.0]) * SECOND)
 
 
-def test_reading_beyond_the_horizon_is_counted_and_dropped(started):
+def test_readings_beyond_the_horizon_are_counted_and_dropped(started):
     source = Scripted()
     engine = started(source)
-    source.put(readings([10.0, 7.9, 8.1], [40, 41, 42]))
+    source.put(readings([10.0, 7.9, 7.5, 8.1], [40, 41, 43, 42]))
     wait_for(lambda: rows(engine) == 2)
-    wait_for(lambda: engine.notices.counts().get("stale") == 1)
+    wait_for(lambda: engine.notices.counts().get("stale") == 2)
     np.testing.assert_array_equal(everything(engine).readings.t, np.array([8.1, 10.0]) * SECOND)
 
 
