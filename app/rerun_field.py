@@ -103,7 +103,7 @@ class FieldDrawing:
         t = np.array([picture.t for picture in pictures], np.int64)
         spread = np.array([picture.spread for picture in pictures])
         rmse = np.array([picture.rmse for picture in pictures])
-        rows.line("/field/spread", t, spread[:, None], 0)
+        rows.line("/field/spread", t, spread[:, None], 0, gaps=True)
         rows.line("/field/rmse", t, rmse[:, None], 0)
         for picture in pictures:
             for kind in self._kinds:

@@ -10,8 +10,9 @@ import viser
 from estimators.field import Field
 from estimators.pictures import Picture
 
-from .viser_charts import BLUE, GREEN, HEIGHT, Range, axes, frame, frame_series, line, no_data
+from .viser_charts import Range
 from .viser_history import History
+from .viser_series import BLUE, GREEN, HEIGHT, axes, frame, frame_series, line, no_data
 from .viser_time import Unit
 
 

@@ -101,8 +101,23 @@ class VehicleScene:
 
     def draw(self, history: History, belief: Any) -> None:
         """Send where everything is now."""
-        if not history.n or not np.isfinite(belief.mean[[self.east, self.north]]).all():
+        if not history.n:
             return
+        mean = history.column("mean")
+        self._trail.points = segments(self._plane(mean[:, self.east], mean[:, self.north], 0.06))
+        self._draw_truth(history)
+        self._draw_readings(history)
+        known = bool(np.isfinite(belief.mean[[self.east, self.north]]).all())
+        # What was drawn before would else stand for an estimate that is not a number.
+        self._vehicle.visible = known
+        self._draw_cloud(belief.points if known else (), belief.modes if known else ())
+        if known:
+            self._draw_vehicle(mean, belief)
+        else:
+            self._draw_ellipse(np.zeros(2), np.full((2, 2), np.nan))
+
+    def _draw_vehicle(self, mean: np.ndarray, belief: Any) -> None:
+        """Move the vehicle with its ellipse, and the world under the camera."""
         # A mean between two peaks is nowhere.
         peak = belief.modes[0] if len(belief.modes) > 1 else belief
         here = peak.mean[[self.east, self.north]]
@@ -114,21 +129,22 @@ class VehicleScene:
         self.world.position = shift
         # The grid is endless: only where its lines fall matters.
         self._grid.position = (*np.mod(shift[:2], 50.0), 0.0)
-        mean = history.column("mean")
-        self._trail.points = segments(self._plane(mean[:, self.east], mean[:, self.north], 0.06))
-        self._draw_truth(history)
-        self._draw_readings(history)
-        self._draw_cloud(belief)
         self._vehicle.position = (*here, 0.0)
         self._vehicle.wxyz = about_z(self._direction(peak, mean))
-        cov = np.zeros((3, 3))
-        cov[:2, :2] = peak.cov[np.ix_([self.east, self.north], [self.east, self.north])]
-        cov[2, 2] = 2 * cov.max() + 1.0  # the largest, so that the ellipse is the first two axes
-        if np.isfinite(cov).all():
-            axes, turn = ellipsoid(cov)
-            for handle in (self._ellipse, self._rim):
-                handle.position, handle.wxyz = (*here, 0.04), turn
-                handle.scale = (float(axes[0]), float(axes[1]), 1.0)
+        self._draw_ellipse(here, peak.cov[np.ix_([self.east, self.north], [self.east, self.north])])
+
+    def _draw_ellipse(self, here: np.ndarray, cov: np.ndarray) -> None:
+        known = bool(np.isfinite(cov).all())
+        self._ellipse.visible = self._rim.visible = known
+        if not known:
+            return
+        full = np.zeros((3, 3))
+        full[:2, :2] = cov
+        full[2, 2] = 2 * full.max() + 1.0  # the largest, so that the ellipse is the first two axes
+        axes, turn = ellipsoid(full)
+        for handle in (self._ellipse, self._rim):
+            handle.position, handle.wxyz = (*here, 0.04), turn
+            handle.scale = (float(axes[0]), float(axes[1]), 1.0)
 
     def _plane(self, east: np.ndarray, north: np.ndarray, height: float) -> np.ndarray:
         pick = np.unique(np.linspace(0, east.size - 1, min(east.size, TRAIL)).astype(int))
@@ -153,15 +169,15 @@ class VehicleScene:
         if len(points):
             self._readings.points = points
 
-    def _draw_cloud(self, belief: Any) -> None:
+    def _draw_cloud(self, points: Any, modes: Any) -> None:
         """The points that stand for the belief, and a dot with its weight at each peak, where there are several."""
         plane = [self.east, self.north]
-        points = belief.points[:, plane] if len(belief.points) else np.zeros((0, 2))
+        points = points[:, plane] if len(points) else np.zeros((0, 2))
         points = points[np.isfinite(points).all(axis=1)]
         self._cloud.visible = bool(len(points))
         if len(points):
             self._cloud.points = np.column_stack((points, np.full(len(points), 0.2))).astype(np.float32)
-        several = belief.modes if len(belief.modes) > 1 else ()
+        several = modes if len(modes) > 1 else ()
         for k, (dot, label) in enumerate(self._modes):
             shown = k < len(several) and bool(np.isfinite(several[k].mean[plane]).all())
             if shown:
@@ -173,8 +189,10 @@ class VehicleScene:
 
     def _direction(self, peak: Any, mean: np.ndarray) -> float:
         if self.heading is not None:
-            return float(peak.mean[self.heading])
+            if np.isfinite(peak.mean[self.heading]):
+                self._course = float(peak.mean[self.heading])
+            return self._course
         step = mean[-1, [self.east, self.north]] - mean[max(0, len(mean) - 20), [self.east, self.north]]
-        if np.hypot(*step) > 1.0:
+        if np.hypot(*step) > 1.0:  # not so if one of the two is NaN
             self._course = float(np.arctan2(step[1], step[0]))
         return self._course

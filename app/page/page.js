@@ -64,8 +64,14 @@ function show(status) {
   const turned = Object.keys(status.turned).length > 0;
   const recorded = status.began_as === "recorded" ? (turned ? " · recorded, turned" : " · as recorded") : "";
   $("title").textContent = status.title + recorded;
-  const lasting = status.health !== "tracking" && status.since !== null;
-  $("health").textContent = lasting ? `${status.health} for ${spell((status.t - status.since) / 1e9)}` : status.health;
+  const lost = status.lost !== null;
+  const lasting = lost || (status.health !== "tracking" && status.since !== null);
+  const condition = lost ? "not a number" : status.health;
+  const since = lost ? status.lost : status.since;
+  $("health").textContent = lasting ? `${condition} for ${spell((status.t - since) / 1e9)}` : condition;
+  $("health").title = lost
+    ? "The estimate is not a number: reset it, or choose another filter"
+    : "Health of the estimate";
   $("health").dataset.health = status.health;
   $("estimator").textContent = status.estimator.toUpperCase();
   $("revision").textContent = status.refolding ? `${status.revision} …` : status.revision;
