@@ -15,7 +15,7 @@ from estimators.log import READING, truth_of
 from estimators.model import StateSpaceModel
 
 from .observed import observed
-from .viser_camera import fit_cameras
+from .viser_camera import distance_for, fit_cameras
 from .viser_geometry import about_z, circle, disc, ellipsoid, segments
 from .viser_history import History
 
@@ -24,6 +24,10 @@ MODES = 4
 POINTS = 1500
 SOFTNESS = 0.3
 """Part of the way to the vehicle that the view moves in one frame."""
+
+FOV = float(np.radians(40))
+NEAREST = 15.0
+"""Metres from which the first view looks at walls at least: a vehicle is some 4 m long."""
 
 
 class VehicleScene:
@@ -44,8 +48,11 @@ class VehicleScene:
             for other in dots
             if dot.sensor == other.sensor and (dot.state, other.state) == (self.east, self.north)
         ]
-        self.follow = True
-        self._anchor: np.ndarray | None = None
+        corners = np.array([corner for line in scene.walls for corner in line]).reshape(-1, 2)
+        # Among walls the place is what matters, all of it: two peaks may be at its two ends.
+        self._home = 0.5 * (corners.min(axis=0) + corners.max(axis=0)) if corners.size else None
+        self.follow = self._home is None
+        self._anchor: np.ndarray | None = None if self._home is None else self._home.copy()
         self._course = 0.0
         api = server.scene
         api.set_up_direction("+z")
@@ -88,12 +95,18 @@ class VehicleScene:
         )
         camera = server.initial_camera
         camera.position, camera.look_at, camera.up = (0.0, -55.0, 60.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+        if self._home is not None:
+            outline = np.column_stack((corners - self._home, np.zeros(len(corners))))
+            away = np.array([0.0, -55.0, 60.0])
+            camera.position = away / np.linalg.norm(away) * max(NEAREST, distance_for(outline, away, FOV))
         camera.far = 20_000.0
-        fit_cameras(server, float(np.radians(40)))
+        fit_cameras(server, FOV)
+        self._move_world()
 
     def controls(self, gui: viser.GuiApi) -> None:
         """What a user may choose about the scene."""
-        follow = gui.add_checkbox("Follow", self.follow, hint="Keep the vehicle in the middle")
+        rest = "" if self._home is None else "; else the whole of the walls"
+        follow = gui.add_checkbox("Follow", self.follow, hint=f"Keep the vehicle in the middle{rest}")
 
         @follow.on_update
         def _(event: viser.GuiEvent) -> None:
@@ -121,17 +134,24 @@ class VehicleScene:
         # A mean between two peaks is nowhere.
         peak = belief.modes[0] if len(belief.modes) > 1 else belief
         here = peak.mean[[self.east, self.north]]
-        if self._anchor is None or np.linalg.norm(here - self._anchor) > 200.0:
-            self._anchor = here.copy()
-        if self.follow:
-            self._anchor += SOFTNESS * (here - self._anchor)
+        middle = here if self.follow or self._home is None else self._home
+        if self._anchor is None or np.linalg.norm(middle - self._anchor) > 200.0:
+            self._anchor = middle.copy()
+        if self.follow or self._home is not None:
+            self._anchor += SOFTNESS * (middle - self._anchor)
+        self._move_world()
+        self._vehicle.position = (*here, 0.0)
+        self._vehicle.wxyz = about_z(self._direction(peak, mean))
+        self._draw_ellipse(here, peak.cov[np.ix_([self.east, self.north], [self.east, self.north])])
+
+    def _move_world(self) -> None:
+        """Bring what is to be in the middle there."""
+        if self._anchor is None:
+            return
         shift = np.array([*-self._anchor, 0.0])
         self.world.position = shift
         # The grid is endless: only where its lines fall matters.
         self._grid.position = (*np.mod(shift[:2], 50.0), 0.0)
-        self._vehicle.position = (*here, 0.0)
-        self._vehicle.wxyz = about_z(self._direction(peak, mean))
-        self._draw_ellipse(here, peak.cov[np.ix_([self.east, self.north], [self.east, self.north])])
 
     def _draw_ellipse(self, here: np.ndarray, cov: np.ndarray) -> None:
         known = bool(np.isfinite(cov).all())
