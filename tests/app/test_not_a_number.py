@@ -9,21 +9,29 @@ from types import SimpleNamespace
 import numpy as np
 import pyarrow as pa
 import pytest
+import rerun as rr
+import viser
 from fake_engine import FakeEngine, events
 from rerun.chunk import RrdReader
 from scripted import SECOND, Scripted, readings, twin
 
 from app.commands import SetEstimator
 from app.engine import Engine
+from app.heatmap import ESTIMATE, NOTHING, Scale
 from app.layout import pair_name
+from app.rerun_field import FieldDrawing
 from app.rerun_view import RerunFeed
 from app.server_api import status_json
 from app.viser_decimate import extended, runs
+from app.viser_field_chart import FieldChart
 from app.viser_status import status_html
+from app.viser_time import SECONDS
 from app.viser_view import ViserView
 from config.schema import SceneSection, ViewSection
 from estimators.log import READING, RESET
 from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.models import MODELS
+from estimators.pictures import Picture
 from estimators.track import DIVERGED
 from estimators.tuning import Tuning
 
@@ -248,3 +256,36 @@ def test_runs_are_drawn_apart_and_the_oldest_together():
     (nothing,) = runs(np.full(3, np.nan), np.zeros(3, bool), 4)
     assert np.isnan(nothing).all()
     np.testing.assert_array_equal(extended(np.array([np.nan, 1.0, np.nan, 3.0, np.nan])), [1, 1, 2, 3, 3])
+
+
+def test_a_field_that_is_not_a_number_is_grey_and_has_no_scale():
+    model = MODELS["thermal_field"]
+    lost = np.full(model.grid.shape, np.nan)
+    scale = Scale(ESTIMATE)
+    scale.fit(lost)
+    assert scale.ticks() == [] and np.all(scale.indices(lost) == NOTHING)
+    stream = rr.RecordingStream("field")
+    data = stream.binary_stream()
+    rows = SimpleNamespace(root="", stream=stream, times=lambda t: rr.TimeColumn("time", duration=t * 1e-9))
+    FieldDrawing(model, truth=False)._draw(rows, SECOND, ESTIMATE.name, lost)
+    assert b"/field/estimate/image" in data.read()
+
+
+def test_a_fields_chart_has_a_gap_too():
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    try:
+        spread = np.array([1.0, 1.1, np.nan, np.nan, 0.9, 0.8])
+        pictures = [
+            Picture(k, k * SECOND, 1, 2 * value, 0.9, value, None, None, None) for k, value in enumerate(spread)
+        ]
+        chart = FieldChart(server.gui, MODELS["thermal_field"].grid, SECONDS, truth=True)
+        history = SimpleNamespace(column=lambda name: np.arange(6) * SECOND, origin=0)
+        chart.draw(pictures, history, None, SECONDS)
+        x, *lines, _ = chart._chart.data
+        expected = np.full((2, 6), np.nan)
+        expected[0, :2], expected[1, 4:] = spread[:2], spread[4:]
+        np.testing.assert_array_equal(x, np.arange(6.0))
+        np.testing.assert_allclose(lines, np.vstack((2 * expected, expected)))
+        assert len(chart._chart.series) == 6
+    finally:
+        server.stop()
