@@ -75,6 +75,7 @@ function show(status) {
   $("health").dataset.health = status.health;
   $("estimator").textContent = status.estimator.toUpperCase();
   $("revision").textContent = status.refolding ? `${status.revision} …` : status.revision;
+  compare(status.revision);
   const number = (value) => (typeof value === "number" ? value.toPrecision(3) : "–");
   const bounded = typeof status.nis === "number";
   $("nis").textContent = bounded ? `${number(status.nis)} (${number(status.nis_low)} – ${number(status.nis_high)})` : "–";
@@ -84,6 +85,18 @@ function show(status) {
   const playing = status.finished ? "ended" : status.paused ? "paused" : null;
   $("playing").hidden = playing === null;
   $("playing").textContent = playing ?? "";
+}
+
+// The newest revision that was heard of, and the one that the right pane's viewer has drawn.
+const revisions = { newest: null, drawn: null };
+
+function compare(revision) {
+  revisions.newest = Math.max(revision, revisions.newest ?? 0);
+  const late = revisions.drawn !== null && revisions.drawn !== revisions.newest;
+  const text = late ? `revision ${revisions.drawn} still; drawing ${revisions.newest} …` : "";
+  if ($("behind").textContent === text) return;
+  $("behind").textContent = text;
+  $("behind").hidden = !late;
 }
 
 function offer(names) {
@@ -131,8 +144,11 @@ try {
       if (message.boot && message.boot !== settings.boot) location.reload(); // another server, perhaps another twin
       if (message.status) show((window.nisus.status = message.status));
       if (message.recordings) offer(message.recordings);
-      if (message.recording) window.nisus.revision = message.revision;
+      if (message.recording) compare((window.nisus.revision = message.revision));
       if (message.drawn) {
+        // Unless it lost patience with the viewer, that shows the recording announced last.
+        if (!viewer.announced) revisions.drawn = window.nisus.revision;
+        compare(window.nisus.revision);
         window.nisus.drawn += 1;
         $("notice").hidden = true;
       }
