@@ -228,9 +228,11 @@ class Engine:
                 t=int(log.t[last]) if last >= 0 else None,
                 health=int(track.health[last]) if last >= 0 else TRACKING,
                 since=int(log.t[last_run(track.health)]) if last >= 0 else None,
+                lost=self._watch.lost,
                 counts={
                     **self.notices.counts(),
                     **self._tally.count(track.verdict, log.channel),
+                    **({"recovered": fold.recoveries()} if fold.recoveries() else {}),
                 },
                 nis=float(track.nis_mean[last]) if last >= 0 else np.nan,
                 nis_low=float(track.nis_low[last]) if last >= 0 else np.nan,
@@ -378,6 +380,10 @@ class Engine:
         fold = done.fold
         with self._lock:
             old, log = self._fold, self._log
+            # What the new revision says of the readings counts, also of those that it loses here; not what others said.
+            lost = max(0, log.first - fold.log.first)
+            tally = Tally(self.model)
+            tally.forget(fold.track.verdict[:lost], fold.log.channel[:lost])
             try:
                 fold.follow(log, changed_from)
             except EstimatorError:
@@ -397,8 +403,7 @@ class Engine:
                     Readings(*(column[: old.n].copy() for column in log.readings)),
                     old.track,
                 )
-                self._fold = fold
-                self._tally.again()
+                self._fold, self._tally = fold, tally
                 self._revision += 1
                 self._watch.again()
                 self._watch.look(fold, fold.n)

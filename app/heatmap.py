@@ -102,7 +102,9 @@ class Scale:
         return np.where(known, np.clip(np.where(known, place, 0.0), 0, NOTHING - 1), NOTHING).astype(np.uint8)
 
     def ticks(self) -> list[tuple[float, str]]:
-        """Places from 0 (low) to 1 (high) of the numbers beside it, with their text."""
+        """Places from 0 (low) to 1 (high) of the numbers beside it, with their text; none before the first number."""
+        if not np.isfinite(self.low):
+            return []
         first = int(np.ceil(self.low / self.step - 1e-9))
         last = int(np.floor(self.high / self.step + 1e-9))
         width = self.high - self.low

@@ -62,8 +62,10 @@ class Belief:
 class Status:
     """The state of the running twin, for panels and the API.
 
-    `t` is the time of the last event (ns), `since` that of the first from which on the health is what it is now,
-    `latency_ms` the 99th percentile from a reading's arrival to its row.
+    `t` is the time of the last event (ns), `since` that of the first from which on the health is what it is now, `lost`
+    that of the first from which on the estimate is not a number (None if it is one). `counts` are those of the rows of
+    this revision, and of what befell the twin beside them. `latency_ms` is the 99th percentile from a reading's arrival
+    to its row.
     """
 
     estimator: str
@@ -74,6 +76,7 @@ class Status:
     t: int | None
     health: int
     since: int | None
+    lost: int | None
     counts: dict[str, int]
     nis: float
     nis_low: float

@@ -103,7 +103,7 @@ class FieldDrawing:
         t = np.array([picture.t for picture in pictures], np.int64)
         spread = np.array([picture.spread for picture in pictures])
         rmse = np.array([picture.rmse for picture in pictures])
-        rows.line("/field/spread", t, spread[:, None], 0)
+        rows.line("/field/spread", t, spread[:, None], 0, gaps=True)
         rows.line("/field/rmse", t, rmse[:, None], 0)
         for picture in pictures:
             for kind in self._kinds:
@@ -126,7 +126,7 @@ class FieldDrawing:
         ticks = scale.ticks()
         # A label stands below its point, in its middle.
         across, above = frame.width + 2.0 * self._bar + 0.09 * frame.width, 0.035 * frame.height
-        positions = np.array([[across, (1.0 - place) * frame.height - above] for place, _ in ticks])
+        positions = np.array([[across, (1.0 - place) * frame.height - above] for place, _ in ticks]).reshape(-1, 2)
         rows.stream.send_columns(
             f"{rows.root}/field/{name}/scale",
             indexes=at,

@@ -133,13 +133,29 @@ class PairDrawing:
             self._last = None
         else:
             pick = pick[t[pick] >= self._last + step // 2]
-        mean = track.mean[:, self._columns]
-        pick = pick[np.isfinite(mean[pick]).all(axis=1)]
-        if pick.size:
-            self._pictures(rows, t[pick], track.select(pick), past)
-            if not past:
-                self._last = int(t[pick[-1]])
-            self._truth(rows, readings, t[pick])
+        if not pick.size:
+            return
+        columns = (
+            track.mean[pick][:, self._columns],
+            track.std[pick][:, self._columns],
+            track.cross[pick, self._index],
+        )
+        known = np.isfinite(np.column_stack(columns)).all(axis=1)
+        for run in np.split(pick, np.flatnonzero(known[1:] != known[:-1]) + 1):
+            if known[np.searchsorted(pick, run[0])]:
+                self._pictures(rows, t[run], track.select(run), past)
+            else:
+                self._blank(rows, t[run[:1]], past)
+        if not past:
+            self._last = int(t[pick[-1]])
+        self._truth(rows, readings, t[pick])
+
+    def _blank(self, rows: RerunRows, t: np.ndarray, past: bool) -> None:
+        """Show nothing from a time (1,) on, at which the estimate is not a number."""
+        for name in ("ellipse", "mean", "numbers", "way"):
+            rows.gap(f"{self._path}/{name}", t)
+        if not past:
+            self._way, self._way_t = self._way[:0], self._way_t[:0]
 
     def _pictures(self, rows: RerunRows, t: np.ndarray, track: Track, past: bool) -> None:
         mean = track.mean[:, self._columns] / self._scale

@@ -9,7 +9,7 @@ import rerun as rr
 
 from estimators.log import READING, Readings, truth_of
 from estimators.pictures import Picture
-from estimators.track import GATED, HEALTH_NAMES, Track
+from estimators.track import FAILED, GATED, HEALTH_NAMES, Track
 
 from .layout import HEALTH_COLORS, TIMELINE, blueprint, pair_name, styles
 from .observed import observed
@@ -162,8 +162,8 @@ class RerunRows:
         rows = last_of_each_time(t)
         width = self.width(t)
         for j, name in enumerate(state.name for state in self.model.shown_states):
-            self._line(f"/previous/state/{name}", t[rows], track.mean[rows, j, None], width)
-        self._line("/previous/nis", t[rows], track.nis_mean[rows, None], width)
+            self._line(f"/previous/state/{name}", t[rows], track.mean[rows, j, None], width, gaps=True)
+        self._line("/previous/nis", t[rows], track.nis_mean[rows, None], width, gaps=True)
 
     def notices(self, notices: list[Any]) -> None:
         """Log lines for people."""
@@ -189,12 +189,13 @@ class RerunRows:
         for j, name in enumerate(state.name for state in self.model.shown_states):
             # A probability has no band.
             mean, twice = track.mean[rows, j], 2.0 * track.std[rows, j] * (j != self.model.mode)
-            self._line(f"/state/{name}", t[rows], np.stack((mean, mean + twice, mean - twice), axis=1), width)
+            band = np.stack((mean, mean + twice, mean - twice), axis=1)
+            self._line(f"/state/{name}", t[rows], band, width, gaps=True)
 
     def _window_nis(self, t: np.ndarray, track: Track, width: int) -> None:
         rows = last_of_each_time(t)
         columns = (track.nis_mean[rows], track.nis_low[rows], track.nis_high[rows])
-        self._line("/nis/window", t[rows], np.stack(columns, axis=1), width, by_first=True)
+        self._line("/nis/window", t[rows], np.stack(columns, axis=1), width, by_first=True, gaps=True)
 
     def _health_changes(self, t: np.ndarray, track: Track, past: bool) -> None:
         health = track.health
@@ -231,20 +232,41 @@ class RerunRows:
             for r in range(len(sensor.rows)):
                 nu, twice = track.innovation[mask, r], 2.0 * track.innovation_std[mask, r]
                 path = f"/innovation/{self.model.row_names[self.model.row_start[k] + r]}"
-                self._line(path, t[mask], np.stack((nu, twice, -twice), axis=1), width, by_first=True)
+                failed = track.verdict[mask] == FAILED
+                self._line(path, t[mask], np.stack((nu, twice, -twice), axis=1), width, by_first=True, gaps=failed)
         self._line("/nis/reading", t[is_reading], track.nis[is_reading, None], width)
 
     def log_static(self, path: str, what: Any) -> None:
         """Log what holds at every time."""
         self.stream.log(f"{self.root}{path}", what, static=True)
 
-    def line(self, path: str, t: np.ndarray, values: np.ndarray, width: int) -> None:
-        """Log values (n, k) over time, thinned by the extremes of the first column; rows with NaN are left out."""
-        self._line(path, t, values, width, by_first=True)
+    def line(self, path: str, t: np.ndarray, values: np.ndarray, width: int, *, gaps: bool = False) -> None:
+        """Log values (n, k) over time, thinned by the extremes of the first column; see `_line` for rows with NaN."""
+        self._line(path, t, values, width, by_first=True, gaps=gaps)
 
-    def _line(self, path: str, t: np.ndarray, values: np.ndarray, width: int, *, by_first: bool = False) -> None:
-        """Log values (n, k) that are finite, thinned by their lowest and highest, or by those of the first column."""
+    def gap(self, path: str, t: np.ndarray) -> None:
+        """Log that under a path there is nothing from each of some times on, until something is logged."""
+        if t.size:
+            clear = rr.Clear.columns(is_recursive=np.zeros(t.size, bool))
+            self.stream.send_columns(path, indexes=[self.times(t)], columns=clear)
+
+    def _line(
+        self,
+        path: str,
+        t: np.ndarray,
+        values: np.ndarray,
+        width: int,
+        *,
+        by_first: bool = False,
+        gaps: bool | np.ndarray = False,
+    ) -> None:
+        """Log values (n, k) that are finite, thinned by their lowest and highest, or by those of the first column.
+
+        Where they are not, the line leads on to the next; but where `gaps` says so, it ends, and begins anew behind.
+        """
         good = np.isfinite(values).all(axis=1)
+        ends = ~good & gaps
+        self.gap(f"{self.root}{path}", t[ends & ~np.append(False, ends[:-1])])
         t, values = t[good], values[good]
         if not t.size:
             return

@@ -34,6 +34,7 @@ def status_json(engine: Any) -> dict[str, Any]:
         "t": status.t,
         "health": HEALTH_NAMES[status.health],
         "since": status.since,
+        "lost": status.lost,
         "nis": _plain(getattr(status, "nis", None)),
         "nis_low": _plain(getattr(status, "nis_low", None)),
         "nis_high": _plain(getattr(status, "nis_high", None)),

@@ -134,9 +134,20 @@ class BeliefScene:
         """Send where everything is now."""
         axes = list(self.axes)
         index = [axis.state for axis in axes]
+        lift = np.array([0.0, 0.0, 0.02 if len(axes) < 3 else 0.0])
         mean, cov = belief.mean[index], belief.cov[np.ix_(index, index)]
-        if not (np.isfinite(mean).all() and np.isfinite(cov).all()):
-            return
+        known = bool(np.isfinite(mean).all() and np.isfinite(cov).all())
+        # What was drawn before would else stand for an estimate that is not a number.
+        self._belief.visible = known
+        if known:
+            self._draw_belief(history, belief, axes, mean, cov, lift)
+        self._mark(axes, index, belief.modes if known else (), lift)
+        self._cloud(self._truth, axes, self._true_point(history, index), lift)
+
+    def _draw_belief(
+        self, history: History, belief: Any, axes: list[_Axis], mean: np.ndarray, cov: np.ndarray, lift: np.ndarray
+    ) -> None:
+        index = [axis.state for axis in axes]
         for k, axis in enumerate(axes):
             # A mode's axis always shows all of its values.
             last = 0.0 if axis.state != self.model.mode or self.model.jump is None else len(self.model.jump.modes) - 1.0
@@ -157,15 +168,12 @@ class BeliefScene:
         for handle in self._bodies:
             handle.wxyz = turn
             handle.scale = (float(half[0]), float(half[1]), float(half[2]) if n == 3 else 1.0)
-        lift = np.array([0.0, 0.0, 0.02 if n < 3 else 0.0])
         trail = self._place(axes, history.settled("mean", TRAIL)[:, index])
         trail[(np.abs(trail) > 1.0).any(axis=1)] = np.nan
         self._trail.points = segments(np.vstack((trail, centre)) - centre)
         self._cloud(
             self._points, axes, belief.points[:, index] if len(belief.points) else np.zeros((0, n)), lift, centre
         )
-        self._mark(axes, index, belief.modes, lift)
-        self._cloud(self._truth, axes, self._true_point(history, index), lift)
 
     def _mark(self, axes: list[_Axis], index: list[int], modes: tuple[Mode, ...], lift: np.ndarray) -> None:
         """Put a dot with its weight at each peak, where there are several."""

@@ -12,40 +12,20 @@ from estimators.model import StateSpaceModel
 from estimators.track import GATED
 
 from .observed import observed
-from .viser_decimate import Buckets, bridge
+from .viser_decimate import Buckets, bridge, extended, runs
 from .viser_history import History
-from .viser_time import Unit, unit_for, window_name
+from .viser_series import BLUE, DOTS, GREEN, GREY, HEIGHT, RED, axes, frame, nis_series, no_data, send, state_series
+from .viser_time import unit_for, window_name
 
-BLUE, GREEN, GREY, RED = "#2563eb", "#16a34a", "#9ca3af", "#dc2626"
-DOTS = ("#f59e0b", "#8b5cf6", "#0891b2")
 WINDOWS = (10.0, 30.0, 60.0, 300.0)
 """Seconds that the charts can show, beside the twin's own window and everything."""
 
 BUCKETS = 300
-HEIGHT = 130
+RUNS = 6
+"""Stretches without a gap in which a line is drawn at most."""
+
 SHOWN = 6
 """States that have a chart of their own; of more, the last chart shows the one chosen."""
-
-
-def line(color: str, width: float, **more: Any) -> dict[str, Any]:
-    """A series that is drawn as a line, over gaps too."""
-    return {"stroke": color, "width": width, "auto": False, "spanGaps": True, "points": {"show": False}, **more}
-
-
-def frame_series() -> dict[str, Any]:
-    """A series that is not seen."""
-    # uPlot finds no range of a series with NaN. So this invisible one, which has none, spans the range for all.
-    return {"label": "range", "stroke": "rgba(0,0,0,0)", "width": 0, "points": {"show": False}}
-
-
-def _dots(color: str, size: float) -> dict[str, Any]:
-    # A line of no width: uPlot draws the points only.
-    return {
-        "stroke": color,
-        "width": 0,
-        "auto": False,
-        "points": {"show": True, "size": size, "fill": color, "width": 0},
-    }
 
 
 class Range:
@@ -146,8 +126,8 @@ class Charts:
         if x.size == 1:
             x, times, values = np.repeat(x, 2), np.repeat(times, 2), np.repeat(values, 2, axis=0)
         for chart, j in zip(self._charts, self._shown, strict=True):
-            chart.data = self._state_data(x, times, values, j)
-        self._nis_chart.data = self._nis_data(x, values)
+            send(chart, *self._state_data(x, times, values, j))
+        send(self._nis_chart, *self._nis_data(x, values))
 
     def _in_unit(self, times: np.ndarray, origin: int) -> np.ndarray:
         """Times as the axes have them, in the unit that suits what is shown."""
@@ -184,58 +164,50 @@ class Charts:
             out[:, self._nis + k] = history.column(name)[rows]
         return out
 
-    def _state_data(self, x: np.ndarray, times: np.ndarray, values: np.ndarray, j: int) -> tuple[np.ndarray, ...]:
+    def _state_data(
+        self, x: np.ndarray, times: np.ndarray, values: np.ndarray, j: int
+    ) -> tuple[list[np.ndarray], tuple[dict[str, Any], ...]]:
+        """Columns of one state's chart, and the series that they are."""
         nx = len(self.model.shown)
         previous = np.full(x.size, np.nan)
         if self._previous is not None and self._previous[0].size:
             t, mean = self._previous
             previous = np.interp(times, t, mean[:, j], left=np.nan, right=np.nan)
         dots = [values[:, 4 * nx + j * 4 + d] for d in range(4)]
-        lines = [previous, bridge(values[:, 3 * nx + j]), values[:, j]]
-        columns = [values[:, nx + j], values[:, 2 * nx + j], *dots[:3], *lines, dots[3]]
-        return x, *columns, self._ranges[j].series(columns)
+        mean, high, low = (values[:, k * nx + j] for k in range(3))
+        known = np.isfinite(mean)
+        means, before = runs(mean, known, RUNS), runs(previous, np.isfinite(previous), RUNS)
+        # Where the estimate is not a number, the band has no width, so it is not seen.
+        band = [np.where(np.isfinite(edge), edge, extended(mean)) for edge in (high, low)]
+        columns = [*band, *dots[:3], *before, bridge(values[:, 3 * nx + j]), *means, dots[3]]
+        return [x, *columns, self._ranges[j].series(columns)], state_series(len(before), len(means))
 
-    def _nis_data(self, x: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, ...]:
+    def _nis_data(self, x: np.ndarray, values: np.ndarray) -> tuple[list[np.ndarray], tuple[dict[str, Any], ...]]:
+        """Columns of the NIS chart, and the series that they are."""
         nis, mean, low, high = (values[:, self._nis + k] for k in range(4))
         bound = np.nanmax(high) if np.isfinite(high).any() else np.nan
         if np.isfinite(bound):
             # One outlier must not flatten the rest: what lies far above the bound is drawn at the top.
             nis = np.minimum(nis, 4 * bound)
-        columns = [bridge(high), bridge(low), bridge(mean), nis]
-        return x, *columns, self._ranges[-1].series([*columns, np.zeros(x.size)])
+        known = np.isfinite(mean)
+        band = [np.where(known, edge, extended(mean)) for edge in (high, low)]
+        highs, lows, means = (runs(column, known, RUNS) for column in (high, low, mean))
+        columns = [*band, *highs, *lows, *means, nis]
+        return [x, *columns, self._ranges[-1].series([*columns, np.zeros(x.size)])], nis_series(len(means))
 
     def _state_chart(self, gui: viser.GuiApi, j: int) -> viser.GuiUplotHandle:
         state = self.model.shown_states[j]
-        band = line("rgba(37,99,235,0)", 0)
-        series = [
-            {"label": "time"},
-            {**band, "label": "+2σ"},
-            {**band, "label": "-2σ"},
-            *(_dots(color, 4) for color in DOTS),
-            line(GREY, 1, label="previous"),
-            line(GREEN, 1.5, label="truth"),
-            line(BLUE, 1.5, label="mean"),
-            _dots(RED, 5),
-            frame_series(),
-        ]
+        series = state_series(1, 1)
         return gui.add_uplot(
             no_data(len(series)),
-            tuple(series),  # type: ignore[arg-type]
+            series,  # type: ignore[arg-type]
             title=_title(self.model.label(state.name), state.unit),
             bands=({"series": (1, 2), "fill": "rgba(37,99,235,0.16)"},),
             **frame(HEIGHT, self.unit),
         )
 
     def _make_nis_chart(self, gui: viser.GuiApi) -> viser.GuiUplotHandle:
-        edge = line(GREY, 1, dash=(4, 4))
-        series = (
-            {"label": "time"},
-            {**edge, "label": "high"},
-            {**edge, "label": "low"},
-            line(BLUE, 1.5, label="windowed mean"),
-            _dots("#94a3b8", 3),
-            frame_series(),
-        )
+        series = nis_series(1)
         return gui.add_uplot(
             no_data(len(series)),
             series,  # type: ignore[arg-type]
@@ -261,29 +233,5 @@ class Charts:
         return f'<div style="font-size:0.75em;padding:0 0.8em 0.3em;font-weight:400">{"".join(parts)}</div>'
 
 
-def no_data(series: int) -> tuple[np.ndarray, ...]:
-    """Empty axes: all NaN but the times and the range."""
-    ends = np.array([0.0, 1.0])
-    return ends, *(np.full(2, np.nan) for _ in range(series - 2)), ends
-
-
 def _title(name: str, unit: str) -> str:
     return f"{name} [{unit}]" if unit and unit != "1" else name
-
-
-def axes(unit: Unit) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Time below, in a unit, and values to the left."""
-    axis = {"font": "11px sans-serif", "ticks": {"size": 4}}
-    below = {"size": 22, "label": unit.name, "labelSize": 12, "labelGap": -2, "labelFont": "11px sans-serif"}
-    return {**axis, **below}, {**axis, "size": 52}
-
-
-def frame(height: int, unit: Unit) -> dict[str, Any]:
-    """Axes, height and margins of a chart."""
-    return {
-        "scales": {"x": {"time": False}},
-        "axes": axes(unit),
-        "legend": {"show": False},
-        "height": height,
-        "padding": (4, 14, 0, 0),
-    }

@@ -120,3 +120,21 @@ def bridge(values: np.ndarray) -> np.ndarray:
         return values
     index = np.arange(values.size)
     return np.interp(index, good, values[good], left=np.nan, right=np.nan)
+
+
+def extended(values: np.ndarray) -> np.ndarray:
+    """Fill all NaN: on straight lines between finite values, level before the first and after the last."""
+    good = np.flatnonzero(np.isfinite(values))
+    return np.interp(np.arange(values.size), good, values[good]) if good.size else values
+
+
+def runs(values: np.ndarray, known: np.ndarray, most: int) -> list[np.ndarray]:
+    """One column for each run of values that are known, with NaN elsewhere; at least one, at most `most`.
+
+    Of more runs the oldest are in one column.
+    """
+    starts = known & ~np.append(False, known[:-1])
+    number = np.cumsum(starts)
+    count = int(number[-1]) if number.size else 0
+    column = np.maximum(number - max(0, count - most), 1)
+    return [np.where(known & (column == k), values, np.nan) for k in range(1, max(1, min(count, most)) + 1)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import viser
@@ -10,8 +11,10 @@ import viser
 from estimators.field import Field
 from estimators.pictures import Picture
 
-from .viser_charts import BLUE, GREEN, HEIGHT, Range, axes, frame, frame_series, line, no_data
+from .viser_charts import RUNS, Range
+from .viser_decimate import runs
 from .viser_history import History
+from .viser_series import BLUE, GREEN, HEIGHT, axes, frame, frame_series, line, no_data, send
 from .viser_time import Unit
 
 
@@ -20,7 +23,7 @@ class FieldChart:
 
     def __init__(self, gui: viser.GuiApi, field: Field, unit: Unit, *, truth: bool) -> None:
         self._range, self._unit = Range(), unit
-        series = ({"label": "time"}, line(GREEN, 1.5, label="RMSE"), line(BLUE, 1.5, label="spread"), frame_series())
+        series = _series(1)
         what = "RMSE (green) and spread (blue) of all cells" if truth else "spread of all cells"
         self._chart = gui.add_uplot(
             no_data(len(series)),
@@ -43,4 +46,13 @@ class FieldChart:
         x = (np.array([picture.t for picture in chosen]) - history.origin) * (1e-9 / unit.seconds)
         rmse, spread = (np.array([getattr(picture, name) for picture in chosen]) for name in ("rmse", "spread"))
         ends = self._range.series([rmse, spread, np.zeros(len(chosen))])
-        self._chart.data = (x, rmse, spread, ends)
+        known = np.isfinite(spread)
+        errors, spreads = runs(rmse, known, RUNS), runs(spread, known, RUNS)
+        send(self._chart, [x, *errors, *spreads, ends], _series(len(spreads)))
+
+
+def _series(count: int) -> tuple[dict[str, Any], ...]:
+    """The series of the chart, of which both lines come in some runs."""
+    errors = (line(GREEN, 1.5, label="RMSE") for _ in range(count))
+    spreads = (line(BLUE, 1.5, label="spread") for _ in range(count))
+    return {"label": "time"}, *errors, *spreads, frame_series()

@@ -20,15 +20,20 @@ def status_html(status: Any, origin: int | None, unit: Unit = SECONDS) -> str:
     lasting = status.health != TRACKING and status.since is not None and origin is not None
     since = f" since {unit.text((status.since - origin) * 1e-9)}" if lasting else ""
     remedy = ""
-    if status.health == DIVERGED:
-        remedy = "<div>The readings contradict the estimate. <b>Reset</b> begins anew from the prior.</div>"
+    if status.lost is not None:
+        when = "" if origin is None else f" since {unit.text((status.lost - origin) * 1e-9)}"
+        remedy = (
+            f"The estimate is not a number{when}. <b>Reset</b> begins anew from the prior; or choose another filter."
+        )
+    elif status.health == DIVERGED:
+        remedy = "The readings contradict the estimate. <b>Reset</b> begins anew from the prior."
     at = "" if status.t is None or origin is None else unit.text((status.t - origin) * 1e-9)
     state = "ended" if status.finished else "paused" if status.paused else ""
     fold = "⟳ refolding" if status.refolding else f"revision {status.revision}"
     latency = status.latency_ms
     counts = dict(status.counts)
     known = [(name, counts.pop(name, 0)) for name in COUNTED]
-    known += [(name, counts[name]) for name in ("held out", "failed") if counts.get(name)]
+    known += [(name, counts[name]) for name in ("held out", "failed", "recovered") if counts.get(name)]
     cells = "".join(
         f'<span style="margin-right:0.9em;white-space:nowrap"><span style="opacity:0.65">{html.escape(name)}</span> '
         f"{count:,}</span>"
@@ -41,7 +46,7 @@ def status_html(status: Any, origin: int | None, unit: Unit = SECONDS) -> str:
         'font-variant-numeric:tabular-nums">'
         '<div style="display:flex;justify-content:space-between;gap:0.5em">'
         f'<b style="color:{COLORS.get(health, "#6b7280")}">● {health}{since}</b>'
-        f"<span>{state}</span><span>{fold}</span><span>{at}</span></div><div>{cells}</div>{remedy}</div>"
+        f"<span>{state}</span><span>{fold}</span><span>{at}</span></div><div>{cells}</div><div>{remedy}</div></div>"
     )
 
 

@@ -15,7 +15,7 @@ from estimators.log import READING, truth_of
 from estimators.model import StateSpaceModel
 
 from .observed import observed
-from .viser_camera import fit_cameras
+from .viser_camera import distance_for, fit_cameras
 from .viser_geometry import about_z, circle, disc, ellipsoid, segments
 from .viser_history import History
 
@@ -24,6 +24,10 @@ MODES = 4
 POINTS = 1500
 SOFTNESS = 0.3
 """Part of the way to the vehicle that the view moves in one frame."""
+
+FOV = float(np.radians(40))
+NEAREST = 15.0
+"""Metres from which the first view looks at walls at least: a vehicle is some 4 m long."""
 
 
 class VehicleScene:
@@ -44,8 +48,11 @@ class VehicleScene:
             for other in dots
             if dot.sensor == other.sensor and (dot.state, other.state) == (self.east, self.north)
         ]
-        self.follow = True
-        self._anchor: np.ndarray | None = None
+        corners = np.array([corner for line in scene.walls for corner in line]).reshape(-1, 2)
+        # Among walls the place is what matters, all of it: two peaks may be at its two ends.
+        self._home = 0.5 * (corners.min(axis=0) + corners.max(axis=0)) if corners.size else None
+        self.follow = self._home is None
+        self._anchor: np.ndarray | None = None if self._home is None else self._home.copy()
         self._course = 0.0
         api = server.scene
         api.set_up_direction("+z")
@@ -88,12 +95,18 @@ class VehicleScene:
         )
         camera = server.initial_camera
         camera.position, camera.look_at, camera.up = (0.0, -55.0, 60.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+        if self._home is not None:
+            outline = np.column_stack((corners - self._home, np.zeros(len(corners))))
+            away = np.array([0.0, -55.0, 60.0])
+            camera.position = away / np.linalg.norm(away) * max(NEAREST, distance_for(outline, away, FOV))
         camera.far = 20_000.0
-        fit_cameras(server, float(np.radians(40)))
+        fit_cameras(server, FOV)
+        self._move_world()
 
     def controls(self, gui: viser.GuiApi) -> None:
         """What a user may choose about the scene."""
-        follow = gui.add_checkbox("Follow", self.follow, hint="Keep the vehicle in the middle")
+        rest = "" if self._home is None else "; else the whole of the walls"
+        follow = gui.add_checkbox("Follow", self.follow, hint=f"Keep the vehicle in the middle{rest}")
 
         @follow.on_update
         def _(event: viser.GuiEvent) -> None:
@@ -101,34 +114,57 @@ class VehicleScene:
 
     def draw(self, history: History, belief: Any) -> None:
         """Send where everything is now."""
-        if not history.n or not np.isfinite(belief.mean[[self.east, self.north]]).all():
+        if not history.n:
             return
-        # A mean between two peaks is nowhere.
-        peak = belief.modes[0] if len(belief.modes) > 1 else belief
-        here = peak.mean[[self.east, self.north]]
-        if self._anchor is None or np.linalg.norm(here - self._anchor) > 200.0:
-            self._anchor = here.copy()
-        if self.follow:
-            self._anchor += SOFTNESS * (here - self._anchor)
-        shift = np.array([*-self._anchor, 0.0])
-        self.world.position = shift
-        # The grid is endless: only where its lines fall matters.
-        self._grid.position = (*np.mod(shift[:2], 50.0), 0.0)
         mean = history.column("mean")
         self._trail.points = segments(self._plane(mean[:, self.east], mean[:, self.north], 0.06))
         self._draw_truth(history)
         self._draw_readings(history)
-        self._draw_cloud(belief)
+        known = bool(np.isfinite(belief.mean[[self.east, self.north]]).all())
+        # What was drawn before would else stand for an estimate that is not a number.
+        self._vehicle.visible = known
+        self._draw_cloud(belief.points if known else (), belief.modes if known else ())
+        if known:
+            self._draw_vehicle(mean, belief)
+        else:
+            self._draw_ellipse(np.zeros(2), np.full((2, 2), np.nan))
+
+    def _draw_vehicle(self, mean: np.ndarray, belief: Any) -> None:
+        """Move the vehicle with its ellipse, and the world under the camera."""
+        # A mean between two peaks is nowhere.
+        peak = belief.modes[0] if len(belief.modes) > 1 else belief
+        here = peak.mean[[self.east, self.north]]
+        middle = here if self.follow or self._home is None else self._home
+        if self._anchor is None or np.linalg.norm(middle - self._anchor) > 200.0:
+            self._anchor = middle.copy()
+        if self.follow or self._home is not None:
+            self._anchor += SOFTNESS * (middle - self._anchor)
+        self._move_world()
         self._vehicle.position = (*here, 0.0)
         self._vehicle.wxyz = about_z(self._direction(peak, mean))
-        cov = np.zeros((3, 3))
-        cov[:2, :2] = peak.cov[np.ix_([self.east, self.north], [self.east, self.north])]
-        cov[2, 2] = 2 * cov.max() + 1.0  # the largest, so that the ellipse is the first two axes
-        if np.isfinite(cov).all():
-            axes, turn = ellipsoid(cov)
-            for handle in (self._ellipse, self._rim):
-                handle.position, handle.wxyz = (*here, 0.04), turn
-                handle.scale = (float(axes[0]), float(axes[1]), 1.0)
+        self._draw_ellipse(here, peak.cov[np.ix_([self.east, self.north], [self.east, self.north])])
+
+    def _move_world(self) -> None:
+        """Bring what is to be in the middle there."""
+        if self._anchor is None:
+            return
+        shift = np.array([*-self._anchor, 0.0])
+        self.world.position = shift
+        # The grid is endless: only where its lines fall matters.
+        self._grid.position = (*np.mod(shift[:2], 50.0), 0.0)
+
+    def _draw_ellipse(self, here: np.ndarray, cov: np.ndarray) -> None:
+        known = bool(np.isfinite(cov).all())
+        self._ellipse.visible = self._rim.visible = known
+        if not known:
+            return
+        full = np.zeros((3, 3))
+        full[:2, :2] = cov
+        full[2, 2] = 2 * full.max() + 1.0  # the largest, so that the ellipse is the first two axes
+        axes, turn = ellipsoid(full)
+        for handle in (self._ellipse, self._rim):
+            handle.position, handle.wxyz = (*here, 0.04), turn
+            handle.scale = (float(axes[0]), float(axes[1]), 1.0)
 
     def _plane(self, east: np.ndarray, north: np.ndarray, height: float) -> np.ndarray:
         pick = np.unique(np.linspace(0, east.size - 1, min(east.size, TRAIL)).astype(int))
@@ -153,15 +189,15 @@ class VehicleScene:
         if len(points):
             self._readings.points = points
 
-    def _draw_cloud(self, belief: Any) -> None:
+    def _draw_cloud(self, points: Any, modes: Any) -> None:
         """The points that stand for the belief, and a dot with its weight at each peak, where there are several."""
         plane = [self.east, self.north]
-        points = belief.points[:, plane] if len(belief.points) else np.zeros((0, 2))
+        points = points[:, plane] if len(points) else np.zeros((0, 2))
         points = points[np.isfinite(points).all(axis=1)]
         self._cloud.visible = bool(len(points))
         if len(points):
             self._cloud.points = np.column_stack((points, np.full(len(points), 0.2))).astype(np.float32)
-        several = belief.modes if len(belief.modes) > 1 else ()
+        several = modes if len(modes) > 1 else ()
         for k, (dot, label) in enumerate(self._modes):
             shown = k < len(several) and bool(np.isfinite(several[k].mean[plane]).all())
             if shown:
@@ -173,8 +209,10 @@ class VehicleScene:
 
     def _direction(self, peak: Any, mean: np.ndarray) -> float:
         if self.heading is not None:
-            return float(peak.mean[self.heading])
+            if np.isfinite(peak.mean[self.heading]):
+                self._course = float(peak.mean[self.heading])
+            return self._course
         step = mean[-1, [self.east, self.north]] - mean[max(0, len(mean) - 20), [self.east, self.north]]
-        if np.hypot(*step) > 1.0:
+        if np.hypot(*step) > 1.0:  # not so if one of the two is NaN
             self._course = float(np.arctan2(step[1], step[0]))
         return self._course

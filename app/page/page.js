@@ -64,11 +64,18 @@ function show(status) {
   const turned = Object.keys(status.turned).length > 0;
   const recorded = status.began_as === "recorded" ? (turned ? " · recorded, turned" : " · as recorded") : "";
   $("title").textContent = status.title + recorded;
-  const lasting = status.health !== "tracking" && status.since !== null;
-  $("health").textContent = lasting ? `${status.health} for ${spell((status.t - status.since) / 1e9)}` : status.health;
+  const lost = status.lost !== null;
+  const lasting = lost || (status.health !== "tracking" && status.since !== null);
+  const condition = lost ? "not a number" : status.health;
+  const since = lost ? status.lost : status.since;
+  $("health").textContent = lasting ? `${condition} for ${spell((status.t - since) / 1e9)}` : condition;
+  $("health").title = lost
+    ? "The estimate is not a number: reset it, or choose another filter"
+    : "Health of the estimate";
   $("health").dataset.health = status.health;
   $("estimator").textContent = status.estimator.toUpperCase();
   $("revision").textContent = status.refolding ? `${status.revision} …` : status.revision;
+  compare(status.revision);
   const number = (value) => (typeof value === "number" ? value.toPrecision(3) : "–");
   const bounded = typeof status.nis === "number";
   $("nis").textContent = bounded ? `${number(status.nis)} (${number(status.nis_low)} – ${number(status.nis_high)})` : "–";
@@ -78,6 +85,18 @@ function show(status) {
   const playing = status.finished ? "ended" : status.paused ? "paused" : null;
   $("playing").hidden = playing === null;
   $("playing").textContent = playing ?? "";
+}
+
+// The newest revision that was heard of, and the one that the right pane's viewer has drawn.
+const revisions = { newest: null, drawn: null };
+
+function compare(revision) {
+  revisions.newest = Math.max(revision, revisions.newest ?? 0);
+  const late = revisions.drawn !== null && revisions.drawn !== revisions.newest;
+  const text = late ? `revision ${revisions.drawn} still; drawing ${revisions.newest} …` : "";
+  if ($("behind").textContent === text) return;
+  $("behind").textContent = text;
+  $("behind").hidden = !late;
 }
 
 function offer(names) {
@@ -125,8 +144,11 @@ try {
       if (message.boot && message.boot !== settings.boot) location.reload(); // another server, perhaps another twin
       if (message.status) show((window.nisus.status = message.status));
       if (message.recordings) offer(message.recordings);
-      if (message.recording) window.nisus.revision = message.revision;
+      if (message.recording) compare((window.nisus.revision = message.revision));
       if (message.drawn) {
+        // Unless it lost patience with the viewer, that shows the recording announced last.
+        if (!viewer.announced) revisions.drawn = window.nisus.revision;
+        compare(window.nisus.revision);
         window.nisus.drawn += 1;
         $("notice").hidden = true;
       }

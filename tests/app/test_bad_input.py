@@ -216,7 +216,7 @@ def test_particles_that_all_weigh_nothing_recover_and_it_is_said(name, start):
     track = rows(engine).track
     assert track.verdict.tolist() == [USED, FAILED, USED, USED, USED]
     assert np.isfinite(track.mean).all() and abs(track.mean[-1, 0] - 40.0) < 5.0
-    wait_for(lambda: engine.notices.counts().get("recovered") == 1)
+    wait_for(lambda: engine.status().counts.get("recovered") == 1)
     assert engine.status().counts["failed"] == 1
     text = f"{name}: no particle explained a reading; the cloud was widened, 1 time(s) so far"
     assert text in [line.text for line in engine.notices.since(0)]

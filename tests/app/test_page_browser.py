@@ -127,12 +127,24 @@ def test_a_session_on_the_page(browser, served, tmp_path, monkeypatch):
     path = tmp_path / engine.status().recording
     assert path.name.startswith("motor_winding") and path.suffix == ".rrd"
 
-    # Swap the filter.
+    # Swap the filter. The right pane says that it is behind, from the word of a new revision until that is drawn.
+    page.evaluate(
+        """() => {
+            window.said = [];
+            const behind = document.getElementById("behind");
+            const note = () => window.said.push([behind.hidden, behind.textContent]);
+            new MutationObserver(note).observe(behind, { attributes: true, childList: true });
+        }"""
+    )
     panel.get_by_role("tab", name="Tune").click()
     panel.get_by_role("combobox", name="Estimator").click()
     panel.get_by_role("option", name="Unscented Kalman filter", exact=True).click()
     wait_for(lambda: engine.status().estimator == "ukf" and not engine.status().refolding, PATIENCE)
     assert engine.status().revision == 1
+    until(page, "window.said.some(([hidden]) => !hidden) && document.getElementById('behind').hidden")
+    said = page.evaluate("window.said")
+    assert [False, "revision 0 still; drawing 1 …"] in said and said[-1] == [True, ""]
+    assert page.evaluate("window.nisus.revision") == 1
 
     # Drag Q: larger process noise must make a wider band on every row of the history.
     before = track_of(engine)

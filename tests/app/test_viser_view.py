@@ -386,6 +386,39 @@ def test_vehicle_scene_stands_at_the_heaviest_peak_among_its_walls():
         server.stop()
 
 
+def test_the_first_view_holds_all_walls_and_stays_until_it_is_to_follow():
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    try:
+        walls = (((80.0, -3.0), (140.0, -3.0), (140.0, 45.0)), ((90.0, 0.0), (80.0, 1.0)))
+        section = SceneSection(kind="vehicle", position=("east", "north"), heading="heading", walls=walls)
+        scene = VehicleScene(server, MODELS["agv_corridor"], section)
+        camera = server.initial_camera
+        forward = (camera.look_at - camera.position) / np.linalg.norm(camera.look_at - camera.position)
+        sideways = np.array([1.0, 0.0, 0.0])
+        tangents = []
+        for corner in [corner for line in walls for corner in line]:
+            sight = np.array([*corner, 0.0]) + scene.world.position - camera.position
+            tangents += [abs(sight @ axis) / (sight @ forward) for axis in (sideways, np.cross(sideways, forward))]
+        # Some wall fills the view but for its margin of a tenth; none is out of it.
+        assert max(tangents) == pytest.approx(0.9 * np.tan(camera.fov / 2))
+        rows = History(3, 4, 16)
+        rows.n = 1
+        cov = 0.01 * np.eye(3)
+        belief = SimpleNamespace(mean=np.array([135.0, 1.0, 0.0]), cov=cov, points=np.zeros((0, 3)), modes=())
+        scene.draw(rows, belief)
+        np.testing.assert_allclose(scene.world.position, [-110.0, -21.0, 0.0])
+        scene.follow = True
+        for _ in range(40):
+            scene.draw(rows, belief)
+        np.testing.assert_allclose(scene.world.position, [-135.0, -1.0, 0.0], atol=0.01)
+        scene.follow = False
+        for _ in range(40):
+            scene.draw(rows, belief)
+        np.testing.assert_allclose(scene.world.position, [-110.0, -21.0, 0.0], atol=0.01)
+    finally:
+        server.stop()
+
+
 def test_vehicle_scene_keeps_the_vehicle_in_the_middle():
     def f(x, u, p, dt, out):
         out[0] = x[0] + dt * x[2]
