@@ -85,13 +85,13 @@ def fold_twin(arguments: Arguments) -> int:
     if arguments.out is not None:
         _write(arguments.out, twin, log, fold.track, pictures)
     if arguments.json:
-        print(json.dumps(_as_dict(twin, result, seconds)))
+        print(json.dumps(_as_dict(twin, result, seconds, fold)))
     else:
-        _print(twin, result, seconds, counts, fold.track)
+        _print(twin, result, seconds, counts, fold)
     return 0
 
 
-def _as_dict(twin: Twin, result: Score, seconds: float) -> dict[str, Any]:
+def _as_dict(twin: Twin, result: Score, seconds: float, fold: Fold) -> dict[str, Any]:
     def number(value: float) -> float | None:
         return float(value) if np.isfinite(value) else None
 
@@ -110,11 +110,14 @@ def _as_dict(twin: Twin, result: Score, seconds: float) -> dict[str, Any]:
         "log_likelihood": number(result.log_likelihood),
         "gated": result.gated,
         "missing": result.missing,
+        "failed": int(np.sum(fold.track.verdict == FAILED)),
+        "failure": str(fold.failure) if fold.failure else None,
         "seconds_per_event": seconds,
     }
 
 
-def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], track: Track) -> None:
+def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], fold: Fold) -> None:
+    track = fold.track
     units = {state.name: state.unit for state in twin.model.shown_states}
     grid = twin.model.grid
     rows = [
@@ -152,6 +155,8 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], trac
     failed = int(np.sum(track.verdict == FAILED))
     if failed:
         rows.append(("failed", f"{failed}: no estimate, or none with this reading, is a number"))
+    if fold.failure:
+        rows.append((f"the model failed {fold.failures} time(s)", str(fold.failure)))
     row_units = dict(
         zip(twin.model.row_names, [row.unit for sensor in twin.model.sensors for row in sensor.rows], strict=True)
     )

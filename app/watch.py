@@ -16,16 +16,20 @@ class Watch:
         self._notices = notices
         self._health = TRACKING
         self._recoveries = 0
+        self._failures = 0
+        self._said: set[str] = set()
 
     def again(self) -> None:
-        """Another fold begins, whose recoveries are counted from none."""
-        self._recoveries = 0
+        """Another fold begins, whose recoveries and failures are counted from none."""
+        self._recoveries = self._failures = 0
+        self._said.clear()
 
     def look(self, fold: Fold, before: int) -> None:
         """Report the rows from `before` on."""
         track, log = fold.track, fold.log
         for key, text in complaints(fold.model, log.channel, track, before):
             self._notices.report(key, text, counted=False)
+        self._look_at_failures(fold)
         count, known = fold.recoveries(), self._recoveries
         self._recoveries = count
         if count > known:
@@ -38,3 +42,13 @@ class Watch:
             level = "info" if self._health == TRACKING else "warn"
             since = int(log.t[last_run(track.health)])
             self._notices.say(f"health: {HEALTH_NAMES[self._health]}{more}", level=level, t=since)
+
+    def _look_at_failures(self, fold: Fold) -> None:
+        """Say what a black box failed with; the same words once, as readings that failed are counted anyway."""
+        count, known = fold.failures, self._failures
+        self._failures = count
+        text = str(fold.failure)
+        if count > known and text not in self._said:
+            self._said.add(text)
+            more = "the readings concerned count as failed, and the estimate goes on where the model answers again"
+            self._notices.report("model failed", f"{text}; {more}", level="error", counted=False)

@@ -18,7 +18,7 @@ from .compiled import compile_model
 from .context import context_of, context_type, prior
 from .diagnostics import Bounds, HealthPolicy, assess, assess_signature, chi_square_bounds
 from .driven import driven
-from .errors import EstimatorError
+from .errors import EstimatorError, ModelError
 from .filter import Code, Estimator, call_describe, call_predict, call_start, call_update, code_type
 from .fold_python import LONGEST, UNSET
 from .indicator import indicator
@@ -311,6 +311,16 @@ class Fold:
         """How often the filter had to help itself since it started, as a cloud of particles that lost the asset."""
         return 0 if self.estimator.recoveries is None else self.estimator.recoveries(self._state)
 
+    @property
+    def failures(self) -> int:
+        """How often a black box failed since this fold was made; the readings concerned have failed."""
+        return int(getattr(self._context, "failures", 0))
+
+    @property
+    def failure(self) -> ModelError | None:
+        """What a black box said when it failed last."""
+        return getattr(self._context, "failure", None)
+
     def modes(self) -> list[Mode]:
         """The peaks of the estimate, the heaviest first; a Gaussian filter has one."""
         if self.estimator.modes is not None:
@@ -320,8 +330,7 @@ class Fold:
     def advance(self, limit: int | None = None) -> int:
         """Fold the events that the log has beyond `n`, at most `limit`; return how many.
 
-        Raises:
-            ModelError: If a black box fails; the fold is then where it last remembered itself, at or before `n`.
+        A black box that fails stops nothing: see `failures`.
         """
         end = self.log.n if limit is None else min(self.log.n, self.n + limit)
         begun = self.n
@@ -345,7 +354,7 @@ class Fold:
             try:
                 self._run_events(run_some, self.n, stop)
             except BaseException:
-                # A model's own Python failed between two events: back to where the state is known.
+                # Python was stopped between two events: back to where the state is known.
                 self._restore(self.n)
                 raise
             self.n = stop
@@ -485,10 +494,12 @@ def fold(
 
     Raises:
         EstimatorError: If the estimator does not exist or does not apply to the model.
-        ModelError: If the model's functions disagree with its declaration.
+        ModelError: If the model's functions disagree with its declaration, or those of a black box fail.
     """
     growing = Fold(estimator, model, tuning, log, pairs=pairs, policy=policy)
     growing.advance()
+    if growing.failure is not None:
+        raise growing.failure
     return growing.track
 
 

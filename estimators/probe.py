@@ -5,7 +5,9 @@ from __future__ import annotations
 import re
 import traceback
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from types import CodeType
 from typing import Any
 
 import numpy as np
@@ -21,12 +23,23 @@ def plain(function: Any) -> Callable:
 
 def place(function: Any, error: BaseException | None = None) -> str:
     """File and line of a function, or of the last line in its file that an error came through, as `file:line: `."""
-    code = getattr(plain(function), "__code__", None)
+    code = _code(function)
     if code is None:
         return ""
     frames = traceback.extract_tb(error.__traceback__ if error else None)
     lines = [frame.lineno for frame in frames if frame.filename == code.co_filename and frame.lineno]
+    if error is not None and error.__cause__ is not None:
+        # Of an error in another process only the text of its traceback comes.
+        found = re.findall(rf'File "{re.escape(code.co_filename)}", line (\d+)', str(error.__cause__))
+        lines += [int(line) for line in found]
     return _shown(code.co_filename, lines[-1] if lines else code.co_firstlineno)
+
+
+def _code(function: Any) -> CodeType | None:
+    """The code of a function, of what a `partial` holds, or of an object that can be called."""
+    function = plain(function)
+    function = function.func if isinstance(function, partial) else function
+    return getattr(function, "__code__", None) or getattr(type(function).__call__, "__code__", None)
 
 
 def _shown(file: str, line: int) -> str:
