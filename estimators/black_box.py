@@ -17,6 +17,7 @@ import numba
 import numpy as np
 
 from .errors import ModelError
+from .from_file import portable
 from .jit import floats
 from .model import StateSpaceModel
 from .probe import place
@@ -48,6 +49,8 @@ class BlackBox:
 
     def __init__(self, model: StateSpaceModel) -> None:
         self.model = model
+        functions = (model.f, *(sensor.h for sensor in model.sensors)) if model.executor is not None else ()
+        self._sent = {id(function): portable(function) for function in functions}
 
     def f(self, X: np.ndarray, u: np.ndarray, p: np.ndarray, dt: float) -> np.ndarray:
         """The states (N, nx) that follow those of a block X (N, nx).
@@ -82,7 +85,7 @@ class BlackBox:
                 parts = [_call(function, X, *rest)]
             else:
                 pieces = np.array_split(X, max(1, min(_workers(pool), len(X))))
-                futures = [pool.submit(_call, function, piece, *rest) for piece in pieces]
+                futures = [pool.submit(_call, self._sent[id(function)], piece, *rest) for piece in pieces]
                 parts = [future.result() for future in futures]
         except (Exception, SystemExit) as error:  # noqa: BLE001  the user's own function may raise anything
             at = place(function, error)
@@ -154,5 +157,5 @@ def _told(error: BaseException, states: int) -> str:
     if isinstance(error, BrokenExecutor):
         _pool.cache_clear()
     if isinstance(error, (BrokenExecutor, PicklingError)) or "pickle" in str(error):
-        return f"{line}; processes need functions that can be imported by name, use threads for others"
+        return f"{line}; processes need functions that stand by their names in a module or file, use threads for others"
     return f"{line}; mend it, or let it return NaN in the rows of states that it has no answer for"
