@@ -18,6 +18,7 @@ from estimators.errors import ConfigError, SourceError
 from estimators.fold import Fold
 from estimators.log import KIND_NAMES, Log, truth_of
 from estimators.pictures import Picture
+from estimators.post_mortem import failures
 from estimators.score import Score, score
 from estimators.track import FAILED, HEALTH_NAMES, VERDICT_NAMES, Track
 from estimators.tuning import TOGETHER
@@ -111,9 +112,15 @@ def _as_dict(twin: Twin, result: Score, seconds: float, fold: Fold) -> dict[str,
         "gated": result.gated,
         "missing": result.missing,
         "failed": int(np.sum(fold.track.verdict == FAILED)),
-        "failure": str(fold.failure) if fold.failure else None,
+        "failure": _why(fold),
         "seconds_per_event": seconds,
     }
+
+
+def _why(fold: Fold) -> str | None:
+    """What of the model made the first reading or estimate fail that did."""
+    rows = failures(fold.track)
+    return fold.cause(int(rows[0])) if rows.size else None
 
 
 def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], fold: Fold) -> None:
@@ -155,8 +162,9 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], fold
     failed = int(np.sum(track.verdict == FAILED))
     if failed:
         rows.append(("failed", f"{failed}: no estimate, or none with this reading, is a number"))
-    if fold.failure:
-        rows.append((f"the model failed {fold.failures} time(s)", str(fold.failure)))
+    why = _why(fold)
+    if why:
+        rows.append((f"the model failed {fold.failures} time(s)" if fold.failures else "because", why))
     row_units = dict(
         zip(twin.model.row_names, [row.unit for sensor in twin.model.sensors for row in sensor.rows], strict=True)
     )

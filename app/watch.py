@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from estimators.fold import Fold
+from estimators.post_mortem import failures
 from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
 
 from .notices import Notices
 from .tally import complaints, last_run
+
+TRIES = 3
+"""Failures of one fold whose cause is sought; a reading of 1e300 has none in the model, so more than one."""
 
 
 class Watch:
@@ -18,11 +22,14 @@ class Watch:
         self._recoveries = 0
         self._failures = 0
         self._said: set[str] = set()
+        self._tries, self._fresh = 0, False
 
     def again(self) -> None:
         """Another fold begins, whose recoveries and failures are counted from none."""
         self._recoveries = self._failures = 0
         self._said.clear()
+        # Nobody has looked at its rows yet.
+        self._tries, self._fresh = 0, True
 
     def look(self, fold: Fold, before: int) -> None:
         """Report the rows from `before` on."""
@@ -30,6 +37,7 @@ class Watch:
         for key, text in complaints(fold.model, log.channel, track, before):
             self._notices.report(key, text, counted=False)
         self._look_at_failures(fold)
+        self._look_for_cause(fold, before)
         count, known = fold.recoveries(), self._recoveries
         self._recoveries = count
         if count > known:
@@ -52,3 +60,17 @@ class Watch:
             self._said.add(text)
             more = "the readings concerned count as failed, and the estimate goes on where the model answers again"
             self._notices.report("model failed", f"{text}; {more}", level="error", counted=False)
+
+    def _look_for_cause(self, fold: Fold, before: int) -> None:
+        """Say once for each fold what of the model made a reading or the estimate fail, if it is to blame."""
+        first = 0 if self._fresh else before
+        self._fresh = False
+        if self._tries >= TRIES or fold.failure is not None:
+            return
+        rows = failures(fold.track, first)
+        if rows.size:
+            self._tries += 1
+            text = fold.cause(int(rows[0]))
+            if text is not None:
+                self._tries = TRIES
+                self._notices.say(text, level="error", t=int(fold.log.t[rows[0]]))

@@ -27,6 +27,7 @@ from .log import INPUT, READING, RESET, TICK, TRUTH, Log
 from .model import StateSpaceModel
 from .modes import Mode
 from .pictures import Pictures
+from .post_mortem import Estimate, cause, failures
 from .quantiles import chi_square_quantile
 from .registry import find_estimator
 from .track import MISSING, NONE, Track, track_type
@@ -320,6 +321,33 @@ class Fold:
     def failure(self) -> ModelError | None:
         """What a black box said when it failed last."""
         return getattr(self._context, "failure", None)
+
+    def cause(self, row: int) -> str | None:
+        """What of the model is to blame for a row whose reading failed or whose estimate is no number, in one line.
+
+        Tried anew from the last estimate before it that is a number; None if nothing is found. Takes milliseconds.
+        """
+        if self.failure is not None:
+            return str(self.failure)
+        log, track, model = self.log, self.track, self.model
+        known = np.setdiff1d(np.arange(row), failures(track))
+        last = int(known[-1]) if known.size else -1
+        at, base = self.base_at(max(0, last))
+        x, u, then = base.mean.copy(), base.u.copy(), base.clock
+        std = np.sqrt(base.cov[0] if base.cov.shape[0] == 1 else np.diag(base.cov))
+        if known.size:
+            x[model.shown], std[model.shown], then = track.mean[last], track.std[last], int(log.t[last])
+        for k in at + np.flatnonzero(log.kind[at:row] == INPUT):
+            given = log.value[k, : u.size]
+            np.copyto(u, given, where=np.isfinite(given))
+        dt = (int(log.t[row]) - then) * 1e-9 if then != UNSET else 0.0
+        if dt > LONGEST * model.max_step:
+            x, std, dt = model.prior_mean.copy(), model.prior_std, 0.0
+        sensor = int(log.channel[row]) if log.kind[row] == READING else None
+        predicted = None
+        if len(model.shown) == model.nx and np.all(np.isfinite(track.mean[row]) & np.isfinite(track.std[row])):
+            predicted = Estimate(track.mean[row].copy(), track.std[row])
+        return cause(self._compiled, Estimate(x, std), u, self._held["p"], self._held["q"], dt, sensor, predicted)
 
     def modes(self) -> list[Mode]:
         """The peaks of the estimate, the heaviest first; a Gaussian filter has one."""

@@ -63,7 +63,7 @@ def _gist(error: Exception) -> str:
     return (rows or lines or ["no message"])[0]
 
 
-def _numbers(values: np.ndarray) -> str:
+def numbers(values: np.ndarray) -> str:
     """The first entries of a vector."""
     return f"[{', '.join(f'{value:.4g}' for value in values[:4])}{', …' if values.size > 4 else ''}]"
 
@@ -81,6 +81,18 @@ def _remedy(error: Exception, function: Any, takes: str, sizes: str, at: str) ->
     return f"it may not fail at {at}; mend it, or the prior"
 
 
+def indefinite(Q: np.ndarray) -> str | None:
+    """Why a matrix of finite numbers is no covariance; None if it is one."""
+    # Beside its own variances: a Q of nanometres may be lopsided too.
+    if np.any(np.abs(Q - Q.T) > 1e-9 * np.sqrt(np.abs(np.outer(np.diag(Q), np.diag(Q))))):
+        return "is not symmetric (fill both triangles)"
+    values = np.linalg.eigvalsh(Q)
+    # Rounding leaves the zero eigenvalues of a singular Q at n ε of the largest.
+    if values[0] < -1e-9 * max(values[-1], -values[0]):
+        return f"is not positive semidefinite (it has the eigenvalue {values[0]:.3g})"
+    return None
+
+
 def probe(model: StateSpaceModel) -> None:
     """Run the plain functions once with arrays of the declared sizes, where an index that is too large is an error."""
     x = model.prior_mean.copy()
@@ -95,7 +107,7 @@ def probe(model: StateSpaceModel) -> None:
         ("Q", model.Q, "x, u, p, q, dt", (x, u, p, q, dt), (n, n)),
         ("shape", model.shape, "z, p", (np.random.default_rng(0).standard_normal(n), p), (n,)),
     ]
-    at = f"x = {_numbers(x)}, u = {_numbers(u)}, p = {_numbers(p)}"
+    at = f"x = {numbers(x)}, u = {numbers(u)}, p = {numbers(p)}"
     for sensor in model.sensors:
         m = len(sensor.rows)
         calls.append((f"h of sensor {sensor.name}", sensor.h, "x, u, p", (x, u, p), (m,)))
@@ -129,19 +141,12 @@ def probe(model: StateSpaceModel) -> None:
                 f"not finite at the prior, the first of them out[{first}]; it must fill them all with finite numbers "
                 f"at {at}"
             )
-        # Beside its own variances: a Q of nanometres may be lopsided too.
-        if what == "Q" and np.any(np.abs(out - out.T) > 1e-9 * np.sqrt(np.abs(np.outer(np.diag(out), np.diag(out))))):
+        wrong = indefinite(out) if what == "Q" else None
+        if wrong:
             raise ModelError(
-                f"{place(function)}model {model.name}: Q is not symmetric at the prior; fill both triangles"
+                f"{place(function)}model {model.name}: Q {wrong} at the prior; a covariance must be symmetric and "
+                "positive semidefinite"
             )
-        if what == "Q":
-            values = np.linalg.eigvalsh(out)
-            # Rounding leaves the zero eigenvalues of a singular Q at n ε of the largest.
-            if values[0] < -1e-9 * max(values[-1], -values[0]):
-                raise ModelError(
-                    f"{place(function)}model {model.name}: Q has the eigenvalue {values[0]:.3g} at the prior; a "
-                    "covariance must be positive semidefinite"
-                )
 
 
 def probe_angles(model: StateSpaceModel, h: Sequence[Callable]) -> None:

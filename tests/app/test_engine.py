@@ -1,6 +1,7 @@
 """The engine: whatever order, pieces, retunes and failures, the track is the fold of the log."""
 
 import itertools
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -457,3 +458,41 @@ def test_the_same_failure_is_said_once_however_long_it_lasts():
     watch.again()
     watch.look(growing, growing.n)
     assert sum("the solver is away" in line.text for line in notices.since(0)) == 2
+
+
+def cooling(x, u, p, q, dt, out):
+    """A variance below 50 °C only."""
+    out[0, 0] = q[0] * dt * (50.0 - x[0])
+    out[1, 1] = q[1] * dt
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "ukf"])
+def test_a_noise_that_is_none_where_the_asset_gets_is_named_once_a_fold(started, estimator):
+    source = Scripted()
+    engine = started(source, model=replace(MODEL, Q=cooling, linear=False), estimator=estimator)
+    times = np.arange(1.0, 61.0)
+    source.put(readings(times, 40.0 + times))
+    wait_for(lambda: rows(engine) == 60)
+
+    def said():
+        return [line for line in engine.notices.since(0) if "positive semidefinite" in line.text]
+
+    assert engine.status().counts["failed"] > 0 and engine.status().health == DIVERGED
+    (line,) = said()
+    place = rf"\S*test_engine.py:{cooling.__code__.co_firstlineno}: model motor_winding: "
+    found = re.match(
+        place + r"Q\(x, u, dt\) is not positive semidefinite \(it has the eigenvalue -\S+\) at x = \[(\S+), ", line.text
+    )
+    assert found and float(found[1]) > 50.0 and line.level == "error"
+    # When it happened: the asset is at 50 °C after 10 s.
+    assert 5 * SECOND < line.t < 60 * SECOND
+    source.put(readings([61.0, 62.0], [101.0, 102.0]))
+    wait_for(lambda: rows(engine) == 62)
+    assert len(said()) == 1
+    engine.submit(commands.SetTuning("R.winding", 5.0))
+    wait_for(lambda: everything(engine).revision == 1)
+    assert len(said()) == 2
+    # A fold without trouble has nothing to say.
+    engine.submit(commands.SetTuning("Q.temperature", 0.0))
+    wait_for(lambda: everything(engine).revision == 2)
+    assert len(said()) == 2

@@ -1,6 +1,8 @@
 """The table that `nisus fold --out` writes: a row an event, with what is true where it is known."""
 
 import json
+import re
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -86,3 +88,31 @@ def test_what_a_black_box_failed_with_is_told(tmp_path: Path, capsys: pytest.Cap
     twin = load_twin(path)
     row = fold_row(twin, "filterpy-ukf", [read_log(twin, None)[0].readings])
     assert row.failure.startswith(said)
+
+
+def test_what_of_the_model_made_a_reading_fail_is_told(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """h ends at 42 m, beyond which the level rises: √ of a negative number."""
+    box = """\
+        import numpy as np
+        from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
+
+        def f(x, u, p, dt, out):
+            out[0] = x[0] + dt
+
+        def h(x, u, p, out):
+            out[0] = x[0] + 0.0 * np.sqrt(42.0 - x[0])
+
+        Box = StateSpaceModel(
+            name="box", title="box", states=(State("level", "m", 40.0, 0.01),), f=f,
+            noises=(Noise("level", "m2/s", 1e-6),), sensors=(Sensor("gauge", (Row("level", "m", 1e-4),), h=h),),
+        )
+        """
+    (tmp_path / "drive.csv").write_text("t,y\n0,40\n1,41\n2,41.9\n3,43\n")
+    (tmp_path / "box.py").write_text(textwrap.dedent(box))
+    (tmp_path / "box.yaml").write_text(BOXED.replace("filterpy-ukf", "ukf"))
+    assert fold_twin(Fold(str(tmp_path / "box.yaml"))) == 0
+    printed = capsys.readouterr().out
+    said = r"h\(x, u\) of sensor gauge is \[nan\] at x = \[4\d.*\], where the estimate got; it must be finite"
+    assert re.search(rf"\nbecause +{re.escape(str(tmp_path))}/box.py:7: model box: {said}", printed)
+    assert fold_twin(Fold(str(tmp_path / "box.yaml"), json=True)) == 0
+    assert re.search(said, json.loads(capsys.readouterr().out)["failure"])
