@@ -137,6 +137,18 @@ def test_the_inputs_that_held_are_taken():
     assert "x = [3], u = [1], dt = 1 s" in growing.cause(4)
 
 
+def test_the_path_is_walked_in_the_models_own_steps():
+    """Four steps of 1 s from 0 m at 1 m/s: f is asked at 0, 1 and 2 m, and has no answer there."""
+    model = walk(f=root_step, states=(State("s", "m", 0.0, 1e-6),), noises=(Noise("s", "m²/s", 0.0),), max_step=1.0)
+    log = Log(model.width)
+    for t, kind, value in ((0, READING, 0.0), (0, INPUT, 1.0), (4, READING, 4.0)):
+        log.extend(Readings.one(t * SECOND, 0, kind, 0, [value], 1))
+    growing = Fold("ekf", model, Tuning.of(model), log)
+    growing.advance()
+    assert list(failures(growing.track)) == [2]
+    assert "f(x, u, dt) is [nan] at x = [2], u = [1], dt = 1 s" in growing.cause(2)
+
+
 def test_a_block_that_returns_no_number_is_named_too():
     """The black box gives NaN where x > 0.5, and is asked at the estimate alone."""
 
