@@ -8,8 +8,9 @@ import pytest
 from blocks import BOX, both_block, f_block
 
 from estimators.fold import Fold
+from estimators.joint import Unknown, joint
 from estimators.log import INPUT, READING, TICK, Log, Readings
-from estimators.model import Input, Noise, Row, Sensor, State, StateSpaceModel
+from estimators.model import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.post_mortem import failures
 from estimators.track import FAILED
 from estimators.tuning import Tuning
@@ -135,6 +136,14 @@ def test_the_inputs_that_held_are_taken():
     rows = failures(growing.track)
     assert rows[0] == 4
     assert "x = [3], u = [1], dt = 1 s" in growing.cause(4)
+
+
+@pytest.mark.parametrize(("changes", "culprit"), [({"f": root_step}, root_step), ({"Q": shrinking}, shrinking)])
+def test_the_models_own_function_is_named_where_a_parameter_is_estimated(changes, culprit):
+    gain = Parameter("gain", "1", 1.0)
+    growing = driven(joint(walk(parameters=(gain,), **changes), {"gain": Unknown(0.1, 0.0)}))
+    line = growing.cause(int(failures(growing.track)[0]))
+    assert f"test_post_mortem.py:{culprit.__code__.co_firstlineno}: model walk: " in line
 
 
 def test_the_path_is_walked_in_the_models_own_steps():
