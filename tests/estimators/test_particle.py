@@ -13,7 +13,7 @@ from estimators.fold import Fold, fold
 from estimators.log import READING, TICK, Log, Readings
 from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.particle import RECOVERIES, block, members
-from estimators.track import FAILED, MISSING, USED
+from estimators.track import FAILED, GATED, HELD_OUT, MISSING, USED
 from estimators.tuning import Tuning
 
 NAMES = ("pf", "pf-reg", "pf-ekf", "apf")
@@ -264,6 +264,30 @@ def test_a_reading_without_a_value_changes_nothing(name):
     assert list(missed.verdict) == [USED, MISSING, USED, USED, MISSING]
     assert np.array_equal(plain.mean, missed.mean[[0, 2, 3]]) and missed.mean[4] == plain.mean[2]
     assert np.array_equal(plain.log_likelihood, missed.log_likelihood[[0, 2, 3]])
+
+
+@pytest.mark.parametrize(("key", "value", "verdict"), [("gate", 0.999, GATED), ("use.y", False, HELD_OUT)])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_reading_that_is_not_used_moves_no_particle(name, key, value, verdict):
+    """The estimate is what a question at that time was answered with just before."""
+    model = scalar()
+    tuning = Tuning.of(model).with_options({"particles": 200}).set(key, value)
+    track = fold(name, model, tuning, log_of((0, READING, 2.1), (1, TICK, 0), (1, READING, 9.0)))
+    assert track.verdict[2] == verdict
+    # Moments may be added up in another order.
+    np.testing.assert_allclose(track.mean[2], track.mean[1], rtol=1e-12)
+    np.testing.assert_allclose(track.std[2], track.std[1], rtol=1e-9)
+
+
+def test_every_child_of_the_auxiliary_filter_is_a_copy_of_its_parent():
+    """Of two particles one explains the reading, by far: both are that one then, as no noise moves them apart."""
+    quiet = Sensor("y", (Row("y", "m", 1e-6),), h=itself)
+    model = scalar(sensors=(quiet,), noises=(Noise("s", "m²/s", 0.0),))
+    for seed in range(5):
+        tuning = replace(Tuning.of(model).with_options({"particles": 2}), seed=seed)
+        run = Fold("apf", model, tuning, log_of((0, TICK, 0), (0, READING, 2.5)))
+        run.advance()
+        assert run.track.verdict[1] == USED and run.track.std[0, 0] > 0.0 and run.track.std[1, 0] == 0.0
 
 
 @pytest.mark.parametrize("name", EXACT)
