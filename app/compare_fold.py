@@ -153,6 +153,8 @@ def _timed(
         while fold.n < log.n and (t[fold.n] == t[fold.n - 1] or t[fold.n - 1] == t[0]):
             fold.advance(1)
         took.append(time.process_time() - begun)
+        if fold.failure is not None:
+            raise fold.failure
     return fold, min(took) / fold.n
 
 

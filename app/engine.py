@@ -364,9 +364,11 @@ class Engine:
     def retune(self, estimator: str, tuning: Tuning) -> None:
         """Fold the history again, beside the running fold, over a copy of the log."""
         self._options.leave(self.estimator, self.tuning)
+        # First, so that nobody sees the new tuning without a refold that is waited for.
+        ticket = self._requests.ask()
         self.estimator, self.tuning = estimator, tuning
         log, base = self._log.copy(), self._base
-        self._refolder.request(self._requests.ask(), lambda: self._make_fold(estimator, tuning, log, base))
+        self._refolder.request(ticket, lambda: self._make_fold(estimator, tuning, log, base))
         self._status = None
 
     def _adopt(self, done: Refolded) -> None:

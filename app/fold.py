@@ -18,6 +18,7 @@ from estimators.errors import ConfigError, SourceError
 from estimators.fold import Fold
 from estimators.log import KIND_NAMES, Log, truth_of
 from estimators.pictures import Picture
+from estimators.post_mortem import failures
 from estimators.score import Score, score
 from estimators.track import FAILED, HEALTH_NAMES, VERDICT_NAMES, Track
 from estimators.tuning import TOGETHER
@@ -86,13 +87,13 @@ def fold_twin(arguments: Arguments) -> int:
     if arguments.out is not None:
         _write(arguments.out, twin, log, fold.track, pictures)
     if arguments.json:
-        print(json.dumps(_as_dict(twin, result, seconds)))
+        print(json.dumps(_as_dict(twin, result, seconds, fold)))
     else:
-        _print(twin, result, seconds, counts, fold.track)
+        _print(twin, result, seconds, counts, fold)
     return 0
 
 
-def _as_dict(twin: Twin, result: Score, seconds: float) -> dict[str, Any]:
+def _as_dict(twin: Twin, result: Score, seconds: float, fold: Fold) -> dict[str, Any]:
     def number(value: float) -> float | None:
         return float(value) if np.isfinite(value) else None
 
@@ -111,11 +112,20 @@ def _as_dict(twin: Twin, result: Score, seconds: float) -> dict[str, Any]:
         "log_likelihood": number(result.log_likelihood),
         "gated": result.gated,
         "missing": result.missing,
+        "failed": int(np.sum(fold.track.verdict == FAILED)),
+        "failure": _why(fold),
         "seconds_per_event": seconds,
     }
 
 
-def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], track: Track) -> None:
+def _why(fold: Fold) -> str | None:
+    """What of the model made the first reading or estimate fail that did."""
+    rows = failures(fold.track)
+    return fold.cause(int(rows[0])) if rows.size else None
+
+
+def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], fold: Fold) -> None:
+    track = fold.track
     units = {state.name: state.unit for state in twin.model.shown_states}
     grid = twin.model.grid
     rows = [
@@ -153,6 +163,9 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], trac
     failed = int(np.sum(track.verdict == FAILED))
     if failed:
         rows.append(("failed", f"{failed}: no estimate, or none with this reading, is a number"))
+    why = _why(fold)
+    if why:
+        rows.append((f"the model failed {fold.failures} time(s)" if fold.failures else "because", why))
     row_units = dict(
         zip(twin.model.row_names, [row.unit for sensor in twin.model.sensors for row in sensor.rows], strict=True)
     )

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
-import sys
 import traceback
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,6 +14,7 @@ from config.loader import Loaded, shown_path
 from config.problems import nearest
 from config.yaml_lines import Key
 from estimators.errors import ModelError, NisusError
+from estimators.from_file import run_file
 from estimators.joint import Unknown, joint
 from estimators.model import Field, State, StateSpaceModel
 from estimators.models import MODELS
@@ -50,22 +49,13 @@ def find_model(loaded: Loaded, key: Key, reference: str) -> StateSpaceModel:
 def _import(path: Path) -> ModuleType:
     """Run a user's file as a module of a name of its own, with its folder importable meanwhile."""
     path = path.resolve()
-    unique = f"nisus_model_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
-    spec = importlib.util.spec_from_file_location(unique, path)
-    if spec is None:
+    if path.suffix != ".py":
         raise ModelError(f"{shown_path(path)}: it is not a Python file; its name must end in .py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[unique] = module  # Before it runs: dataclasses and Numba look their module up by name.
-    sys.path.insert(0, str(path.parent))
+    unique = f"nisus_model_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
     try:
-        # Not through the loader, which would leave a __pycache__ beside the user's file and trust a stale one.
-        exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)
+        return run_file(unique, path)
     except (Exception, SystemExit) as error:
-        sys.modules.pop(unique, None)
         raise _blame(error, path) from error
-    finally:
-        sys.path.remove(str(path.parent))
-    return module
 
 
 def _as_model(found: Any, name: str, path: Path, loaded: Loaded, key: Key) -> StateSpaceModel:

@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from estimators.fold import Fold
+from estimators.post_mortem import failures
 from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING, Track
 
 from .notices import Notices
 from .tally import UNSETTLED, complaints, last_run
+
+TRIES = 3
+"""Failures of one fold whose cause is sought; a reading of 1e300 has none in the model, so more than one."""
 
 
 class Watch:
@@ -19,6 +23,9 @@ class Watch:
         self._health = TRACKING
         self._recoveries = 0
         self._lost: tuple[int, int] | None = None
+        self._failures = 0
+        self._said: set[str] = set()
+        self._tries, self._fresh = 0, False
 
     @property
     def lost(self) -> int | None:
@@ -26,15 +33,20 @@ class Watch:
         return None if self._lost is None else self._lost[1]
 
     def again(self) -> None:
-        """Another fold begins, whose recoveries are counted from none."""
-        self._recoveries = 0
+        """Another fold begins, whose recoveries and failures are counted from none."""
+        self._recoveries = self._failures = 0
         self._lost = None
+        self._said.clear()
+        # Nobody has looked at its rows yet.
+        self._tries, self._fresh = 0, True
 
     def look(self, fold: Fold, before: int) -> None:
         """Report the rows from `before` on."""
         track, log = fold.track, fold.log
         for key, text in complaints(fold.model, log.channel, track, before):
             self._notices.report(key, text, counted=False)
+        self._look_at_failures(fold)
+        self._look_for_cause(fold, before)
         count, known = fold.recoveries(), self._recoveries
         self._recoveries = count
         if count > known:
@@ -70,6 +82,30 @@ class Watch:
                 break
             end = start
         return log.first + end, int(log.t[end])
+
+    def _look_at_failures(self, fold: Fold) -> None:
+        """Say what a black box failed with; the same words once, as readings that failed are counted anyway."""
+        count, known = fold.failures, self._failures
+        self._failures = count
+        text = str(fold.failure)
+        if count > known and text not in self._said:
+            self._said.add(text)
+            more = "the readings concerned count as failed, and the estimate goes on where the model answers again"
+            self._notices.report("model failed", f"{text}; {more}", level="error", counted=False)
+
+    def _look_for_cause(self, fold: Fold, before: int) -> None:
+        """Say once for each fold what of the model made a reading or the estimate fail, if it is to blame."""
+        first = 0 if self._fresh else before
+        self._fresh = False
+        if self._tries >= TRIES or fold.failure is not None:
+            return
+        rows = failures(fold.track, first)
+        if rows.size:
+            self._tries += 1
+            text = fold.cause(int(rows[0]))
+            if text is not None:
+                self._tries = TRIES
+                self._notices.say(text, level="error", t=int(fold.log.t[rows[0]]))
 
 
 def numbers(track: Track, start: int, end: int) -> np.ndarray:

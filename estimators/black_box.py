@@ -17,8 +17,10 @@ import numba
 import numpy as np
 
 from .errors import ModelError
+from .from_file import portable
 from .jit import floats
 from .model import StateSpaceModel
+from .probe import place
 
 ANSWER = 2
 """Numbers behind the parameters: where the members stand, and where the answers for them."""
@@ -47,6 +49,8 @@ class BlackBox:
 
     def __init__(self, model: StateSpaceModel) -> None:
         self.model = model
+        functions = (model.f, *(sensor.h for sensor in model.sensors)) if model.executor is not None else ()
+        self._sent = {id(function): portable(function) for function in functions}
 
     def f(self, X: np.ndarray, u: np.ndarray, p: np.ndarray, dt: float) -> np.ndarray:
         """The states (N, nx) that follow those of a block X (N, nx).
@@ -81,16 +85,17 @@ class BlackBox:
                 parts = [_call(function, X, *rest)]
             else:
                 pieces = np.array_split(X, max(1, min(_workers(pool), len(X))))
-                futures = [pool.submit(_call, function, piece, *rest) for piece in pieces]
+                futures = [pool.submit(_call, self._sent[id(function)], piece, *rest) for piece in pieces]
                 parts = [future.result() for future in futures]
-        except Exception as error:  # noqa: BLE001  the user's own function may raise anything
-            raise ModelError(f"model {self.model.name}: {what} fails on {_told(error, len(X))}") from error
+        except (Exception, SystemExit) as error:  # noqa: BLE001  the user's own function may raise anything
+            at = place(function, error)
+            raise ModelError(f"{at}model {self.model.name}: {what} fails on {_told(error, len(X))}") from error
         pieces = [X] if pool is None else pieces
         for piece, part in zip(pieces, parts, strict=True):
             if part.shape != (len(piece), columns):
                 raise ModelError(
-                    f"model {self.model.name}: {what} returns shape {part.shape} for {len(piece)} states; it must be "
-                    f"{(len(piece), columns)}, a row a state"
+                    f"{place(function)}model {self.model.name}: {what} returns shape {part.shape} for {len(piece)} "
+                    f"states; it must be {(len(piece), columns)}, a row a state"
                 )
         return np.concatenate(parts) if len(parts) > 1 else np.array(parts[0])
 
@@ -146,11 +151,11 @@ def _workers(pool: Executor) -> int:
     return int(getattr(pool, "_max_workers", numba.config.NUMBA_NUM_THREADS))
 
 
-def _told(error: Exception, states: int) -> str:
-    """One line that says what went wrong, and what to do where the executor is the reason."""
+def _told(error: BaseException, states: int) -> str:
+    """One line that says what went wrong, and what to do about it."""
     line = f"a block of {states} states: {type(error).__name__}: {' '.join(str(error).split()) or 'no message'}"
     if isinstance(error, BrokenExecutor):
         _pool.cache_clear()
     if isinstance(error, (BrokenExecutor, PicklingError)) or "pickle" in str(error):
-        return f"{line}; processes need functions that can be imported by name, use threads for others"
-    return line
+        return f"{line}; processes need functions that stand by their names in a module or file, use threads for others"
+    return f"{line}; mend it, or let it return NaN in the rows of states that it has no answer for"

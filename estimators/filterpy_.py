@@ -283,10 +283,11 @@ def start_enkf(view: View, mean: np.ndarray, cov: np.ndarray, state: np.ndarray)
 def predict_enkf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndarray, work: np.ndarray) -> None:
     """xᵢ ← f(xᵢ, u) + wᵢ, wᵢ ~ N(0, Q)."""
     X, filter_ = _members(view, state), _enkf(view)
+    forward = view.f(X, u, dt)  # before anything changes: it may fail
     filter_.seed(view.seed, int(state[-1]), PROCESS)
     state[-1] += 1.0
     filter_.sigmas, filter_.dt = X.copy(), dt
-    filter_.fx = in_turn(view.f(X, u, dt))
+    filter_.fx = in_turn(forward)
     filter_.Q = view.Q(X.mean(axis=0), u, dt)
     try:
         filter_.predict()

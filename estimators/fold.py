@@ -18,7 +18,7 @@ from .compiled import compile_model
 from .context import context_of, context_type, prior
 from .diagnostics import Bounds, HealthPolicy, assess, assess_signature, chi_square_bounds
 from .driven import driven
-from .errors import EstimatorError
+from .errors import EstimatorError, ModelError
 from .filter import Code, Estimator, call_describe, call_predict, call_start, call_update, code_type
 from .fold_python import LONGEST, UNSET
 from .indicator import indicator
@@ -27,6 +27,7 @@ from .log import INPUT, READING, RESET, TICK, TRUTH, Log
 from .model import StateSpaceModel
 from .modes import Mode
 from .pictures import Pictures
+from .post_mortem import Estimate, cause, failures
 from .quantiles import chi_square_quantile
 from .registry import find_estimator
 from .track import MISSING, NONE, Track, track_type
@@ -311,6 +312,43 @@ class Fold:
         """How often the filter had to help itself since it started, as a cloud of particles that lost the asset."""
         return 0 if self.estimator.recoveries is None else self.estimator.recoveries(self._state)
 
+    @property
+    def failures(self) -> int:
+        """How often a black box failed since this fold was made; the readings concerned have failed."""
+        return int(getattr(self._context, "failures", 0))
+
+    @property
+    def failure(self) -> ModelError | None:
+        """What a black box said when it failed last."""
+        return getattr(self._context, "failure", None)
+
+    def cause(self, row: int) -> str | None:
+        """What of the model is to blame for a row whose reading failed or whose estimate is no number, in one line.
+
+        Tried anew from the last estimate before it that is a number; None if nothing is found. Takes milliseconds.
+        """
+        if self.failure is not None:
+            return str(self.failure)
+        log, track, model = self.log, self.track, self.model
+        known = np.setdiff1d(np.arange(row), failures(track))
+        last = int(known[-1]) if known.size else -1
+        at, base = self.base_at(max(0, last))
+        x, u, then = base.mean.copy(), base.u.copy(), base.clock
+        std = np.sqrt(base.cov[0] if base.cov.shape[0] == 1 else np.diag(base.cov))
+        if known.size:
+            x[model.shown], std[model.shown], then = track.mean[last], track.std[last], int(log.t[last])
+        for k in at + np.flatnonzero(log.kind[at:row] == INPUT):
+            given = log.value[k, : u.size]
+            np.copyto(u, given, where=np.isfinite(given))
+        dt = (int(log.t[row]) - then) * 1e-9 if then != UNSET else 0.0
+        if dt > LONGEST * model.max_step:
+            x, std, dt = model.prior_mean.copy(), model.prior_std, 0.0
+        sensor = int(log.channel[row]) if log.kind[row] == READING else None
+        predicted = None
+        if len(model.shown) == model.nx and np.all(np.isfinite(track.mean[row]) & np.isfinite(track.std[row])):
+            predicted = Estimate(track.mean[row].copy(), track.std[row])
+        return cause(self._compiled, Estimate(x, std), u, self._held["p"], self._held["q"], dt, sensor, predicted)
+
     def modes(self) -> list[Mode]:
         """The peaks of the estimate, the heaviest first; a Gaussian filter has one."""
         if self.estimator.modes is not None:
@@ -320,8 +358,7 @@ class Fold:
     def advance(self, limit: int | None = None) -> int:
         """Fold the events that the log has beyond `n`, at most `limit`; return how many.
 
-        Raises:
-            ModelError: If a black box fails; the fold is then where it last remembered itself, at or before `n`.
+        A black box that fails stops nothing: see `failures`.
         """
         end = self.log.n if limit is None else min(self.log.n, self.n + limit)
         begun = self.n
@@ -345,7 +382,7 @@ class Fold:
             try:
                 self._run_events(run_some, self.n, stop)
             except BaseException:
-                # A model's own Python failed between two events: back to where the state is known.
+                # Python was stopped between two events: back to where the state is known.
                 self._restore(self.n)
                 raise
             self.n = stop
@@ -485,10 +522,12 @@ def fold(
 
     Raises:
         EstimatorError: If the estimator does not exist or does not apply to the model.
-        ModelError: If the model's functions disagree with its declaration.
+        ModelError: If the model's functions disagree with its declaration, or those of a black box fail.
     """
     growing = Fold(estimator, model, tuning, log, pairs=pairs, policy=policy)
     growing.advance()
+    if growing.failure is not None:
+        raise growing.failure
     return growing.track
 
 

@@ -111,8 +111,9 @@ class StateSpaceModel:
 
     A `black_box` is not compiled: f(X, u, p, dt) takes a block of states X (N, nx) and returns the next ones (N, nx), a
     sensor's h(X, u, p) returns (N, ny). Row i of the result depends on row i alone, and on no chance. `executor` splits
-    the block: "threads" (for an f that gives up the GIL), "processes" (f must be importable by its name), or any
-    concurrent.futures.Executor; None runs it as it is. Q and shape remain functions of one state, which are compiled.
+    the block: "threads" (for an f that gives up the GIL), "processes" (f and h must stand by their names in a module or
+    in the model's file, which each process runs once), or any concurrent.futures.Executor; None runs it as it is. Q and
+    shape remain functions of one state, which are compiled.
     """
 
     name: str

@@ -5,7 +5,9 @@ from __future__ import annotations
 import re
 import traceback
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from types import CodeType
 from typing import Any
 
 import numpy as np
@@ -21,12 +23,27 @@ def plain(function: Any) -> Callable:
 
 def place(function: Any, error: BaseException | None = None) -> str:
     """File and line of a function, or of the last line in its file that an error came through, as `file:line: `."""
-    code = getattr(plain(function), "__code__", None)
+    code = _code(function)
     if code is None:
         return ""
     frames = traceback.extract_tb(error.__traceback__ if error else None)
     lines = [frame.lineno for frame in frames if frame.filename == code.co_filename and frame.lineno]
+    if error is not None and error.__cause__ is not None:
+        # Of an error in another process only the text of its traceback comes.
+        found = re.findall(rf'File "{re.escape(code.co_filename)}", line (\d+)', str(error.__cause__))
+        lines += [int(line) for line in found]
     return _shown(code.co_filename, lines[-1] if lines else code.co_firstlineno)
+
+
+def _code(function: Any) -> CodeType | None:
+    """The code of a function, of what a `partial` holds, or of an object that can be called."""
+    function = plain(function)
+    function = function.func if isinstance(function, partial) else function
+    code = getattr(function, "__code__", None) or getattr(type(function).__call__, "__code__", None)
+    if code and "inner" in code.co_freevars and Path(code.co_filename).parent == Path(__file__).parent:
+        # A wrapper of joint.py or indicator.py: the model's own function is inside.
+        return _code(function.__closure__[code.co_freevars.index("inner")].cell_contents)
+    return code
 
 
 def _shown(file: str, line: int) -> str:
@@ -50,7 +67,7 @@ def _gist(error: Exception) -> str:
     return (rows or lines or ["no message"])[0]
 
 
-def _numbers(values: np.ndarray) -> str:
+def numbers(values: np.ndarray) -> str:
     """The first entries of a vector."""
     return f"[{', '.join(f'{value:.4g}' for value in values[:4])}{', …' if values.size > 4 else ''}]"
 
@@ -68,6 +85,18 @@ def _remedy(error: Exception, function: Any, takes: str, sizes: str, at: str) ->
     return f"it may not fail at {at}; mend it, or the prior"
 
 
+def indefinite(Q: np.ndarray) -> str | None:
+    """Why a matrix of finite numbers is no covariance; None if it is one."""
+    # Beside its own variances: a Q of nanometres may be lopsided too.
+    if np.any(np.abs(Q - Q.T) > 1e-9 * np.sqrt(np.abs(np.outer(np.diag(Q), np.diag(Q))))):
+        return "is not symmetric (fill both triangles)"
+    values = np.linalg.eigvalsh(Q)
+    # Rounding leaves the zero eigenvalues of a singular Q at n ε of the largest.
+    if values[0] < -1e-9 * max(values[-1], -values[0]):
+        return f"is not positive semidefinite (it has the eigenvalue {values[0]:.3g})"
+    return None
+
+
 def probe(model: StateSpaceModel) -> None:
     """Run the plain functions once with arrays of the declared sizes, where an index that is too large is an error."""
     x = model.prior_mean.copy()
@@ -82,7 +111,7 @@ def probe(model: StateSpaceModel) -> None:
         ("Q", model.Q, "x, u, p, q, dt", (x, u, p, q, dt), (n, n)),
         ("shape", model.shape, "z, p", (np.random.default_rng(0).standard_normal(n), p), (n,)),
     ]
-    at = f"x = {_numbers(x)}, u = {_numbers(u)}, p = {_numbers(p)}"
+    at = f"x = {numbers(x)}, u = {numbers(u)}, p = {numbers(p)}"
     for sensor in model.sensors:
         m = len(sensor.rows)
         calls.append((f"h of sensor {sensor.name}", sensor.h, "x, u, p", (x, u, p), (m,)))
@@ -116,19 +145,12 @@ def probe(model: StateSpaceModel) -> None:
                 f"not finite at the prior, the first of them out[{first}]; it must fill them all with finite numbers "
                 f"at {at}"
             )
-        # Beside its own variances: a Q of nanometres may be lopsided too.
-        if what == "Q" and np.any(np.abs(out - out.T) > 1e-9 * np.sqrt(np.abs(np.outer(np.diag(out), np.diag(out))))):
+        wrong = indefinite(out) if what == "Q" else None
+        if wrong:
             raise ModelError(
-                f"{place(function)}model {model.name}: Q is not symmetric at the prior; fill both triangles"
+                f"{place(function)}model {model.name}: Q {wrong} at the prior; a covariance must be symmetric and "
+                "positive semidefinite"
             )
-        if what == "Q":
-            values = np.linalg.eigvalsh(out)
-            # Rounding leaves the zero eigenvalues of a singular Q at n ε of the largest.
-            if values[0] < -1e-9 * max(values[-1], -values[0]):
-                raise ModelError(
-                    f"{place(function)}model {model.name}: Q has the eigenvalue {values[0]:.3g} at the prior; a "
-                    "covariance must be positive semidefinite"
-                )
 
 
 def probe_angles(model: StateSpaceModel, h: Sequence[Callable]) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from .compiled import CompiledModel
+from .errors import ModelError
 from .filter import Options
 from .gaussian import admit
 from .jacobians import scratch_size, sensor_jacobian, state_jacobian
@@ -23,7 +24,10 @@ _STEP = 6e-6
 
 
 class View:
-    """A model, a tuning and the options of a filter, for its Python functions; nothing in it changes but `kept`."""
+    """A model, a tuning and the options of a filter, for its Python functions.
+
+    Nothing in it changes but what filters keep in `kept`, and the count of the model's failures, with the last of them.
+    """
 
     def __init__(
         self, compiled: CompiledModel, context: np.void, tuning: Tuning, options: Options, pairs: np.ndarray
@@ -43,6 +47,14 @@ class View:
         self._angles = [angles[part] for part in rows]
         self._scratch = np.empty(scratch_size(model.nx, model.width))
         self.kept: dict[Any, Any] = {}
+        self.failures = 0
+        self.failure: ModelError | None = None
+
+    def failed(self, error: ModelError) -> None:
+        """Note that the model's own Python failed."""
+        self.failures += 1
+        # Its frames hold the filter's arrays.
+        self.failure = error.with_traceback(None)
 
     def prior(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean (nx,) and covariance (nx, nx) of the prior."""

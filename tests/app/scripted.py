@@ -22,7 +22,7 @@ def readings(times_s, values):
     )
 
 
-def twin(history=200_000, horizon=2.0, tick=1000.0):
+def twin(history=200_000, horizon=2.0, tick=1000.0, model=MODEL, estimator="kf"):
     time = SimpleNamespace(horizon=horizon, degraded_after=5.0, stale_after=30.0, tick=tick)
     config = SimpleNamespace(time=time, history=history)
     return SimpleNamespace(
@@ -31,9 +31,9 @@ def twin(history=200_000, horizon=2.0, tick=1000.0):
         title="scripted",
         text="model: motor_winding\n",
         path="scripted.yaml",
-        model=MODEL,
-        tuning=Tuning.of(MODEL),
-        estimator="kf",
+        model=model,
+        tuning=Tuning.of(model),
+        estimator=estimator,
         recorded=False,
         pairs=np.array([[0, 1]]),
         config=config,

@@ -184,7 +184,9 @@ def test_a_covariance_that_is_none_is_refused_when_the_model_loads():
         name="crossed", title="Crossed", f=f, Q=Q, states=(State("a", "m", 0, 1), State("b", "m", 0, 1)),
         noises=(Noise("a", "m²/s", 0.5),), sensors=(Sensor("a", (Row("a", "m", 1.0),), h),),
     )  # fmt: skip
-    with pytest.raises(ModelError, match=r"Q has the eigenvalue -0.5 at the prior; a covariance must be positive"):
+    with pytest.raises(
+        ModelError, match=r"Q is not positive semidefinite \(it has the eigenvalue -0.5\) at the prior; a cov"
+    ):
         compile_model(model)
 
 

@@ -1,14 +1,21 @@
 """The engine: whatever order, pieces, retunes and failures, the track is the fold of the log."""
 
+import itertools
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scripted import MODEL, SECOND, Scripted, readings, twin, wait_for
 
 from app import commands
 from app.engine import Engine
+from app.notices import Notices
 from app.twin import load_twin
-from estimators.fold import fold
+from app.watch import Watch
+from estimators.fold import Fold, fold
 from estimators.log import READING, Log, Readings
+from estimators.track import DIVERGED, FAILED, USED
 from estimators.tuning import Tuning
 
 
@@ -364,3 +371,128 @@ def test_what_went_wrong_is_counted_by_sensor_however_often_it_is_folded():
         assert counts["gated"] == counts["gated force"] == 1 and "gated position" not in counts
     finally:
         engine.stop()
+
+
+class Solver:
+    """The motor's winding behind a solver that can be away."""
+
+    def __init__(self):
+        self.away = False
+
+    def f(self, X, u, p, dt):
+        if self.away:
+            raise RuntimeError("the solver is away")
+        return X @ np.array([[1.0, dt], [0.0, 1.0]]).T
+
+    def h(self, X, u, p):
+        return X[:, :1]
+
+    def model(self):
+        sensors = tuple(replace(sensor, h=self.h, H=None) for sensor in MODEL.sensors)
+        return replace(MODEL, f=self.f, F=None, linear=False, sensors=sensors, black_box=True)
+
+
+def test_a_black_box_that_fails_loses_nothing_and_says_so_once(started):
+    """15 readings of which the solver misses 5: those have failed, the others are as if they had not come."""
+    solver = Solver()
+    box = solver.model()
+    source = Scripted()
+    engine = started(source, model=box, estimator="filterpy-ukf")
+    times, values = series(15)
+    for rest, away in ((slice(0, 5), False), (slice(5, 10), True), (slice(10, 15), False)):
+        solver.away = away
+        for one in range(rest.start, rest.stop):
+            source.put(readings(times[one : one + 1], values[one : one + 1]))
+            wait_for(lambda upto=one + 1: rows(engine) == upto)
+    pull = everything(engine)
+    np.testing.assert_array_equal(pull.readings.value[:, 0], values)
+    assert list(pull.track.verdict) == [USED] * 5 + [FAILED] * 5 + [USED] * 5
+    assert engine.status().counts["failed"] == 5 and engine.status().counts["used"] == 10
+    assert np.all(pull.track.health[5:10] == DIVERGED) and np.all(np.isnan(pull.track.mean[5:10]))
+    kept = np.r_[0:5, 10:15]
+    log = Log(box.width)
+    log.extend(readings(times[kept], values[kept]))
+    expected = fold("filterpy-ukf", box, Tuning.of(box), log)
+    np.testing.assert_array_equal(pull.track.mean[kept], expected.mean)
+    np.testing.assert_array_equal(pull.track.std[kept], expected.std)
+    said = [line.text for line in pull.notices if "solver" in line.text]
+    line = Solver.f.__code__.co_firstlineno + 2
+    assert len(said) == 1
+    assert f"test_engine.py:{line}: model motor_winding: f fails on a block of 5 states: RuntimeError: the" in said[0]
+    assert "return NaN in the rows" in said[0] and "count as failed" in said[0]
+    assert "engine error" not in engine.status().counts
+
+
+def test_a_refold_over_a_black_box_that_fails_says_so_too(started):
+    solver = Solver()
+    source = Scripted()
+    engine = started(source, model=solver.model(), estimator="filterpy-ukf")
+    times, values = series(5)
+    source.put(readings(times, values))
+    wait_for(lambda: rows(engine) == 5)
+    solver.away = True
+    engine.submit(commands.SetTuning("Q.rate", 0.5))
+    wait_for(lambda: everything(engine).revision == 1)
+    pull = everything(engine)
+    # The first needs no f: the clock starts with it.
+    assert list(pull.track.verdict) == [USED] + [FAILED] * 4
+    assert sum("the solver is away" in line.text for line in engine.notices.since(0)) == 1
+
+
+def test_the_same_failure_is_said_once_however_long_it_lasts():
+    """A minute passes between two readings, so that nothing is left out for coming too fast."""
+    solver = Solver()
+    model = solver.model()
+    log = Log(model.width)
+    growing = Fold("filterpy-ukf", model, Tuning.of(model), log)
+    notices = Notices(lambda: 0, clock=itertools.count(0, 60).__next__)
+    watch = Watch(notices)
+    for k, away in enumerate([False, True, True, False, True]):
+        solver.away = away
+        log.extend(readings([k + 1.0], [40.0]))
+        growing.advance()
+        watch.look(growing, k)
+    texts = [line.text for line in notices.since(0)]
+    assert sum("the solver is away" in text for text in texts) == 1
+    assert sum("reading could not be used" in text for text in texts) == 3
+    watch.again()
+    watch.look(growing, growing.n)
+    assert sum("the solver is away" in line.text for line in notices.since(0)) == 2
+
+
+def cooling(x, u, p, q, dt, out):
+    """A variance below 50 °C only."""
+    out[0, 0] = q[0] * dt * (50.0 - x[0])
+    out[1, 1] = q[1] * dt
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "ukf"])
+def test_a_noise_that_is_none_where_the_asset_gets_is_named_once_a_fold(started, estimator):
+    source = Scripted()
+    engine = started(source, model=replace(MODEL, Q=cooling, linear=False), estimator=estimator)
+    times = np.arange(1.0, 61.0)
+    source.put(readings(times, 40.0 + times))
+    wait_for(lambda: rows(engine) == 60)
+
+    def said():
+        return [line for line in engine.notices.since(0) if "positive semidefinite" in line.text]
+
+    assert engine.status().counts["failed"] > 0 and engine.status().health == DIVERGED
+    (line,) = said()
+    place = rf"\S*test_engine.py:{cooling.__code__.co_firstlineno}: model motor_winding: "
+    found = re.match(
+        place + r"Q\(x, u, dt\) is not positive semidefinite \(it has the eigenvalue -\S+\) at x = \[(\S+), ", line.text
+    )
+    assert found and float(found[1]) > 50.0 and line.level == "error"
+    # When it happened: the asset is at 50 °C after 10 s.
+    assert 5 * SECOND < line.t < 60 * SECOND
+    source.put(readings([61.0, 62.0], [101.0, 102.0]))
+    wait_for(lambda: rows(engine) == 62)
+    assert len(said()) == 1
+    engine.submit(commands.SetTuning("R.winding", 5.0))
+    wait_for(lambda: everything(engine).revision == 1)
+    assert len(said()) == 2
+    # A fold without trouble has nothing to say.
+    engine.submit(commands.SetTuning("Q.temperature", 0.0))
+    wait_for(lambda: everything(engine).revision == 2)
+    assert len(said()) == 2

@@ -1,7 +1,9 @@
 """Black-box models: the same answers as compiled ones, on any executor; what they may not do is one clear line."""
 
+import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from estimators.errors import EstimatorError, ModelError
 from estimators.fold import Fold, fold
 from estimators.log import INPUT, READING, RESET, TICK, Log, Readings
 from estimators.registry import ESTIMATORS, find_estimator, unfit
+from estimators.track import DIVERGED, FAILED, NONE
 from estimators.tuning import Tuning
 
 SECOND = 1_000_000_000
@@ -162,23 +165,145 @@ def test_declarations_that_contradict_themselves(change, says):
         replace(BOX, **change)
 
 
-def test_a_failure_in_the_middle_leaves_a_fold_that_can_go_on():
-    """The sensor's function fails once; the fold is then where it remembers itself, and folds to the same bits."""
-    broken = [False]
+class Switch:
+    """A black box whose functions fail while they are named in `off`."""
 
-    def both(X, u, p):
-        if broken[0]:
-            raise OSError("the licence server is away")
+    def __init__(self):
+        self.off = set()
+
+    def f(self, X, u, p, dt):
+        self.check("f")
+        return f_block(X, u, p, dt)
+
+    def both(self, X, u, p):
+        self.check("both")
         return both_block(X, u, p)
 
-    model = replace(BOX, sensors=(replace(BOX.sensors[0], h=both), BOX.sensors[1]))
-    log = some_log(150)
-    growing = Fold("enkf", model, Tuning.of(model), log)
-    growing.advance(100)
-    broken[0] = True
-    with pytest.raises(ModelError, match="h of sensor both fails on a block of 50 states: OSError: the licence server"):
-        growing.advance()
-    assert growing.n <= 100
-    broken[0] = False
+    def check(self, name):
+        if name in self.off:
+            raise OSError("the licence server is away")
+
+    def model(self):
+        return replace(BOX, f=self.f, sensors=(replace(BOX.sensors[0], h=self.both), BOX.sensors[1]))
+
+
+ANY = (*COMPILED, "filterpy-ekf", "filterpy-ukf", "filterpy-enkf")
+
+
+def few(name):
+    """A tuning with few members."""
+    options = {"ensemble": {"members": 9.0}, "particle": {"particles": 60.0}}
+    return Tuning.of(BOX).with_options(options.get(ESTIMATORS[name].family, {}))
+
+
+def folded(name, switch, log, off):
+    """A fold event by event; `off` says what fails at which event."""
+    growing = Fold(name, switch.model(), few(name), log)
+    for k in range(log.n):
+        switch.off = {off[k]} if k in off else set()
+        assert growing.advance(1) == 1
+    return growing
+
+
+@pytest.mark.parametrize("name", ANY)
+def test_a_reading_whose_h_fails_is_as_one_without_a_value(name):
+    """Nothing of the state may have changed, not even how often it drew: the bits behind it are the same."""
+    log = some_log(40)
+    fails = [int(k) for k in np.flatnonzero((log.kind[: log.n] == READING) & (log.channel[: log.n] == 0))[3:8]]
+    growing = folded(name, Switch(), log, dict.fromkeys(fails, "both"))
+    without = some_log(40)
+    without.value[fails] = np.nan
+    expected = fold(name, BOX, few(name), without)
+    track = growing.track
+    assert np.all(track.verdict[fails] == FAILED) and growing.failures == len(fails)
+    for column in ("mean", "std", "nis"):
+        np.testing.assert_array_equal(getattr(track, column), getattr(expected, column))
+    said = r"test_black_box.py:\d+: model duffing: h of sensor both fails on .* states?: OSError: the licence"
+    assert re.search(said, str(growing.failure)) and "\n" not in str(growing.failure)
+    # Once it answers again, a refold knows nothing of it.
+    growing.rewind(0)
     growing.advance()
-    identical(growing.track, fold("enkf", BOX, Tuning.of(BOX), log))
+    identical(growing.track, fold(name, BOX, few(name), some_log(40)))
+
+
+@pytest.mark.parametrize("name", ANY)
+def test_a_reading_that_f_does_not_reach_is_as_if_it_had_not_come(name):
+    """The estimate then is no number, and goes on from where it stood; so does one that a tick asks for."""
+    log = some_log(40)
+    kind, t = log.kind[: log.n], log.t[: log.n]
+    moves = np.flatnonzero((kind[1:] == READING) & (np.diff(t) > 0)) + 1
+    # None of several at one time: the next of them would have to make the step.
+    alone = [int(k) for k in moves if k + 1 < log.n and t[k + 1] > t[k]][2:5]
+    tick = [int(k) for k in np.flatnonzero(kind == TICK) if t[k] > t[k - 1]][:1]
+    assert len(alone) == 3 and tick
+    growing = folded(name, Switch(), log, dict.fromkeys(alone + tick, "f"))
+    kept = np.setdiff1d(np.arange(log.n), alone + tick)
+    shorter = Log(ONE.width)
+    shorter.extend(log.readings.select(kept))
+    expected, track = fold(name, BOX, few(name), shorter), growing.track
+    assert np.all(track.verdict[alone] == FAILED) and np.all(track.verdict[tick] == NONE)
+    assert np.all(np.isnan(track.mean[alone + tick])) and np.all(np.isnan(track.std[alone + tick]))
+    assert np.all(track.health[alone + tick] == DIVERGED)
+    for column in ("mean", "std", "nis", "verdict"):
+        np.testing.assert_array_equal(getattr(track, column)[kept], getattr(expected, column))
+
+
+def test_an_f_that_fails_half_way_keeps_the_steps_that_were_made():
+    """Of three steps to an input at 0.4 s the second fails: the next event goes on from 0.133 s, with that input.
+
+    The tolerance is for 0.4 / 3 s, which the clock has in whole nanoseconds.
+    """
+    calls = [0, 0]
+
+    def second_fails(X, u, p, dt):
+        calls.append(dt)
+        if len(calls) == 2:
+            raise OSError("the licence server is away")
+        return f_block(X, u, p, dt)
+
+    def log_of(*events):
+        log = Log(ONE.width)
+        for seconds, kind, values in ((0.0, READING, [0.2, 0.1]), *events):
+            log.extend(Readings.one(round(seconds * SECOND), 0, kind, 0, values, ONE.width))
+        return log
+
+    model = replace(BOX, f=second_fails)
+    growing = Fold("filterpy-ukf", model, Tuning.of(BOX), log_of((0.4, INPUT, [2.0]), (0.5, READING, [0.3, 0.2])))
+    calls.clear()
+    growing.advance()
+    assert growing.failures == 1 and np.isnan(growing.track.mean[1, 0])
+    steps = log_of((0.4 / 3, INPUT, [2.0]), (0.5, READING, [0.3, 0.2]))
+    expected = fold("filterpy-ukf", BOX, Tuning.of(BOX), steps)
+    np.testing.assert_allclose(growing.track.mean[2], expected.mean[2], rtol=1e-8)
+    np.testing.assert_allclose(growing.track.std[2], expected.std[2], rtol=1e-8)
+
+
+def test_a_whole_fold_of_a_black_box_that_fails_is_an_error():
+    switch = Switch()
+    model = switch.model()
+    compile_model(model)
+    switch.off = {"f"}
+    with pytest.raises(ModelError, match="f fails on a block of 50 states: OSError.*return NaN in the rows of states"):
+        fold("enkf", model, Tuning.of(model), some_log(5))
+
+
+def gives_up(X, u, p, dt):
+    raise SystemExit("no display")
+
+
+def test_the_place_of_what_can_be_called_otherwise():
+    """A partial, an object with __call__, one that ends the process, and one that fails in another process."""
+
+    class Called:
+        def __call__(self, X, u, p, dt):
+            return fails(X, u, p, dt)
+
+    def with_scale(scale, X, u, p, dt):
+        raise ValueError("scale")
+
+    for function in (partial(with_scale, 2.0), Called(), gives_up):
+        with pytest.raises(ModelError, match=r"test_black_box.py:\d+: model duffing: f fails"):
+            compile_model(replace(BOX, f=function))
+    line = fails.__code__.co_firstlineno + 1
+    with pytest.raises(ModelError, match=rf"test_black_box.py:{line}: model duffing: f fails .*out of licences"):
+        compile_model(replace(BOX, f=fails, executor="processes"))

@@ -6,14 +6,26 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from estimators.diagnostics import HealthPolicy, chi_square_bounds, nis_bounds
+from estimators.diagnostics import FAR, FEW, HealthPolicy, assess, chi_square_bounds, nis_bounds
 from estimators.fold import Fold, fold
-from estimators.log import READING, TICK, TRUTH, Log, Readings
+from estimators.log import READING, RESET, TICK, TRUTH, Log, Readings
 from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS
 from estimators.score import score
-from estimators.track import DEGRADED, DIVERGED, GATED, STALE, TRACKING, USED
+from estimators.track import (
+    DEGRADED,
+    DIVERGED,
+    FAILED,
+    GATED,
+    HELD_OUT,
+    MISSING,
+    NONE,
+    STALE,
+    TRACKING,
+    USED,
+    Track,
+)
 from estimators.tuning import Tuning
 
 SECOND = 1_000_000_000
@@ -279,3 +291,81 @@ def test_health_does_not_depend_on_pieces(seed):
         pass
     for name in ("health", "age", "nis_mean", "nis_low", "nis_high"):
         np.testing.assert_array_equal(getattr(growing.track, name), getattr(whole, name))
+
+
+def events_of(rng, n):
+    """Times, kinds and a track of all that can happen: stretches of readings and of silence, good and bad ones, resets.
+
+    Steps are 0 or 1 s, so that ages are whole and meet their limits exactly.
+    """
+    t = np.cumsum(rng.integers(0, 2, n)) * SECOND
+    kind = np.full(n, TICK, np.int8)
+    track = Track.allocate(n, 2, 0, 1)
+    track.mean[:], track.std[:] = 0.0, 1.0
+    at = 0
+    while at < n:
+        rows = np.arange(at, min(n, at + int(rng.integers(20, 400))))
+        share = rng.choice([0.02, 0.1, 0.9])
+        verdicts = rng.choice(
+            [USED, GATED, FAILED, MISSING, HELD_OUT], p=rng.dirichlet([6, 1, 1, 1, 1]), size=rows.size
+        )
+        judged = rng.random(rows.size) < share
+        track.verdict[rows[judged]] = verdicts[judged]
+        kind[rows[judged]] = READING
+        track.dof[rows] = rng.integers(1, 4, rows.size)
+        track.nis[rows] = rng.chisquare(track.dof[rows]) * rng.choice([1.0, 2.0, 3.0, 6.0])
+        at += rows.size
+    kind[rng.choice(n, n // 150)] = RESET
+    track.verdict[kind == RESET] = NONE
+    for column in (track.mean, track.std):
+        column[rng.choice(n, n // 100), rng.integers(0, 2)] = rng.choice([np.inf, np.nan])
+    return t, kind, track
+
+
+def by_definition(t, kind, track, policy):
+    """Each row's age, NIS of the window, bounds and health, from the words of `HealthPolicy` and of `assess`."""
+    judged = np.isin(track.verdict, (USED, GATED, FAILED))
+    quantiles = {q: chi2.ppf(q, np.arange(3 * policy.window + 1)) for q in (0.025, 0.975, 0.999)}
+    resets = np.flatnonzero(kind == RESET)
+    for i in range(len(t)):
+        # The row that last changed the window.
+        e = max([k for k in range(i, -1, -1) if judged[k] or kind[k] == RESET][:1] or [0])
+        after = max(resets[resets <= e], default=-1)
+        rows = [k for k in range(max(after + 1, e - FAR * policy.window + 1, 0), e + 1) if judged[k]][-policy.window :]
+        used = [k for k in rows if track.verdict[k] == USED]
+        total, dof = float(np.sum(track.nis[used])), int(np.sum(track.dof[used], dtype=int))
+        values = [np.nan] * 3
+        if used:
+            values = [total / len(used), *(quantiles[q][dof] / len(used) for q in (0.025, 0.975))]
+        health = TRACKING
+        refused = len(rows) - len(used)
+        if len(rows) >= FEW and (refused > policy.diverged_gated * len(rows) or total > policy.diverged_nis * dof):
+            health = DIVERGED
+        elif len(used) >= FEW and total > quantiles[0.999][dof]:
+            health = DEGRADED
+        age = (t[i] - t[e]) / SECOND
+        if not (np.all(np.isfinite(track.mean[i])) and np.all(np.isfinite(track.std[i]))):
+            yield age, *values, DIVERGED
+        elif age > policy.stale_after:
+            yield age, *values, STALE
+        else:
+            yield age, *values, DEGRADED if age > policy.degraded_after and health == TRACKING else health
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_health_is_its_definition_in_any_pieces(seed):
+    """A window of 12 that may look back 240 rows, of which a quarter may be refused: of 12 exactly 3."""
+    rng = np.random.default_rng(seed)
+    policy = HealthPolicy(window=12, degraded_after=2.0, stale_after=6.0, diverged_nis=2.5, diverged_gated=0.25)
+    t, kind, track = events_of(rng, 3000)
+    at = 0
+    while at < len(t):
+        end = min(len(t), at + int(rng.choice([1, 7, 40, 500])))
+        assess(at, end, t, kind, track, policy, chi_square_bounds(3 * policy.window))
+        at = end
+    age, mean, low, high, health = map(np.array, zip(*by_definition(t, kind, track, policy), strict=True))
+    assert set(health) == {TRACKING, DEGRADED, DIVERGED, STALE}
+    np.testing.assert_array_equal(track.age, age)
+    np.testing.assert_array_equal(track.health, health)
+    for column, expected in ((track.nis_mean, mean), (track.nis_low, low), (track.nis_high, high)):
+        np.testing.assert_allclose(column, expected, rtol=1e-12)  # sums of at most 12 numbers, in another order
