@@ -297,6 +297,19 @@ def test_localised_analyses_equal_dense_ones(name, dense, radius, members):
     np.testing.assert_allclose(after[:, far], before[:, far], rtol=0, atol=1e-14)
 
 
+def near_the_end(x, u, p, out):
+    out[0] = x[36]
+
+
+@pytest.mark.parametrize("name", LOCAL)
+def test_a_reading_moves_the_states_that_it_reaches_and_no_others(name):
+    """The first block of 32 states is not among them."""
+    sensor = Sensor("end", (Row("r36", "1", 0.5, position=(18.0,)),), h=near_the_end)
+    before, after, _ = analysed(name, replace(RING, sensors=(sensor,)), {"members": 8, "radius": 0.6}, 0, [3.0])
+    moved = np.flatnonzero(np.max(np.abs(after - before), axis=0) > 1e-12)
+    assert 36 in moved and np.all(np.abs(0.5 * moved - 18.0) < 2 * 0.6)
+
+
 @pytest.mark.parametrize("name", LOCAL)
 def test_a_radius_without_end_is_no_radius(name):
     """At 1e8 times the domain the taper is 1 to rounding; so letkf, worked out state by state, is etkf."""
@@ -310,9 +323,10 @@ def test_a_radius_without_end_is_no_radius(name):
             np.testing.assert_allclose(local, turned, rtol=0, atol=1e-10)
 
 
-def test_localised_inflation_acts_where_the_reading_does():
-    _, plain, _ = analysed("letkf", RING, {"members": 8, "radius": 2.0}, 0, Y)
-    _, wide, _ = analysed("letkf", RING, {"members": 8, "radius": 2.0, "inflation": 1.5}, 0, Y)
+@pytest.mark.parametrize("name", ["ensrf", "letkf"])
+def test_localised_inflation_acts_where_the_reading_does(name):
+    _, plain, _ = analysed(name, RING, {"members": 8, "radius": 2.0}, 0, Y)
+    _, wide, _ = analysed(name, RING, {"members": 8, "radius": 2.0, "inflation": 1.5}, 0, Y)
     factor = 1 + 0.5 * ring_tapers(2.0)[0].max(1)
     mean = plain.mean(0)
     np.testing.assert_allclose(wide, mean + factor * (plain - mean), rtol=0, atol=1e-12)
