@@ -417,7 +417,7 @@ def judge(context, sensor, m, ZT, Z, d, rows, G, U, v, score):
     if nis <= limit:
         # As in gaussian.py: a reading that far off would leave members that are no numbers.
         return USED if nis < np.inf else FAILED
-    return GATED if limit < np.inf else FAILED
+    return GATED if limit < nis else FAILED
 
 
 @jit

@@ -175,10 +175,12 @@ def judge(context, sensor, m, nu, U, score):
     score[2] = -0.5 * (nis + log_det + m * LOG_2PI)
     if flags(context.used, context.n_sensors)[sensor] == 0:
         return HELD_OUT
-    if not nis <= floats(context.gate, context.width + 1)[m]:
-        return GATED
-    # A reading that far off would leave an estimate that is no number.
-    return USED if nis < np.inf else FAILED
+    limit = floats(context.gate, context.width + 1)[m]
+    if nis <= limit:
+        # A reading that far off would leave an estimate that is no number.
+        return USED if nis < np.inf else FAILED
+    # Of a NIS that is no number the model is the reason.
+    return GATED if limit < nis else FAILED
 
 
 @inlined

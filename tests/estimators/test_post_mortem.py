@@ -175,3 +175,17 @@ def test_a_block_that_returns_no_number_is_named_too():
     growing.advance()
     assert list(failures(growing.track)) == [2]
     assert re.search(r"test_post_mortem.py:\d+: model duffing: f\(x, u, dt\) is \[nan, nan\]", growing.cause(2))
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "iekf", "ukf", "ckf", "sr-ekf", "sr-ukf", "enkf", "etkf", "ensrf"])
+@pytest.mark.parametrize("gate", [None, 0.999])
+def test_a_reading_that_the_model_cannot_expect_has_failed_and_is_not_gated(estimator, gate):
+    """Of a NIS that is no number the model is the reason, not the reading."""
+    model = walk(sensors=(Sensor("gauge", (Row("s", "m", 0.01),), h=root),))
+    tuning = Tuning.of(model) if gate is None else Tuning.of(model).set("gate", gate)
+    log = Log(model.width)
+    for t, kind, value in ((1, READING, 0.0), (2, INPUT, 50.0), (3, READING, 0.0)):
+        log.extend(Readings.one(t * SECOND, t * SECOND, kind, 0, value, model.width))
+    growing = Fold(estimator, model, tuning, log)
+    growing.advance()
+    assert growing.track.verdict[2] == FAILED
