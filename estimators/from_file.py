@@ -30,13 +30,16 @@ def run_file(name: str, path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # Before it runs: dataclasses and Numba look their module up by name.
     sys.path.insert(0, str(path.parent))
+    # Nothing is left beside the user's files, by those that this one imports either.
+    before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
     try:
-        # Not through the loader, which would leave a __pycache__ beside the user's file and trust a stale one.
+        # Not through the loader, which would trust a stale __pycache__.
         exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)
     except BaseException:
         sys.modules.pop(name, None)
         raise
     finally:
+        sys.dont_write_bytecode = before
         sys.path.remove(str(path.parent))
     return module
 
