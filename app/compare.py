@@ -17,6 +17,7 @@ from config.loader import shipped
 from config.source_schema import SimulatorSection
 from estimators.errors import ConfigError, SourceError
 from estimators.log import Readings
+from estimators.orphan import leave_with_parent
 from estimators.registry import ESTIMATORS, find_estimator, unfit
 
 from .cli import settings
@@ -159,6 +160,7 @@ def compare(
 
 
 def _share(name: str, overrides: dict[str, str], logs: list[tuple[np.ndarray, ...]]) -> None:
+    leave_with_parent()
     _shared["twin"] = load_twin(name, overrides=overrides)
     _shared["logs"] = [Readings(*columns) for columns in logs]
     numba.set_num_threads(1)  # the processors have a filter each, and a step costs what it costs one

@@ -93,6 +93,11 @@ def fold_twin(arguments: Arguments) -> int:
     return 0
 
 
+def _decimals(number: float) -> str:
+    """A number with four decimals, or four digits where that is more than a line can hold."""
+    return f"{number:.4f}" if abs(number) < 1e6 else f"{number:.4g}"
+
+
 def _as_dict(twin: Twin, result: Score, seconds: float, fold: Fold) -> dict[str, Any]:
     def number(value: float) -> float | None:
         return float(value) if np.isfinite(value) else None
@@ -147,7 +152,7 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], fold
     if result.nis_readings:
         inside = "inside" if result.nis_low <= result.nis <= result.nis_high else "OUTSIDE"
         bounds = f"{result.nis_low:.4f} to {result.nis_high:.4f} of {result.nis_readings} readings"
-        rows.append(("mean NIS", f"{result.nis:.4f}   {inside} its 95 % bounds {bounds}"))
+        rows.append(("mean NIS", f"{_decimals(result.nis)}   {inside} its 95 % bounds {bounds}"))
     # The many rows of one sensor are one line.
     together = {}
     for sensor, start in zip(twin.model.sensors, twin.model.row_start, strict=True):

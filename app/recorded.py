@@ -153,6 +153,13 @@ BEGIN, END = b"RRF2", b"RRF2FOOT"
 """What an .rrd begins with, and what stands in the last bytes of one that was finished."""
 
 
+def finished(path: Path) -> bool:
+    """Whether a recording was closed when it ended; one that was cut is read as far as it goes."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 4 * len(END)))
+        return END in file.read()
+
+
 def _cut_short(path: Path) -> str | None:
     """What is missing of an .rrd that was not finished, and may be ours; None if it was, or is another program's."""
     size = path.stat().st_size

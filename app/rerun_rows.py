@@ -16,6 +16,7 @@ from .observed import observed
 from .rerun_field import FieldDrawing
 from .rerun_pairs import PairDrawing
 from .rerun_thin import last_of_each_time, thin
+from .tally import numbers
 
 CALENDAR = 10**18
 """Nanoseconds from which on times are dates (this one is in 2001), and before which they are durations."""
@@ -161,8 +162,10 @@ class RerunRows:
         """Log another revision's rows as the thin grey lines behind this one's."""
         rows = last_of_each_time(t)
         width = self.width(t)
+        known = numbers(track)[rows]
         for j, name in enumerate(state.name for state in self.model.shown_states):
-            self._line(f"/previous/state/{name}", t[rows], track.mean[rows, j, None], width, gaps=True)
+            mean = np.where(known, track.mean[rows, j], np.nan)
+            self._line(f"/previous/state/{name}", t[rows], mean[:, None], width, gaps=True)
         self._line("/previous/nis", t[rows], track.nis_mean[rows, None], width, gaps=True)
 
     def notices(self, notices: list[Any]) -> None:
@@ -186,10 +189,11 @@ class RerunRows:
 
     def _states(self, t: np.ndarray, track: Track, width: int) -> None:
         rows = last_of_each_time(t)
+        known = numbers(track)[rows]
         for j, name in enumerate(state.name for state in self.model.shown_states):
             # A probability has no band.
             mean, twice = track.mean[rows, j], 2.0 * track.std[rows, j] * (j != self.model.mode)
-            band = np.stack((mean, mean + twice, mean - twice), axis=1)
+            band = np.where(known[:, None], np.stack((mean, mean + twice, mean - twice), axis=1), np.nan)
             self._line(f"/state/{name}", t[rows], band, width, gaps=True)
 
     def _window_nis(self, t: np.ndarray, track: Track, width: int) -> None:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .compile import prepare
+from .complain import complain
 from .port import check_port
-from .recorded import read_recording
+from .recorded import finished, read_recording
 from .recording import tuning_from_json
 from .session import Page, Session
 from .twin import Twin, restore_twin
@@ -57,6 +58,10 @@ def open_review(path: Path, page: Page | None) -> tuple[Session, Recorded]:
     )
     session.engine.notices.restore(recorded.notices)
     session.engine.notices.say(f"{path.name}: {recorded.rows} rows, {recorded.tunings} tuning(s), folded again")
+    if not finished(path):
+        cut = f"{path.name}: was not closed, as by a kill or a full disk; it is reviewed as far as it goes"
+        session.engine.notices.say(cut, level="warn")
+        complain(cut)
     return session, recorded
 
 

@@ -72,6 +72,11 @@ def complaints(model: StateSpaceModel, channel: np.ndarray, track: Track, first:
             yield f"{VERDICT_NAMES[code]} {sensor}", f"{sensor}: reading {what}{nis}"
 
 
+def numbers(track: Track) -> np.ndarray:
+    """Which rows hold an estimate: one state that is not a number leaves none, whatever the others say."""
+    return np.asarray(np.isfinite(track.mean).all(axis=1) & np.isfinite(track.std).all(axis=1))
+
+
 def last_run(codes: np.ndarray) -> int:
     """The first of the equal codes at the end of an array that is not empty."""
     end = len(codes)

@@ -12,6 +12,7 @@ from estimators.model import StateSpaceModel
 from estimators.track import GATED
 
 from .observed import observed
+from .tally import numbers
 from .viser_decimate import Buckets, bridge, extended, runs
 from .viser_history import History
 from .viser_series import BLUE, DOTS, GREEN, GREY, HEIGHT, RED, axes, frame, nis_series, no_data, send, state_series
@@ -94,7 +95,10 @@ class Charts:
 
     def set_previous(self, pull: Any) -> None:
         """The track of the previous revision, drawn as a thin grey line."""
-        self._previous = None if pull is None else (pull.readings.t.copy(), pull.track.mean.copy())
+        if pull is None:
+            self._previous = None
+        else:
+            self._previous = pull.readings.t.copy(), np.where(numbers(pull.track)[:, None], pull.track.mean, np.nan)
 
     def clear(self) -> None:
         """Forget all rows: another revision begins."""
@@ -175,10 +179,12 @@ class Charts:
             previous = np.interp(times, t, mean[:, j], left=np.nan, right=np.nan)
         dots = [values[:, 4 * nx + j * 4 + d] for d in range(4)]
         mean, high, low = (values[:, k * nx + j] for k in range(3))
-        known = np.isfinite(mean)
+        # One state that is not a number leaves no estimate, whatever the others say.
+        known = np.isfinite(values[:, : 3 * nx]).all(axis=1)
+        mean = np.where(known, mean, np.nan)
         means, before = runs(mean, known, RUNS), runs(previous, np.isfinite(previous), RUNS)
         # Where the estimate is not a number, the band has no width, so it is not seen.
-        band = [np.where(np.isfinite(edge), edge, extended(mean)) for edge in (high, low)]
+        band = [np.where(known, edge, extended(mean)) for edge in (high, low)]
         columns = [*band, *dots[:3], *before, bridge(values[:, 3 * nx + j]), *means, dots[3]]
         return [x, *columns, self._ranges[j].series(columns)], state_series(len(before), len(means))
 

@@ -26,6 +26,10 @@ SOFTNESS = 0.3
 """Part of the way to the vehicle that the view moves in one frame."""
 
 FOV = float(np.radians(40))
+
+ABOVE = np.array([0.0, -0.28, 0.96])
+"""From walls to the first view of them, nearly as on a plan: a corridor would else be a line."""
+
 NEAREST = 15.0
 """Metres from which the first view looks at walls at least: a vehicle is some 4 m long."""
 
@@ -97,8 +101,7 @@ class VehicleScene:
         camera.position, camera.look_at, camera.up = (0.0, -55.0, 60.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
         if self._home is not None:
             outline = np.column_stack((corners - self._home, np.zeros(len(corners))))
-            away = np.array([0.0, -55.0, 60.0])
-            camera.position = away / np.linalg.norm(away) * max(NEAREST, distance_for(outline, away, FOV))
+            camera.position = ABOVE * max(NEAREST, distance_for(outline, ABOVE, FOV))
         camera.far = 20_000.0
         fit_cameras(server, FOV)
         self._move_world()

@@ -6,10 +6,10 @@ import numpy as np
 
 from estimators.fold import Fold
 from estimators.post_mortem import failures
-from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING, Track
+from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
 
 from .notices import Notices
-from .tally import UNSETTLED, complaints, last_run
+from .tally import UNSETTLED, complaints, last_run, numbers
 
 TRIES = 3
 """Failures of one fold whose cause is sought; a reading of 1e300 has none in the model, so more than one."""
@@ -69,14 +69,14 @@ class Watch:
         """The first of the last rows without a number: its absolute index, and its time; None if the last has one."""
         track, log = fold.track, fold.log
         end = len(track)
-        if not end or numbers(track, end - 1, end)[0]:
+        if not end or numbers(track.select(slice(end - 1, end)))[0]:
             return None
         known = self._lost
-        if known is not None and known[0] < log.first + before and not numbers(track, before, end).any():
+        if known is not None and known[0] < log.first + before and not numbers(track.select(slice(before, end))).any():
             return known
         while end > 0:
             start = max(0, end - UNSETTLED)
-            good = np.flatnonzero(numbers(track, start, end))
+            good = np.flatnonzero(numbers(track.select(slice(start, end))))
             if good.size:
                 end = start + int(good[-1]) + 1
                 break
@@ -106,8 +106,3 @@ class Watch:
             if text is not None:
                 self._tries = TRIES
                 self._notices.say(text, level="error", t=int(fold.log.t[rows[0]]))
-
-
-def numbers(track: Track, start: int, end: int) -> np.ndarray:
-    """Which rows from `start` to `end` of a track hold an estimate of finite numbers."""
-    return np.asarray(np.isfinite(track.mean[start:end]).all(axis=1) & np.isfinite(track.std[start:end]).all(axis=1))

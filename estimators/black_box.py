@@ -20,6 +20,7 @@ from .errors import ModelError
 from .from_file import portable
 from .jit import floats
 from .model import StateSpaceModel
+from .orphan import leave_with_parent
 from .probe import place
 
 ANSWER = 2
@@ -144,7 +145,9 @@ def _pool(kind: str) -> Executor:
     """The threads or processes that all models share."""
     count = int(numba.config.NUMBA_NUM_THREADS)
     # Spawned, not forked: a fork would copy the locks of threads that it does not copy.
-    return ThreadPoolExecutor(count) if kind == "threads" else ProcessPoolExecutor(count, get_context("spawn"))
+    if kind == "threads":
+        return ThreadPoolExecutor(count)
+    return ProcessPoolExecutor(count, get_context("spawn"), initializer=leave_with_parent)
 
 
 def _workers(pool: Executor) -> int:

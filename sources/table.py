@@ -80,7 +80,9 @@ class Table:
                 t, known = column_ns(chunk.time, self._unit)
                 for row in np.flatnonzero(~known):
                     self._report(
-                        "undated row", f"{path.name}:{chunk.line[row]}: {self._time} is no time; the row is left out"
+                        "undated row",
+                        f"{path.name}:{chunk.line[row]}: {self._time} is no time, or one that needs another unit; "
+                        "the row is left out",
                     )
                 t = t + self._shift
                 self._order.look(path.name, chunk.line[known], t[known])

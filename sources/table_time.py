@@ -12,6 +12,9 @@ from .clock import to_ns
 
 UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1, "min": 60 * 10**9, "h": 3600 * 10**9}
 
+FARTHEST = 2**62
+"""Nanoseconds (146 years) that a time may lie from 0; seconds that lie farther off are milliseconds, or no times."""
+
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -23,7 +26,8 @@ def _of_text(text: str, unit: int) -> int | None:
         return _of_date(text)
     if not np.isfinite(number):
         return None
-    return int((Decimal(text) * unit).to_integral_value())
+    time = int((Decimal(text) * unit).to_integral_value())
+    return time if abs(time) <= FARTHEST else None
 
 
 def _of_date(text: str) -> int | None:
@@ -60,10 +64,12 @@ def column_ns(column: Any, unit: str) -> tuple[np.ndarray, np.ndarray]:
         whole = column.cast(pyarrow.timestamp("ns", getattr(kind, "tz", None))).cast(pyarrow.int64())
         return whole.fill_null(0).to_numpy(zero_copy_only=False), known
     if pyarrow.types.is_integer(kind):
-        return column.cast(pyarrow.int64()).fill_null(0).to_numpy(zero_copy_only=False) * factor, known
+        whole = column.cast(pyarrow.int64()).fill_null(0).to_numpy(zero_copy_only=False)
+        known = known & (np.abs(whole) <= FARTHEST // factor)
+        return np.where(known, whole, 0) * factor, known
     if pyarrow.types.is_floating(kind):
         numbers = column.cast(pyarrow.float64()).to_numpy(zero_copy_only=False)
-        known = known & np.isfinite(numbers)
+        known = known & (np.abs(numbers) <= FARTHEST / factor)
         return to_ns(np.where(known, numbers, 0.0) * (factor / 1e9)), known
     return _of_cells([item or "" for item in column.cast(pyarrow.string()).to_pylist()], factor)
 

@@ -10,6 +10,7 @@ from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TRUTH
 from sources.source import Channel, Condition
 from sources.table import Table
+from sources.table_time import column_ns
 
 CHANNELS = (
     Channel(READING, 0, "temp", ("temp",), units=("degC",), model_units=("K",)),
@@ -104,7 +105,9 @@ def test_rows_without_a_time_or_with_missing_cells_are_left_out_and_counted(tmp_
     got = read_all(table(path, report=reports))
     assert set(got.t.tolist()) == {2 * 10**9}
     assert reports.counts == {"undated row": 1, "unreadable value": 1, "truncated file": 1}
-    assert reports.texts["undated row"] == "drive.csv:2: t is no time; the row is left out"
+    assert (
+        reports.texts["undated row"] == "drive.csv:2: t is no time, or one that needs another unit; the row is left out"
+    )
     assert reports.texts["unreadable value"] == "drive.csv:3: has 3 cells, not 7; the row is left out"
     assert reports.texts["truncated file"] == "drive.csv:5: the last line has 3 cells, not 7"
 
@@ -180,7 +183,9 @@ def test_parquet_times(tmp_path, column, unit, expected):
     pq.write_table(pa.table({"t": column, "x": [1.0, 2.0, 3.0]}), tmp_path / "a.parquet")
     got = read_all(table(tmp_path / "a.parquet", unit=unit, channels=X, report=reports))
     assert got.t.tolist() == expected and got.value[:, 0].tolist() == [1.0, 3.0]
-    assert reports.texts["undated row"] == "a.parquet:2: t is no time; the row is left out"
+    assert (
+        reports.texts["undated row"] == "a.parquet:2: t is no time, or one that needs another unit; the row is left out"
+    )
 
 
 def test_parquet_and_csv_of_one_table_agree(tmp_path):
@@ -252,3 +257,14 @@ def test_a_shift_moves_the_clock(tmp_path):
     path = write(tmp_path, HEADER + "1.5,20,1,2,1,3,7\n")
     moved = Table([path], time_column="t", time_unit="s", time_shift=-0.2, channels=CHANNELS, width=2)
     assert set(read_all(moved).t.tolist()) == {1_300_000_000}
+
+
+def test_times_beyond_any_clock_are_left_out():
+    """Milliseconds that are read as seconds: 64 bits of nanoseconds end at 9.2e9 s."""
+    for column in (["0", "1e10", "-1e10", "1e300", "2"], pa.array([0.0, 1e10, -1e10, 1e300, 2.0])):
+        time, known = column_ns(column, "s")
+        np.testing.assert_array_equal(known, [True, False, False, False, True])
+        np.testing.assert_array_equal(time[known], [0, 2_000_000_000])
+    time, known = column_ns(pa.array([0, 10**10, 2]), "s")
+    np.testing.assert_array_equal(known, [True, False, True])
+    np.testing.assert_array_equal(time[known], [0, 2_000_000_000])
