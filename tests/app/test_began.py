@@ -151,3 +151,14 @@ def test_rows_that_share_an_entry_are_told_one_by_one_where_their_mean_stays():
     # Quarters add up without rounding: the mean is the same to the bit.
     assert first.get("R.thermocouples") == moved.get("R.thermocouples")
     assert turned(twin, "ensrf", moved) == {a: value, b: value}
+
+
+def test_a_review_of_a_file_that_was_not_closed_says_so(review, tmp_path, capsys):
+    whole, cut = tmp_path / "run.rrd", tmp_path / "cut.rrd"
+    cut.write_bytes(whole.read_bytes()[:-1000])
+    capsys.readouterr()
+    for path in (whole, cut):
+        session, _ = open_review(path, None)
+        told = [line.text for line in session.engine.notices.since(0) if "was not closed" in line.text]
+        assert len(told) == (path == cut)
+        assert ("cut.rrd: was not closed" in capsys.readouterr().err) == (path == cut)

@@ -15,7 +15,7 @@ from app import commands
 from app.cli import main
 from app.engine import Engine
 from app.pull import Pull
-from app.recorded import read_recording
+from app.recorded import finished, read_recording
 from app.recorder import Recorder
 from app.recording import RecordingFile, tuning_from_json
 from estimators.errors import SourceError
@@ -205,6 +205,7 @@ def test_truncated_recording_keeps_what_is_whole(tmp_path):
     for part in np.linspace(0.2, 1.0, 12):
         cut.write_bytes(whole[: int(len(whole) * part)])
         recorded = read_recording(cut)
+        assert finished(cut) == (part == 1.0)
         kept.append(recorded.rows)
         if recorded.rows:
             assert_same(refold(recorded), recorded.track)
