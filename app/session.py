@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING, Any
 
 from estimators.errors import SourceError
 
-from .commands import Record
-from .engine import Engine
-from .recorder import Recorder
-from .rerun_rows import RerunRows
+from .engine.commands import Record
+from .engine.engine import Engine
+from .recording.writer import Recorder
+from .rerun.rows import RerunRows
 
 if TYPE_CHECKING:
     from estimators.fold import Base
     from sources.source import Source
 
-    from .twin import Twin
+    from .twin.twin import Twin
 
 SWITCH = 0.0005
 """Seconds after which Python lets another thread run; its default of 5 ms is as long as a reading may take in all."""
@@ -73,8 +73,8 @@ class Session:
         self.view: Any = None
         self.server: Any = None
         if page is not None:
-            from .server import PageServer
-            from .viser_view import ViserView
+            from .server.server import PageServer
+            from .viser.view import ViserView
 
             secret = secrets.token_urlsafe(24)
             try:

@@ -13,26 +13,26 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from . import fold_python
-from .compiled import compile_model
-from .context import context_of, context_type, prior
-from .diagnostics import Bounds, HealthPolicy, assess, assess_signature, chi_square_bounds
-from .driven import driven
+from .compiled.context import context_of, context_type, prior
+from .compiled.model import compile_model
+from .diagnostics.failure_cause import Estimate, cause, failures
+from .diagnostics.field_pictures import Pictures
+from .diagnostics.health import Bounds, HealthPolicy, assess, assess_signature, chi_square_bounds
 from .errors import EstimatorError, ModelError
-from .filter import Code, Estimator, call_describe, call_predict, call_start, call_update, code_type
-from .fold_python import LONGEST, UNSET
-from .indicator import indicator
-from .jit import B1, F1, F2, I1, borrowed, borrowed_rows, i64, jit, jit_brief
+from .estimator import Code, Estimator, call_describe, call_predict, call_start, call_update, code_type
+from .interpreted import fold_loop as fold_python
+from .interpreted.black_box_filters import driven
+from .interpreted.fold_loop import LONGEST, UNSET
+from .interpreted.view import View
 from .log import INPUT, READING, RESET, TICK, TRUTH, Log
-from .model import StateSpaceModel
-from .modes import Mode
-from .pictures import Pictures
-from .post_mortem import Estimate, cause, failures
-from .quantiles import chi_square_quantile
+from .model.mode_as_number import indicator
+from .model.state_space import StateSpaceModel
+from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, i64, jit, jit_brief
+from .numerics.peaks import Mode
+from .numerics.quantiles import chi_square_quantile
 from .registry import find_estimator
 from .track import MISSING, NONE, Track, track_type
 from .tuning import Tuning
-from .view import View
 
 SNAPSHOT_EVERY = 64
 """Events between snapshots of the last `RECENT` events, where late readings fall."""

@@ -5,28 +5,28 @@ from __future__ import annotations
 from collections.abc import Mapping
 from difflib import get_close_matches
 
-from .apf import APF
-from .ckf import CKF
-from .ekf import EKF
-from .enkf import ENKF
-from .ensrf import ENSRF
+from .ensemble.enkf import ENKF
+from .ensemble.ensrf import ENSRF
+from .ensemble.etkf import ETKF
+from .ensemble.letkf import LETKF
+from .ensemble.placed import check_placed
 from .errors import EstimatorError
-from .etkf import ETKF
-from .filter import Estimator, Options
-from .filterpy_ import FILTERPY_EKF, FILTERPY_ENKF, FILTERPY_KF, FILTERPY_UKF
-from .iekf import IEKF
-from .kf import KF
-from .kf_steady import KF_STEADY
-from .letkf import LETKF
-from .model import LARGE, StateSpaceModel
-from .pf import PF, PF_REG
-from .pf_ekf import PF_EKF
-from .placed import check_placed
-from .rbpf import RBPF
-from .sr_ekf import SR_EKF
-from .sr_kf import SR_KF
-from .sr_ukf import SR_UKF
-from .ukf import UKF
+from .estimator import Estimator, Options
+from .gaussian.ckf import CKF
+from .gaussian.ekf import EKF
+from .gaussian.iekf import IEKF
+from .gaussian.kf import KF
+from .gaussian.kf_steady import KF_STEADY
+from .gaussian.sr_ekf import SR_EKF
+from .gaussian.sr_kf import SR_KF
+from .gaussian.sr_ukf import SR_UKF
+from .gaussian.ukf import UKF
+from .interpreted.filterpy import FILTERPY_EKF, FILTERPY_ENKF, FILTERPY_KF, FILTERPY_UKF
+from .model.state_space import LARGE, StateSpaceModel
+from .particle.apf import APF
+from .particle.pf import PF, PF_REG
+from .particle.pf_ekf import PF_EKF
+from .particle.rbpf import RBPF
 
 GAUSSIAN = (KF, KF_STEADY, EKF, IEKF, UKF, CKF, SR_KF, SR_EKF, SR_UKF)
 PARTICLE = (PF, PF_REG, PF_EKF, APF, RBPF)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from .jit import B1, F1, F2
+from .numerics.jit import B1, F1, F2
 
 NONE, USED, GATED, HELD_OUT, MISSING, FAILED = range(6)
 """Verdict on an event: not a reading; used; refused by the gate; held out and scored; no finite row; not usable,

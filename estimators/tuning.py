@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .errors import LARGEST, ConfigError
-from .model import StateSpaceModel
+from .model.state_space import StateSpaceModel
 
 _versions = count(1)
 

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from estimators.errors import SourceError
-from estimators.jit import jit
 from estimators.log import INPUT, READING, TRUTH, Readings
+from estimators.numerics.jit import jit
 
+from .can.signals import ABSENT, PRESENT, SHORT
 from .geodesy import east_north
-from .signals import ABSENT, PRESENT, SHORT
 from .source import Channel, Report
 from .units import conversion
 

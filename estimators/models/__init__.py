@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..model import StateSpaceModel
+from ..model.state_space import StateSpaceModel
 from .agv_corridor import AGV_CORRIDOR
 from .battery_cell import BATTERY_CELL
 from .battery_pack import BATTERY_PACK

@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..jit import jit
-from ..model import Input, Noise, Row, Sensor, State, StateSpaceModel
+from ..model.state_space import Input, Noise, Row, Sensor, State, StateSpaceModel
+from ..numerics.jit import jit
 
 EAST, NORTH, HEADING = range(3)
 SPEED, YAW_RATE = range(2)

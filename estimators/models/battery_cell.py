@@ -26,8 +26,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..jit import jit
-from ..model import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from ..model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from ..numerics.jit import jit
 
 NODES = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """States of charge at which the open-circuit voltage is given."""

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..jit import jit
-from ..model import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from ..model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from ..numerics.jit import jit
 from .battery_cell import (
     AIR,
     BATTERY_CELL,

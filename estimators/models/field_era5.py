@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..field import Field
-from ..grid import exponential
-from ..model import Noise, Parameter, Row, Sensor, StateSpaceModel
+from ..model.field import Field
+from ..model.state_space import Noise, Parameter, Row, Sensor, StateSpaceModel
+from ..numerics.smoothed_noise import exponential
 
 SPACING = (27.8, 16.3)
 """km to the south and to the east."""

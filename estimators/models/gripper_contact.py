@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..model import Input, Jump, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from ..model.state_space import Input, Jump, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 
 CONTACT, DEPTH, SPEED, SURFACE, OFFSET = range(5)
 MASS, DAMPING, STIFFNESS, RATE, ROUGHNESS = range(5)

@@ -10,7 +10,7 @@ of the readings as in Evensen & van Leeuwen (2000), doi:10.1175/1520-0493(2000)1
 
 from __future__ import annotations
 
-from ..model import Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from ..model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 
 
 def f(x, u, p, dt, out):

@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..field import Field
-from ..jit import jit
-from ..model import Noise, Parameter, Row, Sensor, StateSpaceModel
+from ..model.field import Field
+from ..model.state_space import Noise, Parameter, Row, Sensor, StateSpaceModel
+from ..numerics.jit import jit
 
 N = 40
 

@@ -18,8 +18,8 @@ order of a water-cooled motor of about 50 kW.
 
 from __future__ import annotations
 
-from ..jit import jit
-from ..model import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from ..model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from ..numerics.jit import jit
 
 COPPER = 0.00393
 """Temperature coefficient of copper's resistivity at 20 °C, 1/K."""

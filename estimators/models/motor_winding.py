@@ -5,7 +5,7 @@ T' = T + dt·rate,  rate' = rate,  y = T + v. The process noise is a random walk
 
 from __future__ import annotations
 
-from ..model import Noise, Row, Sensor, State, StateSpaceModel
+from ..model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 
 
 def f(x, u, p, dt, out):

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..model import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from ..model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 
 EAST, NORTH, HEADING, SPEED, ACCEL_BIAS, YAW_RATE_BIAS, WHEEL_SCALE, EAST_ERROR, NORTH_ERROR = range(9)
 ACCEL, YAW_RATE = range(2)

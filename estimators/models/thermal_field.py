@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..field import Field
-from ..grid import exponential
-from ..jit import jit
-from ..model import Input, Noise, Parameter, Row, Sensor, StateSpaceModel
+from ..model.field import Field
+from ..model.state_space import Input, Noise, Parameter, Row, Sensor, StateSpaceModel
+from ..numerics.jit import jit
+from ..numerics.smoothed_noise import exponential
 
 SPACING = 0.01
 """Side of a cell, m."""

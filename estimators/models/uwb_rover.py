@@ -22,7 +22,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..model import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from ..model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 
 EAST, NORTH, HEADING, YAW_RATE_BIAS, RANGE_SCALE, BIAS = range(6)
 SPEED, YAW_RATE, RIGHT, LEFT = range(4)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from app.commands import Pause, Record, Restore, SetEstimator, SetOption, SetTuning, Speed, UseSensor
+from app.engine.commands import Pause, Record, Restore, SetEstimator, SetOption, SetTuning, Speed, UseSensor
 from config.schema import ViewSection
 from estimators.fold import Fold
 from estimators.log import Log, Readings

@@ -9,12 +9,12 @@ import threading
 from types import SimpleNamespace
 from urllib.parse import parse_qs, urlsplit
 
-from scripted import twin
 from websockets.datastructures import Headers
 from websockets.http11 import Response
 from websockets.sync.server import serve
 
-from app.viser_guard import HEADER
+from app.viser.private_server import HEADER
+from tests.app.scripted import twin
 
 SECRET = "the secret between the servers"
 PATIENCE = 60.0

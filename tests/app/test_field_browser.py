@@ -4,13 +4,13 @@ import io
 
 import numpy as np
 import pytest
-from scripted import Scripted, wait_for
-from test_field_views import PLATE, SHAPE
 
-from app.engine import Engine
-from app.twin import load_twin
-from app.viser_guard import HEADER
-from app.viser_view import ViserView
+from app.engine.engine import Engine
+from app.twin.twin import load_twin
+from app.viser.private_server import HEADER
+from app.viser.view import ViserView
+from tests.app.scripted import Scripted, wait_for
+from tests.app.test_field_views import PLATE, SHAPE
 
 pytestmark = pytest.mark.browser
 

@@ -5,23 +5,24 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
-from scripted import Scripted, wait_for
 
-from app import commands, viser_field
-from app.engine import Engine
-from app.heatmap import ERROR, FAR, NOTHING, ODD, QUIET, SILENT, Frame, Scale, sensor_colors
-from app.observed import observed
-from app.recorded import read_recording
-from app.recorder import Recorder
-from app.rerun_rows import RerunRows
-from app.rerun_view import RerunFeed
-from app.review import open_review
-from app.twin import load_twin
-from app.viser_view import ViserView
+from app.cli.review import open_review
+from app.drawing.direct_readings import observed
+from app.drawing.heatmap import ERROR, FAR, NOTHING, ODD, QUIET, SILENT, Frame, Scale, sensor_colors
+from app.engine import commands
+from app.engine.engine import Engine
+from app.recording.reader import read_recording
+from app.recording.writer import Recorder
+from app.rerun.feed import RerunFeed
+from app.rerun.rows import RerunRows
+from app.twin.twin import load_twin
+from app.viser import field_scene as viser_field
+from app.viser.view import ViserView
 from estimators.errors import ConfigError
-from estimators.field import Field
 from estimators.fold import Fold
 from estimators.log import READING, Log
+from estimators.model.field import Field
+from tests.app.scripted import Scripted, wait_for
 
 PLATE = """
 title: A small plate

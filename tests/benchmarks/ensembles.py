@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from estimators.compiled import compile_model
+from estimators.compiled.model import compile_model
 from estimators.fold import Base, Fold
 from estimators.log import READING, Log, Readings
-from estimators.model import StateSpaceModel
+from estimators.model.state_space import StateSpaceModel
 from estimators.models.lorenz96 import LORENZ96
 from estimators.models.thermal_field import thermal_field
 from estimators.tuning import Tuning

@@ -8,12 +8,12 @@ from datetime import datetime, timedelta
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 
-from estimators.filter import call_predict, call_update
+from estimators.estimator import call_predict, call_update
 from estimators.fold import Fold
-from estimators.jit import borrowed, floats, jit
 from estimators.log import READING, Log, Readings
-from estimators.model import StateSpaceModel
+from estimators.model.state_space import StateSpaceModel
 from estimators.models import MODELS
+from estimators.numerics.jit import borrowed, floats, jit
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.twin import load_twin
+from app.twin.twin import load_twin
 from estimators.fold import Fold
 from estimators.log import READING, Log, Readings
 from estimators.models import MODELS

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from app import commands
-from app.compile import prepare
-from app.recorded import read_recording
-from app.run import live_source
+from app.cli.prepare import prepare
+from app.cli.run import live_source
+from app.engine import commands
+from app.recording.reader import read_recording
 from app.session import Page, Session
-from app.twin import load_twin
+from app.twin.twin import load_twin
 from estimators.log import READING
 
 FLAGS = (

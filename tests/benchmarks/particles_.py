@@ -15,7 +15,7 @@ import numpy as np
 
 from estimators.fold import Fold
 from estimators.log import READING, Log, Readings
-from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models.gripper_contact import GRIPPER_CONTACT
 from estimators.tuning import Tuning
 

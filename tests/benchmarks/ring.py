@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 
 STD, Q, R = 0.5, 0.01, 0.04
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from estimators.log import READING
-from sources.can_log import CanLog
-from sources.decoder import Decoder
+from sources.can.decoder import Decoder
+from sources.can.log import CanLog
 from sources.source import Channel
 
 from .timing import both, judged

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimators.log import INPUT, READING, Log, Readings
-from estimators.model import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 
 SECOND = 1_000_000_000
 ROWS = (1, 2, 3)

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from linear_models import ROWS, random_linear, random_log
 
 from estimators.errors import EstimatorError
 from estimators.fold import RECENT, Fold, fold
@@ -12,6 +11,7 @@ from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Log, Readings
 from estimators.registry import ESTIMATORS
 from estimators.track import FAILED, GATED, HELD_OUT, MISSING, NONE, USED
 from estimators.tuning import Tuning
+from tests.estimators.linear_models import ROWS, random_linear, random_log
 
 SECOND = 1_000_000_000
 MATRICES = random_linear(np.random.default_rng(1), 3, 2)

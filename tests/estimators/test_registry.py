@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_filterpy import PENDULUM
 
 from estimators.errors import EstimatorError
 from estimators.fold import Fold
@@ -12,6 +11,7 @@ from estimators.log import READING, Log, Readings
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS, checked, find_estimator, unfit
 from estimators.tuning import Tuning
+from tests.estimators.interpreted.test_filterpy import PENDULUM
 
 WINDING = MODELS["motor_winding"]
 ANYBODYS = replace(WINDING, conditionally_linear=WINDING.state_names)
@@ -109,7 +109,7 @@ def test_every_estimator_runs_every_model_it_applies_to(name, model):
     if reason := unfit(ESTIMATORS[name], model):
         assert model.name in reason
         return
-    from estimators.compiled import compile_model
+    from estimators.compiled.model import compile_model
 
     compiled = compile_model(model)
     x = model.prior_mean

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from test_filterpy import PENDULUM
 
 from estimators.errors import ConfigError
-from estimators.model import Parameter, StateSpaceModel
+from estimators.model.state_space import Parameter, StateSpaceModel
 from estimators.models import MODELS
 from estimators.tuning import Tuning
+from tests.estimators.interpreted.test_filterpy import PENDULUM
 
 MOTOR = MODELS["motor_winding"]
 

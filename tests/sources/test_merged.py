@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from can_tools import read_all, same
 
 from estimators.errors import SourceError
 from estimators.log import Readings
 from sources.memory import MemorySource
 from sources.merged import Merged
+from tests.sources.can.can_tools import read_all, same
 
 
 def events(times, who):
@@ -49,10 +49,10 @@ def test_span_and_refusals():
 def test_bus_and_gnss_of_one_drive(data):
     """BLF and two GNSS tables of a car: one log in order, positions along the road that its README describes."""
     from estimators.log import READING
-    from sources.can_log import CanLog
-    from sources.decoder import Decoder
+    from sources.can.decoder import Decoder
+    from sources.can.log import CanLog
     from sources.source import Channel
-    from sources.table import Table
+    from sources.tables.table import Table
 
     folder = data("can_comma2k19_rav4")
     speed = Channel(READING, 0, "speed", ("SPEED",), "SPEED", model_units=("m/s",))

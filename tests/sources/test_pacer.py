@@ -4,11 +4,11 @@ import threading
 
 import numpy as np
 import pytest
-from can_tools import read_all
 
 from estimators.log import Readings
 from sources.memory import MemorySource
 from sources.pacer import BATCH, Pacer
+from tests.sources.can.can_tools import read_all
 
 S = 10**9
 

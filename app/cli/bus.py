@@ -1,0 +1,102 @@
+"""`nisus bus`: a twin's simulated asset, played on a CAN bus in a process of its own."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from estimators.errors import ConfigError
+
+from ..twin.twin import Twin, load_twin
+from .main import settings
+from .stderr import complain
+
+if TYPE_CHECKING:
+    from .main import Bus
+
+GROUP = "239.74.163.2"
+"""python-can's own multicast address."""
+
+FORMATS = (".asc", ".blf", ".csv", ".log", ".mf4", ".trc")
+"""What python-can writes and `nisus fold --log` reads; not .db, whose writer forgets what is queued when it stops."""
+
+
+def play_bus(arguments: Bus) -> int:
+    """Carry the command out."""
+    if arguments.duration is not None and not arguments.duration > 0:
+        raise ConfigError(f"--duration {arguments.duration:g}: must be positive")
+    twin = load_twin(arguments.twin, overrides=settings(arguments.set))
+    if arguments.interface == "virtual" and arguments.record is None:
+        raise ConfigError("--interface virtual: its frames stay in this process; use udp_multicast, or give --record")
+    channel = _channel(arguments, twin)
+    counts: Counter[str] = Counter()
+
+    def report(key: str, text: str) -> None:
+        counts[key] += 1
+        if counts[key] == 1:
+            complain(text)
+
+    player = twin.plan.player(report, interface=arguments.interface, channel=channel)
+    logger = None
+    try:
+        if arguments.record is not None:
+            logger = _logger(arguments.record)
+            player.listeners.append(logger)
+        print(f"Nisus plays the asset of {twin.name} on {arguments.interface} {channel}; Ctrl-C ends it.", flush=True)
+        if arguments.interface != "virtual":
+            print(
+                f"To listen: nisus run {arguments.twin} --set source.interface={arguments.interface} "
+                f"--set source.channel={channel}",
+                flush=True,
+            )
+        _play(player, arguments.duration)
+    finally:
+        player.close()
+        if logger is not None:
+            logger.stop()
+    print(", ".join([f"{player.sent} frames sent", *(f"{key} {count}" for key, count in counts.items())]))
+    return 0
+
+
+def _channel(arguments: Bus, twin: Twin) -> str | int:
+    """The channel that was given; else the twin's where it is of this interface, else the interface's own."""
+    if arguments.channel is not None:
+        return int(arguments.channel) if arguments.channel.isdecimal() else arguments.channel
+    source: Any = twin.config.source
+    if getattr(source, "interface", None) == arguments.interface:
+        return source.channel
+    if arguments.interface == "udp_multicast":
+        return GROUP
+    if arguments.interface == "virtual":
+        return "nisus"
+    raise ConfigError(f"--interface {arguments.interface}: which bus is not known; give --channel, for example can0")
+
+
+def _logger(path: Path) -> Any:
+    """A writer of python-can's for the format that the file's ending names."""
+    import can
+
+    if not path.absolute().parent.is_dir():
+        raise ConfigError(f"--record {path}: there is no folder {path.parent}; create it first")
+    if path.suffix.lower() not in FORMATS:
+        raise ConfigError(f"--record {path}: is no CAN log format; end it in {', '.join(FORMATS)}")
+    return can.Logger(path)
+
+
+def _play(player: Any, duration: float | None) -> None:
+    """Until the asset has said all, the time is up, or a signal comes."""
+    done = threading.Event()
+    previous = signal.signal(signal.SIGTERM, lambda *_: done.set())
+    end = time.monotonic() + duration if duration is not None else float("inf")
+    try:
+        player.start()
+        while not player.finished and (left := end - time.monotonic()) > 0 and not done.wait(min(0.2, left)):
+            pass
+    except KeyboardInterrupt:
+        pass
+    finally:
+        signal.signal(signal.SIGTERM, previous)

@@ -1,0 +1,265 @@
+"""The command line: `nisus run`, `fold`, `compare`, `filters`, `review`, `bus`, `twins`, `schema`, `new`."""
+
+from __future__ import annotations
+
+import functools
+import operator
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, get_args
+
+import tyro
+
+from estimators.errors import ConfigError, NisusError
+
+from .stderr import complain
+
+Twin = Annotated[str, tyro.conf.Positional]
+Settings = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+
+
+@dataclass(frozen=True)
+class Run:
+    """Run a twin, and show it in the browser."""
+
+    twin: Twin
+    """Name of a twin that ships (see `nisus twins`), or path of a YAML file."""
+    estimator: str | None = None
+    """Estimator in place of the twin's own: kf, ekf, ukf."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable: Q.temperature=0.02, R.winding=9, p.NAME, use.SENSOR=false, gate, or a dotted YAML key."""
+    log: tuple[Path, ...] = ()
+    """Recordings in place of the twin's own."""
+    record: Path | None = None
+    """Record into this .rrd file from the start."""
+    speed: float = 1.0
+    """Times real time for replays and simulations; inf is as fast as possible."""
+    duration: float | None = None
+    """Stop after so many seconds."""
+    port: int = 9900
+    """Of the page, on 127.0.0.1; 0 takes a free one."""
+    no_browser: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the URL, open nothing."""
+    headless: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """No page at all: run, and record if asked."""
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Fold a twin's readings as fast as possible, and print what the estimate was worth."""
+
+    twin: Twin
+    """Name of a twin that ships, or path of a YAML file."""
+    estimator: str | None = None
+    """Estimator in place of the twin's own."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable, as for `run`."""
+    log: tuple[Path, ...] = ()
+    """Recordings in place of the twin's own."""
+    duration: float | None = None
+    """Take only so many seconds of the source."""
+    out: Path | None = None
+    """Write the track to this .parquet, or a recording to this .rrd."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print one JSON object."""
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Fold every filter that applies over the same log, in parallel, and print what each estimate was worth.
+
+    A filter that draws its members folds eight times, with another seed each; its figures are mean ± standard
+    deviation of one fold. A step is one event of the log; its cost is that of one processor.
+    """
+
+    twin: Twin
+    """Name of a twin that ships, path of a YAML file, or `all`: each that ships."""
+    estimators: tuple[str, ...] = ()
+    """Only these filters."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable, as for `run`."""
+    log: tuple[Path, ...] = ()
+    """Recordings in place of the twin's own."""
+    duration: float | None = None
+    """Take only so many seconds of the source."""
+    logs: int = 1
+    """So many logs of a simulated twin, with seeds from its own on; figures are mean ± standard deviation over them."""
+    budget: float = 20.0
+    """Seconds of one processor for the folds of one filter; a slower one folds a shorter span, which its row states."""
+    jobs: int | None = None
+    """Processes; default: one a processor."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print one JSON list."""
+    write: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Put the table into the head of the twin's YAML."""
+
+
+@dataclass(frozen=True)
+class Filters:
+    """List the estimators: what they assume, their options, what they cost and when they fail."""
+
+    twin: str | None = None
+    """Name or YAML file of a twin: which of them apply to it, what they cost there, and why the others do not."""
+
+
+@dataclass(frozen=True)
+class Review:
+    """Open a recording on the page, with the panel that folds its readings again."""
+
+    file: Annotated[Path, tyro.conf.Positional]
+    """The .rrd file."""
+    port: int = 9900
+    """Of the page, on 127.0.0.1; 0 takes a free one."""
+    no_browser: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the URL, open nothing."""
+    duration: float | None = None
+    """Stop after so many seconds."""
+
+
+@dataclass(frozen=True)
+class Bus:
+    """Play a twin's asset on its CAN bus, in a process of its own."""
+
+    twin: Twin
+    """Name of a twin with a CAN source that has an `asset`, or path of a YAML file."""
+    interface: str = "udp_multicast"
+    """python-can's name of the bus: udp_multicast reaches other processes of this machine, socketcan a real bus."""
+    channel: str | None = None
+    """Channel of the interface; default: the twin's where it suits, else the interface's own."""
+    set: Settings = ()
+    """KEY=VALUE of the YAML, repeatable."""
+    duration: float | None = None
+    """Stop after so many seconds."""
+    record: Path | None = None
+    """Also write the frames to this log, in any format python-can writes (.blf, .asc, .log, .csv, .mf4)."""
+
+
+@dataclass(frozen=True)
+class Twins:
+    """List the twins that ship."""
+
+
+@dataclass(frozen=True)
+class Schema:
+    """Write the JSON Schema of a twin's YAML, for editors that complete and check."""
+
+    out: Path | None = None
+    """File; without it, standard output."""
+
+
+@dataclass(frozen=True)
+class New:
+    """Write a working pair NAME.yaml and NAME.py to start a twin of your own from."""
+
+    name: Annotated[str, tyro.conf.Positional]
+    """Of the twin."""
+    folder: Path = field(default_factory=Path.cwd)
+    """Where to."""
+
+
+Command = Run | Fold | Compare | Filters | Review | Bus | Twins | Schema | New
+COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in get_args(Command)}
+
+
+def settings(given: Sequence[str], estimator: str | None = None) -> dict[str, str]:
+    """The KEY=VALUE pairs of `--set`, and `--estimator` as one more.
+
+    Raises:
+        ConfigError: If one has no `=`, or no key before it.
+    """
+    pairs: dict[str, str] = {}
+    for text in given:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip():
+            lacks = "key" if equals else "value"
+            raise ConfigError(f"--set {text}: has no {lacks}; write KEY=VALUE, for example --set R.winding=9")
+        pairs[key.strip()] = value.strip()
+    if estimator is not None:
+        pairs["estimator"] = estimator
+    return pairs
+
+
+def carry_out(command: Command) -> int:
+    """Run one command; imports only what it needs, so that `nisus twins` answers at once."""
+    if isinstance(command, Run):
+        from .run import run_twin
+
+        return run_twin(command)
+    if isinstance(command, Fold):
+        from .fold import fold_twin
+
+        return fold_twin(command)
+    if isinstance(command, Compare):
+        from .compare import compare_twin
+
+        return compare_twin(command)
+    if isinstance(command, Filters):
+        from .filters import show_filters
+
+        return show_filters(command)
+    if isinstance(command, Review):
+        from .review import review_recording
+
+        return review_recording(command)
+    if isinstance(command, Bus):
+        from .bus import play_bus
+
+        return play_bus(command)
+    if isinstance(command, Twins):
+        from config.loader import load, shipped
+
+        for name in shipped():
+            print(f"{name:<16} {load(name).config.title or ''}")
+        return 0
+    if isinstance(command, Schema):
+        from config.json_schema import json_schema_text
+
+        text = json_schema_text()
+        if command.out is None:
+            print(text)
+        else:
+            command.out.write_text(text + "\n", encoding="utf-8")
+        return 0
+    from .new import write_twin
+
+    for path in write_twin(command.name, command.folder):
+        print(path)
+    return 0
+
+
+def parse(arguments: Sequence[str]) -> Command:
+    """The command that the words say; leaves with tyro's explanation if they say none.
+
+    That of a subcommand that is there gets its words alone, so that only its own options are suggested.
+    """
+    if arguments and arguments[0] in COMMANDS:
+        name = arguments[0]
+        return tyro.cli(COMMANDS[name], args=arguments[1:], prog=f"nisus {name}")  # type: ignore[no-any-return]
+    named = [Annotated[command, tyro.conf.subcommand(name)] for name, command in COMMANDS.items()]
+    union: Any = functools.reduce(operator.or_, named)
+    return tyro.cli(union, args=arguments, prog="nisus", description=__doc__)  # type: ignore[no-any-return]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point: 0 when all went well, 2 with one line on standard error when it did not."""
+    try:
+        return carry_out(parse(sys.argv[1:] if arguments is None else arguments))
+    except NisusError as error:
+        complain(error)
+        return 2
+    except BrokenPipeError:
+        # Whoever read the output has had enough of it (`| head`). Python's own flush at exit must not fail again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        complain(f"{error.filename or ''}: {error.strerror or error}")
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,22 @@
+"""What concerns a recording as a whole is said on standard error too, whatever else is counted or shown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sources.tables.order import REMARKS
+
+from .stderr import complain
+
+
+def remarking(report: Callable[[str, str], None]) -> Callable[[str, str], None]:
+    """A report that also says each remark, once."""
+    said: set[str] = set()
+
+    def both(key: str, text: str) -> None:
+        if key in REMARKS and key not in said:
+            said.add(key)
+            complain(text)
+        report(key, text)
+
+    return both

@@ -1,0 +1,68 @@
+"""`nisus run`: a twin on its source, live or replayed, shown on the page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from estimators.errors import ConfigError
+
+from ..server.port import check_port
+from ..session import Page, Session
+from ..twin.twin import Twin, load_twin
+from .main import settings
+from .prepare import prepare
+from .remarks import remarking
+from .stderr import complain
+
+if TYPE_CHECKING:
+    from sources.source import Source
+
+    from .main import Run
+
+
+def live_source(twin: Twin, speed: float) -> Callable[[Callable[[str, str], None]], Source]:
+    """How to open the twin's source so that it comes in its own time: a bus as it is, anything else paced."""
+
+    def open_source(report: Callable[[str, str], None]) -> Source:
+        from sources.pacer import Pacer
+
+        report = remarking(report)
+        source = twin.open_source(report)
+        if source.live:
+            return source
+        source.close()
+        return Pacer(lambda: twin.open_source(report), speed=speed)
+
+    return open_source
+
+
+SAID = 5
+"""Failures that a run without a page tells at its end; it has no list of events."""
+
+
+def run_twin(arguments: Run) -> int:
+    """Carry the command out."""
+    if not arguments.speed > 0 or math.isnan(arguments.speed):
+        raise ConfigError(f"--speed {arguments.speed:g}: must be positive, or inf for as fast as possible")
+    if arguments.record is not None and arguments.record.suffix != ".rrd":
+        raise ConfigError(f"--record {arguments.record}: must end in .rrd")
+    if arguments.record is not None and arguments.record.exists():
+        raise ConfigError(f"--record {arguments.record}: is there already; choose another name, or remove it")
+    twin = load_twin(
+        arguments.twin, log_files=arguments.log or None, overrides=settings(arguments.set, arguments.estimator)
+    )
+    page = None if arguments.headless else Page(arguments.port, not arguments.no_browser)
+    if page is not None:
+        check_port(page.port)
+    prepare(twin)
+    session = Session(twin, live_source(twin, arguments.speed), page=page)
+    session.run(record=arguments.record, duration=arguments.duration, until_finished=arguments.headless)
+    if arguments.headless:
+        status = session.engine.status()
+        print(", ".join(f"{name} {count}" for name, count in status.counts.items() if count or name == "readings"))
+        failures = {notice.text: None for notice in session.engine.notices.since(0) if notice.level == "error"}
+        for text in list(failures)[:SAID]:
+            complain(text)
+    return 0

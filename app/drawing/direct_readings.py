@@ -1,0 +1,77 @@
+"""Which sensor rows read a state as it is, so that their readings are drawn over it: charts and scene ask the same."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimators.model.state_space import Sensor, StateSpaceModel
+
+NEAR, AWAY = 0.05, 0.2
+"""How far a row may be from its state, as a share: where the prior has its mean (a wheel's scale), and elsewhere, where
+a small error that the model estimates too comes on top (a GNSS receiver's)."""
+
+STEP = 1e-3
+"""Of a state's standard deviation, for slopes."""
+
+
+@dataclass(frozen=True)
+class Observed:
+    """One row of a sensor, and the state that it reads."""
+
+    sensor: int
+    row: int
+    state: int
+
+
+def observed(model: StateSpaceModel) -> list[Observed]:
+    """The sensor rows that read one charted state, give or take a scale near one: h ≈ x_j, ∂h/∂x_j ≈ 1.
+
+    Looked at where the prior has its mean, and at two places within its standard deviation.
+    """
+    rng = np.random.default_rng(0)
+    share = np.array([NEAR, AWAY, AWAY])
+    moves = np.concatenate((np.zeros((1, model.nx)), rng.uniform(0.3, 0.9, (2, model.nx))))
+    points = model.prior_mean + moves * model.prior_std
+    charted = list(zip(model.shown.tolist(), model.shown_states, strict=True))
+    u = np.array([item.default for item in model.inputs])
+    p = np.array([parameter.value for parameter in model.parameters])
+    found = []
+    for k, sensor in enumerate(model.sensors):
+        values, there = np.full((len(points), len(sensor.rows)), np.nan), np.zeros(len(sensor.rows))
+        for x, out in zip(points, values, strict=True):
+            _expect(model, sensor, x, u, p, out)
+        slopes = np.zeros((len(sensor.rows), len(charted)))
+        for column, (j, state) in enumerate(charted):
+            moved = points[0].copy()
+            moved[j] += STEP * state.std
+            _expect(model, sensor, moved, u, p, there)
+            slopes[:, column] = (there - values[0]) / (STEP * state.std)
+        for r, row in enumerate(sensor.rows):
+            # A distance to a wall grows as the vehicle moves, but is not where the vehicle is; and a sum of two states
+            # may be one of them by chance, as long as the other is zero.
+            likely = [
+                j
+                for column, (j, state) in enumerate(charted)
+                if state.unit == row.unit
+                and abs(slopes[r, column] - 1.0) < NEAR
+                and np.all(np.abs(values[:, r] - points[:, j]) < share * np.maximum(np.abs(points[:, j]), state.std))
+            ]
+            likely.sort(key=lambda j: model.state_names[j] not in (row.name, sensor.name))
+            if likely:
+                found.append(Observed(k, r, likely[0]))
+    return found
+
+
+def _expect(
+    model: StateSpaceModel, sensor: Sensor, x: np.ndarray, u: np.ndarray, p: np.ndarray, out: np.ndarray
+) -> None:
+    """Fill `out` with h(x, u, p); NaN, which is near nothing, where Python raises and machine code would not."""
+    try:
+        if model.black_box:
+            out[:] = sensor.h(x[np.newaxis], u, p)[0]
+        else:
+            sensor.h(x, u, p, out)
+    except Exception:
+        out[:] = np.nan

@@ -1,0 +1,182 @@
+"""Pictures of a field: values to colours, a scale with round numbers beside them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from estimators.diagnostics.field_pictures import Picture, plane_shape, reduction
+from estimators.model.field import Field
+from estimators.model.state_space import StateSpaceModel
+
+from .geometry import round_step, tick_text
+
+WARM = ("#0b1354", "#3b2e8c", "#7b2f8d", "#b73779", "#e8604c", "#f9a03f", "#fcf3a6")
+"""Low to high values of a quantity."""
+
+SPREAD = ("#f7fbff", "#c6dbef", "#6baed6", "#2171b5", "#08306b")
+"""None to much."""
+
+SIGNED = ("#1d4ed8", "#7aa2f0", "#f5f5f5", "#f2a07a", "#b91c1c")
+"""Negative, none, positive."""
+
+NOTHING = 255
+"""Index of the colour of what is unknown: grey."""
+
+QUIET, ODD, FAR, SILENT, RIM = (255, 255, 255), (245, 158, 11), (220, 38, 38), (120, 120, 128), (51, 65, 85)
+"""Colours of a sensor whose innovation is below two of its deviations, below three, above; that said nothing; and of
+the line around it."""
+
+
+class Kind(NamedTuple):
+    """One picture of a field: its name, its title, a shorter one, its colours from low to high."""
+
+    name: str
+    title: str
+    brief: str
+    colors: tuple[str, ...]
+
+
+ESTIMATE = Kind("estimate", "estimate", "estimate", WARM)
+DEVIATION = Kind("std", "standard deviation", "std", SPREAD)
+ERROR = Kind("error", "estimate − truth", "error", SIGNED)
+TRUE = Kind("truth", "truth", "truth", WARM)
+
+
+def kinds(truth: bool) -> tuple[Kind, ...]:
+    """The pictures that there are."""
+    return (ESTIMATE, DEVIATION, ERROR, TRUE) if truth else (ESTIMATE, DEVIATION)
+
+
+def image_of(picture: Picture, kind: Kind) -> np.ndarray | None:
+    """The values (rows, columns) that a kind of picture shows, or None."""
+    if kind is ERROR:
+        return None if picture.mean is None or picture.truth is None else picture.mean - picture.truth
+    return {ESTIMATE.name: picture.mean, DEVIATION.name: picture.std, TRUE.name: picture.truth}[kind.name]
+
+
+def palette(colors: tuple[str, ...]) -> np.ndarray:
+    """256 colours (256, 3) uint8 between some, evenly spaced; the last stands for `NOTHING`."""
+    anchors = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in colors], float)
+    at = np.linspace(0, len(colors) - 1, NOTHING)
+    columns = [np.interp(at, np.arange(len(colors)), anchors[:, k]) for k in range(3)]
+    return np.vstack((np.stack(columns, axis=1).round(), [[205, 205, 210]])).astype(np.uint8)
+
+
+class Scale:
+    """The values from the lowest to the highest colour: round numbers that change seldom."""
+
+    def __init__(self, kind: Kind) -> None:
+        self.kind = kind
+        self.low, self.high, self.step = np.nan, np.nan, 1.0
+
+    def fit(self, values: np.ndarray) -> None:
+        """Widen it at once if values lie outside; narrow it if they fill less than half."""
+        finite = values[np.isfinite(values)]
+        if not finite.size:
+            return
+        if self.kind is ERROR:
+            # A few cells at a front must not make the rest of the picture white.
+            reach = float(np.quantile(np.abs(finite), 0.995))
+            low, high = -reach, reach
+        else:
+            low, high = float(finite.min()), float(finite.max())
+            if self.kind is DEVIATION:
+                low = 0.0
+        if self.low <= low and high <= self.high and high - low >= 0.5 * (self.high - self.low):
+            return
+        span = max(high - low, 1e-9 + 1e-6 * abs(high))
+        self.step = round_step(span / 4.0)
+        # To tenths of a step: a scale that ends at round numbers only could be twice as wide as the values.
+        grain = self.step / 2.0
+        self.low, self.high = np.floor(low / grain + 1e-9) * grain, np.ceil(high / grain - 1e-9) * grain
+        if self.high <= self.low:
+            self.high = self.low + self.step
+
+    def indices(self, values: np.ndarray) -> np.ndarray:
+        """Colour of each value, uint8; what is unknown gets `NOTHING`."""
+        place = (values - self.low) / (self.high - self.low) * (NOTHING - 1)
+        known = np.isfinite(place)
+        return np.where(known, np.clip(np.where(known, place, 0.0), 0, NOTHING - 1), NOTHING).astype(np.uint8)
+
+    def ticks(self) -> list[tuple[float, str]]:
+        """Places from 0 (low) to 1 (high) of the numbers beside it, with their text; none before the first number."""
+        if not np.isfinite(self.low):
+            return []
+        first = int(np.ceil(self.low / self.step - 1e-9))
+        last = int(np.floor(self.high / self.step + 1e-9))
+        width = self.high - self.low
+        return [
+            (float((k * self.step - self.low) / width), tick_text(k * self.step, self.step))
+            for k in range(first, last + 1)
+        ]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where a field's cells lie in its picture: each is `tall` × `wide` pixels, so that distances keep their shape."""
+
+    field: Field
+    rows: int
+    columns: int
+    tall: int
+    wide: int
+    reduced: int
+
+    @staticmethod
+    def of(field: Field) -> Frame:
+        """The frame of a field, at least some 150 pixels large."""
+        rows, columns = plane_shape(field.shape)
+        steps = field.steps[-2:] if len(field.shape) > 1 else (max(1.0, columns / 12) * field.steps[0], field.steps[0])
+        ratio = steps[0] / steps[1]
+        best = min(
+            ((a, b) for a in range(1, 41) for b in range(1, 9)),
+            key=lambda ab: abs(np.log(ab[0] / ab[1] / ratio)) + 0.02 * abs(np.log(ab[1] * columns / 180.0)),
+        )
+        return Frame(field, rows, columns, best[0], best[1], reduction(field.shape))
+
+    @property
+    def height(self) -> int:
+        """Pixels from top to bottom."""
+        return self.rows * self.tall
+
+    @property
+    def width(self) -> int:
+        """Pixels from left to right."""
+        return self.columns * self.wide
+
+    def enlarge(self, image: np.ndarray) -> np.ndarray:
+        """A picture (rows, columns) in pixels."""
+        return np.repeat(np.repeat(image, self.tall, axis=0), self.wide, axis=1)
+
+    def pixels(self, positions: np.ndarray) -> np.ndarray:
+        """Where places (k, axes) of the field lie, as (across, down) in pixels (k, 2)."""
+        cells = np.atleast_2d(positions) / np.array(self.field.steps)
+        down = cells[:, -2] if cells.shape[1] > 1 else np.zeros(len(cells))
+        scale = np.array([self.wide, self.tall]) / self.reduced
+        return (np.stack((cells[:, -1], down), axis=1) + 0.5) * scale
+
+
+def positioned(model: StateSpaceModel) -> tuple[np.ndarray, np.ndarray]:
+    """Places (k, axes) of the sensor rows that have one, and (sensor, row) of each (k, 2)."""
+    found = [
+        (row.position, (k, r))
+        for k, sensor in enumerate(model.sensors)
+        for r, row in enumerate(sensor.rows)
+        if row.position is not None
+    ]
+    axes = len(model.grid.shape) if model.grid is not None else 1
+    places = np.array([place for place, _ in found], float).reshape(-1, axes)
+    return places, np.array([which for _, which in found], int).reshape(-1, 2)
+
+
+def sensor_colors(normalised: np.ndarray) -> np.ndarray:
+    """Colours (k, 3) uint8 of innovations in units of their deviation (k,); NaN is a sensor that said nothing."""
+    size = np.abs(normalised)
+    colors = np.full((size.size, 3), SILENT, np.uint8)
+    colors[size < 2.0] = QUIET
+    colors[(size >= 2.0) & (size < 3.0)] = ODD
+    colors[size >= 3.0] = FAR
+    return colors

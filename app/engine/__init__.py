@@ -1,0 +1,1 @@
+"""The thread that folds, and what it takes and gives."""

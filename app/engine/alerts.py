@@ -1,0 +1,108 @@
+"""What new rows mean for people: readings that could not be used, clouds that were lost, changes of health."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimators.diagnostics.failure_cause import failures
+from estimators.fold import Fold
+from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
+
+from .counts import UNSETTLED, complaints, last_run, numbers
+from .notices import Notices
+
+TRIES = 3
+"""Failures of one fold whose cause is sought; a reading of 1e300 has none in the model, so more than one."""
+
+
+class Watch:
+    """Reports the rows of a fold as they come."""
+
+    def __init__(self, notices: Notices) -> None:
+        self._notices = notices
+        self._health = TRACKING
+        self._recoveries = 0
+        self._lost: tuple[int, int] | None = None
+        self._failures = 0
+        self._said: set[str] = set()
+        self._tries, self._fresh = 0, False
+
+    @property
+    def lost(self) -> int | None:
+        """Time (ns) from which on the estimate has not been a number; None if it is one."""
+        return None if self._lost is None else self._lost[1]
+
+    def again(self) -> None:
+        """Another fold begins, whose recoveries and failures are counted from none."""
+        self._recoveries = self._failures = 0
+        self._lost = None
+        self._said.clear()
+        # Nobody has looked at its rows yet.
+        self._tries, self._fresh = 0, True
+
+    def look(self, fold: Fold, before: int) -> None:
+        """Report the rows from `before` on."""
+        track, log = fold.track, fold.log
+        for key, text in complaints(fold.model, log.channel, track, before):
+            self._notices.report(key, text, counted=False)
+        self._look_at_failures(fold)
+        self._look_for_cause(fold, before)
+        count, known = fold.recoveries(), self._recoveries
+        self._recoveries = count
+        if count > known:
+            name = fold.estimator.name
+            text = f"{name}: no particle explained a reading; the cloud was widened, {count} time(s) so far"
+            self._notices.report("recovered", text, counted=False)
+        was_lost = self._lost is not None
+        self._lost = self._look_for_numbers(fold, before)
+        if self._lost is not None and not was_lost:
+            text = "the estimate is not a number; Reset or another filter may mend it"
+            self._notices.say(text, level="error", t=self._lost[1])
+        if len(track) and track.health[-1] != self._health:
+            self._health = int(track.health[-1])
+            more = "; Reset begins anew from the prior" if self._health == DIVERGED and self._lost is None else ""
+            level = "info" if self._health == TRACKING else "warn"
+            since = int(log.t[last_run(track.health)])
+            self._notices.say(f"health: {HEALTH_NAMES[self._health]}{more}", level=level, t=since)
+
+    def _look_for_numbers(self, fold: Fold, before: int) -> tuple[int, int] | None:
+        """The first of the last rows without a number: its absolute index, and its time; None if the last has one."""
+        track, log = fold.track, fold.log
+        end = len(track)
+        if not end or numbers(track.select(slice(end - 1, end)))[0]:
+            return None
+        known = self._lost
+        if known is not None and known[0] < log.first + before and not numbers(track.select(slice(before, end))).any():
+            return known
+        while end > 0:
+            start = max(0, end - UNSETTLED)
+            good = np.flatnonzero(numbers(track.select(slice(start, end))))
+            if good.size:
+                end = start + int(good[-1]) + 1
+                break
+            end = start
+        return log.first + end, int(log.t[end])
+
+    def _look_at_failures(self, fold: Fold) -> None:
+        """Say what a black box failed with; the same words once, as readings that failed are counted anyway."""
+        count, known = fold.failures, self._failures
+        self._failures = count
+        text = str(fold.failure)
+        if count > known and text not in self._said:
+            self._said.add(text)
+            more = "the readings concerned count as failed, and the estimate goes on where the model answers again"
+            self._notices.report("model failed", f"{text}; {more}", level="error", counted=False)
+
+    def _look_for_cause(self, fold: Fold, before: int) -> None:
+        """Say once for each fold what of the model made a reading or the estimate fail, if it is to blame."""
+        first = 0 if self._fresh else before
+        self._fresh = False
+        if self._tries >= TRIES or fold.failure is not None:
+            return
+        rows = failures(fold.track, first)
+        if rows.size:
+            self._tries += 1
+            text = fold.cause(int(rows[0]))
+            if text is not None:
+                self._tries = TRIES
+                self._notices.say(text, level="error", t=int(fold.log.t[rows[0]]))

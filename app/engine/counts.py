@@ -1,0 +1,112 @@
+"""Counts for the status line and complaints for the events: verdicts, and the time from arrival to row."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from estimators.log import READING, Readings
+from estimators.model.state_space import StateSpaceModel
+from estimators.track import FAILED, GATED, MISSING, VERDICT_NAMES, Track
+
+UNSETTLED = 8192
+"""Rows at the end that the tally counts each time; a late reading rarely reaches behind them."""
+
+LATENCIES = 4096
+
+
+class Tally:
+    """Rows by verdict, of each sensor, since the start; those that are settled are counted once."""
+
+    def __init__(self, model: StateSpaceModel) -> None:
+        self._sensors = model.sensor_names
+        self._forgotten = np.zeros((len(self._sensors), len(VERDICT_NAMES)), np.int64)
+        self.again()
+
+    def again(self) -> None:
+        """Rows moved or changed: count them anew, on top of what the forgotten ones held."""
+        self._settled, self._counts = 0, self._forgotten.copy()
+
+    def changed(self, index: int) -> None:
+        """Rows from `index` on changed."""
+        if index < self._settled:
+            self.again()
+
+    def forget(self, verdict: np.ndarray, channel: np.ndarray) -> None:
+        """The oldest rows, with these verdicts and channels, are dropped."""
+        self._forgotten = self._forgotten + self._of(verdict, channel)
+        self.again()
+
+    def count(self, verdict: np.ndarray, channel: np.ndarray) -> dict[str, int]:
+        """Readings in all and by verdict, given the verdicts and channels of all rows; and what went wrong where."""
+        settled = max(self._settled, len(verdict) - UNSETTLED)
+        self._counts += self._of(verdict[self._settled : settled], channel[self._settled : settled])
+        self._settled = settled
+        each = self._counts + self._of(verdict[settled:], channel[settled : len(verdict)])
+        totals = each.sum(axis=0)
+        counts = {"readings": int(totals[1:].sum())}
+        counts |= {name: int(count) for name, count in zip(VERDICT_NAMES[1:], totals[1:], strict=True)}
+        if len(self._sensors) > 1:
+            for code in (GATED, MISSING, FAILED):
+                for sensor in np.flatnonzero(each[:, code]):
+                    counts[f"{VERDICT_NAMES[code]} {self._sensors[sensor]}"] = int(each[sensor, code])
+        return counts
+
+    def _of(self, verdict: np.ndarray, channel: np.ndarray) -> np.ndarray:
+        """How many rows have each verdict (columns), by sensor (rows); those without a reading have verdict 0."""
+        kinds = len(VERDICT_NAMES)
+        flat = np.where(verdict == 0, 0, channel * kinds + verdict)
+        return np.bincount(flat, minlength=len(self._sensors) * kinds).reshape(-1, kinds)
+
+
+def complaints(model: StateSpaceModel, channel: np.ndarray, track: Track, first: int) -> Iterator[tuple[str, str]]:
+    """Key and text for each kind of reading among the rows from `first` on that could not be used: its last one."""
+    for code, what in ((GATED, "refused by the gate"), (MISSING, "has no value"), (FAILED, "could not be used")):
+        rows = np.flatnonzero(track.verdict[first:] == code)
+        if rows.size:
+            row = first + int(rows[-1])
+            sensor = model.sensors[channel[row]].name
+            nis = f" (NIS {track.nis[row]:.3g})" if np.isfinite(track.nis[row]) else ""
+            yield f"{VERDICT_NAMES[code]} {sensor}", f"{sensor}: reading {what}{nis}"
+
+
+def numbers(track: Track) -> np.ndarray:
+    """Which rows hold an estimate: one state that is not a number leaves none, whatever the others say."""
+    return np.asarray(np.isfinite(track.mean).all(axis=1) & np.isfinite(track.std).all(axis=1))
+
+
+def last_run(codes: np.ndarray) -> int:
+    """The first of the equal codes at the end of an array that is not empty."""
+    end = len(codes)
+    while end > 0:
+        start = max(0, end - UNSETTLED)
+        others = np.flatnonzero(codes[start:end] != codes[-1])
+        if others.size:
+            return start + int(others[-1]) + 1
+        end = start
+    return 0
+
+
+class Latency:
+    """The last times from arrival to row."""
+
+    def __init__(self) -> None:
+        self._ms = np.zeros(LATENCIES)
+        self._n = 0
+
+    def note(self, batch: Readings) -> None:
+        """The rows of a batch are there."""
+        arrivals = batch.arrival[batch.kind == READING]
+        if not arrivals.size:
+            return
+        took = (time.time_ns() - arrivals[-LATENCIES:]) * 1e-6
+        at = (self._n + np.arange(took.size)) % LATENCIES
+        self._ms[at] = took
+        self._n += took.size
+
+    def percentile(self, percent: float) -> float | None:
+        """Milliseconds that so many percent did not exceed."""
+        count = min(self._n, LATENCIES)
+        return float(np.percentile(self._ms[:count], percent)) if count else None

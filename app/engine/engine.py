@@ -1,0 +1,426 @@
+"""The engine: one thread that owns the log and the fold, and lets everybody else read copies.
+
+Readings, commands and finished refolds come through one inbox and are dealt with in order. Views pull; nothing they
+do, or fail to do, reaches this thread.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from estimators.diagnostics.health import HealthPolicy
+from estimators.errors import EstimatorError, NisusError
+from estimators.fold import SPARSE_EVERY, Base, Fold
+from estimators.log import TICK, Log, Readings
+from estimators.numerics.peaks import modes_of
+from estimators.registry import find_estimator
+from estimators.track import TRACKING
+
+from . import commands
+from .alerts import Watch
+from .counts import Latency, Tally, last_run
+from .execute import Remembered, obey
+from .feeder import Feeder, Finished, Restarted
+from .idle_ticks import Silence
+from .notices import Notices
+from .outputs import Belief, Cursor, Pull, Status
+from .playback import playback_status
+from .refolder import Refolded, Refolder, Requests
+
+if TYPE_CHECKING:
+    from estimators.diagnostics.field_pictures import Picture
+    from estimators.tuning import Tuning
+    from sources.source import Source
+
+    from ..twin.twin import Twin
+
+STATUS_AGE = 0.1
+
+
+class Engine:
+    """A running twin."""
+
+    def __init__(
+        self,
+        twin: Twin,
+        open_source: Callable[[Callable[[str, str], None]], Source],
+        *,
+        base: Base | None = None,
+        horizon: float | None = None,
+    ) -> None:
+        """Open the source and prepare the fold.
+
+        Args:
+            twin: What to run.
+            open_source: Called with a report function; must give the source, paced or live.
+            base: Where the fold of the source's first event starts, if not at the prior (a recording's).
+            horizon: Seconds of lateness allowed, in place of the twin's; infinity takes every reading (a recording's
+                were judged when they came).
+
+        Raises:
+            NisusError: If the source cannot be opened or the model does not compile.
+        """
+        self.twin = twin
+        self.model = twin.model
+        self.pairs = twin.pairs
+        section = twin.config.time
+        self._policy = HealthPolicy(degraded_after=section.degraded_after, stale_after=section.stale_after)
+        allowed = section.horizon if horizon is None else horizon
+        self._horizon = round(allowed * 1e9) if np.isfinite(allowed) else None
+        self._first_base = base
+        self._tick = section.tick
+        self._history = max(2 * SPARSE_EVERY, twin.config.history)
+        self.estimator, self.tuning = twin.estimator, twin.tuning
+        self._options = Remembered(twin)
+        self._lock = threading.Lock()
+        self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._cursors: list[Cursor] = []
+        self.notices = Notices(lambda: self._log.newest if self._log.n else 0)
+        self._base: Base | None = base
+        self._clear(base)
+        self._feeder = Feeder(lambda: open_source(self.notices.report), self._inbox, self.notices.report)
+        self._refolder = Refolder(self._inbox.put)
+        self._requests = Requests()
+        self._previous: Pull | None = None
+        self._revision = 0
+        self._stopping = threading.Event()
+        self._finished = False
+        self._silence = Silence(section.tick)
+        self._latency = Latency()
+        self._watch = Watch(self.notices)
+        self._status: tuple[float, Status] | None = None
+        self.recorder: Any = None
+        self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
+
+    def _clear(self, base: Base | None) -> None:
+        """An empty log and the fold that follows it."""
+        self._log = Log(self.model.width, self._history + 4 * SPARSE_EVERY)
+        self._base = base
+        self._fold = self._make_fold(self.estimator, self.tuning, self._log, base)
+        self._tally = Tally(self.model)
+
+    def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
+        period = self.twin.picture if self.model.grid is not None else None
+        return Fold(
+            estimator, self.model, tuning, log, pairs=self.pairs, policy=self._policy, base=base, picture=period
+        )
+
+    # For everybody, from any thread
+
+    def start(self) -> None:
+        """Begin to read and fold."""
+        self._refolder.start()
+        self._thread.start()
+        self._feeder.start()
+
+    def stop(self) -> None:
+        """Stop reading and folding."""
+        self._stopping.set()
+        self._feeder.stop()
+        self._refolder.stop()
+        if self._thread.is_alive():
+            self._thread.join(timeout=5.0)
+
+    def submit(self, command: commands.Command) -> None:
+        """Queue a command."""
+        self._inbox.put(command)
+
+    def cursor(self) -> Cursor:
+        """A cursor for one consumer, for `pull`; give it back with `release`."""
+        cursor = Cursor()
+        with self._lock:
+            self._cursors.append(cursor)
+        return cursor
+
+    def release(self, cursor: Cursor) -> None:
+        """Forget a cursor."""
+        with self._lock:
+            self._cursors = [item for item in self._cursors if item is not cursor]
+
+    def pull(self, cursor: Cursor, limit: int | None = None) -> Pull:
+        """Copies of the rows since the cursor, at most `limit`, and the notices since."""
+        with self._lock:
+            log, fold = self._log, self._fold
+            fresh = cursor.revision != self._revision
+            if fresh:
+                cursor.revision, cursor.next, cursor.picture = self._revision, 0, -1
+            start = max(cursor.next, log.first)
+            end = log.first + fold.n
+            if limit is not None:
+                end = min(end, start + limit)
+            rows = slice(start - log.first, max(start, end) - log.first)
+            readings = log.readings.select(rows)
+            pull = Pull(
+                self._revision,
+                fresh,
+                start,
+                Readings(*(column.copy() for column in readings)),
+                fold.track.select(rows).copy(),
+                pictures=_since(fold, cursor.picture, max(start, end)),
+            )
+            cursor.next = max(start, end)
+            if pull.pictures:
+                cursor.picture = pull.pictures[-1].before
+        lines = self.notices.since(cursor.notice)
+        if lines:
+            cursor.notice = lines[-1].number + 1
+        return replace(pull, notices=lines)
+
+    @property
+    def source(self) -> Source:
+        """Where the readings come from; it may be opened anew."""
+        return self._feeder.source
+
+    def options_of(self, estimator: str) -> Mapping[str, float]:
+        """The options with which an estimator starts: as it was left, or as the YAML says."""
+        return self._options.of(estimator)
+
+    def span(self) -> tuple[int, int]:
+        """Times of the first and the last event, ns; zeros while there is none."""
+        with self._lock:
+            return (int(self._log.t[0]), int(self._log.t[self._log.n - 1])) if self._log.n else (0, 0)
+
+    def base(self) -> Base | None:
+        """Where a fold of the present log starts, if its oldest events were dropped; else None, for the prior."""
+        return self._base
+
+    def folded_with(self) -> tuple[Tuning, str]:
+        """Tuning and estimator of the fold that `pull` shows."""
+        with self._lock:
+            return self._fold.tuning, self._fold.estimator.name
+
+    def previous(self) -> Pull | None:
+        """The whole previous revision, for comparison; its arrays never change."""
+        return self._previous
+
+    def belief(self) -> Belief:
+        """The estimate now."""
+        with self._lock:
+            mean, cov = self._fold.moments()
+            points, clock = self._fold.points(), self._fold.clock
+            model, several = self._fold.model, self._fold.estimator.modes is not None
+        # Clustering takes milliseconds, which the engine's thread must not wait for.
+        modes = modes_of(points, model.circular) if several else []
+        return Belief(clock, mean, cov, points, tuple(modes) if len(modes) > 1 else ())
+
+    def status(self) -> Status:
+        """What a panel shows; found anew at most ten times a second."""
+        kept = self._status
+        if kept is not None and time.monotonic() - kept[0] < STATUS_AGE:
+            return kept[1]
+        with self._lock:
+            log, fold = self._log, self._fold
+            track = fold.track
+            last = fold.n - 1
+            status = Status(
+                estimator=self.estimator,
+                tuning=self.tuning,
+                options=find_estimator(self.estimator, self.model).complete(dict(self.tuning.options)),
+                revision=self._revision,
+                refolding=self._requests.waiting,
+                t=int(log.t[last]) if last >= 0 else None,
+                health=int(track.health[last]) if last >= 0 else TRACKING,
+                since=int(log.t[last_run(track.health)]) if last >= 0 else None,
+                lost=self._watch.lost,
+                counts={
+                    **self.notices.counts(),
+                    **self._tally.count(track.verdict, log.channel),
+                    **({"recovered": fold.recoveries()} if fold.recoveries() else {}),
+                },
+                nis=float(track.nis_mean[last]) if last >= 0 else np.nan,
+                nis_low=float(track.nis_low[last]) if last >= 0 else np.nan,
+                nis_high=float(track.nis_high[last]) if last >= 0 else np.nan,
+                **playback_status(self._feeder.source),
+                finished=self._finished,
+                recording=self.recorder.path if self.recorder is not None else None,
+                latency_ms=self._latency.percentile(99.0),
+                latency_p50_ms=self._latency.percentile(50.0),
+            )
+        self._status = (time.monotonic(), status)
+        return status
+
+    # The engine's own thread
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                self._round()
+            except NisusError as error:
+                self.notices.report("engine error", str(error), level="error")
+            except Exception as error:  # noqa: BLE001  nothing a user or a sensor does may stop the twin
+                self.notices.report("engine error", f"{type(error).__name__}: {error}", level="error")
+
+    def _round(self) -> None:
+        """Wait for something, then deal with all that is there."""
+        try:
+            item = self._inbox.get(timeout=min(0.05, self._tick))
+        except queue.Empty:
+            self._when_silent()
+            return
+        batches: list[Readings] = []
+        while item is not None:
+            if isinstance(item, Readings):
+                batches.append(item)
+                if not self._feeder.live:
+                    self._feeder.taken()
+            else:
+                self._accept(batches)
+                batches = []
+                self._obey(item)
+            try:
+                item = self._inbox.get_nowait() if sum(map(len, batches)) < SPARSE_EVERY else None
+            except queue.Empty:
+                item = None
+        self._accept(batches)
+
+    def _accept(self, batches: list[Readings]) -> None:
+        if not batches:
+            return
+        batch = batches[0] if len(batches) == 1 else Readings.concat(batches, self.model.width)
+        with self._lock:
+            first, stale = self._log.extend(batch, self._horizon)
+            self._silence.broken(self._log.newest)
+            before = min(first, self._fold.n)
+            if first < self._fold.n:
+                self._go_back(first)
+            self._fold.advance()
+            self._watch.look(self._fold, before)
+            if self._log.n > self._history + 3 * SPARSE_EVERY:
+                self._forget()
+        if stale:
+            self.notices.report("stale", f"{stale} reading(s) later than the horizon dropped", times=stale)
+        if self._feeder.live:
+            self._latency.note(batch)
+
+    def _go_back(self, index: int) -> None:
+        """Events at and behind `index` changed: fold them again, and let every cursor fetch them again."""
+        self._fold.rewind(index)
+        self._tally.changed(index)
+        absolute = self._log.first + index
+        self._requests.changed(absolute)
+        for cursor in self._cursors:
+            cursor.next = min(cursor.next, absolute)
+            cursor.picture = min(cursor.picture, absolute)
+
+    def _forget(self) -> None:
+        """Drop the oldest events, up to a snapshot, from which later refolds start."""
+        count = (self._log.n - self._history) // SPARSE_EVERY * SPARSE_EVERY
+        count, self._base = self._fold.base_at(count)
+        if count:
+            self._tally.forget(self._fold.track.verdict[:count], self._log.channel[:count])
+            self._fold.drop_front(count)
+            self._log.drop_front(count)
+
+    def _when_silent(self) -> None:
+        if self._finished or not self._log.n:
+            return
+        now = self._silence.asks(self._feeder.source, int(self._log.t[self._log.n - 1]))
+        if now is not None:
+            self.insert(Readings.one(now, time.time_ns(), TICK, 0, [], self.model.width))
+
+    def _obey(self, item: Any) -> None:
+        """Carry one command out, or take a refold or a word from the feeder."""
+        if isinstance(item, Refolded):
+            self._adopt(item)
+        elif isinstance(item, Restarted):
+            self._restart()
+        elif isinstance(item, Finished):
+            with self._lock:
+                self._fold.finish()
+            self._finished = True
+            self.notices.say("the source has ended; the estimate stays")
+        else:
+            obey(item, self)
+
+    def _restart(self) -> None:
+        """The source began again: so does the log. The fold is a new revision of it; a refold is asked for again."""
+        wanted = (self.estimator, self.tuning) if self._requests.waiting else None
+        with self._lock:
+            self._previous = None
+            self.estimator, self.tuning = self._fold.estimator.name, self._fold.tuning
+            self._clear(self._first_base)
+            self._revision += 1
+            self._finished = False
+            self._requests.forget()
+            self._watch.again()
+        if wanted:
+            self.retune(*wanted)
+
+    def insert(self, event: Readings) -> None:
+        """Put an event of our own behind the last one."""
+        with self._lock:
+            before = self._fold.n
+            self._log.extend(event)
+            self._fold.advance()
+            self._watch.look(self._fold, before)
+
+    def retune(self, estimator: str, tuning: Tuning) -> None:
+        """Fold the history again, beside the running fold, over a copy of the log."""
+        self._options.leave(self.estimator, self.tuning)
+        # First, so that nobody sees the new tuning without a refold that is waited for.
+        ticket = self._requests.ask()
+        self.estimator, self.tuning = estimator, tuning
+        log, base = self._log.copy(), self._base
+        self._refolder.request(ticket, lambda: self._make_fold(estimator, tuning, log, base))
+        self._status = None
+
+    def _adopt(self, done: Refolded) -> None:
+        """Swap a finished refold in, after it has caught up with what came meanwhile."""
+        wanted, changed_from = self._requests.answer(done.ticket)
+        if not wanted:
+            return
+        if done.fold is None:
+            self._refuse(done.ticket, done.error)
+            return
+        fold = done.fold
+        with self._lock:
+            old, log = self._fold, self._log
+            # What the new revision says of the readings counts, also of those that it loses here; not what others said.
+            lost = max(0, log.first - fold.log.first)
+            tally = Tally(self.model)
+            tally.forget(fold.track.verdict[:lost], fold.log.channel[:lost])
+            try:
+                fold.follow(log, changed_from)
+            except EstimatorError:
+                # The log was cut meanwhile: the answer no longer fits, ask again.
+                stale = True
+            else:
+                stale = False
+                try:
+                    fold.advance()
+                except NisusError as error:
+                    self._refuse(done.ticket, str(error))
+                    return
+                self._previous = Pull(
+                    self._revision,
+                    False,
+                    log.first,
+                    Readings(*(column[: old.n].copy() for column in log.readings)),
+                    old.track,
+                )
+                self._fold, self._tally = fold, tally
+                self._revision += 1
+                self._watch.again()
+                self._watch.look(fold, fold.n)
+        if stale:
+            self.retune(self.estimator, self.tuning)
+
+    def _refuse(self, ticket: int, reason: str) -> None:
+        """A refold failed: what runs goes on, and is what the panel shows."""
+        self.notices.say(f"not folded again: {reason}", level="error")
+        if ticket == self._requests.newest:
+            self.estimator, self.tuning = self._fold.estimator.name, self._fold.tuning
+
+
+def _since(fold: Fold, index: int, end: int) -> list[Picture]:
+    """The pictures of a fold after event `index`, up to event `end`."""
+    if fold.pictures is None:
+        return []
+    return [picture for picture in fold.pictures.taken if index < picture.before <= end]

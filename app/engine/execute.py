@@ -1,0 +1,101 @@
+"""Carries out what a user asks of the twin, on the engine's thread, between two events."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from estimators.errors import ConfigError
+from estimators.log import RESET, Readings
+from estimators.registry import checked, find_estimator
+
+from . import commands
+from .playback import PLAYBACK, play
+
+if TYPE_CHECKING:
+    from estimators.estimator import Estimator
+    from estimators.tuning import Tuning
+
+    from .engine import Engine
+
+Refolding = commands.SetEstimator | commands.SetTuning | commands.SetOption | commands.UseSensor | commands.Restore
+"""Commands that fold the history again."""
+
+
+def retuned(command: Refolding, engine: Any) -> tuple[str, Tuning]:
+    """The estimator and the tuning that a command asks for.
+
+    Raises:
+        NisusError: If the engine would refuse them, with the reason.
+    """
+    if isinstance(command, commands.Restore):
+        return engine.twin.estimator, engine.twin.tuning
+    estimator, tuning = engine.estimator, engine.tuning
+    if isinstance(command, commands.SetEstimator):
+        entry = find_estimator(command.name, engine.model)
+        options = engine.options_of(entry.name)
+        checked(entry, engine.model, options)
+        return entry.name, tuning.with_options(options)
+    if isinstance(command, commands.SetOption):
+        entry = find_estimator(estimator, engine.model)
+        options = {**tuning.options, command.name: _number(entry, command)}
+        checked(entry, engine.model, options)
+        return estimator, tuning.with_options(options)
+    if isinstance(command, commands.UseSensor):
+        return estimator, tuning.set(f"use.{command.name}", command.used)
+    return estimator, tuning.set(command.key, command.value)
+
+
+def _number(entry: Estimator, command: commands.SetOption) -> float:
+    """The value of an option; one of several words may be given as the word."""
+    if not isinstance(command.value, str):
+        return float(command.value)
+    choices = next((option.choices for option in entry.options if option.name == command.name), ())
+    if command.value not in choices:
+        wanted = f"one of {', '.join(choices)}" if choices else "a number"
+        raise ConfigError(f"estimator {entry.name}: {command.name} is {command.value!r}; it must be {wanted}")
+    return float(choices.index(command.value))
+
+
+def obey(command: commands.Command, engine: Engine) -> None:
+    """Carry one command out.
+
+    Raises:
+        NisusError: If it cannot be done, with the reason; nothing is changed then.
+    """
+    if isinstance(command, Refolding):
+        engine.retune(*retuned(command, engine))
+    elif isinstance(command, commands.Reset):
+        engine.insert(_reset_now(engine))
+        engine.notices.say("estimate reset to the prior")
+    elif isinstance(command, commands.Record):
+        if engine.recorder is None:
+            raise ConfigError("this session cannot record")
+        engine.recorder.record(command.path)
+    elif isinstance(command, PLAYBACK):
+        play(engine.source, command, engine.span()[0])
+
+
+def _reset_now(engine: Engine) -> Readings:
+    """A reset now: an event of the log, so that refolds and recordings have it where it was."""
+    now = engine.span()[1]
+    if not now:
+        raise ConfigError("nothing to reset: no reading has come yet")
+    return Readings.one(now, time.time_ns(), RESET, 0, [], engine.model.width)
+
+
+class Remembered:
+    """The options with which each filter was left, for when it is chosen again; at first those of the YAML."""
+
+    def __init__(self, twin: Any) -> None:
+        self._twin = twin
+        self._left: dict[str, Mapping[str, float]] = {}
+
+    def leave(self, estimator: str, tuning: Tuning) -> None:
+        """The filter ran with this tuning."""
+        self._left[estimator] = tuning.options
+
+    def of(self, estimator: str) -> Mapping[str, float]:
+        """What a filter starts with."""
+        return self._left.get(estimator, self._twin.options_of(estimator))

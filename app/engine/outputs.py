@@ -1,0 +1,91 @@
+"""What the engine shows to views, recorder and API: copies, so that nobody ever waits for anybody."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from estimators.diagnostics.field_pictures import Picture
+from estimators.log import Readings
+from estimators.numerics.peaks import Mode
+from estimators.track import Track
+from estimators.tuning import Tuning
+
+from .notices import Notice
+
+
+@dataclass
+class Cursor:
+    """How far one consumer has read. `next` is the absolute index of the next row; a rewritten row moves it back.
+
+    `picture` is the index of the last picture of a large field that was read.
+    """
+
+    revision: int = -1
+    next: int = 0
+    notice: int = 0
+    picture: int = -1
+
+
+@dataclass(frozen=True)
+class Pull:
+    """Rows since the cursor.
+
+    `fresh`: these rows start anew (another revision, or the first pull): forget what was drawn. `first` is the
+    absolute index of the first row; if it is below what was pulled before, a late reading rewrote the rows from there.
+    `pictures` are those of a large field since the cursor; one with an index that was seen before takes its place.
+    """
+
+    revision: int
+    fresh: bool
+    first: int
+    readings: Readings
+    track: Track
+    notices: list[Notice] = field(default_factory=list)
+    pictures: list[Picture] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Belief:
+    """The estimate now: time (ns), mean (nx,), covariance (nx, nx), points to draw (k, nx), its peaks if several."""
+
+    t: int
+    mean: np.ndarray
+    cov: np.ndarray
+    points: np.ndarray
+    modes: tuple[Mode, ...] = ()
+
+
+@dataclass(frozen=True)
+class Status:
+    """The state of the running twin, for panels and the API.
+
+    `t` is the time of the last event (ns), `since` that of the first from which on the health is what it is now, `lost`
+    that of the first from which on the estimate is not a number (None if it is one). `counts` are those of the rows of
+    this revision, and of what befell the twin beside them. `latency_ms` is the 99th percentile from a reading's arrival
+    to its row.
+    """
+
+    estimator: str
+    tuning: Tuning
+    options: dict[str, float]
+    revision: int
+    refolding: bool
+    t: int | None
+    health: int
+    since: int | None
+    lost: int | None
+    counts: dict[str, int]
+    nis: float
+    nis_low: float
+    nis_high: float
+    paused: bool
+    speed: float | None
+    seekable: bool
+    span: tuple[int, int] | None
+    finished: bool
+    recording: Path | None
+    latency_ms: float | None
+    latency_p50_ms: float | None

@@ -1,0 +1,1 @@
+"""Recordings: their format, the writer and the reader."""

@@ -1,0 +1,226 @@
+"""A recording read back: twin, tuning, log and track as they were at the end, to the bit.
+
+A recorder writes rows again from the index where a late reading belongs, and all of them for another revision. So rows
+are taken in the order of the file, and an index that is not new cuts off what lay behind it.
+"""
+
+from __future__ import annotations
+
+import struct
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rerun.chunk import RrdReader
+
+from estimators.errors import SourceError
+from estimators.fold import Base
+from estimators.log import Readings
+from estimators.track import Track
+
+from .format import FORMAT, PREFIX, TIMELINE, base_from_json
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What a recording holds: twin, the last tuning, log and track as they were at the end, lines (t, level, text)."""
+
+    path: Path
+    name: str
+    text: str
+    twin_path: Path
+    base: Base | None
+    tuning: str
+    tunings: int
+    readings: Readings
+    track: Track
+    notices: list[tuple[int, str, str]]
+    first: int
+    rows: int
+
+
+def read_recording(path: Path) -> Recorded:
+    """Read a recording back, also one whose writer was killed.
+
+    Raises:
+        SourceError: If it cannot be read, or is not a recording of Nisus.
+    """
+    if not path.is_file():
+        raise SourceError(f"{path}: there is no such recording; check the path")
+    content = _Content()
+    try:
+        content.read(path)
+    except Exception:  # noqa: BLE001  Rerun's reader raises many kinds on a damaged file
+        # Cut in the middle of a message, by a full disk or a power cut: what stands before it is whole.
+        with tempfile.TemporaryDirectory() as folder:
+            whole = Path(folder) / path.name
+            content = _Content()
+            try:
+                copy_whole(path, whole)
+                content.read(whole)
+            except Exception as error:  # noqa: BLE001  as above
+                if not (content.header and content.events):
+                    text = _cut_short(path) or f"cannot be read ({_line(error)}); is it an .rrd file?"
+                    raise SourceError(f"{path}: {text}") from None
+    header, tunings, notices = content.header, content.tunings, content.notices
+    events, tracks = content.events, content.tracks
+    if not header or not tunings:
+        text = _cut_short(path) or "holds no recording of Nisus; record one with `nisus run TWIN --record FILE.rrd`"
+        raise SourceError(f"{path}: {text}")
+    if int(header["format"]) != FORMAT:
+        raise SourceError(f"{path}: has format {header['format']}, this version reads {FORMAT}; use the other")
+    first, log_columns = _latest(events)
+    _, track_columns = _latest(tracks)
+    readings = _assemble(Readings, log_columns)
+    track = _assemble(Track, track_columns)
+    rows = min(len(readings), len(track))
+    return Recorded(
+        path=path,
+        name=str(header["name"]),
+        text=str(header["yaml"]),
+        twin_path=Path(str(header["path"])),
+        base=base_from_json(str(header["base"])),
+        tuning=str(tunings[-1]),
+        tunings=len(tunings),
+        readings=readings.select(slice(0, rows)),
+        track=track.select(slice(0, rows)),
+        notices=notices,
+        first=first,
+        rows=rows,
+    )
+
+
+class _Content:
+    """What the entities under /nisus hold, in the order of the file."""
+
+    def __init__(self) -> None:
+        self.header: dict[str, Any] = {}
+        self.tunings: list[str] = []
+        self.notices: list[tuple[int, str, str]] = []
+        self.events: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
+        self.tracks: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
+
+    def read(self, path: Path) -> None:
+        with warnings.catch_warnings():
+            # A killed writer leaves no footer; that such a file can still be read is the point.
+            warnings.simplefilter("ignore")
+            reader = RrdReader(str(path))
+        for chunk in reader.stream():
+            if not chunk.entity_path.startswith("/nisus/"):
+                continue
+            batch = chunk.to_record_batch()
+            names = {name: k for k, name in enumerate(batch.schema.names)}
+            if chunk.entity_path == "/nisus/twin":
+                self.header = {name: _flat(batch.column(k))[0] for name, k in names.items() if not _control(name)}
+            elif chunk.entity_path == "/nisus/notices":
+                parts = (_flat(batch.column(names[name])).tolist() for name in ("t", "level", "text"))
+                self.notices += zip(*parts, strict=True)
+            elif chunk.entity_path == "/nisus/tuning":
+                self.tunings += _flat(batch.column(names["json"])).tolist()
+            else:
+                index = batch.column(names[TIMELINE]).to_numpy()
+                columns = {name: _flat(batch.column(k)) for name, k in names.items() if not _control(name)}
+                (self.events if chunk.entity_path == "/nisus/events" else self.tracks).append((index, columns))
+
+
+STREAM_HEADER, MESSAGE_HEADER = 12, struct.Struct("<QQ")
+"""Bytes before the first message of an .rrd; and before each: its kind, and how many bytes follow."""
+
+
+def copy_whole(path: Path, to: Path) -> None:
+    """Copy an .rrd up to the last message that is there in full."""
+    size = path.stat().st_size
+    end = STREAM_HEADER
+    with path.open("rb") as file:
+        while end + MESSAGE_HEADER.size <= size:
+            file.seek(end)
+            _, length = MESSAGE_HEADER.unpack(file.read(MESSAGE_HEADER.size))
+            if end + MESSAGE_HEADER.size + length > size:
+                break
+            end += MESSAGE_HEADER.size + length
+        file.seek(0)
+        with to.open("wb") as copy:
+            while end > 0 and (piece := file.read(min(end, 1 << 20))):
+                copy.write(piece)
+                end -= len(piece)
+
+
+BEGIN, END = b"RRF2", b"RRF2FOOT"
+"""What an .rrd begins with, and what stands in the last bytes of one that was finished."""
+
+
+def finished(path: Path) -> bool:
+    """Whether a recording was closed when it ended; one that was cut is read as far as it goes."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 4 * len(END)))
+        return END in file.read()
+
+
+def _cut_short(path: Path) -> str | None:
+    """What is missing of an .rrd that was not finished, and may be ours; None if it was, or is another program's."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        rerun = file.read(len(BEGIN)) == BEGIN
+        file.seek(STREAM_HEADER)
+        message = file.read(MESSAGE_HEADER.size)
+        length = MESSAGE_HEADER.unpack(message)[1] if len(message) == MESSAGE_HEADER.size else size
+        # The first message names the program; Rerun writes it in plain letters.
+        name = file.read(min(length, size))
+        file.seek(max(0, size - 4 * len(END)))
+        whole = END in file.read()
+    if whole or not rerun:
+        return None
+    if len(name) < length:
+        return f"is cut short: {size:,} bytes do not say what it records; look for another copy"
+    if PREFIX.encode() not in name:
+        return None
+    return f"is a recording of Nisus, cut short before its first row: {size:,} bytes are there; look for another copy"
+
+
+def _control(name: str) -> bool:
+    return name == TIMELINE or name.startswith("rerun.") or name in ("log_time", "log_tick")
+
+
+def _flat(column: Any) -> np.ndarray:
+    return column.flatten().to_numpy(zero_copy_only=False)
+
+
+def _line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+
+
+def _latest(chunks: list[tuple[np.ndarray, dict[str, np.ndarray]]]) -> tuple[int, dict[str, np.ndarray]]:
+    """The rows that hold at the end: the last one written under each index, nothing behind an index written anew."""
+    if not chunks:
+        return 0, {}
+    index = np.concatenate([chunk for chunk, _ in chunks])
+    names = chunks[0][1].keys()
+    columns = {name: np.concatenate([values[name] for _, values in chunks]) for name in names}
+    # A row holds if no later row has an index that is not above its own.
+    later = np.minimum.accumulate(index[::-1])[::-1]
+    keep = np.append(index[:-1] < later[1:], True)
+    kept = {name: column[keep] for name, column in columns.items()}
+    return int(index[keep][0]), kept
+
+
+def _assemble(kind: Callable[..., Any], columns: dict[str, np.ndarray]) -> Any:
+    return kind(*(_column(name, columns) for name in kind._fields))  # type: ignore[attr-defined]
+
+
+def _column(name: str, columns: dict[str, np.ndarray]) -> np.ndarray:
+    if name in columns:
+        return columns[name]
+    wide = list(_numbered(name, columns))
+    rows = len(next(iter(columns.values()))) if columns else 0
+    return np.stack(wide, axis=1) if wide else np.zeros((rows, 0))
+
+
+def _numbered(name: str, columns: dict[str, np.ndarray]) -> Iterator[np.ndarray]:
+    k = 0
+    while f"{name}_{k}" in columns:
+        yield columns[f"{name}_{k}"]
+        k += 1

@@ -1,0 +1,1 @@
+"""Rerun: live series, and the layout of recordings."""

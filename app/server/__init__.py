@@ -1,0 +1,1 @@
+"""The one loopback port: the page, the API, and what is passed through."""

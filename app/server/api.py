@@ -1,0 +1,126 @@
+"""The page's API: what the twin says of itself, and commands to it, as JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from pathlib import Path
+from typing import Any
+
+from estimators.errors import ConfigError
+from estimators.track import HEALTH_NAMES
+
+from ..engine import commands
+from ..engine.changes import began_as, turned
+from ..engine.execute import Refolding, retuned
+from ..engine.playback import LONGEST
+
+
+def status_json(engine: Any) -> dict[str, Any]:
+    """What the page's header shows, and more for whoever asks."""
+    status = engine.status()
+    return {
+        "twin": engine.twin.name,
+        "title": engine.twin.title,
+        "estimator": status.estimator,
+        "options": _plain(dict(status.options)),
+        "tuning": {key: _plain(value) for key, value, *_ in status.tuning.items()},
+        "began_as": began_as(engine.twin),
+        "turned": _plain(turned(engine.twin, status.estimator, status.tuning)),
+        "revision": status.revision,
+        "refolding": status.refolding,
+        "t": status.t,
+        "health": HEALTH_NAMES[status.health],
+        "since": status.since,
+        "lost": status.lost,
+        "nis": _plain(getattr(status, "nis", None)),
+        "nis_low": _plain(getattr(status, "nis_low", None)),
+        "nis_high": _plain(getattr(status, "nis_high", None)),
+        "counts": dict(status.counts),
+        "paused": status.paused,
+        "finished": status.finished,
+        "speed": _plain(status.speed),
+        "seekable": status.seekable,
+        "recording": str(status.recording) if status.recording is not None else None,
+        "latency_ms": _plain(status.latency_ms),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """JSON has no infinity and no NaN."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if value is None or isinstance(value, (bool, str, int)):
+        return value
+    number = float(value)
+    return number if math.isfinite(number) else str(number) if math.isinf(number) else None
+
+
+def command_from_json(body: Any, engine: Any) -> commands.Command:
+    """The command that `{"command": NAME, field: value, ...}` stands for; infinity is written "inf".
+
+    Raises:
+        NisusError: If there is no such command, a field is missing, unknown or of another kind, or the engine would
+            refuse it: better said to who asked than shown later as an event.
+    """
+    known = {kind.__name__: kind for kind in typing.get_args(commands.Command)}
+    name = body.get("command") if isinstance(body, dict) else body
+    if not isinstance(body, dict) or not isinstance(name, str) or name not in known:
+        raise ConfigError(f"command: {name!r} is not known; one of {', '.join(known)}")
+    kind = known[name]
+    hints = typing.get_type_hints(kind)
+    given = {key: value for key, value in body.items() if key != "command"}
+    names = [item.name for item in dataclasses.fields(kind)]
+    if sorted(given) != sorted(names):
+        has, takes = (", ".join(part) or "no field" for part in (given, names))
+        raise ConfigError(f"{kind.__name__}: has {has}; it takes {takes}")
+    command = kind(**{name: _converted(kind.__name__, name, given[name], hints[name]) for name in names})
+    _check(command, engine)
+    return command
+
+
+def _check(command: commands.Command, engine: Any) -> None:
+    if isinstance(command, Refolding):
+        retuned(command, engine)
+    elif isinstance(command, commands.Speed) and not command.factor > 0:
+        raise ConfigError(f'Speed: factor is {command.factor:g}; it must be positive, or "inf"')
+    elif isinstance(command, commands.Seek) and not abs(command.seconds) <= LONGEST:
+        raise ConfigError(f"Seek: seconds is {command.seconds:g}; it must lie within {LONGEST:g} s")
+    elif isinstance(command, commands.Record) and engine.recorder is None:
+        raise ConfigError("Record: this session cannot record")
+    if isinstance(command, (commands.Pause, commands.Speed, commands.Step, commands.Seek)):
+        if not engine.status().seekable:
+            raise ConfigError("a live source cannot be paused, stepped or sought; only a replay or a simulation can")
+
+
+def _recording(where: str, name: str) -> Path:
+    # A bare name: a browser says what the file is called, not where on the disk it goes, nor what it replaces.
+    path = Path(name)
+    if path.suffix != ".rrd" or name != path.name or "\\" in name or name.startswith("."):
+        raise ConfigError(f"{where}; it must be a file name that ends in .rrd, without folders")
+    if path.exists():
+        raise ConfigError(f"{where}, which is there already; choose another name")
+    return path
+
+
+def _converted(command: str, name: str, value: Any, hint: Any) -> Any:
+    allowed = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    for kind in allowed:
+        if kind is type(None) and value is None:
+            return None
+        if kind in (bool, str) and isinstance(value, kind):
+            return value
+        if kind is float and not isinstance(value, bool) and (isinstance(value, (int, float)) or value == "inf"):
+            try:
+                number = float(value)
+            except OverflowError:
+                raise ConfigError(f"{command}: {name} is too large; it must be a finite number") from None
+            if not math.isnan(number):
+                return number
+        if kind is Path and isinstance(value, str):
+            return _recording(f"{command}: {name} is {value!r}", value)
+    wanted = " or ".join({"float": "a number", "bool": "true or false", "NoneType": "null", "str": "a text",
+                          "Path": "a path"}[kind.__name__] for kind in allowed)  # fmt: skip
+    raise ConfigError(f"{command}: {name} is {value!r}; it must be {wanted}")

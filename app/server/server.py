@@ -1,0 +1,286 @@
+"""The page server: one loopback port for the page, its API, its streams, recordings, and Viser behind it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gzip
+import json
+import sys
+import threading
+import time
+import uuid
+from collections.abc import AsyncIterator
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from estimators.errors import NisusError
+
+from ..rerun.feed import RerunFeed
+from .api import command_from_json, status_json
+from .gate import Gate, user_token
+from .port import listen
+from .viewer_assets import FILES, viewer_assets, viewer_version
+from .viser_proxy import ViserProxy
+
+PERIOD = 0.2
+"""Seconds between two frames that one Rerun viewer is fed, at least."""
+
+STATUS_PERIOD = 0.5
+"""Seconds between two words on the twin's status."""
+
+PAGE = Path(__file__).parent / "page"
+FOR_EVER = "public, max-age=31536000, immutable"
+KINDS = {".js": "text/javascript", ".wasm": "application/wasm"}
+
+
+def _policy(port: int, scripts: str) -> str:
+    """A content security policy under which no request leaves this server."""
+    # Not every browser takes 'self' to include the WebSockets of the same address.
+    sockets = f"ws://127.0.0.1:{port} ws://localhost:{port}"
+    return (
+        f"default-src 'self'; script-src 'self' {scripts}; style-src 'self' 'unsafe-inline'; "
+        f"img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob: {sockets}; "
+        "worker-src 'self' blob: data:; frame-src 'self'; frame-ancestors 'self'; object-src 'none'; "
+        "base-uri 'none'; form-action 'self'"
+    )
+
+
+class PageServer:
+    """Serves one engine to any number of browsers, from a thread of its own."""
+
+    def __init__(
+        self,
+        engine: Any,
+        *,
+        port: int,
+        viser_port: int | None,
+        secret: str,
+        review: Path | None = None,
+    ) -> None:
+        """Take the port.
+
+        Args:
+            engine: What to show.
+            port: On 127.0.0.1; 0 takes a free one.
+            viser_port: Where the private Viser server listens; None if there is none.
+            secret: What Viser asks for.
+            review: The recording that is reviewed, offered beside those that this process writes.
+
+        Raises:
+            ConfigError: If the port cannot be had.
+        """
+        self._engine = engine
+        self._review = review
+        self._boot = uuid.uuid4().hex
+        self._socket = listen(port)
+        self.port: int = self._socket.getsockname()[1]
+        self._token = user_token()
+        self._assets: Future[Path] = Future()
+        self._viser = ViserProxy(viser_port, secret) if viser_port is not None else None
+        config = uvicorn.Config(
+            Gate(self._application(), self._token, self.port), log_config=None, log_level="critical", access_log=False,
+            server_header=False, lifespan="off", ws_per_message_deflate=False, timeout_graceful_shutdown=1,
+        )  # fmt: skip
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(
+            target=self._server.run, kwargs={"sockets": [self._socket]}, name="page server", daemon=True
+        )
+
+    @property
+    def url(self) -> str:
+        """Address of the page, with the token that it asks for."""
+        return f"http://127.0.0.1:{self.port}/?token={self._token}"
+
+    def start(self) -> None:
+        """Serve; the Rerun viewer's files are prepared meanwhile, if this machine has not got them yet."""
+        threading.Thread(target=self._prepare, name="viewer assets", daemon=True).start()
+        self._thread.start()
+        while not self._server.started and self._thread.is_alive():
+            time.sleep(0.005)
+
+    def stop(self) -> None:
+        """Close all connections, and the port."""
+        self._server.should_exit = True
+        if self._thread.is_alive():
+            self._thread.join(timeout=5.0)
+        self._socket.close()
+
+    def _prepare(self) -> None:
+        try:
+            self._assets.set_result(viewer_assets(lambda line: print(line, file=sys.stderr, flush=True)))
+        except NisusError as error:
+            self._assets.set_exception(error)
+
+    def _application(self) -> Starlette:
+        routes: list[Any] = [
+            Route("/", self._page),
+            Route("/api/status", self._status),
+            Route("/api/recordings", self._list_recordings),
+            Route("/api/command", self._command, methods=["POST"]),
+            Route(f"/viewer/{viewer_version()}/{{name}}", self._viewer_file),
+            Route("/rec/{name}", self._recording),
+            WebSocketRoute("/rerun/stream", self._stream),
+            Mount("/page", StaticFiles(directory=PAGE)),
+        ]
+        if self._viser is not None:
+            routes += [
+                WebSocketRoute("/viser/{path:path}", self._viser.websocket),
+                WebSocketRoute("/viser", self._viser.websocket),
+                Route("/viser/{path:path}", self._viser.http),
+            ]
+        application = Starlette(routes=routes)
+        return _WithHeaders(application, self.port)  # type: ignore[return-value]
+
+    async def _page(self, request: Request) -> Response:
+        text = (PAGE / "index.html").read_text()
+        settings = {"viewer": f"/viewer/{viewer_version()}", "boot": self._boot, "viser": self._viser is not None}
+        # In an attribute, not in a script: the policy allows no inline ones.
+        quoted = json.dumps(settings).replace("&", "&amp;").replace('"', "&quot;")
+        return Response(text.replace("{{settings}}", quoted), media_type="text/html")
+
+    async def _status(self, request: Request) -> Response:
+        status = status_json(self._engine)
+        return JSONResponse({**status, "recordings": sorted(self._recordings())})
+
+    async def _list_recordings(self, request: Request) -> Response:
+        found = {name: path for name, path in self._recordings().items() if path.is_file()}
+        return JSONResponse([{"name": name, "bytes": path.stat().st_size} for name, path in sorted(found.items())])
+
+    async def _command(self, request: Request) -> Response:
+        if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+            return PlainTextResponse("Nisus: Content-Type must be application/json.\n", 415)
+        try:
+            command = command_from_json(await request.json(), self._engine)
+        except (NisusError, ValueError, RecursionError) as error:
+            return JSONResponse({"error": str(error)}, 400)
+        self._engine.submit(command)
+        return JSONResponse({"submitted": type(command).__name__}, 202)
+
+    async def _viewer_file(self, request: Request) -> Response:
+        name = request.path_params["name"]
+        if name not in FILES:
+            return PlainTextResponse("Nisus: there is no such file.\n", 404)
+        try:
+            folder = await asyncio.wrap_future(self._assets)
+        except NisusError as error:
+            return PlainTextResponse(f"{error}\n", 503)
+        path = folder / f"{name}.gz"
+        headers = {"Cache-Control": FOR_EVER, "Vary": "Accept-Encoding"}
+        kind = KINDS[Path(name).suffix]
+        if "gzip" in request.headers.get("accept-encoding", ""):
+            return FileResponse(path, media_type=kind, headers={**headers, "Content-Encoding": "gzip"})
+        content = await asyncio.to_thread(lambda: gzip.decompress(path.read_bytes()))
+        return Response(content, media_type=kind, headers=headers)
+
+    def _recordings(self) -> dict[str, Path]:
+        """What may be fetched: recordings that this process wrote, and the one it reviews."""
+        recorder = getattr(self._engine, "recorder", None)
+        paths = [*getattr(recorder, "finished", []), *([self._review] if self._review is not None else [])]
+        return {path.name: path for path in paths}
+
+    async def _recording(self, request: Request) -> Response:
+        path = self._recordings().get(request.path_params["name"])
+        if path is None or not path.is_file():
+            return PlainTextResponse("Nisus: this process has no such recording.\n", 404)
+        return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+
+    async def _stream(self, browser: WebSocket) -> None:
+        """Feed one Rerun viewer: each frame when it has drawn the one before."""
+        await browser.accept()
+        layout = browser.query_params.get("layout", "1") == "1"
+        feed = await asyncio.to_thread(RerunFeed, self._engine, layout=layout)
+        drawn = asyncio.Event()
+        drawn.set()
+        listener = asyncio.create_task(_listen_to(browser, drawn))
+        feeder = asyncio.create_task(self._feed(browser, feed, drawn))
+        try:
+            await asyncio.wait([listener, feeder], return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            # Cancelled first, then awaited: the feed is closed only when no thread is inside it.
+            for task in (listener, feeder):
+                task.cancel()
+            await asyncio.gather(listener, feeder, return_exceptions=True)
+            await asyncio.to_thread(feed.close)
+            with contextlib.suppress(RuntimeError):
+                await browser.close()
+
+    async def _feed(self, browser: WebSocket, feed: RerunFeed, drawn: asyncio.Event) -> None:
+        told = -STATUS_PERIOD
+        while True:
+            begun = time.monotonic()
+            if begun - told >= STATUS_PERIOD:
+                told = begun
+                status = {"status": status_json(self._engine), "boot": self._boot}
+                await browser.send_text(json.dumps({**status, "recordings": sorted(self._recordings())}))
+            if drawn.is_set():
+                async for message in _given(feed):
+                    if isinstance(message, str):
+                        await browser.send_text(message)
+                    else:
+                        drawn.clear()
+                        await browser.send_bytes(message)
+            with contextlib.suppress(TimeoutError):
+                # Until the frame is drawn, or the status is due.
+                await asyncio.wait_for(drawn.wait(), STATUS_PERIOD)
+            await asyncio.sleep(max(0.0, PERIOD - (time.monotonic() - begun)))
+
+
+async def _given(feed: RerunFeed) -> AsyncIterator[str | bytes]:
+    """What the feed gives next, made in a thread: a long history takes a while."""
+    task = asyncio.ensure_future(asyncio.to_thread(feed.next))
+    try:
+        messages = await asyncio.shield(task)
+    except asyncio.CancelledError:
+        await task
+        raise
+    for message in messages:
+        yield message
+
+
+async def _listen_to(browser: WebSocket, drawn: asyncio.Event) -> None:
+    """A word from the browser says that it has drawn what it got."""
+    with contextlib.suppress(WebSocketDisconnect):
+        while True:
+            await browser.receive_text()
+            drawn.set()
+
+
+class _WithHeaders:
+    """Adds the security headers to every answer."""
+
+    def __init__(self, application: Starlette, port: int) -> None:
+        self._application = application
+        common = [
+            (b"x-content-type-options", b"nosniff"),
+            (b"referrer-policy", b"no-referrer"),
+            (b"cross-origin-resource-policy", b"same-origin"),
+            (b"cross-origin-opener-policy", b"same-origin"),
+        ]
+        own = _policy(port, "'wasm-unsafe-eval'")
+        # Viser's client is one file of inline scripts that unpack themselves.
+        viser = _policy(port, "'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:")
+        self._own = [*common, (b"content-security-policy", own.encode())]
+        self._viser = [*common, (b"content-security-policy", viser.encode())]
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        extra = self._viser if scope.get("path", "").startswith("/viser") else self._own
+
+        async def send_more(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                headers = [*message.get("headers", []), *extra]
+                if not any(name == b"cache-control" for name, _ in headers):
+                    headers.append((b"cache-control", b"no-cache"))
+                message = {**message, "headers": headers}
+            await send(message)
+
+        await self._application(scope, receive, send_more)

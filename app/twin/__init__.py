@@ -1,0 +1,1 @@
+"""A twin put together from its YAML."""

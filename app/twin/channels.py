@@ -1,0 +1,100 @@
+"""The channels of a twin: which signals or columns feed which sensor, input or true state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import inf
+from typing import TYPE_CHECKING, Any
+
+from config.loader import Loaded
+from config.source_schema import ChannelSection, RangeSection, SignalSection
+from config.yaml_lines import Key
+from estimators.log import INPUT, READING, TRUTH
+from estimators.model.state_space import Field, StateSpaceModel
+
+from .model import check_names
+
+if TYPE_CHECKING:
+    from sources.source import Channel, Condition
+
+
+def channels(loaded: Loaded, section: Any, key: Key, model: StateSpaceModel) -> list[tuple[Key, Channel]]:
+    """The channels of a section, each with its key in the YAML.
+
+    Raises:
+        ConfigError: With file and line, if a name or a number of rows does not fit the model.
+    """
+    rows_of = {sensor.name: [(row.name, row.unit) for row in sensor.rows] for sensor in model.sensors}
+    inputs_of = {item.name: [(item.name, item.unit)] for item in model.inputs}
+    field = model.states if isinstance(model.states, Field) else None
+    states_of = {state.name: [(state.name, state.unit)] for state in model.states} if model.grid is None else {}
+    found: list[tuple[Key, Channel]] = []
+    for group, kind, known, word in (
+        ("sensors", READING, rows_of, "sensor"),
+        ("inputs", INPUT, inputs_of, "input"),
+        ("truth", TRUTH, states_of, "state"),
+    ):
+        given = dict(getattr(section, group))
+        if kind == TRUTH and field is not None and field.name in given:
+            read = {name for _, item in found for name in item.signals}
+            found += _cells(loaded, (*key, group, field.name), given.pop(field.name), field, read)
+        check_names(loaded, (*key, group), given, list(known), word, model)
+        for name, item in given.items():
+            place = (*key, group, name)
+            found.append((place, _channel(loaded, place, item, kind, list(known).index(name), name, known[name])))
+    return found
+
+
+def _cells(loaded: Loaded, key: Key, item: ChannelSection, field: Field, read: set[str]) -> list[tuple[Key, Channel]]:
+    """The true values of a whole field from one array; the cells among `read` are no truth."""
+    if isinstance(item, SignalSection) or len(item.names()) != 1:
+        raise loaded.error(key, f"is a field of {len(field)} cells; name one array of a table")
+    found = []
+    for k in range(len(field)):
+        state = field[k]
+        column = f"{item.names()[0]}[{state.name.partition('[')[2]}"
+        if column not in read:
+            cell = item.model_copy(update={"columns": (column,)})
+            found.append((key, _channel(loaded, key, cell, TRUTH, k, state.name, [(state.name, state.unit)])))
+    return found
+
+
+def _channel(
+    loaded: Loaded, key: Key, item: ChannelSection, kind: int, index: int, name: str, rows: list[tuple[str, str]]
+) -> Channel:
+    from sources.source import Channel
+
+    names = item.names()
+    word = "signals" if isinstance(item, SignalSection) else "columns"
+    if len(names) != len(rows):
+        row_names = ", ".join(row for row, _ in rows)
+        raise loaded.error((*key, word), f"names {len(names)}; {name} takes {len(rows)}: {row_names}")
+    return Channel(
+        kind=kind,
+        index=index,
+        name=name,
+        signals=names,
+        message=item.message if isinstance(item, SignalSection) else None,
+        units=_spread(item.units or (None,), len(rows)),
+        model_units=tuple(unit for _, unit in rows),
+        scale=_spread(item.scale, len(rows)),
+        offset=_spread(item.offset, len(rows)),
+        where=_conditions(item.where),
+        only=_conditions(item.only),
+        convert=item.convert,
+        origin=item.origin,
+    )
+
+
+def _conditions(given: Mapping[str, RangeSection]) -> tuple[Condition, ...]:
+    from sources.source import Condition
+
+    return tuple(
+        Condition(signal, -inf if limits.min is None else limits.min, inf if limits.max is None else limits.max)
+        for signal, limits in given.items()
+    )
+
+
+def _spread(values: tuple, count: int) -> tuple:
+    """A value for each row, from one for all or one each (the schema has checked the number)."""
+    return values * count if len(values) == 1 else values

@@ -1,0 +1,186 @@
+"""The model of a twin: found by name or in the user's file, then set up as the twin's YAML says."""
+
+from __future__ import annotations
+
+import hashlib
+import traceback
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from config.loader import Loaded, shown_path
+from config.problems import nearest
+from config.yaml_lines import Key
+from estimators.errors import ModelError, NisusError
+from estimators.model.joint import Unknown, joint
+from estimators.model.state_space import Field, State, StateSpaceModel
+from estimators.model.user_file import run_file
+from estimators.models import MODELS
+
+
+def find_model(loaded: Loaded, key: Key, reference: str) -> StateSpaceModel:
+    """The model that `reference`, the value at `key`, means: a name, or ./file.py:Name beside the YAML.
+
+    Raises:
+        ConfigError: If there is no such model or file.
+        ModelError: If the user's file fails, with its file and line.
+    """
+    file, _, name = reference.rpartition(":")
+    if not file and not reference.endswith(".py"):
+        if reference in MODELS:
+            return MODELS[reference]
+        near = nearest(reference, MODELS).rstrip("?")
+        raise loaded.error(key, f"is {reference!r}; no model of that name ships; {near}, or write ./file.py:Name")
+    if not file or not name:
+        raise loaded.error(key, f"is {reference!r}; name what to take from the file, as in ./pump.py:Pump")
+    path = Path(file).expanduser()
+    path = path if path.is_absolute() else loaded.path.absolute().parent / path
+    if not path.is_file():
+        raise loaded.error(key, f"is {reference!r}; there is no file {shown_path(path)}; it is sought beside the YAML")
+    module = _import(path)
+    if not hasattr(module, name):
+        names = [item for item in vars(module) if not item.startswith("_")]
+        raise loaded.error(key, f"is {reference!r}; {shown_path(path)} has no {name}; {nearest(name, names)}")
+    return _as_model(getattr(module, name), name, path, loaded, key)
+
+
+def _import(path: Path) -> ModuleType:
+    """Run a user's file as a module of a name of its own, with its folder importable meanwhile."""
+    path = path.resolve()
+    if path.suffix != ".py":
+        raise ModelError(f"{shown_path(path)}: it is not a Python file; its name must end in .py")
+    unique = f"nisus_model_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    try:
+        return run_file(unique, path)
+    except (Exception, SystemExit) as error:
+        raise _blame(error, path) from error
+
+
+def _as_model(found: Any, name: str, path: Path, loaded: Loaded, key: Key) -> StateSpaceModel:
+    if not isinstance(found, StateSpaceModel) and callable(found):
+        try:
+            found = found()
+        except (Exception, SystemExit) as error:
+            raise _blame(error, path.resolve()) from error
+    if not isinstance(found, StateSpaceModel):
+        raise loaded.error(
+            key, f"names {name}, which is of type {type(found).__name__}; it must be a StateSpaceModel, or return one"
+        )
+    return found
+
+
+def _blame(error: BaseException, path: Path) -> ModelError:
+    """One line with the place in the user's code from which an exception came."""
+    if isinstance(error, SyntaxError) and error.filename:
+        return ModelError(f"{shown_path(Path(error.filename))}:{error.lineno}: {error.msg}; correct the Python")
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if Path(frame.filename).is_relative_to(path.parent)]
+    place = f"{shown_path(Path(own[-1].filename))}:{own[-1].lineno}" if own else shown_path(path)
+    text = " ".join(str(error).split()) or "no message"
+    if isinstance(error, NisusError):
+        return ModelError(f"{place}: {text}")
+    return ModelError(f"{place}: {type(error).__name__}: {text}; correct the model's file")
+
+
+def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
+    """The model with the YAML's parameters, prior and noise in place of its own.
+
+    Raises:
+        ConfigError: With file and line, if the YAML names what the model lacks or a value breaks its rule.
+    """
+    config = loaded.config
+    names = [item.name for item in model.parameters]
+    check_names(loaded, ("parameters",), config.parameters, names, "parameter", model)
+    check_names(loaded, ("estimate",), config.estimate, names, "parameter", model)
+    for item in model.parameters:
+        value = config.parameters.get(item.name, item.value)
+        if not item.low <= value <= item.high:
+            raise loaded.error(
+                ("parameters", item.name),
+                f"is {value:g} {item.unit}; it must lie between {item.low:g} and {item.high:g}",
+            )
+    parameters = tuple(replace(p, value=config.parameters.get(p.name, p.value)) for p in model.parameters)
+    unknowns = {name: Unknown(section.std, section.drift) for name, section in config.estimate.items()}
+    model = joint(replace(model, parameters=parameters), unknowns)
+    field = isinstance(model.states, Field)
+    known = (model.states.name,) if isinstance(model.states, Field) else model.state_names
+    check_names(loaded, ("prior",), config.prior, known, "field" if field else "state", model)
+    check_names(loaded, ("noise",), config.noise, [item.name for item in model.noises], "noise", model)
+    check_names(loaded, ("sensors",), config.sensors, model.sensor_names, "sensor", model)
+    return replace(
+        model,
+        states=_states(model, loaded),
+        noises=tuple(
+            replace(noise, variance=config.noise[noise.name].value) if noise.name in config.noise else noise
+            for noise in model.noises
+        ),
+        sensors=tuple(_sensor(sensor, loaded) for sensor in model.sensors),
+    )
+
+
+def _states(model: StateSpaceModel, loaded: Loaded) -> Sequence[State]:
+    """The states with the YAML's prior; that of a field is given for all its cells, under the field's name."""
+    given, cells = loaded.config.prior, loaded.config.view.cells
+    states = model.states
+    if cells is not None and model.grid is None:
+        raise loaded.error(("view", "cells"), f"is for large fields; every state of {model.name} is kept; leave it out")
+    if isinstance(states, Field):
+        if cells is not None:
+            check_named(loaded, ("view", "cells"), cells, model)
+            states = replace(states, shown=tuple(model.state_names.index(name) for name in cells))
+        prior = given.get(states.name)
+        if prior is None:
+            return states
+        means = states.means if prior.mean is None else ()
+        return replace(
+            states, mean=states.mean if prior.mean is None else prior.mean, means=means, std=prior.std or states.std
+        )
+    found = []
+    for state in states:
+        prior = given.get(state.name)
+        mean, std = (prior.mean, prior.std) if prior else (None, None)
+        found.append(replace(state, mean=state.mean if mean is None else mean, std=std or state.std))
+    return tuple(found)
+
+
+def _sensor(sensor: Any, loaded: Loaded) -> Any:
+    section = loaded.config.sensors.get(sensor.name)
+    if section is None or section.variances is None:
+        return sensor
+    key = ("sensors", sensor.name, "std" if section.std is not None else "variance")
+    variances = one_each(loaded, key, section.variances, [row.name for row in sensor.rows])
+    rows = tuple(replace(row, variance=variance) for row, variance in zip(sensor.rows, variances, strict=True))
+    return replace(sensor, rows=rows)
+
+
+def one_each(loaded: Loaded, key: Key, values: tuple, rows: list[str]) -> tuple:
+    """A value for each row, from one for all or one each."""
+    if len(values) == 1:
+        return values * len(rows)
+    if len(values) != len(rows):
+        raise loaded.error(key, f"has {len(values)} entries; give one, or {len(rows)}: {', '.join(rows)}")
+    return values
+
+
+def check_names(loaded: Loaded, key: Key, given: Any, known: Any, kind: str, model: StateSpaceModel) -> None:
+    """Refuse a name under `key` that the model does not have.
+
+    Raises:
+        ConfigError: With file and line, and the near names.
+    """
+    for name in given:
+        if name not in known:
+            raise loaded.error((*key, name), f"is no {kind} of {model.name}; {nearest(name, known)}")
+
+
+def check_named(loaded: Loaded, key: Key, names: Any, model: StateSpaceModel) -> None:
+    """Refuse a state that the value at `key` names and the model does not have.
+
+    Raises:
+        ConfigError: With file and line, and the near names.
+    """
+    for name in names:
+        if name not in model.state_names:
+            raise loaded.error(key, f"names {name!r}, no state of {model.name}; {nearest(name, model.state_names)}")

@@ -1,0 +1,234 @@
+"""A twin put together: its YAML, model, tuning and source."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from config.loader import Loaded, load, load_text
+from config.schema import TwinSection
+from config.source_schema import AssetSection
+from config.yaml_lines import parse
+from estimators.errors import ConfigError, EstimatorError
+from estimators.model.state_space import StateSpaceModel
+from estimators.registry import checked, find_entry, find_estimator
+from estimators.tuning import Tuning
+
+from .model import check_named, configure, find_model
+from .source import Plan, plan_source
+
+if TYPE_CHECKING:
+    from sources.can.player import Player
+    from sources.source import Report, Source
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A model set up as its YAML says, the first tuning, and what it takes to open the source.
+
+    `pairs` (k, 2) holds the indices of the states whose ellipses are drawn. `overrides` are the command line's
+    changes to the YAML, which `text` holds as it was read. `recorded` says that tuning and estimator are a recording's.
+    """
+
+    loaded: Loaded
+    model: StateSpaceModel
+    tuning: Tuning
+    estimator: str
+    pairs: np.ndarray
+    overrides: Mapping[str, str]
+    plan: Plan
+    recorded: bool = False
+
+    @property
+    def config(self) -> TwinSection:
+        """The checked configuration, with defaults filled in."""
+        return self.loaded.config
+
+    @property
+    def path(self) -> Path:
+        """The YAML file."""
+        return self.loaded.path
+
+    @property
+    def text(self) -> str:
+        """The YAML as it was read."""
+        return self.loaded.text
+
+    @property
+    def name(self) -> str:
+        """Short name."""
+        return self.config.name or self.path.stem
+
+    @property
+    def title(self) -> str:
+        """One line for the top of the page."""
+        return self.config.title or self.model.title
+
+    @property
+    def picture(self) -> float | None:
+        """Seconds between two pictures of a large field; None if there is none."""
+        view = self.config.view
+        return (view.picture or view.window / 60.0) if self.model.grid is not None else None
+
+    @property
+    def tells_field(self) -> bool:
+        """Whether the source tells the truth of a whole large field."""
+        grid, source = self.model.grid, self.config.source
+        if grid is None:
+            return False
+        if isinstance(source, AssetSection):
+            return source.truth.every is not None
+        return any(grid.name in getattr(part, "truth", {}) for part in getattr(source, "parts", (source,)))
+
+    def options_of(self, estimator: str) -> Mapping[str, float]:
+        """The options that the YAML gives for an estimator."""
+        first = self.config.estimator
+        return {**self.config.filters.get(estimator, {}), **(first.options if estimator == first.name else {})}
+
+    def open_source(self, report: Report, *, live: bool = True) -> Source:
+        """Open the source.
+
+        Args:
+            report: Called as report(key, text) with what is worth counting; from the source's thread.
+            live: False asks for events that end: a recording in place of a bus.
+
+        Raises:
+            SourceError: If it cannot be opened, with the remedy.
+        """
+        return self.plan.open(report, live=live)
+
+    def player(self, report: Report, *, interface: str | None = None, channel: str | int | None = None) -> Player:
+        """The asset of a twin on a CAN bus, ready to play there, or on another `interface` and `channel`.
+
+        Raises:
+            SourceError: If the source is no bus, it has no `asset`, or the bus cannot be opened.
+        """
+        return self.plan.player(report, interface=interface, channel=channel)
+
+
+def load_twin(
+    name_or_path: str | os.PathLike[str],
+    *,
+    log_files: Sequence[str | os.PathLike[str]] | None = None,
+    overrides: Mapping[str, str] | None = None,
+) -> Twin:
+    """Put a twin together.
+
+    Args:
+        name_or_path: Name of a twin that ships, or path of a YAML file.
+        log_files: Recordings in place of the twin's own.
+        overrides: The command line's `--set KEY=VALUE`: a tuning key (Q.temperature), or a dotted key of the YAML.
+
+    Raises:
+        ConfigError: If the YAML or an override breaks a rule.
+        ModelError: If the model's file fails.
+    """
+    overrides = dict(overrides or {})
+    return _assemble(load(name_or_path, _of_yaml(overrides)), overrides, log_files)
+
+
+def restore_twin(text: str, base_path: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> Twin:
+    """Put a twin together from the YAML text that a recording holds; `base_path` is where its file was.
+
+    Raises:
+        ConfigError: If the YAML breaks a rule.
+        ModelError: If the model's file fails, or is no longer there.
+    """
+    overrides = dict(overrides or {})
+    return _assemble(load_text(text, Path(base_path), _of_yaml(overrides)), overrides, None)
+
+
+def _of_yaml(overrides: Mapping[str, str]) -> dict[str, str]:
+    """The overrides that change the YAML; the others are keys of the tuning."""
+    return {key: value for key, value in overrides.items() if key.split(".")[0] in TwinSection.model_fields}
+
+
+def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[str | os.PathLike[str]] | None) -> Twin:
+    config = loaded.config
+    model = configure(find_model(loaded, ("model",), config.model), loaded)
+    for name, given in config.filters.items():
+        _check_options(loaded, ("filters", name), name, given, model)
+    first = config.estimator
+    with _placed(loaded, ("estimator",)):
+        find_estimator(first.name, model)
+    _check_options(loaded, ("estimator", "options"), first.name, first.options, model)
+    options = {**config.filters.get(first.name, {}), **first.options}
+    tuning = Tuning.of(model).with_options(options).set("gate", config.gate)
+    for name, section in config.sensors.items():
+        if not section.use:
+            tuning = tuning.set(f"use.{name}", False)
+    for key, value in overrides.items():
+        if key not in _of_yaml(overrides):
+            tuning = _set(tuning, key, value)
+    return Twin(
+        loaded=loaded,
+        model=model,
+        tuning=tuning,
+        estimator=first.name,
+        pairs=_pairs(loaded, model),
+        overrides=overrides,
+        plan=plan_source(loaded, model, [Path(file) for file in log_files] if log_files else None),
+    )
+
+
+def _check_options(
+    loaded: Loaded, key: tuple[str, ...], name: str, given: Mapping[str, float], model: StateSpaceModel
+) -> None:
+    """Refuse options, given under `key`, that the estimator of that name cannot run with; each has its own line."""
+    with _placed(loaded, key):
+        entry = find_entry(name)
+    for option, value in given.items():
+        with _placed(loaded, (*key, option)):
+            checked(entry, model, {option: value})
+
+
+@contextmanager
+def _placed(loaded: Loaded, key: tuple[str, ...]) -> Iterator[None]:
+    """What is wrong with an estimator is said of its place in the YAML."""
+    try:
+        yield
+    except EstimatorError as error:
+        raise ConfigError(f"{loaded.places.at(key)}: {error}") from None
+
+
+def _set(tuning: Tuning, key: str, text: str) -> Tuning:
+    option = f"--set {key}={text}"
+    try:
+        value, _ = parse(text, option)
+    except ConfigError:
+        value = text
+    wants_bool = key.startswith("use.")
+    tuning_keys = tuning.keys()
+    if key in tuning_keys and (not isinstance(value, (int, float)) or isinstance(value, bool) != wants_bool):
+        raise ConfigError(f"{option}: {key} must be {'true or false' if wants_bool else 'a number'}")
+    try:
+        return tuning.set(key, value if key in tuning_keys else None)
+    except ConfigError as error:
+        more = "" if key in tuning_keys else f"; or a key of the YAML: {', '.join(TwinSection.model_fields)}"
+        raise ConfigError(f"{option}: {error}{more}") from None
+
+
+def _pairs(loaded: Loaded, model: StateSpaceModel) -> np.ndarray:
+    """Indices of the pairs of states in the view; the scene's names are checked on the way."""
+    view = loaded.config.view
+    for key in ("axes", "position", "heading"):
+        value = getattr(view.scene, key)
+        check_named(loaded, ("view", "scene", key), (value,) if isinstance(value, str) else value or (), model)
+    if view.pairs is None and model.grid is not None:
+        return np.zeros((0, 2), int)
+    if view.pairs is None:
+        return np.array([[0, 1]] if model.nx > 1 else np.zeros((0, 2)), int)
+    for k, pair in enumerate(view.pairs):
+        check_named(loaded, ("view", "pairs", k), pair, model)
+        if pair[0] == pair[1]:
+            raise loaded.error(("view", "pairs", k), f"names {pair[0]} twice; an ellipse needs two states")
+        for name in pair:
+            if model.state_names.index(name) not in model.shown:
+                raise loaded.error(("view", "pairs", k), f"names {name}, which is not among view.cells; add it there")
+    return np.array([[model.state_names.index(name) for name in pair] for pair in view.pairs], int).reshape(-1, 2)

@@ -1,0 +1,1 @@
+"""Viser: the scene, the panel and its charts."""

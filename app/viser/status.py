@@ -1,0 +1,73 @@
+"""The panel's texts: the status line, the list of events, the note about an edit."""
+
+from __future__ import annotations
+
+import html
+from typing import Any
+
+from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
+
+from .time_units import SECONDS, Unit
+
+COLORS = {"tracking": "#16a34a", "degraded": "#d97706", "diverged": "#dc2626", "stale": "#6b7280"}
+LEVELS = {"info": "#6b7280", "warn": "#d97706", "error": "#dc2626"}
+COUNTED = ("readings", "gated", "missing", "stale")
+
+
+def status_html(status: Any, origin: int | None, unit: Unit = SECONDS) -> str:
+    """Health, revision and counts in two lines that keep their places while the numbers run; times as in the charts."""
+    health = HEALTH_NAMES[status.health]
+    lasting = status.health != TRACKING and status.since is not None and origin is not None
+    since = f" since {unit.text((status.since - origin) * 1e-9)}" if lasting else ""
+    remedy = ""
+    if status.lost is not None:
+        when = "" if origin is None else f" since {unit.text((status.lost - origin) * 1e-9)}"
+        remedy = (
+            f"The estimate is not a number{when}. <b>Reset</b> begins anew from the prior; or choose another filter."
+        )
+    elif status.health == DIVERGED:
+        remedy = "The readings contradict the estimate. <b>Reset</b> begins anew from the prior."
+    at = "" if status.t is None or origin is None else unit.text((status.t - origin) * 1e-9)
+    state = "ended" if status.finished else "paused" if status.paused else ""
+    fold = "⟳ refolding" if status.refolding else f"revision {status.revision}"
+    latency = status.latency_ms
+    counts = dict(status.counts)
+    known = [(name, counts.pop(name, 0)) for name in COUNTED]
+    known += [(name, counts[name]) for name in ("held out", "failed", "recovered") if counts.get(name)]
+    cells = "".join(
+        f'<span style="margin-right:0.9em;white-space:nowrap"><span style="opacity:0.65">{html.escape(name)}</span> '
+        f"{count:,}</span>"
+        for name, count in known
+    )
+    if latency is not None:
+        cells += f'<span style="white-space:nowrap"><span style="opacity:0.65">latency</span> {latency:.1f} ms</span>'
+    return (
+        '<div style="padding:0.2em 1.4em 0.6em 0.9em;font-size:0.8em;line-height:1.6;'
+        'font-variant-numeric:tabular-nums">'
+        '<div style="display:flex;justify-content:space-between;gap:0.5em">'
+        f'<b style="color:{COLORS.get(health, "#6b7280")}">● {health}{since}</b>'
+        f"<span>{state}</span><span>{fold}</span><span>{at}</span></div><div>{cells}</div><div>{remedy}</div></div>"
+    )
+
+
+def events_html(notices: list[Any], origin: int | None, unit: Unit = SECONDS) -> str:
+    """The last events, newest first."""
+    style = "padding:0.2em 0.9em 0.6em;font-size:0.8em;line-height:1.5;overflow-wrap:anywhere"
+    if not notices:
+        return f'<div style="{style};opacity:0.65">Nothing to report.</div>'
+    lines = []
+    for notice in reversed(notices):
+        at = "" if origin is None or notice.t is None else unit.text((notice.t - origin) * 1e-9)
+        color = LEVELS.get(str(notice.level).lower(), LEVELS["info"])
+        lines.append(
+            f'<div style="border-left:3px solid {color};padding-left:0.5em;margin-bottom:0.35em">'
+            f'<span style="opacity:0.65">{at}</span> {html.escape(str(notice.text))}</div>'
+        )
+    return f'<div style="{style}">{"".join(lines)}</div>'
+
+
+def note_html(text: str) -> str:
+    """One line in red, or nothing."""
+    if not text:
+        return ""
+    return f'<div style="color:#dc2626;font-size:0.8em;padding:0 0.9em 0.5em">{html.escape(text)}</div>'

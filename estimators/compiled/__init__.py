@@ -1,0 +1,1 @@
+"""A model as machine code, and the context in which a filter sees it."""

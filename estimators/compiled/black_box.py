@@ -1,0 +1,164 @@
+"""A model whose functions run on blocks of states in Python, split over threads, processes or any executor.
+
+A compiled filter that runs f and h at its own members alone is driven on it: the block is run first, and what the
+filter calls as f or h looks the answer up by the address of the member (see driven.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from functools import lru_cache
+from multiprocessing import get_context
+from pickle import PicklingError
+from typing import Any
+
+import numba
+import numpy as np
+
+from ..errors import ModelError
+from ..model.check import place
+from ..model.state_space import StateSpaceModel
+from ..model.user_file import portable
+from ..numerics.jit import floats
+from .orphan import leave_with_parent
+
+ANSWER = 2
+"""Numbers behind the parameters: where the members stand, and where the answers for them."""
+
+
+def answered_f(x, u, p, dt, out):
+    """out = the answer for the member at the address of x."""
+    k = p.size - ANSWER
+    member = (x.ctypes.data - int(p[k])) // (8 * x.size)
+    answer = floats(int(p[k + 1]) + 8 * member * out.size, out.size)
+    for j in range(out.size):
+        out[j] = answer[j]
+
+
+def answered_h(x, u, p, out):
+    """out = the answer for the member at the address of x."""
+    k = p.size - ANSWER
+    member = (x.ctypes.data - int(p[k])) // (8 * x.size)
+    answer = floats(int(p[k + 1]) + 8 * member * out.size, out.size)
+    for j in range(out.size):
+        out[j] = answer[j]
+
+
+class BlackBox:
+    """The functions f(X, u, p, dt) and h(X, u, p) of a black box, run where its executor says."""
+
+    def __init__(self, model: StateSpaceModel) -> None:
+        self.model = model
+        functions = (model.f, *(sensor.h for sensor in model.sensors)) if model.executor is not None else ()
+        self._sent = {id(function): portable(function) for function in functions}
+
+    def f(self, X: np.ndarray, u: np.ndarray, p: np.ndarray, dt: float) -> np.ndarray:
+        """The states (N, nx) that follow those of a block X (N, nx).
+
+        Raises:
+            ModelError: If the function fails or returns another shape.
+        """
+        return self._run("f", self.model.f, X, self.model.nx, u, p, dt)
+
+    def h(self, sensor: int, X: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """What a sensor is expected to say (N, ny) of every state of a block X (N, nx).
+
+        Raises:
+            ModelError: If the function fails or returns another shape.
+        """
+        given = self.model.sensors[sensor]
+        return self._run(f"h of sensor {given.name}", given.h, X, len(given.rows), u, p)
+
+    def f_of_one(self, x: np.ndarray, u: np.ndarray, p: np.ndarray, dt: float, out: np.ndarray) -> None:
+        """Fill out = f(x, u, p, dt)."""
+        out[:] = self.f(x[None], u, p, dt)[0]
+
+    def h_of_one(self, sensor: int, x: np.ndarray, u: np.ndarray, p: np.ndarray, out: np.ndarray) -> None:
+        """Fill out = h(x, u, p) of a sensor."""
+        out[:] = self.h(sensor, x[None], u, p)[0]
+
+    def _run(self, what: str, function: Callable, X: np.ndarray, columns: int, *rest: Any) -> np.ndarray:
+        executor = self.model.executor
+        pool = _pool(executor) if isinstance(executor, str) else executor
+        try:
+            if pool is None:
+                parts = [_call(function, X, *rest)]
+            else:
+                pieces = np.array_split(X, max(1, min(_workers(pool), len(X))))
+                futures = [pool.submit(_call, self._sent[id(function)], piece, *rest) for piece in pieces]
+                parts = [future.result() for future in futures]
+        except (Exception, SystemExit) as error:  # noqa: BLE001  the user's own function may raise anything
+            at = place(function, error)
+            raise ModelError(f"{at}model {self.model.name}: {what} fails on {_told(error, len(X))}") from error
+        pieces = [X] if pool is None else pieces
+        for piece, part in zip(pieces, parts, strict=True):
+            if part.shape != (len(piece), columns):
+                raise ModelError(
+                    f"{place(function)}model {self.model.name}: {what} returns shape {part.shape} for {len(piece)} "
+                    f"states; it must be {(len(piece), columns)}, a row a state"
+                )
+        return np.concatenate(parts) if len(parts) > 1 else np.array(parts[0])
+
+    def probe(self) -> None:
+        """Run f and every h at the prior and near it, as a block and state by state, which must agree.
+
+        Raises:
+            ModelError: If they fail, return another shape, something that is not finite at the prior, or another value
+                for a state when it comes with others (or again).
+        """
+        model = self.model
+        X = model.prior_mean + np.array([[0.0], [0.1], [-0.1]]) * model.prior_std
+        u = np.array([item.default for item in model.inputs], float)
+        p = np.array([item.value for item in model.parameters], float)
+        dt = min(1.0, model.max_step)
+        calls: list[tuple[str, Callable[[np.ndarray], np.ndarray]]] = [("f", lambda X: self.f(X, u, p, dt))]
+        for k, sensor in enumerate(model.sensors):
+            calls.append((f"h of sensor {sensor.name}", lambda X, k=k: self.h(k, X, u, p)))  # type: ignore[misc]
+        for what, run in calls:
+            block = run(X)
+            bad = int(np.sum(~np.isfinite(block[0])))
+            if bad:
+                raise ModelError(
+                    f"model {model.name}: {what} returns {bad} of {block[0].size} numbers that are not finite at the "
+                    "prior; they must all be"
+                )
+            alone = np.concatenate([run(x[None]) for x in X])
+            # Vectorised loops may round differently in blocks of another size.
+            if not np.allclose(alone, block, rtol=1e-9, atol=1e-12 * np.nanmax(np.abs(block)), equal_nan=True):
+                raise ModelError(
+                    f"model {model.name}: {what} returns another value for a state alone than in a block; a row of the "
+                    "result may depend on that row alone, and on no chance"
+                )
+
+
+def _call(function: Callable, X: np.ndarray, u: np.ndarray, p: np.ndarray, *rest: float) -> np.ndarray:
+    """Run a block; what the filter holds cannot be written to."""
+    given = [X.view(), u.view(), p.view()]
+    for array in given:
+        array.flags.writeable = False
+    return np.asarray(function(*given, *rest), float)
+
+
+@lru_cache(maxsize=2)
+def _pool(kind: str) -> Executor:
+    """The threads or processes that all models share."""
+    count = int(numba.config.NUMBA_NUM_THREADS)
+    # Spawned, not forked: a fork would copy the locks of threads that it does not copy.
+    if kind == "threads":
+        return ThreadPoolExecutor(count)
+    return ProcessPoolExecutor(count, get_context("spawn"), initializer=leave_with_parent)
+
+
+def _workers(pool: Executor) -> int:
+    return int(getattr(pool, "_max_workers", numba.config.NUMBA_NUM_THREADS))
+
+
+def _told(error: BaseException, states: int) -> str:
+    """One line that says what went wrong, and what to do about it."""
+    line = f"a block of {states} states: {type(error).__name__}: {' '.join(str(error).split()) or 'no message'}"
+    if isinstance(error, BrokenExecutor):
+        _pool.cache_clear()
+    if isinstance(error, (BrokenExecutor, PicklingError)) or "pickle" in str(error):
+        return f"{line}; processes need functions that stand by their names in a module or file, use threads for others"
+    return f"{line}; mend it, or let it return NaN in the rows of states that it has no answer for"

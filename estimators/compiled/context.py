@@ -1,0 +1,233 @@
+"""What a compiled filter sees of a model and a tuning: addresses of code, layout, numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import from_dtype, types
+from numba.extending import intrinsic
+
+from ..numerics.jit import C1, F1, F2, caller, f64, flags, floats, i64, inlined, ints, jit, matrix
+from .row_loops import call_f_rows, call_h_rows
+
+f_signature = types.void(F1, F1, F1, f64, F1)
+f_complex_signature = types.void(C1, F1, F1, f64, C1)
+F_signature = types.void(F1, F1, F1, f64, F2)
+h_signature = types.void(F1, F1, F1, F1)
+h_complex_signature = types.void(C1, F1, F1, C1)
+H_signature = types.void(F1, F1, F1, F2)
+Q_signature = types.void(F1, F1, F1, F1, f64, F2)
+shape_signature = types.void(F1, F1, F1)
+log_likelihood_signature = f64(F1, F1, F1, F1, F1)
+
+call_f_complex = caller(f_complex_signature)
+call_F = caller(F_signature)
+call_h_complex = caller(h_complex_signature)
+call_H = caller(H_signature)
+call_jump = caller(f_signature)
+call_Q = caller(Q_signature)
+call_shape = caller(shape_signature)
+call_log_likelihood = caller(log_likelihood_signature)
+
+
+_FIELDS = """
+    nx nu n_parameters n_noises f f_complex F F_mode Q Q_varies each_state shape h h_complex H H_mode
+    log_likelihood n_sensors row_start row_count n_rows circular_x circular_y noise_state noise_states max_step
+    prior_mean prior_cov prior_rows linear_states n_linear sampled_states n_sampled jump mode n_modes p q r used
+    gate width options n_options pairs n_pairs shown n_shown prepared n_prepared seed
+""".split()
+
+_layout = np.dtype([(name, np.float64 if name == "max_step" else np.int64) for name in _FIELDS])
+
+context_type = from_dtype(_layout)
+"""All that a compiled filter may know: the model's code and layout, the tuning, the options. Never written to.
+
+Plain numbers: sizes, modes, and addresses of code and of arrays, which the functions below turn into views. A record is
+handed over as one address; a tuple would be forty numbers in every call, and counted arrays cost more than a step.
+"""
+
+
+def context_of(**values: float) -> np.void:
+    """A context with these values, which are all that it has.
+
+    Raises:
+        KeyError: If one is missing.
+    """
+    return np.array([tuple(values[name] for name in _FIELDS)], _layout)[0]
+
+
+@intrinsic
+def place_of(typing_context: Any, context: Any) -> Any:
+    """The address of a context: a parallel loop takes no records."""
+
+    def codegen(_: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return builder.ptrtoint(given[0], ir.IntType(64))
+
+    return i64(context_type), codegen
+
+
+@intrinsic
+def context_at(typing_context: Any, place: Any) -> Any:
+    """The context at an address."""
+
+    def codegen(lowering: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return builder.inttoptr(given[0], lowering.get_value_type(context_type))
+
+    return context_type(i64), codegen
+
+
+def with_parameters(context: np.void, p: np.ndarray) -> np.void:
+    """The same context with other parameters p, an array that must outlive it."""
+    changed = np.array([context], _layout)
+    changed["p"], changed["n_parameters"] = p.ctypes.data, p.size
+    return changed[0]
+
+
+@jit
+def parameters(context):
+    """The model's parameters p."""
+    return floats(context.p, context.n_parameters)
+
+
+@jit
+def process_variances(context):
+    """q (nw,): the variance that each process noise adds in a second."""
+    return floats(context.q, context.n_noises)
+
+
+@jit
+def sensor_rows(context, sensor):
+    """A sensor's first row among all rows, and how many it has."""
+    return ints(context.row_start, context.n_sensors)[sensor], ints(context.row_count, context.n_sensors)[sensor]
+
+
+@jit
+def sensor_variances(context, sensor):
+    """r (ny,): the variances of one sensor's rows."""
+    first, count = sensor_rows(context, sensor)
+    return floats(context.r, context.n_rows)[first : first + count]
+
+
+@jit
+def circular_states(context):
+    """For each state, whether it is an angle (int8)."""
+    return flags(context.circular_x, context.nx)
+
+
+@jit
+def circular_rows(context, sensor):
+    """For each row of a sensor, whether it is an angle (int8)."""
+    first, count = sensor_rows(context, sensor)
+    return flags(context.circular_y, context.n_rows)[first : first + count]
+
+
+@jit
+def options(context):
+    """The numbers that the estimator's `tune` made of its options."""
+    return floats(context.options, context.n_options)
+
+
+@jit
+def transition(context, x, u, dt, out):
+    """out = f(x, u, p, dt)."""
+    call_f_rows(context.f, x.ctypes.data, 0, 1, u.ctypes.data, context.p, dt, out.ctypes.data, 0)
+
+
+@jit
+def transition_rows(context, X, stride, n, u, dt, out):
+    """f of n states that begin at the address X, `stride` numbers apart, into rows of `out` (n or more, nx or more)."""
+    call_f_rows(context.f, X, stride, n, u.ctypes.data, context.p, dt, out.ctypes.data, out.shape[1])
+
+
+@jit
+def expect(context, sensor, x, u, out):
+    """out = h(x, u, p) of one sensor."""
+    h = ints(context.h, context.n_sensors)[sensor]
+    call_h_rows(h, x.ctypes.data, 0, 1, u.ctypes.data, context.p, out.ctypes.data, 0)
+
+
+@jit
+def expect_rows(context, sensor, X, stride, n, u, out):
+    """h of one sensor at n states that begin at the address X, `stride` numbers apart, into rows of `out`."""
+    h = ints(context.h, context.n_sensors)[sensor]
+    call_h_rows(h, X, stride, n, u.ctypes.data, context.p, out.ctypes.data, out.shape[1])
+
+
+@inlined
+def add_process_noise(context, x, u, dt, P, scratch):
+    """Add Q(x, u, p, q, dt) to P (nx, nx), or q·dt on the diagonal where the model gives no Q."""
+    if context.Q == 0:
+        first = ints(context.noise_state, context.n_noises)
+        count = ints(context.noise_states, context.n_noises)
+        q = process_variances(context)
+        for k in range(q.size):
+            for j in range(first[k], first[k] + count[k]):
+                P[j, j] += q[k] * dt
+    else:
+        add_given_noise(context, x, u, dt, P, scratch)
+
+
+@jit
+def add_given_noise(context, x, u, dt, P, scratch):
+    """Add the model's own Q(x, u, p, q, dt) to P."""
+    n = context.nx
+    for i in range(n):
+        for j in range(n):
+            scratch[i, j] = 0.0
+    call_Q(context.Q, x, u, parameters(context), process_variances(context), dt, scratch)
+    for i in range(n):
+        for j in range(n):
+            P[i, j] += scratch[i, j]
+
+
+@jit
+def prior(context):
+    """Mean (nx,) and covariance of the prior, (nx, nx), or (1, nx) where it is diagonal."""
+    n = context.nx
+    rows = context.prior_rows
+    return floats(context.prior_mean, n), matrix(floats(context.prior_cov, rows * n), 0, rows, n)
+
+
+@jit
+def linear_states(context):
+    """The indices of the states in which the model is linear, given the others."""
+    return ints(context.linear_states, context.n_linear)
+
+
+@jit
+def sampled_states(context):
+    """The indices of all the other states but the mode, if there is one (`context.mode`, or -1)."""
+    return ints(context.sampled_states, context.n_sampled)
+
+
+@jit
+def jump_chances(context, x, u, dt, out):
+    """out = the probability of each next mode (n_modes,), `dt` seconds on."""
+    call_jump(context.jump, x, u, parameters(context), dt, out)
+
+
+@jit
+def shown_states(context):
+    """The index of the state in each of the track's columns."""
+    return ints(context.shown, context.n_shown)
+
+
+@jit
+def shaped(context, z, out):
+    """out = L z: white noise z (nx,) correlated in space as the model says."""
+    call_shape(context.shape, z, parameters(context), out)
+
+
+@jit
+def has_own_likelihood(context, sensor):
+    """Whether the sensor's noise is given by a function of its own instead of r."""
+    return ints(context.log_likelihood, context.n_sensors)[sensor] != 0
+
+
+@jit
+def own_likelihood(context, sensor, y, x, u):
+    """log p(y | x) of a sensor that gives it."""
+    target = ints(context.log_likelihood, context.n_sensors)[sensor]
+    return call_log_likelihood(target, y, x, u, parameters(context), sensor_variances(context, sensor))

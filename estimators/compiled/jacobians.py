@@ -1,0 +1,131 @@
+"""Derivatives of a model's f and h: its own, by complex step, or by central differences.
+
+Complex step: df/dx_j = Im f(x + i·e·e_j) / e, exact to rounding for an analytic f, since nothing is subtracted.
+Source: Squire & Trapp (1998), doi:10.1137/S003614459631241X.
+"""
+
+from __future__ import annotations
+
+from ..numerics.jit import complexes, ints, jit
+from ..numerics.linalg import wrap
+from .context import (
+    call_F,
+    call_f_complex,
+    call_H,
+    call_h_complex,
+    circular_rows,
+    circular_states,
+    expect,
+    parameters,
+    transition,
+)
+
+ANALYTIC, COMPLEX_STEP, CENTRAL = range(3)
+"""How a Jacobian is found: the model's own function, complex step, central differences."""
+
+
+def scratch_size(nx: int, ny: int) -> int:
+    """Numbers that a Jacobian takes to work in: two complex vectors, or three real ones."""
+    return 2 * nx + 2 * max(nx, ny)
+
+
+_COMPLEX_STEP = 1e-20
+_CENTRAL_STEP = 6e-6  # about the cube root of the rounding error, where truncation and rounding balance
+
+
+@jit
+def complex_step_f(target, x, u, p, dt, J, scratch):
+    """Fill J (nx, nx) with df/dx of the complex function at address `target`."""
+    n = x.size
+    z = complexes(scratch, 0, n)
+    out = complexes(scratch, 2 * n, n)
+    for i in range(n):
+        z[i] = x[i]
+    for j in range(n):
+        z[j] = complex(x[j], _COMPLEX_STEP)
+        call_f_complex(target, z, u, p, dt, out)
+        z[j] = x[j]
+        for i in range(n):
+            J[i, j] = out[i].imag / _COMPLEX_STEP
+
+
+@jit
+def complex_step_h(target, x, u, p, J, scratch):
+    """Fill J (ny, nx) with dh/dx of the complex function at address `target`."""
+    n = x.size
+    m = J.shape[0]
+    z = complexes(scratch, 0, n)
+    out = complexes(scratch, 2 * n, m)
+    for i in range(n):
+        z[i] = x[i]
+    for j in range(n):
+        z[j] = complex(x[j], _COMPLEX_STEP)
+        call_h_complex(target, z, u, p, out)
+        z[j] = x[j]
+        for i in range(m):
+            J[i, j] = out[i].imag / _COMPLEX_STEP
+
+
+@jit
+def state_jacobian(context, x, u, dt, F, scratch):
+    """Fill F (nx, nx) with df/dx at x; `scratch` has `scratch_size` numbers."""
+    if context.F_mode == ANALYTIC:
+        call_F(context.F, x, u, parameters(context), dt, F)
+    elif context.F_mode == COMPLEX_STEP:
+        complex_step_f(context.f_complex, x, u, parameters(context), dt, F, scratch)
+    else:
+        n = x.size
+        z = scratch[:n]
+        high = scratch[n : 2 * n]
+        low = scratch[2 * n : 3 * n]
+        circular = circular_states(context)
+        for i in range(n):
+            z[i] = x[i]
+        for j in range(n):
+            step = _CENTRAL_STEP * max(1.0, abs(x[j]))
+            z[j] = x[j] + step
+            above = z[j]
+            transition(context, z, u, dt, high)
+            z[j] = x[j] - step
+            below = z[j]
+            transition(context, z, u, dt, low)
+            z[j] = x[j]
+            for i in range(n):
+                difference = high[i] - low[i]
+                # An angle may jump by 2π between the two: a model that wraps, atan2 on its cut.
+                if circular[i] != 0:
+                    difference = wrap(difference)
+                F[i, j] = difference / (above - below)
+
+
+@jit
+def sensor_jacobian(context, sensor, x, u, H, scratch):
+    """Fill H (ny, nx) with dh/dx of one sensor at x; `scratch` has `scratch_size` numbers."""
+    mode = ints(context.H_mode, context.n_sensors)[sensor]
+    if mode == ANALYTIC:
+        call_H(ints(context.H, context.n_sensors)[sensor], x, u, parameters(context), H)
+    elif mode == COMPLEX_STEP:
+        target = ints(context.h_complex, context.n_sensors)[sensor]
+        complex_step_h(target, x, u, parameters(context), H, scratch)
+    else:
+        m, n = H.shape
+        z = scratch[:n]
+        high = scratch[n : n + m]
+        low = scratch[n + m : n + 2 * m]
+        circular = circular_rows(context, sensor)
+        for i in range(n):
+            z[i] = x[i]
+        for j in range(n):
+            step = _CENTRAL_STEP * max(1.0, abs(x[j]))
+            z[j] = x[j] + step
+            above = z[j]
+            expect(context, sensor, z, u, high)
+            z[j] = x[j] - step
+            below = z[j]
+            expect(context, sensor, z, u, low)
+            z[j] = x[j]
+            for i in range(m):
+                difference = high[i] - low[i]
+                if circular[i] != 0:
+                    difference = wrap(difference)
+                H[i, j] = difference / (above - below)

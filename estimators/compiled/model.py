@@ -1,0 +1,318 @@
+"""A model as machine code, and the context in which a filter sees it.
+
+`compile_model` turns the plain functions of a `StateSpaceModel` into addresses, and checks on the way that they agree
+with the declaration: shapes, finiteness at the prior, and derivatives.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from typing import Any
+
+import numba
+import numpy as np
+
+from ..errors import ModelError
+from ..model.check import plain, probe, probe_angles, probe_likelihoods, uncompilable
+from ..model.jump import check_parts
+from ..model.state_space import LARGE, Field, StateSpaceModel
+from ..numerics.jit import address, jit
+from .black_box import ANSWER, BlackBox, answered_f, answered_h
+from .context import (
+    F_signature,
+    H_signature,
+    Q_signature,
+    f_complex_signature,
+    f_signature,
+    h_complex_signature,
+    h_signature,
+    log_likelihood_signature,
+    shape_signature,
+)
+from .jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step_f, complex_step_h, scratch_size
+from .row_loops import f_rows_signature, h_rows_signature, looped_f, looped_h
+
+
+@dataclass(frozen=True)
+class CompiledModel:
+    """A model whose functions are machine code; `f`, `h[k]` and `Q` can be called from Python too.
+
+    A field too large for a matrix Q, or with a shape, has draw(z, p, q, dt) instead, which turns white z (nx,) into
+    noise of the process.
+    """
+
+    model: StateSpaceModel
+    f: Callable
+    h: tuple[Callable, ...]
+    Q: Callable
+    static: dict[str, Any] = field(repr=False)
+    keep_alive: tuple[Any, ...] = field(repr=False)
+    draw: Callable | None = None
+    box: BlackBox | None = None
+
+    def f_block(self, X: np.ndarray, u: np.ndarray, p: np.ndarray, dt: float) -> np.ndarray:
+        """f of every state of a block X (N, nx)."""
+        if self.box is not None:
+            return self.box.f(X, u, p, dt)
+        out = np.empty(X.shape)
+        for x, row in zip(np.ascontiguousarray(X), out, strict=True):
+            self.f(x, u, p, dt, row)
+        return out
+
+    def h_block(self, sensor: int, X: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """h (N, ny) of one sensor at every state of a block X (N, nx)."""
+        if self.box is not None:
+            return self.box.h(sensor, X, u, p)
+        out = np.empty((len(X), len(self.model.sensors[sensor].rows)))
+        for x, row in zip(np.ascontiguousarray(X), out, strict=True):
+            self.h[sensor](x, u, p, row)
+        return out
+
+
+def compile_model(model: StateSpaceModel) -> CompiledModel:
+    """Compile a model and check its functions against its declaration.
+
+    Raises:
+        ModelError: If a function cannot be compiled, fills the wrong shape, gives a value that is not finite at the
+            prior, or an analytic Jacobian disagrees with differences.
+    """
+    return _compile(model)
+
+
+@lru_cache(maxsize=32)
+def _compile(model: StateSpaceModel) -> CompiledModel:
+    kept: list[Any] = []
+
+    def code(function: Callable | None, signature: Any, what: str) -> int:
+        if function is None:
+            return 0
+        try:
+            dispatcher = jit(getattr(function, "py_func", function))
+            kept.append(dispatcher)
+            return address(dispatcher, signature)
+        except numba.core.errors.NumbaError as error:
+            raise uncompilable(model, what, function, error) from None
+
+    def rows_code(dispatcher: Any, signature: Any) -> int:
+        kept.append(dispatcher)
+        return address(dispatcher, signature)
+
+    def complex_code(function: Callable, signature: Any) -> int:
+        """The same function over complex numbers, or 0 where it is not analytic (comparisons, abs, atan2)."""
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                dispatcher = jit(getattr(function, "py_func", function))
+                kept.append(dispatcher)
+                return address(dispatcher, signature)
+        except Exception as error:  # noqa: BLE001  Numba raises many kinds; each means the same here
+            del error
+            return 0
+
+    probe(model)
+    probe_likelihoods(model)
+    box = BlackBox(model) if model.black_box else None
+    if box is not None:
+        box.probe()
+    sizes = (model.nx, model.nu, len(model.parameters) + (ANSWER if box else 0))
+    code(answered_f if box else model.f, f_signature, "f")
+    f = rows_code(looped_f(kept[-1], *sizes), f_rows_signature)
+    f_dispatcher = box.f_of_one if box else kept[-2]
+    F = code(model.F, F_signature, "F")
+    diagonal = model.shape is not None or model.nx > LARGE
+    model_Q = _each_cell if isinstance(model.states, Field) and not model.Q and not diagonal else model.Q
+    Q = code(model_Q, Q_signature, "Q")
+    Q_dispatcher = kept[-1] if model_Q else None
+    shape = code(model.shape, shape_signature, "shape")
+    shape_dispatcher = kept[-1] if model.shape else None
+    h, H, h_dispatchers, likelihoods = [], [], [], []
+    for k, sensor in enumerate(model.sensors):
+        code(answered_h if box else sensor.h, h_signature, f"h of sensor {sensor.name}")
+        h_dispatchers.append(partial(box.h_of_one, k) if box else kept[-1])
+        h.append(rows_code(looped_h(kept[-1], *sizes, len(sensor.rows)), h_rows_signature))
+        H.append(code(sensor.H, H_signature, f"H of sensor {sensor.name}"))
+        what = f"log_likelihood of sensor {sensor.name}"
+        likelihoods.append(code(sensor.log_likelihood, log_likelihood_signature, what))
+    derivable = model.nx <= LARGE and box is None
+    f_complex = 0 if model.F or not derivable else complex_code(model.f, f_complex_signature)
+    h_complex = [
+        0 if sensor.H or not derivable else complex_code(sensor.h, h_complex_signature) for sensor in model.sensors
+    ]
+
+    acts_on = [model.acts_on(noise.name) for noise in model.noises] if model.Q is None else []
+
+    def q_function(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
+        if Q_dispatcher is not None:
+            Q_dispatcher(x, u, p, q, dt, out)
+            return
+        for k, states in enumerate(acts_on):
+            for j in states:
+                out[j, j] += q[k] * dt
+
+    def draw(z, p, q, dt):  # noqa: ANN001, ANN202
+        w = z
+        if shape_dispatcher is not None:
+            w = np.empty_like(z)
+            shape_dispatcher(z, p, w)
+        return sum(np.sqrt(q[k] * dt) * _within(states, w) for k, states in enumerate(acts_on))
+
+    compiled = CompiledModel(
+        model=model,
+        f=f_dispatcher,
+        h=tuple(h_dispatchers),
+        Q=q_function,
+        keep_alive=tuple(kept),
+        draw=draw if diagonal else None,
+        box=box,
+        static={
+            "f": f,
+            "f_complex": f_complex,
+            "F": F,
+            "F_mode": ANALYTIC if F else COMPLEX_STEP if f_complex else CENTRAL,
+            "Q": Q,
+            "shape": shape,
+            "each_state": int(model.Q is None),
+            "Q_varies": int(_varies(model)),
+            "h": np.array(h, np.int64),
+            "h_complex": np.array(h_complex, np.int64),
+            "H": np.array(H, np.int64),
+            "H_mode": np.array(
+                [ANALYTIC if a else COMPLEX_STEP if c else CENTRAL for a, c in zip(H, h_complex, strict=True)], np.int64
+            ),
+            "log_likelihood": np.array(likelihoods, np.int64),
+            "row_start": np.array(model.row_start, np.int64),
+            "row_count": np.array([len(sensor.rows) for sensor in model.sensors], np.int64),
+            "circular_x": model.circular,
+            "circular_y": np.array([row.circular for sensor in model.sensors for row in sensor.rows], np.int8),
+            "max_step": float(model.max_step),
+            "noise_state": np.array([states.start for states in acts_on], np.int64),
+            "noise_states": np.array([len(states) for states in acts_on], np.int64),
+            "prior_mean": model.prior_mean,
+            "prior_cov": model.prior_std[None] ** 2 if diagonal else np.diag(model.prior_std**2),
+            "linear_states": model.linear_states,
+            "n_linear": len(model.linear_states),
+            "sampled_states": _sampled(model),
+            "n_sampled": _sampled(model).size,
+            "jump": code(model.jump.chances, f_signature, "jump.chances") if model.jump else 0,
+            "mode": model.mode,
+            "n_modes": len(model.jump.modes) if model.jump else 0,
+            "prior_rows": 1 if diagonal else model.nx,
+            "shown": model.shown,
+        },
+    )
+    probe_angles(model, compiled.h)
+    if derivable:
+        _check_derivatives(compiled)
+    check_parts(model)
+    return compiled
+
+
+def _sampled(model: StateSpaceModel) -> np.ndarray:
+    """Indices of the states that are neither conditionally linear nor the mode; of a field nobody asks."""
+    if isinstance(model.states, Field):
+        return np.zeros(0, np.int64)
+    return np.array([j for j in range(model.nx) if j != model.mode and j not in model.linear_states], np.int64)
+
+
+def _within(states: range, w: np.ndarray) -> np.ndarray:
+    """The entries of w (nx,) that a range of states has, and zero elsewhere."""
+    out = np.zeros_like(w)
+    out[states.start : states.stop] = w[states.start : states.stop]
+    return out
+
+
+def _each_cell(x, u, p, q, dt, out):
+    """Q of a field whose noise has its name: the same for every cell."""
+    for j in range(x.size):
+        out[j, j] = q[0] * dt
+
+
+def _varies(model: StateSpaceModel) -> bool:
+    """Whether Q depends on the state, judged by its values at the prior and at 32 states spread around it."""
+    if model.Q is None:
+        return False
+    rng = np.random.default_rng(0)
+    u = np.array([item.default for item in model.inputs], float)
+    p = np.array([item.value for item in model.parameters], float)
+    q = np.array([max(noise.variance, 1e-12) for noise in model.noises], float)
+    mean = np.array([state.mean for state in model.states], float)
+    std = np.array([state.std for state in model.states], float)
+    found = []
+    with np.errstate(all="ignore"):
+        for spread in [0.0] + [1.0, 5.0] * 16:
+            out = np.zeros((model.nx, model.nx))
+            x = mean + spread * std * rng.standard_normal(model.nx)
+            plain(model.Q)(x, u, p, q, min(1.0, model.max_step), out)
+            found.append(out)
+    return any(not np.array_equal(found[0], other, equal_nan=True) for other in found[1:])
+
+
+def _check_derivatives(compiled: CompiledModel) -> None:
+    """Compare every analytic or complex-step Jacobian with central differences; demote or refuse what disagrees."""
+    model, static = compiled.model, compiled.static
+    rng = np.random.default_rng(0)
+    u = np.array([item.default for item in model.inputs], float)
+    p = np.array([item.value for item in model.parameters], float)
+    std = model.prior_std
+    dt = min(0.1, model.max_step)
+    scratch = np.empty(scratch_size(model.nx, model.width))
+
+    def differences(function: Callable, x: np.ndarray, rows: int) -> np.ndarray:
+        J = np.empty((rows, x.size))
+        for j in range(x.size):
+            step = 1e-5 * max(abs(x[j]), std[j], 1e-3)
+            high, low = x.copy(), x.copy()
+            high[j] += step
+            low[j] -= step
+            a, b = np.empty(rows), np.empty(rows)
+            function(high, a)
+            function(low, b)
+            J[:, j] = (a - b) / (high[j] - low[j])
+        return J
+
+    points = [static["prior_mean"] + 0.3 * std * rng.standard_normal(model.nx) for _ in range(3)]
+
+    def disagree(jacobian: Callable, function: Callable, rows: int) -> float:
+        """Largest difference relative to the size of the Jacobian, over the points where all is finite."""
+        worst = 0.0
+        for x in points:
+            J = np.zeros((rows, model.nx))
+            jacobian(x, J)
+            D = differences(function, x, rows)
+            if np.all(np.isfinite(D)):
+                error = np.max(np.abs(J - D)) / max(1e-9, np.max(np.abs(D)))
+                worst = max(worst, error if np.isfinite(error) else np.inf)
+        return worst
+
+    def f(x, out):  # noqa: ANN001, ANN202
+        compiled.f(x, u, p, dt, out)
+
+    tolerance = 1e-4  # central differences with a step of 1e-5 are good to about 1e-8; a wrong formula is off by more
+    if static["F_mode"] == ANALYTIC:
+        error = disagree(lambda x, J: plain(model.F)(x, u, p, dt, J), f, model.nx)
+        if error > tolerance:
+            raise ModelError(f"model {model.name}: F differs from central differences of f by {error:.2g} (relative)")
+    elif static["F_mode"] == COMPLEX_STEP:
+        if disagree(lambda x, J: complex_step_f(static["f_complex"], x, u, p, dt, J, scratch), f, model.nx) > tolerance:
+            static["F_mode"] = CENTRAL
+    for k, sensor in enumerate(model.sensors):
+
+        def h(x, out, k=k):  # noqa: ANN001, ANN202
+            compiled.h[k](x, u, p, out)
+
+        rows = len(sensor.rows)
+        mode = static["H_mode"][k]
+        if mode == ANALYTIC:
+            error = disagree(lambda x, J, s=sensor: plain(s.H)(x, u, p, J), h, rows)
+            if error > tolerance:
+                raise ModelError(
+                    f"model {model.name}: H of sensor {sensor.name} differs from central differences of h "
+                    f"by {error:.2g} (relative)"
+                )
+        elif mode == COMPLEX_STEP:
+            target = int(static["h_complex"][k])
+            if disagree(lambda x, J, a=target: complex_step_h(a, x, u, p, J, scratch), h, rows) > tolerance:
+                static["H_mode"][k] = CENTRAL

@@ -1,0 +1,132 @@
+"""Why a reading failed: the model's functions tried again, one by one, from the last estimate that was a number.
+
+A filter that finds no covariance, or no number, cannot say which function of the model gave it. This is found out
+afterwards, outside the fold: the path of the estimate to the failure is walked as the filter predicts, from the
+estimate and from places around it, where sigma points and particles are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from ..compiled.model import CompiledModel
+from ..errors import ModelError
+from ..model.check import indefinite, numbers, place
+from ..model.state_space import SHOWN
+from ..track import FAILED, GATED, Track
+
+AWAY = (1.0, -1.0, 3.0, -3.0)
+"""Standard deviations from the estimate, a state at a time; the sigma points of nx states lie at about √nx."""
+
+STEPS = 100
+"""Of a prediction that are walked; in more, as many longer ones."""
+
+
+class Estimate(NamedTuple):
+    """Mean and standard deviation, (nx,) each."""
+
+    mean: np.ndarray
+    std: np.ndarray
+
+
+def failures(track: Track, first: int = 0) -> np.ndarray:
+    """Rows from `first` on whose reading failed (or was refused without a NIS), or whose estimate is no number."""
+    rows = track.select(slice(first, len(track)))
+    known = np.all(np.isfinite(rows.mean), axis=1) & np.all(np.isfinite(rows.std), axis=1)
+    failed = (rows.verdict == FAILED) | (rows.verdict == GATED) & ~np.isfinite(rows.nis)
+    return first + np.flatnonzero(~known | failed)
+
+
+def cause(
+    compiled: CompiledModel,
+    before: Estimate,
+    u: np.ndarray,
+    p: np.ndarray,
+    q: np.ndarray,
+    dt: float,
+    sensor: int | None,
+    predicted: Estimate | None,
+) -> str | None:
+    """What of the model is no number, or no covariance, between an estimate and a reading dt seconds later.
+
+    Args:
+        compiled: The model.
+        before: The estimate before.
+        u: Inputs, (nu,).
+        p: Parameters.
+        q: Noise variances.
+        dt: Seconds to the reading; 0 if nothing is predicted.
+        sensor: Which one's reading failed; None if the estimate did without one.
+        predicted: The estimate that the reading met, if it is a number.
+
+    Returns:
+        One line that names the function, the place and the remedy; None if all of them are in order, or a black box
+        fails altogether.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            met = _walk(compiled, before.mean, u, p, q, dt)
+            if isinstance(met, str):
+                return met
+            if sensor is not None:
+                met = met if predicted is None else predicted.mean
+                asked = (_ask(compiled, sensor, x, u, p) for x in (met, *_around(compiled, predicted or before)))
+                found = next((line for line in asked if line is not None), None)
+                if found is not None:
+                    return found
+            walked = (_walk(compiled, x, u, p, q, dt) for x in _around(compiled, before))
+            return next((line for line in walked if isinstance(line, str)), None)
+    except ModelError:
+        return None
+
+
+def _around(compiled: CompiledModel, estimate: Estimate) -> Iterator[np.ndarray]:
+    """States around an estimate, where asking there is cheap."""
+    if estimate.mean.size <= SHOWN and compiled.box is None:
+        for away in AWAY:
+            for j in np.flatnonzero(estimate.std > 0.0):
+                x = estimate.mean.copy()
+                x[j] += away * estimate.std[j]
+                yield x
+
+
+def _walk(
+    compiled: CompiledModel, x: np.ndarray, u: np.ndarray, p: np.ndarray, q: np.ndarray, dt: float
+) -> str | np.ndarray:
+    """Where the prediction from a state ends, or the first function that is not in order on the way."""
+    model = compiled.model
+    steps = max(1, min(STEPS, int(np.ceil(dt / model.max_step)))) if dt > 0.0 else 0
+    for _ in range(steps):
+        step = dt / steps
+        at = f"x = {numbers(x)}, u = {numbers(u)}, dt = {step:.4g} s"
+        if model.Q is not None:
+            Q = np.zeros((x.size, x.size))
+            compiled.Q(x, u, p, q, step, Q)
+            wrong = indefinite(Q) if np.all(np.isfinite(Q)) else "is not finite"
+            if wrong:
+                return _line(compiled, "Q(x, u, dt)", model.Q, wrong, at, "a covariance for every state")
+        there = np.full(x.size, np.nan)
+        compiled.f(x, u, p, step, there)
+        if not np.all(np.isfinite(there)):
+            return _line(compiled, "f(x, u, dt)", model.f, f"is {numbers(there)}", at, "finite for every state")
+        x = there
+    return x
+
+
+def _ask(compiled: CompiledModel, sensor: int, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> str | None:
+    """What is wrong with h of a sensor at a state."""
+    given = compiled.model.sensors[sensor]
+    y = np.full(len(given.rows), np.nan)
+    compiled.h[sensor](x, u, p, y)
+    if np.all(np.isfinite(y)):
+        return None
+    at = f"x = {numbers(x)}, u = {numbers(u)}"
+    return _line(compiled, f"h(x, u) of sensor {given.name}", given.h, f"is {numbers(y)}", at, "finite for every state")
+
+
+def _line(compiled: CompiledModel, what: str, function: Callable, wrong: str, at: str, rule: str) -> str:
+    name = compiled.model.name
+    return f"{place(function)}model {name}: {what} {wrong} at {at}, where the estimate got; it must be {rule}"

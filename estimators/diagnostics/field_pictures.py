@@ -1,0 +1,178 @@
+"""Pictures of a large field, taken while it is folded: its mean, its spread, and the truth where it was told.
+
+A track keeps a few cells at every event; a picture is all cells at a few times. One is taken when a period of the
+log's time is over, and whenever most of the field's true values were told: that is also when the estimate is scored
+over all cells. Both follow from the log alone, so a refold takes the same pictures.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..log import TRUTH, Log
+from ..model.field import Field
+from ..numerics.quantiles import normal_quantile
+
+SIDE = 200
+"""Cells of a picture along an axis at most; a larger field is averaged over squares."""
+
+MEMORY = 64 * 2**20
+"""Bytes that the pictures of a fold may take; then every second of the older ones keeps its numbers only."""
+
+
+class Picture(NamedTuple):
+    """A field before event `before` of the log, at the time `t` of the event before that.
+
+    Where most of the truth was told, `cells` is how many true values were, else 0; of their errors `rmse` is the root
+    mean square and `inside` the share inside the 95 % band (NaN without truth). `spread` is the root mean variance,
+    over the same cells, or all. `mean`, `std` and `truth` (rows, columns) are float32, NaN where unknown; None where
+    they were not kept or told.
+    """
+
+    before: int
+    t: int
+    cells: int
+    rmse: float
+    inside: float
+    spread: float
+    mean: np.ndarray | None
+    std: np.ndarray | None
+    truth: np.ndarray | None
+
+
+class Pictures:
+    """The pictures of one fold, in the order of events."""
+
+    def __init__(self, field: Field, period: float | None) -> None:
+        """Begin without any.
+
+        Args:
+            field: What they show.
+            period: Seconds between two; None for those at which most of the truth is told only.
+        """
+        self.field = field
+        self.period = None if period is None else max(1, round(period * 1e9))
+        self.taken: list[Picture] = []
+        rows, columns = plane_shape(field.shape)
+        self._most = max(2, MEMORY // (12 * rows * columns))
+        self._half = normal_quantile(0.975)
+
+    def due(self, log: Log, n: int) -> bool:
+        """Whether one is to be taken before the log's event `n`: a time ends there, and a period or a telling."""
+        if not 0 < n < log.n or log.t[n] == log.t[n - 1]:
+            return False
+        if self.period is not None and log.t[n] // self.period != log.t[n - 1] // self.period:
+            return True
+        return bool(log.kind[n - 1] == TRUTH) and self._most_of(self._told(log, n))
+
+    def next(self, log: Log, n: int, end: int) -> int:
+        """The first event after `n` before which one is due; `end` if there is none."""
+        t, kind = log.t[n:end], log.kind[n:end]
+        new = t[1:] != t[:-1]
+        likely = new & (kind[:-1] == TRUTH)
+        if self.period is not None:
+            likely |= new & (t[1:] // self.period != t[:-1] // self.period)
+        for k in np.flatnonzero(likely):
+            if self.due(log, n + int(k) + 1):
+                return n + int(k) + 1
+        return end
+
+    def check(self, log: Log, n: int) -> bool:
+        """Whether one is to be taken now, before event `n`; one that should not be there is dropped."""
+        there = bool(self.taken) and self.taken[-1].before == log.first + n
+        wanted = self.due(log, n)
+        if there and not wanted:
+            self.taken.pop()
+        return wanted and not there
+
+    def take(self, log: Log, n: int, mean: np.ndarray, variances: np.ndarray) -> None:
+        """Take one before event `n`.
+
+        Args:
+            log: The log.
+            n: Events that went into it.
+            mean: Of every cell (nx,).
+            variances: Likewise (nx,).
+        """
+        truth = self._told(log, n)
+        known = np.isfinite(truth)
+        cells = int(known.sum()) if self._most_of(truth) else 0
+        rmse, inside, spread = np.nan, np.nan, float(np.sqrt(variances.mean()))
+        if cells:
+            error, variance = (mean - truth)[known], variances[known]
+            rmse, spread = float(np.sqrt(np.mean(error**2))), float(np.sqrt(variance.mean()))
+            inside = float(np.mean(np.abs(error) <= self._half * np.sqrt(variance)))
+        shape = self.field.shape
+        self.taken.append(
+            Picture(
+                log.first + n,
+                int(log.t[n - 1]),
+                cells,
+                rmse,
+                inside,
+                spread,
+                plane(mean, shape),
+                np.sqrt(plane(variances, shape)),
+                plane(truth, shape) if cells else None,
+            )
+        )
+        kept = [k for k, picture in enumerate(self.taken) if picture.mean is not None]
+        if len(kept) > self._most:
+            for k in kept[1 : len(kept) // 2 : 2]:
+                self.taken[k] = self.taken[k]._replace(mean=None, std=None, truth=None)
+
+    def cut(self, index: int) -> None:
+        """Forget those after the absolute index `index`: what went into them will be folded again."""
+        while self.taken and self.taken[-1].before > index:
+            self.taken.pop()
+
+    def drop_front(self, first: int) -> None:
+        """Forget those before the absolute index `first`."""
+        self.taken = [picture for picture in self.taken if picture.before >= first]
+
+    def _most_of(self, truth: np.ndarray) -> bool:
+        return 2 * int(np.isfinite(truth).sum()) > truth.size
+
+    def _told(self, log: Log, n: int) -> np.ndarray:
+        """The true values that were told at the time of event n - 1, (nx,), NaN where none was."""
+        truth = np.full(len(self.field), np.nan)
+        at = log.t[n - 1]
+        for k in range(int(np.searchsorted(log.t[:n], at)), n):
+            if log.kind[k] == TRUTH:
+                first = int(log.channel[k])
+                values = log.value[k, : truth.size - first]
+                part = truth[first : first + values.size]
+                part[np.isfinite(values)] = values[np.isfinite(values)]
+        return truth
+
+
+def layer(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Rows and columns of what is drawn of a field: of one axis a strip, of more than two the middle of the first."""
+    return (1, shape[0]) if len(shape) == 1 else (shape[-2], shape[-1])
+
+
+def reduction(shape: tuple[int, ...]) -> int:
+    """Cells along each side of the squares over which a picture averages."""
+    return max(1, -(-max(layer(shape)) // SIDE))
+
+
+def plane_shape(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Rows and columns of a picture."""
+    side = reduction(shape)
+    rows, columns = layer(shape)
+    return -(-rows // side), -(-columns // side)
+
+
+def plane(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Values (nx,) of a field as a picture (rows, columns), float32; a square with an unknown cell is unknown."""
+    middle = values.reshape(-1, *layer(shape))
+    image = middle[middle.shape[0] // 2]
+    side = reduction(shape)
+    if side > 1:
+        starts = [np.arange(0, n, side) for n in image.shape]
+        counts = [np.diff(np.append(start, n)) for start, n in zip(starts, image.shape, strict=True)]
+        sums = np.add.reduceat(np.add.reduceat(image, starts[0], axis=0), starts[1], axis=1)
+        image = sums / np.outer(*counts)
+    return image.astype(np.float32)

@@ -1,0 +1,105 @@
+"""What a fold was worth: NIS in its bounds, errors where the truth is known, predictions of sensors held out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..log import READING, Readings, truth_of
+from ..model.state_space import StateSpaceModel
+from ..numerics.quantiles import normal_quantile
+from ..track import GATED, HELD_OUT, MISSING, USED, VERDICT_NAMES, Track
+from .field_pictures import Picture
+from .health import PROBABILITY, nis_bounds
+
+
+class Fit(NamedTuple):
+    """How well something was predicted: RMSE in its unit, and the share of errors inside their 95 % band."""
+
+    rmse: float
+    coverage: float
+
+
+class Score(NamedTuple):
+    """Mean NIS of the used readings with its 95 % bounds, their log-likelihood, counts, and fits.
+
+    `states` are fits against the truth, by state; `held_out` fits of the readings of sensors held out, by sensor row.
+    `field` is that of all cells of a large field, over the times at which they were told; None without such.
+    """
+
+    nis: float
+    nis_low: float
+    nis_high: float
+    nis_readings: int
+    log_likelihood: float
+    readings: int
+    gated: int
+    missing: int
+    states: dict[str, Fit]
+    held_out: dict[str, Fit]
+    field: Fit | None = None
+
+
+def score(track: Track, events: Readings, model: StateSpaceModel, pictures: Sequence[Picture] = ()) -> Score:
+    """Sum a track up. Errors are taken at the truth events, whose rows hold the estimate at that time.
+
+    Of a large field the fold's `pictures` are summed up too; the track knows a few cells only.
+    """
+    used = track.verdict == USED
+    dof, count = int(track.dof[used].sum()), int(used.sum())
+    low, high = nis_bounds(dof, count) if count else (np.nan, np.nan)
+    verdicts = np.bincount(track.verdict, minlength=len(VERDICT_NAMES))
+    return Score(
+        nis=float(track.nis[used].mean()) if count else np.nan,
+        nis_low=low,
+        nis_high=high,
+        nis_readings=count,
+        log_likelihood=float(track.log_likelihood[used].sum()),
+        readings=int((events.kind == READING).sum()),
+        gated=int(verdicts[GATED]),
+        missing=int(verdicts[MISSING]),
+        states=_against_truth(track, events, model),
+        held_out=_held_out(track, events, model),
+        field=_over_field(pictures),
+    )
+
+
+def _over_field(pictures: Sequence[Picture]) -> Fit | None:
+    told = [picture for picture in pictures if picture.cells]
+    if not told:
+        return None
+    cells = np.array([picture.cells for picture in told], float)
+    square = np.average([picture.rmse**2 for picture in told], weights=cells)
+    return Fit(float(np.sqrt(square)), float(np.average([picture.inside for picture in told], weights=cells)))
+
+
+def _against_truth(track: Track, events: Readings, model: StateSpaceModel) -> dict[str, Fit]:
+    fits: dict[str, Fit] = {}
+    for k, (j, state) in enumerate(zip(model.shown, model.shown_states, strict=True)):
+        rows, values = truth_of(events, int(j))
+        if rows.size:
+            error = track.mean[rows, k] - values
+            if state.circular:
+                error = (error + np.pi) % (2.0 * np.pi) - np.pi
+            fits[state.name] = _fit(error, track.std[rows, k])
+    return fits
+
+
+def _held_out(track: Track, events: Readings, model: StateSpaceModel) -> dict[str, Fit]:
+    fits: dict[str, Fit] = {}
+    held = track.verdict == HELD_OUT
+    for i, sensor in enumerate(model.sensors):
+        rows = held & (events.channel == i)
+        for k in range(len(sensor.rows)):
+            error, std = track.innovation[rows, k], track.innovation_std[rows, k]
+            finite = np.isfinite(error)
+            if finite.any():
+                fits[model.row_names[model.row_start[i] + k]] = _fit(error[finite], std[finite])
+    return fits
+
+
+def _fit(error: np.ndarray, std: np.ndarray) -> Fit:
+    half = normal_quantile(0.5 + PROBABILITY / 2.0)
+    return Fit(float(np.sqrt(np.mean(error**2))), float(np.mean(np.abs(error) <= half * std)))

@@ -1,0 +1,1 @@
+"""Filters that carry an ensemble and never form a covariance."""

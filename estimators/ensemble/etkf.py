@@ -1,0 +1,237 @@
+"""The ensemble transform Kalman filter: all members are turned at once so that their moments are the posterior's.
+
+In whitened anomalies Z (N, m) of the expected reading and d of the reading itself (see ensemble.py),
+
+    x̄ ← x̄ + Aᵀ w,   w = (I + Z Zᵀ)⁻¹ Z d / √(N - 1);      A ← T A,   T = (I + Z Zᵀ)^(-1/2)
+
+with the symmetric root, which changes the members least and leaves their mean. All of it happens in the space of
+the members; the states follow in one product.
+
+Sources: Bishop, Etherton & Majumdar (2001), doi:10.1175/1520-0493(2001)129<0420:ASWTET>2.0.CO;2; Hunt, Kostelich &
+Szunyogh (2007), doi:10.1016/j.physd.2006.11.008; Sakov & Oke (2008), doi:10.1175/2007MWR2021.1 (symmetric root and
+rotations that keep the mean).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..compiled.context import options as numbers
+from ..compiled.context import sensor_rows
+from ..estimator import Estimator, Option
+from ..numerics.jit import jit
+from ..numerics.random import key_of, normal
+from ..numerics.simd import add_scaled
+from ..numerics.symmetric import gram, symmetric_eigen
+from ..track import FAILED, USED
+from .blocks import transform_all
+from .shared import (
+    ADD,
+    CREWS,
+    INFLATE,
+    INFLATION,
+    MEMBERS,
+    OWN,
+    ROTATE,
+    add_spread,
+    block,
+    describe,
+    ensemble,
+    judge,
+    moments,
+    next_draw,
+    observe,
+    points,
+    predict,
+    settle,
+    start,
+    state_size,
+    tune,
+    work_size,
+    workspace,
+)
+
+
+@jit
+def symmetric_transform(m, ZT, Z, d, G, V, values, small, v, B, T):
+    """T = (I + Z Zᵀ)^(-1/2) and √(N - 1) w, from the eigenvectors of Zᵀ Z or Z Zᵀ, whichever is smaller.
+
+    With Zᵀ Z = V Λ Vᵀ,  T = I - Z V φ(Λ) Vᵀ Zᵀ,  φ(λ) = (1 - 1/√(1+λ))/λ = 1 / (1 + λ + √(1+λ)), which is good at 0.
+
+    Args:
+        m: Rows of the reading.
+        ZT: Whitened anomalies (m, N).
+        Z: Their transpose (N, m).
+        d: Whitened innovation (m,).
+        G: Scratch (side, side), side = min(m, N).
+        V: Scratch (side, side).
+        values: Scratch (side,).
+        small: Scratch (3 side,).
+        v: Gets √(N - 1) w, (N,).
+        B: Scratch (m, at least N).
+        T: Gets T (N, N).
+
+    Returns:
+        False if a number is not finite.
+    """
+    N = ZT.shape[1]
+    for i in range(N):
+        v[i] = 0.0
+        for j in range(N):
+            T[i, j] = 0.0
+    if m < N:
+        gram(Z, N, m, G)
+        if not symmetric_eigen(G, m, values, V, small):
+            return False
+        for i in range(N):
+            T[i, i] = 1.0
+        for k in range(m):
+            b = B[k]
+            for i in range(N):
+                b[i] = 0.0
+            innovation = 0.0
+            for j in range(m):
+                add_scaled(N, V[k, j], ZT[j].ctypes.data, b.ctypes.data)
+                innovation += V[k, j] * d[j]
+            grown = 1.0 + max(values[k], 0.0)
+            add_scaled(N, innovation / grown, b.ctypes.data, v.ctypes.data)
+            phi = 1.0 / (grown + np.sqrt(grown))
+            for i in range(N):
+                add_scaled(N, -phi * b[i], b.ctypes.data, T[i].ctypes.data)
+        return True
+    gram(ZT, m, N, G)
+    if not symmetric_eigen(G, N, values, V, small):
+        return False
+    g = small[:N]
+    for i in range(N):
+        g[i] = 0.0
+    for k in range(m):
+        add_scaled(N, d[k], ZT[k].ctypes.data, g.ctypes.data)
+    for k in range(N):
+        b = V[k]
+        innovation = 0.0
+        for i in range(N):
+            innovation += b[i] * g[i]
+        grown = 1.0 + max(values[k], 0.0)
+        add_scaled(N, innovation / grown, b.ctypes.data, v.ctypes.data)
+        root = 1.0 / np.sqrt(grown)
+        for i in range(N):
+            add_scaled(N, root * b[i], b.ctypes.data, T[i].ctypes.data)
+    return True
+
+
+@jit
+def rotate_members(seed, index, T, W):
+    """T ← Ω T with a random orthogonal Ω that leaves the mean: Ω 1 = Ωᵀ 1 = 1; W is scratch (N, N + 1).
+
+    Ω = H diag(1, Q) H, where the reflection H turns the first unit vector into 1/√N and Q is a random rotation of the
+    other N - 1 axes, from the orthogonalisation of normal numbers.
+
+    Source: Sakov & Oke (2008), doi:10.1175/2007MWR2021.1.
+    """
+    N = T.shape[0]
+    key = key_of(seed, index, ROTATE)
+    Q = np.zeros((N, N))
+    Q[0, 0] = 1.0
+    for i in range(1, N):
+        for j in range(1, N):
+            Q[i, j] = normal(key, np.uint64(i * N + j))
+        # Twice: the second time takes away what rounding left.
+        for _ in range(2):
+            for k in range(1, i):
+                dot = 0.0
+                for j in range(1, N):
+                    dot += Q[i, j] * Q[k, j]
+                add_scaled(N, -dot, Q[k].ctypes.data, Q[i].ctypes.data)
+        norm = 0.0
+        for j in range(1, N):
+            norm += Q[i, j] * Q[i, j]
+        for j in range(1, N):
+            Q[i, j] /= np.sqrt(norm)
+    h = np.full(N, 1.0 / np.sqrt(N))
+    h[0] -= 1.0
+    half = 1.0 - 1.0 / np.sqrt(N)
+    for _ in range(2):
+        for i in range(N):
+            dot = 0.0
+            for j in range(N):
+                dot += Q[i, j] * h[j]
+            add_scaled(N, -dot / half, h.ctypes.data, Q[i].ctypes.data)
+        for i in range(N):
+            for j in range(i):
+                Q[i, j], Q[j, i] = Q[j, i], Q[i, j]
+    for i in range(N):
+        for j in range(N):
+            W[i, j] = 0.0
+        for k in range(N):
+            add_scaled(N, Q[i, k], T[k].ctypes.data, W[i].ctypes.data)
+    for i in range(N):
+        for j in range(N):
+            T[i, j] = W[i, j]
+
+
+@jit
+def global_analysis(context, index, m, ZT, Z, d, G, V, values, small, v, B, T, W, X, rest):
+    """Turn all states by one transform; False, and nothing is changed, if a number is not finite."""
+    N = X.shape[0]
+    if not symmetric_transform(m, ZT, Z, d, G, V, values, small, v, B, T):
+        return False
+    given = numbers(context)
+    if given[OWN] > 0.0:
+        rotate_members(context.seed, index, T, W)
+    for i in range(N):
+        for j in range(N):
+            W[i, j] = given[INFLATION] * T[i, j] + v[j] / np.sqrt(N - 1.0)
+        W[i, N] = 1.0
+    transform_all(X, W, int(given[CREWS]), rest)
+    return True
+
+
+@jit
+def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
+    """Condition the ensemble on a reading; see the module's equations.
+
+    Its moments become those of the Kalman update of the ensemble's own moments, exactly, where h is linear. The spread
+    collapses over many readings where members are few, unless it is inflated: the members' own sampling error is in
+    no covariance.
+    """
+    X = ensemble(context, state)
+    N = X.shape[0]
+    _, ny = sensor_rows(context, sensor)
+    parts = workspace(N, ny, min(ny, N), work)
+    ZT, Z, B, G, U, V, W, T, d, rows, expected, v, _, values, small, rest = parts
+    m = observe(context, sensor, u, y, X, ZT, d, rows, expected, innovation, innovation_std)
+    verdict = judge(context, sensor, m, ZT, Z, d, rows, G, U, v, score)
+    if verdict != USED:
+        return verdict
+    index = next_draw(X, state)
+    if not global_analysis(context, index, m, ZT, Z, d, G, V, values, small, v, B, T, W, X, rest):
+        return FAILED
+    add_spread(context, index, X, rest)
+    settle(context, X)
+    return USED
+
+
+ETKF = Estimator(
+    name="etkf",
+    title="Ensemble transform Kalman filter",
+    family="ensemble",
+    assumes="posterior near Gaussian, its spread within the span of the members; no localisation (letkf has it)",
+    model_runs="members",
+    fails_when="few members of many states: chance covariances move what the reading knows nothing of",
+    source="Hunt, Kostelich & Szunyogh (2007), doi:10.1016/j.physd.2006.11.008",
+    functions=(start, predict, update, describe),
+    runs=lambda options, nx: options["members"],
+    state_size=state_size,
+    work_size=work_size,
+    moments=moments,
+    blocks=block,
+    points=points,
+    options=(
+        MEMBERS,
+        INFLATE,
+        ADD,
+        Option("rotation", 0, 0, 1, "", "1 turns the members at random after each reading; mean and spread stay"),
+    ),
+    tune=tune,
+)

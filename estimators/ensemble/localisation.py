@@ -1,0 +1,150 @@
+"""Localisation: a reading acts only near its sensor, because far from it an ensemble's covariances are mostly chance.
+
+What is near is found once, when a fold is prepared, and laid out by blocks of states as the analysis goes through
+them (see blocks.py): for each sensor the blocks that it reaches, for each of these the sensor's rows that reach it, and
+for each such row the taper at each of the block's states.
+
+Source: Gaspari & Cohn (1999), doi:10.1002/qj.49712555417, equation 4.10, with c half the radius.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from ..errors import EstimatorError
+from ..estimator import Options
+from ..model.state_space import StateSpaceModel
+from ..numerics.jit import floats, ints, jit, matrix
+from ..numerics.simd import WIDE
+from ..numerics.simd_ir import LANES
+from ..numerics.threads import threaded
+from .placed import check_placed
+
+_FIELDS = 6
+"""Numbers a sensor in the table: how many blocks, and where they, their rows' starts, rows, tapers and the tapers
+between the sensor's own rows begin, in units of 8 bytes from the table's start. The first number of all is 1."""
+
+_MOST_BYTES = 2e9
+"""A table may not be larger: localisation that reaches everywhere is none."""
+
+
+def crews(numbers: int, threaded_from: int) -> int:
+    """Threads that share the work on an ensemble of so many numbers."""
+    return int(numba.config.NUMBA_NUM_THREADS) if numbers >= threaded_from and threaded() else 1
+
+
+def gaspari_cohn(distance: np.ndarray, radius: float) -> np.ndarray:
+    """The taper: 1 at no distance, 5/24 at half the radius, 0 from the radius on; positive definite in up to 3 axes.
+
+    Source: Gaspari & Cohn (1999), doi:10.1002/qj.49712555417, equation 4.10.
+    """
+    z = np.asarray(distance, float) / (0.5 * radius)
+    near = (((-0.25 * z + 0.5) * z + 0.625) * z - 5.0 / 3.0) * z**2 + 1.0
+    with np.errstate(divide="ignore"):
+        far = ((((z / 12.0 - 0.5) * z + 0.625) * z + 5.0 / 3.0) * z - 5.0) * z + 4.0 - 2.0 / (3.0 * z)
+    return np.where(z <= 1.0, near, np.where(z < 2.0, np.maximum(far, 0.0), 0.0))
+
+
+def apart(a: np.ndarray, b: np.ndarray, periods: np.ndarray) -> np.ndarray:
+    """Distances between places a (..., axes) and b (..., axes), the short way round where an axis is periodic."""
+    difference = np.abs(a - b)
+    with np.errstate(invalid="ignore"):
+        difference = np.where(np.isfinite(periods), np.minimum(difference, periods - difference), difference)
+    return np.sqrt(np.sum(difference**2, axis=-1))
+
+
+def prepare(model: StateSpaceModel, options: Options) -> np.ndarray:
+    """Lay out which readings reach which states, as int64s (float64s among them by their bits).
+
+    Raises:
+        EstimatorError: If a radius is given and the model does not say where its states or sensors are, or the
+            layout would not fit into memory.
+    """
+    radius = options.get("radius", 0.0)
+    if not radius > 0:
+        return np.zeros(1, np.int64)
+    check_placed(model, radius)
+    places = model.positions()
+    assert places is not None
+    rows = [[row.position for row in sensor.rows] for sensor in model.sensors]
+    from scipy.spatial import cKDTree
+
+    periods = np.array(model.periods or (np.inf,) * places.shape[1])
+    boxed = np.where(np.isfinite(periods), periods, 0.0)
+    tree = cKDTree(np.where(boxed > 0, places % np.where(boxed > 0, boxed, 1.0), places), boxsize=boxed)
+    parts: list[np.ndarray] = []
+    heads = np.zeros((len(rows), _FIELDS), np.int64)
+    at = 1 + heads.size
+    for k, sensor in enumerate(rows):
+        own = np.array(sensor, float)
+        where = np.where(boxed > 0, own % np.where(boxed > 0, boxed, 1.0), own)
+        near = [np.array(tree.query_ball_point(place, radius), np.int64) for place in where]
+        tapers = [
+            gaspari_cohn(apart(places[found], place, periods), radius) for found, place in zip(near, own, strict=True)
+        ]
+        layout = _by_blocks(near, tapers, model.nx)
+        between = gaspari_cohn(apart(own[:, None], own[None], periods), radius)
+        heads[k, 0] = layout[0].size
+        for field, part in enumerate((*layout, between), start=1):
+            heads[k, field] = at
+            parts.append(np.ascontiguousarray(part).view(np.int64).ravel())
+            at += parts[-1].size
+        if 8 * at > _MOST_BYTES:
+            raise EstimatorError(
+                f"radius is {radius:g}: its tapers on {model.nx:,} states take more than {_MOST_BYTES * 1e-9:g} GB; "
+                "choose a smaller one, or 0 for no localisation"
+            )
+    return np.concatenate([np.ones(1, np.int64), heads.ravel(), *parts])
+
+
+def _by_blocks(
+    near: list[np.ndarray], tapers: list[np.ndarray], nx: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Blocks reached, where each one's entries start (one more than blocks), each entry's row and tapers (WIDE,)."""
+    wide = nx // WIDE
+    blocks, rows, taper = [], [], []
+    for row, (states, values) in enumerate(zip(near, tapers, strict=True)):
+        narrow = states >= wide * WIDE
+        block = np.where(narrow, wide + (states - wide * WIDE) // LANES, states // WIDE)
+        lane = np.where(narrow, (states - wide * WIDE) % LANES, states % WIDE)
+        reached, inverse = np.unique(block, return_inverse=True)
+        table = np.zeros((reached.size, WIDE))
+        table[inverse, lane] = values
+        blocks.append(reached)
+        rows.append(np.full(reached.size, row, np.int64))
+        taper.append(table)
+    by_entry, of_row, table = np.concatenate(blocks), np.concatenate(rows), np.concatenate(taper)
+    order = np.lexsort((of_row, by_entry))
+    found, start = np.unique(by_entry[order], return_index=True)
+    starts = np.append(start, by_entry.size).astype(np.int64)
+    return found.astype(np.int64), starts, of_row[order], table[order]
+
+
+@jit
+def localised(context):
+    """Whether the filter localises."""
+    return ints(context.prepared, 1)[0] != 0
+
+
+@jit
+def reached(context, sensor):
+    """Blocks that a sensor reaches, starts of their entries, rows of the entries, and tapers (entries, WIDE)."""
+    table = ints(context.prepared, context.n_prepared)
+    head = table[1 + _FIELDS * sensor : 1 + _FIELDS * (sensor + 1)]
+    count = head[0]
+    start = table[head[2] : head[2] + count + 1]
+    entries = start[count]
+    tapers = floats(context.prepared + 8 * head[4], entries * WIDE)
+    return table[head[1] : head[1] + count], start, table[head[3] : head[3] + entries], matrix(tapers, 0, entries, WIDE)
+
+
+@jit
+def between_rows(context, sensor):
+    """The taper between a sensor's rows, (ny, ny); (0, 0) where the filter does not localise."""
+    if not localised(context):
+        return matrix(floats(context.prepared, 1), 0, 0, 0)
+    table = ints(context.prepared, context.n_prepared)
+    ny = ints(context.row_count, context.n_sensors)[sensor]
+    at = table[1 + _FIELDS * sensor + 5]
+    return matrix(floats(context.prepared + 8 * at, ny * ny), 0, ny, ny)

@@ -1,0 +1,1 @@
+"""Filters that carry a mean and a covariance, or its factor."""

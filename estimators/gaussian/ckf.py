@@ -1,0 +1,49 @@
+"""The cubature Kalman filter: 2n points of equal weight on a sphere through the true f and h, nothing to tune.
+
+The points x ± √n U[k] with P = Uᵀ U, each of weight 1/(2n), are the unscented ones for α = 1, β = 0, κ = 0, whose
+central point weighs nothing: it only anchors the mean of angles. Third-degree exact, and P cannot turn indefinite by a
+negative weight.
+
+Source: Arasaratnam & Haykin (2009), doi:10.1109/TAC.2009.2019800.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..estimator import Estimator, Options
+from ..model.state_space import StateSpaceModel
+from ..tuning import Tuning
+from .robust import OPTIONS, memory, shared
+from .shared import describe, moments, start, state_size
+from .ukf import predict, sigma_points, update, weights, work_size
+
+
+def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
+    """The shared options, and the weights of the cubature rule."""
+    return np.array(shared(values) + weights(1.0, 0.0, 0.0, model.nx))
+
+
+def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
+    """The cubature points (2 nx, nx) of a state."""
+    return sigma_points(*moments(values, state, nx), np.sqrt(nx))[1:]
+
+
+CKF = Estimator(
+    name="ckf",
+    title="Cubature Kalman filter",
+    family="Gaussian",
+    assumes="f and h smooth within the spread; posterior well described by mean and covariance",
+    model_runs="2 nx + 1",
+    fails_when="the points, √nx standard deviations out, leave where the model holds; or several peaks",
+    source="Arasaratnam & Haykin (2009), doi:10.1109/TAC.2009.2019800",
+    functions=(start, predict, update, describe),
+    runs=lambda options, nx: 2 * nx + 1,
+    state_size=state_size,
+    work_size=work_size,
+    moments=moments,
+    points=points,
+    options=OPTIONS,
+    tune=tune,
+    memory=memory,
+)

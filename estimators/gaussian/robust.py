@@ -1,0 +1,280 @@
+"""What every Gaussian filter offers against a wrong model or wrong readings: inflation, weights, adaptation.
+
+All of it is off by default and then costs a comparison. What an adaptation remembers stands behind the filter's own
+state, so it is rewound and reproduced with it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..compiled.context import add_process_noise, options, sensor_rows, sensor_variances
+from ..estimator import Option, Options
+from ..model.state_space import StateSpaceModel
+from ..numerics.jit import floats, inlined, jit, matrix
+from ..numerics.linalg import cholesky, solve_transposed, solve_upper
+
+JOSEPH, INFLATION, ROBUST, ROBUST_AT, ADAPT, ADAPT_RATE, ADAPT_BOUND, OWN = range(8)
+"""Positions in the context's options; those of the filter itself begin at OWN."""
+
+NONE, HUBER, STUDENT_T = range(3)
+"""How a reading is weighted."""
+
+OFF, ADAPT_R, ADAPT_Q = range(3)
+"""What is adapted."""
+
+JOSEPH_OPTION = Option.choice("joseph", ("off", "on"), "update P by the Joseph form; off subtracts K S Kᵀ, faster", 1)
+
+INFLATION_OPTION = Option("inflation", 1.0, 1.0, 100.0, "1/s", "factor by which P grows in a second, beside Q; 1: none")
+
+OPTIONS = (
+    INFLATION_OPTION,
+    Option.choice("robust", ("none", "huber", "student-t"), "how the weight of a reading falls with its distance"),
+    Option("huber", 1.345, 0.1, 10.0, "std", "distance from which Huber's weight falls"),
+    Option("dof", 4.0, 1.0, 100.0, "", "degrees of freedom of Student's t; fewer have heavier tails"),
+    Option.choice("adapt", ("off", "R", "Q"), "what follows the innovations: each sensor row's variance, or all of Q"),
+    Option("memory", 200.0, 10.0, 1e5, "readings", "over how many readings an adaptation averages"),
+    Option("bound", 10.0, 1.0, 1e4, "", "an adapted variance stays within this factor of the tuned one"),
+)
+"""Options of every Gaussian filter that has a gain of its own."""
+
+MOST = 1000
+"""Iterations of a weight, at most: Huber's takes a few, Student's t some tens, or hundreds where two nearly fit."""
+
+
+def shared(values: Options) -> list[float]:
+    """The numbers of the shared options, in the order of the positions above."""
+    kind = values.get("robust", NONE)
+    return [
+        values.get("joseph", 0.0),
+        float(np.log(values["inflation"])),
+        kind,
+        values["dof"] if kind == STUDENT_T else values.get("huber", 0.0),
+        values.get("adapt", OFF),
+        1.0 / values.get("memory", 1.0),
+        values.get("bound", 1.0),
+    ]
+
+
+def memory(values: Options, model: StateSpaceModel) -> int:
+    """Numbers that an adaptation keeps: for each sensor row its mean and the variance in use; or one scale of Q."""
+    rows = sum(len(sensor.rows) for sensor in model.sensors)
+    return {OFF: 0, ADAPT_R: 2 * rows, ADAPT_Q: 1}[int(values["adapt"])]
+
+
+def scratch_size(ny: int) -> int:
+    """Numbers that `reweigh` takes to work in."""
+    return ny * ny + 4 * ny
+
+
+@jit
+def forget(context, state):
+    """Set what an adaptation remembers to the tuned values."""
+    kind = options(context)[ADAPT]
+    if kind == ADAPT_R:
+        rows = context.n_rows
+        r = floats(context.r, rows)
+        at = state.size - 2 * rows
+        for i in range(rows):
+            state[at + i] = r[i]
+            state[at + rows + i] = r[i]
+    elif kind == ADAPT_Q:
+        state[state.size - 1] = 1.0
+
+
+@jit
+def growth(context, dt):
+    """The factor by which P grows in dt seconds beside Q.
+
+    Old readings are forgotten exponentially, which keeps the gain from dying; a rate, so that it does not matter in how
+    many steps the time is crossed. Source: Simon (2006), Optimal State Estimation, 7.4 (the fading-memory filter).
+    """
+    rate = options(context)[INFLATION]
+    return np.exp(rate * dt) if rate != 0.0 else 1.0
+
+
+@jit
+def noise_scale(context, state):
+    """The adapted factor of Q, or 1."""
+    return state[state.size - 1] if options(context)[ADAPT] == ADAPT_Q else 1.0
+
+
+@inlined
+def add_noise(context, x, u, dt, state, P, scratch):
+    """P ← growth·P + scale·Q; scratch is (nx, nx)."""
+    if options(context)[INFLATION] != 0.0 or options(context)[ADAPT] == ADAPT_Q:
+        scale = noise_scale(context, state)
+        multiply(growth(context, dt) / scale, P)
+        add_process_noise(context, x, u, dt, P, scratch)
+        multiply(scale, P)
+    else:
+        add_process_noise(context, x, u, dt, P, scratch)
+
+
+@jit
+def multiply(a, P):
+    """P ← a P."""
+    for i in range(P.shape[0]):
+        for j in range(P.shape[1]):
+            P[i, j] *= a
+
+
+@inlined
+def reading_variances(context, sensor, state, r):
+    """Fill r (ny,) with the variances of one sensor's rows, as adapted."""
+    first, count = sensor_rows(context, sensor)
+    if options(context)[ADAPT] == ADAPT_R:
+        first += state.size - context.n_rows
+        for i in range(count):
+            r[i] = state[first + i]
+    else:
+        tuned = floats(context.r, context.n_rows)
+        for i in range(count):
+            r[i] = tuned[first + i]
+
+
+@jit
+def weight(kind, at, m, nu, r, S, V, z):
+    """The weight w by which a reading counts: as if its noise were N(0, R / w). NaN if S + R (1/w - 1) has no factor.
+
+    nu, r (m,): raw innovation and variances; S (m, m) includes R; V (m, m) and z (2 m,) are scratch.
+    """
+    return huber(at, m, nu, r, S, V, z) if kind == HUBER else student_t(at, m, nu, r, S, V, z)
+
+
+@jit
+def huber(k, m, nu, r, S, V, z):
+    """Huber's weight w = min(1, k / d), where d is the distance |R^-½ (y - h(x⁺))| that the weighted update leaves.
+
+    It minimises ½ |x - x̂|²_P⁻¹ + ρ_k(d), with ρ_k quadratic up to k and linear beyond. As d = s φ(s) with s = 1 / w
+    and φ = |R^½ (S + (s - 1) R)⁻¹ ν|, that is φ(s) = k: Newton's method on 1/φ, which is nearly straight.
+
+    Sources: Huber (1964), doi:10.1214/aoms/1177703732; Moré & Sorensen (1983), doi:10.1137/0904038, for the equation.
+    """
+    s = 1.0
+    for _ in range(MOST):
+        if not precision_times(s, m, nu, r, S, V, z):
+            return np.nan
+        square = 0.0
+        for i in range(m):
+            square += r[i] * z[i] * z[i]
+            z[i] *= r[i]
+        excess = np.sqrt(square) / k - 1.0
+        if excess <= 1e-12:
+            break
+        solve_transposed(V, m, z)
+        slope = 0.0
+        for i in range(m):
+            slope += z[i] * z[i]
+        s += excess * square / slope
+    return 1.0 / s
+
+
+@jit
+def student_t(dof, m, nu, r, S, V, z):
+    """The mean precision, as a share of R⁻¹, of noise that follows a multivariate t with scale matrix R.
+
+    w = (dof + m) / (dof + tr(R⁻¹ E (y - h(x)) (y - h(x))ᵀ)), the variational solution, iterated from w = 1. With
+    T = S + (1/w - 1) R the residual is R/w T⁻¹ ν, and H P⁺ Hᵀ = R/w - R/w T⁻¹ R/w.
+
+    Source: Piché, Särkkä & Hartikainen (2012), doi:10.1109/MLSP.2012.6349794.
+    """
+    w = 1.0
+    unit = z[m : 2 * m]
+    for _ in range(MOST):
+        if not precision_times(1.0 / w, m, nu, r, S, V, z):
+            return np.nan
+        total = 0.0
+        for i in range(m):
+            for j in range(m):
+                unit[j] = 1.0 if j == i else 0.0
+            solve_transposed(V, m, unit)
+            inverse = 0.0
+            for j in range(m):
+                inverse += unit[j] * unit[j]
+            total += 1.0 / w + r[i] * (z[i] * z[i] - inverse) / (w * w)
+        better = (dof + m) / (dof + total)
+        if abs(better - w) <= 1e-12 * w:
+            return better
+        w = better
+    return w
+
+
+@jit
+def precision_times(s, m, nu, r, S, V, z):
+    """Fill z with T⁻¹ ν and V with the factor of T = S + (s - 1) R; False if T has none."""
+    for i in range(m):
+        for j in range(m):
+            V[i, j] = S[i, j]
+        V[i, i] += (s - 1.0) * r[i]
+        z[i] = nu[i]
+    if not cholesky(V, V, m):
+        return False
+    solve_transposed(V, m, z)
+    solve_upper(V, m, z)
+    return True
+
+
+@jit
+def reweigh(context, y, r, innovation, m, nu, S, U, room):
+    """Weight the noise of a reading: r (ny,) is divided by w; S, its factor U and the whitened nu then belong to it.
+
+    Returns:
+        Whether S still has a factor.
+    """
+    raw = room[:m]
+    variance = room[m : 2 * m]
+    rows(y, innovation, raw)
+    rows(y, r, variance)
+    V = matrix(room, 4 * m, m, m)
+    w = weight(options(context)[ROBUST], options(context)[ROBUST_AT], m, raw, variance, S, V, room[2 * m : 4 * m])
+    for i in range(m):
+        S[i, i] += (1.0 / w - 1.0) * variance[i]
+        nu[i] = raw[i]
+    for i in range(r.size):
+        r[i] /= w
+    if not cholesky(S, U, m):
+        return False
+    solve_transposed(U, m, nu)
+    return True
+
+
+@jit
+def rows(y, full, finite):
+    """Fill `finite` (m,) with the entries of `full` (ny,) whose row of the reading is there."""
+    k = 0
+    for i in range(full.size):
+        if np.isfinite(y[i]):
+            finite[k] = full[i]
+            k += 1
+
+
+@jit
+def adapt(context, sensor, y, state, innovation, innovation_std, score):
+    """Let R or Q follow the innovations of a reading that was used, over a fading memory of N readings.
+
+    R: r ← mean of ν² - (S - r), of each row. Q: one factor s of all of Q, s ← s (1 + (NIS / m - 1) / N), so that
+    the mean NIS becomes what it should be. One of the two: both show in the size of ν alone, where any split between
+    them fits as well. What is in use stays within the bound. The spread of an adapted r is about
+    S √(2 / (2N - 1)), that of ln s about 1 / √(N m γ) with γ the share of S that scales with s.
+
+    An outlier is taken at its face value: use the gate. Sources: Mohamed & Schwarz (1999), doi:10.1007/s001900050236,
+    for R (there over a window); Bar-Shalom, Li & Kirubarajan (2001), 11.2, for the level of Q.
+    """
+    kind = options(context)[ADAPT]
+    rate = options(context)[ADAPT_RATE]
+    bound = options(context)[ADAPT_BOUND]
+    if kind == ADAPT_Q:
+        scale = noise_scale(context, state) * (1.0 + rate * (score[0] / score[1] - 1.0))
+        state[state.size - 1] = min(max(scale, 1.0 / bound), bound)
+        return
+    n_rows = context.n_rows
+    first, count = sensor_rows(context, sensor)
+    tuned = sensor_variances(context, sensor)
+    mean = state.size - 2 * n_rows + first
+    used = state.size - n_rows + first
+    for i in range(count):
+        if np.isfinite(y[i]):
+            sample = innovation[i] ** 2 - innovation_std[i] ** 2 + state[used + i]
+            state[mean + i] += rate * (sample - state[mean + i])
+            state[used + i] = min(max(state[mean + i], tuned[i] / bound), tuned[i] * bound)

@@ -1,0 +1,1 @@
+"""Filters and folds in plain Python: black boxes, and FilterPy as a second opinion."""

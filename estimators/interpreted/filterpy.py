@@ -1,0 +1,408 @@
+"""FilterPy's filters behind one adapter: KF, EKF, UKF and EnKF as a second opinion, selectable like our own.
+
+FilterPy's objects do the algebra of a step. The flat state stays the truth: an object is given it before a step, and
+what the object made of it is taken over only where the reading is used; so snapshots, gate and held-out sensors work
+as with every filter. A reading's rows that are missing, sensors of several sizes and rates, offsets of a linear model
+and angles are the adapter's.
+
+Where FilterPy 2.0 must be handled with care:
+- `ExtendedKalmanFilter.predict_update` evaluates H before it predicts, so predict() and update() are called; its
+  `predict_x` is F x even where f is curved, and is overridden with f.
+- `UnscentedKalmanFilter.update` takes the sigma points of the last predict(), which are stale for a second reading at
+  one time: they are drawn anew from x and P.
+- `UnscentedKalmanFilter` takes sigma points from a P that is singular but for rounding and returns a wrong estimate
+  without a word: such a reading fails, as in our own (`only_rounding`).
+- `EnsembleKalmanFilter.update` leaves a P = P - K S Kᵀ that is not its members' covariance: the members' is reported.
+  Its perturbations do not have mean zero over the members. It has one Q for all members, here that of their mean.
+- `EnsembleKalmanFilter` draws from NumPy's global generator: its methods run here with a generator of
+  (seed, draw), which the state counts, and touch no other.
+
+Source: Labbe, Kalman and Bayesian Filters in Python; FilterPy (MIT licence), https://github.com/rlabbe/filterpy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import FunctionType, MethodType
+from typing import Any
+
+import numpy as np
+from filterpy.kalman import (
+    EnsembleKalmanFilter,
+    ExtendedKalmanFilter,
+    KalmanFilter,
+    MerweScaledSigmaPoints,
+    UnscentedKalmanFilter,
+)
+
+from ..ensemble import shared as ensemble
+from ..estimator import Estimator, Option, Options
+from ..gaussian import kf, ukf
+from ..gaussian import shared as gaussian
+from ..gaussian.ukf import only_rounding
+from ..track import FAILED, MISSING, USED
+from .view import View, wrapped
+
+PROCESS, START, PERTURB = range(3)
+"""Streams of randomness."""
+
+
+def in_turn(block: np.ndarray) -> Callable[..., np.ndarray]:
+    """A function that hands out the rows of a block: FilterPy asks point by point, in order; the block ran at once."""
+    rows = iter(block)
+    return lambda *_: next(rows)
+
+
+def moments_of(view: View, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Views of mean (nx,) and covariance (nx, nx) in a state."""
+    n = view.nx
+    return state[:n], state[n:].reshape(n, n)
+
+
+def keep(view: View, state: np.ndarray, x: np.ndarray, P: np.ndarray) -> None:
+    """Write a mean, its angles within ±π, and a covariance, symmetric to the last bit."""
+    state[: view.nx] = wrapped(x, view.circular)
+    state[view.nx :] = (0.5 * (P + P.T)).ravel()
+
+
+def start(view: View, mean: np.ndarray, cov: np.ndarray, state: np.ndarray) -> None:
+    """The state that stands for N(mean, cov)."""
+    keep(view, state, mean, cov)
+
+
+def describe(view: View, state: np.ndarray, mean: np.ndarray, std: np.ndarray, cross: np.ndarray) -> None:
+    """Mean, standard deviation and the configured covariances."""
+    x, P = moments_of(view, state)
+    mean[:] = x[view.shown]
+    std[:] = np.sqrt(np.diag(P)[view.shown])
+    cross[:] = P[view.pairs[:, 0], view.pairs[:, 1]]
+
+
+def predict_kf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndarray, work: np.ndarray) -> None:
+    """x ← F x + c, P ← F P Fᵀ + Q, with c what f adds to F x: inputs, offsets."""
+    x, P = moments_of(view, state)
+    F = view.F(view.prior()[0], u, dt)
+    filter_ = KalmanFilter(dim_x=view.nx, dim_z=1, dim_u=1)
+    filter_.x, filter_.P = x.copy(), P.copy()
+    offset = view.f(x[None], u, dt)[0] - F @ x
+    filter_.predict(u=np.ones(1), B=offset[:, None], F=F, Q=view.Q(x, u, dt))
+    keep(view, state, filter_.x, filter_.P)
+
+
+def update_kf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any) -> int:
+    """Condition on a reading z = y - h(x) + H x, which takes inputs and offsets out of it, and turns of angles."""
+
+    def step(x: np.ndarray, P: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
+        filter_ = KalmanFilter(dim_x=view.nx, dim_z=rows.size)
+        filter_.x, filter_.P = x, P
+        H = view.H(sensor, x, u)[rows]
+        nu = wrapped(y[rows] - view.h(sensor, x[None], u)[0, rows], view.circular_rows(sensor)[rows])
+        filter_.update(H @ x + nu, R=R, H=H)
+        return filter_
+
+    return _update(view, sensor, y, step, *rest)
+
+
+class _Extended(ExtendedKalmanFilter):
+    """FilterPy's EKF whose mean goes through f itself."""
+
+    forward: np.ndarray
+
+    def predict_x(self, u: object = 0) -> None:
+        self.x = self.forward
+
+
+def predict_ekf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndarray, work: np.ndarray) -> None:
+    """x ← f(x, u), P ← F P Fᵀ + Q."""
+    x, P = moments_of(view, state)
+    filter_ = _Extended(dim_x=view.nx, dim_z=1)
+    filter_.x, filter_.P = x.copy(), P.copy()
+    filter_.F, filter_.Q = view.F(x, u, dt), view.Q(x, u, dt)
+    filter_.forward = view.f(x[None], u, dt)[0]
+    filter_.predict()
+    keep(view, state, filter_.x, filter_.P)
+
+
+def update_ekf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any) -> int:
+    """Condition on a reading, linearised at the prediction."""
+
+    def step(x: np.ndarray, P: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
+        filter_ = _Extended(dim_x=view.nx, dim_z=rows.size)
+        filter_.x, filter_.P = x, P
+        angles = view.circular_rows(sensor)[rows]
+        filter_.update(
+            y[rows],
+            lambda x: view.H(sensor, x, u)[rows],
+            lambda x: view.h(sensor, x[None], u)[0, rows],
+            R=R,
+            residual=lambda a, b: wrapped(a - b, angles),
+        )
+        return filter_
+
+    return _update(view, sensor, y, step, *rest)
+
+
+def _mean_of(angles: np.ndarray) -> Callable[..., np.ndarray] | None:
+    """The weighted mean of points some of whose columns are angles, added up from the central point."""
+    if not np.any(angles):
+        return None
+    return lambda points, weights: points[0] + weights @ wrapped(points - points[0], angles)
+
+
+def _residual_of(angles: np.ndarray) -> Callable[..., np.ndarray] | None:
+    return (lambda a, b: wrapped(a - b, angles)) if np.any(angles) else None
+
+
+def _unscented(view: View, angles: np.ndarray) -> Any:
+    values = view.options
+    points = MerweScaledSigmaPoints(view.nx, values["alpha"], values["beta"], values["kappa"])
+    return UnscentedKalmanFilter(
+        view.nx,
+        max(1, angles.size),
+        0.0,
+        hx=None,
+        fx=None,
+        points=points,
+        x_mean_fn=_mean_of(view.circular),
+        residual_x=_residual_of(view.circular),
+        z_mean_fn=_mean_of(angles),
+        residual_z=_residual_of(angles),
+    )
+
+
+def predict_ukf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndarray, work: np.ndarray) -> None:
+    """x, P ← mean and covariance of the propagated sigma points, plus Q; NaN where P has no factor."""
+    x, P = moments_of(view, state)
+    filter_ = _unscented(view, np.zeros(0, bool))
+    filter_.x, filter_.P, filter_.Q = x.copy(), P.copy(), view.Q(x, u, dt)
+    try:
+        block = view.f(filter_.points_fn.sigma_points(x, P), u, dt)
+        filter_.predict(dt=dt, fx=in_turn(block))
+    except ValueError:  # no Cholesky factor: LinAlgError is one
+        state[:] = np.nan
+        return
+    keep(view, state, filter_.x, filter_.P)
+
+
+def update_ukf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any) -> int:
+    """Condition on a reading, with sigma points drawn anew from the prediction."""
+
+    def step(x: np.ndarray, P: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
+        filter_ = _unscented(view, view.circular_rows(sensor)[rows])
+        filter_.x, filter_.P = x, P
+        filter_.sigmas_f = filter_.points_fn.sigma_points(x, P)
+        block = np.ascontiguousarray(view.h(sensor, filter_.sigmas_f, u)[:, rows])
+        filter_.update(y[rows], R=R, hx=in_turn(block))
+        U = np.ascontiguousarray(np.linalg.cholesky(P).T)
+        w = float(filter_.points_fn.Wm[1])
+        across = block[1 : x.size + 1] - block[x.size + 1 :]
+        if only_rounding(U, P, across, filter_.S - R, np.diag(R).copy(), w, y[rows]):
+            raise ValueError("the sigma points rest on rounding")
+        return filter_
+
+    return _update(view, sensor, y, step, *rest)
+
+
+def _update(
+    view: View,
+    sensor: int,
+    y: np.ndarray,
+    step: Callable[..., Any],
+    index: int,
+    state: np.ndarray,
+    work: np.ndarray,
+    innovation: np.ndarray,
+    innovation_std: np.ndarray,
+    score: np.ndarray,
+) -> int:
+    """Let FilterPy update a copy by the rows that came; judge its innovation; take the copy over if it is used."""
+    r = view.variances(sensor)
+    rows = np.flatnonzero(np.isfinite(y[: r.size]))
+    if not rows.size:
+        return MISSING
+    x, P = moments_of(view, state)
+    try:
+        filter_ = step(x.copy(), P.copy(), rows, np.diag(r[rows]))
+    except ValueError:  # S or P is singular or not finite
+        score[1] = rows.size
+        return FAILED
+    verdict = view.admit(sensor, y, filter_.y, filter_.S, innovation, innovation_std, score)
+    if verdict == USED:
+        keep(view, state, filter_.x, filter_.P)
+    return verdict
+
+
+class _Ensemble(EnsembleKalmanFilter):
+    """FilterPy's EnKF with draws of its own generator."""
+
+    def __init__(self, nx: int, members: int) -> None:
+        self.rng = np.random.default_rng(0)
+
+        def draw(mean: np.ndarray, cov: np.ndarray, size: int) -> np.ndarray:
+            return self.rng.multivariate_normal(mean, cov, size, check_valid="ignore")
+
+        for name in ("initialize", "predict", "update"):
+            method = getattr(EnsembleKalmanFilter, name)
+            own = {**method.__globals__, "multivariate_normal": draw}
+            function = FunctionType(method.__code__, own, name, method.__defaults__, method.__closure__)
+            setattr(self, name, MethodType(function, self))
+        super().__init__(x=np.zeros(nx), P=np.zeros((nx, nx)), dim_z=1, dt=0.0, N=members, hx=None, fx=None)
+
+    def seed(self, *place: int) -> None:
+        """Draw from here on what (seed, draw, stream) determine."""
+        self.rng = np.random.default_rng([number % 2**64 for number in place])
+
+
+def _enkf(view: View) -> Any:
+    if "enkf" not in view.kept:
+        view.kept["enkf"] = _Ensemble(view.nx, ensemble.members(view.options))
+    return view.kept["enkf"]
+
+
+def _members(view: View, state: np.ndarray) -> np.ndarray:
+    return state[: -ensemble.HEAD].reshape(-1, view.nx)
+
+
+def _settle(view: View, X: np.ndarray) -> None:
+    """Bring the angles of the members within half a turn of their mean, and that within ±π."""
+    if np.any(view.circular):
+        near = wrapped(X - X[0], view.circular)
+        shift = near.mean(axis=0)
+        X[:] = np.where(view.circular, wrapped(X[0] + shift, view.circular) + near - shift, X)
+
+
+def start_enkf(view: View, mean: np.ndarray, cov: np.ndarray, state: np.ndarray) -> None:
+    """Draw the members from N(mean, cov)."""
+    filter_ = _enkf(view)
+    filter_.seed(view.seed, 0, START)
+    filter_.initialize(np.array(mean), cov)
+    X = _members(view, state)
+    X[:] = filter_.sigmas
+    _settle(view, X)
+    state[-1] = 0.0
+
+
+def predict_enkf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndarray, work: np.ndarray) -> None:
+    """xᵢ ← f(xᵢ, u) + wᵢ, wᵢ ~ N(0, Q)."""
+    X, filter_ = _members(view, state), _enkf(view)
+    forward = view.f(X, u, dt)  # before anything changes: it may fail
+    filter_.seed(view.seed, int(state[-1]), PROCESS)
+    state[-1] += 1.0
+    filter_.sigmas, filter_.dt = X.copy(), dt
+    filter_.fx = in_turn(forward)
+    filter_.Q = view.Q(X.mean(axis=0), u, dt)
+    try:
+        filter_.predict()
+    except ValueError:  # Q is not finite
+        state[:] = np.nan
+        return
+    X[:] = filter_.sigmas
+    _settle(view, X)
+
+
+def update_enkf(
+    view: View,
+    u: np.ndarray,
+    sensor: int,
+    y: np.ndarray,
+    index: int,
+    state: np.ndarray,
+    work: np.ndarray,
+    innovation: np.ndarray,
+    innovation_std: np.ndarray,
+    score: np.ndarray,
+) -> int:
+    """xᵢ ← xᵢ + K (y + vᵢ - h(xᵢ)), vᵢ ~ N(0, R), with the covariances of the members."""
+    r = view.variances(sensor)
+    rows = np.flatnonzero(np.isfinite(y[: r.size]))
+    if not rows.size:
+        return MISSING
+    X, filter_ = _members(view, state), _enkf(view)
+    angles = view.circular_rows(sensor)[rows]
+    expected = view.h(sensor, X, u)[:, rows]
+    # FilterPy subtracts plainly: angles are told within half a turn of one another, and so is the reading.
+    expected = expected[0] + wrapped(expected - expected[0], angles)
+    centre = expected.mean(axis=0)
+    nu = wrapped(y[rows] - centre, angles)
+    filter_.seed(view.seed, int(state[-1]), PERTURB)
+    filter_.sigmas, filter_.x, filter_.P = X.copy(), X.mean(axis=0), np.zeros((view.nx, view.nx))
+    filter_.hx, filter_._mean_z = in_turn(expected), np.zeros(rows.size)
+    try:
+        filter_.update(centre + nu, R=np.diag(r[rows]))
+    except ValueError:  # S is singular or not finite
+        score[1] = rows.size
+        return FAILED
+    verdict = view.admit(sensor, y, nu, filter_.S, innovation, innovation_std, score)
+    if verdict == USED:
+        X[:] = filter_.sigmas
+        state[-1] += 1.0
+        _settle(view, X)
+    return verdict
+
+
+def describe_enkf(view: View, state: np.ndarray, mean: np.ndarray, std: np.ndarray, cross: np.ndarray) -> None:
+    """Mean, standard deviation and the configured covariances of the members."""
+    x, P = ensemble.moments(view.options, state, view.nx)
+    mean[:] = wrapped(x, view.circular)[view.shown]
+    std[:] = np.sqrt(np.diag(P)[view.shown])
+    cross[:] = P[view.pairs[:, 0], view.pairs[:, 1]]
+
+
+def _no_work(options: Options, nx: int, ny: int) -> int:
+    return 0
+
+
+def _entry(name: str, functions: tuple[Any, Any, Any, Any], **other: Any) -> Estimator:
+    return Estimator(
+        name=f"filterpy-{name}",
+        title=f"FilterPy's {name.upper()}",
+        family="reference",
+        functions=functions,
+        interpreted=True,
+        state_size=other.pop("state_size", gaussian.state_size),
+        work_size=_no_work,
+        moments=other.pop("moments", gaussian.moments),
+        points=other.pop("points", gaussian.no_points),
+        source="Labbe (2014), FilterPy 2.0, https://github.com/rlabbe/filterpy",
+        **other,
+    )
+
+
+FILTERPY_KF = _entry(
+    "kf",
+    (start, predict_kf, update_kf, describe),
+    assumes="linear f and h, Gaussian noise",
+    model_runs="1",
+    fails_when="as kf; in Python, a hundred times slower",
+    applies=kf.applies,
+)
+FILTERPY_EKF = _entry(
+    "ekf",
+    (start, predict_ekf, update_ekf, describe),
+    assumes="differentiable f and h, nearly straight within the spread of the estimate",
+    model_runs="1 and its derivatives",
+    fails_when="as ekf; in Python, a hundred times slower",
+    runs=lambda options, nx: nx + 1,
+)
+FILTERPY_UKF = _entry(
+    "ukf",
+    (start, predict_ukf, update_ukf, describe),
+    assumes="f and h smooth within the spread; posterior well described by mean and covariance",
+    model_runs="2 nx + 1",
+    fails_when="as ukf, and sooner: it subtracts K S Kᵀ and inverts S",
+    runs=lambda options, nx: 2 * nx + 1,
+    points=ukf.points,
+    options=tuple(option for option in ukf.UKF.options if option.name in ("alpha", "beta", "kappa")),
+)
+FILTERPY_ENKF = _entry(
+    "enkf",
+    (start_enkf, predict_enkf, update_enkf, describe_enkf),
+    assumes="posterior near Gaussian, its spread within the span of the members",
+    model_runs="members",
+    fails_when="few members: chance covariances, perturbations that shift the mean; the spread collapses",
+    runs=lambda options, nx: options["members"],
+    state_size=ensemble.state_size,
+    moments=ensemble.moments,
+    points=ensemble.points,
+    options=(Option("members", 50, 2, 10_000, "", "number of members"),),
+)

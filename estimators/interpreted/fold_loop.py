@@ -1,0 +1,117 @@
+"""The fold's loop in Python, for filters that are not compiled: the same events, rows and order as the kernel's.
+
+What the kernel gets as addresses this loop gets as Python functions, and its context is a `View`; see filter.py for
+the four functions. Everything else, snapshots and rewinds too, is the Fold's and knows no difference.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError
+from ..log import INPUT, READING, RESET, TICK, TRUTH
+from ..track import FAILED, MISSING, NONE, Track
+
+UNSET = int(np.iinfo(np.int64).min)
+"""The clock before the first event, which sets it: the prior holds at that time."""
+
+LONGEST = 10_000
+"""Steps of the model's `max_step` that are predicted in one go; a clock that jumps must not keep the fold busy."""
+
+
+def begin(code: Any, context: Any, mean: np.ndarray, cov: np.ndarray, state: np.ndarray) -> None:
+    """The state that stands for N(mean, cov)."""
+    with np.errstate(all="ignore"):
+        code.start(context, mean, cov, state)
+
+
+def _advance_to(
+    code: Any, context: Any, u: np.ndarray, clock: np.ndarray, t: int, index: int, state: np.ndarray, work: np.ndarray
+) -> None:
+    """Predict to time t; where the model fails, state and clock stay at the last step that it answered."""
+    begun = int(clock[0])
+    if begun != UNSET and t > begun:
+        dt = (t - begun) * 1e-9
+        if dt > LONGEST * context.max_step:
+            code.start(context, *context.prior(), state)
+        else:
+            steps = 1 if dt <= context.max_step else int(np.ceil(dt / context.max_step))
+            for k in range(steps):
+                code.predict(context, u, dt / steps, index, state, work)
+                clock[0] = begun + round((k + 1) * (t - begun) / steps)
+    clock[0] = t
+
+
+def run(
+    code: Any,
+    context: Any,
+    first: int,
+    start: int,
+    end: int,
+    t: np.ndarray,
+    kind: np.ndarray,
+    channel: np.ndarray,
+    value: np.ndarray,
+    clock: np.ndarray,
+    u: np.ndarray,
+    state: np.ndarray,
+    spare: np.ndarray,
+    work: np.ndarray,
+    score: np.ndarray,
+    track: Track,
+) -> None:
+    """Fold events `start` to `end` as the kernel does; see `fold.run`.
+
+    Where a model's own Python fails, the view counts it and the fold goes on: a reading has failed, an estimate that
+    would need the answer is no number, and the state stays what and when it was, for the next event to go on from.
+    A filter asks the model before it changes its state, so that it never stands in between.
+    """
+    with np.errstate(all="ignore"):  # as compiled code: a number that is not finite is an answer, not a warning
+        for i in range(start, end):
+            what, now, index = int(kind[i]), int(t[i]), first + i
+            track.innovation[i] = np.nan
+            track.innovation_std[i] = np.nan
+            score[:] = np.nan, 0.0, np.nan
+            verdict = NONE
+            told = state
+            known = True
+            if what in (READING, INPUT):
+                try:
+                    known = False
+                    _advance_to(code, context, u, clock, now, index, state, work)
+                    known = True
+                    if what == READING:
+                        innovation, innovation_std = track.innovation[i], track.innovation_std[i]
+                        verdict = code.update(
+                            context, u, int(channel[i]), value[i], index, state, work, innovation, innovation_std, score
+                        )
+                except ModelError as error:
+                    context.failed(error)
+                    verdict = FAILED if what == READING else NONE
+                if what == INPUT:
+                    given = value[i, : u.size]
+                    np.copyto(u, given, where=np.isfinite(given))
+            elif what == RESET:
+                code.start(context, *context.prior(), state)
+                clock[0] = now
+            else:
+                if clock[0] == UNSET:
+                    clock[0] = now
+                # Several queries at one time are one: `spare` still holds its answer.
+                if i == start or not TRUTH <= kind[i - 1] <= TICK or now != t[i - 1]:
+                    spare[:] = state
+                    try:
+                        _advance_to(code, context, u, clock.copy(), now, index, spare, work)
+                    except ModelError as error:
+                        context.failed(error)
+                        spare[:] = np.nan
+                told = spare
+            code.describe(context, told, track.mean[i], track.std[i], track.cross[i])
+            if not known:
+                track.mean[i], track.std[i], track.cross[i] = np.nan, np.nan, np.nan
+            track.nis[i] = score[0] if verdict != MISSING else np.nan
+            track.dof[i] = int(score[1])
+            track.log_likelihood[i] = score[2]
+            track.verdict[i] = verdict

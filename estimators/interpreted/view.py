@@ -1,0 +1,138 @@
+"""What a filter in Python sees of a model and a tuning: functions of blocks of states, and numbers.
+
+The context (see context.py) says the same to a compiled filter; a view wraps it, so that both judge a reading by the
+same code.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
+from ..compiled.model import CompiledModel
+from ..errors import ModelError
+from ..estimator import Options
+from ..gaussian.shared import admit
+from ..model.state_space import StateSpaceModel
+from ..track import FAILED
+from ..tuning import Tuning
+
+_STEP = 6e-6
+"""Of a central difference, relative: about the cube root of the rounding error (see jacobians.py)."""
+
+
+class View:
+    """A model, a tuning and the options of a filter, for its Python functions.
+
+    Nothing in it changes but what filters keep in `kept`, and the count of the model's failures, with the last of them.
+    """
+
+    def __init__(
+        self, compiled: CompiledModel, context: np.void, tuning: Tuning, options: Options, pairs: np.ndarray
+    ) -> None:
+        model = compiled.model
+        self.model: StateSpaceModel = model
+        self.compiled, self.context, self.options, self.pairs = compiled, context, options, pairs
+        self.nx, self.max_step, self.seed = model.nx, model.max_step, tuning.seed
+        self.p = np.ascontiguousarray(tuning.p, float)
+        self.q = np.ascontiguousarray(tuning.q, float)
+        self.circular = np.asarray(model.circular, bool)
+        self.shown = model.shown
+        ends = [first + len(sensor.rows) for first, sensor in zip(model.row_start, model.sensors, strict=True)]
+        rows = [slice(first, end) for first, end in zip(model.row_start, ends, strict=True)]
+        angles = np.array([row.circular for sensor in model.sensors for row in sensor.rows], bool)
+        self._r = [np.ascontiguousarray(tuning.r[part], float) for part in rows]
+        self._angles = [angles[part] for part in rows]
+        self._scratch = np.empty(scratch_size(model.nx, model.width))
+        self.kept: dict[Any, Any] = {}
+        self.failures = 0
+        self.failure: ModelError | None = None
+
+    def failed(self, error: ModelError) -> None:
+        """Note that the model's own Python failed."""
+        self.failures += 1
+        # Its frames hold the filter's arrays.
+        self.failure = error.with_traceback(None)
+
+    def prior(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (nx,) and covariance (nx, nx) of the prior."""
+        return self.compiled.static["prior_mean"], self.compiled.static["prior_cov"]
+
+    def variances(self, sensor: int) -> np.ndarray:
+        """r (ny,): the variances of a sensor's rows."""
+        return self._r[sensor]
+
+    def circular_rows(self, sensor: int) -> np.ndarray:
+        """For each row of a sensor, whether it is an angle."""
+        return self._angles[sensor]
+
+    def f(self, X: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+        """f of every state of a block X (N, nx), dt seconds on."""
+        return self.compiled.f_block(X, u, self.p, dt)
+
+    def h(self, sensor: int, X: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """What a sensor is expected to say (N, ny) of every state of a block X (N, nx)."""
+        return self.compiled.h_block(sensor, X, u, self.p)
+
+    def F(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+        """df/dx (nx, nx) at a state; of a black box by central differences, all of them in one block."""
+        if self.model.black_box:
+            return self._differences(lambda X: self.f(X, u, dt), x, self.circular)
+        F = np.empty((self.nx, self.nx))
+        state_jacobian(self.context, np.ascontiguousarray(x), u, dt, F, self._scratch)
+        return F
+
+    def H(self, sensor: int, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """dh/dx (ny, nx) of a sensor at a state."""
+        if self.model.black_box:
+            return self._differences(lambda X: self.h(sensor, X, u), x, self._angles[sensor])
+        H = np.empty((self._r[sensor].size, self.nx))
+        sensor_jacobian(self.context, sensor, np.ascontiguousarray(x), u, H, self._scratch)
+        return H
+
+    def _differences(self, function: Any, x: np.ndarray, circular: np.ndarray) -> np.ndarray:
+        step = np.diag(_STEP * np.maximum(1.0, np.abs(x)))
+        above, below = x + step, x - step
+        images = function(np.vstack((above, below)))
+        D = wrapped(images[: self.nx] - images[self.nx :], circular)
+        return (D / np.diag(above - below)[:, None]).T
+
+    def Q(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+        """Covariance (nx, nx) of the noise that is added in dt seconds at a state."""
+        Q = np.zeros((self.nx, self.nx))
+        self.compiled.Q(np.ascontiguousarray(x), u, self.p, self.q, dt, Q)
+        return Q
+
+    def admit(
+        self,
+        sensor: int,
+        y: np.ndarray,
+        nu: np.ndarray,
+        S: np.ndarray,
+        innovation: np.ndarray,
+        innovation_std: np.ndarray,
+        score: np.ndarray,
+    ) -> int:
+        """Judge the innovation nu (m,) of a reading's finite rows, of covariance S (m, m), as every filter does.
+
+        Returns:
+            The verdict.
+        """
+        rows = np.isfinite(y[: self._r[sensor].size])
+        innovation[: rows.size][rows] = nu
+        innovation_std[: rows.size][rows] = np.sqrt(np.diag(S))
+        if not np.all(np.isfinite(S)):
+            score[1] = nu.size
+            return FAILED
+        U = np.zeros_like(S)
+        return int(admit(self.context, sensor, nu.size, nu.copy(), np.ascontiguousarray(S), U, score))
+
+
+def wrapped(difference: np.ndarray, circular: np.ndarray) -> np.ndarray:
+    """Differences (…, k) with those of angles brought to ±π."""
+    if not np.any(circular):
+        return difference
+    turned: np.ndarray = np.where(circular, (difference + np.pi) % (2.0 * np.pi) - np.pi, difference)
+    return turned

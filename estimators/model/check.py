@@ -1,0 +1,205 @@
+"""A model's functions tried at its prior, before they are compiled: what is wrong is said of their file and line."""
+
+from __future__ import annotations
+
+import re
+import traceback
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from types import CodeType
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError
+from .state_space import LARGE, StateSpaceModel
+
+
+def plain(function: Any) -> Callable:
+    """The Python function behind a compiled one."""
+    return getattr(function, "py_func", function)  # type: ignore[no-any-return]
+
+
+def place(function: Any, error: BaseException | None = None) -> str:
+    """File and line of a function, or of the last line in its file that an error came through, as `file:line: `."""
+    code = _code(function)
+    if code is None:
+        return ""
+    frames = traceback.extract_tb(error.__traceback__ if error else None)
+    lines = [frame.lineno for frame in frames if frame.filename == code.co_filename and frame.lineno]
+    if error is not None and error.__cause__ is not None:
+        # Of an error in another process only the text of its traceback comes.
+        found = re.findall(rf'File "{re.escape(code.co_filename)}", line (\d+)', str(error.__cause__))
+        lines += [int(line) for line in found]
+    return _shown(code.co_filename, lines[-1] if lines else code.co_firstlineno)
+
+
+def _code(function: Any) -> CodeType | None:
+    """The code of a function, of what a `partial` holds, or of an object that can be called."""
+    function = plain(function)
+    function = function.func if isinstance(function, partial) else function
+    code = getattr(function, "__code__", None) or getattr(type(function).__call__, "__code__", None)
+    if code and "inner" in code.co_freevars and Path(code.co_filename).parent == Path(__file__).parent:
+        # A wrapper of joint.py or indicator.py: the model's own function is inside.
+        return _code(function.__closure__[code.co_freevars.index("inner")].cell_contents)
+    return code
+
+
+def _shown(file: str, line: int) -> str:
+    path = Path(file)
+    return f"{path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path}:{line}: "
+
+
+def uncompilable(model: StateSpaceModel, what: str, function: Callable | None, error: Exception) -> ModelError:
+    """What Numba says of a function, in one line: of its long message, what went wrong, and where."""
+    where = re.findall(r'File "([^"]+)", line (\d+)', str(error))
+    at = _shown(str(Path(where[-1][0]).resolve()), int(where[-1][1])) if where else place(function)
+    return ModelError(
+        f"{at}model {model.name}: {what} cannot be compiled: {_gist(error)}; keep to numbers, math and loops"
+    )
+
+
+def _gist(error: Exception) -> str:
+    """The line of a long message that says what went wrong."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    rows = [line for line in lines if not line.startswith(("Failed in", "File ", "During:", "^", "[1]", "[2]"))]
+    return (rows or lines or ["no message"])[0]
+
+
+def numbers(values: np.ndarray) -> str:
+    """The first entries of a vector."""
+    return f"[{', '.join(f'{value:.4g}' for value in values[:4])}{', …' if values.size > 4 else ''}]"
+
+
+def _remedy(error: Exception, function: Any, takes: str, sizes: str, at: str) -> str:
+    """What to do about an error that a function of the model raises at the prior."""
+    if isinstance(error, (NameError, AttributeError, ImportError)):
+        return "correct the name, or define it in the model's file"
+    own = getattr(plain(function), "__code__", None)
+    inside = any(own and frame.filename == own.co_filename for frame in traceback.extract_tb(error.__traceback__))
+    if isinstance(error, TypeError) and not inside:
+        return f"it takes {takes}"
+    if isinstance(error, IndexError) or any(word in str(error) for word in ("broadcast", "unpack", "shape")):
+        return f"check it against the declared sizes: {sizes}"
+    return f"it may not fail at {at}; mend it, or the prior"
+
+
+def indefinite(Q: np.ndarray) -> str | None:
+    """Why a matrix of finite numbers is no covariance; None if it is one."""
+    # Beside its own variances: a Q of nanometres may be lopsided too.
+    if np.any(np.abs(Q - Q.T) > 1e-9 * np.sqrt(np.abs(np.outer(np.diag(Q), np.diag(Q))))):
+        return "is not symmetric (fill both triangles)"
+    values = np.linalg.eigvalsh(Q)
+    # Rounding leaves the zero eigenvalues of a singular Q at n ε of the largest.
+    if values[0] < -1e-9 * max(values[-1], -values[0]):
+        return f"is not positive semidefinite (it has the eigenvalue {values[0]:.3g})"
+    return None
+
+
+def probe(model: StateSpaceModel) -> None:
+    """Run the plain functions once with arrays of the declared sizes, where an index that is too large is an error."""
+    x = model.prior_mean.copy()
+    u = np.array([item.default for item in model.inputs], float)
+    p = np.array([item.value for item in model.parameters], float)
+    q = np.array([noise.variance for noise in model.noises], float)
+    dt = min(1.0, model.max_step)
+    n = model.nx
+    calls: list[tuple[str, Callable | None, str, tuple, tuple[int, ...]]] = [
+        ("f", model.f, "x, u, p, dt", (x, u, p, dt), (n,)),
+        ("F", model.F, "x, u, p, dt", (x, u, p, dt), (n, n)),
+        ("Q", model.Q, "x, u, p, q, dt", (x, u, p, q, dt), (n, n)),
+        ("shape", model.shape, "z, p", (np.random.default_rng(0).standard_normal(n), p), (n,)),
+    ]
+    at = f"x = {numbers(x)}, u = {numbers(u)}, p = {numbers(p)}"
+    for sensor in model.sensors:
+        m = len(sensor.rows)
+        calls.append((f"h of sensor {sensor.name}", sensor.h, "x, u, p", (x, u, p), (m,)))
+        calls.append((f"H of sensor {sensor.name}", sensor.H, "x, u, p", (x, u, p), (m, n)))
+    for what, function, takes, arguments, shape in calls:
+        if function is None or (model.black_box and what not in ("Q", "shape")):
+            continue
+        out = np.full(shape, np.nan)
+        if what == "Q":
+            out[:] = 0.0
+        copies = tuple(item.copy() if isinstance(item, np.ndarray) else item for item in arguments)
+        try:
+            with np.errstate(all="ignore"):
+                plain(function)(*copies, out)
+        except Exception as error:  # noqa: BLE001  the user's own function may raise anything
+            sizes = f"{n} states, {u.size} inputs and {p.size} parameters, out of shape {shape}"
+            raise ModelError(
+                f"{place(function, error)}model {model.name}: {what} fails at the prior: {type(error).__name__}: "
+                f"{_gist(error)}; {_remedy(error, function, f'({takes}, out)', sizes, at)}"
+            ) from None
+        if not all(np.array_equal(copy, item) for copy, item in zip(copies, arguments, strict=True)):
+            raise ModelError(
+                f"{place(function)}model {model.name}: {what} writes to its arguments, which are the filter's own; it "
+                "may fill out only"
+            )
+        bad = np.argwhere(~np.isfinite(out))
+        if bad.size:
+            first = ", ".join(map(str, bad[0]))
+            raise ModelError(
+                f"{place(function)}model {model.name}: {what} leaves {len(bad)} of {out.size} entries of out unset or "
+                f"not finite at the prior, the first of them out[{first}]; it must fill them all with finite numbers "
+                f"at {at}"
+            )
+        wrong = indefinite(out) if what == "Q" else None
+        if wrong:
+            raise ModelError(
+                f"{place(function)}model {model.name}: Q {wrong} at the prior; a covariance must be symmetric and "
+                "positive semidefinite"
+            )
+
+
+def probe_angles(model: StateSpaceModel, h: Sequence[Callable]) -> None:
+    """Refuse a sensor row that tells a full turn of a circular state, whose filters turn it back to within ±π."""
+    if model.nx > LARGE or not np.any(model.circular):
+        return
+    x = model.prior_mean + 0.3 * model.prior_std
+    u = np.array([item.default for item in model.inputs], float)
+    p = np.array([item.value for item in model.parameters], float)
+    for sensor, expected in zip(model.sensors, h, strict=True):
+        here, there = np.empty(len(sensor.rows)), np.empty(len(sensor.rows))
+        expected(x, u, p, here)
+        for j in np.flatnonzero(model.circular):
+            turned = x.copy()
+            turned[j] += 2.0 * np.pi
+            expected(turned, u, p, there)
+            for row, before, after in zip(sensor.rows, here, there, strict=True):
+                change = after - before
+                if row.circular:
+                    change -= 2.0 * np.pi * np.round(change / (2.0 * np.pi))
+                if abs(change) > 1e-6 * max(1.0, abs(before)):
+                    raise ModelError(
+                        f"model {model.name}: row {row.name} of sensor {sensor.name} changes by {change:.3g} with a "
+                        f"full turn of {model.state_names[int(j)]}, which is circular; declare the row circular, or "
+                        "let h be periodic"
+                    )
+
+
+def probe_likelihoods(model: StateSpaceModel) -> None:
+    """Run each sensor's own log_likelihood once, at the reading that the prior predicts."""
+    x = np.array([state.mean for state in model.states], float)
+    u = np.array([item.default for item in model.inputs], float)
+    p = np.array([item.value for item in model.parameters], float)
+    for sensor in model.sensors:
+        if sensor.log_likelihood is None:
+            continue
+        y = np.empty(len(sensor.rows))
+        r = np.array([row.variance for row in sensor.rows], float)
+        plain(sensor.h)(x, u, p, y)
+        named = f"model {model.name}: log_likelihood of sensor {sensor.name}"
+        try:
+            value = float(plain(sensor.log_likelihood)(y, x, u, p, r))
+        except Exception as error:  # noqa: BLE001  the user's own function may raise anything
+            raise ModelError(
+                f"{place(sensor.log_likelihood, error)}{named} fails at the prior: {type(error).__name__}: "
+                f"{_gist(error)}; it takes (y, x, u, p, r) and returns a float"
+            ) from None
+        if np.isnan(value) or value == np.inf:
+            raise ModelError(
+                f"{place(sensor.log_likelihood)}{named} is {value} at the prior; it must be a finite number, or -inf "
+                "where the reading is impossible"
+            )

@@ -1,0 +1,372 @@
+"""What a model is: names, units, prior, noise and plain functions of ONE state.
+
+x' = f(x, u, p, dt) + w,   w ~ N(0, Q(x, u, p, dt))
+y  = h(x, u, p) + v,       v ~ N(0, R)
+
+A model is written once, for one state, in plain Python that fills `out`; `compiled.py` turns it into machine code
+that every filter calls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..errors import LARGEST, ModelError
+from .field import CellNames, Field, State
+from .jump import Jump
+
+LARGE = 1024
+"""States beyond which no filter forms an (nx, nx) matrix: priors are diagonal, moments are means and variances."""
+
+TRUTH_BLOCK = 32
+"""Most states for which an event of the log must have room to tell the truth."""
+
+SHOWN = 64
+"""States that a track keeps where the model does not say which."""
+
+__all__ = ["LARGE", "Field", "Input", "Jump", "Noise", "Parameter", "Row", "Sensor", "State", "StateSpaceModel"]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """One source of process noise: `variance` is what it adds in one second, in `unit`.
+
+    Without the model's Q, `name` is the state that it acts on, or the field on each of whose cells it acts.
+    """
+
+    name: str
+    unit: str
+    variance: float
+
+
+@dataclass(frozen=True)
+class Input:
+    """One entry of u, a known input, held between its readings; `default` until the first."""
+
+    name: str
+    unit: str
+    default: float = 0.0
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One entry of p, a constant of the model, with the range in which it makes sense."""
+
+    name: str
+    unit: str
+    value: float
+    low: float = -np.inf
+    high: float = np.inf
+
+
+@dataclass(frozen=True)
+class Row:
+    """One entry of a sensor's reading, with the variance of its noise; `circular` and `position` as in `State`."""
+
+    name: str
+    unit: str
+    variance: float
+    circular: bool = False
+    position: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One sensor: the rows that one reading of it holds, and what the model expects it to say.
+
+    h(x, u, p, out) fills `out` (ny,). The optional H(x, u, p, out) fills the Jacobian (ny, nx). A sensor whose noise is
+    not Gaussian gives log_likelihood(y, x, u, p, r) -> log p(y | x), with r (ny,) the rows' variances as they are tuned
+    now; rows of y that are missing are NaN. Particle filters use it; the others use h and r.
+    """
+
+    name: str
+    rows: tuple[Row, ...]
+    h: Callable
+    H: Callable | None = None
+    log_likelihood: Callable | None = None
+
+
+@dataclass(frozen=True)
+class StateSpaceModel:
+    """A state-space model; see the module's equations.
+
+    f(x, u, p, dt, out) fills the next state (nx,) after `dt` seconds. Q(x, u, p, q, dt, out) fills the covariance
+    (nx, nx) of the noise added in `dt`, where q (nw,) holds the variances of `noises` as they are tuned now; without
+    it, q is added to the states of the same names, as q·dt. F(x, u, p, dt, out) fills the Jacobian (nx, nx).
+
+    `states` may be a `Field`, of any size. Beyond `LARGE` states there is no Q; shape(z, p, out) may then fill `out`
+    (nx,) with L z, where L Lᵀ has ones on its diagonal: the noise of the process, √(q·dt) L z, and the spread of the
+    prior, std L z, are correlated in space by it, without a matrix.
+
+    A `jump` makes one state a discrete mode (see jump.py). `conditionally_linear` names states in which f and h are
+    linear once the other states are known, with noise that does not depend on them: `rbpf` carries these by a Kalman
+    filter.
+
+    Steps longer than `max_step` seconds are split, so an f that integrates crudely need not integrate far.
+
+    A `black_box` is not compiled: f(X, u, p, dt) takes a block of states X (N, nx) and returns the next ones (N, nx), a
+    sensor's h(X, u, p) returns (N, ny). Row i of the result depends on row i alone, and on no chance. `executor` splits
+    the block: "threads" (for an f that gives up the GIL), "processes" (f and h must stand by their names in a module or
+    in the model's file, which each process runs once), or any concurrent.futures.Executor; None runs it as it is. Q and
+    shape remain functions of one state, which are compiled.
+    """
+
+    name: str
+    title: str
+    states: Sequence[State]
+    sensors: tuple[Sensor, ...]
+    noises: tuple[Noise, ...]
+    f: Callable
+    inputs: tuple[Input, ...] = ()
+    parameters: tuple[Parameter, ...] = ()
+    Q: Callable | None = None
+    F: Callable | None = None
+    shape: Callable | None = None
+    linear: bool = False
+    max_step: float = np.inf
+    source: str = ""
+    black_box: bool = False
+    executor: Executor | str | None = None
+    jump: Jump | None = None
+    conditionally_linear: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse what no filter could run: nothing to estimate, names used twice, numbers out of range."""
+        for kind in ("states", "sensors", "noises"):
+            if not getattr(self, kind):
+                raise ModelError(f"model {self.name}: {kind} is empty; name at least one")
+        field = isinstance(self.states, Field)
+        for kind in (
+            ("sensors", "noises", "inputs", "parameters")
+            if field
+            else ("states", "sensors", "noises", "inputs", "parameters")
+        ):
+            names = [item.name for item in getattr(self, kind)]
+            twice = sorted({name for name in names if names.count(name) > 1})
+            if twice:
+                raise ModelError(f"model {self.name}: {kind} names {twice[0]!r} twice; every name must differ")
+        for state in () if field else self.states:
+            if not (0.0 < state.std <= LARGEST and abs(state.mean) <= LARGEST):
+                raise ModelError(
+                    f"model {self.name}: the prior of {state.name} is {state.mean} ± {state.std}; "
+                    f"both must be finite, {LARGEST:g} at most, and the second positive"
+                )
+        for item in self.parameters:
+            if not item.low <= item.high:
+                raise ModelError(
+                    f"model {self.name}: parameter {item.name} ranges from {item.low:g} to {item.high:g}; "
+                    "the first must not be above the second"
+                )
+        for sensor in self.sensors:
+            rows = [row.name for row in sensor.rows]
+            if not rows:
+                raise ModelError(f"model {self.name}: sensor {sensor.name} has no rows; name at least one")
+            if len(set(rows)) < len(rows):
+                raise ModelError(f"model {self.name}: sensor {sensor.name} names a row twice; every name must differ")
+        for noise in self.noises:
+            if not (noise.variance >= 0 and np.isfinite(noise.variance)):
+                raise ModelError(
+                    f"model {self.name}: noise {noise.name} has variance {noise.variance}; it must be zero or positive"
+                )
+        for sensor in self.sensors:
+            for row in sensor.rows:
+                if not (row.variance > 0 and np.isfinite(row.variance)):
+                    raise ModelError(
+                        f"model {self.name}: sensor {sensor.name}.{row.name} has variance {row.variance}; "
+                        "it must be positive"
+                    )
+        if self.Q is None:
+            strays = [noise.name for noise in self.noises if not self.acts_on(noise.name)]
+            if strays:
+                raise ModelError(
+                    f"model {self.name}: noise {strays[0]!r} is not a state or field; name one, "
+                    "or write Q(x, u, p, q, dt, out)"
+                )
+        elif self.shape is not None or self.nx > LARGE:
+            raise ModelError(
+                f"model {self.name}: Q of {self.nx:,} states would be a matrix of {8e-9 * self.nx**2:.3g} GB; name the "
+                "noise after the field and correlate it with shape(z, p, out), which takes Q's place"
+            )
+        if self.black_box:
+            if self.F is not None or any(s.H is not None or s.log_likelihood is not None for s in self.sensors):
+                raise ModelError(
+                    f"model {self.name}: a black box gives f and h of blocks of states only; leave out F, H and "
+                    "log_likelihood"
+                )
+        elif self.executor is not None:
+            raise ModelError(f"model {self.name}: executor is for a black box; set black_box=True or leave it out")
+        if isinstance(self.executor, str) and self.executor not in ("threads", "processes"):
+            raise ModelError(
+                f"model {self.name}: executor is {self.executor!r}; it must be 'threads', 'processes', or a "
+                "concurrent.futures.Executor"
+            )
+        self._check_parts()
+        if not self.max_step > 0:
+            raise ModelError(f"model {self.name}: max_step is {self.max_step} s; it must be positive")
+
+    def _check_parts(self) -> None:
+        """Refuse a mode or a linear part that the states do not have."""
+        if isinstance(self.states, Field) and (self.jump or self.conditionally_linear):
+            raise ModelError(f"model {self.name}: a field has no mode and no linear part; list the states")
+        for name in self.conditionally_linear:
+            if name not in self.state_names or (self.jump and name == self.jump.state):
+                what = "the mode" if name in self.state_names else "no state"
+                raise ModelError(f"model {self.name}: conditionally_linear names {name!r}, {what}")
+        if len(set(self.conditionally_linear)) < len(self.conditionally_linear):
+            raise ModelError(f"model {self.name}: conditionally_linear names a state twice")
+        if self.jump is None:
+            return
+        if self.jump.state not in self.state_names:
+            raise ModelError(f"model {self.name}: jump names {self.jump.state!r}, no state; name one of them")
+        state = self.states[self.mode]
+        last = len(self.jump.modes) - 1
+        if last < 1 or not 0 <= state.mean <= last or state.circular:
+            raise ModelError(
+                f"model {self.name}: the mode {state.name} has {last + 1} values and the prior mean {state.mean:g}; it "
+                f"needs at least 2, a mean between 0 and {max(1, last)}, and is no angle"
+            )
+        if self.Q is None and any(noise.name == state.name for noise in self.noises):
+            raise ModelError(f"model {self.name}: a noise acts on the mode {state.name}, which jumps; leave it out")
+        if self.black_box or self.linear:
+            raise ModelError(f"model {self.name}: a model with a jump is neither linear nor a black box; say neither")
+
+    @cached_property
+    def mode(self) -> int:
+        """Index of the state that is the discrete mode; -1 if none is."""
+        return -1 if self.jump is None else self.state_names.index(self.jump.state)
+
+    @cached_property
+    def linear_states(self) -> np.ndarray:
+        """Indices of the conditionally linear states, rising; of a linear model all."""
+        if self.linear and not self.conditionally_linear and not isinstance(self.states, Field):
+            return np.arange(self.nx)
+        return np.array(sorted(self.state_names.index(name) for name in self.conditionally_linear), np.int64)
+
+    def label(self, state: str) -> str:
+        """What an estimate of that state is called: its name, or, of a mode with two values, a probability."""
+        two = self.jump is not None and state == self.jump.state and len(self.jump.modes) == 2
+        return f"probability of {state}" if two else state
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return len(self.states)
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @cached_property
+    def ny(self) -> int:
+        """Rows of the longest sensor."""
+        return max(len(sensor.rows) for sensor in self.sensors)
+
+    @cached_property
+    def state_names(self) -> Sequence[str]:
+        """Names of the states, in order."""
+        if isinstance(self.states, Field):
+            return CellNames(self.states)
+        return tuple(state.name for state in self.states)
+
+    @cached_property
+    def prior_mean(self) -> np.ndarray:
+        """Prior mean of every state, (nx,)."""
+        if isinstance(self.states, Field):
+            return self.states.prior_mean
+        return np.array([state.mean for state in self.states], float)
+
+    @cached_property
+    def prior_std(self) -> np.ndarray:
+        """Prior standard deviation of every state, (nx,)."""
+        if isinstance(self.states, Field):
+            return np.full(self.nx, float(self.states.std))
+        return np.array([state.std for state in self.states], float)
+
+    @cached_property
+    def circular(self) -> np.ndarray:
+        """For each state, whether it is an angle, (nx,) int8."""
+        if isinstance(self.states, Field):
+            return np.zeros(self.nx, np.int8)
+        return np.array([state.circular for state in self.states], np.int8)
+
+    @property
+    def grid(self) -> Field | None:
+        """The field, if it has too many cells for each to have a chart; it is then drawn as pictures."""
+        return self.states if isinstance(self.states, Field) and self.nx > SHOWN else None
+
+    @cached_property
+    def shown(self) -> np.ndarray:
+        """Indices of the states whose estimates a track keeps, a column each: all, or those that a field names."""
+        if isinstance(self.states, Field) and self.states.shown:
+            return np.array(self.states.shown, np.int64)
+        if self.nx <= SHOWN:
+            return np.arange(self.nx)
+        if isinstance(self.states, Field):
+            axes = [np.unique(np.linspace(0, n - 1, 6).round().astype(int)[1:-1]) for n in self.states.shape]
+            cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+            return np.ravel_multi_index(cells.T, self.states.shape)[:SHOWN].astype(np.int64)
+        return np.unique(np.linspace(0, self.nx - 1, SHOWN).round().astype(np.int64))
+
+    @cached_property
+    def shown_states(self) -> tuple[State, ...]:
+        """The states of the track's columns, in order."""
+        return tuple(self.states[int(j)] for j in self.shown)
+
+    def acts_on(self, noise: str) -> range:
+        """The states to which a noise of that name adds: one, or a whole field; none if there is no such name."""
+        if isinstance(self.states, Field):
+            return range(self.nx if noise == self.states.name else 0)
+        if noise not in self.state_names:
+            return range(0)
+        first = self.state_names.index(noise)
+        return range(first, first + 1)
+
+    def positions(self) -> np.ndarray | None:
+        """Where every state is, (nx, axes); None if one of them does not say."""
+        if isinstance(self.states, Field):
+            return self.states.positions()
+        places = [state.position for state in self.states]
+        return None if any(place is None for place in places) else np.array(places, float)
+
+    @property
+    def periods(self) -> tuple[float, ...] | None:
+        """Length after which space repeats along each axis (infinite where it does not); None where nothing does."""
+        return self.states.periods if isinstance(self.states, Field) else None
+
+    @cached_property
+    def sensor_names(self) -> tuple[str, ...]:
+        """Names of the sensors, in order."""
+        return tuple(sensor.name for sensor in self.sensors)
+
+    @cached_property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the inputs, in order."""
+        return tuple(item.name for item in self.inputs)
+
+    @cached_property
+    def row_names(self) -> tuple[str, ...]:
+        """Every sensor row: `speed`, or `gnss.east` where a sensor has several rows."""
+        return tuple(
+            sensor.name if len(sensor.rows) == 1 else f"{sensor.name}.{row.name}"
+            for sensor in self.sensors
+            for row in sensor.rows
+        )
+
+    @cached_property
+    def row_start(self) -> tuple[int, ...]:
+        """Index of each sensor's first row among all rows."""
+        return tuple(int(k) for k in np.cumsum([0] + [len(sensor.rows) for sensor in self.sensors])[:-1])
+
+    @cached_property
+    def width(self) -> int:
+        """Columns that one event of the log needs: the longest of a reading, the inputs, and a block of true states.
+
+        A block holds the whole state of a small model, and `TRUTH_BLOCK` states of a large one.
+        """
+        return max(min(self.nx, TRUTH_BLOCK), self.nu, self.ny)

@@ -1,0 +1,1 @@
+"""Numbers without a model: compiling, dense linear algebra, random numbers, vector instructions."""

@@ -1,0 +1,1 @@
+"""Filters that carry weighted particles."""

@@ -1,0 +1,293 @@
+"""The Rao-Blackwellised particle filter: sample what is nonlinear, leave the rest to a Kalman filter a particle.
+
+The model says which states it is linear in once the others are known (`conditionally_linear`), and may have a discrete
+mode (`jump`). A particle carries a value of the others and of the mode, and mean and covariance of the linear states
+given the whole past of these; a reading moves it as a Kalman filter and weighs it by N(y; h(x), H P Hᵀ + R). The
+estimate is the mixture of these Gaussians. What is integrated exactly needs no particles: the variance is never larger
+than that of `pf` with as many. With nothing to sample it is the Kalman filter.
+
+The mode and the sampled states move as the model says, blind to the reading that comes.
+
+Sources: Doucet, de Freitas, Murphy & Russell (2000), Rao-Blackwellised particle filtering for dynamic Bayesian
+networks, UAI 2000, section 3; Schön, Gustafsson & Nordlund (2005), Marginalized particle filters for mixed
+linear/nonlinear state-space models, doi:10.1109/TSP.2005.849151, algorithm 1.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..compiled.context import circular_rows, circular_states, expect, sensor_variances
+from ..compiled.context import options as numbers
+from ..estimator import Estimator, Option, Options
+from ..gaussian.shared import admit
+from ..model.state_space import StateSpaceModel
+from ..numerics.jit import floats, jit, matrix
+from ..numerics.linalg import wrap
+from ..numerics.peaks import Mode, modes_of
+from ..numerics.random import key_of, normal
+from ..track import FAILED, MISSING, USED
+from .mode_draws import any_mode, jump_key, nearest_mode
+from .pf import finite_rows
+from .rbpf_steps import ADOPT, CONDITION, PREDICT, fix_mode, sample, tune, work_size
+from .shared import (
+    DRAWN,
+    EQUAL,
+    HEAD,
+    MEMBERS,
+    PROCESS,
+    RECOVER,
+    RECOVERIES,
+    RESAMPLE,
+    SETTLED,
+    START,
+    cloud,
+    cloud_moments,
+    describe,
+    moments,
+    next_draw,
+    records_of,
+    recoveries,
+    sized,
+    weigh_equally,
+    wrap_record,
+)
+from .shared import OPTIONS as CLOUD_OPTIONS
+from .steps import impoverished, keep, normalise, resample, shared, sweep, total
+
+
+@jit
+def _spread(context, C, whole, key, member, mode, x, P, column, before):
+    """Add a draw of N(0, C) to a particle: its sampled states move, its linear ones get what is left of C."""
+    if context.mode >= 0:
+        fix_mode(context, C, mode, x, column)
+    sample(context, C, key, np.uint64(member * x.size), x, column, before)
+    wrap_record(circular_states(context), x)
+    for a in range(x.size):
+        for b in range(x.size):
+            P[a, b] = C[a, b] if whole else P[a, b] + C[a, b]
+
+
+@jit
+def _begin(context, mean, cov, index, stream, state):
+    """The cloud that stands for N(mean, cov), of equal weights; the head's counters stay."""
+    nx = context.nx
+    n = int(numbers(context)[MEMBERS])
+    records = records_of(state, nx, n)
+    key = key_of(context.seed, index, stream)
+    C, column, before = np.empty((nx, nx)), np.empty(nx), np.empty(nx)
+    mode = 0.0
+    for i in range(n):
+        x = records[i, :nx]
+        for a in range(nx):
+            x[a] = mean[a]
+            for b in range(nx):
+                C[a, b] = cov[a, b]
+        if context.mode >= 0:
+            j = context.mode
+            std = np.sqrt(cov[j, j])
+            mode = nearest_mode(context, mean[j] + std * normal(jump_key(key), np.uint64(i)), mean[j], std)
+        _spread(context, C, True, key, i, mode, x, matrix(records[i], nx, nx, nx), column, before)
+    weigh_equally(state, nx, n)
+    state[SETTLED] = 0.0
+
+
+@jit
+def start(context, mean, cov, state):
+    """Sampled states and modes drawn from N(mean, cov), and the linear ones given them: Schön et al., step 1."""
+    circular = circular_states(context)
+    for i in range(HEAD):
+        state[i] = 0.0
+    for j in range(mean.size):
+        state[HEAD + j] = circular[j]
+    _begin(context, mean, cov, 0, START, state)
+
+
+@jit
+def _recover(context, index, state):
+    """Widen a cloud in which no particle explains the reading, as `particle.recover` does: any mode, twice the spread.
+
+    The sampled states move by a draw from the cloud's covariance, the linear ones get it added to theirs.
+    """
+    nx = context.nx
+    n = int(numbers(context)[MEMBERS])
+    state[RECOVERIES] += 1.0
+    mean, cov = np.empty(nx), np.empty((nx, nx))
+    cloud_moments(state, nx, n, mean, cov)
+    finite = True
+    for i in range(nx):
+        finite = finite and np.isfinite(mean[i]) and np.isfinite(cov[i, i])
+    if not finite:
+        prior = matrix(floats(context.prior_cov, nx * nx), 0, nx, nx)
+        _begin(context, floats(context.prior_mean, nx), prior, index, RECOVER, state)
+        return
+    records = records_of(state, nx, n)
+    key = key_of(context.seed, index, RECOVER)
+    C, column, before = np.empty((nx, nx)), np.empty(nx), np.empty(nx)
+    mode = 0.0
+    for i in range(n):
+        for a in range(nx):
+            for b in range(nx):
+                C[a, b] = cov[a, b]
+        if context.mode >= 0:
+            for a in range(nx):
+                C[a, context.mode] = 0.0
+                C[context.mode, a] = 0.0
+            mode = any_mode(context, jump_key(key), i)
+        _spread(context, C, False, key, i, mode, records[i, :nx], matrix(records[i], nx, nx, nx), column, before)
+    state[SETTLED] = 0.0
+
+
+@jit
+def predict(context, u, dt, index, state, work):
+    """The mode jumps, the sampled states are drawn, the linear ones follow by a Kalman filter given the draw.
+
+    Source: Schön, Gustafsson & Nordlund (2005), theorem 1 and algorithm 1, step 4.
+    """
+    n = int(numbers(context)[MEMBERS])
+    index = next_draw(state)
+    sums, _, _, _, _, _, _ = shared(context, work, n)
+    sweep(PREDICT, context, u, dt, 0, u, key_of(context.seed, index, PROCESS), 0.0, state, work)
+    total(context, work, sums)
+    if sums[0] > 0.0:
+        state[EQUAL] = 0.0
+        if sums[0] >= n:
+            _recover(context, index, state)
+
+
+@jit
+def _refer(context, sensor, u, state, reference):
+    """What the first particle that can tell expects of the sensor: close to what all do, as a place to sum from."""
+    n = int(numbers(context)[MEMBERS])
+    records = records_of(state, context.nx, n)
+    for i in range(n):
+        expect(context, sensor, records[i, : context.nx], u, reference)
+        finite = True
+        for k in range(reference.size):
+            finite &= np.isfinite(reference[k])
+        if finite:
+            return
+    for k in range(reference.size):
+        reference[k] = 0.0
+
+
+@jit
+def _mixture(context, sensor, y, sums, S, nu, innovation, innovation_std):
+    """Innovation and its covariance, those of the mixture of the particles' predictions; `nu` holds the reference.
+
+    ν = y - Σ w ŷ,  S = Σ w (S_i + ŷ ŷᵀ) - (Σ w ŷ)(Σ w ŷ)ᵀ
+
+    Returns:
+        The number of finite rows.
+    """
+    r = sensor_variances(context, sensor)
+    angles = circular_rows(context, sensor)
+    m = finite_rows(y, r.size)
+    k = 0
+    for row in range(r.size):
+        if not np.isfinite(y[row]):
+            continue
+        shift = sums[4 + k] / sums[0]
+        # Row `row` moves up to k ≤ row.
+        nu[k] = y[row] - nu[row] - shift
+        if angles[row] != 0:
+            nu[k] = wrap(nu[k])
+        for j in range(k + 1):
+            S[k, j] = sums[4 + m + k * m + j] / sums[0] - shift * sums[4 + j] / sums[0]
+            S[j, k] = S[k, j]
+        S[k, k] = max(S[k, k], r[row])
+        innovation[row] = nu[k]
+        innovation_std[row] = np.sqrt(S[k, k])
+        k += 1
+    return m
+
+
+@jit
+def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
+    """Each particle a Kalman update; w ← w N(y; h(x), H P Hᵀ + R); resampling where few carry the weight.
+
+    NIS is that of the mixture's mean and covariance, the log-likelihood the mixture's own, log Σ w N. When no particle
+    explains the reading the verdict is `FAILED`, the reading is not used, and the cloud is widened. A reading beyond
+    the numbers fails alone.
+    """
+    n = int(numbers(context)[MEMBERS])
+    rows = sensor_variances(context, sensor).size
+    if finite_rows(y, rows) == 0:
+        return MISSING
+    sums, _, _, S_flat, U_flat, nu, _ = shared(context, work, n)
+    S = matrix(S_flat, 0, rows, rows)
+    settled = state[SETTLED]
+    index = next_draw(state)
+    _refer(context, sensor, u, state, nu[:rows])
+    sweep(CONDITION, context, u, 0.0, sensor, y, np.uint64(0), 0.0, state, work)
+    total(context, work, sums)
+    m = _mixture(context, sensor, y, sums, S, nu, innovation, innovation_std)
+    verdict = admit(context, sensor, m, nu, S, matrix(U_flat, 0, rows, rows), score)
+    state[SETTLED] = settled
+    score[2] = np.nan
+    if verdict == USED:
+        sweep(ADOPT, context, u, 0.0, sensor, y, np.uint64(0), 0.0, state, work)
+    log_sum = normalise(context, u, sensor, y, state, work, sums)
+    if log_sum > -np.inf:
+        score[2] = log_sum
+    if verdict == USED and log_sum > -np.inf:
+        keep(context, u, sensor, y, log_sum, sums, state, work)
+        if impoverished(context, state):
+            resample(context, u, sensor, y, key_of(context.seed, index, RESAMPLE), sums, state, work)
+    elif verdict == USED or (verdict == FAILED and not score[0] == np.inf):
+        verdict = FAILED
+        state[SETTLED] = 0.0
+        _recover(context, index, state)
+    return verdict
+
+
+def points(options: Options, state: np.ndarray, nx: int) -> np.ndarray:
+    """Draws of the mixture (`DRAWN`, nx): particles picked by weight at even steps, and one of each's Gaussian."""
+    w, records = cloud(options, state, nx)
+    picked = np.minimum(np.searchsorted(np.cumsum(w), (np.arange(DRAWN) + 0.5) / DRAWN), len(w) - 1)
+    P = records[picked, nx:].reshape(DRAWN, nx, nx)
+    values, vectors = np.linalg.eigh(np.where(np.isfinite(P), P, 0.0))
+    z = np.sqrt(np.maximum(values, 0.0)) * np.random.default_rng(0).standard_normal((DRAWN, nx))
+    return np.asarray(records[picked, :nx] + np.einsum("kij,kj->ki", vectors, z))
+
+
+def modes(options: Options, state: np.ndarray, nx: int) -> list[Mode]:
+    """The peaks of the mixture."""
+    return modes_of(points(options, state, nx), state[HEAD : HEAD + nx] != 0.0)
+
+
+def applies(model: StateSpaceModel) -> str | None:
+    """Only a model that says what is linear, or has a mode, leaves something to a Kalman filter a particle."""
+    if not len(model.linear_states):
+        return (
+            f"rbpf needs states that are linear once the others are known; {model.name} names none in "
+            "conditionally_linear; use pf"
+        )
+    own = [sensor.name for sensor in model.sensors if sensor.log_likelihood is not None]
+    if own:
+        return f"rbpf needs Gaussian sensors; {own[0]} of {model.name} has a log_likelihood of its own; use pf"
+    return None
+
+
+OPTIONS = (Option("particles", 500, 2, 1e6, "", "number of particles, each with a Kalman filter"), *CLOUD_OPTIONS[1:])
+
+RBPF = Estimator(
+    name="rbpf",
+    title="Rao-Blackwellised particle filter",
+    family="particle",
+    assumes="f and h linear in the states of conditionally_linear given the others and the mode; Gaussian noise",
+    model_runs="2 N, and the derivatives of f and h",
+    fails_when="a jump or a sampled state that the readings demand is so unlikely that no particle tries it",
+    source="Schön, Gustafsson & Nordlund (2005), doi:10.1109/TSP.2005.849151",
+    functions=(start, predict, update, describe),
+    runs=lambda options, nx: options["particles"] * (nx + 1),
+    state_size=sized(lambda nx: nx + nx * nx),
+    work_size=work_size,
+    moments=moments,
+    points=points,
+    modes=modes,
+    recoveries=recoveries,
+    options=OPTIONS,
+    tune=tune,
+    applies=applies,
+)

@@ -1,0 +1,127 @@
+"""Resampling: how many children each particle gets, by four schemes, and the children put in place.
+
+All are unbiased, E[children of i] = N w_i. Systematic and stratified put one point into each of N equal strata of the
+cumulated weights (the same place in each, or a place of its own); residual gives ⌊N w_i⌋ and draws the rest;
+multinomial draws all. Stratified and residual never vary more than multinomial; systematic is the cheapest and mostly
+varies least, but in contrived orders can be the worst.
+
+Source: Douc & Cappé (2005), Comparison of resampling schemes for particle filtering, doi:10.1109/ISPA.2005.195385.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..numerics.jit import jit
+from ..numerics.random import unit, word
+
+SYSTEMATIC, STRATIFIED, RESIDUAL, MULTINOMIAL = range(4)
+
+SCHEME_NAMES = ("systematic", "stratified", "residual", "multinomial")
+
+
+@jit
+def points_below(scheme, key, t):
+    """How many of the points k + u_k, k = 0 … N-1, lie below t; u_k is one number or a stratum's own."""
+    k = np.floor(t)
+    place = np.uint64(0) if scheme == SYSTEMATIC else np.uint64(k)
+    return k + 1.0 if unit(word(key, place)) < t - k else k
+
+
+@jit
+def strata_children(scheme, key, w, before, after, scale, children):
+    """Fill `children` of the members whose weights are `w` by systematic or stratified resampling.
+
+    The members are a run out of N. `before` and `after` are the cumulated weights at its ends in units of points (0 to
+    exactly N), which its neighbours see with the same bits, and `scale` turns a weight into points. So runs can be
+    done in any order, on any number of threads.
+    """
+    below = points_below(scheme, key, before)
+    cumulated = before
+    last = w.size - 1
+    for i in range(w.size):
+        cumulated += w[i] * scale
+        upto = points_below(scheme, key, after if i == last else min(cumulated, after))
+        children[i] = upto - below
+        below = upto
+
+
+@jit
+def _draw_children(key, w, total, draws, children):
+    """Add `draws` children, each to member i with probability w_i / total.
+
+    Sorted uniforms from the top: the largest of k is U^(1/k) times the next larger. Source: Bentley & Saxe (1980),
+    Generating sorted lists of random numbers, doi:10.1145/355900.355907.
+    """
+    i = w.size - 1
+    edge = total - w[i]
+    top = 1.0
+    for k in range(draws, 0, -1):
+        top *= np.exp(np.log(unit(word(key, np.uint64(k)))) / k)
+        target = top * total
+        while target < edge and i > 0:
+            i -= 1
+            edge -= w[i]
+        children[i] += 1.0
+
+
+@jit
+def drawn_children(scheme, key, w, total, children):
+    """Fill `children` (N,) by residual or multinomial resampling; `w` is overwritten by the residual one."""
+    n = w.size
+    if scheme == MULTINOMIAL:
+        for i in range(n):
+            children[i] = 0.0
+        _draw_children(key, w, total, n, children)
+        return
+    given = 0.0
+    rest = 0.0
+    for i in range(n):
+        share = n * (w[i] / total)
+        children[i] = np.floor(share)
+        given += children[i]
+        w[i] = share - children[i]
+        rest += w[i]
+    # The sum of rounded shares can fall short of a whole number by rounding, never by half.
+    draws = int(n - given)
+    if draws > 0:
+        _draw_children(key, w, rest, draws, children)
+
+
+@jit
+def match_children(children, parents):
+    """Match each child beyond a parent's first with a place that becomes free, both in the order of the members.
+
+    On return the first entries of `children` (N,) are the places and those of `parents` (N,) who fills them.
+
+    Returns:
+        How many there are.
+    """
+    free = 0
+    extra = 0
+    for i in range(children.size):
+        count = children[i]
+        # Written always and kept if due: a branch on a random number is guessed wrong half the time. free ≤ i.
+        children[free] = i
+        free += count == 0.0
+        parents[extra] = i
+        extra += count > 1.0
+        while count > 2.0:
+            parents[extra] = i
+            extra += 1
+            count -= 1.0
+    return free
+
+
+@jit
+def copy_children(count, places, parents, rows):
+    """Copy the row of each parent over the row of its place; rows are (N, k).
+
+    The order of the members means nothing, so nothing else need move.
+    """
+    width = rows.shape[1]
+    for k in range(count):
+        row = rows[int(places[k])]
+        parent = rows[int(parents[k])]
+        for j in range(width):
+            row[j] = parent[j]

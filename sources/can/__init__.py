@@ -1,0 +1,1 @@
+"""CAN buses and logs of CAN frames."""

@@ -1,0 +1,211 @@
+"""Bits to numbers: the signals of CAN messages as tables, and the compiled loop that reads them.
+
+A live bus gives a few frames at a time and a recording thousands; one compiled loop serves both.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from estimators.numerics.jit import jit
+
+UNSIGNED, SIGNED, FLOAT32, FLOAT64 = range(4)
+PRESENT, ABSENT, SHORT = range(3)
+"""A value is there; the frame does not carry the signal (multiplexing); the frame ends before it."""
+
+
+class Signals(NamedTuple):
+    """Signals of all messages, one a row; those of message m are rows first[m] to first[m + 1].
+
+    `start` counts bits from the least significant bit of byte 0 for little-endian signals, and from the most
+    significant one of byte 0 for big-endian ones. `parent` is the multiplexer's position within the message, or -1;
+    ids[ids_first[s]:ids_first[s + 1]] are its values with which the frame carries the signal, and
+    known[known_first[s]:known_first[s + 1]] the values that a multiplexer s may have at all.
+    """
+
+    first: np.ndarray
+    start: np.ndarray
+    length: np.ndarray
+    big: np.ndarray
+    kind: np.ndarray
+    scale: np.ndarray
+    offset: np.ndarray
+    parent: np.ndarray
+    ids: np.ndarray
+    ids_first: np.ndarray
+    known: np.ndarray
+    known_first: np.ndarray
+
+
+@jit
+def _bits(data: Any, i: int, start: int, length: int, big: bool) -> Any:
+    """`length` bits of frame i as an unsigned integer."""
+    raw = np.uint64(0)
+    got = 0
+    position = start
+    while got < length:
+        byte = np.uint64(data[i, position >> 3])
+        shift = position & 7
+        take = min(8 - shift, length - got)
+        mask = np.uint64((1 << take) - 1)
+        if big:
+            raw = (raw << np.uint64(take)) | ((byte >> np.uint64(8 - shift - take)) & mask)
+        else:
+            raw = raw | (((byte >> np.uint64(shift)) & mask) << np.uint64(got))
+        got += take
+        position += take
+    return raw
+
+
+@jit
+def extract(signals, plan, length, data, values, state, bad):
+    """Physical values of every signal of every frame.
+
+    Args:
+        signals: The tables.
+        plan: Message of each frame, (n,); frames with -1 are left out.
+        length: Bytes of each frame, (n,).
+        data: Their bytes, (n, at least the longest message), zeros behind the end.
+        values: Filled, (n, signals of a message): physical value, NaN where there is none.
+        state: Filled, same shape: PRESENT, ABSENT or SHORT.
+        bad: Filled, (n,): 1 where a multiplexer has a value that the database does not know, 2 where the frame ends
+            before a multiplexer.
+    """
+    as_bits = np.zeros(1, np.uint64)
+    as_double = as_bits.view(np.float64)
+    as_half_bits = np.zeros(1, np.uint32)
+    as_single = as_half_bits.view(np.float32)
+    raws = np.zeros(max(1, values.shape[1]), np.int64)
+    for i in range(plan.size):
+        bad[i] = 0
+        m = plan[i]
+        if m < 0:
+            continue
+        for j in range(signals.first[m + 1] - signals.first[m]):
+            s = signals.first[m] + j
+            values[i, j] = np.nan
+            parent = signals.parent[s]
+            if parent >= 0:
+                here = False
+                if state[i, parent] == PRESENT:
+                    for k in range(signals.ids_first[s], signals.ids_first[s + 1]):
+                        if signals.ids[k] == raws[parent]:
+                            here = True
+                            break
+                if not here:
+                    state[i, j] = ABSENT
+                    continue
+            n = signals.length[s]
+            multiplexer = signals.known_first[s + 1] > signals.known_first[s]
+            if signals.start[s] + n > 8 * length[i]:
+                state[i, j] = SHORT
+                if multiplexer:
+                    bad[i] = 2
+                continue
+            state[i, j] = PRESENT
+            raw = _bits(data, i, signals.start[s], n, signals.big[s])
+            kind = signals.kind[s]
+            if kind == UNSIGNED:
+                value = float(raw)
+                raws[j] = np.int64(raw)
+            elif kind == SIGNED:
+                integer = np.int64(raw)
+                if n < 64 and (raw >> np.uint64(n - 1)) & np.uint64(1):
+                    integer = integer - (np.int64(1) << np.int64(n))
+                value = float(integer)
+                raws[j] = integer
+            elif kind == FLOAT32:
+                as_half_bits[0] = np.uint32(raw)
+                value = float(as_single[0])
+            else:
+                as_bits[0] = raw
+                value = as_double[0]
+            values[i, j] = value * signals.scale[s] + signals.offset[s]
+            if multiplexer:
+                known = False
+                for k in range(signals.known_first[s], signals.known_first[s + 1]):
+                    if signals.known[k] == raws[j]:
+                        known = True
+                        break
+                if not known:
+                    bad[i] = 1
+
+
+def _network_start(signal: Any) -> int:
+    """Bits from the front of the frame to the signal's first one, in the order in which its bytes are read."""
+    if signal.byte_order == "little_endian":
+        return int(signal.start)
+    return 8 * (int(signal.start) // 8) + (7 - int(signal.start) % 8)
+
+
+def vectorises(signal: Any) -> bool:
+    """Whether `extract` gives exactly what cantools gives: else cantools decodes the message, frame by frame."""
+    conversion = signal.conversion
+    whole = float(conversion.scale).is_integer() and float(conversion.offset).is_integer()
+    if signal.is_float:
+        return signal.length in (32, 64)
+    if signal.length > 64:
+        return False
+    # cantools keeps integers whole, and these may be longer than a float can hold.
+    identity = conversion.scale == 1 and conversion.offset == 0
+    return identity or not whole or signal.length + int(abs(conversion.scale)).bit_length() <= 52
+
+
+def ordered(message: Any, names: tuple[str, ...]) -> list[Any]:
+    """The signals called `names` and the multiplexers above them, each multiplexer before what it selects."""
+    by_name = {signal.name: signal for signal in message.signals}
+    found: dict[str, Any] = {}
+
+    def visit(name: str) -> None:
+        signal = by_name[name]
+        if signal.multiplexer_signal is not None:
+            visit(signal.multiplexer_signal)
+        found.setdefault(name, signal)
+
+    for name in names:
+        visit(name)
+    return list(found.values())
+
+
+def tabulate(messages: list[tuple[Any, list[Any]]]) -> Signals:
+    """The tables of messages (cantools) and the signals of each that are wanted, in the order of `ordered`."""
+    first, ids_first, known_first = [0], [0], [0]
+    columns: list[list[Any]] = [[] for _ in range(9)]
+    start, length, big, kind, scale, offset, parent, ids, known = columns
+    for message, signals in messages:
+        names = [signal.name for signal in signals]
+        for signal in signals:
+            start.append(_network_start(signal))
+            length.append(signal.length)
+            big.append(signal.byte_order != "little_endian")
+            kind.append(
+                (FLOAT32 if signal.length == 32 else FLOAT64)
+                if signal.is_float
+                else (SIGNED if signal.is_signed else UNSIGNED)
+            )
+            scale.append(float(signal.conversion.scale))
+            offset.append(float(signal.conversion.offset))
+            parent.append(-1 if signal.multiplexer_signal is None else names.index(signal.multiplexer_signal))
+            ids.extend(signal.multiplexer_ids or ())
+            ids_first.append(len(ids))
+            selected = [s for s in message.signals if s.multiplexer_signal == signal.name]
+            known.extend(sorted({value for s in selected for value in s.multiplexer_ids or ()}))
+            known_first.append(len(known))
+        first.append(len(start))
+    whole, real = np.int64, np.float64
+    return Signals(
+        first=np.array(first, whole),
+        start=np.array(start, whole),
+        length=np.array(length, whole),
+        big=np.array(big, np.bool_),
+        kind=np.array(kind, whole),
+        scale=np.array(scale, real),
+        offset=np.array(offset, real),
+        parent=np.array(parent, whole),
+        ids=np.array(ids, whole),
+        ids_first=np.array(ids_first, whole),
+        known=np.array(known, whole),
+        known_first=np.array(known_first, whole),
+    )

@@ -1,0 +1,1 @@
+"""Simulated assets, and faults on demand."""

@@ -1,0 +1,226 @@
+"""A simulated asset: a model with a truth of its own, and sensors with rates, noise and losses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimators.compiled.model import compile_model
+from estimators.errors import NisusError, SourceError
+from estimators.log import INPUT, READING, TICK, TRUTH, Readings
+from estimators.model.state_space import StateSpaceModel
+
+from .faults import Fault, Faults
+from .profile import Constant, Profile
+
+BATCH = 512
+"""Events after which `read` returns."""
+
+
+@dataclass(frozen=True)
+class SensorPlan:
+    """A sensor speaks at every `every`th step; one in `drop_every` of its readings is lost (it arrives empty).
+
+    `variances` of its true noise, one for each row, in place of the model's.
+    """
+
+    every: int = 1
+    variances: tuple[float, ...] | None = None
+    drop_every: int | None = None
+
+
+class Simulator:
+    """Gives the events of a simulated asset as fast as it is asked.
+
+    In each step, in this order: the mode jumps, where the model has one; x ← f(x, u, p, dt) + w with w ~ N(0, Q); then
+    y = h(x, u, p) + v with v ~ N(0, R) for each sensor that is due, drawn even if the reading is lost, so that a loss
+    does not change what follows. Its first event is a tick at time zero, where the estimator's prior holds; then, after
+    every step: the inputs if they changed, the readings, and the true states that a track shows, in blocks of the log's
+    width; or, every `truth_every` steps, all states.
+    """
+
+    live = False
+
+    def __init__(
+        self,
+        model: StateSpaceModel,
+        *,
+        seed: int,
+        step: float,
+        duration: float | None = None,
+        initial: Mapping[str, float] | None = None,
+        truth_parameters: Mapping[str, float] | None = None,
+        truth_model: StateSpaceModel | None = None,
+        truth_noise: Mapping[str, float] | None = None,
+        inputs: Mapping[str, Profile] | None = None,
+        sensors: Mapping[str, SensorPlan] | None = None,
+        faults: Sequence[Fault] = (),
+        truth_every: int | None = None,
+    ) -> None:
+        """Set the asset up.
+
+        Args:
+            model: The estimator's model: channels, sensors and, unless told otherwise, the truth.
+            seed: Of all noise.
+            step: Seconds.
+            duration: Seconds; None never ends.
+            initial: True states at the start, where they differ from the prior's mean.
+            truth_parameters: Parameters of the asset, where they differ from the model's values.
+            truth_model: Another model with the same states, inputs and sensors: unmodelled behaviour.
+            truth_noise: Variances that the asset's noise adds in a second, where they differ.
+            inputs: Profiles by name; the others keep their default.
+            sensors: Plans by name; a sensor without one speaks at every step.
+            faults: Of sensors, applied in this order.
+            truth_every: Steps between two tellings of all states of a large field; None for never.
+
+        Raises:
+            SourceError: If a duration or step is not positive, or a fault does not fit the sensors.
+        """
+        truth = truth_model or model
+        if not step > 0:
+            raise SourceError(f"simulator: step is {step} s; it must be positive")
+        if duration is not None and not duration > 0:
+            raise SourceError(f"simulator: duration is {duration} s; it must be positive, or null for no end")
+        self._truth = compile_model(truth)
+        self._model = model
+        self._step = step
+        self._steps = None if duration is None else round(duration / step)
+        self.endless = duration is None
+        self.span = None if duration is None else (0, self._time(round(duration / step)))
+        self._x = truth.prior_mean.copy()
+        for name, value in dict(initial or {}).items():
+            self._x[truth.state_names.index(name)] = value
+        values = dict(truth_parameters or {})
+        self._p = np.array([values.get(item.name, item.value) for item in truth.parameters], float)
+        variances = dict(truth_noise or {})
+        self._q = np.array([variances.get(item.name, item.variance) for item in truth.noises], float)
+        profiles = dict(inputs or {})
+        self._profiles = [profiles.get(item.name, Constant(item.default)) for item in model.inputs]
+        plans = dict(sensors or {})
+        self._plans = [plans.get(sensor.name, SensorPlan()) for sensor in model.sensors]
+        self._std = [
+            np.sqrt(plan.variances if plan.variances is not None else [row.variance for row in sensor.rows])
+            for plan, sensor in zip(self._plans, model.sensors, strict=True)
+        ]
+        self._faults = Faults(faults, model.sensors, seed)
+        self._spoken = [0] * len(self._plans)
+        self._circular = np.flatnonzero(truth.circular)
+        self._rng = np.random.default_rng(seed)
+        self._factor: tuple[bytes, np.ndarray] | None = None
+        self._told = _runs(model.shown, model.width)
+        self._all_every = truth_every
+        self._all = _runs(np.arange(model.nx), model.width) if truth_every is not None else []
+        self._k = 0
+        self._u = self._inputs(0.0)
+        self._begun = False
+
+    def _time(self, k: int) -> int:
+        return round(k * self._step * 1e9)
+
+    def _inputs(self, t: float) -> np.ndarray:
+        return np.array([profile.at(t) for profile in self._profiles], float)
+
+    def read(self, timeout: float) -> Readings | None:
+        """The events of the next steps; None at the end."""
+        rows: list[tuple[int, int, int, np.ndarray]] = []
+        if not self._begun:
+            self._begun = True
+            rows.append((0, TICK, 0, np.zeros(0)))
+            if self._u.size:
+                rows.append((0, INPUT, 0, self._u))
+        while len(rows) < BATCH and (self._steps is None or self._k < self._steps):
+            try:
+                self._advance(rows)
+            except NisusError:
+                raise
+            except Exception as error:
+                raise SourceError(
+                    f"the simulator's model {self._model.name} fails at {self._k * self._step:g} s: "
+                    f"{type(error).__name__}: {error}; it may not fail where the asset goes"
+                ) from error
+        if not rows:
+            return None
+        value = np.full((len(rows), self._model.width), np.nan)
+        for i, (_, _, _, given) in enumerate(rows):
+            value[i, : given.size] = given
+        t = np.array([row[0] for row in rows], np.int64)
+        return Readings(
+            t,
+            t.copy(),
+            np.array([row[1] for row in rows], np.int8),
+            np.array([row[2] for row in rows], np.int32),
+            value,
+        )
+
+    def _advance(self, rows: list[tuple[int, int, int, np.ndarray]]) -> None:
+        """One step, and what is said of it."""
+        truth = self._truth
+        self._k += 1
+        t = self._time(self._k)
+        pieces = max(1, int(np.ceil(self._step / truth.model.max_step)))
+        for _ in range(pieces):
+            self._jump(self._step / pieces)
+            after = np.empty_like(self._x)
+            truth.f(self._x, self._u, self._p, self._step / pieces, after)
+            self._x = after
+        self._x = self._x + self._noise()
+        for j in self._circular:
+            self._x[j] = (self._x[j] + np.pi) % (2.0 * np.pi) - np.pi
+        u = self._inputs(self._k * self._step)
+        if not np.array_equal(u, self._u):
+            rows.append((t, INPUT, 0, u))
+            self._u = u
+        for i, plan in enumerate(self._plans):
+            if self._k % plan.every:
+                continue
+            y = np.empty(self._std[i].size)
+            truth.h[i](self._x, self._u, self._p, y)
+            y += self._rng.normal(0.0, self._std[i], size=y.size)
+            y = self._faults.spoil(i, self._k * self._step, y)
+            lost = plan.drop_every is not None and self._spoken[i] % plan.drop_every == plan.drop_every - 1
+            self._spoken[i] += 1
+            rows.append((t, READING, i, np.full(y.size, np.nan) if lost else y))
+        told = self._all if self._all_every is not None and self._k % self._all_every == 0 else self._told
+        rows += [(t, TRUTH, first, self._x[first:end].copy()) for first, end in told]
+
+    def _jump(self, dt: float) -> None:
+        """Draw the next mode as the model says."""
+        jump = self._truth.model.jump
+        if jump is None:
+            return
+        chances = np.empty(len(jump.modes))
+        getattr(jump.chances, "py_func", jump.chances)(self._x.copy(), self._u, self._p, dt, chances)
+        self._x[self._truth.model.mode] = self._rng.choice(chances.size, p=chances)
+
+    def _noise(self) -> np.ndarray:
+        """A draw of N(0, Q), as numpy's multivariate_normal makes it, with the factor kept while Q stays."""
+        truth = self._truth
+        if truth.draw is not None:
+            return truth.draw(self._rng.standard_normal(self._x.size), self._p, self._q, self._step)
+        Q = np.zeros((self._x.size, self._x.size))
+        truth.Q(self._x, self._u, self._p, self._q, self._step, Q)
+        key = Q.tobytes()
+        if self._factor is None or key != self._factor[0]:
+            U, s, _ = np.linalg.svd(Q)
+            self._factor = (key, U * np.sqrt(s))
+        return self._factor[1] @ self._rng.standard_normal(self._x.size)
+
+    def now(self) -> int | None:
+        """It has no clock of its own."""
+        return None
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+
+def _runs(states: np.ndarray, width: int) -> list[tuple[int, int]]:
+    """Runs of consecutive states, at most `width` long, as pairs of first and end."""
+    runs: list[tuple[int, int]] = []
+    for state in states.tolist():
+        if runs and runs[-1][1] == state and state - runs[-1][0] < width:
+            runs[-1] = (runs[-1][0], state + 1)
+        else:
+            runs.append((state, state + 1))
+    return runs

@@ -1,0 +1,228 @@
+"""The columns of CSV, Parquet, MATLAB and NumPy files, a few thousand rows at a time."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Generator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from estimators.errors import SourceError
+
+from ..source import nearest, quoted
+
+CHUNK = 4096
+
+LONGEST = 2**20
+"""Letters in a line of column names."""
+
+UNREADABLE = "unreadable value"
+
+Problem = Callable[[str, int, str], None]
+"""problem(key, line or row number, text)."""
+
+
+class Chunk(NamedTuple):
+    """Rows of a table: the raw time column, and the values (n, columns) with masks of what is blank.
+
+    `line` is the line (CSV) or row (of the others) of each, counted from 1.
+    """
+
+    line: np.ndarray
+    time: Any
+    values: np.ndarray
+    blank: np.ndarray
+
+
+def missing_column(path: Path, name: str, names: Sequence[str]) -> SourceError:
+    """The error of a column that a file does not have."""
+    return SourceError(f"{path}: there is no column {name!r}; {nearest(name, names)}")
+
+
+def check_columns(path: Path, wanted: Sequence[str]) -> None:
+    """Refuse a file that lacks a column, or rows, or that is no table at all.
+
+    Raises:
+        SourceError: Naming the file, the column and those that are near.
+    """
+    if not path.is_file():
+        raise SourceError(f"{path}: there is no such file; check the path of the recording")
+    if path.stat().st_size == 0:
+        raise SourceError(f"{path}: the file is empty; record it again")
+    names = column_names(path)
+    for name in wanted:
+        if name not in names:
+            raise missing_column(path, name, names)
+    if path.suffix.lower() == ".csv" and not _has_rows(path):
+        raise SourceError(f"{path}: it has a header and no rows; record it again")
+
+
+def column_names(path: Path) -> list[str]:
+    """Names of a file's columns."""
+    if is_mat(path):
+        from .mat import mat_names
+
+        return mat_names(path)
+    if is_npz(path):
+        from .npz import npz_names
+
+        return npz_names(path)
+    return parquet_names(path) if is_parquet(path) else _header(path)[0]
+
+
+def read_table(path: Path, time: str, columns: Sequence[str], problem: Problem) -> Generator[Chunk, None, None]:
+    """Rows of a table of any kind, by the ending of its name."""
+    if is_mat(path):
+        from .mat import read_mat
+
+        return read_mat(path, time, columns, problem)
+    if is_npz(path):
+        from .npz import read_npz
+
+        return read_npz(path, time, columns, problem)
+    return (read_parquet if is_parquet(path) else read_csv)(path, time, columns, problem)
+
+
+def is_mat(path: Path) -> bool:
+    """Whether the name says that it is a MATLAB file."""
+    return path.suffix.lower() == ".mat"
+
+
+def is_npz(path: Path) -> bool:
+    """Whether the name says that it is a NumPy archive."""
+    return path.suffix.lower() == ".npz"
+
+
+def is_parquet(path: Path) -> bool:
+    """Whether the name says so."""
+    return path.suffix.lower() in (".parquet", ".pq")
+
+
+def parquet_names(path: Path) -> list[str]:
+    """Columns of a Parquet file.
+
+    Raises:
+        SourceError: If it is none, or cut short: its columns are listed at its end.
+    """
+    import pyarrow
+    import pyarrow.parquet
+
+    try:
+        return list(pyarrow.parquet.read_schema(path).names)
+    except (pyarrow.ArrowException, OSError) as error:
+        gist = " ".join(str(error).split())[:160]
+        raise SourceError(f"{path}: it cannot be read as Parquet ({gist}); check that it is whole") from None
+
+
+def _has_rows(path: Path) -> bool:
+    """Whether anything follows the first line of a CSV."""
+    with path.open("rb") as file:
+        file.readline()
+        return any(line.strip() for line in file)
+
+
+def _header(path: Path) -> tuple[list[str], str]:
+    """Names in the first line of a CSV, and the mark between them.
+
+    Raises:
+        SourceError: If it begins with bytes that no text has.
+    """
+    with path.open("rb") as binary:
+        head = binary.read(CHUNK)
+    if any(byte < 9 or 13 < byte < 32 for byte in head):
+        raise SourceError(
+            f"{path}:1: it begins with {head[:20]!r} and is no text; give a CSV in UTF-8, or name the file by what it "
+            "is (.parquet, .mat, .npz)"
+        )
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
+        first = file.readline(LONGEST)
+    mark = max(",;\t", key=first.count)
+    names = next(csv.reader([first], delimiter=mark), [])
+    return [name.strip() for name in names], mark
+
+
+def read_csv(path: Path, time: str, columns: Sequence[str], problem: Problem) -> Generator[Chunk, None, None]:
+    """Rows of a CSV; text that is no number is missing and told to `problem`, and so is a row that is cut short."""
+    names, mark = _header(path)
+    at_time = names.index(time)
+    places = [names.index(name) for name in columns]
+    broken: tuple[int, int] | None = None
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
+        reader = csv.reader(file, delimiter=mark)
+        next(reader)
+        ended = False
+        while not ended:
+            rows: list[list[str]] = []
+            lines: list[int] = []
+            while len(rows) < CHUNK and not ended:
+                try:
+                    row = next(reader, None)
+                except csv.Error as error:
+                    problem("truncated file", reader.line_num, f"{error}; the rest is left out")
+                    row = None
+                if row is None:
+                    ended = True
+                elif row:
+                    if broken is not None:
+                        problem(UNREADABLE, broken[0], f"has {broken[1]} cells, not {len(names)}; the row is left out")
+                    broken = None if len(row) == len(names) else (reader.line_num, len(row))
+                    if broken is None:
+                        rows.append(row)
+                        lines.append(reader.line_num)
+            if rows:
+                values = np.empty((len(rows), len(columns)))
+                blank = np.zeros(values.shape, np.bool_)
+                for k, place in enumerate(places):
+                    _numbers([row[place] for row in rows], columns[k], lines, values[:, k], blank[:, k], problem)
+                yield Chunk(np.array(lines), [row[at_time].strip() for row in rows], values, blank)
+    if broken is not None:
+        problem("truncated file", broken[0], f"the last line has {broken[1]} cells, not {len(names)}")
+
+
+def _numbers(
+    cells: list[str], name: str, lines: list[int], values: np.ndarray, blank: np.ndarray, problem: Problem
+) -> None:
+    """Fill a column of values from text."""
+    try:
+        values[:] = [float(cell) for cell in cells]
+        return
+    except ValueError:
+        pass
+    for k, cell in enumerate(cells):
+        try:
+            values[k] = float(cell)
+        except ValueError:
+            values[k] = np.nan
+            if not cell.strip():
+                blank[k] = True
+            elif cell.strip().lower() not in ("na", "n/a", "null", "none"):
+                problem(
+                    UNREADABLE, lines[k], f"{name} is {quoted(cell.strip())}, which is no number; the value is missing"
+                )
+
+
+def read_parquet(path: Path, time: str, columns: Sequence[str], problem: Problem) -> Generator[Chunk, None, None]:
+    """Rows of a Parquet file; null is blank, and text is read as in a CSV."""
+    import pyarrow
+    import pyarrow.parquet
+
+    row = 1
+    with pyarrow.parquet.ParquetFile(path) as file:
+        for batch in file.iter_batches(CHUNK, columns=list(dict.fromkeys((time, *columns)))):
+            n = batch.num_rows
+            values = np.empty((n, len(columns)))
+            blank = np.zeros(values.shape, np.bool_)
+            lines = list(range(row, row + n))
+            for k, name in enumerate(columns):
+                column = batch.column(name)
+                blank[:, k] = column.is_null().to_numpy(zero_copy_only=False)
+                if pyarrow.types.is_string(column.type) or pyarrow.types.is_large_string(column.type):
+                    cells = [item or "" for item in column.to_pylist()]
+                    _numbers(cells, name, lines, values[:, k], blank[:, k], problem)
+                else:
+                    numbers = column.cast(pyarrow.float64(), safe=False)
+                    values[:, k] = numbers.to_numpy(zero_copy_only=False)
+            yield Chunk(np.array(lines), batch.column(time), values, blank)
+            row += n

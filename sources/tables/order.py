@@ -1,0 +1,76 @@
+"""The order of a table's times: what a wrong sort, a wrong unit or a wrong column does to them, said once."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimators.log import BEFORE
+
+from ..source import Report
+
+MANY = 100_000
+"""Rows one after the other at one time from which on the time is doubted."""
+
+BACKWARDS, STANDING = REMARKS = ("times run backwards", "time stands still")
+"""Keys under which it is told."""
+
+
+class Order:
+    """Looks at the times of the rows as they are read.
+
+    A row that is older than one before it by more than the horizon is dropped as stale by the log; the first of them
+    is told with its line. Late rows within the horizon are as recorded, and put where they belong.
+    """
+
+    def __init__(self, column: str, unit: str, horizon: int | None, report: Report) -> None:
+        """Look at the times of `column`, in `unit`; `horizon` in ns, None for none."""
+        self._column, self._unit, self._horizon, self._report = column, unit, horizon, report
+        self._newest, self._newest_at = BEFORE, ""
+        self._run, self._run_at, self._run_length = BEFORE, "", 0
+        self._told: set[str] = set()
+
+    def look(self, file: str, line: np.ndarray, t: np.ndarray) -> None:
+        """The next rows: their lines and times (ns), each (n,)."""
+        if t.size:
+            self._backwards(file, line, t)
+            self._standing(file, line, t)
+
+    def _tell(self, key: str, text: str) -> None:
+        if key not in self._told:
+            self._told.add(key)
+            self._report(key, text)
+
+    def _backwards(self, file: str, line: np.ndarray, t: np.ndarray) -> None:
+        if self._horizon is None:
+            return
+        newest = np.maximum.accumulate(np.concatenate(([self._newest], t)))
+        late = np.flatnonzero(t < newest[:-1] - self._horizon)
+        if late.size:
+            k = int(late[0])
+            at = f"{file}:{line[int(np.argmax(t[:k]))]}" if k and np.max(t[:k]) > self._newest else self._newest_at
+            self._tell(
+                BACKWARDS,
+                f"{file}:{line[k]}: {self._column} is {(newest[k] - t[k]) * 1e-9:.6g} s before that of {at}, more than "
+                f"time.horizon ({self._horizon * 1e-9:g} s), and such rows are dropped as stale; sort the rows by "
+                f"{self._column}, or raise time.horizon",
+            )
+        if newest[-1] > self._newest:
+            self._newest, self._newest_at = int(newest[-1]), f"{file}:{line[int(np.argmax(t))]}"
+
+    def _standing(self, file: str, line: np.ndarray, t: np.ndarray) -> None:
+        edges = np.concatenate(([0], np.flatnonzero(np.diff(t)) + 1, [t.size]))
+        lengths = np.diff(edges)
+        carried = self._run_length if t[0] == self._run else 0
+        lengths[0] += carried
+        if not carried:
+            self._run_at = f"{file}:{line[0]}"
+        for k in np.flatnonzero(lengths >= MANY):
+            at = self._run_at if k == 0 else f"{file}:{line[edges[k]]}"
+            self._tell(
+                STANDING,
+                f"{at}: {self._column} stays {t[edges[k]] * 1e-9:g} s for {MANY} rows and more; check that it is the "
+                f"column of the time (time.column), and its unit (time.unit, {self._unit})",
+            )
+        if lengths.size > 1:
+            self._run_at = f"{file}:{line[edges[-2]]}"
+        self._run, self._run_length = int(t[-1]), int(lengths[-1])

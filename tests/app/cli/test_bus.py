@@ -1,0 +1,129 @@
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from app.cli import bus
+from app.cli.main import Bus, main
+from app.twin.twin import load_twin
+from estimators.errors import ConfigError
+from estimators.log import INPUT, READING, TRUTH, Readings, truth_of
+
+
+class Clock:
+    """Nanoseconds that jump to whatever is waited for, so that an hour is played at once."""
+
+    def __init__(self) -> None:
+        self.now = 0
+
+    def __call__(self) -> int:
+        return self.now
+
+    def wait(self, seconds: float) -> bool:
+        self.now += round(seconds * 1e9)
+        return False
+
+
+def play_at_once(player: Any, duration: float | None) -> None:
+    clock = Clock()
+    player._clock, player._stop.wait = clock, clock.wait
+    player.run()
+
+
+def events(*, log: Path) -> Readings:
+    source = load_twin("motor_can", log_files=[log]).open_source(lambda key, text: None, live=False)
+    batches = []
+    while (batch := source.read(1.0)) is not None:
+        batches.append(batch)
+    source.close()
+    return Readings.concat(batches, 5)
+
+
+@pytest.mark.parametrize("suffix", bus.FORMATS)
+def test_what_is_recorded_is_what_the_asset_said(suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bus, "_play", play_at_once)
+    file = tmp_path / f"drive{suffix}"
+    settings = ("source.asset.duration=12",)
+    assert bus.play_bus(Bus("motor_can", interface="virtual", set=settings, record=file)) == 0
+    got = events(log=file)
+    twin = load_twin("motor_can", overrides={"source.asset.duration": "12"})
+    section: Any = twin.config.source
+    simulator = twin.plan.simulator(section.asset, ("source", "asset"))
+    batches = []
+    while (batch := simulator.read(0.0)) is not None:
+        batches.append(batch)
+    said = Readings.concat(batches, 5)
+    sensors = [
+        [batch.value[(batch.kind == READING) & (batch.channel == k), 0] for batch in (got, said)] for k in range(3)
+    ]
+    states = [[truth_of(batch, k)[1] for batch in (got, said)] for k in range(4)]
+    assert (got.kind == TRUTH).sum() == (said.kind == TRUTH).sum() == 120, "one block of true states a step"
+    for ours, theirs in sensors + states:
+        assert ours.size == 120
+        np.testing.assert_allclose(ours, theirs, atol=0.00501, err_msg="half of the signal's 0.01 °C")
+    pulled = got.value[(got.kind == INPUT) & np.isfinite(got.value[:, 1]), 1]
+    assert dict(Counter(pulled.tolist())).keys() == {60.0, 160.0}, "the cycle's first step of i_q is at 8 s"
+
+
+def test_listeners_hear_what_the_bus_took(monkeypatch: pytest.MonkeyPatch) -> None:
+    twin = load_twin("motor_can", overrides={"source.asset.duration": "1"})
+    player = twin.plan.player(lambda key, text: None, interface="virtual", channel="test-listeners")
+    ear = can.Bus(interface="virtual", channel="test-listeners")
+    heard: list[can.Message] = []
+    player.listeners.append(heard.append)
+    play_at_once(player, None)
+    on_bus = []
+    while (message := ear.recv(0)) is not None:
+        on_bus.append((message.arbitration_id, bytes(message.data)))
+    assert [(message.arbitration_id, bytes(message.data)) for message in heard] == on_bus
+    assert player.sent == len(on_bus) > 0
+    player.close()
+    ear.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("interface", "channel", "expected"),
+    [
+        ("virtual", None, "motor"),
+        ("udp_multicast", None, bus.GROUP),
+        ("udp_multicast", "239.0.0.1", "239.0.0.1"),
+        ("socketcan", "can0", "can0"),
+        ("vector", "1", 1),
+    ],
+)
+def test_the_channel(interface: str, channel: str | None, expected: str | int) -> None:
+    assert bus._channel(Bus("motor_can", interface=interface, channel=channel), load_twin("motor_can")) == expected
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["motor_can", "--duration", "0"], "--duration 0: must be positive"),
+        (["motor_can", "--interface", "virtual"], "stay in this process; use udp_multicast, or give --record"),
+        (["motor_can", "--interface", "socketcan"], "which bus is not known; give --channel, for example can0"),
+        (["motor_winding"], "source is of type simulator"),
+        (["motor_can", "--interface", "virtual", "--record", "drive.txt"], "--record drive.txt: is no CAN log format"),
+        (
+            ["motor_can", "--interface", "virtual", "--record", "drive.db"],
+            "end it in .asc, .blf, .csv, .log, .mf4, .trc",
+        ),
+        (["motor_can", "--interface", "virtual", "--record", "no/drive.blf"], "there is no folder no; create it first"),
+        (["motor_can", "--interface", "no_such_bus", "--channel", "x"], "CAN bus no_such_bus:x: it cannot be opened"),
+    ],
+)
+def test_what_cannot_be_played_is_one_line(
+    arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["bus", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert expected in error and error.count("\n") == 1
+
+
+def test_an_unknown_format_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError):
+        bus._logger(tmp_path / "drive.txt")
+    assert not list(tmp_path.iterdir())

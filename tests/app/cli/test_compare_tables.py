@@ -1,0 +1,127 @@
+"""The tables in the heads of the twins that ship: whole, and what the filters do."""
+
+import math
+import re
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from app.cli.compare_fold import Outcome, draws, refold, within
+from app.cli.compare_table import read_cell, read_span, read_table
+from app.cli.fold import read_log
+from app.twin.twin import Twin, load_twin
+from config.loader import shipped
+from estimators.errors import SourceError
+from estimators.log import Readings
+from estimators.registry import ESTIMATORS, unfit
+from tests.conftest import absent
+
+SEED = 1234
+"""Not among the table's 0 to 7."""
+
+SECONDS = 0.4
+"""A filter that draws, or is plain Python, is folded again if its table says that it takes no longer."""
+
+LEAST = 0.5
+"""Spread of a share in per cent at least: near 100 it is skewed, and eight seeds may show none at all."""
+
+SIGMA = 5.0 * math.sqrt(1 + 1 / 8)
+"""Standard deviations between a new seed's figure and the mean of eight, five if the spread were known exactly."""
+
+
+@lru_cache(maxsize=1)
+def recorded(name: str) -> tuple[Twin, Readings]:
+    twin = load_twin(name)
+    try:
+        return twin, read_log(twin, None)[0].readings
+    except SourceError as error:
+        if "is not there" in str(error):
+            absent(str(error))
+        raise
+
+
+def quick(estimator: str, cells: dict[str, str], events: Readings) -> bool:
+    entry = ESTIMATORS[estimator]
+    seconds = 1e-6 * float(cells["µs/step"]) * len(within(events, read_span(cells)))
+    return seconds < SECONDS or not (draws(entry) or entry.interpreted)
+
+
+def figures(outcome: Outcome) -> dict[str, float]:
+    found = {f"RMSE [{unit}]": value for unit, value in outcome.rmse.items()}
+    return {**found, "mean NIS": outcome.nis, "in band [%]": 100.0 * outcome.coverage}
+
+
+def mismatches(twin: Twin, events: Readings, rows: dict[str, dict[str, str]]) -> list[str]:
+    """Figures of the quick filters that are not those of a new fold."""
+    wrong = []
+    for estimator, cells in rows.items():
+        if cells["µs/step"] == "-" or not quick(estimator, cells, events):
+            continue
+        random = draws(ESTIMATORS[estimator])
+        span = read_span(cells)
+        outcome = refold(twin, estimator, within(events, span), SEED if random else 0)
+        for title, value in figures(outcome).items():
+            # Within a short span the errors hang together: the share in the band is that of one draw, all or nothing,
+            # and the spread of eight says little of a ninth.
+            if random and span is not None and title == "in band [%]":
+                continue
+            cell = read_cell(cells[title])
+            # Rounding to the printed digit, and as much again for a spread that was rounded too.
+            if np.isnan(cell.value) and np.isnan(value):
+                continue
+            spread = max(cell.spread + cell.rounding, LEAST if title == "in band [%]" else 0.0)
+            bound = SIGMA * spread + cell.rounding if random else 1.001 * cell.rounding
+            if not abs(value - cell.value) <= bound:
+                wrong.append(f"{estimator}: {title} is {cells[title]} in the table and {value:.6g} now")
+    return wrong
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_every_filter_that_applies_has_a_row(name: str) -> None:
+    twin = load_twin(name)
+    rows = read_table(twin.text)
+    assert list(rows) == [key for key, entry in ESTIMATORS.items() if unfit(entry, twin.model) is None]
+    for estimator, cells in rows.items():
+        noted = [f"{option} {value:g}" for option, value in twin.options_of(estimator).items()]
+        assert all(option in cells["notes"] for option in noted), f"{estimator}: options are now {noted}"
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_the_table_says_what_the_filters_do(name: str) -> None:
+    """To the last printed digit, or for filters that draw, as near as another seed comes."""
+    twin, events = recorded(name)
+    rows = read_table(twin.text)
+    said = re.search(rf"# nisus compare {name}: (\d+) events", twin.text)
+    assert said and int(said[1]) == len(events)
+    assert not (wrong := mismatches(twin, events, rows)), "; ".join(wrong) + f": write it anew, nisus compare {name}"
+
+
+@pytest.mark.parametrize("name", [name for name in shipped() if "Over 20 logs" in load_twin(name).text])
+def test_other_logs_are_as_the_head_says(name: str) -> None:
+    """Two logs of the simulator that are not among the twenty, folded by the twin's own filter."""
+    text = load_twin(name).text
+    said = re.search(r"Over 20 logs \(seeds (\d+) to (\d+), ([\w-]+)\): mean NIS (\S+), in band (\S+) %", text)
+    assert said
+    nis, band = read_cell(said[4]), read_cell(said[5])
+    for seed in (int(said[2]) + 1, int(said[2]) + 2):
+        twin = load_twin(name, overrides={"source.seed": str(seed)})
+        assert twin.estimator == said[3]
+        outcome = refold(twin, twin.estimator, read_log(twin, None)[0].readings)
+        assert abs(outcome.nis - nis.value) < SIGMA * nis.spread
+        assert abs(100.0 * outcome.coverage - band.value) < SIGMA * max(band.spread, LEAST)
+
+
+def test_a_table_that_is_no_longer_true_is_found() -> None:
+    twin, events = recorded("motor_winding")
+    rows = read_table(twin.text)
+    for estimator in ("kf", "etkf"):
+        for title in ("RMSE [°C]", "mean NIS", "in band [%]"):
+            cell = read_cell(rows[estimator][title])
+            step = 2 * cell.rounding if np.isnan(cell.spread) else 15 * cell.spread
+            changed = {
+                **rows[estimator],
+                title: f"{cell.value + step:.9g}" + f"±{cell.spread}" * draws(ESTIMATORS[estimator]),
+            }
+            (wrong,) = mismatches(twin, events, {estimator: changed})
+            assert wrong.startswith(f"{estimator}: {title} is {changed[title]}")

@@ -1,0 +1,72 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from app.cli.new import write_twin
+from app.twin.twin import load_twin
+from estimators.errors import ConfigError
+from estimators.fold import fold
+from estimators.log import READING, Log, truth_of
+from estimators.track import USED
+
+
+def test_the_pair_that_new_writes_loads_as_it_stands(tmp_path: Path) -> None:
+    yaml_path, python_path = write_twin("my-pump", tmp_path)
+    assert (yaml_path.name, python_path.name) == ("my-pump.yaml", "my-pump.py")
+    twin = load_twin(yaml_path)
+    assert twin.name == "my-pump" and twin.model.state_names == ("level", "delivery")
+    # The YAML repeats the model's own values, so that a user sees one set of numbers, whichever file is open.
+    np.testing.assert_allclose(twin.tuning.q, [1e-6, 4e-12])
+    np.testing.assert_allclose(twin.tuning.r, [1e-4, 2.5e-7])
+    np.testing.assert_allclose(twin.tuning.p, [0.5, 0.02])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["my-pump.py", "my-pump.yaml"], "no leftovers"
+
+
+@pytest.mark.parametrize("name", ["", "1pump", "../pump", "pump.yaml", "pu mp", "-pump", "pümp"])
+def test_a_bad_name_is_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as caught:
+        write_twin(name, tmp_path)
+    assert str(caught.value) == f"the name {name!r} will not do; use letters, digits, _ and -, and begin with a letter"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_shipped_name_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"^the name 'motor_winding' is that of a twin that ships; choose another$"):
+        write_twin("motor_winding", tmp_path)
+
+
+@pytest.mark.parametrize("there", ["pump.yaml", "pump.py"])
+def test_nothing_is_overwritten(there: str, tmp_path: Path) -> None:
+    (tmp_path / there).write_text("mine")
+    with pytest.raises(ConfigError) as caught:
+        write_twin("pump", tmp_path)
+    assert str(caught.value) == f"{tmp_path / there}: it is there already and is not overwritten; choose another name"
+    assert [path.name for path in tmp_path.iterdir()] == [there] and (tmp_path / there).read_text() == "mine"
+
+
+def test_a_folder_that_is_absent_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="there is no such folder; make it first$"):
+        write_twin("pump", tmp_path / "absent")
+
+
+def test_the_pair_folds_and_does_what_its_text_promises(tmp_path: Path) -> None:
+    twin = load_twin(write_twin("pump", tmp_path)[0])
+    log = Log(twin.model.width)
+    source = twin.open_source(lambda key, text: None, live=False)
+    while (batch := source.read(0.0)) is not None:
+        log.extend(batch)
+    track = fold(twin.estimator, twin.model, twin.tuning, log)
+    events = log.readings
+    late = events.select(events.t > 60_000_000_000)
+    (rows, level), (other, delivery) = (truth_of(late, k) for k in (0, 1))
+    late_mean = track.mean[-len(late) :]
+    error = late_mean[rows, 0] - level
+    assert np.sqrt(np.mean(error**2)) < 0.01, "below the noise of one reading, 0.01 m"
+    miss = late_mean[other, 1] - delivery
+    assert np.abs(miss).max() < 5e-5, "a third of the 0.00015 m³ by which the prior is wrong"
+    # χ² bounds at 99.99 % of the mean of the NIS of all used readings, one degree of freedom each.
+    nis = track.nis[(events.kind == READING) & (track.verdict == USED)]
+    low, high = chi2.ppf([0.00005, 0.99995], nis.size) / nis.size
+    assert low < nis.mean() < high

@@ -1,0 +1,108 @@
+"""A function of a model that does not return is named; one that does is not, however often it is called."""
+
+import io
+import sys
+import threading
+import time
+
+import app.compile
+import pytest
+
+from app.cli.prepare import CALL_PATIENCE, CallWatch, attend
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+
+ENTERED, LEAVE = threading.Event(), threading.Event()
+
+
+def waits(x, u, p, dt, out):
+    ENTERED.set()
+    LEAVE.wait()
+
+
+def h(x, u, p, out):
+    out[0] = x[0]
+
+
+MODEL = StateSpaceModel(
+    name="slow",
+    title="A model whose f waits",
+    states=(State("x", "1"),),
+    noises=(Noise("x", "1", 1.0),),
+    sensors=(Sensor("s", (Row("r", "1", 1.0),), h),),
+    f=waits,
+)
+
+
+def call():
+    """A call of f that has begun, and its thread."""
+    ENTERED.clear()
+    LEAVE.clear()
+    thread = threading.Thread(target=waits, args=(None,) * 5, daemon=True)
+    thread.start()
+    ENTERED.wait()
+    return thread
+
+
+def test_a_call_that_does_not_return_is_named_once():
+    now = 0.0
+    watch = CallWatch(MODEL, clock=lambda: now)
+    thread = call()
+    try:
+        assert watch.look() is None
+        now = CALL_PATIENCE - 0.1
+        assert watch.look() is None
+        now = CALL_PATIENCE
+        line = watch.look()
+        assert line is not None and "\n" not in line
+        place, rest = line.split(": ", 1)
+        assert place.endswith(f"test_compile.py:{waits.__code__.co_firstlineno + 2}")  # where it waits
+        assert rest.startswith("f of the model slow has not returned for 10 s; ") and "Ctrl-C" in rest
+        now = 100.0
+        assert watch.look() is None
+    finally:
+        LEAVE.set()
+        thread.join()
+
+
+def test_calls_that_return_are_not():
+    now = 0.0
+    watch = CallWatch(MODEL, clock=lambda: now)
+    for _ in range(3):  # each of them looked at twice, and longer than the patience in sum
+        thread = call()
+        assert watch.look() is None
+        now += 0.6 * CALL_PATIENCE
+        assert watch.look() is None
+        LEAVE.set()
+        thread.join()
+    assert watch.look() is None
+
+
+def test_attended_work_gives_what_it_gives():
+    assert attend(MODEL, lambda: 3, "doing") == 3
+    with pytest.raises(ZeroDivisionError):
+        attend(MODEL, lambda: 1 / 0, "doing")
+
+
+class Pipe(io.StringIO):
+    """Output that somebody reads at the other end, as far as it was flushed."""
+
+    read = ""
+
+    def flush(self):
+        self.read = self.getvalue()
+
+
+def test_where_output_is_redirected_it_says_what_it_does_before_it_is_done(monkeypatch):
+    pipe = Pipe()
+    monkeypatch.setattr(sys, "stderr", pipe)
+    monkeypatch.setattr(app.compile, "PATIENCE", 0.0)
+
+    def work():
+        end = time.monotonic() + 10.0
+        while not pipe.read and time.monotonic() < end:
+            time.sleep(0.001)
+        return pipe.read
+
+    assert attend(MODEL, work, "compiling filters, once", "compiled filters, once") == "compiling filters, once ...\n"
+    before, after = pipe.read.splitlines()
+    assert after.startswith("compiled filters, once: ")

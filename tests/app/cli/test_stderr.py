@@ -1,0 +1,72 @@
+"""What a command says on standard error: with file and line, and nothing that a terminal would obey."""
+
+from pathlib import Path
+
+import pytest
+
+from app.cli.main import main
+from app.cli.stderr import printable
+from tests.app.cli.test_fold import DRIVE, ROWS
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    (tmp_path / "drive.csv").write_text(ROWS)
+    (tmp_path / "drive.yaml").write_text(DRIVE)
+    return tmp_path
+
+
+def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> list[str]:
+    """The complaints of a command; beside them stands at most that it compiled, if that took long."""
+    code = main(arguments)
+    lines = capsys.readouterr().err.splitlines()
+    assert all(line.isprintable() for line in lines)
+    lines = [line for line in lines if not line.startswith("compil")]
+    assert all(line.startswith("nisus: ") for line in lines)
+    assert code == (2 if lines and "stale" not in lines[0] else 0)
+    return lines
+
+
+def test_only_what_is_shown_as_it_is_passes() -> None:
+    assert printable("Wärme µ ² → ok\nnext") == "Wärme µ ² → ok\nnext"
+    assert printable("\x1b[31m\x00\x9b\r\u202e\udcff") == r"\x1b[31m\x00\x9b\r\u202e\udcff"
+
+
+@pytest.mark.parametrize("way", ["log", "yaml", "name"])
+def test_raw_bytes_of_a_file_stay_in_it(drive: Path, way: str, capsys: pytest.CaptureFixture[str]) -> None:
+    raw = b"\x1b]0;title\x07\x1b[2J" + bytes(range(256)) * 20
+    if way == "log":
+        (drive / "raw.csv").write_bytes(raw)
+        (line,) = said(capsys, "fold", str(drive / "drive.yaml"), "--log", str(drive / "raw.csv"))
+        assert "drive.yaml:2: source: " in line and "raw.csv:1: it begins with b'\\x1b]0;title\\x07" in line
+    elif way == "yaml":
+        (drive / "drive.csv").write_bytes(raw)
+        (line,) = said(capsys, "fold", str(drive / "drive.yaml"))
+        assert "drive.csv:1: it begins with b'\\x1b]0;title\\x07" in line
+    else:
+        (line,) = said(capsys, "fold", str(drive / "drive.yaml"), "--log", "\x1b[2Jraw.csv")
+        assert line == r"nisus: --log \x1b[2Jraw.csv: there is no such file; check the path"
+    assert len(line) < 600
+
+
+def test_a_recording_without_rows_is_named_and_so_is_one_that_feeds_nothing(
+    drive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (drive / "drive.csv").write_text(ROWS.splitlines()[0] + "\n")
+    (line,) = said(capsys, "fold", str(drive / "drive.yaml"))
+    assert "drive.yaml:2: source: " in line and line.endswith("drive.csv: it has a header and no rows; record it again")
+    (drive / "mute.csv").write_text("t,y,temperature,rate\n0,,,\n1,,,\n")
+    (line,) = said(capsys, "fold", str(drive / "drive.yaml"), "--log", str(drive / "mute.csv"))
+    assert line == (
+        f"nisus: --log {drive / 'mute.csv'}: the source said nothing that a sensor needs; check the channel maps"
+    )
+
+
+@pytest.mark.parametrize("arguments", [["fold"], ["run", "--headless", "--speed", "inf"]])
+def test_times_that_run_backwards_are_said_once(
+    drive: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = "".join(f"{60 - k},40,,\n" for k in range(60))
+    (drive / "drive.csv").write_text("t,y,temperature,rate\n" + rows)
+    (line,) = said(capsys, arguments[0], str(drive / "drive.yaml"), *arguments[1:])
+    assert line.startswith("nisus: drive.csv:5: t is 3 s before that of drive.csv:2, more than time.horizon (2 s), ")

@@ -1,0 +1,260 @@
+"""What no filter can run with is refused in one line, or gives way visibly, by whatever way it comes."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import viser
+from viser import GuiEvent
+
+from app.engine import commands
+from app.engine.engine import Engine
+from app.engine.playback import play
+from app.server.api import command_from_json, status_json
+from app.twin.twin import load_twin, restore_twin
+from app.viser.coalescer import TYPING_PAUSE
+from app.viser.view import ViserView
+from estimators.compiled.model import compile_model
+from estimators.errors import ConfigError, ModelError, NisusError
+from estimators.fold import fold
+from estimators.log import READING, Log, Readings
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.models import MODELS
+from estimators.registry import ESTIMATORS, unfit
+from estimators.track import DIVERGED, FAILED, GATED, USED
+from estimators.tuning import Tuning
+from tests.app.scripted import SECOND, Scripted, wait_for
+from tests.conftest import ROOT
+
+BAD = {
+    "no particles": ("pf", "particles", 0.0, "particles is 0; it must lie between 2 and"),
+    "no members": ("etkf", "members", 0.0, "members is 0; it must lie between 2 and"),
+    "no spread of sigma points": ("ukf", "alpha", 0.0, "alpha is 0; it must lie between"),
+    "a fraction of members": ("etkf", "members", 2.5, "members is 2.5; it must be a whole number"),
+    "a fraction of particles": ("pf", "particles", 99.5, "particles is 99.5; it must be a whole number"),
+    "a radius without positions": ("ensrf", "radius", 5.0, "does not say where its states are; give them positions"),
+    "no such option": ("ekf", "particles", 9.0, "has no option 'particles'"),
+}
+PATH = ROOT / "config" / "twins" / "motor_winding.yaml"
+
+
+@pytest.fixture
+def start():
+    engines = []
+
+    def start(made):
+        source = Scripted()
+        engine = Engine(made, lambda report: source)
+        engine.start()
+        engines.append(engine)
+        return source, engine
+
+    yield start
+    for engine in engines:
+        engine.stop()
+
+
+def reading(model, second, values):
+    return Readings.one(round(second * SECOND), round(second * SECOND), READING, 0, values, model.width)
+
+
+def rows(engine):
+    cursor = engine.cursor()
+    pull = engine.pull(cursor)
+    engine.release(cursor)
+    return pull
+
+
+def errors(engine):
+    return [line.text for line in engine.notices.since(0) if line.level == "error"]
+
+
+def one_line(text, expected):
+    assert expected in text and "\n" not in text and "Traceback" not in text
+
+
+@pytest.mark.parametrize("way", ["yaml", "filters", "set", "api", "page"])
+@pytest.mark.parametrize("case", BAD)
+def test_an_option_that_cannot_be_is_one_line_and_changes_nothing(case, way, start):
+    name, option, value, expected = BAD[case]
+    if way in ("yaml", "filters", "set"):
+        with pytest.raises(NisusError) as caught:
+            if way == "set":
+                overrides = {"estimator": name, f"estimator.options.{option}": str(value)}
+                place = f"--set estimator.options.{option}={value}: "
+                load_twin("motor_winding", overrides=overrides)
+            else:
+                text, line = with_option(way, name, option, value)
+                place = f"motor_winding.yaml:{line}: "
+                restore_twin(text, PATH)
+        one_line(str(caught.value), expected)
+        assert place in str(caught.value)
+        return
+    source, engine = start(load_twin("motor_winding", overrides={"estimator": name}))
+    if way == "api":
+        with pytest.raises(NisusError) as caught:
+            command_from_json({"command": "SetOption", "name": option, "value": value}, engine)
+        one_line(str(caught.value), expected)
+        return
+    source.put(reading(engine.model, 1.0, [40.0]))
+    wait_for(lambda: len(rows(engine).readings) == 1)
+    estimator, options = engine.status().estimator, engine.status().options
+    from_the_page(engine, option, value)
+    wait_for(lambda: errors(engine))
+    (text,) = errors(engine)
+    one_line(text, expected)
+    wait_for(lambda: not engine.status().refolding)
+    engine._status = None
+    assert (engine.status().estimator, engine.status().options) == (estimator, options)
+    assert rows(engine).revision == 0
+    source.put(reading(engine.model, 2.0, [41.0]))
+    wait_for(lambda: len(rows(engine).readings) == 2)
+    assert rows(engine).track.verdict[1] == USED
+
+
+def with_option(way, name, option, value):
+    """The twin's YAML with one option of a filter, of the first one or of another, and the line where it stands."""
+    head, tail = PATH.read_text().split("\nestimator: kf")
+    first = f"\nestimator:\n  name: {name}\n  options:\n    {option}: {value}"
+    other = f"\nestimator: kf\nfilters:\n  {name}:\n    {option}: {value}"
+    head += first if way == "yaml" else other
+    return head + tail[tail.index("\ngate:") :], head.count("\n") + 1
+
+
+def from_the_page(engine, option, value):
+    """As a browser that sends what its own widgets would not."""
+    view = ViserView(engine, secret="s3cret")
+    now = [0.0]
+    view.coalescer._clock = lambda: now[0]
+    try:
+        view.frame()
+        row = view.panel.options.rows.get(option)
+        if row is None:
+            engine.submit(commands.SetOption(option, value))  # the panel has no row for what the filter has not
+            return
+        handle = row.field if row.field is not None else row.slider
+        handle._impl.value = f"{value:g}" if isinstance(handle, viser.GuiTextHandle) else value
+        for callback in handle._impl.update_cb:
+            callback(GuiEvent(SimpleNamespace(client_id=0), 0, handle))
+        now[0] += 10 * TYPING_PAUSE
+        view.coalescer.flush()
+    finally:
+        view.stop()
+
+
+@pytest.mark.parametrize("value", ["abc", "inf", None, [1], {}])
+def test_an_option_that_is_no_number_is_refused_by_the_api(value, start):
+    _, engine = start(load_twin("motor_winding", overrides={"estimator": "ukf"}))
+    with pytest.raises(NisusError) as caught:
+        command_from_json({"command": "SetOption", "name": "alpha", "value": value}, engine)
+    one_line(str(caught.value), "alpha" if isinstance(value, str) else "value")
+
+
+def test_a_number_beyond_all_numbers_is_refused(start):
+    _, engine = start(load_twin("motor_winding"))
+    key = engine.tuning.keys()[0]
+    with pytest.raises(ConfigError, match="value is too large; it must be a finite number"):
+        command_from_json({"command": "SetTuning", "key": key, "value": 10**400}, engine)
+    with pytest.raises(ConfigError, match=rf"{key} is 1e\+300; it must be 1e\+50 at most"):
+        command_from_json({"command": "SetTuning", "key": key, "value": 1e300}, engine)
+
+
+def test_a_choice_may_be_given_as_its_word(start):
+    source, engine = start(load_twin("motor_winding", overrides={"estimator": "ekf"}))
+    source.put(reading(engine.model, 1.0, [40.0]))
+    engine.submit(command_from_json({"command": "SetOption", "name": "robust", "value": "huber"}, engine))
+    wait_for(lambda: engine.status().options["robust"] == 1.0)
+
+
+def test_a_covariance_that_is_none_is_refused_when_the_model_loads():
+    def f(x, u, p, dt, out):
+        out[0] = x[0]
+        out[1] = x[1]
+
+    def Q(x, u, p, q, dt, out):
+        out[0, 0] = q[0] * dt
+        out[1, 1] = q[0] * dt
+        out[0, 1] = 2.0 * q[0] * dt
+        out[1, 0] = 2.0 * q[0] * dt
+
+    def h(x, u, p, out):
+        out[0] = x[0]
+
+    model = StateSpaceModel(
+        name="crossed", title="Crossed", f=f, Q=Q, states=(State("a", "m", 0, 1), State("b", "m", 0, 1)),
+        noises=(Noise("a", "m²/s", 0.5),), sensors=(Sensor("a", (Row("a", "m", 1.0),), h),),
+    )  # fmt: skip
+    with pytest.raises(
+        ModelError, match=r"Q is not positive semidefinite \(it has the eigenvalue -0.5\) at the prior; a cov"
+    ):
+        compile_model(model)
+
+
+@pytest.mark.parametrize("spike", [1e9, -1e12, 1e155, 1e300, -1e300])
+@pytest.mark.parametrize("name", list(ESTIMATORS))
+def test_a_spike_is_gated_and_leaves_no_trace(name, spike):
+    """Whatever its size, and the others see the same: three rows at once, of which one is mad."""
+    model = MODELS["motor_winding"] if unfit(ESTIMATORS[name], MODELS["lorenz63"]) else MODELS["lorenz63"]
+    options = {option.name: 50.0 for option in ESTIMATORS[name].options if option.name in ("particles", "members")}
+    tuning = Tuning.of(model).set("gate", 0.9973).with_options(options)
+    sound = model.prior_mean[: model.ny]
+    mad = np.where(np.arange(model.ny) == 0, spike, sound)
+    log = Log(model.width)
+    for k, values in enumerate((sound, mad, sound, sound), start=1):
+        log.extend(reading(model, 0.01 * k, values))
+    track = fold(name, model, tuning, log)
+    assert track.verdict.tolist() == [USED, GATED, USED, USED]
+    assert np.isfinite(track.mean).all() and np.isfinite(track.std).all()
+    assert track.innovation[1, 0] == pytest.approx(spike, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["pf", "pf-reg", "pf-ekf", "apf"])
+def test_particles_that_all_weigh_nothing_recover_and_it_is_said(name, start):
+    """Without a gate: the square of such a residual is beyond the numbers, so every density is zero."""
+    source, engine = start(load_twin("motor_winding", overrides={"estimator": name}))
+    for second, value in enumerate([40.0, 1e200, 41.0, 40.5, 39.5], start=1):
+        source.put(reading(engine.model, second, [value]))
+    wait_for(lambda: len(rows(engine).readings) == 5)
+    track = rows(engine).track
+    assert track.verdict.tolist() == [USED, FAILED, USED, USED, USED]
+    assert np.isfinite(track.mean).all() and abs(track.mean[-1, 0] - 40.0) < 5.0
+    wait_for(lambda: engine.status().counts.get("recovered") == 1)
+    assert engine.status().counts["failed"] == 1
+    text = f"{name}: no particle explained a reading; the cloud was widened, 1 time(s) so far"
+    assert text in [line.text for line in engine.notices.since(0)]
+
+
+@pytest.mark.parametrize("twin", ["lorenz63", "road_car"])
+def test_an_estimate_that_is_no_number_stays_off_the_page(twin, start):
+    made = load_twin(twin, overrides={"estimator": "ekf", "gate": "null"})
+    source, engine = start(made)
+    model = engine.model
+    source.put(reading(model, 1.0, model.prior_mean[: len(model.sensors[0].rows)]))
+    wait_for(lambda: len(rows(engine).readings) == 1)
+    engine._fold._state[:] = np.nan
+    source.put(reading(model, 1.1, model.prior_mean[: len(model.sensors[0].rows)]))
+    wait_for(lambda: len(rows(engine).readings) == 2)
+    view = ViserView(engine, secret="s3cret")
+    try:
+        view.frame()
+        engine._status = None
+        status = engine.status()
+        assert (status.health, status.since) == (DIVERGED, int(1.1 * SECOND))
+        for text in (view.panel.status.content, view.panel._events_list.content, str(status_json(engine))):
+            assert "nan" not in text.lower()
+        assert "diverged since 0.1 s" in view.panel.status.content
+        for node in vars(view.scene).values():
+            if isinstance(node, viser.SceneNodeHandle):
+                assert np.isfinite([*node.position, *node.wxyz]).all()
+        engine.submit(commands.Reset())
+        wait_for(lambda: len(rows(engine).readings) == 3)
+        assert np.isfinite(rows(engine).track.mean[2]).all()
+    finally:
+        view.stop()
+
+
+@pytest.mark.parametrize("seconds", [1e300, -1e300, np.inf])
+def test_a_seek_beyond_all_time_is_refused(seconds):
+    source = SimpleNamespace(seek=lambda t: None, span=(0, SECOND))
+    with pytest.raises(ConfigError, match="must lie within 1e\\+09 s"):
+        play(source, commands.Seek(seconds), 0)

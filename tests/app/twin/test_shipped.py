@@ -1,0 +1,78 @@
+"""Every twin that ships opens, folds, and does what its opening text promises."""
+
+import numpy as np
+import pytest
+
+from app.twin.twin import load_twin
+from config.loader import TWINS, shipped
+from estimators.errors import SourceError
+from estimators.fold import fold
+from estimators.log import READING, Log, Readings, truth_of
+from estimators.track import GATED, USED, Track
+from tests.conftest import absent
+
+
+def folded(name: str) -> tuple[Readings, Track]:
+    twin = load_twin(name)
+    try:
+        source = twin.open_source(lambda key, text: None, live=False)
+    except SourceError as error:
+        if "is not there" in str(error):
+            absent(str(error))
+        raise
+    log = Log(twin.model.width)
+    while (batch := source.read(1.0)) is not None:
+        log.extend(batch)
+    source.close()
+    return log.readings, fold(twin.estimator, twin.model, twin.tuning, log)
+
+
+HUGE = ("thermal_field_large",)
+"""Twins whose fold takes minutes; their first readings are folded."""
+
+
+def test_a_million_cells_fold() -> None:
+    for name in HUGE:
+        twin = load_twin(name, overrides={"source.duration": "2"})
+        source = twin.open_source(lambda key, text: None)
+        log = Log(twin.model.width)
+        while (batch := source.read(1.0)) is not None:
+            log.extend(batch)
+        tuning = twin.tuning.with_options({"members": 3, "radius": 0.5})
+        track = fold(twin.estimator, twin.model, tuning, log)
+        assert np.sum(track.verdict == USED) == 2
+        assert np.isfinite(track.mean).all() and (track.std > 0).all()
+
+
+@pytest.mark.parametrize("name", [name for name in shipped() if name not in HUGE])
+def test_it_opens_and_folds(name: str) -> None:
+    events, track = folded(name)
+    readings = events.kind == READING
+    assert readings.sum() > 100
+    used, gated = (np.sum(track.verdict[readings] == verdict) for verdict in (USED, GATED))
+    assert used > 100 and gated < 0.1 * used, f"{used} readings were used and {gated} gated"
+    # Of a mode one may be certain.
+    uncertain = np.delete(track.std, model.mode, axis=1) if (model := load_twin(name).model).jump else track.std
+    assert np.isfinite(track.mean).all() and (uncertain > 0).all() and (track.std >= 0).all()
+
+
+def test_the_motor_on_the_bus_finds_its_magnet() -> None:
+    events, track = folded("motor_can")
+    assert (TWINS.parent / "logs" / "motor_can.blf").stat().st_size < 1_000_000
+    seconds = (events.t - events.t[0]) * 1e-9
+    for state, bound in ((0, 0.5), (1, 0.5), (2, 0.5)):
+        rows, values = truth_of(events, state)
+        assert np.abs(track.mean[rows, state] - values)[seconds[rows] > 20].max() < bound
+    magnet, values = truth_of(events, 3)
+    miss = np.abs(track.mean[magnet, 3] - values)
+    assert miss[0] > 5 and miss[seconds[magnet] > 150].max() < 4
+    assert track.std[magnet, 3][-1] < 3
+
+
+def test_the_winding_gives_the_articles_numbers() -> None:
+    events, track = folded("motor_winding")
+    rows, values = truth_of(events, 0)
+    assert events.t[rows[0]] > 0
+    assert np.sqrt(np.mean((track.mean[rows, 0] - values) ** 2)) == pytest.approx(1.0432, abs=5e-5)
+    assert np.nanmean(track.nis) == pytest.approx(0.8227, abs=5e-5)
+    np.testing.assert_allclose(track.std[-1] ** 2, [0.81306, 0.012751], rtol=1e-5)

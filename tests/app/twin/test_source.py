@@ -1,0 +1,382 @@
+# ruff: noqa: E501  (a table of whole messages reads better unbroken)
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.twin.twin import Twin, load_twin
+from estimators.errors import ConfigError, NisusError, SourceError
+from estimators.log import INPUT, READING, TRUTH, Readings
+from estimators.models import MODELS
+
+DBC = """\
+VERSION ""
+BU_: A
+BO_ 256 THERMAL: 4 A
+ SG_ WindingTemp : 0|16@1+ (0.01,-50) [0|0] "degC" A
+ SG_ Valid : 16|1@1+ (1,0) [0|1] "" A
+"""
+
+LOG = """\
+model: motor_winding
+source:
+  type: can_log
+  folder: data
+  files: drive.log
+  get: ask the test bench
+  dbc: thermal.dbc
+  sensors:
+    winding:
+      message: THERMAL
+      signals: WindingTemp
+      where: {Valid: 1}
+"""
+
+TABLE = """\
+model: motor_winding
+source:
+  type: table
+  files: [a*.csv]
+  time: {column: t_ms, unit: ms}
+  sensors:
+    winding: {columns: temp_f, units: degF}
+  truth:
+    rate: {columns: rate, units: K/min}
+"""
+
+CSV = "t_ms,temp_f,rate\n0,32,60\n500,212,30\n1000,,0\n"
+
+
+@pytest.fixture(autouse=True)
+def _inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Messages show paths as they look from the working directory."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("NISUS_DATA", raising=False)
+    Path("data").mkdir()
+    Path("data/thermal.dbc").write_text(DBC)
+    Path("data/drive.log").write_text(
+        "(1.000000) can0 100#401F0100\n(1.500000) can0 100#FFFF0000\n(2.000000) can0 100#50230100\n"
+    )
+
+
+def twin_of(text: str, **options: object) -> Twin:
+    Path("motor.yaml").write_text(text)
+    return load_twin("motor.yaml", **options)  # type: ignore[arg-type]
+
+
+def events(twin: Twin, *, live: bool = False) -> Readings:
+    reports: list[tuple[str, str]] = []
+    source = twin.open_source(lambda key, text: reports.append((key, text)), live=live)
+    batches = []
+    while (batch := source.read(1.0)) is not None:
+        batches.append(batch)
+    source.close()
+    return Readings.concat(batches, twin.model.width)
+
+
+def of(batch: Readings, kind: int) -> Readings:
+    return batch.select(batch.kind == kind)
+
+
+def message(text: str, kind: type[NisusError], **options: object) -> str:
+    with pytest.raises(kind) as caught:
+        events(twin_of(text, **options))
+    return str(caught.value)
+
+
+def test_a_can_log_is_read_through_its_dbc_and_conditions() -> None:
+    batch = of(events(twin_of(LOG)), READING)
+    np.testing.assert_array_equal(batch.t, [1_000_000_000, 1_500_000_000, 2_000_000_000])
+    np.testing.assert_allclose(batch.value[:, 0], [30.0, np.nan, 40.4], rtol=1e-12)
+
+
+def test_a_table_is_read_in_the_models_units() -> None:
+    Path("a1.csv").write_text(CSV)
+    batch = events(twin_of(TABLE))
+    readings, truth = of(batch, READING), of(batch, TRUTH)
+    np.testing.assert_array_equal(readings.t - readings.t[0], [0, 500_000_000])  # an empty cell is no reading
+    np.testing.assert_allclose(readings.value[:, 0], [0.0, 100.0], atol=1e-9)
+    assert set(truth.channel.tolist()) == {1}
+    np.testing.assert_allclose(truth.value[:, 0], [1.0, 0.5, 0.0], rtol=1e-12)
+
+
+def test_nisus_data_replaces_the_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("data").rename("elsewhere")
+    monkeypatch.setenv("NISUS_DATA", "elsewhere")
+    assert len(of(events(twin_of(LOG)), READING)) == 3
+
+
+def test_nisus_data_leaves_a_twin_without_folder_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("a1.csv").write_text(CSV)
+    monkeypatch.setenv("NISUS_DATA", "elsewhere")
+    assert len(of(events(twin_of(TABLE)), READING)) == 2
+
+
+def test_log_files_replace_the_recording() -> None:
+    Path("other.log").write_text("(5.000000) can0 100#401F0100\n")
+    assert of(events(twin_of(LOG, log_files=["other.log"])), READING).t.tolist() == [5_000_000_000]
+
+
+def test_a_recording_stands_in_for_a_bus() -> None:
+    bus = LOG.replace("can_log", "can\n  interface: virtual\n  channel: x\n  recording: data/drive.log")
+    bus = bus.replace("  folder: data\n  files: drive.log\n  get: ask the test bench\n", "").replace(
+        "dbc: t", "dbc: data/t"
+    )
+    assert len(of(events(twin_of(bus)), READING)) == 3
+    without = bus.replace("  recording: data/drive.log\n", "")
+    assert message(without, SourceError) == (
+        "motor.yaml:2: source is a live bus, which does not end; give a recording of it with --log FILE"
+    )
+    assert len(of(events(twin_of(without, log_files=["data/drive.log"])), READING)) == 3
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "kind", "expected"),
+    [
+        ("files: drive.log", "files: absent.log", SourceError, "motor.yaml:5: source.files is not there: data/absent.log; set NISUS_DATA to the folder that holds the recordings or give other recordings with --log FILE; to get it: ask the test bench"),
+        ("files: drive.log", "files: [drive.log, 'x*.log']", SourceError, "motor.yaml:5: source.files is not there: data/x*.log; set NISUS_DATA to the folder that holds the recordings or give other recordings with --log FILE; to get it: ask the test bench"),
+        ("dbc: thermal.dbc", "dbc: absent.dbc", SourceError, "motor.yaml:7: source.dbc is not there: data/absent.dbc; set NISUS_DATA to the folder that holds the recordings; to get it: ask the test bench"),
+        ("    winding:\n", "    windin:\n", ConfigError, "motor.yaml:9: source.sensors.windin is no sensor of motor_winding; did you mean winding?"),
+        ("signals: WindingTemp", "signals: [WindingTemp, Valid]", ConfigError, "motor.yaml:11: source.sensors.winding.signals names 2; winding takes 1: winding"),
+        ("  sensors:\n", "  inputs:\n", ConfigError, "motor.yaml:9: source.inputs.winding is no input of motor_winding; there are none to choose from"),
+    ],
+)  # fmt: skip
+def test_a_source_that_cannot_be_opened_is_one_line(old: str, new: str, kind: type[NisusError], expected: str) -> None:
+    assert old in LOG
+    assert message(LOG.replace(old, new, 1), kind) == expected
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "place", "words"),
+    [
+        ("WindingTemp", "WindingTmp", "motor.yaml:9: source.sensors.winding: ", ["WindingTmp", "THERMAL", "WindingTemp"]),
+        ("message: THERMAL", "message: THERMIC", "motor.yaml:9: source.sensors.winding: ", ["THERMIC", "THERMAL", "thermal.dbc"]),
+        ("where: {Valid", "where: {Vald", "motor.yaml:9: source.sensors.winding: ", ["Vald", "Valid"]),
+        ("where:", "units: km/h\n      where:", "motor.yaml:9: source.sensors.winding: ", ["km/h", "°C"]),
+        ("where:", "units: furlong2x\n      where:", "motor.yaml:9: source.sensors.winding: ", ["furlong2x"]),
+    ],
+)  # fmt: skip
+def test_what_the_dbc_lacks_is_one_line_at_the_mapping(old: str, new: str, place: str, words: list[str]) -> None:
+    assert old in LOG
+    text = message(LOG.replace(old, new, 1), SourceError)
+    assert text.startswith(place) and "\n" not in text
+    for word in words:
+        assert word in text
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("columns: temp_f", "columns: temp_c", ["temp_c", "temp_f"]),
+        ("units: degF", "units: m/s", ["m/s", "°C"]),
+    ],
+)
+def test_what_a_table_lacks_is_one_line_at_the_mapping(old: str, new: str, words: list[str]) -> None:
+    Path("a1.csv").write_text(CSV)
+    text = message(TABLE.replace(old, new, 1), SourceError)
+    assert text.startswith("motor.yaml:7: source.sensors.winding: ") and "\n" not in text
+    for word in words:
+        assert word in text
+
+
+def test_what_is_no_channels_fault_is_not_blamed_on_one() -> None:
+    Path("a1.csv").write_text(CSV)
+    text = message(TABLE.replace("t_ms", "t_s"), SourceError)
+    assert text.startswith("motor.yaml:2: source: ") and "t_s" in text and "did you mean t_ms?" in text
+    Path("data/thermal.dbc").write_text("no DBC at all {")
+    text = message(LOG, SourceError)
+    assert text.startswith("motor.yaml:2: source: ") and "thermal.dbc" in text and "\n" not in text
+    Path("data/thermal.dbc").write_text(DBC)
+    text = message(LOG.replace("drive.log", "thermal.dbc"), SourceError)
+    assert text.startswith("motor.yaml:5: source.files: ") and "thermal.dbc" in text and "\n" not in text
+
+
+def test_log_files_that_fit_nothing_are_one_line() -> None:
+    assert (
+        message(LOG, SourceError, log_files=["absent.blf"]) == "--log absent.blf: there is no such file; check the path"
+    )
+    simulator = "model: motor_winding\nsource: {type: simulator}\n"
+    assert message(simulator, SourceError, log_files=["a.blf"]) == (
+        "--log a.blf: the source of motor is a simulator; --log needs type can, can_log, table or merged"
+    )
+
+
+def test_merged_recordings_and_their_replacements() -> None:
+    Path("a1.csv").write_text(CSV)
+    indent = lambda text: "".join("      " + line + "\n" for line in text.split("source:\n")[1].splitlines())  # noqa: E731
+    part = lambda text: "    - " + indent(text).replace("        ", "      ").lstrip()  # noqa: E731
+    merged = "model: motor_winding\nsource:\n  type: merged\n  parts:\n" + part(LOG) + part(TABLE)
+    batch = events(twin_of(merged))
+    assert len(of(batch, READING)) == 5 and len(of(batch, TRUTH)) == 3
+    assert np.all(np.diff(batch.t) >= 0)
+    Path("new.log").write_text("(5.000000) can0 100#401F0100\n")
+    assert of(events(twin_of(merged, log_files=["new.log"])), READING).t.tolist() == [5_000_000_000]
+    Path("new.csv").write_text(CSV)
+    assert len(of(events(twin_of(merged, log_files=["new.log", "new.csv"])), READING)) == 3
+    truth_only = part(TABLE).replace("sensors:\n        winding: {columns: temp_f, units: degF}\n      ", "")
+    assert "sensors" not in truth_only
+    log_and_truth = merged.replace(part(TABLE), truth_only)
+    assert len(of(events(twin_of(log_and_truth)), TRUTH)) == 3
+    assert message(merged[: merged.index("    - ")] + truth_only, ConfigError).startswith(
+        "motor.yaml:2: source feeds no"
+    )
+    two = merged + part(TABLE).replace("a*.csv", "b*.csv")
+    Path("b1.csv").write_text(CSV)
+    assert message(two, SourceError, log_files=["new.csv"]) == (
+        "--log new.csv: 2 parts of motor.yaml:4 could read it; give it the name of the file that it replaces"
+    )
+    Path("new").mkdir()
+    Path("new/b7.csv").write_text(CSV)
+    assert len(of(events(twin_of(two, log_files=["new/b7.csv"])), READING)) == 2
+
+
+def test_a_simulators_inputs_and_plans_reach_it() -> None:
+    text = """\
+model: motor_drive
+source:
+  type: simulator
+  step: 0.5
+  duration: 5
+  inputs: {i_q: [10, {steps: [[0, 0], [2, 5]]}], ambient: {sine: {mean: 20, amplitude: 1, period: 4}}}
+  sensors: {winding: {every: 2, std: 1e-9}, tooth: {drop_every: 5}}
+"""
+    twin = twin_of(text)
+    batch = events(twin)
+    readings, inputs = of(batch, READING), of(batch, INPUT)
+    assert np.bincount(readings.channel).tolist() == [5, 10, 10]
+    assert np.isnan(readings.value[readings.channel == 1, 0]).sum() == 2
+    i_q = inputs.value[:, 1]
+    assert i_q[inputs.t < 2_000_000_000][0] == 10.0 and np.nanmax(i_q) == 15.0
+    ambient = inputs.value[:, 4]  # 20 + sin(2π t / 4 s) at every half second
+    np.testing.assert_allclose([np.nanmin(ambient), np.nanmax(ambient)], [19.0, 21.0], atol=1e-9)
+    truth = of(batch, TRUTH)
+    winding = readings.select(readings.channel == 0)
+    exact = truth.select((truth.channel == 0) & np.isin(truth.t, winding.t))
+    np.testing.assert_allclose(winding.value[:, 0], exact.value[:, 0], atol=1e-7)
+
+
+LENGTHY = """\
+model: motor_drive
+source:
+  type: simulator
+  step: STEP
+  duration: DURATION
+"""
+
+
+@pytest.mark.parametrize(
+    ("step", "duration", "expected"),
+    [
+        # motor_drive has three sensors.
+        ("1e-12", "600", "motor.yaml:4: source.step is 1e-12 s; the simulator would make 1.8e+15 events in 600 s, and may "
+            "make 1e+08; lengthen it, or shorten source.duration"),
+        ("0.5", "1e15", "motor.yaml:5: source.duration is 1e+15 s; the simulator would make 6e+15 events in 1e+15 s, and "
+            "may make 1e+08; shorten it, or lengthen source.step"),
+        ("1e-7", "null", "motor.yaml:4: source.step is 1e-07 s; the simulator would make 3e+09 events in 100 s, and may "
+            "make 1e+08; lengthen it"),
+        ("1e10", "null", "motor.yaml:4: source.step is 1e+10 s; the simulator would make RUNS steps of f in 1e+10 s, and "
+            "may make 1e+08; shorten it"),
+    ],
+)  # fmt: skip
+def test_a_simulation_that_would_never_end_is_one_line(step: str, duration: str, expected: str) -> None:
+    runs = f"{1e10 / MODELS['motor_drive'].max_step:.3g}"
+    text = LENGTHY.replace("STEP", step).replace("DURATION", duration)
+    with pytest.raises(ConfigError) as caught:
+        twin_of(text)
+    assert str(caught.value) == expected.replace("RUNS", runs)
+
+
+def test_a_long_simulation_may_be_as_long_as_said() -> None:
+    # 3 sensors · 2 a second: 1e8 events take 16.7 million seconds.
+    twin_of(LENGTHY.replace("STEP", "0.5").replace("DURATION", "16600000"))
+    with pytest.raises(ConfigError):
+        twin_of(LENGTHY.replace("STEP", "0.5").replace("DURATION", "16700000"))
+
+
+BUS = """\
+model: motor_winding
+source:
+  type: can
+  interface: virtual
+  channel: CHANNEL
+  dbc: data/thermal.dbc
+  sensors: {winding: {message: THERMAL, signals: WindingTemp}}
+  asset: {step: 0.01, duration: 0.2, initial: {temperature: 60}, sensors: {winding: {std: 1e-9}}}
+"""
+
+
+def test_a_virtual_bus_plays_its_own_asset() -> None:
+    source = twin_of(BUS.replace("CHANNEL", "test-played")).open_source(lambda key, text: None)
+    assert source.live
+    batches: list[Readings] = []
+    try:
+        for _ in range(100):  # reads wait for frames; 20 come, and silence for ten seconds is a failure
+            batches.append(source.read(0.1) or Readings.empty(1))
+            if sum(map(len, batches)) >= 20:
+                break
+    finally:
+        source.close()
+    batch = Readings.concat(batches, 1)
+    assert len(batch) == 20 and set(batch.kind.tolist()) == {READING}
+    # 60 °C ± the process noise of 0.2 s, some hundredths, in steps of the DBC's 0.01 °C.
+    np.testing.assert_allclose(batch.value[:, 0], 60.0, atol=1.0)
+    np.testing.assert_allclose(batch.value[:, 0] * 100, np.round(batch.value[:, 0] * 100), atol=1e-6)
+    assert source.read(0.0) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (LOG, "motor.yaml:2: source is of type can_log; only one of type can has a bus to play an asset on"),
+        (BUS[: BUS.index("  asset")], "motor.yaml:2: source has no asset to play; describe one under source.asset"),
+    ],
+)
+def test_what_has_no_asset_cannot_play_one(text: str, expected: str) -> None:
+    with pytest.raises(SourceError) as caught:
+        twin_of(text).player(lambda key, text: None)
+    assert str(caught.value) == expected
+
+
+def test_a_truth_of_another_model_must_fit() -> None:
+    Path("other.py").write_text("from estimators.models import MODELS\nOther = MODELS['motor_drive']\n")
+    text = "model: motor_winding\nsource:\n  type: simulator\n  duration: 2\n  truth:\n    model: ./other.py:Other\n"
+    assert message(text, ConfigError) == (
+        "motor.yaml:6: source.truth.model has states winding, tooth, yoke, magnet; they must be temperature, rate"
+    )
+    assert len(events(twin_of(text.replace("./other.py:Other", "motor_winding")))) == 5
+
+
+CAR = """\
+model: road_car
+source:
+  type: table
+  files: car.csv
+  time: {column: t}
+  sensors:
+    gnss_position: {columns: [lat, lon], convert: east_north, origin: [55.0, 12.0]}
+    gnss_heading: {columns: compass, units: deg, scale: -1, offset: 1.5}
+"""
+
+
+def test_scale_offset_and_origin_reach_the_source() -> None:
+    Path("car.csv").write_text("t,lat,lon,compass\n0,55.0,12.0,90\n1,55.001,12.0,0\n")
+    batch = of(events(twin_of(CAR)), READING)
+    twin = twin_of(CAR)
+    position = batch.select(batch.channel == twin.model.sensor_names.index("gnss_position"))
+    # One thousandth of a degree of latitude at 55° is 111.34 m on the WGS84 ellipsoid.
+    np.testing.assert_allclose(position.value[:, :2], [[0.0, 0.0], [0.0, 111.34]], atol=0.02)
+    heading = batch.select(batch.channel == twin.model.sensor_names.index("gnss_heading"))
+    np.testing.assert_allclose(heading.value[:, 0], [1.5 - np.pi / 2, 1.5], atol=1e-9)
+    moved = of(events(twin_of(CAR.replace("[55.0, 12.0]", "[55.001, 12.0]"))), READING)
+    np.testing.assert_allclose(moved.value[0, :2], [0.0, -111.34], atol=0.02)
+
+
+def test_conversions_that_make_no_sense_are_one_line() -> None:
+    inputs = CAR + "  inputs:\n    accel: {columns: a, convert: east_north}\n"
+    assert message(inputs, ConfigError) == (
+        "motor.yaml:10: source.inputs.accel.convert is east_north; it needs two values, latitude and longitude, and 1 are named"
+    )
+    inputs = CAR + "  inputs:\n    accel: {columns: [a, b], convert: east_north}\n"
+    assert message(inputs, ConfigError) == "motor.yaml:10: source.inputs.accel.columns names 2; accel takes 1: accel"
+    nothing = CAR[: CAR.index("  sensors")]
+    assert message(nothing, ConfigError).startswith("motor.yaml:2: source feeds no sensor; name at least one of ")

@@ -1,0 +1,326 @@
+# ruff: noqa: E501  (a table of whole messages reads better unbroken)
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.twin.twin import Twin, load_twin, restore_twin
+from estimators.compiled.model import compile_model
+from estimators.errors import ConfigError, ModelError, NisusError
+
+MOTOR = """\
+model: motor_winding
+prior:
+  temperature: {mean: 30, std: 4}
+noise:
+  rate: {std: 0.1}
+sensors:
+  winding: {std: 3}
+estimator: kf
+gate: 0.99
+view:
+  pairs: [[rate, temperature]]
+source:
+  type: simulator
+  duration: 120
+  initial: {rate: 0.2}
+"""
+
+PUMP = """\
+from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
+
+
+def f(x, u, p, dt, out):
+    out[0] = 0.9 * x[0]
+
+
+def h(x, u, p, out):
+    out[0] = x[0]
+
+
+def Pump():
+    return StateSpaceModel(
+        name="pump", title="Pump", states=(State("level", "m"),), noises=(Noise("level", "m²/s", 0.1),),
+        sensors=(Sensor("level", (Row("level", "m", 0.01),), h=h),), f=f,
+    )
+"""
+
+
+@pytest.fixture(autouse=True)
+def _inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Messages show paths as they look from the working directory."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("NISUS_DATA", raising=False)
+
+
+def twin_of(text: str, **options: object) -> Twin:
+    Path("motor.yaml").write_text(text)
+    return load_twin("motor.yaml", **options)  # type: ignore[arg-type]
+
+
+def message(text: str, kind: type[NisusError] = ConfigError, **options: object) -> str:
+    with pytest.raises(kind) as caught:
+        twin_of(text, **options)
+    return str(caught.value)
+
+
+def test_the_yaml_sets_the_model_and_the_tuning_up() -> None:
+    twin = twin_of(MOTOR + "title: My motor\n")
+    assert [(state.mean, state.std) for state in twin.model.states] == [(30.0, 4.0), (0.0, 1.0)]
+    np.testing.assert_allclose(twin.tuning.q, [0.01, 0.01])
+    np.testing.assert_allclose(twin.tuning.r, [9.0])
+    assert twin.tuning.gate == 0.99 and twin.tuning.used.tolist() == [True]
+    assert twin.estimator == "kf" and twin.title == "My motor" and twin.name == "motor"
+    assert twin.pairs.tolist() == [[1, 0]]
+
+
+def test_a_sensor_that_is_not_used_is_held_out() -> None:
+    assert twin_of(MOTOR.replace("{std: 3}", "{use: false}")).tuning.used.tolist() == [False]
+
+
+def test_overrides_set_the_tuning_and_the_yaml() -> None:
+    twin = twin_of(
+        MOTOR,
+        overrides={
+            "Q.temperature": "2e-2",
+            "R.winding": "5",
+            "use.winding": "false",
+            "gate": "null",
+            "source.seed": "9",
+        },
+    )
+    assert twin.tuning.get("Q.temperature") == 0.02 and twin.tuning.get("R.winding") == 5.0
+    assert twin.tuning.get("use.winding") is False and twin.tuning.gate is None
+    assert twin.config.source.seed == 9
+    assert twin.text == MOTOR
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("Q.temperature", "-1", "--set Q.temperature=-1: Q.temperature is -1; a variance must be zero or positive"),
+        ("R.winding", "big", "--set R.winding=big: R.winding must be a number"),
+        ("R.winding", "true", "--set R.winding=true: R.winding must be a number"),
+        ("use.winding", "0", "--set use.winding=0: use.winding must be true or false"),
+        ("use.winding", "[", "--set use.winding=[: use.winding must be true or false"),
+        ("gate", "3", "--set gate=3: gate is 3; it must be below 1"),
+        ("source.duration", "-1", "--set source.duration=-1: source.duration is -1; it must be positive"),
+    ],
+)
+def test_an_override_that_breaks_a_rule_is_one_line(key: str, value: str, expected: str) -> None:
+    assert message(MOTOR, overrides={key: value}) == expected
+
+
+def test_an_unknown_override_names_what_is_near() -> None:
+    text = message(MOTOR, overrides={"Q.temprature": "1"})
+    assert text.startswith("--set Q.temprature=1: Q.temprature is no tuning key of motor_winding; near: Q.temperature")
+    assert "; or a key of the YAML: name, title, model" in text and "\n" not in text
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        (
+            "model: motor_winding",
+            "model: motor_windin",
+            "motor.yaml:1: model is 'motor_windin'; no model of that name ships; did you mean motor_winding ",
+        ),
+        (
+            "  temperature: {mean",
+            "  temprature: {mean",
+            "motor.yaml:3: prior.temprature is no state of motor_winding; did you mean temperature?",
+        ),
+        (
+            "  rate: {std",
+            "  heat: {std",
+            "motor.yaml:5: noise.heat is no noise of motor_winding; choose from temperature, rate",
+        ),
+        (
+            "  winding: {std: 3}",
+            "  windin: {std: 3}",
+            "motor.yaml:7: sensors.windin is no sensor of motor_winding; did you mean winding?",
+        ),
+        (
+            "  winding: {std: 3}",
+            "  winding: {std: [3, 4]}",
+            "motor.yaml:7: sensors.winding.std has 2 entries; give one, or 1: winding",
+        ),
+        ("estimator: kf", "estimator: kff", "motor.yaml:8: estimator 'kff' does not exist; near: kf, "),
+        (
+            "estimator: kf",
+            "estimator: {name: ukf, options: {alfa: 1}}",
+            "motor.yaml:8: estimator ukf has no option 'alfa'; it has ",
+        ),
+        (
+            "pairs: [[rate, temperature]]",
+            "pairs: [[rate, temp]]",
+            "motor.yaml:11: view.pairs[0] names 'temp', no state of motor_winding; did you mean temperature?",
+        ),
+        (
+            "pairs: [[rate, temperature]]",
+            "pairs: [[rate, rate]]",
+            "motor.yaml:11: view.pairs[0] names rate twice; an ellipse needs two states",
+        ),
+        (
+            "pairs: [[rate, temperature]]",
+            "scene: {axes: [speed]}",
+            "motor.yaml:11: view.scene.axes names 'speed', no state of motor_winding; choose from temperature, rate",
+        ),
+        (
+            "initial: {rate: 0.2}",
+            "initial: {speed: 1}",
+            "motor.yaml:15: source.initial.speed is no state of motor_winding; choose from temperature, rate",
+        ),
+        (
+            "initial: {rate: 0.2}",
+            "inputs: {load: 1}",
+            "motor.yaml:15: source.inputs.load is no input of motor_winding; there are none to choose from",
+        ),
+        (
+            "model: motor_winding",
+            "model: motor_winding\nparameters: {r: 1}",
+            "motor.yaml:2: parameters.r is no parameter of motor_winding; there are none to choose from",
+        ),
+    ],
+)
+def test_what_the_model_lacks_is_one_line_with_what_is_near(old: str, new: str, expected: str) -> None:
+    assert old in MOTOR
+    text = message(MOTOR.replace(old, new, 1))
+    assert text.startswith(expected) if expected.endswith(" ") else text == expected
+    assert "\n" not in text
+
+
+def test_a_parameter_out_of_its_range_is_one_line() -> None:
+    text = PUMP.replace("Noise, Row", "Noise, Parameter, Row")
+    Path("pump.py").write_text(
+        text.replace("f=f,", 'f=f, parameters=(Parameter("area", "m²", 1.0, low=0.5, high=2.0),),')
+    )
+    yaml = "model: ./pump.py:Pump\nparameters:\n  area: 3\nsource: {type: simulator}\n"
+    assert message(yaml) == "motor.yaml:3: parameters.area is 3 m²; it must lie between 0.5 and 2"
+
+
+def test_a_model_from_a_file_beside_the_yaml(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.dont_write_bytecode", False)
+    Path("twins").mkdir()
+    Path("twins/pump.py").write_text(PUMP)
+    Path("twins/pump.yaml").write_text("model: ./pump.py:Pump\nsource: {type: simulator}\n")
+    twin = load_twin("twins/pump.yaml")
+    assert twin.model.name == "pump" and twin.pairs.shape == (0, 2)
+    compiled = compile_model(twin.model)
+    out = np.zeros(1)
+    compiled.f(np.array([2.0]), np.zeros(0), np.zeros(0), 1.0, out)
+    assert out[0] == pytest.approx(1.8)
+    assert sorted(os.listdir("twins")) == ["pump.py", "pump.yaml"], "loading leaves nothing beside the user's files"
+    Path("twins/pump.py").write_text(PUMP.replace("0.9", "0.8"))
+    compile_model(load_twin("twins/pump.yaml").model).f(np.array([2.0]), np.zeros(0), np.zeros(0), 1.0, out)
+    assert out[0] == pytest.approx(1.6), "an edited file is read again"
+
+
+@pytest.mark.parametrize(
+    ("python", "reference", "kind", "expected"),
+    [
+        (
+            PUMP,
+            "./pum.py:Pump",
+            ConfigError,
+            "motor.yaml:1: model is './pum.py:Pump'; there is no file pum.py; it is sought beside the YAML",
+        ),
+        (
+            PUMP,
+            "./pump.py:Pumpe",
+            ConfigError,
+            "motor.yaml:1: model is './pump.py:Pumpe'; pump.py has no Pumpe; did you mean Pump?",
+        ),
+        (
+            PUMP,
+            "./pump.py",
+            ConfigError,
+            "motor.yaml:1: model is './pump.py'; name what to take from the file, as in ./pump.py:Pump",
+        ),
+        (
+            PUMP + "X = 3\n",
+            "./pump.py:X",
+            ConfigError,
+            "motor.yaml:1: model names X, which is of type int; it must be a StateSpaceModel, or return one",
+        ),
+        (
+            PUMP + "def X(a): pass\n",
+            "./pump.py:X",
+            ModelError,
+            "pump.py: TypeError: X() missing 1 required positional argument: 'a'; correct the model's file",
+        ),
+        ("import math\nx = 1 +\n", "./pump.py:Pump", ModelError, "pump.py:2: invalid syntax; correct the Python"),
+        (
+            "\nimport absent_module\n",
+            "./pump.py:Pump",
+            ModelError,
+            "pump.py:2: ModuleNotFoundError: No module named 'absent_module'; correct the model's file",
+        ),
+        (
+            "def g():\n    return 1 / 0\n\n\ng()\n",
+            "./pump.py:Pump",
+            ModelError,
+            "pump.py:2: ZeroDivisionError: division by zero; correct the model's file",
+        ),
+        (
+            "import sys\nsys.exit(3)\n",
+            "./pump.py:Pump",
+            ModelError,
+            "pump.py:2: SystemExit: 3; correct the model's file",
+        ),
+        ("x = 1\x00", "./pump.py:Pump", ModelError, "pump.py: "),
+        (
+            PUMP.replace("0.01", "-1.0"),
+            "./pump.py:Pump",
+            ModelError,
+            "pump.py:13: model pump: sensor level.level has variance -1.0; it must be positive",
+        ),
+    ],
+)
+def test_a_model_file_that_fails_is_one_line_in_the_users_code(
+    python: str, reference: str, kind: type[NisusError], expected: str
+) -> None:
+    Path("pump.py").write_text(python)
+    text = message(f"model: {reference}\nsource: {{type: simulator}}\n", kind)
+    assert text.startswith(expected) if expected.endswith(" ") else text == expected
+    assert "\n" not in text
+
+
+def test_a_model_whose_shapes_disagree_is_refused_when_compiled() -> None:
+    Path("pump.py").write_text(PUMP.replace("out[0] = 0.9 * x[0]", "out[0] = x[0] + x[1]"))
+    twin = twin_of("model: ./pump.py:Pump\nsource: {type: simulator}\n")
+    with pytest.raises(ModelError) as caught:
+        compile_model(twin.model)
+    assert str(caught.value).startswith("pump.py:5: model pump: ") and "\n" not in str(caught.value)
+
+
+def test_a_twin_is_restored_from_its_text_alone() -> None:
+    Path("pump.py").write_text(PUMP)
+    text = "model: ./pump.py:Pump\nsensors: {level: {std: 0.5}}\nsource: {type: simulator}\n"
+    twin = restore_twin(text, "gone.yaml", {"Q.level": "0.3"})
+    assert twin.model.sensors[0].rows[0].variance == 0.25 and twin.tuning.get("Q.level") == 0.3
+    assert twin.name == "gone" and twin.text == text
+
+
+def test_a_parameter_to_estimate_becomes_a_state_that_the_yaml_may_name() -> None:
+    text = (
+        "model: motor_drive\nparameters: {yoke_coolant: 0.04}\nestimate:\n  yoke_coolant: {std: 0.01, drift: 0.001}\n"
+        "prior: {yoke_coolant: {std: 0.02}}\nview: {pairs: [[yoke, yoke_coolant]]}\n"
+        "source: {type: simulator, duration: 10, initial: {yoke_coolant: 0.05}}\n"
+    )
+    model = twin_of(text).model
+    assert model.states[-1].name == "yoke_coolant"
+    assert (model.states[-1].mean, model.states[-1].std) == (0.04, 0.02)
+    assert model.noises[-1].variance == pytest.approx(1e-6)
+    with pytest.raises(ConfigError, match="motor.yaml:4: .*yoke_coolnt is no parameter of motor_drive; did you mean"):
+        twin_of(text.replace("  yoke_coolant: {std", "  yoke_coolnt: {std"))
+
+
+def test_a_filter_given_by_name_takes_options(tmp_path):
+    """`estimator: ekf` in the YAML, or --estimator, and its options each by a --set of their own, in any order."""
+    for name, given in [("battery_panasonic", {}), ("motor_winding", {"estimator": "ekf"}), ("lorenz63", {})]:
+        overrides = {"estimator.options.inflation": "1.25", **given}
+        made = load_twin(name, overrides=overrides)
+        assert made.tuning.options["inflation"] == 1.25
+        assert made.estimator == given.get("estimator", load_twin(name).estimator)

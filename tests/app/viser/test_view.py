@@ -1,0 +1,458 @@
+"""The Viser pane against an engine without threads: who may connect, what an edit submits, what a status shows."""
+
+import asyncio
+import base64
+import http.client
+import os
+import socket
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import viser
+import websockets
+from viser import _messages
+
+from app.engine.commands import Pause, Record, Reset, Seek, SetEstimator, SetOption, SetTuning, Speed, UseSensor
+from app.viser.coalescer import DRAG_INTERVAL, TYPING_PAUSE
+from app.viser.history import History
+from app.viser.private_server import HEADER, guarded_server
+from app.viser.rows import PATIENCE
+from app.viser.vehicle_scene import VehicleScene
+from app.viser.view import ViserView
+from config.schema import SceneSection, ViewSection
+from estimators.log import READING, TRUTH, Readings
+from estimators.models import MODELS
+from estimators.numerics.peaks import Mode
+from tests.app.fake_engine import FakeEngine, events
+
+WINDING = MODELS["motor_winding"]
+BROWSER = SimpleNamespace(client_id=0)
+
+
+class Clock:
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self):
+        return self.now
+
+
+def history(n=60, seed=0):
+    rng = np.random.default_rng(seed)
+    t = 1.0 + np.arange(n)
+    truth = 40.0 + 0.1 * t
+    parts = [events(WINDING, READING, 0, t, truth + rng.normal(0, 2, n)), events(WINDING, TRUTH, 0, t, truth)]
+    both = Readings.concat(parts, WINDING.width)
+    return both.select(np.argsort(both.t, kind="stable"))
+
+
+@pytest.fixture
+def engine():
+    engine = FakeEngine(WINDING, "kf")
+    engine.put(history())
+    return engine
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def view(engine, clock, monkeypatch):
+    view = ViserView(engine, secret="s3cret")
+    monkeypatch.setattr(view.coalescer, "_clock", clock)
+    for row in view.panel.rows.values():
+        monkeypatch.setattr(row._held, "_clock", clock)
+    view.frame()
+    yield view
+    view.stop()
+
+
+def edit(handle, value):
+    """What Viser does when a browser sends a value: set it, then call back with that browser."""
+    handle._impl.value = value
+    for callback in handle._impl.update_cb:
+        callback(viser.GuiEvent(BROWSER, 0, handle))
+
+
+# Who may connect
+
+
+@pytest.fixture(scope="module")
+def server():
+    server = guarded_server("s3cret", "test")
+    yield server
+    server.stop()
+
+
+def get(port, path="/", **headers):
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    connection.request("GET", path, headers=headers)
+    response = connection.getresponse()
+    body = response.read()
+    connection.close()
+    return response.status, body
+
+
+def test_page_needs_the_secret(server):
+    port = server.get_port()
+    status, body = get(port, **{HEADER: "s3cret"})
+    assert status == 200 and b"<html" in body.lower()
+    for headers in ({}, {HEADER: ""}, {HEADER: "s3cre"}, {HEADER: "s3crets"}, {HEADER: "S3CRET"}):
+        assert get(port, **headers)[0] == 403
+
+
+def test_upgrade_without_the_secret_is_refused_on_the_wire(server):
+    """A raw socket: neither a missing header nor a header given twice opens a WebSocket."""
+    key = base64.b64encode(os.urandom(16)).decode()
+    for extra in ("", f"{HEADER}: wrong\r\n", f"{HEADER}: s3cret\r\n{HEADER}: wrong\r\n"):
+        with socket.create_connection(("127.0.0.1", server.get_port()), timeout=30) as raw:
+            raw.sendall(
+                f"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n{extra}"
+                f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n"
+                f"Sec-WebSocket-Protocol: viser-v{viser.__version__}\r\n\r\n".encode()
+            )
+            assert raw.recv(64).startswith(b"HTTP/1.1 403")
+
+
+def test_upgrade_with_the_secret_gets_the_scene(server):
+    async def first_message():
+        async with websockets.connect(
+            f"ws://127.0.0.1:{server.get_port()}/",
+            additional_headers={HEADER: "s3cret"},
+            subprotocols=[f"viser-v{viser.__version__}"],
+            compression=None,
+        ) as connection:
+            return await asyncio.wait_for(connection.recv(), 10)
+
+    assert len(asyncio.run(first_message())) > 0
+
+
+def test_serve_is_restored_and_the_tunnel_gone(server):
+    assert websockets.asyncio.server.serve.__module__.startswith("websockets")
+    assert _messages.ShareUrlRequest not in server._websock_server._incoming_handlers
+    with socket.create_connection(("127.0.0.1", server.get_port())) as raw:
+        assert raw.getpeername()[0] == "127.0.0.1"
+
+
+# What an edit submits
+
+
+def test_slider_submits_the_variance_and_moves_the_field(view, engine):
+    row = view.panel.rows["Q.rate"]
+    edit(row.slider, 1.0)
+    assert engine.commands == [SetTuning("Q.rate", 0.01)]
+    assert row.field.value == "0.01"
+
+
+def test_field_submits_after_a_pause_and_moves_the_slider(view, engine, clock):
+    row = view.panel.rows["R.winding"]
+    for text in ("0", "0.", "0.0", "0.04"):
+        edit(row.field, text)
+        clock.now += TYPING_PAUSE / 2
+        view.coalescer.flush()
+    assert engine.commands == []
+    clock.now += TYPING_PAUSE
+    view.coalescer.flush()
+    assert engine.commands == [SetTuning("R.winding", 0.04)]
+    assert row.slider.value == pytest.approx(-2.0)
+
+
+def test_text_that_is_no_number_is_refused_with_a_line(view, engine, clock):
+    row = view.panel.rows["R.winding"]
+    edit(row.field, "4 x")
+    clock.now += 10 * TYPING_PAUSE
+    view.coalescer.flush()
+    assert engine.commands == []
+    assert "R.winding is &#x27;4 x&#x27;; it must be a number" in view.panel._note.content
+
+
+def test_dragging_submits_the_latest_value_at_a_bounded_rate(view, engine, clock):
+    row = view.panel.rows["Q.temperature"]
+    for place in np.linspace(0.0, 2.0, 201):
+        edit(row.slider, float(place))
+        clock.now += 0.005
+        view.coalescer.flush()
+    clock.now += DRAG_INTERVAL
+    view.coalescer.flush()
+    assert len(engine.commands) <= 201 * 0.005 / DRAG_INTERVAL + 2
+    assert engine.commands[-1] == SetTuning("Q.temperature", 1.0)
+
+
+def test_every_control_submits_its_command(view, engine):
+    panel = view.panel
+    edit(panel.estimator.handle, panel._titles["ukf"])
+    edit(panel.gate.handle, "99.73 %")
+    edit(panel.sensors["winding"].handle, False)
+    edit(panel.speed.handle, "max")
+    edit(panel.run_buttons, "Pause")
+    edit(panel.run_buttons, "Reset")
+    view.frame()
+    edit(panel.options.rows["alpha"].slider, 0.5)
+    assert engine.commands == [
+        SetEstimator("ukf"), SetTuning("gate", 0.9973), UseSensor("winding", False), Speed(np.inf), Pause(True),
+        Reset(), SetOption("alpha", 0.5),
+    ]  # fmt: skip
+
+
+def test_seek_goes_where_the_slider_is_left(view, engine, clock):
+    engine.state.span = (1_000_000_000, 61_000_000_000)
+    view.frame()
+    assert view.panel.seek.visible and view.panel.seek.max == 60.0
+    edit(view.panel.seek, 10.0)
+    edit(view.panel.seek, 20.0)
+    clock.now += TYPING_PAUSE
+    view.coalescer.flush()
+    assert engine.commands == [Seek(20.0)]
+
+
+def test_recording_takes_a_bare_name(view, engine):
+    view.panel.file.value = "../../etc/run"
+    edit(view.panel.record, True)
+    view.frame()
+    assert [type(command) for command in engine.commands] == [Record]
+    assert str(engine.commands[0].path) == "run.rrd"
+    assert view.panel.record.label == "Stop recording" and "run.rrd" in view.panel._record_state.content
+    edit(view.panel.record, True)
+    assert engine.commands[-1] == Record(None)
+
+
+# What a status shows
+
+
+def test_status_moves_the_controls_without_an_echo(view, engine):
+    """As after a change by another browser or the API."""
+    engine.submit(SetTuning("Q.rate", 0.1))
+    engine.submit(UseSensor("winding", False))
+    engine.submit(SetEstimator("ukf"))
+    engine.submit(Pause(True))
+    count = len(engine.commands)
+    view.frame()
+    row = view.panel.rows["Q.rate"]
+    assert (row.slider.value, row.field.value) == (pytest.approx(2.0), "0.1")
+    assert view.panel.sensors["winding"].handle.value is False
+    assert view.panel.estimator.handle.value == view.panel._titles["ukf"]
+    assert view.panel.options.shown == "ukf" and view.panel.options.folder.visible
+    assert tuple(view.panel.run_buttons.options)[0] == "Resume"
+    view.coalescer.flush()
+    assert len(engine.commands) == count
+
+
+def test_a_count_is_whole_on_its_slider_and_in_its_field(view, engine):
+    engine.submit(SetEstimator("pf"))
+    view.frame()
+    rows = view.panel.options.rows
+    assert rows["resampling"].slider.step == 1.0 and rows["fraction"].slider.step < 0.1
+    assert rows["particles"].field.value == "2000"
+    engine.submit(SetOption("particles", 12345.0))
+    view.frame()
+    assert rows["particles"].field.value == "12345"
+
+
+def test_slow_engine_does_not_snap_the_slider_back(view, engine, clock):
+    engine.carry_out = False
+    row = view.panel.rows["Q.rate"]
+    edit(row.slider, 1.0)
+    view.frame()
+    assert row.slider.value == 1.0
+    clock.now += PATIENCE + 0.1
+    view.frame()
+    assert row.slider.value == 0.0, "what the engine did not take must not stay on the panel"
+
+
+def test_live_source_offers_reset_only(view, engine):
+    engine.state.seekable, engine.state.speed = False, None
+    view.frame()
+    assert tuple(view.panel.run_buttons.options) == ("Reset",)
+    assert not view.panel.speed.handle.visible
+
+
+def test_text_from_outside_is_escaped(view, engine):
+    engine.notices.append(SimpleNamespace(t=2_000_000_000, level="warn", text="<script>alert(1)</script>"))
+    view.frame()
+    assert "<script>" not in view.panel._events_list.content
+    assert "&lt;script&gt;" in view.panel._events_list.content
+
+
+# What is drawn
+
+
+def test_chart_holds_band_mean_readings_truth_and_previous(view, engine):
+    before = engine.fold.track.mean.copy()
+    engine.submit(SetTuning("Q.temperature", 10.0))
+    view.frame()
+    x, high, low, reading, _, _, previous, truth, mean, _, _ = view.charts._charts[0].data
+    track, readings = engine.fold.track, engine.log.readings
+    used = readings.kind == READING
+    # One bucket of the 60 s window holds the reading and the truth of one second: x doubles, values stay.
+    np.testing.assert_allclose(np.unique(x), np.unique(readings.t - readings.t[0]) * 1e-9)
+    np.testing.assert_allclose(np.unique(mean), np.unique(track.mean[:, 0]))
+    assert high.max() == pytest.approx((track.mean + 2 * track.std)[:, 0].max())
+    assert low.min() == pytest.approx((track.mean - 2 * track.std)[:, 0].min())
+    np.testing.assert_allclose(np.sort(reading[np.isfinite(reading)]), np.sort(readings.value[used, 0]))
+    np.testing.assert_allclose(np.unique(truth), np.unique(readings.value[~used, 0]))
+    np.testing.assert_allclose(np.unique(previous.round(9)), np.unique(before[:, 0].round(9)))
+
+
+def test_chart_shows_the_window_only(view, engine):
+    view._wanted_window = "10 s"
+    view.frame()
+    x = view.charts._charts[0].data[0]
+    assert x.min() >= 59.0 - 10.0 - 0.1 and x.max() == pytest.approx(59.0)
+    view._wanted_window = "all"
+    view.frame()
+    x = view.charts._charts[0].data[0]
+    assert (x.min(), x.max()) == (0.0, pytest.approx(59.0))
+
+
+def test_nothing_new_is_not_drawn_again(view, engine):
+    sent = []
+    view.server._websock_server.queue_message = sent.append
+    view.frame()
+    assert sent == []
+
+
+def test_belief_scene_follows_the_estimate(view, engine):
+    belief = engine.belief()
+    axes = view.scene.axes
+    place = [axis.place(belief.mean[axis.state]) for axis in axes]
+    np.testing.assert_allclose(view.scene._belief.position[:2], place, atol=1e-6)
+    assert np.all(np.abs(place) < 1.0)
+    labels = [float(label.text) for label in view.scene._labels[0]]
+    assert labels[0] < belief.mean[0] < labels[-1]
+
+
+def test_blocks_of_true_states_are_drawn(engine):
+    """Both states in one event, the second not always known: each chart and the belief's point get their own."""
+    t = 100.0 + np.arange(5)
+    block = np.stack((50.0 + t, [0.1, np.nan, 0.3, 0.4, np.nan]), axis=1)
+    engine.put(events(WINDING, TRUTH, 0, t, block))
+    view = ViserView(engine, secret="x")
+    try:
+        view.frame()
+        for j, expected in enumerate((block[:, 0], [0.1, 0.3, 0.4])):
+            values = view.charts._values(view.history, view.history.n - 5, view.history.n)[:, 3 * WINDING.nx + j]
+            np.testing.assert_array_equal(values[np.isfinite(values)], expected)
+        np.testing.assert_array_equal(view.scene._true_point(view.history, [1, 0]), [[0.4, 154.0]])
+    finally:
+        view.stop()
+
+
+def test_peaks_are_marked_with_their_weights_while_there_are_several(view, engine):
+    belief = engine.belief()
+    std = np.sqrt(np.diag(belief.cov))
+    engine.modes = tuple(
+        Mode(weight, belief.mean + side * std, belief.cov) for weight, side in ((0.75, 0.5), (0.25, -0.5))
+    )
+    view.scene.draw(view.history, engine.belief())
+    (first, heavy), (second, light), (third, _) = view.scene._modes[:3]
+    assert first.visible and second.visible and not third.visible
+    assert (heavy.text, light.text) == ("75 %", "25 %")
+    place = [axis.place(engine.modes[1].mean[axis.state]) for axis in view.scene.axes]
+    np.testing.assert_allclose(second.points[0, : len(place)], place[:3], atol=0.05)
+    engine.modes = ()
+    view.scene.draw(view.history, engine.belief())
+    assert not (first.visible or second.visible)
+
+
+def test_the_thread_draws_and_stops(engine):
+    view = ViserView(engine, secret="x")
+    view.start()
+    view.stop()
+    assert not view._thread.is_alive()
+
+
+def test_vehicle_scene_stands_at_the_heaviest_peak_among_its_walls():
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    try:
+        walls = (((-5.0, -1.0), (5.0, -1.0), (5.0, 1.0)),)
+        section = SceneSection(kind="vehicle", position=("east", "north"), heading="heading", walls=walls)
+        scene = VehicleScene(server, MODELS["agv_corridor"], section)
+        peaks = (Mode(0.7, np.array([4.0, 0.5, 0.0]), 0.01 * np.eye(3)), Mode(0.3, -np.ones(3), 0.01 * np.eye(3)))
+        cloud = np.array([[4.0, 0.5, 0.0], [-1.0, -1.0, -1.0], [np.nan, 0.0, 0.0]])
+        belief = SimpleNamespace(mean=np.array([2.5, 0.0, -0.3]), cov=np.eye(3), points=cloud, modes=peaks)
+        rows = History(3, 4, 16)
+        rows.n = 1
+        scene.draw(rows, belief)
+        assert tuple(scene._vehicle.position[:2]) == (4.0, 0.5)
+        assert scene._cloud.visible and scene._cloud.points.shape == (2, 3)
+        assert [label.text for _, label in scene._modes if label.visible] == ["70 %", "30 %"]
+        scene.draw(rows, SimpleNamespace(**{**vars(belief), "modes": peaks[:1]}))
+        assert tuple(scene._vehicle.position[:2]) == (2.5, 0.0)
+        assert not any(label.visible for _, label in scene._modes)
+    finally:
+        server.stop()
+
+
+def test_the_first_view_holds_all_walls_and_stays_until_it_is_to_follow():
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    try:
+        walls = (((80.0, -3.0), (140.0, -3.0), (140.0, 45.0)), ((90.0, 0.0), (80.0, 1.0)))
+        section = SceneSection(kind="vehicle", position=("east", "north"), heading="heading", walls=walls)
+        scene = VehicleScene(server, MODELS["agv_corridor"], section)
+        camera = server.initial_camera
+        forward = (camera.look_at - camera.position) / np.linalg.norm(camera.look_at - camera.position)
+        sideways = np.array([1.0, 0.0, 0.0])
+        tangents = []
+        for corner in [corner for line in walls for corner in line]:
+            sight = np.array([*corner, 0.0]) + scene.world.position - camera.position
+            tangents += [abs(sight @ axis) / (sight @ forward) for axis in (sideways, np.cross(sideways, forward))]
+        # Some wall fills the view but for its margin of a tenth; none is out of it.
+        assert max(tangents) == pytest.approx(0.9 * np.tan(camera.fov / 2))
+        rows = History(3, 4, 16)
+        rows.n = 1
+        cov = 0.01 * np.eye(3)
+        belief = SimpleNamespace(mean=np.array([135.0, 1.0, 0.0]), cov=cov, points=np.zeros((0, 3)), modes=())
+        scene.draw(rows, belief)
+        np.testing.assert_allclose(scene.world.position, [-110.0, -21.0, 0.0])
+        scene.follow = True
+        for _ in range(40):
+            scene.draw(rows, belief)
+        np.testing.assert_allclose(scene.world.position, [-135.0, -1.0, 0.0], atol=0.01)
+        scene.follow = False
+        for _ in range(40):
+            scene.draw(rows, belief)
+        np.testing.assert_allclose(scene.world.position, [-110.0, -21.0, 0.0], atol=0.01)
+    finally:
+        server.stop()
+
+
+def test_vehicle_scene_keeps_the_vehicle_in_the_middle():
+    def f(x, u, p, dt, out):
+        out[0] = x[0] + dt * x[2]
+        out[1] = x[1]
+        out[2] = x[2]
+
+    def fix(x, u, p, out):
+        out[0] = x[0]
+        out[1] = x[1]
+
+    from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+
+    model = StateSpaceModel(
+        name="sled", title="Sled", f=f, linear=True,
+        states=(State("east", "m", 0, 10), State("north", "m", 0, 10), State("speed", "m/s", 0, 5)),
+        noises=(Noise("speed", "(m/s)²/s", 0.1),),
+        sensors=(Sensor("gnss", (Row("east", "m", 1.0), Row("north", "m", 1.0)), fix),),
+    )  # fmt: skip
+    engine = FakeEngine(model, "kf", ViewSection(scene=SceneSection(kind="vehicle", position=("east", "north"))))
+    t = np.arange(1.0, 61.0)
+    engine.put(events(model, READING, 0, t, np.stack((10 * t, 0 * t), axis=1)))
+    north = np.where(t == 30.0, np.nan, 3.0)
+    engine.put(events(model, TRUTH, 0, t, np.stack((10 * t, north), axis=1)))
+    view = ViserView(engine, secret="x")
+    try:
+        view.frame()
+        np.testing.assert_allclose(view.scene.world.position, [-600.0, 0.0, 0.0], atol=2.0)
+        np.testing.assert_allclose(view.scene._vehicle.position[:2], engine.belief().mean[:2], atol=1e-6)
+        assert view.scene._readings.points.shape == (60, 3)
+        way = np.unique(np.asarray(view.scene._truth.points).reshape(-1, 3), axis=0)
+        np.testing.assert_allclose(way[:, 0], 10 * t[t != 30.0], err_msg="where both true states are known")
+        np.testing.assert_allclose(way[:, 1], 3.0)
+        assert view.scene._course == pytest.approx(0.0, abs=0.05)
+        cov = engine.belief().cov[:2, :2]
+        np.testing.assert_allclose(view.scene._ellipse.scale[:2], 2 * np.sqrt(np.linalg.eigvalsh(cov)), rtol=1e-6)
+    finally:
+        view.stop()

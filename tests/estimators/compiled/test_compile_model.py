@@ -1,0 +1,190 @@
+"""A model that disagrees with its declaration is refused with one line that says what, where and how much."""
+
+import numpy as np
+import pytest
+
+from estimators.compiled.model import compile_model
+from estimators.errors import ModelError
+from estimators.model.state_space import Noise, Parameter, Row, Sensor, State
+from tests.estimators.compiled.test_jacobians import F, H, P, U, f, h, model
+
+NOT_COMPILABLE = {"a": 1}
+
+
+def wrong_F(x, u, p, dt, out):
+    F(x, u, p, dt, out)
+    out[1, 2] *= -1.0
+
+
+def wrong_H(x, u, p, out):
+    H(x, u, p, out)
+    out[0, 2] *= 1.01
+
+
+def leaves_out(x, u, p, dt, out):
+    out[0] = x[0]
+    out[2] = x[2]
+
+
+def divides_by_zero(x, u, p, dt, out):
+    out[0] = np.log(-x[2])
+    out[1] = x[1]
+    out[2] = x[2]
+
+
+def reads_too_far(x, u, p, dt, out):
+    out[0] = x[3]
+
+
+def writes_too_far(x, u, p, dt, out):
+    for i in range(4):
+        out[i] = 0.0
+
+
+def reads_a_parameter_too_far(x, u, p, dt, out):
+    out[0] = p[2]
+
+
+def raises(x, u, p, dt, out):
+    raise ValueError("no such state")
+
+
+def uses_python(x, u, p, dt, out):
+    for i in range(3):
+        out[i] = x[i] * getattr(NOT_COMPILABLE, "get")("a")  # noqa: B009
+
+
+def misspelt(x, u, p, dt, out):
+    out[0] = np.sqqrt(x[0])
+
+
+def returns_too_many(x, u, p, dt, out):
+    out[:] = np.zeros(4)
+
+
+def too_few_arguments(x, out):
+    out[0] = x[0]
+
+
+def tiny_lopsided_Q(x, u, p, q, dt, out):
+    for i in range(3):
+        out[i, i] = 1e-9
+    out[0, 1] = 1e-10
+
+
+def lopsided_Q(x, u, p, q, dt, out):
+    out[0, 1] = q[0] * dt
+
+
+def h_writes_too_far(x, u, p, out):
+    for i in range(3):
+        out[i] = x[i]
+
+
+def writes_to_x(x, u, p, dt, out):
+    x[0] += dt * x[1]
+    for i in range(3):
+        out[i] = x[i]
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"f": writes_to_x}, ("f writes to its arguments", "fill out only")),
+        ({"F": wrong_F}, ("F differs", "(relative)")),
+        ({"H": wrong_H}, ("H of sensor s differs", "(relative)")),
+        ({"f": leaves_out}, ("f leaves 1 of 3", "unset", "fill them all")),
+        ({"f": divides_by_zero}, ("f leaves 1 of 3", "not finite at the prior")),
+        ({"f": reads_too_far}, ("f fails at the prior", "3 states", "IndexError")),
+        ({"f": writes_too_far}, ("f fails at the prior", "IndexError")),
+        ({"f": reads_a_parameter_too_far}, ("f fails at the prior", "2 parameters", "IndexError")),
+        ({"f": raises}, ("f fails at the prior", "ValueError: no such state; it may not fail at x = [")),
+        ({"f": misspelt}, ("f fails at the prior", "sqqrt", "correct the name")),
+        ({"f": returns_too_many}, ("f fails at the prior", "ValueError", "declared sizes: 3 states")),
+        ({"f": too_few_arguments}, ("f fails at the prior", "TypeError", "argument", "it takes (x, u, p, dt, out)")),
+        ({"f": uses_python}, ("f cannot be compiled",)),
+        ({"h": h_writes_too_far}, ("h of sensor s fails at the prior", "IndexError")),
+        ({"Q": lopsided_Q}, ("Q is not symmetric",)),
+        ({"Q": tiny_lopsided_Q}, ("Q is not symmetric",)),
+    ],
+    ids=lambda item: None if isinstance(item, tuple) else next(iter(item.values())).__name__,
+)
+def test_one_clear_line(changes, says):
+    with pytest.raises(ModelError) as refused:
+        compile_model(model(**changes))
+    text = str(refused.value)
+    assert "model curved: " in text
+    assert "\n" not in text
+    assert len(text) < 400
+    for part in says:
+        assert part in text
+    # No trace of Numba's or NumPy's own error behind it.
+    assert refused.value.__cause__ is None
+    assert refused.value.__context__ is None or refused.value.__suppress_context__
+
+
+def deeper(x, u, p, dt, out):
+    out[0] = x[0]
+    raises(x, u, p, dt, out)
+
+
+@pytest.mark.parametrize(
+    ("function", "culprit", "line"),
+    [
+        (raises, raises, 1),  # the line that fails, not the first one
+        (deeper, raises, 1),  # in whatever function of the file it is
+        (too_few_arguments, too_few_arguments, 0),  # it never begins
+        (leaves_out, leaves_out, 0),
+        (uses_python, uses_python, 2),  # as Numba says
+    ],
+)
+def test_it_is_said_of_the_line_in_the_models_file(function, culprit, line, monkeypatch, tmp_path):
+    code = culprit.__code__
+    place = f"{code.co_filename}:{code.co_firstlineno + line}: model curved: f "
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ModelError) as refused:
+        compile_model(model(f=function))
+    assert str(refused.value).startswith(place)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"states": ()}, "states is empty"),
+        ({"sensors": ()}, "sensors is empty"),
+        ({"states": (State("a", "1"), State("a", "1"))}, "names 'a' twice"),
+        ({"states": (State("a", "1", std=0.0),)}, "prior of a"),
+        ({"states": (State("a", "1", mean=np.nan),)}, "prior of a"),
+        ({"noises": (Noise("a", "1", -0.1),)}, "variance -0.1"),
+        ({"noises": (Noise("elsewhere", "1", 0.1),)}, "'elsewhere' is not a state"),
+        ({"max_step": 0.0}, "max_step is 0.0 s"),
+        ({"parameters": (Parameter("c", "1", 1.0, 2.0, 0.5),)}, "parameter c ranges from 2 to 0.5"),
+        ({"sensors": (Sensor("s", (), wrong_H),)}, "sensor s has no rows"),
+        ({"sensors": (Sensor("s", (Row("r", "1", 1.0), Row("r", "1", 1.0)), wrong_H),)}, "sensor s names a row twice"),
+    ],
+)
+def test_declarations_that_no_filter_could_run(changes, says):
+    with pytest.raises(ModelError, match="model curved: ") as refused:
+        model(**changes)
+    assert says in str(refused.value)
+
+
+def test_compiled_functions_say_what_the_plain_ones_say():
+    compiled = compile_model(model())
+    x = np.array([0.2, -0.4, 1.9])
+    fast, plain = np.empty(3), np.empty(3)
+    compiled.f(x, U, P, 0.3, fast)
+    f(x, U, P, 0.3, plain)
+    # The same operations; the compiler may call another exp or fuse a multiply-add: two units in the last place.
+    np.testing.assert_allclose(fast, plain, rtol=4e-16 * 4)
+    fast, plain = np.empty(2), np.empty(2)
+    compiled.h[0](x, U, P, fast)
+    h(x, U, P, plain)
+    np.testing.assert_allclose(fast, plain, rtol=4e-16 * 4)
+    out = np.zeros((3, 3))
+    compiled.Q(x, U, P, np.array([0.1]), 0.5, out)
+    np.testing.assert_array_equal(out, np.diag([0.05, 0.0, 0.0]))
+
+
+def test_a_model_is_compiled_once():
+    assert compile_model(model()) is compile_model(model())

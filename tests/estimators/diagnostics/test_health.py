@@ -1,0 +1,359 @@
+"""Diagnostics must be able to fail: inside their bounds for a model that fits, outside for one that does not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from estimators.diagnostics.health import FAR, FEW, HealthPolicy, assess, chi_square_bounds, nis_bounds
+from estimators.diagnostics.score import score
+from estimators.fold import Fold, fold
+from estimators.log import READING, RESET, TICK, TRUTH, Log, Readings
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.models import MODELS
+from estimators.registry import ESTIMATORS
+from estimators.track import DEGRADED, DIVERGED, FAILED, GATED, HELD_OUT, MISSING, NONE, STALE, TRACKING, USED, Track
+from estimators.tuning import Tuning
+
+SECOND = 1_000_000_000
+MOTOR = MODELS["motor_winding"]
+F = np.array([[1.0, 1.0], [0.0, 1.0]])
+Q = np.diag([0.01, 0.001])
+RUNS, STEPS = 200, 40
+
+
+def simulated(seed, bias=0.0):
+    """A run of the motor drawn from its own model; the truth starts from the prior, as the filter believes."""
+    rng = np.random.default_rng(seed)
+    x = np.array([35.0, 0.0]) + rng.normal(0, 1, 2) * [5.0, 1.0]
+    batch = [Readings.one(0, 0, TICK, 0, (), 1)]
+    for k in range(1, STEPS + 1):
+        x = F @ x + rng.normal(0, np.sqrt(np.diag(Q)))
+        batch.append(Readings.one(k * SECOND, 0, READING, 0, x[0] + bias + rng.normal(0, 2.0), 1))
+        batch += [Readings.one(k * SECOND, 0, TRUTH, j, x[j], 1) for j in range(2)]
+    log = Log(1)
+    log.extend(Readings.concat(batch, 1))
+    return log
+
+
+def averages(estimator, tuning, bias=0.0):
+    """NIS summed over all runs and steps; NEES of the last step summed over the runs (independent between runs)."""
+    nis = nees = 0.0
+    for seed in range(RUNS):
+        log = simulated(seed, bias)
+        folded = Fold(estimator, MOTOR, tuning, log)
+        folded.advance()
+        nis += folded.track.nis[folded.track.verdict == USED].sum()
+        mean, cov = folded.moments()
+        error = mean - log.readings.value[-2:, 0]
+        nees += error @ np.linalg.solve(cov, error)
+    return nis, nees
+
+
+# The chance that a sum of chi-squares leaves these bounds is 1e-4; the seeds are fixed, so it does not flicker.
+TAIL = 5e-5
+
+
+@pytest.mark.parametrize("estimator", [name for name, entry in ESTIMATORS.items() if entry.family == "Gaussian"])
+def test_a_model_that_fits_is_inside_its_bounds(estimator):
+    nis, nees = averages(estimator, Tuning.of(MOTOR))
+    assert chi2.ppf(TAIL, RUNS * STEPS) < nis < chi2.ppf(1 - TAIL, RUNS * STEPS)
+    assert chi2.ppf(TAIL, 2 * RUNS) < nees < chi2.ppf(1 - TAIL, 2 * RUNS)
+
+
+@pytest.mark.parametrize(("variance", "side"), [(2.0, "high"), (8.0, "low")])
+def test_a_wrong_sensor_variance_is_outside(variance, side):
+    nis, nees = averages("kf", Tuning.of(MOTOR).set("R.winding", variance))
+    for total, dof in ((nis, RUNS * STEPS), (nees, 2 * RUNS)):
+        if side == "high":
+            assert total > chi2.ppf(1 - TAIL, dof)
+        else:
+            assert total < chi2.ppf(TAIL, dof)
+
+
+def test_a_process_noise_that_is_too_small_is_outside():
+    """Seen in NEES first: where R rules S, the innovations hardly show it (NIS 2.8 % too high here)."""
+    _, nees = averages("kf", Tuning.of(MOTOR).set("Q.rate", 1e-6).set("Q.temperature", 1e-6))
+    assert nees > 10 * chi2.ppf(1 - TAIL, 2 * RUNS)
+
+
+def test_a_biased_sensor_is_seen_where_the_truth_is_known():
+    _, nees = averages("kf", Tuning.of(MOTOR), bias=3.0)
+    assert nees > chi2.ppf(1 - TAIL, 2 * RUNS)
+
+
+def test_bounds_are_the_published_quantiles():
+    """Chi-square 95 %: 0.0010 to 5.0239 for one degree of freedom, 74.222 to 129.561 for a hundred (tables)."""
+    low, high = nis_bounds(1, 1)
+    assert (round(low, 4), round(high, 4)) == (0.0010, 5.0239)
+    low, high = nis_bounds(100, 50)
+    assert (round(low * 50, 3), round(high * 50, 3)) == (74.222, 129.561)
+    table = chi_square_bounds(100)
+    assert (round(table.low[100], 3), round(table.high[100], 3)) == (74.222, 129.561)
+    assert round(table.alarm[1], 3) == 10.828
+    assert len(table.low) == 101
+
+
+def test_score_is_the_definitions():
+    log = simulated(3)
+    track = fold("kf", MOTOR, Tuning.of(MOTOR).set("gate", 0.9), log)
+    events = log.readings
+    result = score(track, events, MOTOR)
+    used = track.verdict == USED
+    assert result.gated == np.sum(track.verdict == GATED) > 0
+    assert result.readings == STEPS
+    assert result.nis_readings == used.sum()
+    np.testing.assert_allclose(result.nis, track.nis[used].mean(), rtol=1e-14)
+    np.testing.assert_allclose(result.log_likelihood, track.log_likelihood[used].sum(), rtol=1e-14)
+    for j, name in enumerate(MOTOR.state_names):
+        rows = (events.kind == TRUTH) & (events.channel == j)
+        error = track.mean[rows, j] - events.value[rows, 0]
+        np.testing.assert_allclose(result.states[name].rmse ** 2, np.mean(error**2), rtol=1e-13)
+        # 1.959964 is the two-sided 95 % quantile of the normal distribution.
+        assert result.states[name].coverage == np.mean(np.abs(error) <= 1.959964 * track.std[rows, j])
+
+
+def test_errors_of_angles_are_the_short_way():
+    log = Log(1)
+    log.extend(Readings.one(0, 0, TRUTH, 0, 3.1, 1))
+    track = fold("kf", COMPASS, Tuning.of(COMPASS), log)
+    short = score(track, log.readings, COMPASS).states["heading"].rmse
+    np.testing.assert_allclose(short, 2 * np.pi - 6.2, rtol=1e-12)
+
+
+def test_true_states_come_in_blocks():
+    """40 states, truth from 0 on and from 32 on, partly unknown, and one event with a single value of old.
+
+    The filter stays at its prior, mean j/10 and 95 % band 1.96 * 0.5, so every number follows by hand.
+    """
+    names = [f"s{j}" for j in range(40)]
+    many = StateSpaceModel(
+        name="many",
+        title="many",
+        states=tuple(State(name, "", mean=j / 10, std=0.5, circular=j == 33) for j, name in enumerate(names)),
+        noises=(Noise("s0", "", 0.0),),
+        sensors=(Sensor("compass", (Row("compass", "", 0.01),), h=itself),),
+        f=unmoved,
+        linear=True,
+    )
+    nan = np.nan
+    low, high = np.full(32, nan), np.full(32, nan)
+    low[0], low[5], low[31] = 0.3, 1.5, 3.1  # errors -0.3, -1, 0
+    high[0], high[1], high[7] = nan, -2.8, 4.3  # state 33: 3.3 + 2.8 = 6.1 is -0.1832 the short way; state 39: -0.4
+    batch = [
+        Readings.one(0, 0, TRUTH, 0, low, 32),
+        Readings.one(0, 0, TRUTH, 32, high, 32),
+        Readings.one(SECOND, 0, TRUTH, 5, 0.5 - 2.0, 32),  # error 2, outside the band as the -1 before it
+        Readings.one(SECOND, 0, TRUTH, 0, nan, 32),
+    ]
+    log = Log(many.width)
+    log.extend(Readings.concat(batch, many.width))
+    fits = score(fold("kf", many, Tuning.of(many), log), log.readings, many).states
+    expected = {
+        "s0": (0.3, 1.0),
+        "s5": (np.sqrt((1.0 + 4.0) / 2), 0.0),
+        "s31": (0.0, 1.0),
+        "s33": (2 * np.pi - 6.1, 1.0),
+        "s39": (0.4, 1.0),
+    }
+    assert list(fits) == list(expected)
+    for name, (rmse, coverage) in expected.items():
+        # The circular mean 3.3 is kept as 3.3 - 2π: one rounding of numbers near 6.
+        assert fits[name].rmse == pytest.approx(rmse, rel=1e-12, abs=1e-14) and fits[name].coverage == coverage
+
+
+def unmoved(x, u, p, dt, out):
+    for j in range(x.size):
+        out[j] = x[j]
+
+
+def still(x, u, p, dt, out):
+    out[0] = x[0]
+
+
+def itself(x, u, p, out):
+    out[0] = x[0]
+
+
+COMPASS = StateSpaceModel(
+    name="compass",
+    title="compass",
+    states=(State("heading", "rad", mean=-3.1, std=0.1, circular=True),),
+    noises=(Noise("heading", "rad²/s", 0.01),),
+    sensors=(Sensor("compass", (Row("compass", "rad", 0.01, circular=True),), h=itself),),
+    f=still,
+    linear=True,
+)
+
+
+# Health
+
+
+def history(values, kind=READING, step=1.0):
+    """Readings `step` seconds apart, one a value."""
+    log = Log(1)
+    for k, value in enumerate(values):
+        log.extend(Readings.one(round(k * step * SECOND), 0, kind, 0, value, 1))
+    return log
+
+
+def healths(log, policy=None, gate=None):
+    return fold("kf", COMPASS, Tuning.of(COMPASS).set("gate", gate), log, policy=policy).health
+
+
+GOOD = list(-3.1 + 0.1 * np.random.default_rng(0).normal(0, 1, 60))
+
+
+def test_good_readings_track():
+    assert np.all(healths(history(GOOD)) == TRACKING)
+
+
+def test_silence_degrades_then_goes_stale_and_a_reading_heals():
+    """Defaults: degraded after 5 s without a reading that is used, stale after 30 s."""
+    log = history(GOOD[:20])
+    last = 19
+    for seconds in (5, 5.001, 29.999, 30.001):
+        log.extend(Readings.one(round((last + seconds) * SECOND), 0, TICK, 0, (), 1))
+    log.extend(Readings.one(60 * SECOND, 0, READING, 0, -3.1, 1))
+    track = fold("kf", COMPASS, Tuning.of(COMPASS), log)
+    assert list(track.health[20:]) == [TRACKING, DEGRADED, DEGRADED, STALE, TRACKING]
+    np.testing.assert_allclose(track.age[20:], [5, 5.001, 29.999, 30.001, 0], atol=1e-12)
+
+
+def test_missing_readings_are_silence():
+    log = history(GOOD[:20] + [np.nan] * 6)
+    assert list(healths(log)[-2:]) == [TRACKING, DEGRADED]
+
+
+def test_readings_too_far_off_degrade_then_diverge():
+    """White steps of `scale` sigmas: mean NIS near scale². Alarm at the 99.9 % quantile, diverged at ten times 1."""
+    rng = np.random.default_rng(1)
+    for scale, expected in ((1.0, TRACKING), (2.2, DEGRADED), (6.0, DIVERGED)):
+        values = -3.1 + scale * 0.127 * rng.choice([-1.0, 1.0], 80)
+        track = fold("kf", COMPASS, Tuning.of(COMPASS), history(values))
+        assert track.health[-1] == expected, (scale, track.nis_mean[-1])
+
+
+def test_a_gate_that_refuses_most_is_divergence():
+    values = GOOD[:20] + [5.0] * 60
+    health = healths(history(values), gate=0.999)
+    assert health[19] == TRACKING
+    assert DIVERGED in health[20:]
+    track = fold("kf", COMPASS, Tuning.of(COMPASS).set("gate", 0.999), history(values))
+    first = int(np.flatnonzero(track.health == DIVERGED)[0])
+    # More than half of the window, which by then holds all that came: 20 good ones and 21 refused.
+    assert np.sum(track.verdict[: first + 1] == GATED) == 21
+
+
+def test_an_estimate_that_is_not_finite_is_divergence():
+    # Far beyond what a tuning may be set to.
+    tuning = replace(Tuning.of(COMPASS), q=np.array([1e308]))
+    track = fold("kf", COMPASS, tuning, history([-3.1, -3.1, -3.1], step=1e6))
+    assert track.health[-1] == DIVERGED
+    assert not np.isfinite(track.std[-1, 0]) or not np.isfinite(track.mean[-1, 0])
+
+
+def test_window_is_the_last_readings():
+    policy = HealthPolicy(window=7)
+    track = fold("kf", COMPASS, Tuning.of(COMPASS), history(GOOD), policy=policy)
+    for k in (0, 3, 6, 7, 30, 59):
+        rows = slice(max(0, k - 6), k + 1)
+        count = rows.stop - rows.start
+        np.testing.assert_allclose(track.nis_mean[k], track.nis[rows].mean(), rtol=1e-13)
+        np.testing.assert_allclose(track.nis_low[k], chi2.ppf(0.025, count) / count, rtol=1e-12)
+        np.testing.assert_allclose(track.nis_high[k], chi2.ppf(0.975, count) / count, rtol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_health_does_not_depend_on_pieces(seed):
+    rng = np.random.default_rng(seed)
+    regimes = ([-3.1, -3.0], [-3.1, 0.0, 2.0], [np.nan], [-3.6, -2.6])
+    values = np.concatenate([rng.choice(regimes[int(rng.integers(4))], 25) for _ in range(16)])
+    log = history(values, step=0.7)
+    tuning = Tuning.of(COMPASS).set("gate", 0.999)
+    whole = fold("kf", COMPASS, tuning, log)
+    assert len(set(whole.health)) > 1
+    growing = Fold("kf", COMPASS, tuning, log)
+    while growing.advance(int(rng.integers(1, 50))):
+        pass
+    for name in ("health", "age", "nis_mean", "nis_low", "nis_high"):
+        np.testing.assert_array_equal(getattr(growing.track, name), getattr(whole, name))
+
+
+def events_of(rng, n):
+    """Times, kinds and a track of all that can happen: stretches of readings and of silence, good and bad ones, resets.
+
+    Steps are 0 or 1 s, so that ages are whole and meet their limits exactly.
+    """
+    t = np.cumsum(rng.integers(0, 2, n)) * SECOND
+    kind = np.full(n, TICK, np.int8)
+    track = Track.allocate(n, 2, 0, 1)
+    track.mean[:], track.std[:] = 0.0, 1.0
+    at = 0
+    while at < n:
+        rows = np.arange(at, min(n, at + int(rng.integers(20, 400))))
+        share = rng.choice([0.02, 0.1, 0.9])
+        verdicts = rng.choice(
+            [USED, GATED, FAILED, MISSING, HELD_OUT], p=rng.dirichlet([6, 1, 1, 1, 1]), size=rows.size
+        )
+        judged = rng.random(rows.size) < share
+        track.verdict[rows[judged]] = verdicts[judged]
+        kind[rows[judged]] = READING
+        track.dof[rows] = rng.integers(1, 4, rows.size)
+        track.nis[rows] = rng.chisquare(track.dof[rows]) * rng.choice([1.0, 2.0, 3.0, 6.0])
+        at += rows.size
+    kind[rng.choice(n, n // 150)] = RESET
+    track.verdict[kind == RESET] = NONE
+    for column in (track.mean, track.std):
+        column[rng.choice(n, n // 100), rng.integers(0, 2)] = rng.choice([np.inf, np.nan])
+    return t, kind, track
+
+
+def by_definition(t, kind, track, policy):
+    """Each row's age, NIS of the window, bounds and health, from the words of `HealthPolicy` and of `assess`."""
+    judged = np.isin(track.verdict, (USED, GATED, FAILED))
+    quantiles = {q: chi2.ppf(q, np.arange(3 * policy.window + 1)) for q in (0.025, 0.975, 0.999)}
+    resets = np.flatnonzero(kind == RESET)
+    for i in range(len(t)):
+        # The row that last changed the window.
+        e = max([k for k in range(i, -1, -1) if judged[k] or kind[k] == RESET][:1] or [0])
+        after = max(resets[resets <= e], default=-1)
+        rows = [k for k in range(max(after + 1, e - FAR * policy.window + 1, 0), e + 1) if judged[k]][-policy.window :]
+        used = [k for k in rows if track.verdict[k] == USED]
+        total, dof = float(np.sum(track.nis[used])), int(np.sum(track.dof[used], dtype=int))
+        values = [np.nan] * 3
+        if used:
+            values = [total / len(used), *(quantiles[q][dof] / len(used) for q in (0.025, 0.975))]
+        health = TRACKING
+        refused = len(rows) - len(used)
+        if len(rows) >= FEW and (refused > policy.diverged_gated * len(rows) or total > policy.diverged_nis * dof):
+            health = DIVERGED
+        elif len(used) >= FEW and total > quantiles[0.999][dof]:
+            health = DEGRADED
+        age = (t[i] - t[e]) / SECOND
+        if not (np.all(np.isfinite(track.mean[i])) and np.all(np.isfinite(track.std[i]))):
+            yield age, *values, DIVERGED
+        elif age > policy.stale_after:
+            yield age, *values, STALE
+        else:
+            yield age, *values, DEGRADED if age > policy.degraded_after and health == TRACKING else health
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_health_is_its_definition_in_any_pieces(seed):
+    """A window of 12 that may look back 240 rows, of which a quarter may be refused: of 12 exactly 3."""
+    rng = np.random.default_rng(seed)
+    policy = HealthPolicy(window=12, degraded_after=2.0, stale_after=6.0, diverged_nis=2.5, diverged_gated=0.25)
+    t, kind, track = events_of(rng, 3000)
+    at = 0
+    while at < len(t):
+        end = min(len(t), at + int(rng.choice([1, 7, 40, 500])))
+        assess(at, end, t, kind, track, policy, chi_square_bounds(3 * policy.window))
+        at = end
+    age, mean, low, high, health = map(np.array, zip(*by_definition(t, kind, track, policy), strict=True))
+    assert set(health) == {TRACKING, DEGRADED, DIVERGED, STALE}
+    np.testing.assert_array_equal(track.age, age)
+    np.testing.assert_array_equal(track.health, health)
+    for column, expected in ((track.nis_mean, mean), (track.nis_low, low), (track.nis_high, high)):
+        np.testing.assert_allclose(column, expected, rtol=1e-12)  # sums of at most 12 numbers, in another order

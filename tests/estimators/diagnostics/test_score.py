@@ -1,0 +1,92 @@
+"""The sums of a track written by hand, of which every number follows from the definitions."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from estimators.diagnostics.field_pictures import Picture
+from estimators.diagnostics.score import score
+from estimators.log import READING, Readings
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.track import GATED, HELD_OUT, MISSING, USED, Track
+
+
+def still(x, u, p, dt, out):
+    out[0] = x[0]
+
+
+def one(x, u, p, out):
+    out[0] = x[0]
+
+
+def two(x, u, p, out):
+    out[0] = x[0]
+    out[1] = x[0]
+
+
+MODEL = StateSpaceModel(
+    name="level",
+    title="level",
+    states=(State("level", "m", 0.0, 1.0),),
+    noises=(Noise("level", "m²/s", 0.1),),
+    sensors=(
+        Sensor("float", (Row("float", "m", 1.0),), h=one),
+        Sensor("sonar", (Row("near", "m", 1.0), Row("far", "m", 1.0)), h=two),
+    ),
+    f=still,
+)
+NAN = np.nan
+# Sensor, verdict, innovations and their deviations, NIS, log-likelihood.
+ROWS = (
+    (0, USED, (1.0, NAN), (1.0, NAN), 1.0, -1.5),
+    (1, USED, (2.0, 1.0), (1.0, 1.0), 4.0, -2.5),
+    (1, GATED, (9.0, 9.0), (1.0, 1.0), 99.0, -50.0),
+    (0, MISSING, (NAN, NAN), (NAN, NAN), NAN, NAN),
+    (0, MISSING, (NAN, NAN), (NAN, NAN), NAN, NAN),
+    (1, HELD_OUT, (3.0, 0.5), (2.0, 0.1), 5.0, -7.0),
+    (1, HELD_OUT, (-4.0, NAN), (2.0, NAN), 6.0, -8.0),
+    (1, USED, (0.5, 1.0), (1.0, 1.0), 1.0, -2.0),
+)
+
+
+@pytest.fixture(scope="module")
+def result():
+    n = len(ROWS)
+    track = Track.allocate(n, 1, 0, 2)
+    for i, (sensor, verdict, nu, std, nis, log_likelihood) in enumerate(ROWS):
+        track.verdict[i], track.dof[i] = verdict, sensor + 1
+        track.innovation[i], track.innovation_std[i] = nu, std
+        track.nis[i], track.log_likelihood[i] = nis, log_likelihood
+    t = np.arange(n, dtype=np.int64) * 10**9
+    sensors = np.array([row[0] for row in ROWS], np.int32)
+    return score(track, Readings(t, t, np.full(n, READING, np.int8), sensors, np.zeros((n, 2))), MODEL)
+
+
+def test_the_used_readings_are_summed_and_the_others_counted(result):
+    assert (result.readings, result.nis_readings, result.gated, result.missing) == (8, 3, 1, 2)
+    assert result.nis == 2.0 and result.log_likelihood == -6.0
+    # Three readings with 1 + 2 + 2 degrees of freedom.
+    assert result.nis_low == pytest.approx(chi2.ppf(0.025, 5) / 3, rel=1e-10)
+    assert result.nis_high == pytest.approx(chi2.ppf(0.975, 5) / 3, rel=1e-10)
+
+
+def test_sensors_held_out_are_judged_row_by_row(result):
+    """Row near: 3 and -4 at 2 each, where the band ends at 3.92; row far: 0.5 at 0.1, and one that is missing."""
+    assert list(result.held_out) == ["sonar.near", "sonar.far"]
+    assert (
+        result.held_out["sonar.near"].rmse == pytest.approx(np.sqrt(12.5))
+        and result.held_out["sonar.near"].coverage == 0.5
+    )
+    assert result.held_out["sonar.far"] == (0.5, 0.0)
+
+
+def test_pictures_of_a_field_weigh_as_many_cells_as_they_knew():
+    def picture(cells, rmse, inside):
+        return Picture(0, 0, cells, rmse, inside, 1.0, None, None, None)
+
+    empty = Readings.one(0, 0, READING, 0, 0.0, 2)
+    pictures = [picture(300, 1.0, 0.9), picture(0, NAN, NAN), picture(100, 3.0, 0.5)]
+    fit = score(Track.allocate(1, 1, 0, 2), empty, MODEL, pictures).field
+    # Squares over all 400 cells: (300 · 1 + 100 · 9) / 400 = 3; inside: 270 + 50 of 400.
+    assert fit.rmse == pytest.approx(np.sqrt(3.0)) and fit.coverage == pytest.approx(0.8)
+    assert score(Track.allocate(1, 1, 0, 2), empty, MODEL, pictures[1:2]).field is None

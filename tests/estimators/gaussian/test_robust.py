@@ -1,0 +1,344 @@
+"""Inflation, robust weights and adaptation, in every Gaussian filter, against numbers worked out by hand."""
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq, minimize
+
+from estimators.errors import EstimatorError
+from estimators.fold import Fold, fold
+from estimators.log import READING, Log, Readings
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.registry import ESTIMATORS
+from estimators.track import GATED, USED
+from estimators.tuning import Tuning
+from tests.estimators.linear_models import ROWS, random_linear, random_log
+
+SECOND = 1_000_000_000
+NAMES = [name for name, entry in ESTIMATORS.items() if entry.family == "Gaussian" and name != "kf-steady"]
+P, R = 4.0, 0.25
+
+
+@pytest.fixture(params=NAMES)
+def estimator(request):
+    return request.param
+
+
+def walk(x, u, p, dt, out):
+    for i in range(x.size):
+        out[i] = x[i]
+
+
+def itself(x, u, p, out):
+    out[0] = x[0]
+
+
+def mixed(x, u, p, out):
+    out[0] = x[0] + 0.5 * x[1]
+    out[1] = x[1] - x[0]
+
+
+def model(*, q=0.0, p=P, r=R, max_step=np.inf):
+    return StateSpaceModel(
+        name="walk",
+        title="random walk",
+        states=(State("x", "m", std=np.sqrt(p)),),
+        noises=(Noise("x", "m²/s", variance=q),),
+        sensors=(Sensor("y", (Row("y", "m", variance=r),), h=itself),),
+        f=walk,
+        linear=True,
+        max_step=max_step,
+    )
+
+
+PLANE = StateSpaceModel(
+    name="plane",
+    title="two states, two rows",
+    states=(State("a", "m", std=2.0), State("b", "m", std=1.0)),
+    noises=(Noise("a", "m²/s", variance=0.0),),
+    sensors=(Sensor("y", (Row("y1", "m", variance=0.25), Row("y2", "m", variance=0.5)), h=mixed),),
+    f=walk,
+    linear=True,
+)
+
+
+def log_of(values, *, step=1.0):
+    width = np.size(values[0])
+    log = Log(width)
+    batch = [Readings.one(round(k * step * SECOND), 0, READING, 0, value, width) for k, value in enumerate(values)]
+    log.extend(Readings.concat(batch, width))
+    return log
+
+
+def folded(estimator, model, values, options, *, step=1.0, gate=None):
+    tuning = Tuning.of(model).with_options(options).set("gate", gate)
+    fold = Fold(estimator, model, tuning, log_of(values, step=step))
+    fold.advance()
+    return fold
+
+
+@pytest.mark.parametrize(("step", "max_step"), [(2.0, np.inf), (2.0, 0.5), (0.25, np.inf)])
+def test_inflation_is_a_rate_whatever_the_steps(estimator, step, max_step):
+    """Without Q, P(2 s) = 3² P(0), in one step or in eight."""
+    values = [np.nan] * (round(2.0 / step) + 1)
+    fold = folded(estimator, model(max_step=max_step), values, {"inflation": 3.0}, step=step)
+    np.testing.assert_allclose(fold.moments()[1][0, 0], 9.0 * P, rtol=1e-12)
+
+
+def test_inflation_comes_before_q(estimator):
+    """One step of 1 s: 2 · 4 + 0.3."""
+    fold = folded(estimator, model(q=0.3), [np.nan, np.nan], {"inflation": 2.0})
+    np.testing.assert_allclose(fold.moments()[1][0, 0], 8.3, rtol=1e-13)
+
+
+@pytest.mark.parametrize("y", [7.0, -30.0, 1e4])
+def test_huber_pulls_with_a_force_that_stops_growing(estimator, y):
+    """Beyond the threshold x/P = ψ = k/√R, whatever y is: x⁺ = ± P k/√R, and y - x⁺ = (R/w) x⁺ / P gives w."""
+    k = 0.7
+    fold = folded(estimator, model(), [y], {"robust": 1, "huber": k})
+    x = np.sign(y) * P * k / np.sqrt(R)
+    noise = (y - x) * P / x  # R / w
+    # The weight is iterated to 1e-12.
+    np.testing.assert_allclose(fold.moments()[0][0], x, rtol=1e-10)
+    np.testing.assert_allclose(fold.moments()[1][0, 0], P * noise / (P + noise), rtol=1e-10)
+    # What the track says of the reading is what it would be without weights.
+    np.testing.assert_allclose(fold.track.nis[0], y * y / (P + R), rtol=1e-13)
+
+
+def test_huber_leaves_small_innovations_alone(estimator):
+    """|y - x⁺| ≤ k √R up to |y| = k (P + R) / √R = 5.95: the plain filter's estimate."""
+    for y in (0.0, 2.0, -5.9):
+        fold = folded(estimator, model(), [y], {"robust": 1, "huber": 0.7})
+        np.testing.assert_allclose(fold.moments()[0][0], P / (P + R) * y, rtol=1e-13, atol=1e-300)
+        np.testing.assert_allclose(fold.moments()[1][0, 0], P * R / (P + R), rtol=1e-13)
+
+
+@pytest.mark.parametrize("y", [0.0, 3.0, -12.0, 1e4])
+def test_student_t_solves_its_equation(estimator, y):
+    """w = (ν + 1) / (ν + ((y - x⁺)² + P⁺) / R), with x⁺ and P⁺ for noise R / w: solved by bisection."""
+    dof = 3.0
+
+    def residual(log_w):
+        w = np.exp(log_w)
+        noise = R / w
+        x, left = P / (P + noise) * y, P * noise / (P + noise)
+        return w - (dof + 1.0) / (dof + ((y - x) ** 2 + left) / R)
+
+    # For an outlier there may be two solutions; the iteration comes from w = 1, so it finds the largest.
+    grid = np.linspace(0.5, -25.0, 4000)
+    values = [residual(g) for g in grid]
+    first = next(k for k in range(len(grid) - 1) if values[k] > 0 >= values[k + 1])
+    w = np.exp(brentq(residual, grid[first + 1], grid[first], xtol=1e-14))
+    fold = folded(estimator, model(), [y], {"robust": 2, "dof": dof})
+    np.testing.assert_allclose(fold.moments()[0][0], P / (P + R / w) * y, rtol=1e-8)
+    np.testing.assert_allclose(fold.moments()[1][0, 0], P * (R / w) / (P + R / w), rtol=1e-8)
+
+
+@pytest.mark.parametrize("y", [(9.0, -6.0), (12.0, np.nan), (np.nan, 40.0)])
+def test_huber_minimises_its_cost(estimator, y):
+    """½ |x|²_P⁻¹ + ρ(|R^-½ (y - H x)|) over the rows that came, minimised by scipy."""
+    k = 1.0
+    H, r, p = np.array([[1.0, 0.5], [-1.0, 1.0]]), np.array([0.25, 0.5]), np.array([4.0, 1.0])
+    finite = np.isfinite(y)
+
+    def cost(x):
+        d = np.linalg.norm((np.array(y) - H @ x)[finite] / np.sqrt(r[finite]))
+        return 0.5 * np.sum(x * x / p) + (0.5 * d * d if d <= k else k * d - 0.5 * k * k)
+
+    best = minimize(cost, np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-15}).x
+    fold = folded(estimator, PLANE, [y], {"robust": 1, "huber": k})
+    plain = folded(estimator, PLANE, [y], {})
+    assert np.max(np.abs(plain.moments()[0] - best)) > 0.1
+    # A minimum is found to the root of the rounding of its cost.
+    np.testing.assert_allclose(fold.moments()[0], best, atol=1e-6)
+
+
+@pytest.mark.parametrize("y", [(0.5, 0.2), (9.0, -6.0), (np.nan, 40.0)])
+def test_student_t_weighs_all_rows_by_one_precision(estimator, y):
+    """w = (ν + m) / (ν + tr(R⁻¹ E e eᵀ)) with e = y - H x given noise R / w, by matrices, iterated from w = 1."""
+    dof, w = 3.0, 1.0
+    finite = np.isfinite(y)
+    H = np.array([[1.0, 0.5], [-1.0, 1.0]])[finite]
+    r, P, y_ = np.array([0.25, 0.5])[finite], np.diag([4.0, 1.0]), np.array(y)[finite]
+    for _ in range(2000):
+        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(r / w))
+        x, left = K @ y_, P - K @ H @ P
+        e = y_ - H @ x
+        w = (dof + r.size) / (dof + np.sum((e * e + np.diag(H @ left @ H.T)) / r))
+    fold = folded(estimator, PLANE, [y], {"robust": 2, "dof": dof})
+    np.testing.assert_allclose(fold.moments()[0], x, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(fold.moments()[1], left, rtol=0, atol=1e-8)
+
+
+def test_the_level_of_q_follows_the_nis_of_a_row(estimator):
+    """s = 1 + (NIS / m - 1) / N after one reading of m = 2 rows."""
+    fold = folded(estimator, PLANE, [(3.0, -2.0)], {"adapt": 2, "memory": 50})
+    H = np.array([[1.0, 0.5], [-1.0, 1.0]])
+    nis = np.array([3.0, -2.0]) @ np.linalg.solve(H @ np.diag([4.0, 1.0]) @ H.T + np.diag([0.25, 0.5]), [3.0, -2.0])
+    np.testing.assert_allclose(fold._state[-1], 1.0 + (nis / 2 - 1.0) / 50, rtol=1e-12)
+
+
+@pytest.mark.parametrize("robust", [1, 2])
+def test_a_spike_is_nearly_forgotten(estimator, robust):
+    """Fifty readings of 1 ± 0.5, one of 1000: the plain filter lurches by 20 m, a robust one by less than 1 m."""
+    rng = np.random.default_rng(0)
+    values = 1.0 + 0.5 * rng.standard_normal(50)
+    values[40] = 1000.0
+    lurch = np.abs(np.diff(folded(estimator, model(q=0.01), values, {}).track.mean[39:41, 0]))
+    calm = np.abs(np.diff(folded(estimator, model(q=0.01), values, {"robust": robust}).track.mean[39:41, 0]))
+    assert lurch > 20.0
+    assert calm < 1.0
+
+
+RUNS, STEPS, MEMORY = 20, 2500, 200
+
+
+def steady_S(q, r):
+    """S of a random walk that is read every second: P = q/2 + √(q²/4 + q r), by Riccati's equation; S = P + r."""
+    return 0.5 * q + np.sqrt(0.25 * q * q + q * r) + r
+
+
+def simulated(seed, q, r):
+    rng = np.random.default_rng(seed)
+    return np.cumsum(np.sqrt(q) * rng.standard_normal(STEPS)) + np.sqrt(r) * rng.standard_normal(STEPS)
+
+
+def test_adaptation_recovers_a_wrong_r(estimator):
+    """Tuned to 1, truly 4: the fading mean of N samples of variance 2 S² has variance 2 S² / (2 N - 1).
+
+    An r that is off moves P and so the gain, which feeds back on the samples: less than half of S is P here.
+    """
+    q, r = 0.04, 4.0
+    S = steady_S(q, r)
+    spread = S * np.sqrt(2.0 / (2 * MEMORY - 1))
+    runs = RUNS if estimator == "kf" else 3
+    found = []
+    for seed in range(runs):
+        options = {"adapt": 1, "memory": MEMORY}
+        fold = folded(estimator, model(q=q, r=1.0), simulated(seed, q, r), options)
+        found.append(fold._state[-1])
+        # What is in use is what the track shows: S = P + r.
+        np.testing.assert_allclose(fold.track.innovation_std[-1, 0] ** 2, S, atol=5 * spread)
+    assert abs(np.mean(found) - r) < 4 * spread / np.sqrt(runs)
+    if runs > 10:
+        assert 0.5 * spread < np.std(found) < 2.0 * spread
+
+
+def test_adaptation_recovers_a_wrong_q(estimator):
+    """Tuned to 0.1, truly 1: ln s settles about ln 10 with variance 1 / (N m γ), γ = d ln S / d ln s."""
+    q, r = 1.0, 1.0
+    gamma = (np.log(steady_S(1.01 * q, r)) - np.log(steady_S(0.99 * q, r))) / np.log(1.01 / 0.99)
+    spread = 1.0 / np.sqrt(MEMORY * gamma)
+    runs = RUNS if estimator == "kf" else 3
+    options = {"adapt": 2, "memory": MEMORY, "bound": 100.0}
+    found = [
+        np.log(folded(estimator, model(q=0.1 * q, r=r), simulated(seed, q, r), options)._state[-1])
+        for seed in range(runs)
+    ]
+    assert abs(np.mean(found) - np.log(10.0)) < 4 * spread / np.sqrt(runs)
+    if runs > 10:
+        assert 0.5 * spread < np.std(found) < 2.0 * spread
+
+
+@pytest.mark.parametrize(("tuned", "expected"), [(0.01, 0.1), (1000.0, 100.0)])
+def test_an_adapted_r_stays_within_its_bound(estimator, tuned, expected):
+    fold = folded(estimator, model(q=0.04, r=tuned), simulated(0, 0.04, 4.0), {"adapt": 1, "memory": 50})
+    np.testing.assert_allclose(fold._state[-1], expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize(("tuned", "expected"), [(1e-4, 10.0), (1e3, 0.1)])
+def test_an_adapted_q_stays_within_its_bound(estimator, tuned, expected):
+    fold = folded(estimator, model(q=tuned, r=1.0), simulated(0, 1.0, 1.0), {"adapt": 2, "memory": 50})
+    np.testing.assert_allclose(fold._state[-1], expected, rtol=1e-14 if expected == 10.0 else 0.2)
+
+
+def test_only_readings_that_were_used_adapt(estimator):
+    """Held out, missing and gated readings leave what is remembered alone."""
+    options = {"adapt": 1, "memory": 20}
+    values = [0.1, np.nan, 0.2, 500.0, 0.3]
+    fold = folded(estimator, model(q=0.01), values, options, gate=0.99)
+    assert list(fold.track.verdict[[0, 3]]) == [USED, GATED]
+    fold_without = folded(estimator, model(q=0.01), [0.1, np.nan, 0.2, np.nan, 0.3], options, gate=0.99)
+    np.testing.assert_array_equal(fold._state, fold_without._state)
+    tuning = Tuning.of(model()).with_options(options).set("use.y", False)
+    held_out = Fold(estimator, model(), tuning, log_of([0.5, 9.0]))
+    held_out.advance()
+    np.testing.assert_array_equal(held_out._state[-2:], [R, R])
+
+
+def test_each_row_has_its_own_variance():
+    """Of three sensors with six rows only the third's second row is noisier than tuned; it alone moves far."""
+    matrices = random_linear(np.random.default_rng(1), 2, 0)
+    rng = np.random.default_rng(4)
+    x, t, batch = matrices.mean.copy(), 0, []
+    for k in range(6000):
+        t += SECOND // 10
+        x = x + 0.1 * matrices.A @ x + rng.multivariate_normal(np.zeros(2), matrices.q * 0.1 * matrices.W)
+        sensor = k % 3
+        noise = np.sqrt(matrices.R[sensor] * (np.array([1.0, 9.0, 1.0]) if sensor == 2 else 1.0))
+        y = matrices.H[sensor] @ x + noise * rng.standard_normal(ROWS[sensor])
+        batch.append(Readings.one(t, t, READING, sensor, y, 3))
+    log = Log(3)
+    log.extend(Readings.concat(batch, 3))
+    tuning = Tuning.of(matrices.model).with_options({"adapt": 1, "memory": 500, "bound": 30})
+    fold = Fold("ekf", matrices.model, tuning, log)
+    fold.advance()
+    ratio = fold._state[-6:] / np.concatenate(matrices.R)
+    expected = np.array([1.0, 1.0, 1.0, 1.0, 9.0, 1.0])
+    S = fold.track.innovation_std
+    for row, (sensor, column) in enumerate([(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]):
+        last = 6000 - 3 + sensor
+        spread = S[last, column] ** 2 * np.sqrt(2.0 / 999) / matrices.R[sensor][column]
+        assert abs(ratio[row] - expected[row]) < 5 * spread
+
+
+@pytest.mark.parametrize("options", [{"adapt": 1}, {"adapt": 2}], ids=str)
+def test_pieces_and_rewinds_do_not_matter(estimator, options):
+    """What an adaptation remembers is cut, rewound and folded again with the rest, to the bit."""
+    options = {**options, "memory": 15, "robust": 1 + int(options["adapt"] == 2), "inflation": 1.5}
+    matrices = random_linear(np.random.default_rng(1), 3, 2)
+    whole_log = random_log(np.random.default_rng(2), matrices, 400)
+    tuning = Tuning.of(matrices.model).with_options(options)
+    whole = fold(estimator, matrices.model, tuning, whole_log)
+    growing = Fold(estimator, matrices.model, tuning, whole_log)
+    for pieces, back in ((7, 0), (130, 100), (61, 10), (400, 3)):
+        growing.advance(pieces)
+        growing.rewind(back)
+    while growing.advance(33):
+        pass
+    np.testing.assert_array_equal(growing.track.mean, whole.mean)
+    np.testing.assert_array_equal(growing.track.innovation_std, whole.innovation_std)
+
+
+def test_a_reset_forgets(estimator):
+    options = {"adapt": 1, "memory": 10}
+    fold = folded(estimator, model(q=0.01), [0.0, 3.0, -4.0], options)
+    assert fold._state[-1] != R
+    from estimators.log import RESET
+
+    log = log_of([0.0, 3.0, -4.0])
+    log.extend(Readings.one(5 * SECOND, 0, RESET, 0, [], 1))
+    fold = Fold(estimator, model(q=0.01), Tuning.of(model(q=0.01)).with_options(options), log)
+    fold.advance()
+    np.testing.assert_array_equal(fold._state[-2:], [R, R])
+
+
+def test_joseph_and_the_short_form_agree_where_both_hold():
+    values = simulated(1, 0.04, 4.0)[:200]
+    for name in ("kf", "ekf", "iekf"):
+        on, off = (folded(name, model(q=0.04, r=4.0), values, {"joseph": choice}).track for choice in (1, 0))
+        np.testing.assert_allclose(on.std, off.std, rtol=1e-12)
+        assert not np.array_equal(on.std, off.std)
+
+
+@pytest.mark.parametrize("y", [(9.0, -6.0), (np.nan, 40.0)])
+@pytest.mark.parametrize("robust", [1, 2])
+@pytest.mark.parametrize("name", ["kf", "ekf", "iekf"])
+def test_joseph_takes_the_weighted_noise_too(name, robust, y):
+    on, off = (folded(name, PLANE, [y], {"robust": robust, "joseph": choice}).moments() for choice in (1, 0))
+    for a, b in zip(on, off, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+
+
+def test_a_choice_that_does_not_exist_is_named():
+    with pytest.raises(EstimatorError, match=r"robust is 1.5; it must be one of 0 \(none\), 1 \(huber\), 2 \(student"):
+        ESTIMATORS["ekf"].complete({"robust": 1.5})

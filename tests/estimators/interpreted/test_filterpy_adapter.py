@@ -1,0 +1,161 @@
+"""FilterPy's filters as entries of the catalogue: ours to 1e-8 where FilterPy is right, and its faults avoided."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from filterpy.kalman import EnsembleKalmanFilter
+
+from estimators.fold import Fold, fold
+from estimators.log import READING, TICK, Log, Readings
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.track import FAILED, GATED, HELD_OUT, MISSING, USED
+from estimators.tuning import Tuning
+from tests.estimators.interpreted.test_filterpy import PENDULUM, log  # noqa: F401  log is a fixture
+from tests.estimators.test_fold import MODEL, as_log, everything, identical
+
+SECOND = 1_000_000_000
+PAIRS = np.array([[0, 1], [0, 2], [1, 2]])
+
+
+def turn(x, u, p, dt, out):
+    out[0] = x[0] + dt * x[1]
+    out[1] = x[1]
+
+
+def heading(x, u, p, out):
+    out[0] = x[0] + 0.05 * x[1] * x[1]
+    out[1] = x[1]
+
+
+COMPASS = StateSpaceModel(
+    name="compass",
+    title="turning past ±π",
+    states=(State("angle", "rad", 3.0, 0.3, circular=True), State("rate", "rad/s", 0.8, 0.3)),
+    noises=(Noise("angle", "rad²/s", 0.01), Noise("rate", "rad²/s³", 0.02)),
+    sensors=(Sensor("compass", (Row("heading", "rad", 0.02, circular=True), Row("rate", "rad/s", 0.1)), h=heading),),
+    f=turn,
+)
+
+
+def close(theirs, ours, what=("mean", "std", "cross", "innovation", "innovation_std", "nis", "log_likelihood")):
+    """1e-8: a few hundred steps of a few hundred roundings, theirs with S inverted and K S Kᵀ subtracted."""
+    np.testing.assert_array_equal(theirs.verdict, ours.verdict)
+    np.testing.assert_array_equal(theirs.dof, ours.dof)
+    for name in what:
+        np.testing.assert_allclose(getattr(theirs, name), getattr(ours, name), rtol=1e-8, atol=1e-8, err_msg=name)
+
+
+@pytest.mark.parametrize("name", ["kf", "ekf", "ukf"])
+def test_a_linear_model_with_gate_inputs_and_held_out_sensor(name):
+    tuning = Tuning.of(MODEL).set("gate", 0.9).set("use.third", False)
+    events = everything(np.random.default_rng(5), 300)
+    ours, theirs = (fold(n, MODEL, tuning, as_log(events), pairs=PAIRS) for n in (name, f"filterpy-{name}"))
+    close(theirs, ours)
+    assert {USED, GATED, HELD_OUT, MISSING} <= set(theirs.verdict)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [("ekf", {}), ("ukf", {}), ("ukf", {"alpha": 0.5, "beta": 1.0, "kappa": 1.0})],
+)
+def test_a_curved_model(name, values, log):  # noqa: F811
+    tuning = Tuning.of(PENDULUM).with_options(values)
+    ours, theirs = (fold(n, PENDULUM, tuning, log, pairs=PAIRS) for n in (name, f"filterpy-{name}"))
+    close(theirs, ours)
+
+
+@pytest.mark.parametrize("name", ["ekf", "ukf"])
+def test_angles_turn_past_pi(name):
+    rng = np.random.default_rng(2)
+    events = Log(2)
+    for k in range(1, 150):
+        y = [3.0 + 0.08 * k + rng.normal(0, 0.1), 0.8 + rng.normal(0, 0.3)]
+        y[0] = (y[0] + np.pi) % (2 * np.pi) - np.pi
+        if rng.random() < 0.2:
+            y[int(rng.integers(2))] = np.nan
+        events.extend(Readings.one(k * SECOND // 10, 0, READING, 0, y, 2))
+    ours, theirs = (fold(n, COMPASS, Tuning.of(COMPASS), events, pairs=PAIRS[:1]) for n in (name, f"filterpy-{name}"))
+    close(theirs, ours)
+    assert np.sum(np.abs(np.diff(theirs.mean[:, 0])) > np.pi) >= 1  # it did pass
+    assert np.nanmax(np.abs(theirs.innovation[:, 0])) < 1.0
+    ensemble = fold("filterpy-enkf", COMPASS, Tuning.of(COMPASS).with_options({"members": 400}), events)
+    off = (ensemble.mean[:, 0] - ours.mean[:, 0] + np.pi) % (2 * np.pi) - np.pi
+    # Chance of 400 members, gathered over the few readings that the filter remembers: half a sigma is ten times that.
+    assert np.max(np.abs(off) / ours.std[:, 0]) < 0.5
+    assert np.all(np.abs(ensemble.mean[:, 0]) <= np.pi)
+
+
+def one_reading(members):
+    tuning = Tuning.of(MODEL).with_options({"members": members})
+    fold_ = Fold(
+        "filterpy-enkf",
+        MODEL,
+        tuning,
+        as_log(
+            Readings.concat(
+                [Readings.one(0, 0, TICK, 0, (), 3), Readings.one(SECOND, 0, READING, 1, [0.4, -0.7], 3)], 3
+            )
+        ),
+    )
+    fold_.advance()
+    return fold_
+
+
+def test_enkf_is_within_monte_carlo_error_of_the_exact_answer():
+    """After a prediction and a reading: a member's mean and variance scatter by σ/√N and σ²√(2/N)."""
+    N = 10_000
+    theirs = one_reading(N)
+    exact = fold("kf", MODEL, Tuning.of(MODEL), theirs.log)
+    # The gain is the members' too and the perturbations add theirs: twice the scatter of plain draws, at 4 sigma.
+    assert np.all(np.abs(theirs.track.mean - exact.mean) < 8 * exact.std / np.sqrt(N))
+    assert np.all(np.abs(theirs.track.std**2 / exact.std**2 - 1) < 8 * np.sqrt(2 / N))
+    np.testing.assert_allclose(theirs.track.nis[1], exact.nis[1], rtol=0.1)
+    # What it reports is the spread of its members.
+    X = theirs.points()
+    mean, cov = theirs.moments()
+    np.testing.assert_allclose(mean, X.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(cov, np.cov(X.T), rtol=1e-10)
+    np.testing.assert_allclose(theirs.track.std[1], X.std(axis=0, ddof=1), rtol=1e-10)
+
+
+def test_enkf_draws_by_seed_and_leaves_the_global_generator_alone():
+    events = everything(np.random.default_rng(6), 120)
+    np.random.seed(7)  # noqa: NPY002  the global one is what must stay
+    before = np.random.get_state()[1].copy()  # noqa: NPY002
+    tuning = Tuning.of(MODEL)
+    one = fold("filterpy-enkf", MODEL, tuning, as_log(events))
+    np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
+    np.random.seed(8)  # noqa: NPY002
+    growing = Log(MODEL.width, capacity=1)
+    pieces = Fold("filterpy-enkf", MODEL, tuning, growing)
+    for k in range(0, len(events), 7):
+        growing.extend(events.select(slice(k, k + 7)))
+        pieces.advance()
+    pieces.rewind(60)
+    pieces.advance()
+    identical(pieces.track, one)
+    other = fold("filterpy-enkf", MODEL, replace(tuning, seed=1), as_log(events))
+    assert np.mean(other.mean != one.mean) > 0.9  # all but the resets, which give the prior's draw
+
+
+def test_enkf_p_is_not_its_members_covariance():
+    """The fault that is avoided exists: after an update FilterPy's P differs from the spread of its own members."""
+    np.random.seed(1)  # noqa: NPY002  FilterPy draws from the global generator
+    enkf = EnsembleKalmanFilter(np.zeros(1), np.eye(1), 1, 1.0, 10, hx=lambda x: x, fx=lambda x, dt: x)
+    enkf.Q *= 0.01
+    enkf.predict()
+    enkf.update(np.array([1.0]))
+    assert abs(enkf.P[0, 0] / np.var(enkf.sigmas, ddof=1) - 1) > 0.01
+
+
+def test_a_covariance_without_a_factor_fails_and_is_no_exception():
+    events = Log(2)
+    events.extend(Readings.one(0, 0, TICK, 0, (), 2))
+    events.extend(Readings.one(SECOND, 0, READING, 0, [0.5], 2))
+    fold_ = Fold("filterpy-ukf", PENDULUM, Tuning.of(PENDULUM), events)
+    fold_.advance(1)
+    fold_._state[3:] = -np.eye(3).ravel()
+    fold_.advance()
+    assert np.all(np.isnan(fold_.track.mean[1]))
+    assert fold_.track.verdict[1] == FAILED

@@ -1,0 +1,182 @@
+"""Parameters moved into the state: the same as a model augmented by hand, and they find the truth."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.cli.fold import read_log
+from app.twin.twin import load_twin
+from estimators.compiled.model import compile_model
+from estimators.diagnostics.score import score
+from estimators.errors import ModelError
+from estimators.fold import fold
+from estimators.log import READING, Log, Readings
+from estimators.model.joint import Unknown, joint
+from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from estimators.models import MODELS
+from estimators.tuning import Tuning
+
+SECOND = 1_000_000_000
+
+
+def fall(x, u, p, dt, out):
+    out[0] = x[0] + dt * (p[1] - p[0] * x[0])
+
+
+def level(x, u, p, out):
+    out[0] = x[0] + p[2]
+
+
+def spread(x, u, p, q, dt, out):
+    out[0, 0] = q[0] * dt
+
+
+def constant(x, u, p, dt, out):
+    out[0] = x[0] + dt * (x[1] - p[0] * x[0])
+    out[1] = x[1]
+
+
+def shifted(x, u, p, out):
+    out[0] = x[0] + p[1]
+
+
+TANK = StateSpaceModel(
+    name="tank",
+    title="Tank with a leak and an inflow",
+    states=(State("level", "m", mean=1.0, std=0.5),),
+    parameters=(
+        Parameter("leak", "1/s", 0.1, 0.0, 1.0),
+        Parameter("inflow", "m/s", 0.3, -2.0, 2.0),
+        Parameter("offset", "m", 0.25, -1.0, 1.0),
+    ),
+    noises=(Noise("level", "m²/s", 0.01),),
+    sensors=(Sensor("level", (Row("level", "m", 0.04),), h=level),),
+    f=fall,
+)
+BY_HAND = StateSpaceModel(
+    name="tank_by_hand",
+    title="The same, its inflow a state",
+    states=(State("level", "m", mean=1.0, std=0.5), State("inflow", "m/s", mean=0.3, std=0.2)),
+    parameters=(Parameter("leak", "1/s", 0.1), Parameter("offset", "m", 0.25)),
+    noises=(Noise("level", "m²/s", 0.01), Noise("inflow", "m²/s³", 0.03**2)),
+    sensors=(Sensor("level", (Row("level", "m", 0.04),), h=shifted),),
+    f=constant,
+    linear=True,
+)
+
+
+def readings(n: int = 80) -> Log:
+    rng = np.random.default_rng(5)
+    x, log = 0.5, Log(1)
+    for k in range(1, n + 1):
+        x += 0.45 - 0.1 * x + rng.normal(0.0, 0.1)
+        log.extend(Readings.one(k * SECOND, 0, READING, 0, x + 0.25 + rng.normal(0.0, 0.2), 1))
+    return log
+
+
+@pytest.mark.parametrize("with_q", [False, True])
+@pytest.mark.parametrize("estimator", ["ekf", "ukf"])
+def test_an_unknown_inflow_is_estimated_as_by_a_kalman_filter_augmented_by_hand(estimator: str, with_q: bool) -> None:
+    tank = replace(TANK, Q=spread) if with_q else TANK
+    model = joint(tank, {"inflow": Unknown(0.2, 0.03)})
+    assert model.state_names == ("level", "inflow")
+    assert [item.name for item in model.parameters] == ["leak", "offset"]
+    log = readings()
+    got = fold(estimator, model, Tuning.of(model), log)
+    exact = fold("kf", BY_HAND, Tuning.of(BY_HAND), log)
+    # The model is linear in x and inflow, and complex step exact; the UKF cancels numbers of order 1 at alpha's scale.
+    np.testing.assert_allclose(got.mean, exact.mean, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(got.std, exact.std, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(got.log_likelihood, exact.log_likelihood, rtol=0, atol=1e-8)
+
+
+def test_parameters_keep_their_places_whichever_move() -> None:
+    model = joint(TANK, {"offset": Unknown(0.1), "leak": Unknown(0.1)})
+    assert model.state_names == ("level", "leak", "offset")
+    compiled = compile_model(model)
+    out, y = np.empty(3), np.empty(1)
+    x, p = np.array([2.0, 0.2, -0.5]), np.array([0.7])
+    compiled.f(x, np.zeros(0), p, 0.5, out)
+    compiled.h[0](x, np.zeros(0), p, y)
+    np.testing.assert_allclose(out, [2.0 + 0.5 * (0.7 - 0.2 * 2.0), 0.2, -0.5], rtol=1e-15)
+    np.testing.assert_allclose(y, [1.5], rtol=1e-15)
+
+
+def test_a_parameter_acts_within_its_range_only() -> None:
+    compiled = compile_model(joint(TANK, {"leak": Unknown(0.1)}))
+    for strayed, held in ((-3.0, 0.0), (5.0, 1.0)):
+        out = np.empty(2)
+        compiled.f(np.array([2.0, strayed]), np.zeros(0), np.array([0.3, 0.0]), 1.0, out)
+        np.testing.assert_allclose(out, [2.0 + 0.3 - held * 2.0, strayed], rtol=1e-15)
+
+
+def test_what_cannot_move_is_refused() -> None:
+    with pytest.raises(ModelError, match="tank has no parameter 'drain' to estimate; it has leak, inflow, offset"):
+        joint(TANK, {"drain": Unknown(1.0)})
+    with pytest.raises(ModelError, match="prior of leak"):
+        joint(TANK, {"leak": Unknown(0.0)})
+    assert joint(TANK, {}) is TANK
+
+
+def test_the_motors_derivatives_reach_the_resistance() -> None:
+    model = MODELS["motor_drive"]
+    moved = joint(model, {"yoke_coolant": Unknown(0.01)})
+    compiled = compile_model(moved)
+    x = np.array([80.0, 75.0, 70.0, 60.0, 0.03])
+    u = np.array([-50.0, 120.0, 300.0, 40.0, 25.0])
+    p = np.array([item.value for item in moved.parameters])
+    z, out = x.astype(complex), np.empty(5, complex)
+    z[4] += 1e-20j
+    compiled.f(z, u, p, 0.5, out)
+    slopes = []
+    for resistance in (0.03 - 1e-6, 0.03 + 1e-6):
+        plain = np.empty(4)
+        full = [resistance if item.name == "yoke_coolant" else item.value for item in model.parameters]
+        compile_model(model).f(x[:4], u, np.array(full), 0.5, plain)
+        slopes.append(plain)
+    # Rounding 1e-14 over 2e-6; truncation 1e-12 times third derivatives of order 1e5.
+    np.testing.assert_allclose(out.imag[:4] / 1e-20, (slopes[1] - slopes[0]) / 2e-6, rtol=1e-6, atol=1e-7)
+    assert abs(out[2].imag / 1e-20) > 1.0  # the yoke feels it
+
+
+def test_another_process_finds_the_compiled_code() -> None:
+    code = (
+        "from estimators.models import MODELS; from estimators.joint import joint, Unknown;"
+        "from estimators.compiled import compile_model;"
+        "m = compile_model(joint(MODELS['motor_drive'], {'yoke_coolant': Unknown(0.01)}));"
+        "print(m.f.stats.cache_hits, *[len(h.stats.cache_hits) for h in m.h], sum(m.f.stats.cache_misses.values()))"
+    )
+    for _ in range(2):
+        told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert told.split()[-1] == "0", told
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "ukf"])
+def test_a_silted_jacket_is_found(estimator: str) -> None:
+    twin = load_twin("motor_joint")
+    log, _ = read_log(twin, None)
+    track = fold(estimator, twin.model, twin.tuning, log)
+    result = score(track, log.readings, twin.model)
+    late = slice(len(track.mean) // 2, None)
+    np.testing.assert_allclose(track.mean[late, 4], 0.04, atol=4 * track.std[late, 4].max())
+    assert track.std[-1, 4] < 5e-4 and track.mean[0, 4] == pytest.approx(0.03)
+    assert result.states["yoke_coolant"].coverage > 0.9
+    assert result.states["magnet"].rmse < 1.8
+    assert result.nis_low < result.nis < result.nis_high
+
+
+def test_on_the_bench_the_magnet_is_found_without_the_jackets_resistance(data: Callable[..., Path]) -> None:
+    data("motor_pmsm_paderborn", "session60_first_30min_2hz.csv")
+    twin = load_twin("motor_bench_joint")
+    log, _ = read_log(twin, None)
+    track = fold("ekf", twin.model, twin.tuning, log)
+    result = score(track, log.readings, twin.model)
+    assert track.mean[0, 4] == pytest.approx(0.048)
+    assert 0.026 < track.mean[-1, 4] < 0.033  # fitted with all temperatures: 0.032
+    assert result.states["magnet"].rmse < 1.1
+    assert result.nis_low < result.nis < result.nis_high

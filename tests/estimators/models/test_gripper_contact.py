@@ -1,0 +1,117 @@
+"""The gripper: its derivatives and chances, the simulated jumps, and who tells best whether it touches."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from app.cli.fold import read_log
+from app.twin.twin import load_twin
+from estimators.compiled.model import compile_model
+from estimators.fold import Fold
+from estimators.log import truth_of
+from estimators.models.gripper_contact import CONTACT, DEPTH, GRIPPER_CONTACT, SURFACE, chances
+
+P = np.array([item.value for item in GRIPPER_CONTACT.parameters])
+SEEDS = (1, 2, 3, 4)
+
+
+@lru_cache
+def contact(name, seed, particles=300, duration=15.0):
+    """Estimates and truth of contact, of a filter over the twin's simulation, and the fold."""
+    twin = load_twin("gripper_contact", overrides={"source.seed": str(seed)})
+    log, _ = read_log(twin, duration)
+    tuning = twin.tuning.with_options({"particles": particles} if name in ("rbpf", "pf") else {})
+    run = Fold(name, twin.model, tuning, log)
+    run.advance()
+    rows, truth = truth_of(log.readings, CONTACT)
+    return run.track.mean[rows, CONTACT], truth, run
+
+
+def brier(name, **more):
+    return np.array([np.mean((p - truth) ** 2) for p, truth, _ in (contact(name, seed, **more) for seed in SEEDS)])
+
+
+def test_chances_over_two_half_steps_are_those_of_a_step():
+    """The depth standing still, the jump is a Markov chain in continuous time: its two rates add up to λ."""
+    for depth in (-1.0, -0.1, 0.0, 0.3):
+        x = np.zeros(5)
+        x[DEPTH] = depth
+        steps = {}
+        for dt in (1e-5, 2e-5):
+            rows = []
+            for mode in (0.0, 1.0):
+                x[CONTACT] = mode
+                out = np.empty(2)
+                chances(x, np.zeros(1), P, dt, out)
+                rows.append(out)
+            steps[dt] = np.array(rows)
+        # Two jumps within a step are left out: an error of (λ dt)² = 2.5e-7 at most.
+        np.testing.assert_allclose(steps[1e-5] @ steps[1e-5], steps[2e-5], rtol=0, atol=5e-7)
+        assert abs(steps[1e-5][0, 1] / 1e-5 + steps[1e-5][1, 0] / 1e-5 - 50.0) < 0.05
+
+
+def test_a_pressed_finger_rests_where_the_pad_balances_the_drive():
+    x, out = np.array([1.0, 0.5, 0.0, 40.0, 0.0]), np.empty(5)
+    for _ in range(1000):
+        compile_model(GRIPPER_CONTACT).f(x, np.array([0.4]), P, 0.01, out)
+        x = out.copy()
+    np.testing.assert_allclose(x, [1.0, 0.4 / 0.5, 0.0, 40.0, 0.0], atol=1e-9)
+
+
+def test_a_slip_does_not_move_the_finger():
+    Q = np.zeros((5, 5))
+    compile_model(GRIPPER_CONTACT).Q(np.zeros(5), np.zeros(1), P, np.array([0.0, 1.0, 0.0]), 0.1, Q)
+    position = np.zeros(5)
+    position[[DEPTH, SURFACE]] = 1.0
+    assert Q[DEPTH, DEPTH] == pytest.approx(0.1) and abs(position @ Q @ position) < 1e-15
+
+
+def test_simulated_jumps_follow_the_chances():
+    """How often each step's chances came true: the sum of (jump - chance) over its standard deviation is N(0, 1)."""
+    twin = load_twin("gripper_contact", overrides={"source.seed": "9"})
+    log, _ = read_log(twin, None)
+    states = np.array([truth_of(log.readings, j)[1] for j in range(5)]).T
+    assert set(np.unique(states[:, CONTACT])) == {0.0, 1.0}
+    miss, variance = 0.0, 0.0
+    for before, after in zip(states[:-1], states[1:], strict=True):
+        out = np.empty(2)
+        chances(before, np.zeros(1), P, 0.01, out)
+        miss += after[CONTACT] - out[1]
+        variance += out[0] * out[1]
+    assert variance > 5.0 and abs(miss) < 4 * np.sqrt(variance)
+
+
+def test_the_probability_of_contact_is_calibrated():
+    """Where the filter says p, contact is there in p of the cases, give or take how few independent cases there are."""
+    p, truth = (np.concatenate([contact("rbpf", seed)[k] for seed in SEEDS]) for k in (0, 1))
+    assert p.min() >= 0.0 and p.max() <= 1.0
+    assert np.mean(truth[p < 0.01]) < 0.005 and np.mean(truth[p > 0.99]) > 0.99
+    middle = (p > 0.2) & (p < 0.8)
+    # Neighbours of a doubtful stretch share its fate: some 10 stretches a run, each of standard deviation ≤ ½.
+    assert abs(np.mean(truth[middle]) - np.mean(p[middle])) < 4 * 0.5 / np.sqrt(10 * len(SEEDS))
+
+
+def test_rbpf_tells_contact_better_than_ukf():
+    assert np.all(brier("rbpf") < brier("ukf")) and brier("ukf").mean() > 1.3 * brier("rbpf").mean()
+    p, _, run = contact("ukf", SEEDS[0])
+    assert p.min() < -0.05 and p.max() > 1.05, "the ukf's number keeps to no range, and this shows"
+    likelihood = {name: np.nansum(contact(name, SEEDS[0])[2].track.log_likelihood) for name in ("rbpf", "ukf")}
+    assert likelihood["rbpf"] > likelihood["ukf"] + 100
+
+
+def test_rbpf_needs_fewer_particles_than_pf():
+    """Of 300 particles each: what is integrated needs none."""
+    assert brier("rbpf").mean() < brier("pf").mean()
+    rows = [np.nansum(contact(name, seed)[2].track.log_likelihood) for name in ("rbpf", "pf") for seed in SEEDS]
+    assert np.all(np.array(rows[:4]) > np.array(rows[4:]))
+
+
+def test_the_estimate_is_consistent():
+    run = contact("rbpf", SEEDS[0])[2]
+    rows, surface = truth_of(run.log.readings, SURFACE)
+    miss = (run.track.mean[rows, SURFACE] - surface) / run.track.std[rows, SURFACE]
+    # After the first touch; neighbours are the same estimate, a handful of independent ones remain.
+    assert np.sqrt(np.mean(miss[rows.size // 3 :] ** 2)) < 2.0
+    nis = run.track.nis[np.isfinite(run.track.nis) & (run.track.verdict == 1)]
+    assert nis.size > 1000 and abs(nis.mean() - 1) < 5 * np.sqrt(2 / nis.size)

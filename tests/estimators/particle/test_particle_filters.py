@@ -1,0 +1,379 @@
+"""Particle filters against a dense joint Gaussian, against themselves in other pieces, and where they must not fail."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numba
+import numpy as np
+import pytest
+
+from estimators.errors import EstimatorError
+from estimators.fold import Fold, fold
+from estimators.log import READING, TICK, Log, Readings
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.particle.shared import RECOVERIES, block, members
+from estimators.track import FAILED, GATED, HELD_OUT, MISSING, USED
+from estimators.tuning import Tuning
+from tests.estimators.linear_models import SECOND, JointGaussian, random_linear, random_log
+
+NAMES = ("pf", "pf-reg", "pf-ekf", "apf")
+EXACT = ("pf", "pf-ekf", "apf")
+"""Those whose limit is the posterior itself; the kernel of pf-reg widens it."""
+
+
+@lru_cache
+def problem():
+    """A linear model, a log of readings drawn from it, and the exact answer."""
+    rng = np.random.default_rng(4)
+    matrices = random_linear(rng, 2, 1)
+    log = random_log(rng, matrices, 8)
+    joint = JointGaussian(matrices, log)
+    cov = joint.H @ joint.cov @ joint.H.T + joint.R
+    y = iter(rng.multivariate_normal(joint.H @ joint.mean + joint.offset, cov))
+    events = log.readings
+    for k in range(log.n):
+        if events.kind[k] == READING:
+            for row in np.flatnonzero(np.isfinite(events.value[k])):
+                log.value[k, row] = next(y)
+    return matrices, log, JointGaussian(matrices, log)
+
+
+def tracks(name, n, seeds, **options):
+    matrices, log, _ = problem()
+    tuning = Tuning.of(matrices.model).with_options({"particles": n, **options})
+    return [fold(name, matrices.model, replace(tuning, seed=seed), log) for seed in range(seeds)]
+
+
+def scalar(**changes):
+    parts = dict(
+        name="walk", title="", states=(State("s", "m", 2.0, 0.5),), noises=(Noise("s", "m²/s", 0.3),), f=still,
+        sensors=(Sensor("y", (Row("y", "m", 0.04),), h=itself),),
+    )  # fmt: skip
+    return StateSpaceModel(**(parts | changes))
+
+
+def still(x, u, p, dt, out):
+    out[0] = x[0]
+
+
+def itself(x, u, p, out):
+    out[0] = x[0]
+
+
+def square(x, u, p, out):
+    out[0] = x[0] * x[0]
+
+
+def root(x, u, p, out):
+    out[0] = np.sqrt(x[0])
+
+
+def relative(x, u, p, q, dt, out):
+    out[0, 0] = q[0] * dt * x[0] * x[0]
+
+
+def within_half(y, x, u, p, r):
+    return 0.0 if abs(y[0] - x[0]) < 0.5 else -np.inf
+
+
+def log_of(*events):
+    log = Log(1)
+    for t, kind, value in events:
+        log.extend(Readings.one(int(t * SECOND), 0, kind, 0, value, 1))
+    return log
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_estimates_are_within_their_monte_carlo_error(name):
+    _, log, joint = problem()
+    used = np.ones(3, bool)
+    runs = tracks(name, 1000, 40)
+    for k in joint.events:
+        mean, cov = joint.filtered(k, used)
+        means = np.array([run.mean[k] for run in runs])
+        # The mean of 40 runs is right to its own standard error, but for a bias of 1/N of the posterior's spread.
+        error = means.std(axis=0, ddof=1) / np.sqrt(len(runs))
+        assert np.all(np.abs(means.mean(axis=0) - mean) < 5 * error + 20 / 1000 * np.sqrt(np.diag(cov))), k
+        spread = np.mean([run.std[k] ** 2 for run in runs], axis=0)
+        assert np.all(np.abs(spread / np.diag(cov) - 1) < 0.1), k
+        nu, S = joint.predictive(k, used)
+        nis = nu @ np.linalg.solve(S, nu)
+        assert abs(np.mean([run.nis[k] for run in runs]) - nis) < 0.05 * (nis + nu.size)
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_the_error_falls_with_the_root_of_n(name):
+    _, log, joint = problem()
+    last = joint.events[-1]
+    mean, cov = joint.filtered(last, np.ones(3, bool))
+
+    def error(n):
+        off = np.array([run.mean[last] - mean for run in tracks(name, n, 60)])
+        return np.sqrt(np.mean(off**2 / np.diag(cov)))
+
+    # An RMS over 60 runs of 2 states is right to 1/√(2·120) = 6.5 %, so the ratio of two to about 5 times 9 %.
+    assert 4 / 1.45 < error(200) / error(3200) < 4 * 1.45
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_the_likelihood_is_unbiased(name):
+    _, _, joint = problem()
+    exact = joint.log_likelihood(np.ones(3, bool))
+    ratio = np.array([np.exp(np.nansum(run.log_likelihood) - exact) for run in tracks(name, 300, 300)])
+    error = ratio.std() / np.sqrt(len(ratio))
+    assert error < 0.1 and abs(ratio.mean() - 1) < 5 * error
+
+
+@pytest.mark.parametrize("scheme", range(4))
+def test_every_scheme_gives_the_posterior(scheme):
+    _, _, joint = problem()
+    last = joint.events[-1]
+    mean, cov = joint.filtered(last, np.ones(3, bool))
+    means = np.array([run.mean[last] for run in tracks("pf", 1000, 40, resampling=scheme, fraction=1.0)])
+    error = means.std(axis=0, ddof=1) / np.sqrt(len(means))
+    assert np.all(np.abs(means.mean(axis=0) - mean) < 5 * error + 20 / 1000 * np.sqrt(np.diag(cov)))
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("n", [500, 20_000])
+def test_any_pieces_and_any_threads_give_the_same_bits(name, n):
+    matrices, log, _ = problem()
+    tuning = Tuning.of(matrices.model).with_options({"particles": n})
+    whole = fold(name, matrices.model, tuning, log)
+    threads = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        pieces = Fold(name, matrices.model, tuning, log)
+        while pieces.advance(3):
+            pass
+        assert pieces.n == log.n
+        for a, b in zip(whole, pieces.track, strict=True):
+            assert np.array_equal(a, b, equal_nan=True)
+        numba.set_num_threads(threads)
+        pieces.rewind(0)
+        pieces.advance()
+        for a, b in zip(whole, pieces.track, strict=True):
+            assert np.array_equal(a, b, equal_nan=True)
+    finally:
+        numba.set_num_threads(threads)
+    other = fold(name, matrices.model, replace(tuning, seed=1), log)
+    assert not np.array_equal(whole.mean, other.mean)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("max_step", [np.inf, 0.1])
+def test_substeps_draw_noise_of_their_own(name, max_step):
+    """Ten steps of the same draws would make ten times the variance of independent ones."""
+    model = scalar(max_step=max_step)
+    track = fold(name, model, Tuning.of(model).with_options({"particles": 1e5}), log_of((0, TICK, 0), (1, TICK, 0)))
+    # A variance of 10⁵ draws is right to 5·√(2/10⁵) = 2.3 %.
+    assert abs(track.std[1, 0] ** 2 / (0.25 + 0.3) - 1) < 0.023
+    assert abs(track.mean[1, 0] - 2.0) < 5 * np.sqrt(0.55 / 1e5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_noise_that_depends_on_the_state_is_each_particles_own(name):
+    model = scalar(Q=relative)
+    track = fold(name, model, Tuning.of(model).with_options({"particles": 1e5}), log_of((0, TICK, 0), (1, TICK, 0)))
+    # E x² = 4 + 0.25; the draws' kurtosis is below 4.
+    assert abs(track.std[1, 0] ** 2 / (0.25 + 0.3 * 4.25) - 1) < 5 * np.sqrt(3 / 1e5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_queries_change_no_draw(name):
+    model = scalar()
+    tuning = Tuning.of(model).with_options({"particles": 200})
+    plain = fold(name, model, tuning, log_of((0, READING, 2.1), (1, READING, 2.4), (2, READING, 2.2)))
+    asked = fold(
+        name, model, tuning,
+        log_of((0, READING, 2.1), (0.5, TICK, 0), (0.9, TICK, 0), (1, READING, 2.4), (2, READING, 2.2)),
+    )  # fmt: skip
+    assert np.array_equal(plain.mean, asked.mean[[0, 3, 4]])
+
+
+def test_the_kernel_widens_the_cloud_by_its_bandwidth():
+    model = scalar(noises=(Noise("s", "m²/s", 0.0),))
+    log = log_of((0, READING, 2.3), (1, TICK, 0))
+    tuning = Tuning.of(model).with_options({"particles": 1e5, "fraction": 1.0, "bandwidth": 2.0})
+    run = Fold("pf-reg", model, tuning, log)
+    run.advance()
+    h = 2.0 * (4 / 3) ** 0.2 * 1e5**-0.2
+    variance = 0.25 * 0.04 / 0.29
+    assert abs(run.track.std[0, 0] ** 2 / variance - 1) < 0.05
+    assert abs(run.track.std[1, 0] ** 2 / run.track.std[0, 0] ** 2 - (1 + h * h)) < 0.02
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_two_peaks_stay_alive_and_are_reported(name):
+    """|x| is seen, its sign is not: both signs stay as likely as the prior made them."""
+    rng = np.random.default_rng(0)
+    model = scalar(
+        states=(State("s", "m", 0.0, 2.0),), noises=(Noise("s", "m²/s", 1e-3),),
+        sensors=(Sensor("y", (Row("y", "m²", 0.3),), h=square),),
+    )  # fmt: skip
+    log = log_of(*((k, READING, 4.0 + 0.5 * rng.standard_normal()) for k in range(20)))
+    run = Fold(name, model, Tuning.of(model).with_options({"particles": 20_000}), log)
+    run.advance()
+    first, second = run.modes()
+    assert abs(abs(first.mean[0]) - 2.0) < 0.15 and abs(first.mean[0] + second.mean[0]) < 0.1
+    # Half each, but for what 20 resamplings of a cloud of 20,000 let the share wander.
+    assert abs(first.weight - 0.5) < 5 * np.sqrt(20 * 0.25 / 20_000) + 0.02
+    assert abs(run.track.mean[-1, 0]) < 0.3 and run.track.std[-1, 0] > 1.8
+
+
+@pytest.mark.parametrize("name", ["pf", "pf-reg", "apf"])
+def test_a_sensor_may_have_a_likelihood_of_its_own(name):
+    model = scalar(sensors=(Sensor("y", (Row("y", "m", 0.04),), h=itself, log_likelihood=within_half),))
+    track = fold(name, model, Tuning.of(model).with_options({"particles": 1e5}), log_of((0, READING, 2.2)))
+    from scipy.stats import norm, truncnorm
+
+    a, b = (1.7 - 2.0) / 0.5, (2.7 - 2.0) / 0.5
+    law = truncnorm(a, b, 2.0, 0.5)
+    inside = norm.cdf(b) - norm.cdf(a)
+    assert track.verdict[0] == USED
+    assert abs(track.mean[0, 0] - law.mean()) < 5 * law.std() / np.sqrt(inside * 1e5)
+    assert abs(track.std[0, 0] / law.std() - 1) < 5 / np.sqrt(2 * inside * 1e5)
+    assert abs(np.exp(track.log_likelihood[0]) - inside) < 5 * np.sqrt(inside / 1e5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_cloud_that_explains_nothing_fails_visibly_and_recovers(name):
+    model = scalar(sensors=(Sensor("y", (Row("y", "m", 0.04),), h=itself, log_likelihood=within_half),))
+    log = log_of(*((0.01 * k, READING, 30.0) for k in range(40)))
+    run = Fold(name, model, Tuning.of(model).with_options({"particles": 2000}), log)
+    run.advance()
+    verdict = run.track.verdict
+    assert verdict[0] == FAILED and verdict[-1] == USED
+    assert run._state[RECOVERIES] == np.sum(verdict == FAILED)
+    for column in (run.track.mean, run.track.std, run.moments()[0], run.points()):
+        assert np.all(np.isfinite(column))
+    assert abs(run.track.mean[-1, 0] - 30.0) < 1.0
+    # A likelihood of zero has no logarithm that a sum of them could use.
+    assert np.all(np.isnan(run.track.log_likelihood[verdict == FAILED]))
+    assert np.all(np.isfinite(run.track.log_likelihood[verdict == USED]))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_reading_without_a_value_changes_nothing(name):
+    """Nor how often the filter drew: what comes behind it has the bits that it would have had."""
+    model = scalar()
+    tuning = Tuning.of(model).with_options({"particles": 200})
+    plain = fold(name, model, tuning, log_of((0, READING, 2.1), (1, READING, 2.4), (2, READING, 2.2)))
+    gaps = log_of((0, READING, 2.1), (1, READING, np.nan), (1, READING, 2.4), (2, READING, 2.2), (2, READING, np.nan))
+    missed = fold(name, model, tuning, gaps)
+    assert list(missed.verdict) == [USED, MISSING, USED, USED, MISSING]
+    assert np.array_equal(plain.mean, missed.mean[[0, 2, 3]]) and missed.mean[4] == plain.mean[2]
+    assert np.array_equal(plain.log_likelihood, missed.log_likelihood[[0, 2, 3]])
+
+
+@pytest.mark.parametrize(("key", "value", "verdict"), [("gate", 0.999, GATED), ("use.y", False, HELD_OUT)])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_reading_that_is_not_used_moves_no_particle(name, key, value, verdict):
+    """The estimate is what a question at that time was answered with just before."""
+    model = scalar()
+    tuning = Tuning.of(model).with_options({"particles": 200}).set(key, value)
+    track = fold(name, model, tuning, log_of((0, READING, 2.1), (1, TICK, 0), (1, READING, 9.0)))
+    assert track.verdict[2] == verdict
+    # Moments may be added up in another order.
+    np.testing.assert_allclose(track.mean[2], track.mean[1], rtol=1e-12)
+    np.testing.assert_allclose(track.std[2], track.std[1], rtol=1e-9)
+
+
+def test_every_child_of_the_auxiliary_filter_is_a_copy_of_its_parent():
+    """Of two particles one explains the reading, by far: both are that one then, as no noise moves them apart."""
+    quiet = Sensor("y", (Row("y", "m", 1e-6),), h=itself)
+    model = scalar(sensors=(quiet,), noises=(Noise("s", "m²/s", 0.0),))
+    for seed in range(5):
+        tuning = replace(Tuning.of(model).with_options({"particles": 2}), seed=seed)
+        run = Fold("apf", model, tuning, log_of((0, TICK, 0), (0, READING, 2.5)))
+        run.advance()
+        assert run.track.verdict[1] == USED and run.track.std[0, 0] > 0.0
+        first, second = block(run.options, run._state, 1)[:, 0]
+        assert first == second
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_the_likelihood_of_a_bent_sensor_is_that_of_quadrature(name):
+    """y = 0 = x² of x ~ N(2, 0.25 + 0.3) after a step, where h is least straight: linearised, 29 % too likely.
+
+    What apf's first stage foresees by that, its second must make up for. The mean of 100 clouds of 5000 is right to
+    its standard error, under 1.5 %.
+    """
+    model = scalar(sensors=(Sensor("y", (Row("y", "m²", 0.3),), h=square),))
+    log = log_of((0, TICK, 0), (1, READING, 0.0))
+    tuning = Tuning.of(model).with_options({"particles": 5000})
+    runs = [fold(name, model, replace(tuning, seed=seed), log) for seed in range(100)]
+    x = np.linspace(-4.0, 8.0, 120_001)
+    density = np.exp(-0.5 * (x - 2.0) ** 2 / 0.55 - 0.5 * x**4 / 0.3) / (2 * np.pi * np.sqrt(0.55 * 0.3))
+    likelihood = np.array([np.exp(run.log_likelihood[1]) for run in runs]) / (np.sum(density) * (x[1] - x[0]))
+    mean = np.average(x, weights=density)
+    std = np.sqrt(np.average((x - mean) ** 2, weights=density))
+    error = likelihood.std(ddof=1) / np.sqrt(len(runs))
+    assert error < 0.015 and abs(likelihood.mean() - 1.0) < 5 * error
+    means = np.array([run.mean[1, 0] for run in runs])
+    # A bias of 1/N of the posterior's spread comes on top.
+    assert abs(means.mean() - mean) < 5 * means.std(ddof=1) / np.sqrt(len(runs)) + 20 / 5000 * std
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_particles_where_the_sensor_says_no_number_are_out(name):
+    """y = √x, of which a sixth of the prior has none: the posterior is that of the others, by quadrature."""
+    model = scalar(states=(State("s", "m", 0.5, 0.5),), sensors=(Sensor("y", (Row("y", "m", 0.04),), h=root),))
+    run = Fold(name, model, Tuning.of(model).with_options({"particles": 20_000}), log_of((0, READING, 0.9)))
+    run.advance()
+    x = np.linspace(0.0, 4.0, 40_001)
+    density = np.exp(-0.5 * ((x - 0.5) / 0.5) ** 2 - 0.5 * ((0.9 - np.sqrt(x)) / 0.2) ** 2)
+    mean = np.average(x, weights=density)
+    std = np.sqrt(np.average((x - mean) ** 2, weights=density))
+    assert run.track.verdict[0] == USED
+    # The effective sample is a third of the cloud.
+    assert abs(run.track.mean[0, 0] - mean) < 5 * std / np.sqrt(20_000 / 3)
+    assert abs(run.track.std[0, 0] / std - 1) < 5 / np.sqrt(2 * 20_000 / 3)
+    assert np.all(np.isfinite(run.points()))
+
+
+def test_copies_of_one_particle_widen_too():
+    """No spread is left to double, nor process noise to bring it back; it takes the seed 23 doublings to reach 0.5."""
+    sharp = Sensor("y", (Row("y", "m", 0.04),), h=itself, log_likelihood=within_half)
+    model = scalar(sensors=(sharp,), noises=(Noise("s", "m²/s", 0.0),))
+    log = log_of(*((0.01 * k, READING, 2.0 if k == 0 else 4.0) for k in range(60)))
+    run = Fold("pf", model, Tuning.of(model).with_options({"particles": 20}), log)
+    run.advance(1)
+    block(run.options, run._state, 1)[:] = 2.0
+    run.advance()
+    failed = int((run.track.verdict == FAILED).sum())
+    assert 10 < failed < 40 and np.all(run.track.verdict[1 + failed :] == USED)
+    assert abs(run.track.mean[-1, 0] - 4.0) < 0.5
+
+
+def test_no_particles_are_refused():
+    matrices, log, _ = problem()
+    with pytest.raises(EstimatorError, match="particles is 0; it must lie between 2 and 1e"):
+        fold("pf", matrices.model, Tuning.of(matrices.model).with_options({"particles": 0}), log)
+
+
+def test_snapshots_of_large_states_keep_to_their_memory(monkeypatch):
+    model = scalar()
+    log = log_of(*((0.01 * k, READING, 2.0) for k in range(3000)))
+    tuning = Tuning.of(model).with_options({"particles": 500})
+    plain = Fold("pf", model, tuning, log)
+    plain.advance()
+    monkeypatch.setattr("estimators.fold.SNAPSHOT_MEMORY", 10 * plain._state.nbytes)
+    small = Fold("pf", model, tuning, log)
+    small.advance()
+    assert len(plain._snapshots) > 20
+    assert sum(state.nbytes for _, _, state in small._snapshots.values()) <= 12 * plain._state.nbytes
+    small.rewind(2000)
+    assert small.n <= 2000
+    small.advance()
+    assert np.array_equal(small.track.mean, plain.track.mean)
+
+
+def test_points_are_drawn_by_weight():
+    model = scalar()
+    run = Fold("pf", model, Tuning.of(model).with_options({"particles": 1e5, "fraction": 0}), log_of((0, READING, 2.6)))
+    run.advance()
+    points, (mean, cov) = run.points(), run.moments()
+    assert points.shape == (2000, 1) and members(run.options) == 100_000
+    assert abs(points.mean() - mean[0]) < 5 * np.sqrt(cov[0, 0] / 2000)
+    assert abs(points.var() / cov[0, 0] - 1) < 5 * np.sqrt(2 / 2000)

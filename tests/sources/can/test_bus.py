@@ -1,0 +1,153 @@
+"""Live buses: frames arrive decoded; a bus that fails is reported and opened again, and `read` never raises."""
+
+import time
+import uuid
+
+import can
+import pytest
+
+from estimators.errors import SourceError
+from estimators.log import Readings
+from sources.can.bus import WAITS, CanBus, open_bus
+from sources.can.decoder import Decoder
+from tests.sources.can.can_tools import Reports, dbc, frame, sensor
+
+DATA = bytes.fromhex("f4010fa000000080")
+GROUP = "239.74.163.2"
+
+
+class Clock:
+    """Seconds that pass when a test says so."""
+
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self):
+        return self.now
+
+
+class FakeBus:
+    """Gives what the script says: a message, None for silence, or an error to raise."""
+
+    def __init__(self, script):
+        self.script = list(script)
+        self.closed = False
+
+    def recv(self, timeout):
+        item = self.script.pop(0) if self.script else None
+        if isinstance(item, Exception):
+            raise item
+        return item
+
+    def shutdown(self):
+        self.closed = True
+
+
+@pytest.fixture
+def decoder(tmp_path):
+    return Decoder([(dbc(tmp_path), None)], [sensor(0, "ENGINE", "Temp")], width=1)
+
+
+def listen(bus, count):
+    """Read until `count` events came; a bus that gives too few for a minute has lost them."""
+    batches, deadline = [], time.monotonic() + 60.0
+    while sum(map(len, batches)) < count:
+        assert time.monotonic() < deadline
+        batches.append(bus.read(0.1))
+    return Readings.concat(batches, 1)
+
+
+def test_frames_of_a_virtual_bus_arrive_decoded_in_order(decoder):
+    name = uuid.uuid4().hex
+    source = CanBus("virtual", name, decoder)
+    before = time.time_ns()
+    with can.Bus(interface="virtual", channel=name) as other:
+        for k in range(3000):
+            other.send(frame(256, k.to_bytes(2, "little") + DATA[2:]))
+            other.send(frame(257, DATA))
+    got = listen(source, 3000)
+    after = time.time_ns()
+    assert [round(10 * (value + 40)) for value in got.value[:, 0]] == list(range(3000))
+    assert before - 1000 <= got.t.min() and got.t.max() <= after  # a float of seconds has 0.24 µs steps
+    assert before <= got.arrival.min() and got.arrival.max() <= after
+    assert (got.arrival >= got.t - 1000).all()
+    assert source.live and before <= source.now()
+    assert len(source.read(0.0)) == 0
+    source.close()
+    assert source.read(0.0) is None
+
+
+def test_what_is_queued_is_taken_at_once(decoder):
+    script = [frame(256, DATA, t=k) for k in range(1, 101)]
+    source = CanBus("fake", 0, decoder, connect=lambda: FakeBus(script))
+    assert len(source.read(0.0)) == 100
+    assert len(source.read(0.0)) == 0
+
+
+def test_a_bus_that_cannot_be_opened_is_one_line(decoder):
+    for interface, channel in (("no_such", 0), ("socketcan", "no_such_can"), ("udp_multicast", "not a group")):
+        with pytest.raises(SourceError) as caught:
+            CanBus(interface, channel, decoder)
+        text = str(caught.value)
+        assert text.startswith(f"CAN bus {interface}:{channel}: it cannot be opened") and "\n" not in text
+
+
+def test_one_bad_packet_is_counted_and_the_bus_stays(decoder):
+    reports, bus = Reports(), FakeBus([frame(256, DATA), can.CanOperationError("garbled"), frame(256, DATA), None])
+    source = CanBus("fake", 0, decoder, report=reports, connect=lambda: bus)
+    assert len(source.read(0.0)) == 1, "what came before the fault is kept"
+    assert len(source.read(0.0)) == 1
+    assert reports.counts == {"bus error": 1} and reports.texts["bus error"] == "CAN bus fake:0: garbled"
+    assert not bus.closed
+
+
+def test_a_bus_that_fails_is_opened_again_with_longer_and_longer_waits(decoder):
+    reports, clock = Reports(), Clock()
+    gone = [OSError("network is down"), OSError("network is down")]
+    first, last = FakeBus([frame(256, DATA), *gone]), FakeBus([frame(256, DATA)])
+    answers = [first, SourceError("no"), SourceError("no"), last]
+    opened_at = []
+
+    def connect():
+        opened_at.append(clock.now)
+        answer = answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    source = CanBus("fake", 0, decoder, report=reports, connect=connect, clock=clock)
+    assert len(source.read(0.0)) == 1
+    assert len(source.read(0.0)) == 0 and first.closed
+    for _ in range(20):
+        got = source.read(0.0)
+        if len(got):
+            break
+        clock.now += 0.05
+    assert len(got) == 1
+    waits = [b - a for a, b in zip(opened_at, opened_at[1:], strict=False)]
+    # Attempts fall on the first read after their time; reads come every 0.05 s here.
+    assert waits == pytest.approx(WAITS[:3], abs=0.051)
+    assert reports.counts == {"bus error": 4, "bus reconnected": 1}
+    assert "next attempt in 0.5 s" in reports.texts["bus error"]
+
+
+def test_error_frames_are_counted_and_give_no_event(decoder):
+    reports = Reports()
+    script = [can.Message(is_error_frame=True, arbitration_id=256, is_extended_id=False), frame(256, DATA)]
+    source = CanBus("fake", 0, decoder, report=reports, connect=lambda: FakeBus(script))
+    assert len(source.read(0.0)) == 1
+    assert reports.counts == {"error frame": 1}
+
+
+def test_multicast_stays_on_this_machine_and_arrives(decoder):
+    try:
+        sender = open_bus("udp_multicast", GROUP, {"port": 43999})
+        source = CanBus("udp_multicast", GROUP, decoder, bus_options={"port": 43999})
+        sender.send(frame(256, DATA))
+    except (SourceError, can.CanError) as error:
+        pytest.skip(f"no multicast here: {error}")
+    assert sender._multicast.hop_limit == 0
+    got = listen(source, 1)
+    assert got.value[0, 0] == 10.0
+    sender.shutdown()
+    source.close()

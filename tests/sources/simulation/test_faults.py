@@ -1,0 +1,147 @@
+"""Faults: each against its own formula, outside its time nothing changes, and errors that name the remedy."""
+
+import numpy as np
+import pytest
+
+from app.twin.twin import load_twin
+from estimators.errors import ConfigError, SourceError
+from estimators.log import READING
+from estimators.models import MODELS
+from sources.simulation.faults import Fault
+from sources.simulation.simulator import SensorPlan, Simulator
+from tests.sources.can.can_tools import read_all, same
+
+PACK = MODELS["motor_drive"]
+SENSOR = PACK.sensors[0].name
+N = 400
+
+
+def run(*faults: Fault, seed: int = 3):
+    return read_all(Simulator(PACK, seed=seed, step=1.0, duration=float(N), faults=faults))
+
+
+def spoken(events, sensor=0):
+    mine = (events.kind == READING) & (events.channel == sensor)
+    return events.t[mine] * 1e-9, events.value[mine, 0]
+
+
+def test_bias_and_drift_add_what_they_say_while_they_last():
+    t, plain = spoken(run())
+    during = (t >= 100) & (t < 200)
+    _, biased = spoken(run(Fault(SENSOR, "bias", 100, 200, size=2.5)))
+    np.testing.assert_allclose(biased - plain, np.where(during, 2.5, 0), atol=1e-12)
+    _, drifted = spoken(run(Fault(SENSOR, "drift", 100, 200, size=0.1)))
+    np.testing.assert_allclose(drifted - plain, np.where(during, 0.1 * (t - 100), 0), atol=1e-12)
+
+
+def test_a_stuck_sensor_repeats_the_last_reading_before():
+    t, plain = spoken(run())
+    _, stuck = spoken(run(Fault(SENSOR, "stuck", 100, 200)))
+    during = (t >= 100) & (t < 200)
+    np.testing.assert_array_equal(stuck[during], plain[t == 99][0])
+    np.testing.assert_array_equal(stuck[~during], plain[~during])
+    _, from_the_start = spoken(run(Fault(SENSOR, "stuck", 0, 200)))
+    np.testing.assert_array_equal(from_the_start[t < 200], plain[0])
+
+
+def test_outliers_and_dropouts_come_at_their_rate():
+    """Counts of N Bernoulli draws and the spread of the hits, within 4 of their own standard deviations."""
+    _, plain = spoken(run())
+    _, wild = spoken(run(Fault(SENSOR, "outliers", size=30.0, rate=0.3)))
+    hits = (wild - plain)[wild != plain]
+    slack = 4 * np.sqrt(N * 0.3 * 0.7)
+    assert abs(hits.size - 0.3 * N) < slack
+    assert abs(hits.std() / 30.0 - 1) < 4 / np.sqrt(2 * hits.size)
+    _, lossy = spoken(run(Fault(SENSOR, "dropout", rate=0.3)))
+    assert abs(np.isnan(lossy).sum() - 0.3 * N) < slack
+    np.testing.assert_array_equal(lossy[~np.isnan(lossy)], plain[~np.isnan(lossy)])
+    _, silent = spoken(run(Fault(SENSOR, "dropout", 100, 200)))
+    assert np.isnan(silent).sum() == 100
+
+
+def test_a_seed_gives_the_same_faults_and_they_touch_nothing_else():
+    fault = Fault(SENSOR, "outliers", 100, 300, size=30.0, rate=0.5)
+    plain, wild = run(), run(fault)
+    assert same(wild, run(fault)) and not same(wild, plain)
+    other = ~((wild.kind == READING) & (wild.channel == 0))
+    assert same(plain.select(other), wild.select(other))
+    # Neither its window nor a later fault changes its draws.
+    t, short = spoken(run(Fault(SENSOR, "outliers", 200, 300, size=30.0, rate=0.5), Fault(SENSOR, "dropout", 390)))
+    np.testing.assert_array_equal(short[(t >= 200) & (t < 300)], spoken(wild)[1][(t >= 200) & (t < 300)])
+
+
+def test_each_fault_has_draws_of_its_own_and_of_the_seed():
+    """Two faults of the same kind add up as independent ones do; another seed hits other readings."""
+    fault = Fault(SENSOR, "outliers", size=30.0, rate=0.3)
+
+    def added(seed, *faults):
+        return spoken(run(*faults, seed=seed))[1] - spoken(run(seed=seed))[1]
+
+    first, both = added(3, fault), added(3, fault, fault)
+    # A correlation of N independent pairs has the standard error 1/√N.
+    assert abs(np.corrcoef(first, both - first)[0, 1]) < 4 / np.sqrt(N)
+    assert abs(np.corrcoef(first, added(4, fault))[0, 1]) < 4 / np.sqrt(N)
+
+
+def test_faults_of_one_row_leave_the_others():
+    model = MODELS["road_car"]
+    plans = {"gnss_position": SensorPlan()}
+    plain, shifted = (
+        read_all(Simulator(model, seed=1, step=1.0, duration=5.0, sensors=plans, faults=faults))
+        for faults in ((), (Fault("gnss_position", "bias", size=7.0, row="north"),))
+    )
+    fixes = (plain.kind == READING) & (plain.channel == 0)
+    np.testing.assert_allclose((shifted.value - plain.value)[fixes][:, :2], [[0.0, 7.0]] * 5, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("fault", "text"),
+    [
+        (Fault("windng", "bias"), "fault 1: there is no sensor 'windng'; choose from"),
+        (Fault(SENSOR, "bend"), "fault 1: kind is 'bend'; choose from bias, drift"),
+        (Fault(SENSOR, "bias", row="x"), f"fault 1: {SENSOR} has no row 'x'; choose from"),
+        (Fault(SENSOR, "bias", 5, 5), "fault 1: it ends at 5 s; that must be after its start, 5 s"),
+        (Fault(SENSOR, "dropout", rate=1.5), "fault 1: rate is 1.5; it is a probability, 0 to 1"),
+    ],
+)
+def test_a_fault_that_cannot_be_is_refused(fault, text):
+    with pytest.raises(SourceError, match=text.replace("(", r"\(")):
+        run(fault)
+
+
+YAML = """model: motor_winding
+source:
+  type: simulator
+  duration: 20
+  faults:
+    - {FAULT}
+"""
+
+
+@pytest.mark.parametrize(
+    ("fault", "text"),
+    [
+        ("{sensor: windin, kind: stuck}", "sensor is 'windin', no sensor of motor_winding; "),
+        ("{sensor: winding, row: x, kind: stuck}", "row is 'x', no row of winding; "),
+        ("{sensor: winding, kind: stuk}", "kind is 'stuk'; it must be 'bias'"),
+        ("{sensor: winding, kind: bias}", "is of kind bias and has no size"),
+        ("{sensor: winding, kind: outliers, size: 3}", "is of kind outliers and has no rate"),
+        ("{sensor: winding, kind: stuck, size: 3}", "size means nothing to a fault of kind stuck; leave it out"),
+        ("{sensor: winding, kind: stuck, start: 4, end: 3}", "end is 3.0 s; it must be above start"),
+    ],
+)
+def test_the_yaml_says_what_is_wrong_with_a_fault(tmp_path, fault, text):
+    path = tmp_path / "pump.yaml"
+    path.write_text(YAML.replace("{FAULT}", fault))
+    with pytest.raises(ConfigError) as error:
+        load_twin(path)
+    assert text in str(error.value) and "pump.yaml:6: source.faults[0]" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_the_yaml_reaches_the_simulator(tmp_path):
+    path = tmp_path / "pump.yaml"
+    path.write_text(YAML.replace("{FAULT}", "{sensor: winding, kind: dropout, start: 5, end: 10}"))
+    events = read_all(load_twin(path).open_source(lambda key, text: None))
+    t, values = spoken(events)
+    np.testing.assert_array_equal(np.isnan(values), (t >= 5) & (t < 10))

@@ -1,0 +1,270 @@
+"""Tables: columns to events, times exact, and every complaint with its file and line."""
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from estimators.errors import SourceError
+from estimators.log import INPUT, READING, TRUTH
+from sources.source import Channel, Condition
+from sources.tables.table import Table
+from sources.tables.time_column import column_ns
+from tests.sources.can.can_tools import Reports, read_all, same
+
+CHANNELS = (
+    Channel(READING, 0, "temp", ("temp",), units=("degC",), model_units=("K",)),
+    Channel(READING, 1, "pair", ("a", "b"), where=(Condition("ok", 1, 1),)),
+    Channel(INPUT, 1, "power", ("power",), units=("kW",), model_units=("W",)),
+    Channel(TRUTH, 2, "x", ("x",)),
+)
+HEADER = "t,temp,a,b,ok,power,x\n"
+NAN = float("nan")
+
+
+def write(folder, text, name="drive.csv"):
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def table(path, *, unit="s", channels=CHANNELS, report=lambda key, text: None):
+    files = path if isinstance(path, list) else [path]
+    return Table(files, time_column="t", time_unit=unit, channels=channels, width=2, report=report)
+
+
+def events(batch):
+    return [
+        (t, kind, channel, *value)
+        for t, kind, channel, value in zip(
+            batch.t.tolist(), batch.kind.tolist(), batch.channel.tolist(), batch.value.tolist(), strict=True
+        )
+    ]
+
+
+def test_a_row_is_inputs_then_readings_then_truths(tmp_path):
+    path = write(tmp_path, HEADER + "0.1,20,1,2,1,3,7\n0.2,21,3,4,0,,8\n")
+    reports = Reports()
+    got = events(read_all(table(path, report=reports)))
+    expected = [
+        (100_000_000, INPUT, 0, NAN, 3000.0),
+        (100_000_000, READING, 0, 293.15, NAN),
+        (100_000_000, READING, 1, 1.0, 2.0),
+        (100_000_000, TRUTH, 2, 7.0, NAN),
+        (200_000_000, READING, 0, 294.15, NAN),
+        (200_000_000, READING, 1, NAN, NAN),
+        (200_000_000, TRUTH, 2, 8.0, NAN),
+    ]
+    np.testing.assert_array_equal(np.array(got), np.array(expected))
+    assert reports.counts == {"condition pair": 1}
+
+
+def test_true_states_of_a_row_are_blocks(tmp_path):
+    """A block begins with a state that is known and reaches as far as the log is wide; here are 2 columns."""
+    names = {0: "w", 1: "a", 2: "b", 5: "power"}
+    channels = [Channel(TRUTH, index, names[index], (names[index],)) for index in (5, 2, 0, 1)]
+    channels[1] = Channel(TRUTH, 2, "b", ("b",), where=(Condition("ok", 1, 1),))
+    path = write(tmp_path, "t,w,a,b,ok,power\n0,1,2,3,1,6\n1,,2,3,1,6\n2,1,,3,1,\n3,1,2,3,0,6\n4,,,,1,\n5,nan,2,3,1,\n")
+    got = events(read_all(table(path, channels=channels)))
+    expected = [
+        (0, TRUTH, 0, 1.0, 2.0),
+        (0, TRUTH, 2, 3.0, NAN),
+        (0, TRUTH, 5, 6.0, NAN),
+        (10**9, TRUTH, 1, 2.0, 3.0),
+        (10**9, TRUTH, 5, 6.0, NAN),
+        (2 * 10**9, TRUTH, 0, 1.0, NAN),
+        (2 * 10**9, TRUTH, 2, 3.0, NAN),
+        (3 * 10**9, TRUTH, 0, 1.0, 2.0),
+        (3 * 10**9, TRUTH, 5, 6.0, NAN),
+        (5 * 10**9, TRUTH, 1, 2.0, 3.0),
+    ]
+    np.testing.assert_array_equal(np.array(got), np.array(expected))
+
+
+def test_blank_says_nothing_and_what_is_no_number_is_missing_with_its_line(tmp_path):
+    reports = Reports()
+    path = write(tmp_path, HEADER + "0,,1,2,1,,\n\n1,hot,3,,1,nan,oops\n2,NaN,inf,1,1,n/a,\n")
+    got = events(read_all(table(path, report=reports)))
+    expected = [
+        (0, READING, 1, 1.0, 2.0),
+        (10**9, INPUT, 0, NAN, NAN),
+        (10**9, READING, 0, NAN, NAN),
+        (10**9, READING, 1, 3.0, NAN),
+        (2 * 10**9, INPUT, 0, NAN, NAN),
+        (2 * 10**9, READING, 0, NAN, NAN),
+        (2 * 10**9, READING, 1, NAN, 1.0),
+    ]
+    np.testing.assert_array_equal(np.array(got), np.array(expected))
+    assert reports.counts == {"unreadable value": 2}
+    assert reports.texts["unreadable value"] == "drive.csv:4: x is 'oops', which is no number; the value is missing"
+
+
+def test_rows_without_a_time_or_with_missing_cells_are_left_out_and_counted(tmp_path):
+    reports = Reports()
+    path = write(tmp_path, HEADER + "soon,1,1,2,1,1,1\n1,2,3\n2,20,1,2,1,3,7\n3,20,1")
+    got = read_all(table(path, report=reports))
+    assert set(got.t.tolist()) == {2 * 10**9}
+    assert reports.counts == {"undated row": 1, "unreadable value": 1, "truncated file": 1}
+    assert (
+        reports.texts["undated row"] == "drive.csv:2: t is no time, or one that needs another unit; the row is left out"
+    )
+    assert reports.texts["unreadable value"] == "drive.csv:3: has 3 cells, not 7; the row is left out"
+    assert reports.texts["truncated file"] == "drive.csv:5: the last line has 3 cells, not 7"
+
+
+@pytest.mark.parametrize("rest", ["", "\n", "\r\n", "\n \n\n"])
+def test_a_header_without_rows_is_named(tmp_path, rest):
+    path = write(tmp_path, HEADER.rstrip() + rest)
+    with pytest.raises(SourceError) as caught:
+        table(path)
+    assert str(caught.value) == f"{path}: it has a header and no rows; record it again"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 40, "t,x\n0,1\n".encode("utf-16"), b"t,\x1b[31mx\n0,1\n"],
+    ids=["picture", "utf-16", "colours"],
+)
+def test_a_file_that_is_no_text_is_told_in_letters_and_briefly(tmp_path, content):
+    path = tmp_path / "drive.csv"
+    path.write_bytes(content)
+    with pytest.raises(SourceError) as caught:
+        table(path)
+    text = str(caught.value)
+    assert text.startswith(f"{path}:1: it begins with {content[:20]!r} and is no text; give a CSV in UTF-8")
+    assert text.isprintable() and len(text) < len(str(path)) + 250
+
+
+def test_what_is_quoted_from_a_file_is_escaped_and_cut(tmp_path):
+    path = write(tmp_path, HEADER.replace("temp", "n" * 500 + "\x9b31m") + "0,1,1,1,1,1,1\n")
+    with pytest.raises(SourceError, match="there is no column 'temp'; choose from t, 'nnn.*[.]{3}', a, b") as caught:
+        table(path)
+    assert str(caught.value).isprintable() and len(str(caught.value)) < len(str(path)) + 200
+    reports = Reports()
+    read_all(table(write(tmp_path, HEADER + f"0,\x9b31m{'9' * 500}x,1,2,1,3,7\n"), report=reports))
+    text = reports.texts["unreadable value"]
+    assert text.startswith("drive.csv:2: temp is '\\x9b31m999") and text.isprintable() and len(text) < 150
+
+
+X = (Channel(READING, 0, "x", ("x",)),)
+
+
+@pytest.mark.parametrize(
+    ("cells", "unit", "expected"),
+    [
+        (["1533226488.123456789", "0.1"], "s", [1533226488123456789, 100000000]),
+        (["1533226488123.4", "5"], "ms", [1533226488123400000, 5000000]),
+        (["1533226488123456789"], "ns", [1533226488123456789]),
+        (["1.5e3", "-2"], "us", [1500000, -2000]),
+        (["1.5"], "min", [90 * 10**9]),
+        (["0.5"], "h", [1800 * 10**9]),
+        (["2013-07-04 00:00:00", "2013-07-04T01:00:00.123456789Z"], "s", [1372896000 * 10**9, 1372899600123456789]),
+        (["2013-07-04T02:00:00+02:00"], "s", [1372896000 * 10**9]),
+        (["1969-12-31T23:59:59.5"], "s", [-500_000_000]),
+    ],
+)
+def test_times_are_exact(tmp_path, cells, unit, expected):
+    path = write(tmp_path, "t,x\n" + "".join(f"{cell},1\n" for cell in cells))
+    assert read_all(table(path, unit=unit, channels=X)).t.tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("column", "unit", "expected"),
+    [
+        (pa.array([1, None, 3], pa.int64()), "us", [1000, 3000]),
+        (pa.array([1.5, float("nan"), 2.5]), "s", [1_500_000_000, 2_500_000_000]),
+        (pa.array([10**15 + 1, None, 10**15 + 2], pa.timestamp("us")), "s", [10**18 + 1000, 10**18 + 2000]),
+        (pa.array([1, None, 2], pa.timestamp("ms", "Europe/Berlin")), "s", [10**6, 2 * 10**6]),
+        (pa.array(["1", "soon", "2"]), "s", [10**9, 2 * 10**9]),
+    ],
+)
+def test_parquet_times(tmp_path, column, unit, expected):
+    reports = Reports()
+    pq.write_table(pa.table({"t": column, "x": [1.0, 2.0, 3.0]}), tmp_path / "a.parquet")
+    got = read_all(table(tmp_path / "a.parquet", unit=unit, channels=X, report=reports))
+    assert got.t.tolist() == expected and got.value[:, 0].tolist() == [1.0, 3.0]
+    assert (
+        reports.texts["undated row"] == "a.parquet:2: t is no time, or one that needs another unit; the row is left out"
+    )
+
+
+def test_parquet_and_csv_of_one_table_agree(tmp_path):
+    """Random numbers, null and blank alike, across chunks."""
+    rng, n = np.random.default_rng(0), 10_000
+    columns = {name: rng.normal(size=n) for name in HEADER.strip().split(",")}
+    columns["t"] = np.arange(n) * 0.01
+    columns["ok"] = (rng.random(n) < 0.9).astype(float)
+    blank = rng.random(n) < 0.2
+    lines = [HEADER]
+    for k in range(n):
+        cells = ["" if name == "temp" and blank[k] else repr(float(columns[name][k])) for name in columns]
+        lines.append(",".join(cells) + "\n")
+    csv = write(tmp_path, "".join(lines))
+    arrays = {name: pa.array(values, mask=blank if name == "temp" else None) for name, values in columns.items()}
+    pq.write_table(pa.table(arrays), tmp_path / "a.parquet")
+    a, b = read_all(table(csv)), read_all(table(tmp_path / "a.parquet"))
+    assert same(a, b)
+    assert (a.channel[a.kind == READING] == 0).sum() == n - blank.sum()
+
+
+def test_other_marks_and_files_one_after_the_other(tmp_path):
+    one = write(tmp_path, "\ufefft;x\n1;10\n", "one.csv")
+    two = write(tmp_path, '"t"\t"x"\n2\t"20"\n', "two.csv")
+    got = read_all(table([one, two], channels=X))
+    assert got.t.tolist() == [10**9, 2 * 10**9] and got.value[:, 0].tolist() == [10.0, 20.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "expected"),
+    [
+        ("a.csv", b"t,temperature,b,ok,a,power,x\n", "a.csv: there is no column 'temp'; did you mean temperature?"),
+        ("b.csv", b"time,temp,a,b,ok,power,x\n", "b.csv: there is no column 't'; did you mean"),
+        ("c.csv", None, "c.csv: there is no such file; check the path of the recording"),
+        ("d.csv", b"", "d.csv: the file is empty; record it again"),
+        ("e.parquet", b"PAR1 nonsense", "e.parquet: it cannot be read as Parquet"),
+    ],
+)
+def test_what_a_table_lacks_is_one_line(tmp_path, name, content, expected):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(SourceError) as caught:
+        table(tmp_path / name)
+    text = str(caught.value)
+    assert text.startswith(str(tmp_path / expected)) and "\n" not in text
+
+
+def test_only_picks_the_rows_that_speak_of_a_sensor(tmp_path):
+    """Ranges to one anchor or the other in one column; a row of neither, or whose anchor is blank, says nothing."""
+    path = tmp_path / "ranges.csv"
+    path.write_text("t,range,anchor,ok\n0,1,7,1\n1,2,8,1\n2,3,7,0\n3,4,9,1\n4,5,,1\n5,nan,8,1\n", encoding="utf-8")
+    channels = [
+        Channel(READING, k, f"r{k}", ("range",), only=(Condition("anchor", a, a),), where=(Condition("ok", 1, 1),))
+        for k, a in enumerate((7, 8))
+    ]
+    reports = Reports()
+    got = events(read_all(table(path, channels=channels, report=reports)))
+    expected = [
+        (0, READING, 0, 1.0, NAN),
+        (10**9, READING, 1, 2.0, NAN),
+        (2 * 10**9, READING, 0, NAN, NAN),
+        (5 * 10**9, READING, 1, NAN, NAN),
+    ]
+    np.testing.assert_array_equal(np.array(got), np.array(expected))
+    assert reports.counts == {"condition r0": 1}
+
+
+def test_a_shift_moves_the_clock(tmp_path):
+    path = write(tmp_path, HEADER + "1.5,20,1,2,1,3,7\n")
+    moved = Table([path], time_column="t", time_unit="s", time_shift=-0.2, channels=CHANNELS, width=2)
+    assert set(read_all(moved).t.tolist()) == {1_300_000_000}
+
+
+def test_times_beyond_any_clock_are_left_out():
+    """Milliseconds that are read as seconds: 64 bits of nanoseconds end at 9.2e9 s."""
+    for column in (["0", "1e10", "-1e10", "1e300", "2"], pa.array([0.0, 1e10, -1e10, 1e300, 2.0])):
+        time, known = column_ns(column, "s")
+        np.testing.assert_array_equal(known, [True, False, False, False, True])
+        np.testing.assert_array_equal(time[known], [0, 2_000_000_000])
+    time, known = column_ns(pa.array([0, 10**10, 2]), "s")
+    np.testing.assert_array_equal(known, [True, False, True])
+    np.testing.assert_array_equal(time[known], [0, 2_000_000_000])
