@@ -14,7 +14,7 @@ no draw, and a refold draws what the fold drew.
 
 `work` is scratch that starts as NaN. `score` takes NIS, degrees of freedom and log-likelihood.
 
-The functions of an `interpreted` filter are plain Python, and its context is a `View` (view.py).
+The functions of an `interpreted` filter are plain Python, and its context is a `View` (interpreted/view.py).
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class Estimator:
     `memory(options, model)` counts numbers that the state holds beyond `state_size`. `runs(options, nx)` is
     `model_runs` as a number: how often a step runs f. `prepare(model, options)` computes what depends on the model
     too, once for a fold, as int64s. `blocks(options, state, nx)` is a view of the members (N, nx) in a state, of a
-    compiled filter that runs f and h at these alone and so can be driven on a black box (see driven.py).
+    compiled filter that runs f and h at these alone and so can run on a black box (interpreted/black_box_filters.py).
     """
 
     name: str

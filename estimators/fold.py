@@ -20,7 +20,7 @@ from .diagnostics.field_pictures import Pictures
 from .diagnostics.health import Bounds, HealthPolicy, assess, assess_signature, chi_square_bounds
 from .errors import EstimatorError, ModelError
 from .estimator import Code, Estimator, call_describe, call_predict, call_start, call_update, code_type
-from .interpreted import fold_loop as fold_python
+from .interpreted import fold_loop
 from .interpreted.black_box_filters import driven
 from .interpreted.fold_loop import LONGEST, UNSET
 from .interpreted.view import View
@@ -231,8 +231,8 @@ class Fold:
         self._run, self._assess, self._run_brief, self._assess_brief, begin = _compiled()
         if model.black_box or self.estimator.interpreted:
             self._context = View(self._compiled, self._context, tuning, self.options, self.pairs)
-            self._run = self._run_brief = fold_python.run
-            begin = fold_python.begin
+            self._run = self._run_brief = fold_loop.run
+            begin = fold_loop.begin
         begin(self._code, self._context, np.ascontiguousarray(mean), np.ascontiguousarray(cov), self._state)
         left = base.state if base is not None and base.estimator == estimator else None
         if left is not None and left.size == self._state.size:

@@ -38,7 +38,7 @@ PERIOD = 0.2
 STATUS_PERIOD = 0.5
 """Seconds between two words on the twin's status."""
 
-PAGE = Path(__file__).parent / "page"
+PAGE = Path(__file__).parent.parent / "page"
 FOR_EVER = "public, max-age=31536000, immutable"
 KINDS = {".js": "text/javascript", ".wasm": "application/wasm"}
 

@@ -1,6 +1,6 @@
 """The ensemble transform Kalman filter: all members are turned at once so that their moments are the posterior's.
 
-In whitened anomalies Z (N, m) of the expected reading and d of the reading itself (see ensemble.py),
+In whitened anomalies Z (N, m) of the expected reading and d of the reading itself (see shared.py),
 
     x̄ ← x̄ + Aᵀ w,   w = (I + Z Zᵀ)⁻¹ Z d / √(N - 1);      A ← T A,   T = (I + Z Zᵀ)^(-1/2)
 

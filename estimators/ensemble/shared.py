@@ -47,7 +47,7 @@ INFLATION, ADDITIVE, CREWS, OWN = range(4)
 """Positions in the context's options; a filter's own number stands at the last."""
 
 PROCESS, START, PERTURB, SPREAD, ROTATE = range(5)
-"""Streams of randomness; see random.py."""
+"""Streams of randomness; see numerics/random.py."""
 
 HEAD = 1
 """Numbers behind the members: how many predictions and analyses have drawn."""
@@ -261,7 +261,7 @@ def _forecast_on_threads(context, u, dt, key, X, crews, scratch, each):
 
 @jit
 def next_draw(X, state):
-    """Number this prediction or analysis among all of the state's: the place of its draws; see filter.py."""
+    """Number this prediction or analysis among all of the state's: the place of its draws; see estimator.py."""
     state[X.size] += 1.0
     return int(state[X.size])
 
@@ -415,7 +415,7 @@ def judge(context, sensor, m, ZT, Z, d, rows, G, U, v, score):
         return HELD_OUT
     limit = floats(context.gate, context.width + 1)[m]
     if nis <= limit:
-        # As in gaussian.py: a reading that far off would leave members that are no numbers.
+        # As in gaussian/shared.py: a reading that far off would leave members that are no numbers.
         return USED if nis < np.inf else FAILED
     return GATED if limit < nis else FAILED
 

@@ -14,14 +14,14 @@ import numpy as np
 from ..estimator import Estimator, Options
 from ..model.state_space import StateSpaceModel
 from ..tuning import Tuning
-from .robust import OPTIONS, memory, shared
+from .robust import OPTIONS, memory, shared_options
 from .shared import describe, moments, start, state_size
 from .ukf import predict, sigma_points, update, weights, work_size
 
 
 def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     """The shared options, and the weights of the cubature rule."""
-    return np.array(shared(values) + weights(1.0, 0.0, 0.0, model.nx))
+    return np.array(shared_options(values) + weights(1.0, 0.0, 0.0, model.nx))
 
 
 def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from ..numerics.jit import inlined, jit, matrix
 from ..numerics.linalg import congruence
 from ..track import FAILED, USED
 from ..tuning import Tuning
-from . import shared as gaussian
+from . import shared
 from .robust import (
     ADAPT,
     JOSEPH,
@@ -26,7 +26,7 @@ from .robust import (
     memory,
     reading_variances,
     reweigh,
-    shared,
+    shared_options,
 )
 from .shared import (
     admit,
@@ -46,13 +46,13 @@ from .shared import (
 
 def work_size(options: Options, nx: int, ny: int) -> int:
     """Scratch: x', F and twice the square for the congruence; or an update's, with K, H, a square; a Jacobian's."""
-    filters = max(nx + 3 * nx * nx, gaussian.scratch_size(nx, ny) + 2 * nx * ny + nx * nx)
+    filters = max(nx + 3 * nx * nx, shared.scratch_size(nx, ny) + 2 * nx * ny + nx * nx)
     return filters + scratch_size(nx, ny)
 
 
 def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     """The shared options alone."""
-    return np.array(shared(values))
+    return np.array(shared_options(values))
 
 
 @jit
@@ -122,7 +122,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     _, m = sensor_rows(context, sensor)
     x = state[:n]
     P = matrix(state, n, n, n)
-    nu, r, S, U, C, W, room, at = gaussian.scratch(work, n, m)
+    nu, r, S, U, C, W, room, at = shared.scratch(work, n, m)
     K = matrix(work, at, n, m)
     H = matrix(work, at + n * m, m, n)
     N = matrix(work, at + 2 * n * m, n, n)

@@ -11,8 +11,7 @@ from ..numerics.jit import jit, matrix
 from ..numerics.linalg import solve_transposed
 from ..track import FAILED, USED
 from ..tuning import Tuning
-from . import ekf
-from . import shared as gaussian
+from . import ekf, shared
 from .ekf import correct, linearise, predict
 from .robust import (
     ADAPT,
@@ -26,7 +25,7 @@ from .robust import (
     memory,
     reading_variances,
     reweigh,
-    shared,
+    shared_options,
 )
 from .shared import admit, compare, describe, factor, moments, move_mean, no_points, start, state_size
 
@@ -41,7 +40,7 @@ def work_size(options: Options, nx: int, ny: int) -> int:
 
 def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     """The shared options, and the number of iterations."""
-    return np.array([*shared(values), values["iterations"]])
+    return np.array([*shared_options(values), values["iterations"]])
 
 
 @jit
@@ -57,7 +56,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     _, ny = sensor_rows(context, sensor)
     x = state[:n]
     P = matrix(state, n, n, n)
-    nu, r, S, U, C, W, room, at = gaussian.scratch(work, n, ny)
+    nu, r, S, U, C, W, room, at = shared.scratch(work, n, ny)
     K = matrix(work, at, n, ny)
     H = matrix(work, at + n * ny, ny, n)
     at += 2 * n * ny

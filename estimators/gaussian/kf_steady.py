@@ -27,11 +27,10 @@ from ..numerics.jit import jit, matrix
 from ..numerics.linalg import congruence
 from ..track import USED
 from ..tuning import Tuning
-from . import kf
-from . import shared as gaussian
+from . import kf, shared
 from .ekf import linearise
 from .kf import constant_jacobian
-from .robust import INFLATION_OPTION, OWN, add_noise, reading_variances, shared
+from .robust import INFLATION_OPTION, OWN, add_noise, reading_variances, shared_options
 from .shared import admit, compare, describe, gain, joseph, no_points, wrap_mean
 
 STEP, WHOLE, GAIN = range(OWN, OWN + 3)
@@ -57,13 +56,13 @@ def work_size(values: Options, nx: int, ny: int) -> int:
 
 def moments(values: Options, state: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray]:
     """Mean (nx,) and covariance (nx, nx) of a state."""
-    return gaussian.moments(values, state, nx)
+    return shared.moments(values, state, nx)
 
 
 @jit
 def start(context, mean, cov, state):
     """The state that stands for N(mean, cov)."""
-    gaussian.start(context, mean, cov, state)
+    shared.start(context, mean, cov, state)
     state[state.size - 1] = MOVING
 
 
@@ -129,7 +128,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     _, ny = sensor_rows(context, sensor)
     x = state[:n]
     P = matrix(state, n, n, n)
-    nu, r, S, U, C, _, _, at = gaussian.scratch(work, n, ny)
+    nu, r, S, U, C, _, _, at = shared.scratch(work, n, ny)
     K = matrix(work, at, n, ny)
     H = matrix(work, at + n * ny, ny, n)
     N = matrix(work, at + 2 * n * ny, n, n)
@@ -197,7 +196,9 @@ def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     K = np.linalg.solve(S, H @ before).T
     rest = np.eye(model.nx) - K @ H
     after = rest @ before @ rest.T + K @ R @ K.T
-    return np.concatenate((shared(values), [period / steps, steps == 1], K.ravel(), after.ravel(), before.ravel()))
+    return np.concatenate(
+        (shared_options(values), [period / steps, steps == 1], K.ravel(), after.ravel(), before.ravel())
+    )
 
 
 def matrices(

@@ -42,7 +42,7 @@ MOST = 1000
 """Iterations of a weight, at most: Huber's takes a few, Student's t some tens, or hundreds where two nearly fit."""
 
 
-def shared(values: Options) -> list[float]:
+def shared_options(values: Options) -> list[float]:
     """The numbers of the shared options, in the order of the positions above."""
     kind = values.get("robust", NONE)
     return [

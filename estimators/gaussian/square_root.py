@@ -2,7 +2,7 @@
 
 The state is x (nx,) followed by upper U (nx, nx) with P = Uᵀ U. P and S are never formed, so a spread of 1e-9 beside
 one of 1 keeps half its digits, where P itself would hold none of 1e-18 beside 1. Behind U stands what an adaptation
-remembers, as in gaussian.py.
+remembers, as in shared.py.
 """
 
 from __future__ import annotations

@@ -19,8 +19,21 @@ from ..numerics.linalg import EPSILON
 from ..numerics.simd_ir import padded
 from ..track import FAILED, USED
 from ..tuning import Tuning
-from . import shared as gaussian
-from .robust import ADAPT, NONE, OFF, OPTIONS, OWN, ROBUST, adapt, add_noise, memory, reading_variances, reweigh, shared
+from . import shared
+from .robust import (
+    ADAPT,
+    NONE,
+    OFF,
+    OPTIONS,
+    OWN,
+    ROBUST,
+    adapt,
+    add_noise,
+    memory,
+    reading_variances,
+    reweigh,
+    shared_options,
+)
 from .shared import admit, compare, describe, downdate, moments, move_mean, start, state_size, wrap_mean
 from .sigma_points import covariance, cross_covariance, deviations, factor, spread_points
 
@@ -37,7 +50,7 @@ def weights(alpha: float, beta: float, kappa: float, nx: int) -> list[float]:
 
 def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     """The shared options, and the weights."""
-    return np.array(shared(values) + weights(values["alpha"], values["beta"], values["kappa"], model.nx))
+    return np.array(shared_options(values) + weights(values["alpha"], values["beta"], values["kappa"], model.nx))
 
 
 def sigma_points(x: np.ndarray, P: np.ndarray, spread: float) -> np.ndarray:
@@ -57,7 +70,7 @@ def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
 def work_size(options: Options, nx: int, ny: int) -> int:
     """Scratch: an update's; the factor, sigma points, the same through f or h, their mean and covariance."""
     n, m = padded(nx), padded(ny)
-    return gaussian.scratch_size(nx, ny) + nx * n + (2 * nx + 1) * (n + max(n, m)) + max(n, m)
+    return shared.scratch_size(nx, ny) + nx * n + (2 * nx + 1) * (n + max(n, m)) + max(n, m)
 
 
 @jit
@@ -127,7 +140,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     sigma = matrix(work, at, 2 * n + 1, padded(n))
     at += sigma.size
     U = matrix(work, at, n, padded(n))
-    nu, r, S, V, C, W, room, _ = gaussian.scratch(work[at + U.size :], n, m)
+    nu, r, S, V, C, W, room, _ = shared.scratch(work[at + U.size :], n, m)
     numbers = options(context)
     w = numbers[OUTER]
     spread = numbers[SPREAD]

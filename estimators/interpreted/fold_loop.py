@@ -1,6 +1,6 @@
 """The fold's loop in Python, for filters that are not compiled: the same events, rows and order as the kernel's.
 
-What the kernel gets as addresses this loop gets as Python functions, and its context is a `View`; see filter.py for
+What the kernel gets as addresses this loop gets as Python functions, and its context is a `View`; see estimator.py for
 the four functions. Everything else, snapshots and rewinds too, is the Fold's and knows no difference.
 """
 

@@ -1,7 +1,7 @@
 """What a filter in Python sees of a model and a tuning: functions of blocks of states, and numbers.
 
-The context (see context.py) says the same to a compiled filter; a view wraps it, so that both judge a reading by the
-same code.
+The context (see compiled/context.py) says the same to a compiled filter; a view wraps it, so that both judge a reading
+by the same code.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ..track import FAILED
 from ..tuning import Tuning
 
 _STEP = 6e-6
-"""Of a central difference, relative: about the cube root of the rounding error (see jacobians.py)."""
+"""Of a central difference, relative: about the cube root of the rounding error (see compiled/jacobians.py)."""
 
 
 class View:

@@ -41,7 +41,7 @@ def _code(function: Any) -> CodeType | None:
     function = function.func if isinstance(function, partial) else function
     code = getattr(function, "__code__", None) or getattr(type(function).__call__, "__code__", None)
     if code and "inner" in code.co_freevars and Path(code.co_filename).parent == Path(__file__).parent:
-        # A wrapper of joint.py or indicator.py: the model's own function is inside.
+        # A wrapper of joint.py or mode_as_number.py: the model's own function is inside.
         return _code(function.__closure__[code.co_freevars.index("inner")].cell_contents)
     return code
 

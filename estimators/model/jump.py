@@ -2,7 +2,7 @@
 
     m' ~ chances(x, u, p, dt),   then   x' = f(x with m', u, p, dt) + w
 
-Filters that sample draw the jump; the others see the model of indicator.py.
+Filters that sample draw the jump; the others see the model of mode_as_number.py.
 
 Source: Doucet, Gordon & Krishnamurthy (2001), Particle filters for state estimation of jump Markov linear systems,
 doi:10.1109/78.905890, section II (the mode jumps first, then the state moves in the new mode).

@@ -3,7 +3,7 @@
 x' = f(x, u, p, dt) + w,   w ~ N(0, Q(x, u, p, dt))
 y  = h(x, u, p) + v,       v ~ N(0, R)
 
-A model is written once, for one state, in plain Python that fills `out`; `compiled.py` turns it into machine code
+A model is written once, for one state, in plain Python that fills `out`; `compiled/` turns it into machine code
 that every filter calls.
 """
 

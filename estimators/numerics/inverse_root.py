@@ -5,7 +5,7 @@ A = Hᵀ T H with H a product of reflections and T tridiagonal; and the inverse 
     (I + T)^(-1/2) ≈ Σ_k w_k ((1 + σ_k) I + T)⁻¹,
 
 to the last bit with a dozen or two of them: the trapezoidal rule on an integral that elliptic functions have smoothed.
-Each is a tridiagonal system, and all are solved side by side in vectors. Turning the vector by the rotations of a QL
+Each is a tridiagonal system, and all are solved side by side in simd_ir. Turning the vector by the rotations of a QL
 iteration takes ten times as long.
 
 Source: Hale, Higham & Trefethen (2008), Computing A^α, log(A), and related matrix functions by contour integrals,
@@ -24,7 +24,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from scipy.special import ellipk, ellipkm1
 
-from . import simd_ir as vectors
+from . import simd_ir
 from .jit import jit
 from .simd import add_scaled, dot
 from .simd_ir import LANES
@@ -104,22 +104,22 @@ def resolve(
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         n, blocks = given[0], given[4]
-        d, e, b, shifts, weights, factors, out = (vectors.pointer(builder, given[k]) for k in (1, 2, 3, 5, 6, 7, 8))
-        lanes = vectors.constant(LANES)
-        values = builder.gep(factors, [builder.mul(builder.add(n, vectors.constant(1)), lanes)])
+        d, e, b, shifts, weights, factors, out = (simd_ir.pointer(builder, given[k]) for k in (1, 2, 3, 5, 6, 7, 8))
+        lanes = simd_ir.constant(LANES)
+        values = builder.gep(factors, [builder.mul(builder.add(n, simd_ir.constant(1)), lanes)])
         sums = builder.gep(values, [builder.mul(n, lanes)])
-        nothing, one = (ir.Constant(vectors.VECTOR, [number] * LANES) for number in (0.0, 1.0))
-        inverse, y = cgutils.alloca_once(builder, vectors.VECTOR), cgutils.alloca_once(builder, vectors.VECTOR)
+        nothing, one = (ir.Constant(simd_ir.VECTOR, [number] * LANES) for number in (0.0, 1.0))
+        inverse, y = cgutils.alloca_once(builder, simd_ir.VECTOR), cgutils.alloca_once(builder, simd_ir.VECTOR)
 
         def entry(pointer: Any, i: Any) -> Any:
-            return vectors.broadcast(builder, builder.load(builder.gep(pointer, [i])))
+            return simd_ir.broadcast(builder, builder.load(builder.gep(pointer, [i])))
 
         with cgutils.for_range(builder, n) as loop:
-            vectors.store(builder, nothing, sums, builder.mul(loop.index, lanes))
-        vectors.store(builder, nothing, factors, builder.mul(n, lanes))
+            simd_ir.store(builder, nothing, sums, builder.mul(loop.index, lanes))
+        simd_ir.store(builder, nothing, factors, builder.mul(n, lanes))
         with cgutils.for_range(builder, blocks) as block:
             at = builder.mul(block.index, lanes)
-            shift, weight = vectors.load(builder, shifts, at), vectors.load(builder, weights, at)
+            shift, weight = simd_ir.load(builder, shifts, at), simd_ir.load(builder, weights, at)
             builder.store(nothing, inverse)
             builder.store(nothing, y)
             with cgutils.for_range(builder, n) as loop:
@@ -127,22 +127,22 @@ def resolve(
                 beside = entry(e, i)
                 factor = builder.fmul(beside, builder.load(inverse))
                 minus = builder.fneg(factor)
-                pivot = vectors.multiply_add(builder, minus, beside, builder.fadd(entry(d, i), shift))
-                value = vectors.multiply_add(builder, minus, builder.load(y), builder.fmul(weight, entry(b, i)))
+                pivot = simd_ir.multiply_add(builder, minus, beside, builder.fadd(entry(d, i), shift))
+                value = simd_ir.multiply_add(builder, minus, builder.load(y), builder.fmul(weight, entry(b, i)))
                 inverted = builder.fdiv(one, pivot)
                 builder.store(inverted, inverse)
                 builder.store(value, y)
-                vectors.store(builder, factor, factors, to)
-                vectors.store(builder, builder.fmul(value, inverted), values, to)
+                simd_ir.store(builder, factor, factors, to)
+                simd_ir.store(builder, builder.fmul(value, inverted), values, to)
             builder.store(nothing, y)
             with cgutils.for_range(builder, n) as loop:
-                to = builder.mul(builder.sub(builder.sub(n, vectors.constant(1)), loop.index), lanes)
-                factor = builder.fneg(vectors.load(builder, factors, builder.add(to, lanes)))
-                x = vectors.multiply_add(builder, factor, builder.load(y), vectors.load(builder, values, to))
+                to = builder.mul(builder.sub(builder.sub(n, simd_ir.constant(1)), loop.index), lanes)
+                factor = builder.fneg(simd_ir.load(builder, factors, builder.add(to, lanes)))
+                x = simd_ir.multiply_add(builder, factor, builder.load(y), simd_ir.load(builder, values, to))
                 builder.store(x, y)
-                vectors.store(builder, builder.fadd(vectors.load(builder, sums, to), x), sums, to)
+                simd_ir.store(builder, builder.fadd(simd_ir.load(builder, sums, to), x), sums, to)
         with cgutils.for_range(builder, n) as loop:
-            total = vectors.sum_of(builder, vectors.load(builder, sums, builder.mul(loop.index, lanes)))
+            total = simd_ir.sum_of(builder, simd_ir.load(builder, sums, builder.mul(loop.index, lanes)))
             builder.store(total, builder.gep(out, [loop.index]))
         return context.get_dummy_value()
 

@@ -35,14 +35,16 @@ def cache_folder() -> Path:
     """Where machine code is kept: per user, and apart for each version of the sources.
 
     Numba looks only at the file of the function it compiles, not at those that the function calls, or takes a constant
-    from; so the sources of this folder that have to do with compiling are part of the path, and an edit to any of them
-    compiles all anew.
+    from; so the sources of the package that have to do with compiling are part of the path, and an edit to any of them
+    compiles all anew. The models that ship are left out: each is compiled by itself.
     """
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     digest = hashlib.sha256(numba.__version__.encode())
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    package = Path(__file__).parent.parent
+    for path in sorted(package.rglob("*.py")):
         source = path.read_bytes()
-        if b"jit" in source or b"intrinsic" in source or path.name in ("log.py", "model.py"):
+        compiling = b"jit" in source or b"intrinsic" in source or path.name in ("log.py", "state_space.py")
+        if compiling and package / "models" not in path.parents:
             digest.update(source)
     return base / "nisus" / "numba" / digest.hexdigest()[:16]
 

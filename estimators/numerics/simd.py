@@ -16,7 +16,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from . import simd_ir as vectors
+from . import simd_ir
 from .simd_ir import LANES
 
 WIDE = 32
@@ -31,32 +31,32 @@ def _combining(width: int) -> Any:
         """out[:] = Σ_k weights[k] x[k·stride :], k < count (at least 1), over all the columns of a block."""
 
         def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            w, x, out = (vectors.pointer(builder, given[k]) for k in (0, 2, 4))
+            w, x, out = (simd_ir.pointer(builder, given[k]) for k in (0, 2, 4))
             count, stride = given[1], given[3]
             before = builder.block
             loop, done = builder.append_basic_block("loop"), builder.append_basic_block("done")
             builder.branch(loop)
             builder.position_at_end(loop)
-            k = builder.phi(vectors.I64)
-            k.add_incoming(vectors.constant(0), before)
-            sums = [builder.phi(vectors.VECTOR) for _ in range(width)]
-            weight = vectors.broadcast(builder, builder.load(builder.gep(w, [k])))
+            k = builder.phi(simd_ir.I64)
+            k.add_incoming(simd_ir.constant(0), before)
+            sums = [builder.phi(simd_ir.VECTOR) for _ in range(width)]
+            weight = simd_ir.broadcast(builder, builder.load(builder.gep(w, [k])))
             row = builder.gep(x, [builder.mul(k, stride)])
             added = []
             for v, total in enumerate(sums):
-                total.add_incoming(vectors.ZERO, before)
+                total.add_incoming(simd_ir.ZERO, before)
                 added.append(
-                    vectors.multiply_add(
-                        builder, weight, vectors.load(builder, row, vectors.constant(v * LANES)), total
+                    simd_ir.multiply_add(
+                        builder, weight, simd_ir.load(builder, row, simd_ir.constant(v * LANES)), total
                     )
                 )
                 total.add_incoming(added[-1], loop)
-            following = builder.add(k, vectors.constant(1))
+            following = builder.add(k, simd_ir.constant(1))
             k.add_incoming(following, loop)
             builder.cbranch(builder.icmp_signed("<", following, count), loop, done)
             builder.position_at_end(done)
             for v, total in enumerate(added):
-                vectors.store(builder, total, out, vectors.constant(v * LANES))
+                simd_ir.store(builder, total, out, simd_ir.constant(v * LANES))
             return context.get_dummy_value()
 
         return types.void(_i64, _i64, _i64, _i64, _i64), codegen
@@ -70,15 +70,15 @@ def _spreading(width: int) -> Any:
         """out[k·stride :] += weights[k] x[:], k < count, over all the columns of a block."""
 
         def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            w, x, out = (vectors.pointer(builder, given[k]) for k in (0, 2, 3))
-            values = [vectors.load(builder, x, vectors.constant(v * LANES)) for v in range(width)]
+            w, x, out = (simd_ir.pointer(builder, given[k]) for k in (0, 2, 3))
+            values = [simd_ir.load(builder, x, simd_ir.constant(v * LANES)) for v in range(width)]
             with cgutils.for_range(builder, given[1]) as loop:
-                weight = vectors.broadcast(builder, builder.load(builder.gep(w, [loop.index])))
+                weight = simd_ir.broadcast(builder, builder.load(builder.gep(w, [loop.index])))
                 row = builder.gep(out, [builder.mul(loop.index, given[4])])
                 for v, value in enumerate(values):
-                    at = vectors.constant(v * LANES)
-                    vectors.store(
-                        builder, vectors.multiply_add(builder, weight, value, vectors.load(builder, row, at)), row, at
+                    at = simd_ir.constant(v * LANES)
+                    simd_ir.store(
+                        builder, simd_ir.multiply_add(builder, weight, value, simd_ir.load(builder, row, at)), row, at
                     )
             return context.get_dummy_value()
 
@@ -97,22 +97,22 @@ def add_scaled(typing_context: Any, n: Any, a: Any, x: Any, y: Any) -> Any:
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         n, a = given[0], given[1]
-        x, y = vectors.pointer(builder, given[2]), vectors.pointer(builder, given[3])
-        wide = vectors.broadcast(builder, a)
+        x, y = simd_ir.pointer(builder, given[2]), simd_ir.pointer(builder, given[3])
+        wide = simd_ir.broadcast(builder, a)
 
         def whole(i: Any) -> None:
-            vectors.store(
+            simd_ir.store(
                 builder,
-                vectors.multiply_add(builder, wide, vectors.load(builder, x, i), vectors.load(builder, y, i)),
+                simd_ir.multiply_add(builder, wide, simd_ir.load(builder, x, i), simd_ir.load(builder, y, i)),
                 y,
                 i,
             )
 
         def single(i: Any) -> None:
             at = builder.gep(y, [i])
-            builder.store(vectors.multiply_add(builder, a, builder.load(builder.gep(x, [i])), builder.load(at)), at)
+            builder.store(simd_ir.multiply_add(builder, a, builder.load(builder.gep(x, [i])), builder.load(at)), at)
 
-        vectors.in_vectors(builder, n, whole, single)
+        simd_ir.in_vectors(builder, n, whole, single)
         return context.get_dummy_value()
 
     return types.void(_i64, _f64, _i64, _i64), codegen
@@ -124,7 +124,7 @@ def combine(typing_context: Any, count: Any, weights: Any, apart: Any, x: Any, s
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         count, apart, stride, n = given[0], given[2], given[4], given[5]
-        w, x, out = (vectors.pointer(builder, given[k]) for k in (1, 3, 6))
+        w, x, out = (simd_ir.pointer(builder, given[k]) for k in (1, 3, 6))
 
         def summed(i: Any, zero: Any, load: Any, spread: Any) -> Any:
             sums = cgutils.alloca_once(builder, zero.type)
@@ -132,22 +132,22 @@ def combine(typing_context: Any, count: Any, weights: Any, apart: Any, x: Any, s
             with cgutils.for_range(builder, count) as loop:
                 weight = builder.load(builder.gep(w, [builder.mul(loop.index, apart)]))
                 row = builder.gep(x, [builder.mul(loop.index, stride)])
-                builder.store(vectors.multiply_add(builder, spread(weight), load(row), builder.load(sums)), sums)
+                builder.store(simd_ir.multiply_add(builder, spread(weight), load(row), builder.load(sums)), sums)
             return builder.load(sums)
 
         def whole(i: Any) -> None:
-            zero = vectors.ZERO
+            zero = simd_ir.ZERO
             added = summed(
-                i, zero, lambda row: vectors.load(builder, row, i), lambda weight: vectors.broadcast(builder, weight)
+                i, zero, lambda row: simd_ir.load(builder, row, i), lambda weight: simd_ir.broadcast(builder, weight)
             )
-            vectors.store(builder, added, out, i)
+            simd_ir.store(builder, added, out, i)
 
         def single(i: Any) -> None:
-            zero = ir.Constant(vectors.F64, 0.0)
+            zero = ir.Constant(simd_ir.F64, 0.0)
             added = summed(i, zero, lambda row: builder.load(builder.gep(row, [i])), lambda weight: weight)
             builder.store(added, builder.gep(out, [i]))
 
-        vectors.in_vectors(builder, n, whole, single)
+        simd_ir.in_vectors(builder, n, whole, single)
         return context.get_dummy_value()
 
     return types.void(_i64, _i64, _i64, _i64, _i64, _i64, _i64), codegen
@@ -169,7 +169,7 @@ def combine_four(
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         count, apart, stride, n, width = (given[k] for k in (0, 2, 4, 5, 7))
-        w, x, out = (vectors.pointer(builder, given[k]) for k in (1, 3, 6))
+        w, x, out = (simd_ir.pointer(builder, given[k]) for k in (1, 3, 6))
 
         def summed(kind: Any, load: Any, spread: Any, store: Any) -> None:
             sums = [cgutils.alloca_once(builder, kind) for _ in range(4)]
@@ -179,28 +179,28 @@ def combine_four(
                 weight = builder.gep(w, [builder.mul(loop.index, apart)])
                 value = load(builder.gep(x, [builder.mul(loop.index, stride)]))
                 for i, one in enumerate(sums):
-                    own = spread(builder.load(builder.gep(weight, [vectors.constant(i)])))
-                    builder.store(vectors.multiply_add(builder, own, value, builder.load(one)), one)
+                    own = spread(builder.load(builder.gep(weight, [simd_ir.constant(i)])))
+                    builder.store(simd_ir.multiply_add(builder, own, value, builder.load(one)), one)
             for i, one in enumerate(sums):
-                store(builder.load(one), builder.gep(out, [builder.mul(width, vectors.constant(i))]))
+                store(builder.load(one), builder.gep(out, [builder.mul(width, simd_ir.constant(i))]))
 
         def whole(at: Any) -> None:
             summed(
-                vectors.VECTOR,
-                lambda row: vectors.load(builder, row, at),
-                lambda weight: vectors.broadcast(builder, weight),
-                lambda value, row: vectors.store(builder, value, row, at),
+                simd_ir.VECTOR,
+                lambda row: simd_ir.load(builder, row, at),
+                lambda weight: simd_ir.broadcast(builder, weight),
+                lambda value, row: simd_ir.store(builder, value, row, at),
             )
 
         def single(at: Any) -> None:
             summed(
-                vectors.F64,
+                simd_ir.F64,
                 lambda row: builder.load(builder.gep(row, [at])),
                 lambda weight: weight,
                 lambda value, row: builder.store(value, builder.gep(row, [at])),
             )
 
-        vectors.in_vectors(builder, n, whole, single)
+        simd_ir.in_vectors(builder, n, whole, single)
         return context.get_dummy_value()
 
     return types.void(_i64, _i64, _i64, _i64, _i64, _i64, _i64, _i64), codegen
@@ -223,23 +223,23 @@ def add_outer(
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         rows, n, a, stride = (given[k] for k in (0, 1, 2, 8))
-        left, x, right, y, z = (vectors.pointer(builder, given[k]) for k in (3, 4, 5, 6, 7))
+        left, x, right, y, z = (simd_ir.pointer(builder, given[k]) for k in (3, 4, 5, 6, 7))
 
         def added(own_x: Any, own_y: Any, load: Any, spread: Any, store: Any) -> None:
             own_x, own_y = builder.fmul(spread(a), own_x), builder.fmul(spread(a), own_y)
             with cgutils.for_range(builder, rows) as loop:
                 row = builder.gep(z, [builder.mul(loop.index, stride)])
                 one, other = (spread(builder.load(builder.gep(side, [loop.index]))) for side in (left, right))
-                first = vectors.multiply_add(builder, one, own_x, load(row))
-                store(vectors.multiply_add(builder, other, own_y, first), row)
+                first = simd_ir.multiply_add(builder, one, own_x, load(row))
+                store(simd_ir.multiply_add(builder, other, own_y, first), row)
 
         def whole(i: Any) -> None:
             added(
-                vectors.load(builder, x, i),
-                vectors.load(builder, y, i),
-                lambda row: vectors.load(builder, row, i),
-                lambda number: vectors.broadcast(builder, number),
-                lambda value, row: vectors.store(builder, value, row, i),
+                simd_ir.load(builder, x, i),
+                simd_ir.load(builder, y, i),
+                lambda row: simd_ir.load(builder, row, i),
+                lambda number: simd_ir.broadcast(builder, number),
+                lambda value, row: simd_ir.store(builder, value, row, i),
             )
 
         def single(i: Any) -> None:
@@ -251,7 +251,7 @@ def add_outer(
                 lambda value, row: builder.store(value, builder.gep(row, [i])),
             )
 
-        vectors.in_vectors(builder, n, whole, single)
+        simd_ir.in_vectors(builder, n, whole, single)
         return context.get_dummy_value()
 
     return types.void(_i64, _i64, _f64, _i64, _i64, _i64, _i64, _i64, _i64), codegen
@@ -263,17 +263,17 @@ def rotate(typing_context: Any, n: Any, c: Any, s: Any, x: Any, y: Any) -> Any:
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         n, c, s = given[:3]
-        x, y = vectors.pointer(builder, given[3]), vectors.pointer(builder, given[4])
-        wide_c, wide_s = vectors.broadcast(builder, c), vectors.broadcast(builder, s)
+        x, y = simd_ir.pointer(builder, given[3]), simd_ir.pointer(builder, given[4])
+        wide_c, wide_s = simd_ir.broadcast(builder, c), simd_ir.broadcast(builder, s)
 
         def turned(c: Any, s: Any, a: Any, b: Any) -> tuple[Any, Any]:
-            left = vectors.multiply_add(builder, c, a, builder.fneg(builder.fmul(s, b)))
-            return left, vectors.multiply_add(builder, s, a, builder.fmul(c, b))
+            left = simd_ir.multiply_add(builder, c, a, builder.fneg(builder.fmul(s, b)))
+            return left, simd_ir.multiply_add(builder, s, a, builder.fmul(c, b))
 
         def whole(i: Any) -> None:
-            left, right = turned(wide_c, wide_s, vectors.load(builder, x, i), vectors.load(builder, y, i))
-            vectors.store(builder, left, x, i)
-            vectors.store(builder, right, y, i)
+            left, right = turned(wide_c, wide_s, simd_ir.load(builder, x, i), simd_ir.load(builder, y, i))
+            simd_ir.store(builder, left, x, i)
+            simd_ir.store(builder, right, y, i)
 
         def single(i: Any) -> None:
             at_x, at_y = builder.gep(x, [i]), builder.gep(y, [i])
@@ -281,7 +281,7 @@ def rotate(typing_context: Any, n: Any, c: Any, s: Any, x: Any, y: Any) -> Any:
             builder.store(left, at_x)
             builder.store(right, at_y)
 
-        vectors.in_vectors(builder, n, whole, single)
+        simd_ir.in_vectors(builder, n, whole, single)
         return context.get_dummy_value()
 
     return types.void(_i64, _f64, _f64, _i64, _i64), codegen
@@ -289,16 +289,16 @@ def rotate(typing_context: Any, n: Any, c: Any, s: Any, x: Any, y: Any) -> Any:
 
 def _summing(builder: Any, n: Any, whole: Any, single: Any) -> Any:
     """Σ over n numbers, by vectors: total = whole(i, total) for the full ones, then single(i, sum) for the rest."""
-    wide, narrow = cgutils.alloca_once(builder, vectors.VECTOR), cgutils.alloca_once(builder, vectors.F64)
-    builder.store(vectors.ZERO, wide)
-    builder.store(ir.Constant(vectors.F64, 0.0), narrow)
-    vectors.in_vectors(
+    wide, narrow = cgutils.alloca_once(builder, simd_ir.VECTOR), cgutils.alloca_once(builder, simd_ir.F64)
+    builder.store(simd_ir.ZERO, wide)
+    builder.store(ir.Constant(simd_ir.F64, 0.0), narrow)
+    simd_ir.in_vectors(
         builder,
         n,
         lambda i: builder.store(whole(i, builder.load(wide)), wide),
         lambda i: builder.store(single(i, builder.load(narrow)), narrow),
     )
-    return builder.fadd(vectors.sum_of(builder, builder.load(wide)), builder.load(narrow))
+    return builder.fadd(simd_ir.sum_of(builder, builder.load(wide)), builder.load(narrow))
 
 
 @intrinsic
@@ -306,11 +306,11 @@ def total(typing_context: Any, n: Any, x: Any) -> Any:
     """Σ x[:n]."""
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        x = vectors.pointer(builder, given[1])
+        x = simd_ir.pointer(builder, given[1])
         return _summing(
             builder,
             given[0],
-            lambda i, sums: builder.fadd(sums, vectors.load(builder, x, i)),
+            lambda i, sums: builder.fadd(sums, simd_ir.load(builder, x, i)),
             lambda i, sums: builder.fadd(sums, builder.load(builder.gep(x, [i]))),
         )
 
@@ -322,14 +322,14 @@ def dot(typing_context: Any, n: Any, a: Any, b: Any) -> Any:
     """Σ a[:n] b[:n]."""
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        a, b = vectors.pointer(builder, given[1]), vectors.pointer(builder, given[2])
+        a, b = simd_ir.pointer(builder, given[1]), simd_ir.pointer(builder, given[2])
         return _summing(
             builder,
             given[0],
-            lambda i, total: vectors.multiply_add(
-                builder, vectors.load(builder, a, i), vectors.load(builder, b, i), total
+            lambda i, total: simd_ir.multiply_add(
+                builder, simd_ir.load(builder, a, i), simd_ir.load(builder, b, i), total
             ),
-            lambda i, total: vectors.multiply_add(
+            lambda i, total: simd_ir.multiply_add(
                 builder, builder.load(builder.gep(a, [i])), builder.load(builder.gep(b, [i])), total
             ),
         )
@@ -342,11 +342,11 @@ def weighted(typing_context: Any, n: Any, w: Any, x: Any, out: Any) -> Any:
     """out[:n] = w[:n] x[:n]; returns Σ out[:n]."""
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        w, x, out = (vectors.pointer(builder, given[k]) for k in (1, 2, 3))
+        w, x, out = (simd_ir.pointer(builder, given[k]) for k in (1, 2, 3))
 
         def whole(i: Any, total: Any) -> Any:
-            value = builder.fmul(vectors.load(builder, w, i), vectors.load(builder, x, i))
-            vectors.store(builder, value, out, i)
+            value = builder.fmul(simd_ir.load(builder, w, i), simd_ir.load(builder, x, i))
+            simd_ir.store(builder, value, out, i)
             return builder.fadd(total, value)
 
         def single(i: Any, total: Any) -> Any:

@@ -1,4 +1,4 @@
-"""The exponential function of many numbers, in vectors."""
+"""The exponential function of many numbers, in simd_ir."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from . import simd_ir as vectors
+from . import simd_ir
 from .simd_ir import LANES
 
 _i64, _f64 = types.int64, types.float64
@@ -34,7 +34,7 @@ def _exp(builder: Any, x: Any) -> Any:
     """
     kind = x.type
     wide = isinstance(kind, ir.VectorType)
-    whole_kind = ir.VectorType(vectors.I64, LANES) if wide else vectors.I64
+    whole_kind = ir.VectorType(simd_ir.I64, LANES) if wide else simd_ir.I64
 
     def number(value: float) -> Any:
         return ir.Constant(kind, [value] * LANES if wide else value)
@@ -45,13 +45,13 @@ def _exp(builder: Any, x: Any) -> Any:
     low = builder.fcmp_ordered("<", x, number(_LOWEST))
     high = builder.fcmp_ordered(">", x, number(_HIGHEST))
     bounded = builder.select(low, number(_LOWEST), builder.select(high, number(_HIGHEST), x))
-    shifted = vectors.multiply_add(builder, bounded, number(1.4426950408889634), number(_ROUND))
+    shifted = simd_ir.multiply_add(builder, bounded, number(1.4426950408889634), number(_ROUND))
     k = builder.fsub(shifted, number(_ROUND))
-    r = vectors.multiply_add(builder, k, number(-_LN2_HIGH), bounded)
-    r = vectors.multiply_add(builder, k, number(-_LN2_LOW), r)
+    r = simd_ir.multiply_add(builder, k, number(-_LN2_HIGH), bounded)
+    r = simd_ir.multiply_add(builder, k, number(-_LN2_LOW), r)
     value = number(1.0 / math.factorial(13))
     for power in range(12, -1, -1):
-        value = vectors.multiply_add(builder, value, r, number(1.0 / math.factorial(power)))
+        value = simd_ir.multiply_add(builder, value, r, number(1.0 / math.factorial(power)))
     exponent = builder.add(builder.bitcast(shifted, whole_kind), whole_number(1023))
     power_of_two = builder.bitcast(builder.shl(exponent, whole_number(52)), kind)
     value = builder.fmul(value, power_of_two)
@@ -65,17 +65,17 @@ def exp_minus(typing_context: Any, n: Any, x: Any, shift: Any, out: Any) -> Any:
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         n, shift = given[0], given[2]
-        x, out = vectors.pointer(builder, given[1]), vectors.pointer(builder, given[3])
-        wide = vectors.broadcast(builder, shift)
+        x, out = simd_ir.pointer(builder, given[1]), simd_ir.pointer(builder, given[3])
+        wide = simd_ir.broadcast(builder, shift)
 
         def whole(i: Any) -> None:
-            vectors.store(builder, _exp(builder, builder.fsub(vectors.load(builder, x, i), wide)), out, i)
+            simd_ir.store(builder, _exp(builder, builder.fsub(simd_ir.load(builder, x, i), wide)), out, i)
 
         def single(i: Any) -> None:
             value = _exp(builder, builder.fsub(builder.load(builder.gep(x, [i])), shift))
             builder.store(value, builder.gep(out, [i]))
 
-        vectors.in_vectors(builder, n, whole, single)
+        simd_ir.in_vectors(builder, n, whole, single)
         return context.get_dummy_value()
 
     return types.void(_i64, _i64, _f64, _i64), codegen

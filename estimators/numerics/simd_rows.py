@@ -1,4 +1,4 @@
-"""Small matrices whose rows are as wide as whole vectors: sigma points and what becomes of them, in vectors.
+"""Small matrices whose rows are as wide as whole vectors: sigma points and what becomes of them, in simd_ir.
 
 All take addresses, as in simd.py. What stands behind a row's own numbers is never part of a result.
 """
@@ -13,7 +13,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from . import simd_ir as vectors
+from . import simd_ir
 from .simd_ir import LANES
 
 _i64, _f64 = types.int64, types.float64
@@ -29,21 +29,21 @@ def centre(typing_context: Any, rows: Any, k: Any, width: Any, x: Any, w: Any, m
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         rows, k, width = given[:3]
-        x, mean = vectors.pointer(builder, given[3]), vectors.pointer(builder, given[5])
-        weight = vectors.broadcast(builder, given[4])
-        nothing = vectors.ZERO
-        lanes = ir.Constant(ir.VectorType(vectors.I64, LANES), list(range(LANES)))
-        sums = cgutils.alloca_once(builder, vectors.VECTOR)
+        x, mean = simd_ir.pointer(builder, given[3]), simd_ir.pointer(builder, given[5])
+        weight = simd_ir.broadcast(builder, given[4])
+        nothing = simd_ir.ZERO
+        lanes = ir.Constant(ir.VectorType(simd_ir.I64, LANES), list(range(LANES)))
+        sums = cgutils.alloca_once(builder, simd_ir.VECTOR)
 
         def others(body: Any) -> None:
-            with vectors.steps(builder, 1, rows) as r:
+            with simd_ir.steps(builder, 1, rows) as r:
                 body(builder.gep(x, [builder.mul(r, width)]))
 
-        with vectors.steps(builder, 0, width, LANES) as at:
-            own = builder.icmp_signed("<", lanes, vectors.broadcast(builder, builder.sub(k, at)))
+        with simd_ir.steps(builder, 0, width, LANES) as at:
+            own = builder.icmp_signed("<", lanes, simd_ir.broadcast(builder, builder.sub(k, at)))
 
             def load(row: Any) -> Any:
-                return builder.select(own, vectors.load(builder, row, at), nothing)
+                return builder.select(own, simd_ir.load(builder, row, at), nothing)
 
             central = load(x)
             builder.store(nothing, sums)
@@ -53,13 +53,13 @@ def centre(typing_context: Any, rows: Any, k: Any, width: Any, x: Any, w: Any, m
 
             others(add)
             shift = builder.fmul(weight, builder.load(sums))
-            vectors.store(builder, builder.fadd(central, shift), mean, at)
+            simd_ir.store(builder, builder.fadd(central, shift), mean, at)
 
             def deviate(row: Any) -> None:
-                vectors.store(builder, builder.fsub(builder.fsub(load(row), central), shift), row, at)
+                simd_ir.store(builder, builder.fsub(builder.fsub(load(row), central), shift), row, at)
 
             others(deviate)
-            vectors.store(builder, builder.fsub(nothing, shift), x, at)
+            simd_ir.store(builder, builder.fsub(nothing, shift), x, at)
         return context.get_dummy_value()
 
     return types.void(_i64, _i64, _i64, _i64, _f64, _i64), codegen
@@ -86,13 +86,13 @@ def product(
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         n, rows, a_width, b_width, columns = (given[k] for k in (0, 1, 3, 5, 9))
-        a, b, out = (vectors.pointer(builder, given[k]) for k in (2, 4, 8))
-        first, weight = vectors.broadcast(builder, given[6]), vectors.broadcast(builder, given[7])
-        sums = [cgutils.alloca_once(builder, vectors.VECTOR) for _ in range(4)]
+        a, b, out = (simd_ir.pointer(builder, given[k]) for k in (2, 4, 8))
+        first, weight = simd_ir.broadcast(builder, given[6]), simd_ir.broadcast(builder, given[7])
+        sums = [cgutils.alloca_once(builder, simd_ir.VECTOR) for _ in range(4)]
 
         def entries(row: Any, i: Any, count: int) -> list[Any]:
             return [
-                vectors.broadcast(builder, builder.load(builder.gep(row, [builder.add(i, vectors.constant(k))])))
+                simd_ir.broadcast(builder, builder.load(builder.gep(row, [builder.add(i, simd_ir.constant(k))])))
                 for k in range(count)
             ]
 
@@ -100,25 +100,25 @@ def product(
             """Rows i, …, i + count - 1 of one vector's columns."""
             mine = sums[:count]
             for one in mine:
-                builder.store(vectors.ZERO, one)
-            with vectors.steps(builder, 1, rows) as r:
-                row = vectors.load(builder, builder.gep(b, [builder.mul(r, b_width)]), at)
+                builder.store(simd_ir.ZERO, one)
+            with simd_ir.steps(builder, 1, rows) as r:
+                row = simd_ir.load(builder, builder.gep(b, [builder.mul(r, b_width)]), at)
                 own = entries(builder.gep(a, [builder.mul(r, a_width)]), i, count)
                 for one, entry in zip(mine, own, strict=True):
-                    builder.store(vectors.multiply_add(builder, entry, row, builder.load(one)), one)
-            zeroth = vectors.load(builder, b, at)
-            mask = vectors.first(builder, builder.sub(columns, at))
+                    builder.store(simd_ir.multiply_add(builder, entry, row, builder.load(one)), one)
+            zeroth = simd_ir.load(builder, b, at)
+            mask = simd_ir.first(builder, builder.sub(columns, at))
             for k, (one, entry) in enumerate(zip(mine, entries(a, i, count), strict=True)):
                 own = builder.fmul(first, builder.fmul(entry, zeroth))
                 whole = builder.fadd(builder.fmul(weight, builder.load(one)), own)
-                to = builder.gep(out, [builder.mul(builder.add(i, vectors.constant(k)), columns)])
-                vectors.store_first(builder, whole, to, at, mask)
+                to = builder.gep(out, [builder.mul(builder.add(i, simd_ir.constant(k)), columns)])
+                simd_ir.store_first(builder, whole, to, at, mask)
 
-        begin = vectors.constant(0)
+        begin = simd_ir.constant(0)
         for count in (4, 2, 1):
-            end = builder.and_(n, vectors.constant(-count))
-            with vectors.steps(builder, begin, end, count) as i:
-                with vectors.steps(builder, 0, b_width, LANES) as at:
+            end = builder.and_(n, simd_ir.constant(-count))
+            with simd_ir.steps(builder, begin, end, count) as i:
+                with simd_ir.steps(builder, 0, b_width, LANES) as at:
                     tile(i, at, count)
             begin = end
         return context.get_dummy_value()
@@ -132,20 +132,20 @@ def subtract_squares(typing_context: Any, n: Any, rows: Any, w: Any, width: Any,
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         n, rows, width = given[0], given[1], given[3]
-        w, p = vectors.pointer(builder, given[2]), vectors.pointer(builder, given[4])
-        left = cgutils.alloca_once(builder, vectors.VECTOR)
-        with vectors.steps(builder, 0, width, LANES) as at:
-            own = vectors.first(builder, builder.sub(n, at))
+        w, p = simd_ir.pointer(builder, given[2]), simd_ir.pointer(builder, given[4])
+        left = cgutils.alloca_once(builder, simd_ir.VECTOR)
+        with simd_ir.steps(builder, 0, width, LANES) as at:
+            own = simd_ir.first(builder, builder.sub(n, at))
             with cgutils.for_range(builder, n) as loop:
                 to = builder.gep(p, [builder.mul(loop.index, n)])
-                builder.store(vectors.load_first(builder, to, at, own), left)
+                builder.store(simd_ir.load_first(builder, to, at, own), left)
                 with cgutils.for_range(builder, rows) as inner:
                     row = builder.gep(w, [builder.mul(inner.index, width)])
-                    factor = vectors.broadcast(builder, builder.fneg(builder.load(builder.gep(row, [loop.index]))))
+                    factor = simd_ir.broadcast(builder, builder.fneg(builder.load(builder.gep(row, [loop.index]))))
                     builder.store(
-                        vectors.multiply_add(builder, factor, vectors.load(builder, row, at), builder.load(left)), left
+                        simd_ir.multiply_add(builder, factor, simd_ir.load(builder, row, at), builder.load(left)), left
                     )
-                vectors.store_first(builder, builder.load(left), to, at, own)
+                simd_ir.store_first(builder, builder.load(left), to, at, own)
         return context.get_dummy_value()
 
     return types.void(_i64, _i64, _i64, _i64, _i64), codegen
@@ -160,46 +160,46 @@ def factor_rows(typing_context: Any, n: Any, a: Any, u: Any, width: Any) -> Any:
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         n, width = given[0], given[3]
-        a, u = (vectors.pointer(builder, given[k]) for k in (1, 2))
-        good = cgutils.alloca_once(builder, vectors.I64)
-        builder.store(vectors.constant(1), good)
-        one, nothing = ir.Constant(vectors.F64, 1.0), vectors.ZERO
+        a, u = (simd_ir.pointer(builder, given[k]) for k in (1, 2))
+        good = cgutils.alloca_once(builder, simd_ir.I64)
+        builder.store(simd_ir.constant(1), good)
+        one, nothing = ir.Constant(simd_ir.F64, 1.0), simd_ir.ZERO
         root = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(vectors.F64, [vectors.F64]), "llvm.sqrt.f64"
+            builder.module, ir.FunctionType(simd_ir.F64, [simd_ir.F64]), "llvm.sqrt.f64"
         )
 
         def columns(first: Any) -> Any:
-            return vectors.steps(builder, first, width, LANES)
+            return simd_ir.steps(builder, first, width, LANES)
 
         with cgutils.for_range(builder, n) as loop, columns(0) as at:
             row = builder.gep(a, [builder.mul(loop.index, n)])
-            value = vectors.load_first(builder, row, at, vectors.first(builder, builder.sub(n, at)))
-            vectors.store(builder, value, builder.gep(u, [builder.mul(loop.index, width)]), at)
+            value = simd_ir.load_first(builder, row, at, simd_ir.first(builder, builder.sub(n, at)))
+            simd_ir.store(builder, value, builder.gep(u, [builder.mul(loop.index, width)]), at)
         with cgutils.for_range(builder, n) as loop:
             k = loop.index
             row = builder.gep(u, [builder.mul(k, width)])
             pivot = builder.load(builder.gep(row, [k]))
-            positive = builder.fcmp_ordered(">", pivot, ir.Constant(vectors.F64, 0.0))
-            finite = builder.fcmp_ordered("<", pivot, ir.Constant(vectors.F64, math.inf))
-            both = builder.zext(builder.and_(positive, finite), vectors.I64)
+            positive = builder.fcmp_ordered(">", pivot, ir.Constant(simd_ir.F64, 0.0))
+            finite = builder.fcmp_ordered("<", pivot, ir.Constant(simd_ir.F64, math.inf))
+            both = builder.zext(builder.and_(positive, finite), simd_ir.I64)
             builder.store(builder.and_(builder.load(good), both), good)
             # The next pivot waits for a division only; the root is off its way.
             inverse = builder.fneg(builder.fdiv(one, pivot))
-            scale = vectors.broadcast(builder, builder.fdiv(one, builder.call(root, [pivot])))
-            begin = builder.and_(k, vectors.constant(-LANES))
-            with vectors.steps(builder, builder.add(k, vectors.constant(1)), n) as i:
-                factor = vectors.broadcast(builder, builder.fmul(builder.load(builder.gep(row, [i])), inverse))
+            scale = simd_ir.broadcast(builder, builder.fdiv(one, builder.call(root, [pivot])))
+            begin = builder.and_(k, simd_ir.constant(-LANES))
+            with simd_ir.steps(builder, builder.add(k, simd_ir.constant(1)), n) as i:
+                factor = simd_ir.broadcast(builder, builder.fmul(builder.load(builder.gep(row, [i])), inverse))
                 other = builder.gep(u, [builder.mul(i, width)])
                 with columns(begin) as at:
-                    value = vectors.multiply_add(
-                        builder, factor, vectors.load(builder, row, at), vectors.load(builder, other, at)
+                    value = simd_ir.multiply_add(
+                        builder, factor, simd_ir.load(builder, row, at), simd_ir.load(builder, other, at)
                     )
-                    vectors.store(builder, value, other, at)
+                    simd_ir.store(builder, value, other, at)
             with columns(0) as at:
                 # What elimination left of zeros is cleared.
-                left = vectors.first(builder, builder.sub(k, at))
-                vectors.store(
-                    builder, builder.select(left, nothing, builder.fmul(scale, vectors.load(builder, row, at))), row, at
+                left = simd_ir.first(builder, builder.sub(k, at))
+                simd_ir.store(
+                    builder, builder.select(left, nothing, builder.fmul(scale, simd_ir.load(builder, row, at))), row, at
                 )
         return builder.load(good)
 
@@ -212,19 +212,19 @@ def around(typing_context: Any, n: Any, x: Any, u: Any, apart: Any, spread: Any,
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         n, apart, width = given[0], given[3], given[6]
-        x, u, points = (vectors.pointer(builder, given[k]) for k in (1, 2, 5))
-        spread = vectors.broadcast(builder, given[4])
+        x, u, points = (simd_ir.pointer(builder, given[k]) for k in (1, 2, 5))
+        spread = simd_ir.broadcast(builder, given[4])
         half = builder.mul(n, width)
-        with vectors.steps(builder, 0, width, LANES) as at:
-            own = vectors.first(builder, builder.sub(n, at))
-            centre = vectors.load_first(builder, x, at, own)
-            vectors.store(builder, centre, points, at)
+        with simd_ir.steps(builder, 0, width, LANES) as at:
+            own = simd_ir.first(builder, builder.sub(n, at))
+            centre = simd_ir.load_first(builder, x, at, own)
+            simd_ir.store(builder, centre, points, at)
             with cgutils.for_range(builder, n) as loop:
                 row = builder.gep(u, [builder.mul(loop.index, apart)])
-                d = builder.fmul(spread, vectors.load_first(builder, row, at, own))
-                to = builder.add(builder.mul(builder.add(loop.index, vectors.constant(1)), width), at)
-                vectors.store(builder, builder.fadd(centre, d), points, to)
-                vectors.store(builder, builder.fsub(centre, d), points, builder.add(to, half))
+                d = builder.fmul(spread, simd_ir.load_first(builder, row, at, own))
+                to = builder.add(builder.mul(builder.add(loop.index, simd_ir.constant(1)), width), at)
+                simd_ir.store(builder, builder.fadd(centre, d), points, to)
+                simd_ir.store(builder, builder.fsub(centre, d), points, builder.add(to, half))
         return context.get_dummy_value()
 
     return types.void(_i64, _i64, _i64, _i64, _f64, _i64, _i64), codegen

@@ -1,4 +1,4 @@
-"""Draws of a discrete mode for filters whose particles carry one (see jump.py)."""
+"""Draws of a discrete mode for filters whose particles carry one (see model/jump.py)."""
 
 from __future__ import annotations
 

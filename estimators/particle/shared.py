@@ -42,7 +42,7 @@ MEMBERS, FRACTION, SCHEME, THREADS, BLOCK_CODE, EXTRA = range(6)
 """Positions in the context's options; `EXTRA` is the kernel's width or a proposal."""
 
 PROCESS, START, RESAMPLE, JITTER, RECOVER, PROPOSE = range(6)
-"""Streams of randomness; see random.py."""
+"""Streams of randomness; see numerics/random.py."""
 
 OPTIONS = (
     Option("particles", 2000, 2, 1e7, "", "number of particles"),

@@ -16,7 +16,7 @@ from app.recording.writer import Recorder
 from app.rerun.feed import RerunFeed
 from app.rerun.rows import RerunRows
 from app.twin.twin import load_twin
-from app.viser import field_scene as viser_field
+from app.viser import field_scene
 from app.viser.view import ViserView
 from estimators.errors import ConfigError
 from estimators.fold import Fold
@@ -272,7 +272,7 @@ def test_a_new_revision_reaches_the_viewer_with_all_its_pictures(running, tmp_pa
 
 def test_the_scene_shows_the_picture_that_is_chosen_and_the_sensor_that_is_off(running, monkeypatch):
     clock = SimpleNamespace(now=0.0)
-    monkeypatch.setattr(viser_field.time, "monotonic", lambda: clock.now)
+    monkeypatch.setattr(field_scene.time, "monotonic", lambda: clock.now)
     live = running()
     view = ViserView(live.engine, secret="s")
     try:
@@ -299,8 +299,8 @@ def test_the_scene_shows_the_picture_that_is_chosen_and_the_sensor_that_is_off(r
         monkeypatch.setattr(type(scene._image), "image", property(lambda self: None, lambda self, value: pytest.fail()))
         view.frame()
         monkeypatch.undo()
-        monkeypatch.setattr(viser_field.time, "monotonic", lambda: clock.now)
-        clock.now += viser_field.EVERY
+        monkeypatch.setattr(field_scene.time, "monotonic", lambda: clock.now)
+        clock.now += field_scene.EVERY
         scene._kind = ERROR
         view.frame()
         assert scene._title.text == "temperature: estimate − truth [°C]"

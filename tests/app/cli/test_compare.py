@@ -3,10 +3,10 @@
 import json
 import re
 
-import app.compare
 import numpy as np
 import pytest
 
+import app.cli.compare
 from app.cli.compare_fold import Figure, Row, fold_row, refold, tidy, within
 from app.cli.compare_table import Cell, read_cell, read_span, read_table, table, write_table
 from app.cli.fold import read_log
@@ -159,8 +159,8 @@ def test_all_twins_in_turn_and_those_without_a_recording_are_named(monkeypatch, 
     bad = tmp_path / "lost.yaml"
     source = "source: {type: table, files: no.csv, time: {column: t}, sensors: {winding: {columns: w}}}\n"
     bad.write_text(f"model: motor_winding\nestimator: kf\n{source}", encoding="utf-8")
-    monkeypatch.setattr(app.compare, "shipped", lambda: [str(bad), str(good)])
-    monkeypatch.setattr(app.compare, "ESTIMATORS", {"kf": ESTIMATORS["kf"]})
+    monkeypatch.setattr(app.cli.compare, "shipped", lambda: [str(bad), str(good)])
+    monkeypatch.setattr(app.cli.compare, "ESTIMATORS", {"kf": ESTIMATORS["kf"]})
     assert main(["compare", "all", "--write"]) == 2
     assert "no.csv" in capsys.readouterr().err
     assert list(read_table(good.read_text(encoding="utf-8"))) == ["kf"]

@@ -5,9 +5,9 @@ import sys
 import threading
 import time
 
-import app.compile
 import pytest
 
+import app.cli.prepare
 from app.cli.prepare import CALL_PATIENCE, CallWatch, attend
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 
@@ -95,7 +95,7 @@ class Pipe(io.StringIO):
 def test_where_output_is_redirected_it_says_what_it_does_before_it_is_done(monkeypatch):
     pipe = Pipe()
     monkeypatch.setattr(sys, "stderr", pipe)
-    monkeypatch.setattr(app.compile, "PATIENCE", 0.0)
+    monkeypatch.setattr(app.cli.prepare, "PATIENCE", 0.0)
 
     def work():
         end = time.monotonic() + 10.0

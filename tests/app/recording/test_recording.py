@@ -24,6 +24,7 @@ from estimators.log import TRUTH, Log, Readings
 from estimators.track import Track
 from estimators.tuning import Tuning
 from tests.app.scripted import MODEL, SECOND, Scripted, readings, twin, wait_for
+from tests.conftest import ROOT
 
 
 def drawn(stream):
@@ -142,13 +143,13 @@ def test_absent_recording_is_one_line(tmp_path):
 
 CHILD = """
 import sys
-sys.path[:0] = [{tests!r}, {root!r}]
+sys.path.insert(0, {root!r})
 import numpy as np
 from pathlib import Path
-from scripted import Scripted, readings, twin, wait_for
-from app import commands
-from app.engine import Engine
-from app.recorder import Recorder
+from tests.app.scripted import Scripted, readings, twin, wait_for
+from app.engine import commands
+from app.engine.engine import Engine
+from app.recording.writer import Recorder
 import time
 source = Scripted(live=True)
 engine = Engine(twin(), lambda report: source)
@@ -168,7 +169,7 @@ while True:
 
 def test_killed_process_loses_less_than_a_second(tmp_path):
     path = tmp_path / "killed.rrd"
-    code = CHILD.format(tests=str(Path(__file__).parent), root=str(Path(__file__).parents[2]), path=str(path))
+    code = CHILD.format(root=str(ROOT), path=str(path))
     child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     try:
         for line in child.stdout:
@@ -276,7 +277,7 @@ def test_a_file_that_takes_no_more_is_one_line_and_keeps_what_it_has(tmp_path):
     limited = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))\n" + CHILD
     code = limited.replace("while True", "while not engine.notices.counts().get('recording failed')")
     code += "print('LINE', [line.text for line in engine.notices.since(0) if line.level == 'error'])\n"
-    code = code.format(tests=str(Path(__file__).parent), root=str(Path(__file__).parents[2]), path=str(path))
+    code = code.format(root=str(ROOT), path=str(path))
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     (said,) = [line for line in child.stdout.splitlines() if line.startswith("LINE")]
     assert f"recording failed: {path}: it can no longer be written" in said and said.count("recording failed") == 1

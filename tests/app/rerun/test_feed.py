@@ -10,7 +10,7 @@ from rerun.chunk import RrdReader
 
 from app.engine import commands
 from app.engine.engine import Engine
-from app.rerun import feed as rerun_view
+from app.rerun import feed
 from app.rerun.feed import AHEAD, RerunFeed
 from app.rerun.layout import pair_name
 from app.rerun.pairs import ASIDE, BELOW, PANE, anchors, axis_scales, ellipse_points
@@ -260,7 +260,7 @@ def test_dates_are_dates_and_seconds_are_durations(fed):
 
 
 def test_a_history_pulled_in_pieces_is_whole(fed, monkeypatch):
-    monkeypatch.setattr(rerun_view, "ROWS", 7)
+    monkeypatch.setattr(feed, "ROWS", 7)
     t = np.arange(1, 51) * 0.1
     fed.put(readings(t, 40 + t))
     fed.next()
@@ -268,7 +268,7 @@ def test_a_history_pulled_in_pieces_is_whole(fed, monkeypatch):
 
 
 def test_rows_rewritten_between_two_pieces_count_once(fed, monkeypatch):
-    monkeypatch.setattr(rerun_view, "ROWS", 10)
+    monkeypatch.setattr(feed, "ROWS", 10)
     t = np.arange(1, 31) * 0.1
     fed.put(readings(t, 40 + t))
     pull = fed.engine.pull
@@ -299,7 +299,7 @@ def test_a_long_history_is_drawn_by_its_extremes(fed):
     fed.next()
     times, values = fed.column(f"/reading/{fed.engine.model.row_names[0]}")
     assert values.max() == 500.0
-    assert times.size <= 2 * (rerun_view.SERIES + 2)
+    assert times.size <= 2 * (feed.SERIES + 2)
     assert sum(map(len, fed.pieces)) < 3_000_000
 
 
@@ -338,7 +338,7 @@ def test_closing_gives_the_cursor_back(fed):
 def test_a_revision_that_begins_between_two_pieces_wins(fed, monkeypatch):
     fed.put(readings(np.arange(1, 21) * 0.1, 40 + np.arange(20.0)))
     pull = fed.engine.pull
-    monkeypatch.setattr(rerun_view, "ROWS", 10)
+    monkeypatch.setattr(feed, "ROWS", 10)
     seen = []
 
     def pull_and_retune(cursor, limit=None):

@@ -2,10 +2,10 @@
 
 import socket
 
-import app.review
-import app.run
 import pytest
 
+import app.cli.review
+import app.cli.run
 from app.cli.main import main
 from app.server.port import check_port
 from estimators.errors import ConfigError
@@ -24,16 +24,16 @@ def test_a_port_in_use_is_told_first(command, taken, monkeypatch, capsys):
     def too_late(*_):
         raise AssertionError("it went on")
 
-    monkeypatch.setattr(app.run, "prepare", too_late)
-    monkeypatch.setattr(app.review, "read_recording", too_late)
+    monkeypatch.setattr(app.cli.run, "prepare", too_late)
+    monkeypatch.setattr(app.cli.review, "read_recording", too_late)
     assert main([command, "motor_winding", "--port", str(taken), "--no-browser"]) == 2
     assert capsys.readouterr().err == f"nisus: port {taken}: Address already in use; choose another with --port\n"
 
 
 def test_without_a_page_the_port_does_not_matter(taken, monkeypatch):
     reached = []
-    monkeypatch.setattr(app.run, "prepare", reached.append)
-    monkeypatch.setattr(app.run, "Session", lambda *_, **__: (_ for _ in ()).throw(ConfigError("enough")))
+    monkeypatch.setattr(app.cli.run, "prepare", reached.append)
+    monkeypatch.setattr(app.cli.run, "Session", lambda *_, **__: (_ for _ in ()).throw(ConfigError("enough")))
     assert main(["run", "motor_winding", "--port", str(taken), "--headless"]) == 2
     assert len(reached) == 1
 

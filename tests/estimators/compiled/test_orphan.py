@@ -12,7 +12,7 @@ PARENT = """\
 import os, time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from estimators.orphan import leave_with_parent
+from estimators.compiled.orphan import leave_with_parent
 
 if __name__ == "__main__":
     pool = ProcessPoolExecutor(2, get_context("spawn"), initializer=leave_with_parent)

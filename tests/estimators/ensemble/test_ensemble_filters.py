@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from estimators.compiled.model import compile_model
-from estimators.ensemble import localisation
-from estimators.ensemble import shared as shared
+from estimators.ensemble import localisation, shared
 from estimators.ensemble.localisation import gaspari_cohn
 from estimators.errors import EstimatorError
 from estimators.fold import Base, Fold

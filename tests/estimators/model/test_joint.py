@@ -146,8 +146,8 @@ def test_the_motors_derivatives_reach_the_resistance() -> None:
 
 def test_another_process_finds_the_compiled_code() -> None:
     code = (
-        "from estimators.models import MODELS; from estimators.joint import joint, Unknown;"
-        "from estimators.compiled import compile_model;"
+        "from estimators.models import MODELS; from estimators.model.joint import joint, Unknown;"
+        "from estimators.compiled.model import compile_model;"
         "m = compile_model(joint(MODELS['motor_drive'], {'yoke_coolant': Unknown(0.01)}));"
         "print(m.f.stats.cache_hits, *[len(h.stats.cache_hits) for h in m.h], sum(m.f.stats.cache_misses.values()))"
     )

@@ -7,8 +7,8 @@ from app.twin.twin import load_twin
 from estimators.errors import ConfigError, SourceError
 from estimators.log import READING, TRUTH
 from sources.source import Channel
+from sources.tables import npz
 from sources.tables.table import Table
-from tests.benchmarks.sources import table_npz
 
 T0 = np.datetime64("2019-03-01T00:00", "ns")
 RNG = np.random.default_rng(0)
@@ -31,8 +31,8 @@ def table(path, columns, kind=READING):
 
 
 def test_cells_and_vectors_come_as_they_were_saved(archive, monkeypatch):
-    monkeypatch.setattr(table_npz, "VALUES", 6)  # two rows at once, so that there are several chunks
-    assert len(table_npz.npz_names(archive)) == 12 + 3
+    monkeypatch.setattr(npz, "VALUES", 6)  # two rows at once, so that there are several chunks
+    assert len(npz.npz_names(archive)) == 12 + 3
     source, rows = table(archive, ("t[2,1]", "one", "t[0,3]")), []
     while (batch := source.read(0.0)) is not None:
         assert len(batch) <= 2
