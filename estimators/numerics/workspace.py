@@ -1,0 +1,68 @@
+"""A filter's scratch, laid out once: the views that a kernel works in, and how much room they take.
+
+A filter declares its workspace as one function that takes arrays one after the other from an address:
+
+    class Work(NamedTuple):
+        D: Any
+        mean: Any
+        end: int
+
+    @inlined
+    def workspace(at, n, m):
+        D, at = take_matrix(at, 2 * n + 1, m)
+        mean, at = take_vector(at, m)
+        return Work(D, mean, at)
+
+A kernel calls it with the address of its scratch, `start_of(work)`. The size follows from the same function, called
+in Python from address zero without touching memory: `size_of(workspace, n, m)`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from numba import carray
+from numba.extending import overload
+
+from .jit import _to_float, inlined
+
+WORD = 8
+"""Bytes of a float64."""
+
+
+def take_matrix(at: int, rows: int, columns: int) -> tuple[Any, int]:
+    """A matrix (rows, columns) that begins at the address `at`, and the address after it."""
+    return None, at + WORD * rows * columns
+
+
+def take_vector(at: int, n: int) -> tuple[Any, int]:
+    """A vector (n,) that begins at the address `at`, and the address after it."""
+    return None, at + WORD * n
+
+
+@overload(take_matrix, inline="always")
+def _take_matrix(at, rows, columns):
+    def take(at, rows, columns):
+        return carray(_to_float(at), (rows, columns)), at + WORD * rows * columns
+
+    return take
+
+
+@overload(take_vector, inline="always")
+def _take_vector(at, n):
+    def take(at, n):
+        return carray(_to_float(at), (n,)), at + WORD * n
+
+    return take
+
+
+@inlined
+def start_of(work):
+    """The address at which a scratch array begins."""
+    return work.ctypes.data
+
+
+def size_of(workspace: Callable[..., Any], *sizes: int) -> int:
+    """How many float64s a workspace of these sizes takes; its last field is where it ends."""
+    return int(getattr(workspace, "py_func", workspace)(0, *sizes)[-1]) // WORD
