@@ -55,7 +55,7 @@ def test_a_call_that_does_not_return_is_named_once():
         line = watch.look()
         assert line is not None and "\n" not in line
         place, rest = line.split(": ", 1)
-        assert place.endswith(f"test_compile.py:{waits.__code__.co_firstlineno + 2}")  # where it waits
+        assert place.endswith(f"test_prepare.py:{waits.__code__.co_firstlineno + 2}")  # where it waits
         assert rest.startswith("f of the model slow has not returned for 10 s; ") and "Ctrl-C" in rest
         now = 100.0
         assert watch.look() is None

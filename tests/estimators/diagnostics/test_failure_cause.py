@@ -92,7 +92,7 @@ def test_the_function_that_failed_is_named_with_file_line_and_state(name, change
         return
     line = growing.cause(int(rows[0]))
     found = re.fullmatch(
-        rf"\S*test_post_mortem.py:{culprit.__code__.co_firstlineno}: model walk: {says} at x = \[([-\d.e]+)\], "
+        rf"\S*test_failure_cause.py:{culprit.__code__.co_firstlineno}: model walk: {says} at x = \[([-\d.e]+)\], "
         r"u = \[[01]\](, dt = 0.5 s)?, where the estimate got; it must be .*",
         line,
     )
@@ -143,7 +143,7 @@ def test_the_models_own_function_is_named_where_a_parameter_is_estimated(changes
     gain = Parameter("gain", "1", 1.0)
     growing = driven(joint(walk(parameters=(gain,), **changes), {"gain": Unknown(0.1, 0.0)}))
     line = growing.cause(int(failures(growing.track)[0]))
-    assert f"test_post_mortem.py:{culprit.__code__.co_firstlineno}: model walk: " in line
+    assert f"test_failure_cause.py:{culprit.__code__.co_firstlineno}: model walk: " in line
 
 
 def test_the_path_is_walked_in_the_models_own_steps():
@@ -174,7 +174,7 @@ def test_a_block_that_returns_no_number_is_named_too():
     growing = Fold("enkf", model, Tuning.of(model), log)
     growing.advance()
     assert list(failures(growing.track)) == [2]
-    assert re.search(r"test_post_mortem.py:\d+: model duffing: f\(x, u, dt\) is \[nan, nan\]", growing.cause(2))
+    assert re.search(r"test_failure_cause.py:\d+: model duffing: f\(x, u, dt\) is \[nan, nan\]", growing.cause(2))
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "iekf", "ukf", "ckf", "sr-ekf", "sr-ukf", "enkf", "etkf", "ensrf"])

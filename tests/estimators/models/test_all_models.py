@@ -44,7 +44,7 @@ def drive(i_d: float = -80.0, i_q: float = 150.0, speed: float = 400.0) -> np.nd
 # Derivatives
 
 
-# The corridor's beams step at corners: tests/estimators/test_corridor.py.
+# The corridor's beams step at corners: test_corridor.py.
 @pytest.mark.parametrize("name", [name for name in MODELS if name != "agv_corridor"])
 def test_jacobians_match_central_differences_at_random_states(name: str) -> None:
     model = MODELS[name]
