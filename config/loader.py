@@ -11,9 +11,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from estimators.errors import ConfigError
+from estimators.errors import ConfigError, nearest
 
-from .problems import nearest, report, shown
+from .problems import report, shown
 from .schema import TwinSection
 from .yaml_lines import Key, Places, dotted, parse
 

@@ -2,29 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from difflib import get_close_matches
 from typing import Any
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from estimators.errors import ConfigError
+from estimators.errors import ConfigError, nearest
 
 from .yaml_lines import Key, Places, dotted
 
 MOST = 5
 """Problems shown at once."""
-
-
-def nearest(name: str, names: Iterable[str]) -> str:
-    """A remedy for a name that is not among `names`: the near ones, or all."""
-    names = [str(item) for item in names]
-    low = name.lower()
-    near = get_close_matches(name, names, n=3, cutoff=0.6) or [item for item in names if item.lower().startswith(low)]
-    if near:
-        return f"did you mean {' or '.join(near)}?"
-    return f"choose from {', '.join(names)}" if names else "there are none to choose from"
 
 
 def shown(value: Any) -> str:

@@ -1,4 +1,9 @@
-"""The errors that Nisus raises, each with one line that a user can act on."""
+"""The errors that Nisus raises, each with one line that a user can act on, and how such a line shows names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
 
 LARGEST = 1e50
 """Beyond any physical quantity in any unit; its fourth power, which covariances multiply up to, is still a number."""
@@ -22,3 +27,30 @@ class EstimatorError(NisusError):
 
 class ModelError(NisusError):
     """A model whose declaration or functions disagree."""
+
+
+MOST = 60
+"""Characters of a text from a file that a message shows."""
+
+
+def quoted(text: str) -> str:
+    """A text from a file as a message shows it: shortened, in quotes, with unprintable characters escaped."""
+    return repr(text if len(text) <= MOST else text[: MOST - 3] + "...")
+
+
+def shown_name(name: str) -> str:
+    """A name from a file as a message shows it: as it is, unless it is long or unprintable."""
+    return name if len(name) <= MOST and name.isprintable() else quoted(name)
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """The remedy for a name that is not among `names`: the near ones, or all of them if they are few."""
+    names = [str(item) for item in names]
+    near = get_close_matches(name, names, n=3, cutoff=0.6)
+    if not near:
+        lower = name.lower()
+        near = [item for item in names if lower in item.lower() or (len(item) > 2 and item.lower() in lower)][:3]
+    if near:
+        return f"did you mean {' or '.join(map(shown_name, near))}?"
+    shown = ", ".join(map(shown_name, names[:24]))
+    return f"choose from {shown}{', ...' if len(names) > 24 else ''}" if names else "there are none to choose from"

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from difflib import get_close_matches
 
 from .ensemble.enkf import ENKF
 from .ensemble.ensrf import ENSRF
 from .ensemble.etkf import ETKF
 from .ensemble.letkf import LETKF
 from .ensemble.placed import check_placed
-from .errors import EstimatorError
+from .errors import EstimatorError, nearest
 from .estimator import Estimator, Options
 from .gaussian.ckf import CKF
 from .gaussian.ekf import EKF
@@ -43,9 +42,7 @@ def find_entry(name: str) -> Estimator:
         EstimatorError: If there is none, with near names, or all.
     """
     if name not in ESTIMATORS:
-        near = get_close_matches(name, ESTIMATORS, n=3, cutoff=0.4)
-        rule = f"near: {', '.join(near)}" if near else f"it must be one of {', '.join(ESTIMATORS)}"
-        raise EstimatorError(f"estimator {name!r} does not exist; {rule}")
+        raise EstimatorError(f"estimator {name!r} does not exist; {nearest(name, ESTIMATORS)}")
     return ESTIMATORS[name]
 
 

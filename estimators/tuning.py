@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
 from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from .errors import LARGEST, ConfigError
+from .errors import LARGEST, ConfigError, nearest
 from .model.state_space import StateSpaceModel
 
 _versions = count(1)
@@ -152,9 +151,7 @@ class Tuning:
         if prefix == "R" and name in model.sensor_names:
             k = model.sensor_names.index(name)
             return "r", slice(model.row_start[k], model.row_start[k] + len(model.sensors[k].rows))
-        near = get_close_matches(key, self.keys(), n=3, cutoff=0.4)
-        rule = f"near: {', '.join(near)}" if near else f"it must be one of {', '.join(self.keys())}"
-        raise ConfigError(f"{key} is no tuning key of {model.name}; {rule}")
+        raise ConfigError(f"{key} is not a tuning key of {model.name}; {nearest(key, self.keys())}")
 
 
 def _mean(values: Any) -> float:

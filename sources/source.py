@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Protocol
 
 from estimators.log import Readings
@@ -79,33 +78,6 @@ class Channel:
     def needed(self) -> tuple[str, ...]:
         """The signals and those of the conditions, each once."""
         return tuple(dict.fromkeys((*self.signals, *(item.signal for item in (*self.where, *self.only)))))
-
-
-MOST = 60
-"""Letters of a text from a file that a message shows."""
-
-
-def quoted(text: str) -> str:
-    """A text from a file as a message shows it: cut, in quotes, and with what is no letter escaped."""
-    return repr(text if len(text) <= MOST else text[: MOST - 3] + "...")
-
-
-def plain(name: str) -> str:
-    """A name from a file as a message shows it: as it is, unless it is long or holds what is no letter."""
-    return name if len(name) <= MOST and name.isprintable() else quoted(name)
-
-
-def nearest(name: str, names: Iterable[str]) -> str:
-    """What to offer in place of a name that is not among `names`: the near ones, or all if they are few."""
-    names = list(names)
-    near = get_close_matches(name, names, n=3, cutoff=0.6)
-    if not near:
-        lower = name.lower()
-        near = [item for item in names if lower in item.lower() or (len(item) > 2 and item.lower() in lower)][:3]
-    if near:
-        return f"did you mean {' or '.join(map(plain, near))}?"
-    shown = ", ".join(map(plain, names[:12]))
-    return f"choose from {shown}{', ...' if len(names) > 12 else ''}" if names else "there are none to choose from"
 
 
 def ignore(key: str, text: str) -> None:

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimators.diagnostics.health import HealthPolicy
 from estimators.diagnostics.score import Fit, score
 from estimators.errors import NisusError
 from estimators.estimator import Estimator
@@ -135,10 +134,8 @@ def _timed(
     """
     log = Log(twin.model.width, max(1, len(events)))
     log.extend(events)
-    section = twin.config.time
-    policy = HealthPolicy(degraded_after=section.degraded_after, stale_after=section.stale_after)
     tuning = replace(twin.tuning.with_options(twin.options_of(estimator)), seed=seed)
-    fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=policy)
+    fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=twin.policy)
     took: list[float] = []
     while not took or (sum(took) < enough and fold.n == log.n):
         fold.rewind(0)

@@ -15,7 +15,6 @@ import pyarrow.parquet as pq
 
 from estimators.diagnostics.failure_cause import failures
 from estimators.diagnostics.field_pictures import Picture
-from estimators.diagnostics.health import HealthPolicy
 from estimators.diagnostics.score import Score, score
 from estimators.errors import ConfigError, SourceError
 from estimators.fold import Fold
@@ -74,10 +73,8 @@ def fold_twin(arguments: Arguments) -> int:
         raise ConfigError(f"--out {arguments.out}: must end in .parquet or .rrd")
     prepare(twin)
     log, counts = read_log(twin, arguments.duration)
-    section = twin.config.time
-    policy = HealthPolicy(degraded_after=section.degraded_after, stale_after=section.stale_after)
     period = twin.picture if arguments.out is not None and arguments.out.suffix == ".rrd" else None
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log, pairs=twin.pairs, policy=policy, picture=period)
+    fold = Fold(twin.estimator, twin.model, twin.tuning, log, pairs=twin.pairs, policy=twin.policy, picture=period)
     begun = time.perf_counter()
     fold.advance()
     fold.finish()

@@ -15,6 +15,7 @@ from config.loader import shown_path
 from estimators.fold import Fold
 from estimators.log import Log
 from estimators.model.state_space import StateSpaceModel
+from estimators.numerics.jit import plain
 
 from ..twin.twin import Twin
 
@@ -95,7 +96,7 @@ class CallWatch:
                 functions.append((f"{what} of sensor {sensor.name}", getattr(sensor, what)))
         if model.jump is not None:
             functions.append(("jump.chances", model.jump.chances))
-        codes = ((getattr(getattr(item, "py_func", item), "__code__", None), what) for what, item in functions)
+        codes = ((getattr(plain(item), "__code__", None), what) for what, item in functions)
         self._names = {code: what for code, what in codes if code is not None}
         self._model = model.name
         self._clock = clock

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import EstimatorError, NisusError
 from estimators.fold import SPARSE_EVERY, Base, Fold
 from estimators.log import TICK, Log, Readings
@@ -71,7 +70,7 @@ class Engine:
         self.model = twin.model
         self.pairs = twin.pairs
         section = twin.config.time
-        self._policy = HealthPolicy(degraded_after=section.degraded_after, stale_after=section.stale_after)
+        self._policy = twin.policy
         allowed = section.horizon if horizon is None else horizon
         self._horizon = round(allowed * 1e9) if np.isfinite(allowed) else None
         self._first_base = base

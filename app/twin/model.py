@@ -11,9 +11,8 @@ from types import ModuleType
 from typing import Any
 
 from config.loader import Loaded, shown_path
-from config.problems import nearest
 from config.yaml_lines import Key
-from estimators.errors import ModelError, NisusError
+from estimators.errors import ModelError, NisusError, nearest
 from estimators.model.joint import Unknown, joint
 from estimators.model.state_space import Field, State, StateSpaceModel
 from estimators.model.user_file import run_file

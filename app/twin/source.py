@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from config.loader import Loaded
-from config.problems import nearest
 from config.source_schema import (
     AssetSection,
     CanLogSection,
@@ -21,7 +20,7 @@ from config.source_schema import (
     TableSection,
 )
 from config.yaml_lines import Key, dotted
-from estimators.errors import NisusError, SourceError
+from estimators.errors import NisusError, SourceError, nearest
 from estimators.log import READING, Readings
 from estimators.model.state_space import StateSpaceModel
 

@@ -15,6 +15,7 @@ from config.loader import Loaded, load, load_text
 from config.schema import TwinSection
 from config.source_schema import AssetSection
 from config.yaml_lines import parse
+from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import ConfigError, EstimatorError
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_entry, find_estimator
@@ -75,6 +76,12 @@ class Twin:
         """Seconds between two pictures of a large field; None if there is none."""
         view = self.config.view
         return (view.picture or view.window / 60.0) if self.model.grid is not None else None
+
+    @property
+    def policy(self) -> HealthPolicy:
+        """When the estimate may be trusted."""
+        section = self.config.time
+        return HealthPolicy(degraded_after=section.degraded_after, stale_after=section.stale_after)
 
     @property
     def tells_field(self) -> bool:

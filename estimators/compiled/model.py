@@ -16,10 +16,10 @@ import numba
 import numpy as np
 
 from ..errors import ModelError
-from ..model.check import plain, probe, probe_angles, probe_likelihoods, uncompilable
+from ..model.check import probe, probe_angles, probe_likelihoods, uncompilable
 from ..model.jump import check_parts
 from ..model.state_space import LARGE, Field, StateSpaceModel
-from ..numerics.jit import address, jit
+from ..numerics.jit import address, jit, plain
 from .black_box import ANSWER, BlackBox, answered_f, answered_h
 from .context import (
     F_signature,
@@ -90,7 +90,7 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
         if function is None:
             return 0
         try:
-            dispatcher = jit(getattr(function, "py_func", function))
+            dispatcher = jit(plain(function))
             kept.append(dispatcher)
             return address(dispatcher, signature)
         except numba.core.errors.NumbaError as error:
@@ -105,7 +105,7 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                dispatcher = jit(getattr(function, "py_func", function))
+                dispatcher = jit(plain(function))
                 kept.append(dispatcher)
                 return address(dispatcher, signature)
         except Exception as error:  # noqa: BLE001  Numba raises many kinds; each means the same here

@@ -13,12 +13,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError
+from ..numerics.jit import plain
 from .state_space import LARGE, StateSpaceModel
-
-
-def plain(function: Any) -> Callable:
-    """The Python function behind a compiled one."""
-    return getattr(function, "py_func", function)  # type: ignore[no-any-return]
 
 
 def place(function: Any, error: BaseException | None = None) -> str:

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import ModelError
-from ..numerics.jit import jit
+from ..numerics.jit import jit, plain
 from .state_space import Noise, State, StateSpaceModel
 
 
@@ -96,11 +96,11 @@ def as_inner(function: Callable) -> Any:
     The cache tells closures apart by what they hold, and a compiled function by an identifier that is random in every
     process; one made from the source finds the code that another process compiled, and never code of another source.
     """
-    plain = getattr(function, "py_func", function)
-    inner = jit(plain)
-    file = inspect.getsourcefile(plain)
+    python = plain(function)
+    inner = jit(python)
+    file = inspect.getsourcefile(python)
     source = Path(file).read_bytes() if file and Path(file).is_file() else uuid.uuid4().bytes
-    key = hashlib.sha256(source + f"{plain.__module__}.{plain.__qualname__}".encode()).hexdigest()
+    key = hashlib.sha256(source + f"{python.__module__}.{python.__qualname__}".encode()).hexdigest()
     inner._set_uuid(str(uuid.UUID(key[:32])))
     return inner
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,11 @@ jit_brief = partial(njit, cache=True, error_model="numpy")
 
 inlined = partial(jit, inline="always")
 """`jit` for helpers that stand inside a filter's step: a call that hands over context and arrays costs 50 to 100 ns."""
+
+
+def plain(function: Any) -> Callable[..., Any]:
+    """The Python function inside a compiled one; any other function as it is."""
+    return getattr(function, "py_func", function)  # type: ignore[no-any-return]
 
 
 def address(dispatcher: Any, signature: Any) -> int:

@@ -25,7 +25,7 @@ from typing import Any
 from numba import carray
 from numba.extending import overload
 
-from .jit import _to_float, inlined
+from .jit import _to_float, inlined, plain
 
 WORD = 8
 """Bytes of a float64."""
@@ -65,4 +65,4 @@ def start_of(work):
 
 def size_of(workspace: Callable[..., Any], *sizes: int) -> int:
     """How many float64s a workspace of these sizes takes; its last field is where it ends."""
-    return int(getattr(workspace, "py_func", workspace)(0, *sizes)[-1]) // WORD
+    return int(plain(workspace)(0, *sizes)[-1]) // WORD

@@ -9,9 +9,9 @@ from typing import Any
 
 import cantools
 
-from estimators.errors import SourceError
+from estimators.errors import SourceError, nearest
 
-from ..source import Channel, nearest
+from ..source import Channel
 
 BusName = int | str | None
 

@@ -11,6 +11,7 @@ from estimators.compiled.model import compile_model
 from estimators.errors import NisusError, SourceError
 from estimators.log import INPUT, READING, TICK, TRUTH, Readings
 from estimators.model.state_space import StateSpaceModel
+from estimators.numerics.jit import plain
 
 from .faults import Fault, Faults
 from .profile import Constant, Profile
@@ -191,7 +192,7 @@ class Simulator:
         if jump is None:
             return
         chances = np.empty(len(jump.modes))
-        getattr(jump.chances, "py_func", jump.chances)(self._x.copy(), self._u, self._p, dt, chances)
+        plain(jump.chances)(self._x.copy(), self._u, self._p, dt, chances)
         self._x[self._truth.model.mode] = self._rng.choice(chances.size, p=chances)
 
     def _noise(self) -> np.ndarray:

@@ -9,9 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from estimators.errors import SourceError
-
-from ..source import nearest, quoted
+from estimators.errors import SourceError, nearest, quoted
 
 CHUNK = 4096
 

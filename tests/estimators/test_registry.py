@@ -98,7 +98,7 @@ def test_kf_refuses_a_nonlinear_model_and_names_what_to_use():
 
 
 def test_an_unknown_name_is_told_the_near_ones():
-    with pytest.raises(EstimatorError, match="'ukff' does not exist; near: ukf"):
+    with pytest.raises(EstimatorError, match="'ukff' does not exist; did you mean ukf"):
         find_estimator("ukff", PENDULUM)
 
 

@@ -199,9 +199,9 @@ def test_an_unknown_option_is_told_near_ones_of_the_same_command(option, near, c
     [
         ("=3", "--set =3: has no key; write KEY=VALUE"),
         ("gate", "--set gate: has no value; write KEY=VALUE"),
-        ("estimator=zzz", f"'zzz' does not exist; it must be one of {', '.join(ESTIMATORS)}\n"),
-        ("zzz=1", "zzz is no tuning key of lorenz63; it must be one of "),
-        ("p.sgma=1", "near: p.sigma"),
+        ("estimator=zzz", f"'zzz' does not exist; choose from {', '.join(ESTIMATORS)}\n"),
+        ("zzz=1", "zzz is not a tuning key of lorenz63; choose from "),
+        ("p.sgma=1", "did you mean p.sigma"),
     ],
 )
 def test_a_setting_that_is_none_is_told_what_it_might_be(given, why, capsys):

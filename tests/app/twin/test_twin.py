@@ -114,7 +114,8 @@ def test_an_override_that_breaks_a_rule_is_one_line(key: str, value: str, expect
 
 def test_an_unknown_override_names_what_is_near() -> None:
     text = message(MOTOR, overrides={"Q.temprature": "1"})
-    assert text.startswith("--set Q.temprature=1: Q.temprature is no tuning key of motor_winding; near: Q.temperature")
+    said = "Q.temprature is not a tuning key of motor_winding; did you mean Q.temperature"
+    assert text.startswith(f"--set Q.temprature=1: {said}")
     assert "; or a key of the YAML: name, title, model" in text and "\n" not in text
 
 
@@ -146,7 +147,7 @@ def test_an_unknown_override_names_what_is_near() -> None:
             "  winding: {std: [3, 4]}",
             "motor.yaml:7: sensors.winding.std has 2 entries; give one, or 1: winding",
         ),
-        ("estimator: kf", "estimator: kff", "motor.yaml:8: estimator 'kff' does not exist; near: kf, "),
+        ("estimator: kf", "estimator: kff", "motor.yaml:8: estimator 'kff' does not exist; did you mean kf"),
         (
             "estimator: kf",
             "estimator: {name: ukf, options: {alfa: 1}}",
