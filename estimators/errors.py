@@ -47,10 +47,11 @@ def nearest(name: str, names: Iterable[str]) -> str:
     """The remedy for a name that is not among `names`: the near ones, or all of them if they are few."""
     names = [str(item) for item in names]
     near = get_close_matches(name, names, n=3, cutoff=0.6)
-    if not near:
+    if not near and len(name) > 2:
         lower = name.lower()
         near = [item for item in names if lower in item.lower() or (len(item) > 2 and item.lower() in lower)][:3]
     if near:
-        return f"did you mean {' or '.join(map(shown_name, near))}?"
+        *others, last = map(shown_name, near)
+        return f"did you mean {', '.join(others)}{' or ' if others else ''}{last}?"
     shown = ", ".join(map(shown_name, names[:24]))
     return f"choose from {shown}{', ...' if len(names) > 24 else ''}" if names else "there are none to choose from"

@@ -59,8 +59,8 @@ def test_versions_never_repeat():
         ("gate", np.nan, "gate is nan; it must lie between 0 and 1"),
         ("R.windng", 1.0, "R.windng is not a tuning key of motor_winding; did you mean R.winding"),
         ("Q.winding", 1.0, "Q.winding is not a tuning key of motor_winding; did you mean R.winding"),
-        ("nonsense", 1.0, "nonsense is no tuning key"),
-        ("", 1.0, "no tuning key"),
+        ("nonsense", 1.0, "nonsense is not a tuning key"),
+        ("", 1.0, "not a tuning key"),
     ],
 )
 def test_what_is_wrong_is_one_line(key, value, says):
