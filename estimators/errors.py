@@ -29,6 +29,10 @@ class ModelError(NisusError):
     """A model whose declaration or functions disagree."""
 
 
+class EventError(NisusError):
+    """An event that does not fit the log or the model."""
+
+
 MOST = 60
 """Characters of a text from a file that a message shows."""
 

@@ -19,7 +19,7 @@ The functions of an `interpreted` filter are plain Python, and its context is a 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -100,7 +100,8 @@ class Estimator:
     `memory(options, model)` counts numbers that the state holds beyond `state_size`. `runs(options, nx)` is
     `model_runs` as a number: how often a step runs f. `prepare(model, options)` computes what depends on the model
     too, once for a fold, as int64s. `blocks(options, state, nx)` is a view of the members (N, nx) in a state, of a
-    compiled filter that runs f and h at these alone and so can run on a black box (interpreted/black_box_filters.py).
+    compiled filter that runs f and h at these alone and so can run on a black box (interpreted/). `fixed_r`
+    says that its gain is for one R, so that no reading can bring its own.
     """
 
     name: str
@@ -124,22 +125,25 @@ class Estimator:
     modes: Callable[[Options, np.ndarray, int], list[Mode]] | None = None
     recoveries: Callable[[np.ndarray], int] | None = None
     interpreted: bool = False
+    fixed_r: bool = False
     blocks: Callable[[Options, np.ndarray, int], np.ndarray] | None = None
 
-    def complete(self, options: dict[str, float]) -> dict[str, float]:
-        """The given options and the defaults of the others.
+    def complete(self, options: Mapping[str, float | str]) -> dict[str, float]:
+        """The given options and the defaults of the others; one of several words may be given as the word.
 
         Raises:
             EstimatorError: If an option is unknown, out of its range, or a fraction where it is a count.
         """
         known = {option.name: option for option in self.options}
-        for name, value in options.items():
+        values = {}
+        for name, given in options.items():
             if name not in known:
                 raise EstimatorError(
                     f"estimator {self.name} has no option {name!r}; "
                     + (f"it has {', '.join(known)}" if known else "it has none")
                 )
             option = known[name]
+            values[name] = value = self._number(option, given)
             if not option.low <= value <= option.high:
                 raise EstimatorError(
                     f"estimator {self.name}: {name} is {value:g}; it must lie between {option.low:g} and "
@@ -152,7 +156,20 @@ class Estimator:
             if option.choices and value != int(value):
                 codes = ", ".join(f"{code} ({choice})" for code, choice in enumerate(option.choices))
                 raise EstimatorError(f"estimator {self.name}: {name} is {value:g}; it must be one of {codes}")
-        return {option.name: float(options.get(option.name, option.default)) for option in self.options}
+        return {option.name: float(values.get(option.name, option.default)) for option in self.options}
+
+    def _number(self, option: Option, given: float | str) -> float:
+        """The value of an option, of a word its place among the choices."""
+        if isinstance(given, str):
+            if given in option.choices:
+                return float(option.choices.index(given))
+            wanted = f"one of {', '.join(option.choices)}" if option.choices else "a number"
+            raise EstimatorError(f"estimator {self.name}: {option.name} is {given!r}; it must be {wanted}")
+        try:
+            return float(given)
+        except (TypeError, ValueError):
+            wanted = f"one of {', '.join(option.choices)}" if option.choices else "a number"
+            raise EstimatorError(f"estimator {self.name}: {option.name} is {given!r}; it must be {wanted}") from None
 
     def code(self) -> Code:
         """Compile the four functions, or load them from the cache; or, if interpreted, the functions themselves."""

@@ -13,24 +13,27 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from .compiled.context import context_of, context_type, prior
+from .compiled.context import context_of, context_type, prior, sensor_rows
 from .compiled.model import compile_model
 from .diagnostics.failure_cause import Estimate, cause, failures
 from .diagnostics.field_pictures import Pictures
 from .diagnostics.health import Bounds, HealthPolicy, assess, assess_signature, chi_square_bounds
+from .door import admitted
 from .errors import EstimatorError, ModelError
 from .estimator import Code, Estimator, call_describe, call_predict, call_start, call_update, code_type
 from .interpreted import fold_loop
 from .interpreted.black_box_filters import driven
 from .interpreted.fold_loop import LONGEST, UNSET
 from .interpreted.view import View
-from .log import INPUT, READING, RESET, TICK, TRUTH, Log
+from .log import BEFORE, INPUT, READING, RESET, TICK, TRUTH, Log
+from .meeting import check_base, check_pairs, check_prior, check_tuning, check_variances
 from .model.mode_as_number import indicator
 from .model.state_space import StateSpaceModel
-from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, i64, jit, jit_brief
+from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, jit, jit_brief
 from .numerics.peaks import Mode
 from .numerics.quantiles import chi_square_quantile
 from .registry import find_estimator
+from .steps import steps_of
 from .track import MISSING, NONE, Track, track_type
 from .tuning import Tuning
 
@@ -62,18 +65,31 @@ def _advance_to(code, context, u, clock, t, index, state, work):
         prior_mean, prior_cov = prior(context)
         call_start(code.start, context, prior_mean, prior_cov, state)
         return
-    steps = 1 if dt <= context.max_step else int(np.ceil(dt / context.max_step))
+    steps = steps_of(dt, context.max_step)
     for _ in range(steps):
         call_predict(code.predict, context, u, dt / steps, index, state, work)
 
 
 @jit
-def run(code, context, first, start, end, t, kind, channel, value, clock, u, state, spare, work, score, track):
+def _exchange(r, own, kept):
+    """r (ny,) ← what a reading brought of its own, where it brought any; `kept` (ny,) gets what stood there."""
+    for k in range(r.size):
+        kept[k] = r[k]
+        if k < own.size and np.isfinite(own[k]):
+            r[k] = own[k]
+
+
+@jit
+def run(code, context, first, start, end, t, kind, channel, value, width, clock, u, state, spare, work, score, track):
     """Fold events `start` to `end`: clock (1,), u (nu,) and state move on in place, one track row is filled an event.
 
-    A tick or a truth is a query: it is answered from a copy of the state, so it never changes the estimate.
+    A tick or a truth is a query: it is answered from a copy of the state, so it never changes the estimate. Variances
+    that a reading brings (columns of `value` from `width` on) take the place of the tuned R while it is folded, so
+    every filter honours them.
     """
     nu = u.size
+    variances = value.shape[1] > width
+    kept = np.empty(context.n_rows if variances else 0)
     u = borrowed(u)
     state = borrowed(state)
     spare = borrowed(spare)
@@ -103,6 +119,10 @@ def run(code, context, first, start, end, t, kind, channel, value, clock, u, sta
                     if np.isfinite(value[i, j]):
                         u[j] = value[i, j]
             else:
+                if variances:
+                    row, rows = sensor_rows(context, channel[i])
+                    r = floats(context.r, context.n_rows)[row : row + rows]
+                    _exchange(r, value[i, width:], kept)
                 verdict = call_update(
                     code.update,
                     context,
@@ -116,6 +136,9 @@ def run(code, context, first, start, end, t, kind, channel, value, clock, u, sta
                     innovation_std[i],
                     score,
                 )
+                if variances:
+                    for k in range(rows):
+                        r[k] = kept[k]
             call_describe(code.describe, context, state, mean[i], std[i], cross[i])
         elif what == RESET:
             prior_mean, prior_cov = prior(context)
@@ -138,9 +161,11 @@ def run(code, context, first, start, end, t, kind, channel, value, clock, u, sta
 
 
 @jit_brief
-def run_brief(code, context, first, start, end, t, kind, channel, value, clock, u, state, spare, work, score, track):
+def run_brief(
+    code, context, first, start, end, t, kind, channel, value, width, clock, u, state, spare, work, score, track
+):
     """`run`, with the GIL."""
-    run(code, context, first, start, end, t, kind, channel, value, clock, u, state, spare, work, score, track)
+    run(code, context, first, start, end, t, kind, channel, value, width, clock, u, state, spare, work, score, track)
 
 
 @jit_brief
@@ -156,7 +181,9 @@ def _begin(code, context, mean, cov, state):
 
 I4 = types.int32[::1]
 begin_signature = types.void(code_type, context_type, F1, F2, F1)
-run_signature = types.void(code_type, context_type, i64, i64, i64, I1, B1, I4, F2, I1, F1, F1, F1, F1, F1, track_type)
+run_signature = types.void(
+    code_type, context_type, i64, i64, i64, I1, B1, I4, F2, i64, I1, F1, F1, F1, F1, F1, track_type
+)
 
 
 class Base(NamedTuple):
@@ -188,6 +215,7 @@ class Fold:
         policy: HealthPolicy | None = None,
         base: Base | None = None,
         picture: float | None = None,
+        prior: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
         """Prepare; nothing is folded yet.
 
@@ -202,16 +230,25 @@ class Fold:
                 filter that left it goes on from its whole state, also under another tuning, unless an option changed
                 the size of that; any other filter starts from the mean and covariance.
             picture: Seconds of the log between two pictures of a large field; None for those that score it only.
+            prior: Mean (nx,) and covariance (nx, nx), positive semidefinite, in place of the model's; beyond `LARGE`
+                states the variances (1, nx). It holds at the log's start, and a reset goes back to it.
 
         Raises:
-            EstimatorError: If the estimator does not exist, does not apply, or an option is out of range.
+            EstimatorError: If the estimator does not exist, does not apply, an option is out of range, or log, tuning,
+                pairs, base or prior do not fit the model.
+            EventError: If an event does not fit the model.
             ModelError: If the model's functions disagree with its declaration.
         """
         self.estimator: Estimator = find_estimator(estimator, model)
         self.model, self.tuning, self.log = model, tuning, log
-        self.pairs = np.zeros((0, 2), np.int64) if pairs is None else np.ascontiguousarray(pairs, np.int64)
+        self.pairs = check_pairs(pairs, model)
+        check_tuning(tuning, model)
+        self._own_prior = None if prior is None else check_prior(prior, model)
         self.policy = policy or HealthPolicy()
-        self.options = self.estimator.complete(dict(tuning.options))
+        self.options = self.estimator.complete(tuning.options)
+        self.n = 0
+        self._checked = -1
+        self._check_log()
         # Only particles can carry a mode that jumps; the others see it as a number.
         self._compiled = compile_model(model if self.estimator.family == "particle" else indicator(model))
         self._code: Code = driven(self.estimator) if model.black_box else self.estimator.code()
@@ -226,18 +263,20 @@ class Fold:
         self._clock = np.array([UNSET])
         self._u = np.array([item.default for item in model.inputs], float)
         mean, cov = self._held["prior_mean"], self._held["prior_cov"]
+        if base is None and log.start != BEFORE:
+            self._clock[0] = log.start
         if base is not None:
+            check_base(base, model)
             mean, cov, self._clock[0], self._u[:] = base.mean, base.cov, base.clock, base.u
         self._run, self._assess, self._run_brief, self._assess_brief, begin = _compiled()
         if model.black_box or self.estimator.interpreted:
-            self._context = View(self._compiled, self._context, tuning, self.options, self.pairs)
+            self._context = View(self._compiled, self._context, tuning, self.options, self.pairs, self._held)
             self._run = self._run_brief = fold_loop.run
             begin = fold_loop.begin
         begin(self._code, self._context, np.ascontiguousarray(mean), np.ascontiguousarray(cov), self._state)
         left = base.state if base is not None and base.estimator == estimator else None
         if left is not None and left.size == self._state.size:
             self._state[:] = left
-        self.n = 0
         # At least one old snapshot (the start) and one recent, however large the state is.
         self._most = max(1, SNAPSHOT_MEMORY // 2 // self._state.nbytes)
         self._every = SNAPSHOT_EVERY
@@ -259,14 +298,17 @@ class Fold:
         held = {
             "p": np.ascontiguousarray(tuning.p, float),
             "q": np.ascontiguousarray(tuning.q, float),
-            "r": np.ascontiguousarray(tuning.r, float),
+            # Its own: what a reading brings stands here while it is folded, and other folds have the same tuning.
+            "r": np.array(tuning.r, float),
             "used": tuning.used.astype(np.int8),
             "gate": gate,
             "options": np.ascontiguousarray(self.estimator.tune(self.options, model, tuning), float),
             "pairs": self.pairs,
             "prepared": self.estimator.prepare(model, self.options),
         }
-        values = {**self._compiled.static, **held}
+        values: dict[str, Any] = {**self._compiled.static, **held}
+        if self._own_prior is not None:
+            values["prior_mean"], values["prior_cov"] = self._own_prior
         self._held = values
         sizes = {
             "nx": model.nx,
@@ -342,7 +384,8 @@ class Fold:
             np.copyto(u, given, where=np.isfinite(given))
         dt = (int(log.t[row]) - then) * 1e-9 if then != UNSET else 0.0
         if dt > LONGEST * model.max_step:
-            x, std, dt = model.prior_mean.copy(), model.prior_std, 0.0
+            cov = self._held["prior_cov"]
+            x, std, dt = self._held["prior_mean"].copy(), np.sqrt(cov[0] if len(cov) == 1 else np.diag(cov)), 0.0
         sensor = int(log.channel[row]) if log.kind[row] == READING else None
         predicted = None
         if len(model.shown) == model.nx and np.all(np.isfinite(track.mean[row]) & np.isfinite(track.std[row])):
@@ -355,11 +398,31 @@ class Fold:
             return self.estimator.modes(self.options, self._state, self.model.nx)
         return [Mode(1.0, *self.moments())]
 
+    def _check_log(self) -> None:
+        """Where log and model meet: refuse what the model has no place for, and variances that cannot be honoured."""
+        log, layout = self.log, self.model.layout
+        if self._checked == log.changes:
+            return
+        if log.width < layout.least:
+            raise EstimatorError(
+                f"the log has {log.width} value column(s); an event of {self.model.name} needs {layout.least}: make it "
+                "by Log.of(model)"
+            )
+        if not layout.same(log.layout):
+            admitted(log.readings.select(slice(self.n, None)), log.width, layout)
+        if log.has_variances:
+            check_variances(self.estimator, self.options)
+        self._checked = log.changes
+
     def advance(self, limit: int | None = None) -> int:
         """Fold the events that the log has beyond `n`, at most `limit`; return how many.
 
         A black box that fails stops nothing: see `failures`.
+
+        Raises:
+            EventError: If the log was not made for this model, and an event does not fit it.
         """
+        self._check_log()
         end = self.log.n if limit is None else min(self.log.n, self.n + limit)
         begun = self.n
         if self.log.capacity > len(self._rows):
@@ -383,6 +446,7 @@ class Fold:
                 self._run_events(run_some, self.n, stop)
             except BaseException:
                 # Python was stopped between two events: back to where the state is known.
+                self._held["r"][:] = self.tuning.r
                 self._restore(self.n)
                 raise
             self.n = stop
@@ -405,6 +469,7 @@ class Fold:
             log.kind,
             log.channel,
             log.value,
+            log.width,
             self._clock,
             self._u,
             self._state,
@@ -485,7 +550,7 @@ class Fold:
             raise EstimatorError("the log is another one; fold it from its start")
         if cut:
             self.drop_front(cut)
-        self.log = log
+        self.log, self._checked = log, -1
         if changed_from is not None:
             self.rewind(max(0, changed_from - log.first))
 
@@ -514,8 +579,9 @@ def fold(
     *,
     pairs: np.ndarray | None = None,
     policy: HealthPolicy | None = None,
+    prior: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Track:
-    """Fold an estimator over a whole log.
+    """Fold an estimator over a whole log; see `Fold`.
 
     Returns:
         The track, one row an event.
@@ -524,7 +590,7 @@ def fold(
         EstimatorError: If the estimator does not exist or does not apply to the model.
         ModelError: If the model's functions disagree with its declaration, or those of a black box fail.
     """
-    growing = Fold(estimator, model, tuning, log, pairs=pairs, policy=policy)
+    growing = Fold(estimator, model, tuning, log, pairs=pairs, policy=policy, prior=prior)
     growing.advance()
     if growing.failure is not None:
         raise growing.failure

@@ -2,117 +2,67 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-READING, INPUT, TRUTH, TICK, RESET = range(5)
-"""Kinds of event: a sensor's reading; inputs; a true state (scored, never used); a query; back to the prior."""
+from . import series
+from .door import Layout, admitted
+from .errors import EventError
+from .events import BEFORE, INPUT, KIND_NAMES, READING, RESET, TICK, TRUTH, Readings, truth_of
+from .order import in_order, sorted_order
 
-BEFORE = -(2**62)
-"""Earlier than any event, and far enough from the end of int64 that a horizon can be taken off."""
+if TYPE_CHECKING:
+    from .model.state_space import StateSpaceModel
 
-KIND_NAMES = ("reading", "input", "truth", "tick", "reset")
-
-
-class Readings(NamedTuple):
-    """A batch of events in the order of arrival; columns of one length N.
-
-    `channel` is the sensor's index for a reading, the first state's for a truth, else 0. `value` (N, width) holds a
-    reading's rows, all inputs, or the true values of the states channel, channel + 1, ...; NaN is a row that is
-    missing, an input that stays, or a state whose truth is not known.
-    """
-
-    t: np.ndarray
-    arrival: np.ndarray
-    kind: np.ndarray
-    channel: np.ndarray
-    value: np.ndarray
-
-    @staticmethod
-    def empty(width: int) -> Readings:
-        """A batch without events."""
-        none = np.zeros(0, np.int64)
-        return Readings(none, none, np.zeros(0, np.int8), np.zeros(0, np.int32), np.zeros((0, width)))
-
-    @staticmethod
-    def one(t: int, arrival: int, kind: int, channel: int, values: object, width: int) -> Readings:
-        """A batch of one event; `values` fill the first columns, the rest is NaN."""
-        row = np.full((1, width), np.nan)
-        given = np.atleast_1d(np.asarray(values, float))
-        row[0, : given.size] = given
-        return Readings(
-            np.array([t], np.int64),
-            np.array([arrival], np.int64),
-            np.array([kind], np.int8),
-            np.array([channel], np.int32),
-            row,
-        )
-
-    @staticmethod
-    def concat(batches: list[Readings], width: int) -> Readings:
-        """Batches one after the other."""
-        if not batches:
-            return Readings.empty(width)
-        wide = [batch.widened(width) for batch in batches]
-        return Readings(*(np.concatenate(columns) for columns in zip(*wide, strict=True)))
-
-    def widened(self, width: int) -> Readings:
-        """The same events with at least `width` value columns; those that are added know nothing."""
-        missing = width - self.value.shape[1]
-        if missing <= 0:
-            return self
-        return Readings(*self[:4], np.pad(self.value, ((0, 0), (0, missing)), constant_values=np.nan))
-
-    def select(self, index: Any) -> Readings:
-        """The events that a mask, slice or index array picks."""
-        return Readings(*(column[index] for column in self))
-
-    def __len__(self) -> int:
-        """Number of events (not of columns)."""
-        return self.t.size
-
-
-# What `_replace` builds with; NamedTuple's own counts the columns by `len`, which here is the number of events.
-Readings._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[method-assign, assignment]
-
-
-def truth_of(events: Readings, state: int) -> tuple[np.ndarray, np.ndarray]:
-    """What the truth events know of one state.
-
-    Args:
-        events: Any events.
-        state: Index of the state.
-
-    Returns:
-        Indices of the events that know it, ascending, shape (k,), and its finite true values, shape (k,).
-    """
-    channel = events.channel
-    blocks = (events.kind == TRUTH) & (channel <= state) & (channel > state - events.value.shape[1])
-    rows = np.flatnonzero(blocks)
-    values = events.value[rows, state - channel[rows]]
-    known = np.isfinite(values)
-    return rows[known], values[known]
+__all__ = ["BEFORE", "INPUT", "KIND_NAMES", "READING", "RESET", "TICK", "TRUTH", "Log", "Readings", "truth_of"]
 
 
 class Log:
-    """A bounded, columnar log in order of measured time; events of equal time stay in the order of arrival.
+    """A bounded, columnar log in the order of order.py: by measured time, and at one time by kind and channel.
 
     Timestamps are int64 nanoseconds. `first` counts the events that were dropped from the front, so `first + i` names
-    an event for ever. Columns are full-length arrays of which the first `n` rows are valid.
+    an event for ever. Columns are full-length arrays of which the first `n` rows are valid. `changes` counts what was
+    put in. `start` is the time at which the prior holds, `BEFORE` for that of the first event; an event before `floor`
+    is stale: what it would change has been forgotten.
     """
 
     def __init__(self, width: int, capacity: int = 1024) -> None:
         self.width = width
+        self.model: StateSpaceModel | None = None
+        self.layout: Layout | None = None
         self.n = 0
         self.first = 0
+        self.changes = 0
         self.newest = BEFORE
+        self.start = self.floor = BEFORE
+        self._allocate(capacity, width)
+
+    @staticmethod
+    def of(model: StateSpaceModel, *, start: float | None = None, capacity: int = 1024) -> Log:
+        """An empty log of a model: it refuses what the model has no place for, and takes arrays by name.
+
+        Args:
+            model: The model whose sensors, inputs and states the events are of.
+            start: Time at which the prior holds, s; None for that of the first event.
+            capacity: Events that fit before it grows.
+
+        Raises:
+            EventError: If `start` is not a time.
+        """
+        log = Log(model.width, capacity)
+        log.model, log.layout = model, model.layout
+        if start is not None:
+            log.start = log.floor = int(series.nanoseconds("start", start)[0])
+        return log
+
+    def _allocate(self, capacity: int, columns: int) -> None:
         # Filled, not empty: the pages are paid for now, and memory stays flat while the log fills.
         self.t = np.full(capacity, 0, np.int64)
         self.arrival = np.full(capacity, 0, np.int64)
         self.kind = np.full(capacity, 0, np.int8)
         self.channel = np.full(capacity, 0, np.int32)
-        self.value = np.full((capacity, width), np.nan)
+        self.value = np.full((capacity, columns), np.nan)
 
     @property
     def capacity(self) -> int:
@@ -124,63 +74,163 @@ class Log:
         """Views of the valid rows."""
         return Readings(*(column[: self.n] for column in self._columns()))
 
+    @property
+    def has_variances(self) -> bool:
+        """Whether a reading came with variances of its own."""
+        return self.value.shape[1] > self.width
+
     def _columns(self) -> tuple[np.ndarray, ...]:
         return self.t, self.arrival, self.kind, self.channel, self.value
+
+    def add(self, sensor: str, seconds: Any, values: Any, *, variance: Any = None) -> int:
+        """Put readings of one sensor where they belong.
+
+        Args:
+            sensor: Its name in the model.
+            seconds: When they were measured, s, shape (N,) or one number; in any order.
+            values: In the units of the sensor's rows, shape (N,), or (N, rows); NaN is missing.
+            variance: The noise's variance of each, in the units squared, if they tell it (a receiver does); shape as
+                `values`, or anything that can be broadcast to it. NaN leaves the tuned R.
+
+        Returns:
+            How many events the log has now.
+
+        Raises:
+            EventError: If the log is of no model, a name or a shape does not fit, or a time is before the start.
+        """
+        return self._put(series.readings(self._named("add"), sensor, seconds, values, variance))
+
+    def add_inputs(self, seconds: Any, **inputs: Any) -> int:
+        """Put inputs where they belong; each holds until its next value.
+
+        Args:
+            seconds: From when on they hold, s, shape (N,) or one number.
+            **inputs: Values by name, in the inputs' units, shape (N,) or one number; NaN leaves the value before.
+
+        Returns:
+            How many events the log has now.
+
+        Raises:
+            EventError: As `add`.
+        """
+        return self._put(series.inputs(self._named("add_inputs"), seconds, inputs))
+
+    def add_truth(self, seconds: Any, **states: Any) -> int:
+        """Put true states where they belong: the estimate is scored against them, and never sees them.
+
+        Args:
+            seconds: When they held, s, shape (N,) or one number.
+            **states: True values by name, in the states' units, shape (N,) or one number; NaN is not known.
+
+        Returns:
+            How many events the log has now.
+
+        Raises:
+            EventError: As `add`.
+        """
+        return self._put(series.truth(self._named("add_truth"), seconds, states))
+
+    def add_ticks(self, seconds: Any) -> int:
+        """Ask for the estimate at these times, s, shape (N,) or one number: each is a row of the track.
+
+        Returns:
+            How many events the log has now.
+
+        Raises:
+            EventError: If a time is not finite or before the start.
+        """
+        return self._put(series.ticks(self.width, seconds))
+
+    def _named(self, method: str) -> StateSpaceModel:
+        if self.model is None:
+            raise EventError(f"{method}: this log is of no model, so it knows no names; make it by Log.of(model)")
+        return self.model
+
+    def _put(self, batch: Readings) -> int:
+        early = int(np.sum(batch.t < self.floor))
+        if early:
+            raise EventError(
+                f"seconds: {early} of {len(batch)} times are before {self.floor * 1e-9:.9g} s, where the log starts; "
+                "leave them out, or start the log earlier"
+            )
+        self.extend(batch)
+        return self.n
 
     def extend(self, batch: Readings, horizon: int | None = None) -> tuple[int, int]:
         """Put a batch where it belongs in time.
 
         Args:
-            batch: Events in the order of arrival, with at most `width` value columns.
+            batch: Events in any order. Value columns beyond `width` hold variances, see `Readings`.
             horizon: Nanoseconds; an event older than the newest before it by more than this is dropped as stale.
-                Judged event by event, so the outcome does not depend on how arrivals were cut into batches.
+                Judged event by event, so the outcome does not depend on how arrivals were cut into batches. One
+                before `floor` is stale with any horizon.
 
         Returns:
             The lowest index whose event changed (the old `n` if all were appended) and the number dropped.
+
+        Raises:
+            EventError: If an event does not fit; then the log is as it was.
         """
+        # Assigned as it is, a single column would be repeated in all, and a true value become that of other states.
+        batch = admitted(batch, self.width, self.layout).widened(self.width)
         if not len(batch):
             return self.n, 0
-        # Assigned as it is, a single column would be repeated in all, and a true value become that of other states.
-        batch = batch.widened(self.width)
         # A tick says nothing of the asset, so nothing is late because of it.
         said = np.where(batch.kind == TICK, self.newest, batch.t)
         newest = np.maximum(np.maximum.accumulate(said), self.newest)
         self.newest = int(newest[-1])
         stale = 0
-        if horizon is not None:
-            fresh = batch.t >= newest - horizon
+        if horizon is not None or batch.t.min() < self.floor:
+            fresh = batch.t >= (self.floor if horizon is None else np.maximum(newest - horizon, self.floor))
             stale = int(fresh.size - fresh.sum())
             if stale:
                 batch = batch.select(fresh)
                 if not len(batch):
                     return self.n, stale
-        if np.any(batch.t[1:] < batch.t[:-1]):
-            batch = batch.select(np.argsort(batch.t, kind="stable"))
-        self._reserve(len(batch))
-        start, n, end = self.n, self.n, self.n + len(batch)
-        if n and batch.t[0] < self.t[n - 1]:
-            start = int(np.searchsorted(self.t[:n], batch.t[0], side="right"))
-            order = np.argsort(np.concatenate((self.t[start:n], batch.t)), kind="stable")
-            for column, new in zip(self._columns(), batch, strict=True):
-                column[start:end] = np.concatenate((column[start:n], new))[order]
-        else:
-            for column, new in zip(self._columns(), batch, strict=True):
-                column[n:end] = new
-        self.n = end
-        return start, stale
+        if not in_order(batch):
+            batch = batch.select(sorted_order(batch))
+        self._reserve(len(batch), batch.value.shape[1])
+        batch = batch.widened(self.value.shape[1])
+        self.changes += 1
+        return self._insert(batch), stale
 
-    def _reserve(self, extra: int) -> None:
-        need = self.n + extra
-        if need <= self.capacity:
+    def _insert(self, batch: Readings) -> int:
+        """Merge a batch that is in order; the lowest index that changed."""
+        n, end = self.n, self.n + len(batch)
+        start = n
+        if n and batch.t[0] <= self.t[n - 1]:
+            start = int(np.searchsorted(self.t[:n], batch.t[0], side="left"))
+        columns = self._columns()
+        tail = batch if start == n else Readings(*(np.concatenate((a[start:n], b)) for a, b in zip(columns, batch)))
+        changed = n
+        if start < n:
+            order = sorted_order(tail)
+            moved = np.flatnonzero(order != np.arange(order.size))
+            if moved.size:
+                changed = start + int(moved[0])
+                tail = tail.select(order)
+        for column, new in zip(columns, tail, strict=True):
+            column[changed:end] = new[changed - start :]
+        self.n = end
+        return changed
+
+    def _reserve(self, extra: int, columns: int) -> None:
+        """Room for `extra` more events, and for variances where they are the first that bring any."""
+        need, wide = self.n + extra, self.value.shape[1]
+        if need <= self.capacity and columns <= wide:
             return
-        capacity = max(need, 2 * self.capacity)
-        fresh = Log(self.width, capacity)
-        for new, old in zip(fresh._columns(), self._columns(), strict=True):
-            new[: self.n] = old[: self.n]
-        self.t, self.arrival, self.kind, self.channel, self.value = fresh._columns()
+        if columns > wide and self.layout is not None:
+            columns = max(columns, self.width + max(self.layout.rows))
+        old = self._columns()
+        self._allocate(self.capacity if need <= self.capacity else max(need, 2 * self.capacity), max(columns, wide))
+        for new, column in zip(self._columns()[:4], old, strict=False):
+            new[: self.n] = column[: self.n]
+        self.value[: self.n, :wide] = old[4][: self.n]
 
     def drop_front(self, count: int) -> None:
-        """Forget the oldest `count` events."""
+        """Forget the oldest `count` events; what comes later of the time before their end is stale."""
+        if count:
+            self.floor = max(self.floor, int(self.t[count - 1]))
         for column in self._columns():
             column[: self.n - count] = column[count : self.n].copy()
         self.n -= count
@@ -188,8 +238,9 @@ class Log:
 
     def copy(self) -> Log:
         """A log of its own with the same events, for a fold that runs beside the one that grows."""
-        twin = Log(self.width, max(1, self.n))
+        twin = Log(self.width, 1)
+        twin.__dict__.update(self.__dict__)
+        twin._allocate(max(1, self.n), self.value.shape[1])
         for new, old in zip(twin._columns(), self._columns(), strict=True):
             new[: self.n] = old[: self.n]
-        twin.n, twin.first, twin.newest = self.n, self.first, self.newest
         return twin

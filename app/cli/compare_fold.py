@@ -132,7 +132,7 @@ def _timed(
     Returns:
         The fold, and the shortest time an event, s of one processor.
     """
-    log = Log(twin.model.width, max(1, len(events)))
+    log = Log.of(twin.model, capacity=max(1, len(events)))
     log.extend(events)
     tuning = replace(twin.tuning.with_options(twin.options_of(estimator)), seed=seed)
     fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=twin.policy)

@@ -46,7 +46,7 @@ def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
     if duration is None and getattr(source, "endless", False):
         source.close()
         raise SourceError(f"{twin.name}: its source has no end; give --duration SECONDS")
-    log = Log(twin.model.width)
+    log = Log.of(twin.model)
     horizon = round(twin.config.time.horizon * 1e9)
     try:
         while (batch := source.read(1.0)) is not None:

@@ -34,7 +34,7 @@ def prepare(twin: Twin) -> None:
     """
 
     def work() -> None:
-        Fold(twin.estimator, twin.model, twin.tuning, Log(twin.model.width), pairs=twin.pairs)
+        Fold(twin.estimator, twin.model, twin.tuning, Log.of(twin.model), pairs=twin.pairs)
 
     attend(twin.model, work, "compiling filters, once", "compiled filters, once")
 

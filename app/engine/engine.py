@@ -100,7 +100,9 @@ class Engine:
 
     def _clear(self, base: Base | None) -> None:
         """An empty log and the fold that follows it."""
-        self._log = Log(self.model.width, self._history + 4 * SPARSE_EVERY)
+        self._log = Log.of(self.model, capacity=self._history + 4 * SPARSE_EVERY)
+        if base is not None:
+            self._log.floor = base.clock
         self._base = base
         self._fold = self._make_fold(self.estimator, self.tuning, self._log, base)
         self._tally = Tally(self.model)
@@ -284,19 +286,25 @@ class Engine:
             return
         batch = batches[0] if len(batches) == 1 else Readings.concat(batches, self.model.width)
         with self._lock:
-            first, stale = self._log.extend(batch, self._horizon)
+            stale = self._take(batch, self._horizon)
             self._silence.broken(self._log.newest)
-            before = min(first, self._fold.n)
-            if first < self._fold.n:
-                self._go_back(first)
-            self._fold.advance()
-            self._watch.look(self._fold, before)
             if self._log.n > self._history + 3 * SPARSE_EVERY:
                 self._forget()
         if stale:
-            self.notices.report("stale", f"{stale} reading(s) later than the horizon dropped", times=stale)
+            text = f"{stale} reading(s) later than the horizon, or older than the history, dropped"
+            self.notices.report("stale", text, times=stale)
         if self._feeder.live:
             self._latency.note(batch)
+
+    def _take(self, batch: Readings, horizon: int | None = None) -> int:
+        """Put events where they belong, and fold from there on; how many were stale."""
+        first, stale = self._log.extend(batch, horizon)
+        before = min(first, self._fold.n)
+        if first < self._fold.n:
+            self._go_back(first)
+        self._fold.advance()
+        self._watch.look(self._fold, before)
+        return stale
 
     def _go_back(self, index: int) -> None:
         """Events at and behind `index` changed: fold them again, and let every cursor fetch them again."""
@@ -353,12 +361,9 @@ class Engine:
             self.retune(*wanted)
 
     def insert(self, event: Readings) -> None:
-        """Put an event of our own behind the last one."""
+        """Put in an event of our own."""
         with self._lock:
-            before = self._fold.n
-            self._log.extend(event)
-            self._fold.advance()
-            self._watch.look(self._fold, before)
+            self._take(event)
 
     def retune(self, estimator: str, tuning: Tuning) -> None:
         """Fold the history again, beside the running fold, over a copy of the log."""

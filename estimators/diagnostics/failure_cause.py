@@ -16,6 +16,7 @@ from ..compiled.model import CompiledModel
 from ..errors import ModelError
 from ..model.check import indefinite, numbers, place
 from ..model.state_space import SHOWN
+from ..steps import steps_of
 from ..track import FAILED, GATED, Track
 
 AWAY = (1.0, -1.0, 3.0, -3.0)
@@ -98,7 +99,7 @@ def _walk(
 ) -> str | np.ndarray:
     """Where the prediction from a state ends, or the first function that is not in order on the way."""
     model = compiled.model
-    steps = max(1, min(STEPS, int(np.ceil(dt / model.max_step)))) if dt > 0.0 else 0
+    steps = min(STEPS, steps_of(dt, model.max_step)) if dt > 0.0 else 0
     for _ in range(steps):
         step = dt / steps
         at = f"x = {numbers(x)}, u = {numbers(u)}, dt = {step:.4g} s"

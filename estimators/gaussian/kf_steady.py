@@ -19,6 +19,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from .. import steps
 from ..compiled.context import options, sensor_rows, transition
 from ..errors import EstimatorError
 from ..estimator import Estimator, Option, Options
@@ -239,7 +240,7 @@ def columns(function: Callable, n: int, m: int) -> np.ndarray:
 
 def steps_of(model: StateSpaceModel, period: float) -> int:
     """Steps in which the fold crosses a period."""
-    return max(1, int(np.ceil(period / model.max_step)))
+    return steps.steps_of(period, float(model.max_step))
 
 
 def undetectable(model: StateSpaceModel, F: np.ndarray, H: np.ndarray) -> str | None:
@@ -315,4 +316,5 @@ KF_STEADY = Estimator(
     ),
     tune=tune,
     applies=applies,
+    fixed_r=True,
 )

@@ -6,12 +6,14 @@ the four functions. Everything else, snapshots and rewinds too, is the Fold's an
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
 
 from ..errors import ModelError
 from ..log import INPUT, READING, RESET, TICK, TRUTH
+from ..steps import steps_of
 from ..track import FAILED, MISSING, NONE, Track
 
 UNSET = int(np.iinfo(np.int64).min)
@@ -37,7 +39,7 @@ def _advance_to(
         if dt > LONGEST * context.max_step:
             code.start(context, *context.prior(), state)
         else:
-            steps = 1 if dt <= context.max_step else int(np.ceil(dt / context.max_step))
+            steps = steps_of(dt, context.max_step)
             for k in range(steps):
                 code.predict(context, u, dt / steps, index, state, work)
                 clock[0] = begun + round((k + 1) * (t - begun) / steps)
@@ -54,6 +56,7 @@ def run(
     kind: np.ndarray,
     channel: np.ndarray,
     value: np.ndarray,
+    width: int,
     clock: np.ndarray,
     u: np.ndarray,
     state: np.ndarray,
@@ -68,6 +71,7 @@ def run(
     would need the answer is no number, and the state stays what and when it was, for the next event to go on from.
     A filter asks the model before it changes its state, so that it never stands in between.
     """
+    tuned = nullcontext()
     with np.errstate(all="ignore"):  # as compiled code: a number that is not finite is an answer, not a warning
         for i in range(start, end):
             what, now, index = int(kind[i]), int(t[i]), first + i
@@ -84,9 +88,11 @@ def run(
                     known = True
                     if what == READING:
                         innovation, innovation_std = track.innovation[i], track.innovation_std[i]
-                        verdict = code.update(
-                            context, u, int(channel[i]), value[i], index, state, work, innovation, innovation_std, score
-                        )
+                        sensor = int(channel[i])
+                        with context.brought(sensor, value[i, width:]) if value.shape[1] > width else tuned:
+                            verdict = code.update(
+                                context, u, sensor, value[i], index, state, work, innovation, innovation_std, score
+                            )
                 except ModelError as error:
                     context.failed(error)
                     verdict = FAILED if what == READING else NONE

@@ -6,6 +6,8 @@ by the same code.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -30,20 +32,27 @@ class View:
     """
 
     def __init__(
-        self, compiled: CompiledModel, context: np.void, tuning: Tuning, options: Options, pairs: np.ndarray
+        self,
+        compiled: CompiledModel,
+        context: np.void,
+        tuning: Tuning,
+        options: Options,
+        pairs: np.ndarray,
+        held: dict[str, Any],
     ) -> None:
+        """See a model; `held` are the arrays that the context points to."""
         model = compiled.model
         self.model: StateSpaceModel = model
         self.compiled, self.context, self.options, self.pairs = compiled, context, options, pairs
         self.nx, self.max_step, self.seed = model.nx, model.max_step, tuning.seed
-        self.p = np.ascontiguousarray(tuning.p, float)
-        self.q = np.ascontiguousarray(tuning.q, float)
+        self.p, self.q = held["p"], held["q"]
+        self._prior = held["prior_mean"], held["prior_cov"]
         self.circular = np.asarray(model.circular, bool)
         self.shown = model.shown
         ends = [first + len(sensor.rows) for first, sensor in zip(model.row_start, model.sensors, strict=True)]
         rows = [slice(first, end) for first, end in zip(model.row_start, ends, strict=True)]
         angles = np.array([row.circular for sensor in model.sensors for row in sensor.rows], bool)
-        self._r = [np.ascontiguousarray(tuning.r[part], float) for part in rows]
+        self._r = [held["r"][part] for part in rows]
         self._angles = [angles[part] for part in rows]
         self._scratch = np.empty(scratch_size(model.nx, model.width))
         self.kept: dict[Any, Any] = {}
@@ -58,11 +67,22 @@ class View:
 
     def prior(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean (nx,) and covariance (nx, nx) of the prior."""
-        return self.compiled.static["prior_mean"], self.compiled.static["prior_cov"]
+        return self._prior
 
     def variances(self, sensor: int) -> np.ndarray:
         """r (ny,): the variances of a sensor's rows."""
         return self._r[sensor]
+
+    @contextmanager
+    def brought(self, sensor: int, own: np.ndarray) -> Iterator[None]:
+        """While it lasts, r is what a reading brought where it brought any, own (ny or more,); NaN leaves the tuned."""
+        r = self._r[sensor]
+        tuned, own = r.copy(), own[: r.size]
+        np.copyto(r[: own.size], own, where=np.isfinite(own))
+        try:
+            yield
+        finally:
+            r[:] = tuned
 
     def circular_rows(self, sensor: int) -> np.ndarray:
         """For each row of a sensor, whether it is an angle."""

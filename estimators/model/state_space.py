@@ -16,6 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ..door import Layout
 from ..errors import LARGEST, ModelError
 from .field import CellNames, Field, State
 from .jump import Jump
@@ -251,6 +252,12 @@ class StateSpaceModel:
         """What an estimate of that state is called: its name, or, of a mode with two values, a probability."""
         two = self.jump is not None and state == self.jump.state and len(self.jump.modes) == 2
         return f"probability of {state}" if two else state
+
+    @cached_property
+    def layout(self) -> Layout:
+        """What an event of this model may hold."""
+        rows = tuple(len(sensor.rows) for sensor in self.sensors)
+        return Layout(self.name, self.sensor_names, rows, self.nu, self.nx)
 
     @property
     def nx(self) -> int:

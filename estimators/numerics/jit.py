@@ -32,6 +32,10 @@ f64 = types.float64
 i64 = types.int64
 
 
+CONSTANTS = ("errors.py", "events.py", "state_space.py")
+"""Files from which compiled code takes constants, and nothing else."""
+
+
 def cache_folder() -> Path:
     """Where machine code is kept: per user, and apart for each version of the sources.
 
@@ -44,7 +48,9 @@ def cache_folder() -> Path:
     package = Path(__file__).parent.parent
     for path in sorted(package.rglob("*.py")):
         source = path.read_bytes()
-        compiling = b"jit" in source or b"intrinsic" in source or path.name in ("log.py", "state_space.py")
+        compiling = (
+            b"jit" in source or b"intrinsic" in source or path.name in ("errors.py", "events.py", "state_space.py")
+        )
         if compiling and package / "models" not in path.parents:
             digest.update(source)
     return base / "nisus" / "numba" / digest.hexdigest()[:16]

@@ -12,6 +12,7 @@ from estimators.errors import NisusError, SourceError
 from estimators.log import INPUT, READING, TICK, TRUTH, Readings
 from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.jit import plain
+from estimators.steps import steps_of
 
 from .faults import Fault, Faults
 from .profile import Constant, Profile
@@ -160,7 +161,7 @@ class Simulator:
         truth = self._truth
         self._k += 1
         t = self._time(self._k)
-        pieces = max(1, int(np.ceil(self._step / truth.model.max_step)))
+        pieces = steps_of(self._step, truth.model.max_step)
         for _ in range(pieces):
             self._jump(self._step / pieces)
             after = np.empty_like(self._x)

@@ -147,7 +147,11 @@ def test_an_unknown_override_names_what_is_near() -> None:
             "  winding: {std: [3, 4]}",
             "motor.yaml:7: sensors.winding.std has 2 entries; give one, or 1: winding",
         ),
-        ("estimator: kf", "estimator: kff", "motor.yaml:8: estimator 'kff' does not exist; did you mean kf, ukf or ekf?"),
+        (
+            "estimator: kf",
+            "estimator: kff",
+            "motor.yaml:8: estimator 'kff' does not exist; did you mean kf, ukf or ekf?",
+        ),
         (
             "estimator: kf",
             "estimator: {name: ukf, options: {alfa: 1}}",

@@ -1,0 +1,118 @@
+"""Events: what the asset said, one row each, as columns of one length."""
+
+from __future__ import annotations
+
+from operator import index
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .errors import EventError
+
+READING, INPUT, TRUTH, TICK, RESET = range(5)
+"""Kinds of event: a sensor's reading; inputs; a true state (scored, never used); a query; back to the prior."""
+
+BEFORE = -(2**62)
+"""Earlier than any event, and far enough from the end of int64 that a horizon can be taken off."""
+
+KIND_NAMES = ("reading", "input", "truth", "tick", "reset")
+
+
+class Readings(NamedTuple):
+    """A batch of events in the order of arrival; columns of one length N.
+
+    `channel` is the sensor's index for a reading, the first state's for a truth, else 0. `value` (N, width) holds a
+    reading's rows, all inputs, or the true values of the states channel, channel + 1, ...; NaN is a row that is
+    missing, an input that stays, or a state whose truth is not known.
+
+    Columns of `value` beyond the width of the log hold variances: column width + k is that of the noise of row k of
+    this one reading, in the row's unit squared; NaN leaves the tuned one.
+    """
+
+    t: np.ndarray
+    arrival: np.ndarray
+    kind: np.ndarray
+    channel: np.ndarray
+    value: np.ndarray
+
+    @staticmethod
+    def empty(width: int) -> Readings:
+        """A batch without events."""
+        none = np.zeros(0, np.int64)
+        return Readings(none, none, np.zeros(0, np.int8), np.zeros(0, np.int32), np.zeros((0, width)))
+
+    @staticmethod
+    def one(t: int, arrival: int, kind: int, channel: int, values: object, width: int) -> Readings:
+        """A batch of one event; `values` fill the first columns, the rest is NaN.
+
+        Raises:
+            EventError: If a time or an index is not an integer, or the values are more than `width`.
+        """
+        row = np.full((1, width), np.nan)
+        given = np.atleast_1d(np.asarray(values, float))
+        if given.size > width:
+            raise EventError(f"values are {given.size}; they must be {width} at most, the width of the log")
+        row[0, : given.size] = given
+        return Readings(
+            np.array([_whole("t", t)], np.int64),
+            np.array([_whole("arrival", arrival)], np.int64),
+            np.array([_whole("kind", kind)], np.int8),
+            np.array([_whole("channel", channel)], np.int32),
+            row,
+        )
+
+    @staticmethod
+    def concat(batches: list[Readings], width: int) -> Readings:
+        """Batches one after the other, with at least `width` value columns."""
+        if not batches:
+            return Readings.empty(width)
+        widest = max(width, *(batch.value.shape[1] for batch in batches))
+        wide = [batch.widened(widest) for batch in batches]
+        return Readings(*(np.concatenate(columns) for columns in zip(*wide, strict=True)))
+
+    def widened(self, width: int) -> Readings:
+        """The same events with at least `width` value columns; those that are added know nothing."""
+        missing = width - self.value.shape[1]
+        if missing <= 0:
+            return self
+        return Readings(*self[:4], np.pad(self.value, ((0, 0), (0, missing)), constant_values=np.nan))
+
+    def select(self, index: Any) -> Readings:
+        """The events that a mask, slice or index array picks."""
+        return Readings(*(column[index] for column in self))
+
+    def __len__(self) -> int:
+        """Number of events (not of columns)."""
+        return self.t.size
+
+
+# What `_replace` builds with; NamedTuple's own counts the columns by `len`, which here is the number of events.
+Readings._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[method-assign, assignment]
+
+
+def _whole(name: str, value: Any) -> int:
+    """An integer as it is; a float would lose what stands after its point without a word."""
+    try:
+        return index(value)
+    except TypeError:
+        remedy = f"for seconds write round({value} * 1e9)" if name in ("t", "arrival") else "give a whole number"
+        unit = "a whole number of nanoseconds" if name in ("t", "arrival") else "an integer"
+        raise EventError(f"{name} is {value!r}; it must be {unit}: {remedy}") from None
+
+
+def truth_of(events: Readings, state: int) -> tuple[np.ndarray, np.ndarray]:
+    """What the truth events know of one state.
+
+    Args:
+        events: Any events.
+        state: Index of the state.
+
+    Returns:
+        Indices of the events that know it, ascending, shape (k,), and its finite true values, shape (k,).
+    """
+    channel = events.channel
+    blocks = (events.kind == TRUTH) & (channel <= state) & (channel > state - events.value.shape[1])
+    rows = np.flatnonzero(blocks)
+    values = events.value[rows, state - channel[rows]]
+    known = np.isfinite(values)
+    return rows[known], values[known]

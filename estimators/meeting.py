@@ -1,0 +1,136 @@
+"""What a fold is given beside its log, checked against the model: compiled code trusts every size and index."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .errors import LARGEST, EstimatorError
+from .estimator import Estimator, Options
+from .gaussian.robust import ADAPT_R
+from .model.state_space import LARGE, StateSpaceModel
+from .tuning import Tuning
+
+if TYPE_CHECKING:
+    from .fold import Base
+
+ROUNDING = 1e-12
+"""Share of the largest variance by which an eigenvalue of a covariance may be below zero, and two halves may differ."""
+
+
+def check_pairs(pairs: Any, model: StateSpaceModel) -> np.ndarray:
+    """Pairs of states, (k, 2) int64.
+
+    Raises:
+        EstimatorError: If they are not pairs, or name a state that is not there.
+    """
+    if pairs is None:
+        return np.zeros((0, 2), np.int64)
+    given = np.asarray(pairs)
+    if given.size == 0:
+        return np.zeros((0, 2), np.int64)
+    if given.ndim != 2 or given.shape[1] != 2 or given.dtype.kind not in "iu":
+        raise EstimatorError(
+            f"pairs have shape {given.shape} and hold {given.dtype}; they must be indices of states, shape (k, 2)"
+        )
+    if given.min() < 0 or given.max() >= model.nx:
+        wrong = int(given.min() if given.min() < 0 else given.max())
+        raise EstimatorError(f"pairs name state {wrong}; {model.name} has states 0 to {model.nx - 1}")
+    return np.ascontiguousarray(given, np.int64)
+
+
+def check_tuning(tuning: Tuning, model: StateSpaceModel) -> None:
+    """Refuse a tuning with more or fewer entries than the model has.
+
+    Raises:
+        EstimatorError: With the first group that does not fit.
+    """
+    sizes = {
+        "q": (tuning.q, len(model.noises), "noises"),
+        "r": (tuning.r, len(model.row_names), "sensor rows"),
+        "p": (tuning.p, len(model.parameters), "parameters"),
+        "used": (tuning.used, len(model.sensors), "sensors"),
+    }
+    for name, (values, count, what) in sizes.items():
+        if np.shape(values) != (count,):
+            raise EstimatorError(
+                f"tuning: {name} has shape {np.shape(values)}; {model.name} has {count} {what}: start from "
+                "Tuning.of(model)"
+            )
+
+
+def check_base(base: Base, model: StateSpaceModel) -> None:
+    """Refuse a base of another model.
+
+    Raises:
+        EstimatorError: If mean, covariance or inputs are of other sizes.
+    """
+    if base.u.shape != (model.nu,):
+        raise EstimatorError(f"base: u has shape {base.u.shape}; {model.name} has {model.nu} inputs")
+    _check_sizes("base", base.mean, base.cov, model)
+
+
+def check_prior(prior: tuple[Any, Any], model: StateSpaceModel) -> tuple[np.ndarray, np.ndarray]:
+    """A prior's mean (nx,) and covariance (nx, nx), or variances (1, nx) where the model's filters keep only these.
+
+    Raises:
+        EstimatorError: If a size does not fit, a number is not finite, or the covariance is none.
+    """
+    if not (isinstance(prior, (tuple, list)) and len(prior) == 2):
+        raise EstimatorError(f"prior is {type(prior).__name__}; it must be (mean, cov)")
+    mean, cov = (np.array(part, float, order="C") for part in prior)
+    diagonal = model.shape is not None or model.nx > LARGE
+    _check_sizes("prior", mean, cov, model, rows=1 if diagonal else model.nx)
+    if not (np.all(np.abs(mean) <= LARGEST) and np.all(np.abs(cov) <= LARGEST)):
+        raise EstimatorError(f"prior: mean and covariance must be finite, and {LARGEST:g} at most")
+    if diagonal:
+        if np.any(cov < 0.0):
+            raise EstimatorError(f"prior: the least variance is {cov.min():g}; it must be zero or positive")
+        return mean, cov
+    scale = float(np.max(np.diag(cov), initial=0.0))
+    if np.max(np.abs(cov - cov.T)) > ROUNDING * scale:
+        i, j = divmod(int(np.argmax(np.abs(cov - cov.T))), model.nx)
+        raise EstimatorError(
+            f"prior: the covariance of {model.state_names[i]} and {model.state_names[j]} is {cov[i, j]:g}, and "
+            f"{cov[j, i]:g} the other way round; it must be symmetric"
+        )
+    cov = 0.5 * (cov + cov.T)
+    std = np.sqrt(np.maximum(np.diag(cov), 0.0))
+    # Of the correlations: variances of states in different units say nothing of one another.
+    unit = np.where(std > 0.0, std, 1.0)
+    least = float(np.linalg.eigvalsh(cov / np.outer(unit, unit)).min())
+    if np.any(np.diag(cov) < 0.0) or least < -ROUNDING * model.nx:
+        raise EstimatorError(
+            f"prior: the covariance has the eigenvalue {least:g} in units of its deviations; it must be positive "
+            "semidefinite: lessen the correlations"
+        )
+    if model.mode >= 0 and not 0.0 <= mean[model.mode] <= len(model.jump.modes) - 1:  # type: ignore[union-attr]
+        raise EstimatorError(f"prior: the mean of the mode {model.state_names[model.mode]} is out of its range")
+    return mean, cov
+
+
+def _check_sizes(what: str, mean: np.ndarray, cov: np.ndarray, model: StateSpaceModel, rows: int | None = None) -> None:
+    n = model.nx
+    if mean.shape != (n,):
+        raise EstimatorError(f"{what}: mean has shape {mean.shape}; {model.name} has {n} states: give ({n},)")
+    wanted = ((n, n), (1, n)) if rows is None else ((rows, n),)
+    if cov.shape not in wanted:
+        raise EstimatorError(f"{what}: cov has shape {cov.shape}; for {model.name} it must be {wanted[0]}")
+
+
+def check_variances(entry: Estimator, options: Options) -> None:
+    """Refuse readings that bring their own variance where a filter holds on to one R.
+
+    Raises:
+        EstimatorError: With what to do.
+    """
+    if entry.fixed_r:
+        raise EstimatorError(
+            f"estimator {entry.name}: readings bring their own variance, but its gain is for one R; use kf"
+        )
+    if options.get("adapt") == ADAPT_R:
+        raise EstimatorError(
+            f"estimator {entry.name}: readings bring their own variance, but adapt learns one R of each sensor; set "
+            "adapt to off or Q"
+        )

@@ -1,0 +1,150 @@
+"""Arrays by name to events: what `Log.add` and its like take, in seconds and in the units of the model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .errors import EventError
+from .events import BEFORE, INPUT, READING, TICK, TRUTH, Readings
+
+if TYPE_CHECKING:
+    from .model.state_space import StateSpaceModel
+
+
+def nanoseconds(name: str, seconds: Any) -> np.ndarray:
+    """Seconds as int64 nanoseconds, shape (N,).
+
+    Raises:
+        EventError: If one is not finite or beyond ±146 years.
+    """
+    s = _numbers(name, seconds)
+    if s.ndim > 1:
+        raise EventError(f"{name} has shape {s.shape}; it must be one number or (N,)")
+    s = np.atleast_1d(s)
+    bad = ~(np.abs(s) < -BEFORE * 1e-9)
+    if bad.any():
+        at = int(np.argmax(bad))
+        raise EventError(f"{name}[{at}] is {s[at]}; times must be finite, in seconds, and within ±146 years of zero")
+    return np.rint(s * 1e9).astype(np.int64)
+
+
+def readings(model: StateSpaceModel, sensor: str, seconds: Any, values: Any, variance: Any = None) -> Readings:
+    """Readings of one sensor; see `Log.add`."""
+    index = _index("sensor", sensor, model.sensor_names, model)
+    rows = len(model.sensors[index].rows)
+    t = nanoseconds("seconds", seconds)
+    y = _rows(f"values of {sensor}", values, t.size, rows)
+    width = model.width + (model.ny if variance is not None else 0)
+    batch = _blank(t, READING, index, width)
+    batch.value[:, :rows] = y
+    if variance is not None:
+        given = _numbers(f"variance of {sensor}", variance)
+        if given.ndim == 1 and rows > 1 and given.shape == (t.size,) and t.size != rows:
+            given = given[:, None]
+        try:
+            batch.value[:, model.width : model.width + rows] = given.reshape(-1, 1) if rows == 1 else given
+        except ValueError:
+            raise EventError(
+                f"variance of {sensor} has shape {given.shape}; it must be one number or of shape {y.shape}"
+            ) from None
+        bad = ~(np.isnan(given) | (given > 0.0))
+        if bad.any():
+            wrong = given.flat[int(np.argmax(bad))]
+            raise EventError(f"variance of {sensor} is {wrong:g}; it must be positive, or NaN for the tuned one")
+    return batch
+
+
+def inputs(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Readings:
+    """Inputs by name; see `Log.add_inputs`."""
+    if not named:
+        raise EventError(f"add_inputs: no input is given; {model.name} has {_listed(model.input_names)}")
+    t = nanoseconds("seconds", seconds)
+    batch = _blank(t, INPUT, 0, model.width)
+    for name, values in named.items():
+        batch.value[:, _index("input", name, model.input_names, model)] = _column(name, values, t.size)
+    return batch
+
+
+def truth(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Readings:
+    """True states by name, in as few events a time as their places in the state allow; see `Log.add_truth`."""
+    if not named:
+        raise EventError(f"add_truth: no state is given; {model.name} has {_listed(model.state_names)}")
+    t = nanoseconds("seconds", seconds)
+    known = {
+        _index("state", name, model.state_names, model): _column(name, values, t.size) for name, values in named.items()
+    }
+    blocks: list[Readings] = []
+    for state in sorted(known):
+        if not blocks or state >= int(blocks[-1].channel[0]) + model.width:
+            blocks.append(_blank(t, TRUTH, state, model.width))
+        first = int(blocks[-1].channel[0]) if t.size else 0
+        blocks[-1].value[:, state - first] = known[state]
+        if not t.size:
+            break
+    return Readings.concat(blocks, model.width)
+
+
+def ticks(width: int, seconds: Any) -> Readings:
+    """Queries; see `Log.add_ticks`."""
+    return _blank(nanoseconds("seconds", seconds), TICK, 0, width)
+
+
+def _blank(t: np.ndarray, kind: int, channel: int, width: int) -> Readings:
+    """Events that know nothing yet; they arrive when they are measured."""
+    n = t.size
+    return Readings(t, t.copy(), np.full(n, kind, np.int8), np.full(n, channel, np.int32), np.full((n, width), np.nan))
+
+
+def _numbers(name: str, values: Any) -> np.ndarray:
+    try:
+        return np.asarray(values, float)
+    except (TypeError, ValueError):
+        raise EventError(f"{name} holds what is no number, such as {_sample(values)!r}; give numbers") from None
+
+
+def _sample(values: Any) -> Any:
+    if isinstance(values, Iterable) and not isinstance(values, str):
+        return next(iter(values), None)
+    return values
+
+
+def _rows(name: str, values: Any, n: int, rows: int) -> np.ndarray:
+    """Values as (n, rows)."""
+    y = _numbers(name, values)
+    if y.ndim == 0 and rows == 1:
+        y = np.full((n, 1), float(y))
+    elif y.ndim == 1 and rows == 1 or (y.ndim == 1 and n == 1 and y.size == rows):
+        y = y.reshape(-1, rows)
+    if y.shape != (n, rows):
+        wanted = f"({n},)" if rows == 1 else f"({n}, {rows}), a column for each row of the sensor"
+        raise EventError(f"{name} have shape {y.shape} for {n} times; the shape must be {wanted}")
+    return y
+
+
+def _column(name: str, values: Any, n: int) -> np.ndarray:
+    """Values of one input or state as (n,)."""
+    y = _numbers(name, values)
+    if y.ndim == 0:
+        return np.full(n, float(y))
+    if y.shape != (n,):
+        raise EventError(f"{name} has shape {y.shape} for {n} times; the shape must be ({n},), or one number")
+    return y
+
+
+def _index(what: str, name: str, names: Sequence[str], model: StateSpaceModel) -> int:
+    try:
+        return names.index(name)
+    except ValueError:
+        near = get_close_matches(str(name), list(names[:1000]), n=3, cutoff=0.4)
+        rule = f"near: {', '.join(near)}" if near else f"it has {_listed(names)}"
+        raise EventError(f"{model.name} has no {what} {name!r}; {rule}") from None
+
+
+def _listed(names: Sequence[str]) -> str:
+    if not len(names):
+        return "none"
+    return ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
