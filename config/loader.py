@@ -134,6 +134,8 @@ def _override(data: dict[str, Any], places: Places, dotted_key: str, text: str) 
     parts = dotted_key.split(".")
     if parts[0] == "estimator" and len(parts) > 1 and isinstance(data.get("estimator"), str):
         data["estimator"] = {"name": data["estimator"]}
+    if parts in (["estimator"], ["estimator", "name"]):
+        _keep_options(data, places)
     if not all(parts):
         raise ConfigError(f"{option}: the key has an empty part; write it like source.interface")
     key: list[str | int] = []
@@ -156,3 +158,21 @@ def _override(data: dict[str, Any], places: Places, dotted_key: str, text: str) 
             places.options[tuple(key)] = option
         here = here[key[-1]]
     places.options[tuple(key)] = option
+
+
+def _keep_options(data: dict[str, Any], places: Places) -> None:
+    """Move the options of the YAML's own filter to `filters`, before another name takes its place.
+
+    So they are there when that filter runs after all: named on the command line, chosen on the page, or compared.
+    """
+    own, filters = data.get("estimator"), data.get("filters") or {}
+    if not isinstance(own, dict) or not isinstance(filters, dict):
+        return
+    name, options = own.get("name"), own.get("options")
+    given = filters.get(name) if isinstance(name, str) else None
+    if not isinstance(name, str) or not isinstance(options, dict) or not isinstance(given, dict | None):
+        return
+    data["filters"] = {**filters, name: {**(given or {}), **options}}
+    data["estimator"] = {key: value for key, value in own.items() if key != "options"}
+    for key, line in [(key, line) for key, line in places.lines.items() if key[:2] == ("estimator", "options")]:
+        places.lines[("filters", name, *key[2:])] = line

@@ -180,8 +180,8 @@ class Engine:
         return self._feeder.source
 
     def options_of(self, estimator: str) -> Mapping[str, float]:
-        """The options with which an estimator starts: as it was left, or as the YAML says."""
-        return self._options.of(estimator)
+        """The options with which an estimator starts: as it runs, as it was left, or as the YAML says."""
+        return self.tuning.options if estimator == self.estimator else self._options.of(estimator)
 
     def span(self) -> tuple[int, int]:
         """Times of the first and the last event, ns; zeros while there is none."""

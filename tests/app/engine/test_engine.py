@@ -496,3 +496,19 @@ def test_a_noise_that_is_none_where_the_asset_gets_is_named_once_a_fold(started,
     engine.submit(commands.SetTuning("Q.temperature", 0.0))
     wait_for(lambda: everything(engine).revision == 2)
     assert len(said()) == 2
+
+
+def test_the_running_filter_chosen_again_keeps_its_options(started):
+    """It goes on as it runs, not as it stood before the last option was turned."""
+    engine = started(Scripted(live=True), estimator="ukf")
+    engine.submit(commands.SetOption("alpha", 0.5))
+    engine.submit(commands.SetOption("alpha", 0.25))
+    engine.submit(commands.SetEstimator("ukf"))
+    engine.submit(commands.SetOption("beta", 1.0))
+    wait_for(lambda: engine.status().options["beta"] == 1.0)
+    assert engine.status().options["alpha"] == 0.25
+    engine.submit(commands.SetEstimator("kf"))
+    engine.submit(commands.SetEstimator("ukf"))
+    engine.submit(commands.SetOption("kappa", 1.0))
+    wait_for(lambda: engine.status().options.get("kappa") == 1.0)
+    assert (engine.status().options["alpha"], engine.status().options["beta"]) == (0.25, 1.0)

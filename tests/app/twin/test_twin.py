@@ -329,3 +329,22 @@ def test_a_filter_given_by_name_takes_options(tmp_path):
         made = load_twin(name, overrides=overrides)
         assert made.tuning.options["inflation"] == 1.25
         assert made.estimator == given.get("estimator", load_twin(name).estimator)
+
+
+def test_a_filter_named_anew_keeps_what_the_yaml_gives_it() -> None:
+    """Its own one named again runs with its options; another takes its place, and finds them when it comes back."""
+    text = MOTOR.replace(
+        "estimator: kf\n", "estimator: {name: ukf, options: {alpha: 0.5}}\nfilters: {ukf: {beta: 1}}\n"
+    )
+    own = twin_of(text)
+    assert own.tuning.options == {"alpha": 0.5, "beta": 1.0}
+    for key in ("estimator", "estimator.name"):
+        again = twin_of(text, overrides={key: "ukf"})
+        assert (again.estimator, again.tuning.options) == ("ukf", own.tuning.options), key
+        other = twin_of(text, overrides={key: "iekf"})
+        assert (other.estimator, other.tuning.options) == ("iekf", {}), key
+        assert other.options_of("ukf") == own.options_of("ukf") == own.tuning.options, key
+    more = twin_of(text, overrides={"estimator": "ukf", "estimator.options.alpha": "0.7"})
+    assert more.tuning.options == {"alpha": 0.7, "beta": 1.0}
+    with pytest.raises(ConfigError, match=r"^motor.yaml:8: .*alpha is 90"):
+        twin_of(text.replace("alpha: 0.5", "alpha: 90"), overrides={"estimator": "iekf"})
