@@ -20,12 +20,12 @@ from ..compiled.context import options as numbers
 from ..compiled.context import sensor_variances
 from ..estimator import Estimator
 from ..gaussian.shared import admit
-from ..numerics.jit import floats, jit, matrix
+from ..numerics.jit import ints, jit, matrix
 from ..numerics.random import key_of
 from ..track import FAILED, MISSING, USED
 from .pf import finite_rows, predicted
 from .proposals import EXPECT, PROPOSE_PRIOR, predict, predictive, tune, work_size
-from .resampling import copy_children, match_children
+from .resampling import ancestors_of, take_ancestors
 from .shared import (
     MEMBERS,
     OPTIONS,
@@ -70,10 +70,10 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     if verdict == USED and log_sum > -np.inf:
         key = key_of(context.seed, index, RESAMPLE)
         children = children_of(context, u, sensor, y, key, sums, state, work)
-        parents = floats(work.ctypes.data, n)
-        count = match_children(children, parents)
-        copy_children(count, children, parents, records_of(state, nx, n))
-        copy_children(count, children, parents, matrix(predictive(context, work, n), 0, n, 1))
+        ancestors = ints(work.ctypes.data, n)
+        ancestors_of(children, ancestors)
+        take_ancestors(ancestors, records_of(state, nx, n))
+        take_ancestors(ancestors, matrix(predictive(context, work, n), 0, n, 1))
         weigh_equally(state, nx, n)
         state[RESAMPLED] += 1.0
         key = key_of(context.seed, index, PROPOSE)

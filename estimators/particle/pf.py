@@ -49,20 +49,7 @@ from .shared import (
     start,
 )
 from .steps import JITTER as MOVE
-from .steps import (
-    PROPAGATE,
-    WEIGH,
-    first_residual,
-    impoverished,
-    keep,
-    normalise,
-    resample,
-    shared,
-    sweep,
-    total,
-    tune,
-    work_size,
-)
+from .steps import PROPAGATE, WEIGH, first_residual, keep_or_resample, normalise, shared, sweep, total, tune, work_size
 
 
 @jit
@@ -152,16 +139,15 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     log_sum = normalise(context, u, sensor, y, state, work, sums)
     score[2] = log_sum
     if verdict == USED and log_sum > -np.inf:
-        keep(context, u, sensor, y, log_sum, sums, state, work)
-        if impoverished(context, state):
-            resample(context, u, sensor, y, key_of(context.seed, index, RESAMPLE), sums, state, work)
-            if numbers(context)[EXTRA] > 0.0:
-                _, cov = settled_moments(state, nx)
-                belief_root(cov, L)
-                for i in range(nx):
-                    for j in range(nx):
-                        L[i, j] *= numbers(context)[EXTRA]
-                sweep(MOVE, context, u, 0.0, sensor, y, key_of(context.seed, index, JITTER), 0.0, state, work)
+        key = key_of(context.seed, index, RESAMPLE)
+        drawn = keep_or_resample(context, u, sensor, y, key, log_sum, sums, state, work)
+        if drawn and numbers(context)[EXTRA] > 0.0:
+            _, cov = settled_moments(state, nx)
+            belief_root(cov, L)
+            for i in range(nx):
+                for j in range(nx):
+                    L[i, j] *= numbers(context)[EXTRA]
+            sweep(MOVE, context, u, 0.0, sensor, y, key_of(context.seed, index, JITTER), 0.0, state, work)
     elif verdict == USED or verdict == FAILED:
         verdict = FAILED
         recover(context, index, state)

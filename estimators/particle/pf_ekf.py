@@ -37,7 +37,7 @@ from .shared import (
     sized,
     start,
 )
-from .steps import impoverished, keep, normalise, resample, shared, sweep, total
+from .steps import keep_or_resample, normalise, shared, sweep, total
 
 
 @jit
@@ -67,9 +67,8 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     log_sum = normalise(context, u, sensor, y, state, work, sums)
     score[2] = log_sum if log_sum > -np.inf else np.nan
     if verdict == USED and log_sum > -np.inf:
-        keep(context, u, sensor, y, log_sum, sums, state, work)
-        if impoverished(context, state):
-            resample(context, u, sensor, y, key_of(context.seed, index, RESAMPLE), sums, state, work)
+        key = key_of(context.seed, index, RESAMPLE)
+        keep_or_resample(context, u, sensor, y, key, log_sum, sums, state, work)
     elif verdict == USED or verdict == FAILED:
         verdict = FAILED
         recover(context, index, state)

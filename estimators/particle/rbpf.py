@@ -53,7 +53,7 @@ from .shared import (
     wrap_record,
 )
 from .shared import OPTIONS as CLOUD_OPTIONS
-from .steps import impoverished, keep, normalise, resample, shared, sweep, total
+from .steps import keep_or_resample, normalise, shared, sweep, total
 
 
 @jit
@@ -231,9 +231,8 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     if log_sum > -np.inf:
         score[2] = log_sum
     if verdict == USED and log_sum > -np.inf:
-        keep(context, u, sensor, y, log_sum, sums, state, work)
-        if impoverished(context, state):
-            resample(context, u, sensor, y, key_of(context.seed, index, RESAMPLE), sums, state, work)
+        key = key_of(context.seed, index, RESAMPLE)
+        keep_or_resample(context, u, sensor, y, key, log_sum, sums, state, work)
     elif verdict == USED or (verdict == FAILED and not score[0] == np.inf):
         verdict = FAILED
         state[SETTLED] = 0.0

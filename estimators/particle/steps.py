@@ -38,7 +38,7 @@ from ..numerics.simd_exp import exp_minus
 from ..numerics.threads import threaded
 from ..tuning import Tuning
 from .mode_draws import jump, jump_key
-from .resampling import STRATIFIED, copy_children, drawn_children, match_children, strata_children
+from .resampling import STRATIFIED, ancestors_of, drawn_children, strata_children, take_ancestors
 from .shared import (
     BLOCK,
     BLOCK_CODE,
@@ -450,17 +450,41 @@ def normalise(context, u, sensor, y, state, work, sums):
 
 
 @jit
+def _settle(context, sums, state, work):
+    """Mean, covariance and effective sample size, 1 / Σ w², of the weights of `normalise`.
+
+    Source: Kong, Liu & Wong (1994), Sequential imputations, doi:10.1080/01621459.1994.10476469.
+    """
+    _, _, _, _, _, _, reference = shared(context, work, int(numbers(context)[MEMBERS]))
+    mean, cov = settled_moments(state, context.nx)
+    finish_moments(state, sums, reference, mean, cov)
+    state[SETTLED] = 1.0
+    state[ESS] = sums[0] * sums[0] / sums[1]
+
+
+@jit
 def keep(context, u, sensor, y, log_sum, sums, state, work):
     """Make the weights of `normalise` the state's, with its mean and covariance."""
-    nx = context.nx
-    n = int(numbers(context)[MEMBERS])
-    _, _, _, _, _, _, reference = shared(context, work, n)
-    mean, cov = settled_moments(state, nx)
-    finish_moments(state, sums, reference, mean, cov)
+    _settle(context, sums, state, work)
     sweep(COMMIT, context, u, 0.0, sensor, y, np.uint64(0), log_sum, state, work)
-    state[SETTLED] = 1.0
     state[EQUAL] = 0.0
-    state[ESS] = sums[0] * sums[0] / sums[1]
+
+
+@jit
+def keep_or_resample(context, u, sensor, y, key, log_sum, sums, state, work):
+    """Make mean and covariance of the weights of `normalise` the state's, and the weights, or particles drawn by them.
+
+    They are drawn when the effective sample size has fallen under its part of N.
+
+    Returns:
+        Whether they were.
+    """
+    if sums[0] * sums[0] / sums[1] < numbers(context)[FRACTION] * numbers(context)[MEMBERS]:
+        _settle(context, sums, state, work)
+        resample(context, u, sensor, y, key, sums, state, work)
+        return True
+    keep(context, u, sensor, y, log_sum, sums, state, work)
+    return False
 
 
 @jit
@@ -490,18 +514,10 @@ def resample(context, u, sensor, y, key, sums, state, work):
     nx = context.nx
     n = int(numbers(context)[MEMBERS])
     children = children_of(context, u, sensor, y, key, sums, state, work)
-    parents = floats(work.ctypes.data, n)
-    copy_children(match_children(children, parents), children, parents, records_of(state, nx, n))
+    ancestors = ints(work.ctypes.data, n)
+    ancestors_of(children, ancestors)
+    take_ancestors(ancestors, records_of(state, nx, n))
     effective = state[ESS]
     weigh_equally(state, nx, n)
     state[ESS] = effective
     state[RESAMPLED] += 1.0
-
-
-@jit
-def impoverished(context, state):
-    """Whether the effective sample size, 1 / Σ w², has fallen under its part of N.
-
-    Source: Kong, Liu & Wong (1994), Sequential imputations, doi:10.1080/01621459.1994.10476469.
-    """
-    return state[ESS] < numbers(context)[FRACTION] * numbers(context)[MEMBERS]

@@ -377,3 +377,55 @@ def test_points_are_drawn_by_weight():
     assert points.shape == (2000, 1) and members(run.options) == 100_000
     assert abs(points.mean() - mean[0]) < 5 * np.sqrt(cov[0, 0] / 2000)
     assert abs(points.var() / cov[0, 0] - 1) < 5 * np.sqrt(2 / 2000)
+
+
+@pytest.mark.parametrize("name", ("pf", "pf-ekf", "apf"))
+@pytest.mark.parametrize("scheme", range(4))
+def test_siblings_stand_side_by_side(name, scheme):
+    """Nothing moves but by resampling: each particle is a copy of one of the prior's, in the order of these."""
+    model = scalar(noises=(Noise("s", "m²/s", 0.0),))
+    tuning = Tuning.of(model).with_options({"particles": 3000, "resampling": scheme, "fraction": 1.0})
+    if name == "apf":
+        tuning = tuning.with_options({"particles": 3000, "resampling": scheme})
+    run = Fold(name, model, tuning, log_of((0, TICK, 0), (1, READING, 2.3)))
+    run.advance(1)
+    before = block(run.options, run._state, 1)[:, 0].copy()
+    run.advance()
+    order = np.argsort(before)
+    ancestors = order[np.searchsorted(before[order], block(run.options, run._state, 1)[:, 0])]
+    assert np.array_equal(before[ancestors], block(run.options, run._state, 1)[:, 0])
+    assert 100 < np.unique(ancestors).size < 2900
+    assert np.all(np.diff(ancestors) >= 0)
+
+
+def swing(x, u, p, dt, out):
+    out[0] = x[0] + x[1] * dt
+    out[1] = x[1] - 9.81 * np.sin(x[0]) * dt
+
+
+def sine(x, u, p, out):
+    out[0] = np.sin(x[0])
+
+
+@pytest.mark.parametrize(("scheme", "most"), [(0, 0.012), (1, 0.018)])
+def test_resampling_often_keeps_what_the_strata_gain(scheme, most):
+    """A pendulum, resampled at each of 400 readings, over 40 seeds.
+
+    With siblings apart the estimates' standard deviations were 0.0144 and 0.0240 rad, side by side they are 0.0098 and
+    0.0134 (40 seeds tell one to a tenth); multinomial's is 0.044 in either order.
+    """
+    model = StateSpaceModel(
+        name="pendulum", title="", states=(State("angle", "rad", 1.5, 0.3), State("rate", "rad/s", 0.0, 0.3)),
+        noises=(Noise("rate", "rad²/s³", 0.01),), f=swing,
+        sensors=(Sensor("x", (Row("x", "m", 0.1),), h=sine),),
+    )  # fmt: skip
+    rng, x, log = np.random.default_rng(1), np.array([1.5, 0.0]), Log(model.width)
+    for k in range(1, 401):
+        out = np.empty(2)
+        swing(x, None, None, 0.01, out)
+        x = out + [0.0, 0.01 * rng.standard_normal()]
+        value = np.sin(x[0]) + np.sqrt(0.1) * rng.standard_normal()
+        log.extend(Readings.one(k * SECOND // 100, 0, READING, 0, value, model.width))
+    tuning = Tuning.of(model).with_options({"particles": 2000, "fraction": 1.0, "resampling": scheme})
+    means = np.array([fold("pf", model, replace(tuning, seed=seed), log).mean[:, 0] for seed in range(40)])
+    assert np.sqrt(np.mean(means.var(axis=0, ddof=1))) < most

@@ -9,10 +9,10 @@ from estimators.particle.resampling import (
     RESIDUAL,
     STRATIFIED,
     SYSTEMATIC,
-    copy_children,
+    ancestors_of,
     drawn_children,
-    match_children,
     strata_children,
+    take_ancestors,
 )
 
 SCHEMES = (SYSTEMATIC, STRATIFIED, RESIDUAL, MULTINOMIAL)
@@ -81,16 +81,20 @@ def test_weightless_particles_have_no_children(scheme):
         assert set(np.flatnonzero(children(scheme, w, draw))) <= {3, 17}
 
 
-def test_children_take_the_places_of_the_childless():
-    counts = np.array([0.0, 3.0, 0.0, 1.0, 0.0, 2.0])
-    rows = np.arange(12.0).reshape(6, 2)
-    before = rows.copy()
-    parents = np.empty(6)
-    copy_children(match_children(counts, parents), counts, parents, rows)
-    kept = sorted(map(tuple, rows.tolist()))
-    assert kept == sorted(tuple(before[i].tolist()) for i in (1, 1, 1, 3, 5, 5))
-    for i in (1, 3, 5):
-        assert np.array_equal(rows[i], before[i])
+@pytest.mark.parametrize("width", (1, 3, 40))
+@pytest.mark.parametrize("n", (1, 2, 5, 6, 300))
+def test_children_stand_in_the_order_of_their_ancestors(n, width):
+    """Beside NumPy's repeat, which copies; counts of all kinds, the whole of them at either end among them."""
+    rng = np.random.default_rng(n)
+    every = [np.eye(n)[k] * n for k in (0, n // 2, n - 1)]
+    every += [rng.multinomial(n, rng.dirichlet(np.full(n, a))) for a in (0.1, 1, 9)]
+    for counts in every:
+        rows, ancestors = rng.normal(size=(n, width)), np.full(n, -1)
+        expected = np.repeat(rows, counts.astype(int), axis=0)
+        ancestors_of(counts.astype(float), ancestors)
+        assert np.array_equal(ancestors, np.repeat(np.arange(n), counts.astype(int)))
+        take_ancestors(ancestors, rows)
+        assert np.array_equal(rows, expected)
 
 
 @pytest.mark.parametrize("scheme", (SYSTEMATIC, STRATIFIED, RESIDUAL))
