@@ -15,9 +15,9 @@ from typing import Any
 import numba
 import numpy as np
 
+from ..claims import check_parts
 from ..errors import ModelError
 from ..model.check import probe, probe_angles, probe_likelihoods, uncompilable
-from ..model.jump import check_parts
 from ..model.state_space import LARGE, Field, StateSpaceModel
 from ..numerics.jit import address, jit, plain
 from .black_box import ANSWER, BlackBox, answered_f, answered_h
@@ -206,7 +206,7 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
     probe_angles(model, compiled.h)
     if derivable:
         _check_derivatives(compiled)
-    check_parts(model)
+    check_parts(model, compiled.f, compiled.h)
     return compiled
 
 

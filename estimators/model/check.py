@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from types import CodeType
@@ -93,46 +94,98 @@ def indefinite(Q: np.ndarray) -> str | None:
     return None
 
 
+Values = dict[str, Any]
+"""What the functions of a model are called with, by the names that they have in the model's docstring."""
+
+
+def prior_values(model: StateSpaceModel) -> Values:
+    """The arguments at the prior, with default inputs and the declared parameters and noises."""
+    return {
+        "x": model.prior_mean.copy(),
+        "u": np.array([item.default for item in model.inputs], float),
+        "p": np.array([item.value for item in model.parameters], float),
+        "q": np.array([noise.variance for noise in model.noises], float),
+        "z": np.random.default_rng(0).standard_normal(model.nx),
+        "dt": min(1.0, model.max_step),
+    }
+
+
+def _elsewhere(model: StateSpaceModel, values: Values) -> Iterator[Values]:
+    """The arguments at two places away from the prior, where no entry is zero.
+
+    Of a large field there are none: a plain function takes seconds for so many cells.
+    """
+    rng = np.random.default_rng(1)
+    for _ in range(2 if model.nx <= LARGE else 0):
+        away = {
+            name: value + 0.1 * (1.0 + np.abs(value)) * rng.uniform(0.5, 1.0, value.shape)
+            for name, value in values.items()
+            if isinstance(value, np.ndarray)
+        }
+        away["x"] = model.prior_mean + model.prior_std * rng.uniform(0.5, 1.5, model.nx)
+        if model.jump is not None:
+            away["x"][model.mode] = len(model.jump.modes) - 1
+        yield values | away
+
+
+def refuse_writing(
+    model: StateSpaceModel, what: str, function: Callable, takes: str, *out: np.ndarray, more: Values | None = None
+) -> None:
+    """Refuse a function that changes what it is called with, at the prior or away from it.
+
+    At the prior alone it would pass where it scales or turns an entry that is zero there. Away from it the function may
+    fail, as not every state need have an answer.
+
+    Raises:
+        ModelError: With the function's file and line.
+    """
+    prior = prior_values(model) | (more or {})
+    for values in (prior, *_elsewhere(model, prior)):
+        names = takes.split(", ")
+        given = [values[name] for name in names]
+        copies = [item.copy() if isinstance(item, np.ndarray) else item for item in given]
+        with suppress(Exception), np.errstate(all="ignore"):
+            plain(function)(*copies, *(item.copy() for item in out))
+        for name, copy, item in zip(names, copies, given, strict=True):
+            if not np.array_equal(copy, item, equal_nan=isinstance(item, np.ndarray)):
+                raise ModelError(
+                    f"{place(function)}model {model.name}: {what} writes to its argument {name}, which is the "
+                    "filter's own; copy what it changes, and fill out only"
+                )
+
+
 def probe(model: StateSpaceModel) -> None:
-    """Run the plain functions once with arrays of the declared sizes, where an index that is too large is an error."""
-    x = model.prior_mean.copy()
-    u = np.array([item.default for item in model.inputs], float)
-    p = np.array([item.value for item in model.parameters], float)
-    q = np.array([noise.variance for noise in model.noises], float)
-    dt = min(1.0, model.max_step)
-    n = model.nx
-    calls: list[tuple[str, Callable | None, str, tuple, tuple[int, ...]]] = [
-        ("f", model.f, "x, u, p, dt", (x, u, p, dt), (n,)),
-        ("F", model.F, "x, u, p, dt", (x, u, p, dt), (n, n)),
-        ("Q", model.Q, "x, u, p, q, dt", (x, u, p, q, dt), (n, n)),
-        ("shape", model.shape, "z, p", (np.random.default_rng(0).standard_normal(n), p), (n,)),
+    """Run the plain functions with arrays of the declared sizes, where an index that is too large is an error."""
+    values = prior_values(model)
+    x, u, p, n = values["x"], values["u"], values["p"], model.nx
+    calls: list[tuple[str, Callable | None, str, tuple[int, ...]]] = [
+        ("f", model.f, "x, u, p, dt", (n,)),
+        ("F", model.F, "x, u, p, dt", (n, n)),
+        ("Q", model.Q, "x, u, p, q, dt", (n, n)),
+        ("shape", model.shape, "z, p", (n,)),
     ]
     at = f"x = {numbers(x)}, u = {numbers(u)}, p = {numbers(p)}"
     for sensor in model.sensors:
         m = len(sensor.rows)
-        calls.append((f"h of sensor {sensor.name}", sensor.h, "x, u, p", (x, u, p), (m,)))
-        calls.append((f"H of sensor {sensor.name}", sensor.H, "x, u, p", (x, u, p), (m, n)))
-    for what, function, takes, arguments, shape in calls:
+        calls.append((f"h of sensor {sensor.name}", sensor.h, "x, u, p", (m,)))
+        calls.append((f"H of sensor {sensor.name}", sensor.H, "x, u, p", (m, n)))
+    for what, function, takes, shape in calls:
         if function is None or (model.black_box and what not in ("Q", "shape")):
             continue
         out = np.full(shape, np.nan)
         if what == "Q":
             out[:] = 0.0
-        copies = tuple(item.copy() if isinstance(item, np.ndarray) else item for item in arguments)
+        given = [item.copy() if isinstance(item, np.ndarray) else item for item in map(values.get, takes.split(", "))]
         try:
             with np.errstate(all="ignore"):
-                plain(function)(*copies, out)
+                plain(function)(*given, out)
         except Exception as error:  # noqa: BLE001  the user's own function may raise anything
             sizes = f"{n} states, {u.size} inputs and {p.size} parameters, out of shape {shape}"
             raise ModelError(
                 f"{place(function, error)}model {model.name}: {what} fails at the prior: {type(error).__name__}: "
                 f"{_gist(error)}; {_remedy(error, function, f'({takes}, out)', sizes, at)}"
             ) from None
-        if not all(np.array_equal(copy, item) for copy, item in zip(copies, arguments, strict=True)):
-            raise ModelError(
-                f"{place(function)}model {model.name}: {what} writes to its arguments, which are the filter's own; it "
-                "may fill out only"
-            )
+        refuse_writing(model, what, function, takes, np.zeros(shape))
         bad = np.argwhere(~np.isfinite(out))
         if bad.size:
             first = ", ".join(map(str, bad[0]))
@@ -183,17 +236,19 @@ def probe_likelihoods(model: StateSpaceModel) -> None:
     for sensor in model.sensors:
         if sensor.log_likelihood is None:
             continue
-        y = np.empty(len(sensor.rows))
+        y = np.zeros(len(sensor.rows))
         r = np.array([row.variance for row in sensor.rows], float)
         plain(sensor.h)(x, u, p, y)
         named = f"model {model.name}: log_likelihood of sensor {sensor.name}"
         try:
-            value = float(plain(sensor.log_likelihood)(y, x, u, p, r))
+            value = float(plain(sensor.log_likelihood)(y.copy(), x.copy(), u.copy(), p.copy(), r.copy()))
         except Exception as error:  # noqa: BLE001  the user's own function may raise anything
             raise ModelError(
                 f"{place(sensor.log_likelihood, error)}{named} fails at the prior: {type(error).__name__}: "
                 f"{_gist(error)}; it takes (y, x, u, p, r) and returns a float"
             ) from None
+        what = f"log_likelihood of sensor {sensor.name}"
+        refuse_writing(model, what, sensor.log_likelihood, "y, x, u, p, r", more={"y": y + 0.5, "r": r})
         if np.isnan(value) or value == np.inf:
             raise ModelError(
                 f"{place(sensor.log_likelihood)}{named} is {value} at the prior; it must be a finite number, or -inf "

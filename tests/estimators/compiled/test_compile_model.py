@@ -5,7 +5,7 @@ import pytest
 
 from estimators.compiled.model import compile_model
 from estimators.errors import ModelError
-from estimators.model.state_space import Noise, Parameter, Row, Sensor, State
+from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from tests.estimators.compiled.test_jacobians import F, H, P, U, f, h, model
 
 NOT_COMPILABLE = {"a": 1}
@@ -90,7 +90,7 @@ def writes_to_x(x, u, p, dt, out):
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"f": writes_to_x}, ("f writes to its arguments", "fill out only")),
+        ({"f": writes_to_x}, ("f writes to its argument x", "fill out only")),
         ({"F": wrong_F}, ("F differs", "(relative)")),
         ({"H": wrong_H}, ("H of sensor s differs", "(relative)")),
         ({"f": leaves_out}, ("f leaves 1 of 3", "unset", "fill them all")),
@@ -188,3 +188,129 @@ def test_compiled_functions_say_what_the_plain_ones_say():
 
 def test_a_model_is_compiled_once():
     assert compile_model(model()) is compile_model(model())
+
+
+def turns_x(x, u, p, out):
+    x[0] = -x[0]
+    out[0] = x[0]
+
+
+def scales_u(x, u, p, out):
+    u[0] *= 2.0
+    out[0] = x[0] + u[0]
+
+
+def f_scales_u(x, u, p, dt, out):
+    u[0] *= 2.0
+    out[0] = x[0] + u[0]
+
+
+def f_turns_x(x, u, p, dt, out):
+    x[0] = -x[0]
+    out[0] = -x[0]
+
+
+def only_far(x, u, p, dt, out):
+    out[0] = x[0]
+    if x[0] > 0.01:
+        x[0] = 1.0
+
+
+def F_scales_x(x, u, p, dt, out):
+    x[0] *= 2.0
+    out[0, 0] = 1.0
+
+
+def H_scales_x(x, u, p, out):
+    x[0] *= 2.0
+    out[0, 0] = 1.0
+
+
+def Q_scales_x(x, u, p, q, dt, out):
+    x[0] *= 2.0
+    out[0, 0] = q[0] * dt
+
+
+def Q_scales_q(x, u, p, q, dt, out):
+    q[0] *= 2.0
+    out[0, 0] = q[0] * dt
+
+
+def likelihood_scales_x(y, x, u, p, r):
+    x[0] *= 2.0
+    return -0.5 * (y[0] - x[0]) ** 2 / r[0]
+
+
+def likelihood_centres_y(y, x, u, p, r):
+    y[0] -= x[0]
+    return -0.5 * y[0] ** 2 / r[0]
+
+
+def still(x, u, p, dt, out):
+    out[0] = x[0]
+
+
+def itself(x, u, p, out):
+    out[0] = x[0]
+
+
+def walk(sensor=(), **changes):
+    """A state whose prior mean is zero, as are its input and the reading that it expects."""
+    parts = dict(
+        name="walk", title="", states=(State("s", "m", 0.0, 0.5),), noises=(Noise("s", "m²/s", 0.3),), f=still,
+        inputs=(Input("v", "m/s"),),
+        sensors=(Sensor("y", (Row("y", "m", 0.04),), **({"h": itself} | dict(sensor))),),
+    )  # fmt: skip
+    return StateSpaceModel(**(parts | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"f": f_turns_x}, "f writes to its argument x"),
+        ({"f": f_scales_u}, "f writes to its argument u"),
+        ({"f": only_far}, "f writes to its argument x"),
+        ({"F": F_scales_x}, "F writes to its argument x"),
+        ({"Q": Q_scales_x}, "Q writes to its argument x"),
+        ({"Q": Q_scales_q, "noises": (Noise("s", "m²/s", 0.0),)}, "Q writes to its argument q"),
+        ({"sensor": {"h": turns_x}}, "h of sensor y writes to its argument x"),
+        ({"sensor": {"h": scales_u}}, "h of sensor y writes to its argument u"),
+        ({"sensor": {"H": H_scales_x}}, "H of sensor y writes to its argument x"),
+        ({"sensor": {"log_likelihood": likelihood_scales_x}}, "log_likelihood of sensor y writes to its argument x"),
+        ({"sensor": {"log_likelihood": likelihood_centres_y}}, "log_likelihood of sensor y writes to its argument y"),
+    ],
+    ids=lambda item: item.replace(" ", "_") if isinstance(item, str) else "",
+)
+def test_no_function_may_write_to_what_is_zero_at_the_prior(changes, says):
+    compile_model(walk())
+    with pytest.raises(ModelError, match=f"model walk: {says}, which is the filter's own; copy what it changes"):
+        compile_model(walk(**changes))
+
+
+def squares(x, u, p, dt, out):
+    out[0] = x[0] * x[0]
+
+
+def with_a_constant(x, u, p, dt, out):
+    out[0] = 1e6 + 0.9 * (x[0] - 1e6) + dt * u[0]
+
+
+def squares_in_h(x, u, p, out):
+    out[0] = x[0] * x[0]
+
+
+def with_an_offset(x, u, p, out):
+    out[0] = 273.15 + x[0]
+
+
+@pytest.mark.parametrize("mean", (0.0, 1.0, 1e6))
+@pytest.mark.parametrize("std", (1e-4, 1.0))
+def test_what_is_said_to_be_linear_is_tried(mean, std):
+    """A constant part is allowed: the filters call f and h themselves, and need their slopes to be constant."""
+    states = (State("s", "m", mean, std),)
+    compile_model(walk(states=states, linear=True))
+    compile_model(walk(states=states, linear=True, f=with_a_constant, sensor={"h": with_an_offset}))
+    for changes, what in (({"f": squares}, "f"), ({"sensor": {"h": squares_in_h}}, "h of sensor y")):
+        compile_model(walk(states=states, **changes))
+        with pytest.raises(ModelError, match=f"model walk: {what} is not linear, though the model says linear=True"):
+            compile_model(walk(states=states, linear=True, **changes))

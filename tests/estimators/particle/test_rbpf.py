@@ -311,6 +311,11 @@ def lavish(x, u, p, dt, out):
     out[0], out[1] = 0.9, 0.9
 
 
+def turning(x, u, p, dt, out):
+    x[0] = -x[0]
+    out[0], out[1] = 0.9, 0.1
+
+
 def leaning(x, u, p, dt, out):
     out[1] = 1.0 / (1.0 + np.exp(-x[0]))
     out[0] = 1.0 - out[1]
@@ -322,6 +327,7 @@ def leaning(x, u, p, dt, out):
         ({"f": bent}, "f is not linear in s, v"),
         ({"f": moved}, "f moves the mode m from 1 to 0"),
         ({"jump": Jump("m", ("a", "b"), lavish)}, "jump.chances gives .* which sum to 1"),
+        ({"jump": Jump("m", ("a", "b"), turning)}, "jump.chances writes to its argument x"),
         ({"jump": Jump("m", ("a", "b"), leaning)}, "jump.chances depends on s, v"),
         ({"jump": Jump("k", ("a", "b"), chances)}, "jump names 'k', no state"),
         ({"conditionally_linear": ("s", "m")}, "names 'm', the mode"),
