@@ -20,9 +20,10 @@ from estimators.errors import ConfigError, SourceError
 from estimators.log import Readings
 from estimators.registry import ESTIMATORS, find_estimator, unfit
 
+from ..scores import write_scores
 from ..twin.twin import Twin, load_twin
 from .compare_fold import BUDGET, Row, fold_row
-from .compare_table import caption, table, write_table
+from .compare_table import cells, printed
 from .fold import read_log
 from .main import settings
 from .prepare import prepare
@@ -74,13 +75,13 @@ def _compare(arguments: Arguments, name: str) -> None:
             advance()
     rows.sort(key=lambda row: names.index(row.estimator))
     seconds = float(logs[0].t[-1] - logs[0].t[0]) * 1e-9
-    lines = [caption(twin.path.stem, rows, len(logs[0]), seconds, len(logs)), *table(rows)]
+    lines = cells(rows, len(logs[0]), seconds)
     if arguments.json:
         print(json.dumps([_plain(row) for row in rows]))
     else:
-        print("\n".join(lines))
+        print("\n".join(printed(twin.path.stem, lines, len(logs))))
     if arguments.write:
-        write_table(twin.path, lines)
+        write_scores(twin.path, lines)
 
 
 def _logs(twin: Twin, overrides: Mapping[str, str], arguments: Arguments) -> list[Readings]:

@@ -94,7 +94,7 @@ class Compare:
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print one JSON list."""
     write: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Put the table into the head of the twin's YAML."""
+    """Keep the table as CSV: config/scores/NAME.csv for a twin that ships, NAME.scores.csv beside any other YAML."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,10 @@ class Bus:
 
 @dataclass(frozen=True)
 class Twins:
-    """List the twins that ship."""
+    """List the twins that ship, or describe one: what to expect of it, and how every filter scored."""
+
+    name: Annotated[str | None, tyro.conf.Positional] = None
+    """Of a twin that ships, or path of a YAML file."""
 
 
 @dataclass(frozen=True)
@@ -209,11 +212,9 @@ def carry_out(command: Command) -> int:
 
         return play_bus(command)
     if isinstance(command, Twins):
-        from config.loader import load, shipped
+        from ..twins import show_twins
 
-        for name in shipped():
-            print(f"{name:<16} {load(name).config.title or ''}")
-        return 0
+        return show_twins(command)
     if isinstance(command, Schema):
         from config.json_schema import json_schema_text
 

@@ -2,16 +2,24 @@
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
+from pyarrow import csv as pa_csv
 
 import app.cli.compare
+import app.cli.compare_fold
 from app.cli.compare_fold import Figure, Row, fold_row, refold, tidy, within
-from app.cli.compare_table import Cell, read_cell, read_span, read_table, table, write_table
+from app.cli.compare_table import Cell, cells, printed, read_cell, read_span
 from app.cli.fold import read_log
 from app.cli.main import main
+from app.scores import SCORES, read_scores, scores_file, write_scores
 from app.twin.twin import load_twin
+from config.loader import load, shipped
+from estimators.errors import ConfigError
+from estimators.fold import Fold
 from estimators.registry import ESTIMATORS
 
 NOTHING = Figure(np.nan)
@@ -33,48 +41,103 @@ ROWS = [
     ),
     Row("ukf", {}, NOTHING, (np.nan, np.nan), NOTHING, np.nan, {}, failure="no factor"),
 ]
-LINES = ["# nisus compare pump: 3 events", *table(ROWS)]
+LINES = cells(ROWS, events=241, seconds=120.0)
 
 
-def test_a_written_table_stands_behind_the_text_and_is_replaced(tmp_path):
-    path = tmp_path / "pump.yaml"
-    path.write_text("# A pump.\nname: pump  # short\n", encoding="utf-8")
-    write_table(path, [LINES[0], *table(ROWS[:1])])
-    once = path.read_text(encoding="utf-8")
-    assert once.startswith("# A pump.\n#\n# nisus compare pump: 3 events\n# filter")
-    assert once.endswith("\n# end of nisus compare\nname: pump  # short\n")
-    assert list(read_table(once)) == ["kf"]
-    write_table(path, LINES)
-    twice = path.read_text(encoding="utf-8")
-    assert twice.count("end of nisus compare") == 1
-    assert twice.startswith("# A pump.\n#\n# nisus compare") and twice.endswith("name: pump  # short\n")
-    assert list(read_table(twice)) == ["kf", "pf", "ukf"]
-    assert read_table("name: pump\n") == {}
+def test_scores_are_read_back_as_they_were_written(tmp_path):
+    twin = tmp_path / "pump.yaml"
+    assert read_scores(twin) == []
+    write_scores(twin, LINES[:1])
+    assert write_scores(twin, LINES) == tmp_path / "pump.scores.csv"
+    assert read_scores(twin) == LINES
+    # Every row has every column, so that any reader of CSV finds a rectangle.
+    assert len({tuple(line) for line in LINES}) == 1
+
+
+def test_scores_of_a_twin_that_ships_have_a_folder_of_their_own(monkeypatch):
+    monkeypatch.chdir(SCORES.parent)
+    assert scores_file(Path("twins/motor_can.yaml")) == scores_file(load_twin("motor_can").path)
+    assert sorted(path.name for path in SCORES.iterdir()) == [f"{name}.csv" for name in shipped()]
+
+
+def test_scores_that_cannot_be_written_say_where(tmp_path):
+    (tmp_path / "pump.scores.csv").mkdir()
+    with pytest.raises(ConfigError, match=r"pump\.scores\.csv: Is a directory; the scores cannot be written"):
+        write_scores(tmp_path / "pump.yaml", LINES)
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_pandas_and_pyarrow_read_the_scores_without_being_told_how(name):
+    """Each figure is a number to both, and what is empty is missing."""
+    lines = read_scores(load(name).path)
+    frame, table = pd.read_csv(SCORES / f"{name}.csv"), pa_csv.read_csv(SCORES / f"{name}.csv")
+    assert list(frame.columns) == table.column_names == list(lines[0])
+    for title in lines[0]:
+        if title in ("filter", "options", "failure"):
+            continue
+        expected = [float(line[title]) if line[title] else np.nan for line in lines]
+        np.testing.assert_array_equal(frame[title].to_numpy(float), expected)
+        given = [np.nan if value is None else value for value in table[title].to_pylist()]
+        np.testing.assert_array_equal(given, expected)
+    assert frame["filter"].tolist() == table["filter"].to_pylist() == [line["filter"] for line in lines]
 
 
 def test_figures_are_printed_to_the_digits_that_mean_something():
-    rows = read_table("\n".join([LINES[0], *(f"# {line}" for line in LINES[1:]), "# end of nisus compare"]))
-    assert rows["kf"] == {
-        "filter": "kf", "RMSE [°C]": "1.043", "RMSE [V]": "0.01000", "mean NIS": "0.8230", "in band [%]": "89.2",
-        "µs/step": "1.26", "notes": "",
+    kf, pf, ukf = LINES
+    assert kf == {
+        "filter": "kf", "RMSE [°C]": "1.043", "RMSE spread [°C]": "", "RMSE [V]": "0.01000", "RMSE spread [V]": "",
+        "mean NIS": "0.8230", "mean NIS spread": "", "NIS low": "0.700", "NIS high": "1.300", "in band [%]": "89.2",
+        "in band spread [%]": "", "cost [µs/step]": "1.26", "seeds": "1", "diverged": "0", "diverged at [s]": "",
+        "diverged [% of events]": "", "span [s]": "", "options": "", "failure": "", "events": "241", "log [s]": "120",
     }  # fmt: skip
-    assert rows["pf"] == {
-        "filter": "pf", "RMSE [°C]": "1.043±0.012", "RMSE [V]": "123±57", "mean NIS": "0.8231±0.0001",
-        "in band [%]": "89.2±2.1", "µs/step": "126",
-        "notes": "diverged in 2 of 8 at 12.5 s, 25 % of events, first 20 s, particles 4000",
+    assert pf | {"events": "", "log [s]": ""} == {
+        "filter": "pf", "RMSE [°C]": "1.043", "RMSE spread [°C]": "0.012", "RMSE [V]": "123", "RMSE spread [V]": "57",
+        "mean NIS": "0.8231", "mean NIS spread": "0.0001", "NIS low": "0.700", "NIS high": "1.300",
+        "in band [%]": "89.2", "in band spread [%]": "2.1", "cost [µs/step]": "126", "seeds": "8", "diverged": "2",
+        "diverged at [s]": "12.5", "diverged [% of events]": "25", "span [s]": "20", "options": "particles=4000",
+        "failure": "", "events": "", "log [s]": "",
     }  # fmt: skip
-    assert rows["ukf"]["mean NIS"] == rows["ukf"]["RMSE [V]"] == "-" and rows["ukf"]["notes"] == "no factor"
-    assert read_span(rows["pf"]) == 20.0 and read_span(rows["kf"]) is None
-    assert read_cell("123±57") == Cell(123.0, 57.0, 0.5)
-    assert read_cell("0.8230")[::2] == (0.823, 0.00005)
-    assert np.isnan(read_cell("-").value)
+    assert ukf["mean NIS"] == ukf["RMSE [V]"] == ukf["NIS low"] == "" and ukf["failure"] == "no factor"
+    assert read_span(pf) == 20.0 and read_span(kf) is None
+    assert read_cell(pf, "RMSE [V]") == Cell(123.0, 57.0, 0.5)
+    assert read_cell(kf, "mean NIS")[::2] == (0.823, 0.00005)
+    assert np.isnan(read_cell(ukf, "mean NIS").value)
+
+
+def test_the_printed_table_says_what_the_cells_say():
+    caption, *table = printed("pump", LINES)
+    assert caption == "pump: 241 events in 120 s; NIS if consistent 0.700 to 1.300; ± one of 8 seeds"
+    assert [re.split(r"\s{2,}", line) for line in table] == [
+        ["filter", "RMSE [°C]", "RMSE [V]", "mean NIS", "in band [%]", "µs/step", "notes"],
+        ["kf", "1.043", "0.01000", "0.8230", "89.2", "1.26"],
+        ["pf", "1.043±0.012", "123±57", "0.8231±0.0001", "89.2±2.1", "126",
+         "diverged in 2 of 8 at 12.5 s, 25 % of events, first 20 s, particles 4000"],
+        ["ukf", "-", "-", "-", "-", "-", "no factor"],
+    ]  # fmt: skip
+    assert printed("pump", LINES, logs=20)[0].endswith("± one of 20 logs")
 
 
 def test_columns_stand_under_their_titles():
-    head, first, second, third = table(ROWS)
+    _, head, first, second, third = printed("pump", LINES)
     for title, cell in (("mean NIS", "0.8231"), ("µs/step", "126"), ("notes", "diverged")):
         assert head.index(title) == second.index(cell)
     assert head.index("µs/step") == first.index("1.26") and head.index("notes") == third.index("no factor")
+
+
+def test_twins_describes_one_with_its_scores(tmp_path, capsys):
+    assert main(["twins"]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == shipped()
+    assert main(["twins", "lorenz63"]) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("lorenz63: Lorenz 63, the butterfly\n\nThe butterfly: three states that change wings")
+    assert shown.endswith("\n".join(["", "", *printed("lorenz63", read_scores(load("lorenz63").path)), ""]))
+    path = tmp_path / "pump.yaml"
+    path.write_text("# A pump.\n#\n# Second.\nmodel: lorenz63\nsource: {type: simulator}\n# Not the head.\n")
+    assert main(["twins", str(path)]) == 0
+    told = "No scores yet; to write them: nisus compare pump --write"
+    assert capsys.readouterr().out == f"pump\n\nA pump.\n\nSecond.\n\n{told}\n"
+    assert main(["twins", "lorenz"]) == 2
+    assert "no twin of that name ships" in capsys.readouterr().err
 
 
 def test_compare_says_what_fold_says(capsys):
@@ -116,12 +179,24 @@ def test_logs_of_other_seeds_are_those_of_the_simulator(capsys):
     assert "is not simulated" in capsys.readouterr().err
 
 
-def test_a_slow_filter_folds_a_stated_span():
-    """A budget of 60 ms is 60 to 600 steps of FilterPy's, and the log of three minutes has 12,953."""
+def test_a_slow_filter_folds_a_stated_span(monkeypatch):
+    """A step takes 0.1 ms by a clock of the test's own: a budget of 60 ms is 600 of the log's 12,953 events."""
     twin = load_twin("motor_can")
     events = read_log(twin, None)[0].readings
+    stepped = 0
+    advance = Fold.advance
+
+    def counted(fold: Fold, limit: int | None = None) -> int:
+        nonlocal stepped
+        count = advance(fold, limit)
+        stepped += count
+        return count
+
+    monkeypatch.setattr(Fold, "advance", counted)
+    monkeypatch.setattr(app.compare_fold.time, "process_time", lambda: 1e-4 * stepped)
     row = fold_row(twin, "filterpy-ekf", [events], budget=0.06)
-    assert row.span is not None and 0.1 < row.span < 100
+    assert row.span == tidy((events.t[599] - events.t[0]) * 1e-9)
+    assert row.seconds_per_step == pytest.approx(1e-4)
     first = within(events, row.span)
     assert first.t[-1] <= events.t[0] + row.span * 1e9 < events.t[len(first)]
     assert row.nis.value == refold(twin, "filterpy-ekf", first).nis
@@ -163,8 +238,10 @@ def test_all_twins_in_turn_and_those_without_a_recording_are_named(monkeypatch, 
     monkeypatch.setattr(app.cli.compare, "ESTIMATORS", {"kf": ESTIMATORS["kf"]})
     assert main(["compare", "all", "--write"]) == 2
     assert "no.csv" in capsys.readouterr().err
-    assert list(read_table(good.read_text(encoding="utf-8"))) == ["kf"]
-    assert good.read_text(encoding="utf-8").endswith(text)
+    (line,) = read_scores(good)
+    assert line["filter"] == "kf" and line["events"] == "21"
+    assert good.read_text(encoding="utf-8") == text
+    assert not scores_file(bad).exists()
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The tables in the heads of the twins that ship: whole, and what the filters do."""
+"""The scores of the twins that ship: a row for every filter that applies, and what the filters do."""
 
 import math
 import re
@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from app.cli.compare_fold import Outcome, draws, refold, within
-from app.cli.compare_table import read_cell, read_span, read_table
+from app.cli.compare_table import COST, read_cell, read_span
 from app.cli.fold import read_log
+from app.scores import read_scores
 from app.twin.twin import Twin, load_twin
 from config.loader import shipped
 from estimators.errors import SourceError
@@ -43,7 +44,7 @@ def recorded(name: str) -> tuple[Twin, Readings]:
 
 def quick(estimator: str, cells: dict[str, str], events: Readings) -> bool:
     entry = ESTIMATORS[estimator]
-    seconds = 1e-6 * float(cells["µs/step"]) * len(within(events, read_span(cells)))
+    seconds = 1e-6 * float(cells[COST]) * len(within(events, read_span(cells)))
     return seconds < SECONDS or not (draws(entry) or entry.interpreted)
 
 
@@ -52,11 +53,15 @@ def figures(outcome: Outcome) -> dict[str, float]:
     return {**found, "mean NIS": outcome.nis, "in band [%]": 100.0 * outcome.coverage}
 
 
+def scores_of(twin: Twin) -> dict[str, dict[str, str]]:
+    return {cells["filter"]: cells for cells in read_scores(twin.path)}
+
+
 def mismatches(twin: Twin, events: Readings, rows: dict[str, dict[str, str]]) -> list[str]:
     """Figures of the quick filters that are not those of a new fold."""
     wrong = []
     for estimator, cells in rows.items():
-        if cells["µs/step"] == "-" or not quick(estimator, cells, events):
+        if not cells[COST] or not quick(estimator, cells, events):
             continue
         random = draws(ESTIMATORS[estimator])
         span = read_span(cells)
@@ -66,35 +71,35 @@ def mismatches(twin: Twin, events: Readings, rows: dict[str, dict[str, str]]) ->
             # and the spread of eight says little of a ninth.
             if random and span is not None and title == "in band [%]":
                 continue
-            cell = read_cell(cells[title])
+            cell = read_cell(cells, title)
             # Rounding to the printed digit, and as much again for a spread that was rounded too.
             if np.isnan(cell.value) and np.isnan(value):
                 continue
             spread = max(cell.spread + cell.rounding, LEAST if title == "in band [%]" else 0.0)
             bound = SIGMA * spread + cell.rounding if random else 1.001 * cell.rounding
             if not abs(value - cell.value) <= bound:
-                wrong.append(f"{estimator}: {title} is {cells[title]} in the table and {value:.6g} now")
+                wrong.append(f"{estimator}: {title} is {cells[title]} in the scores and {value:.6g} now")
     return wrong
 
 
 @pytest.mark.parametrize("name", shipped())
 def test_every_filter_that_applies_has_a_row(name: str) -> None:
     twin = load_twin(name)
-    rows = read_table(twin.text)
+    rows = scores_of(twin)
     assert list(rows) == [key for key, entry in ESTIMATORS.items() if unfit(entry, twin.model) is None]
     for estimator, cells in rows.items():
-        noted = [f"{option} {value:g}" for option, value in twin.options_of(estimator).items()]
-        assert all(option in cells["notes"] for option in noted), f"{estimator}: options are now {noted}"
+        options = [f"{option}={value:g}" for option, value in twin.options_of(estimator).items()]
+        assert cells["options"].split() == options, f"{estimator}: options are now {options}"
 
 
 @pytest.mark.parametrize("name", shipped())
-def test_the_table_says_what_the_filters_do(name: str) -> None:
+def test_the_scores_say_what_the_filters_do(name: str) -> None:
     """To the last printed digit, or for filters that draw, as near as another seed comes."""
     twin, events = recorded(name)
-    rows = read_table(twin.text)
-    said = re.search(rf"# nisus compare {name}: (\d+) events", twin.text)
-    assert said and int(said[1]) == len(events)
-    assert not (wrong := mismatches(twin, events, rows)), "; ".join(wrong) + f": write it anew, nisus compare {name}"
+    rows = scores_of(twin)
+    assert {int(cells["events"]) for cells in rows.values()} == {len(events)}
+    wrong = mismatches(twin, events, rows)
+    assert not wrong, "; ".join(wrong) + f": write them anew, nisus compare {name} --write"
 
 
 @pytest.mark.parametrize("name", [name for name in shipped() if "Over 20 logs" in load_twin(name).text])
@@ -103,25 +108,22 @@ def test_other_logs_are_as_the_head_says(name: str) -> None:
     text = load_twin(name).text
     said = re.search(r"Over 20 logs \(seeds (\d+) to (\d+), ([\w-]+)\): mean NIS (\S+), in band (\S+) %", text)
     assert said
-    nis, band = read_cell(said[4]), read_cell(said[5])
+    nis, band = ([float(number) for number in figure.split("±")] for figure in said.group(4, 5))
     for seed in (int(said[2]) + 1, int(said[2]) + 2):
         twin = load_twin(name, overrides={"source.seed": str(seed)})
         assert twin.estimator == said[3]
         outcome = refold(twin, twin.estimator, read_log(twin, None)[0].readings)
-        assert abs(outcome.nis - nis.value) < SIGMA * nis.spread
-        assert abs(100.0 * outcome.coverage - band.value) < SIGMA * max(band.spread, LEAST)
+        assert abs(outcome.nis - nis[0]) < SIGMA * nis[1]
+        assert abs(100.0 * outcome.coverage - band[0]) < SIGMA * max(band[1], LEAST)
 
 
-def test_a_table_that_is_no_longer_true_is_found() -> None:
+def test_scores_that_are_no_longer_true_are_found() -> None:
     twin, events = recorded("motor_winding")
-    rows = read_table(twin.text)
+    rows = scores_of(twin)
     for estimator in ("kf", "etkf"):
         for title in ("RMSE [°C]", "mean NIS", "in band [%]"):
-            cell = read_cell(rows[estimator][title])
+            cell = read_cell(rows[estimator], title)
             step = 2 * cell.rounding if np.isnan(cell.spread) else 15 * cell.spread
-            changed = {
-                **rows[estimator],
-                title: f"{cell.value + step:.9g}" + f"±{cell.spread}" * draws(ESTIMATORS[estimator]),
-            }
+            changed = {**rows[estimator], title: f"{cell.value + step:.9g}"}
             (wrong,) = mismatches(twin, events, {estimator: changed})
             assert wrong.startswith(f"{estimator}: {title} is {changed[title]}")
