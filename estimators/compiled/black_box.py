@@ -6,11 +6,11 @@ filter calls as f or h looks the answer up by the address of the member (see int
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from functools import lru_cache
 from multiprocessing import get_context
-from pickle import PicklingError
 from typing import Any
 
 import numba
@@ -90,7 +90,10 @@ class BlackBox:
                 parts = [future.result() for future in futures]
         except (Exception, SystemExit) as error:  # noqa: BLE001  the user's own function may raise anything
             at = place(function, error)
-            raise ModelError(f"{at}model {self.model.name}: {what} fails on {_told(error, len(X))}") from error
+            said = f"a block of {len(X)} states: {type(error).__name__}: {' '.join(str(error).split()) or 'no message'}"
+            here = pool is None or isinstance(pool, ThreadPoolExecutor)
+            remedy = _remedy(error, None if here else self._sent[id(function)])
+            raise ModelError(f"{at}model {self.model.name}: {what} fails on {said}; {remedy}") from error
         pieces = [X] if pool is None else pieces
         for piece, part in zip(pieces, parts, strict=True):
             if part.shape != (len(piece), columns):
@@ -154,11 +157,23 @@ def _workers(pool: Executor) -> int:
     return int(getattr(pool, "_max_workers", numba.config.NUMBA_NUM_THREADS))
 
 
-def _told(error: BaseException, states: int) -> str:
-    """One line that says what went wrong, and what to do about it."""
-    line = f"a block of {states} states: {type(error).__name__}: {' '.join(str(error).split()) or 'no message'}"
+def _remedy(error: BaseException, sent: Callable | None) -> str:
+    """What to do about a failure; `sent` is the function if it had to go to another process."""
     if isinstance(error, BrokenExecutor):
         _pool.cache_clear()
-    if isinstance(error, (BrokenExecutor, PicklingError)) or "pickle" in str(error):
-        return f"{line}; processes need functions that stand by their names in a module or file, use threads for others"
-    return f"{line}; mend it, or let it return NaN in the rows of states that it has no answer for"
+    elif sent is None or _pickles(sent):
+        return "mend it, or let it return NaN in the rows of states that it has no answer for"
+    return "processes need functions that stand by their names in a module or file, use threads for others"
+
+
+def _pickles(function: Callable) -> bool:
+    """Whether a function can go to another process.
+
+    Asked of pickle itself, which raises other errors in each version of Python, and whatever the function's own
+    `__reduce__` raises.
+    """
+    try:
+        pickle.dumps(function)
+    except Exception:  # noqa: BLE001
+        return False
+    return True

@@ -4,6 +4,7 @@ import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from threading import Lock
 
 import numpy as np
 import pytest
@@ -147,9 +148,52 @@ def test_what_a_black_box_may_not_do(function, says):
     assert "\n" not in str(caught.value)
 
 
-def test_a_function_that_processes_cannot_import():
+class Held:
+    """A function that cannot be pickled, for one of the reasons there are: pickle raises another error for each."""
+
+    def __init__(self, kept):
+        self.kept = kept
+
+    def __call__(self, X, u, p, dt):
+        return X
+
+
+class Refuses(Held):
+    def __reduce__(self):
+        raise self.kept
+
+
+def nested():
+    deep = []
+    for _ in range(100_000):
+        deep = [deep]
+    return deep
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda X, u, p, dt: X,
+        (lambda: lambda X, u, p, dt: X)(),  # a local object: AttributeError, in other words since Python 3.13
+        Held(Lock()),  # TypeError
+        Held(nested()),  # RecursionError
+        Refuses(ValueError("no copies")),  # whatever it likes
+    ],
+    ids=["lambda", "local", "lock", "nested", "refuses"],
+)
+def test_a_function_that_processes_cannot_import(function):
     with pytest.raises(ModelError, match="f fails on .*use threads"):
-        compile_model(replace(BOX, f=lambda X, u, p, dt: X, executor="processes"))
+        compile_model(replace(BOX, f=function, executor="processes"))
+
+
+def load_weights(X, u, p, dt):
+    raise ValueError("pickle data was truncated")
+
+
+@pytest.mark.parametrize("executor", [None, "threads", "processes"])
+def test_a_function_that_speaks_of_pickles_is_to_be_mended(executor):
+    with pytest.raises(ModelError, match="pickle data was truncated; mend it, or let it return NaN"):
+        compile_model(replace(BOX, f=load_weights, executor=executor))
 
 
 @pytest.mark.parametrize(
