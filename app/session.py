@@ -18,8 +18,9 @@ from estimators.errors import SourceError
 
 from .engine.commands import Record
 from .engine.engine import Engine
-from .recording.writer import Recorder
+from .recording.writer import FINE, Recorder
 from .rerun.rows import RerunRows
+from .split import NEVER, Split
 
 if TYPE_CHECKING:
     from estimators.fold import Base
@@ -51,6 +52,7 @@ class Session:
         base: Base | None = None,
         horizon: float | None = None,
         review: Path | None = None,
+        split: Split = NEVER,
     ) -> None:
         """Put it together; nothing runs yet.
 
@@ -61,13 +63,14 @@ class Session:
             base: See `Engine`.
             horizon: See `Engine`.
             review: The recording that is reviewed, for the page to offer.
+            split: Into what parts to split a recording.
 
         Raises:
             NisusError: If the source cannot be opened, or the port is in use.
         """
         sys.setswitchinterval(SWITCH)
         self.engine = Engine(twin, open_source, base=base, horizon=horizon)
-        self.recorder = Recorder(self.engine, lambda stream: RerunRows(stream, self.engine, series=None))
+        self.recorder = Recorder(self.engine, lambda stream: RerunRows(stream, self.engine, series=FINE), split)
         self.engine.recorder = self.recorder
         self._page = page
         self.view: Any = None

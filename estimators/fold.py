@@ -199,6 +199,7 @@ class Base(NamedTuple):
     u: np.ndarray
     estimator: str = ""
     state: np.ndarray | None = None
+    first: int = 0
 
 
 class Fold:
@@ -533,7 +534,7 @@ class Fold:
         at = max(key for key in self._snapshots if key <= self.log.first + index)
         clock, u, state = self._snapshots[at]
         mean, cov = self.estimator.moments(self.options, state, self.model.nx)
-        return at - self.log.first, Base(mean, cov, clock, u.copy(), self.estimator.name, state.copy())
+        return at - self.log.first, Base(mean, cov, clock, u.copy(), self.estimator.name, state.copy(), at)
 
     def follow(self, log: Log, changed_from: int | None) -> None:
         """Go on with the log of which the present one is an earlier copy.

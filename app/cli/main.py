@@ -35,6 +35,8 @@ class Run:
     """Recordings in place of the twin's own."""
     record: Path | None = None
     """Record into this .rrd file from the start."""
+    record_split: str | None = None
+    """Go on in another file, run-2.rrd after run.rrd, when one has grown so large or so long: 1GB, 10min."""
     speed: float = 1.0
     """Times real time for replays and simulations; inf is as fast as possible."""
     duration: float | None = None

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..recording.format import tuning_from_json
-from ..recording.reader import finished, read_recording
+from ..recording.reader import read_recording
 from ..server.port import check_port
 from ..session import Page, Session
 from ..twin.twin import Twin, restore_twin
@@ -58,7 +58,7 @@ def open_review(path: Path, page: Page | None) -> tuple[Session, Recorded]:
     )
     session.engine.notices.restore(recorded.notices)
     session.engine.notices.say(f"{path.name}: {recorded.rows} rows, {recorded.tunings} tuning(s), folded again")
-    if not finished(path):
+    if not recorded.closed:
         cut = f"{path.name}: was not closed, as by a kill or a full disk; it is reviewed as far as it goes"
         session.engine.notices.say(cut, level="warn")
         complain(cut)

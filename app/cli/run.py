@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from estimators.errors import ConfigError
 
+from ..recording.format import TAKEN
 from ..server.port import check_port
 from ..session import Page, Session
+from ..split import NEVER, parse_split
 from ..twin.twin import Twin, load_twin
 from .main import settings
 from .prepare import prepare
@@ -48,8 +51,9 @@ def run_twin(arguments: Run) -> int:
         raise ConfigError(f"--speed {arguments.speed:g}: must be positive, or inf for as fast as possible")
     if arguments.record is not None and arguments.record.suffix != ".rrd":
         raise ConfigError(f"--record {arguments.record}: must end in .rrd")
-    if arguments.record is not None and arguments.record.exists():
-        raise ConfigError(f"--record {arguments.record}: is there already; choose another name, or remove it")
+    if arguments.record is not None and os.path.lexists(arguments.record):
+        raise ConfigError(f"--record {arguments.record}: {TAKEN}")
+    split = NEVER if arguments.record_split is None else parse_split(arguments.record_split)
     twin = load_twin(
         arguments.twin, log_files=arguments.log or None, overrides=settings(arguments.set, arguments.estimator)
     )
@@ -57,7 +61,7 @@ def run_twin(arguments: Run) -> int:
     if page is not None:
         check_port(page.port)
     prepare(twin)
-    session = Session(twin, live_source(twin, arguments.speed), page=page)
+    session = Session(twin, live_source(twin, arguments.speed), page=page, split=split)
     session.run(record=arguments.record, duration=arguments.duration, until_finished=arguments.headless)
     if arguments.headless:
         status = session.engine.status()

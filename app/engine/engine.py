@@ -83,6 +83,7 @@ class Engine:
         self._cursors: list[Cursor] = []
         self.notices = Notices(lambda: self._log.newest if self._log.n else 0)
         self._base: Base | None = base
+        self._logs = 0
         self._clear(base)
         self._feeder = Feeder(lambda: open_source(self.notices.report), self._inbox, self.notices.report)
         self._refolder = Refolder(self._inbox.put)
@@ -102,7 +103,8 @@ class Engine:
         """An empty log and the fold that follows it."""
         self._log = Log.of(self.model, capacity=self._history + 4 * SPARSE_EVERY)
         if base is not None:
-            self._log.floor = base.clock
+            self._log.first, self._log.floor = base.first, base.clock
+        self._logs += 1
         self._base = base
         self._fold = self._make_fold(self.estimator, self.tuning, self._log, base)
         self._tally = Tally(self.model)
@@ -133,9 +135,9 @@ class Engine:
         """Queue a command."""
         self._inbox.put(command)
 
-    def cursor(self) -> Cursor:
-        """A cursor for one consumer, for `pull`; give it back with `release`."""
-        cursor = Cursor()
+    def cursor(self, *, follows_log: bool = False) -> Cursor:
+        """A cursor for one consumer, for `pull`; give it back with `release`. See `Cursor` for `follows_log`."""
+        cursor = Cursor(follows_log=follows_log)
         with self._lock:
             self._cursors.append(cursor)
         return cursor
@@ -149,9 +151,10 @@ class Engine:
         """Copies of the rows since the cursor, at most `limit`, and the notices since."""
         with self._lock:
             log, fold = self._log, self._fold
-            fresh = cursor.revision != self._revision
+            fresh = cursor.log != self._logs or (cursor.revision != self._revision and not cursor.follows_log)
+            cursor.log, cursor.revision = self._logs, self._revision
             if fresh:
-                cursor.revision, cursor.next, cursor.picture = self._revision, 0, -1
+                cursor.next, cursor.picture = 0, -1
             start = max(cursor.next, log.first)
             end = log.first + fold.n
             if limit is not None:
@@ -179,6 +182,11 @@ class Engine:
         """Where the readings come from; it may be opened anew."""
         return self._feeder.source
 
+    @property
+    def policy(self) -> HealthPolicy:
+        """When the estimate may be trusted."""
+        return self._policy
+
     def options_of(self, estimator: str) -> Mapping[str, float]:
         """The options with which an estimator starts: as it runs, as it was left, or as the YAML says."""
         return self.tuning.options if estimator == self.estimator else self._options.of(estimator)
@@ -191,6 +199,17 @@ class Engine:
     def base(self) -> Base | None:
         """Where a fold of the present log starts, if its oldest events were dropped; else None, for the prior."""
         return self._base
+
+    def origin(self, index: int) -> tuple[int, Base | None]:
+        """Where a fold that gives the rows from `index` on can start: at an event at or before it, from a base.
+
+        That is None for the prior. Revisions that follow have a snapshot there too, unless their state is so large
+        that theirs are wider apart.
+        """
+        with self._lock:
+            first = self._log.first
+            at, base = self._fold.base_at(max(0, index // SPARSE_EVERY * SPARSE_EVERY - first))
+            return first + at, base if at else self._base
 
     def folded_with(self) -> tuple[Tuning, str]:
         """Tuning and estimator of the fold that `pull` shows."""

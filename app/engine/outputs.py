@@ -20,9 +20,12 @@ from .notices import Notice
 class Cursor:
     """How far one consumer has read. `next` is the absolute index of the next row; a rewritten row moves it back.
 
-    `picture` is the index of the last picture of a large field that was read.
+    `picture` is the index of the last picture of a large field that was read. One that `follows_log` starts anew with
+    another log only; for the others another revision does so too.
     """
 
+    follows_log: bool = False
+    log: int = -1
     revision: int = -1
     next: int = 0
     notice: int = 0
@@ -33,7 +36,7 @@ class Cursor:
 class Pull:
     """Rows since the cursor.
 
-    `fresh`: these rows start anew (another revision, or the first pull): forget what was drawn. `first` is the
+    `fresh`: these rows start anew (another revision or log, or the first pull): forget what was drawn. `first` is the
     absolute index of the first row; if it is below what was pulled before, a late reading rewrote the rows from there.
     `pictures` are those of a large field since the cursor; one with an index that was seen before takes its place.
     """

@@ -1,16 +1,14 @@
 """The recording: an .rrd file that Rerun opens, and that holds all it takes to fold again, to the bit.
 
-Beside what charts show, the file keeps under /nisus, as plain columns: `twin` (YAML, estimator, base), `tuning` (each
-one, with the event from which it held), `events` (the log), `track` (float64) and `notices` (lines for people). Rows
-carry their absolute index; a late reading makes a recorder write rows again from the index where it belongs, and
-another revision from the start. `recorded` reads them back.
+Beside what charts show, the file keeps under /nisus, as plain columns: `twin` (YAML, base), `tuning` (each one, with
+the event from which it was in force), `events` (the log), `base` (where a fold of them starts, if that has moved) and
+`notices` (lines for people). The track is not among them: log and tuning give it again. Rows carry their absolute
+index; a late reading makes a recorder write the events again from where it belongs. `recorded` reads them back.
 """
 
 from __future__ import annotations
 
-import atexit
 import base64
-import ctypes
 import json
 from pathlib import Path
 
@@ -24,13 +22,14 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import Tuning
 
 from ..engine.outputs import Pull
+from ..rrd import RrdFile
 
-FORMAT = 1
+FORMAT = 2
+READABLE = (1, 2)
+"""Formats that can be read; the first kept the track too."""
 PREFIX = "nisus_"
 """Of the name under which a recording is known to Rerun; the twin's follows."""
 TIMELINE = "event"
-PATIENCE = 5.0
-"""Seconds for a file to take what it is given; Rerun would wait for ever on one that takes no more."""
 
 
 def tuning_to_json(tuning: Tuning, estimator: str) -> str:
@@ -70,6 +69,7 @@ def base_to_json(base: Base | None) -> str:
     if base is None:
         return "null"
     moments = {"mean": base.mean.tolist(), "cov": base.cov.tolist(), "clock": base.clock, "u": base.u.tolist()}
+    moments["first"] = base.first
     if base.state is None:
         return json.dumps(moments)
     state = base64.b64encode(np.ascontiguousarray(base.state, "<f8").tobytes()).decode()
@@ -77,7 +77,7 @@ def base_to_json(base: Base | None) -> str:
 
 
 def base_from_json(text: str) -> Base | None:
-    """The base that `base_to_json` wrote; older recordings hold moments only."""
+    """The base that `base_to_json` wrote; older recordings hold moments only, and no index."""
     values = json.loads(text)
     if values is None:
         return None
@@ -89,7 +89,12 @@ def base_from_json(text: str) -> Base | None:
         np.array(values["u"], float),
         values.get("estimator", ""),
         None if state is None else np.frombuffer(base64.b64decode(state), "<f8").astype(float),
+        int(values.get("first", 0)),
     )
+
+
+TAKEN = "is there already; choose another name, or remove it"
+"""What is said of a name that something stands under."""
 
 
 class RecordingFile:
@@ -99,7 +104,7 @@ class RecordingFile:
         """Begin a file.
 
         Args:
-            path: Where; the folder must exist.
+            path: Where; nothing may stand there yet, not even a link that leads nowhere.
             name: Of the twin.
             text: The twin's YAML.
             twin_path: Where the YAML was, for the model's file beside it.
@@ -109,13 +114,14 @@ class RecordingFile:
             SourceError: If the file cannot be written.
         """
         self.path = path
+        self.stream = rr.RecordingStream(f"{PREFIX}{name}", recording_id=f"{name}-{path.stem}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.open("wb").close()
+            self._file = RrdFile(path, self.stream)
+        except FileExistsError:
+            raise SourceError(f"recording {path}: {TAKEN}") from None
         except OSError as error:
             raise SourceError(f"recording {path}: {error.strerror}; choose a place that can be written") from None
-        self.stream = rr.RecordingStream(f"{PREFIX}{name}", recording_id=f"{name}-{path.stem}")
-        self.stream.set_sinks(rr.FileSink(str(path)))
         self.rows = 0
         self.stream.log(
             "/nisus/twin",
@@ -123,8 +129,21 @@ class RecordingFile:
             static=True,
         )
 
+    @property
+    def size(self) -> int:
+        """Bytes that the file has taken."""
+        return self._file.size
+
+    def base(self, base: Base | None, index: int, revision: int) -> None:
+        """Write where a fold of a revision starts, from event `index` on; None is the prior."""
+        self.stream.send_columns(
+            "/nisus/base",
+            indexes=[rr.TimeColumn(TIMELINE, sequence=[index])],
+            columns=rr.AnyValues.columns(json=[base_to_json(base)], revision=[revision]),
+        )
+
     def tuning(self, tuning: Tuning, estimator: str, index: int, revision: int) -> None:
-        """Write the tuning that holds from event `index` on."""
+        """Write the tuning that is in force from event `index` on."""
         self.stream.send_columns(
             "/nisus/tuning",
             indexes=[rr.TimeColumn(TIMELINE, sequence=[index])],
@@ -132,7 +151,7 @@ class RecordingFile:
         )
 
     def write(self, pull: Pull) -> None:
-        """Write rows of log and track, and the lines for people."""
+        """Write rows of the log, and the lines for people."""
         if pull.notices:
             self.stream.send_columns(
                 "/nisus/notices",
@@ -147,31 +166,32 @@ class RecordingFile:
         if not count:
             return
         index = [rr.TimeColumn(TIMELINE, sequence=np.arange(pull.first, pull.first + count))]
-        for entity, columns in (("/nisus/events", pull.readings), ("/nisus/track", pull.track)):
-            # As Arrow's arrays: Rerun would turn NumPy's into Python lists, which takes fifty times as long.
-            flat: dict[str, pa.Array] = {}
-            for name, column in zip(columns._fields, columns, strict=True):
-                if column.ndim == 1:
-                    flat[name] = pa.array(column)
-                else:
-                    flat |= {f"{name}_{k}": pa.array(column[:, k]) for k in range(column.shape[1])}
-            self.stream.send_columns(entity, indexes=index, columns=rr.AnyValues.columns(**flat))
+        # As Arrow's arrays: Rerun would turn NumPy's into Python lists, which takes fifty times as long.
+        flat: dict[str, pa.Array] = {}
+        for name, column in zip(pull.readings._fields, pull.readings, strict=True):
+            if column.ndim == 1:
+                flat[name] = pa.array(column)
+            else:
+                flat |= {f"{name}_{k}": pa.array(column[:, k]) for k in range(column.shape[1])}
+        self.stream.send_columns("/nisus/events", indexes=index, columns=rr.AnyValues.columns(**flat))
         self.rows += count
 
     def flush(self) -> None:
-        """Hand everything to the operating system."""
-        self.stream.flush(timeout_sec=PATIENCE)
+        """Hand everything to the operating system.
+
+        Raises:
+            OSError: If the file takes no more; what it took before stays, and can be read.
+        """
+        self._file.flush()
 
     def abandon(self) -> None:
-        """Leave a file that takes no more as it is.
-
-        Rerun waits without end for what cannot be written, when the stream is dropped and when the process ends. So
-        the stream is never dropped, and the process does not ask.
-        """
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(self.stream))
-        atexit.unregister(rr.rerun_shutdown)
+        """Leave a file that takes no more as it is."""
+        self._file.abandon()
 
     def close(self) -> None:
-        """Finish the file."""
-        self.stream.flush(timeout_sec=PATIENCE)
-        self.stream.disconnect()
+        """Finish the file.
+
+        Raises:
+            OSError: As `flush`.
+        """
+        self._file.close()

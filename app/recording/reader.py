@@ -1,15 +1,14 @@
-"""A recording read back: twin, tuning, log and track as they were at the end, to the bit.
+"""A recording read back: twin, tuning and log as they were at the end, from which the track follows to the bit.
 
-A recorder writes rows again from the index where a late reading belongs, and all of them for another revision. So rows
-are taken in the order of the file, and an index that is not new cuts off what lay behind it.
+A recorder writes events again from the index where a late reading belongs. So rows are taken in the order of the file,
+and an index that is not new cuts off what came after it.
 """
 
 from __future__ import annotations
 
-import struct
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,14 +19,18 @@ from rerun.chunk import RrdReader
 from estimators.errors import SourceError
 from estimators.fold import Base
 from estimators.log import Readings
-from estimators.track import Track
 
-from .format import FORMAT, PREFIX, TIMELINE, base_from_json
+from ..rrd import BEGIN, MESSAGE_HEADER, STREAM_HEADER, whole_until
+from .format import FORMAT, PREFIX, READABLE, TIMELINE, base_from_json
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """What a recording holds: twin, the last tuning, log and track as they were at the end, lines (t, level, text)."""
+    """What a recording holds: twin, the last tuning, the log as it was at the end, lines (t, level, text).
+
+    A fold of `readings` starts at `base` (None: the prior). `first` is the index of their first event in the session,
+    `rows` how many there are, and `closed` whether the recording was finished when it ended.
+    """
 
     path: Path
     name: str
@@ -37,10 +40,10 @@ class Recorded:
     tuning: str
     tunings: int
     readings: Readings
-    track: Track
     notices: list[tuple[int, str, str]]
     first: int
     rows: int
+    closed: bool
 
 
 def read_recording(path: Path) -> Recorded:
@@ -67,30 +70,31 @@ def read_recording(path: Path) -> Recorded:
                     text = _cut_short(path) or f"cannot be read ({_line(error)}); is it an .rrd file?"
                     raise SourceError(f"{path}: {text}") from None
     header, tunings, notices = content.header, content.tunings, content.notices
-    events, tracks = content.events, content.tracks
     if not header or not tunings:
         text = _cut_short(path) or "holds no recording of Nisus; record one with `nisus run TWIN --record FILE.rrd`"
         raise SourceError(f"{path}: {text}")
-    if int(header["format"]) != FORMAT:
+    if int(header["format"]) not in READABLE:
         raise SourceError(f"{path}: has format {header['format']}, this version reads {FORMAT}; use the other")
-    first, log_columns = _latest(events)
-    _, track_columns = _latest(tracks)
-    readings = _assemble(Readings, log_columns)
-    track = _assemble(Track, track_columns)
-    rows = min(len(readings), len(track))
+    first, columns = _latest(content.events)
+    base = base_from_json(content.bases[-1][1] if content.bases else str(header["base"]))
+    start = content.bases[-1][0] if content.bases else first
+    # What stands before the base belongs to a fold that the session had left behind.
+    readings = Readings(*(_column(name, columns) for name in Readings._fields)).select(
+        slice(max(0, start - first), None)
+    )
     return Recorded(
         path=path,
         name=str(header["name"]),
         text=str(header["yaml"]),
         twin_path=Path(str(header["path"])),
-        base=base_from_json(str(header["base"])),
+        base=None if base is None else base._replace(first=start),
         tuning=str(tunings[-1]),
         tunings=len(tunings),
-        readings=readings.select(slice(0, rows)),
-        track=track.select(slice(0, rows)),
+        readings=readings,
         notices=notices,
-        first=first,
-        rows=rows,
+        first=start,
+        rows=len(readings),
+        closed=finished(path),
     )
 
 
@@ -102,7 +106,7 @@ class _Content:
         self.tunings: list[str] = []
         self.notices: list[tuple[int, str, str]] = []
         self.events: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
-        self.tracks: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
+        self.bases: list[tuple[int, str]] = []
 
     def read(self, path: Path) -> None:
         with warnings.catch_warnings():
@@ -121,27 +125,19 @@ class _Content:
                 self.notices += zip(*parts, strict=True)
             elif chunk.entity_path == "/nisus/tuning":
                 self.tunings += _flat(batch.column(names["json"])).tolist()
-            else:
+            elif chunk.entity_path == "/nisus/base":
+                index = batch.column(names[TIMELINE]).to_pylist()
+                self.bases += zip(index, _flat(batch.column(names["json"])).tolist(), strict=True)
+            elif chunk.entity_path == "/nisus/events":
                 index = batch.column(names[TIMELINE]).to_numpy()
                 columns = {name: _flat(batch.column(k)) for name, k in names.items() if not _control(name)}
-                (self.events if chunk.entity_path == "/nisus/events" else self.tracks).append((index, columns))
-
-
-STREAM_HEADER, MESSAGE_HEADER = 12, struct.Struct("<QQ")
-"""Bytes before the first message of an .rrd; and before each: its kind, and how many bytes follow."""
+                self.events.append((index, columns))
 
 
 def copy_whole(path: Path, to: Path) -> None:
     """Copy an .rrd up to the last message that is there in full."""
-    size = path.stat().st_size
-    end = STREAM_HEADER
     with path.open("rb") as file:
-        while end + MESSAGE_HEADER.size <= size:
-            file.seek(end)
-            _, length = MESSAGE_HEADER.unpack(file.read(MESSAGE_HEADER.size))
-            if end + MESSAGE_HEADER.size + length > size:
-                break
-            end += MESSAGE_HEADER.size + length
+        end, _ = whole_until(file, path.stat().st_size)
         file.seek(0)
         with to.open("wb") as copy:
             while end > 0 and (piece := file.read(min(end, 1 << 20))):
@@ -149,15 +145,10 @@ def copy_whole(path: Path, to: Path) -> None:
                 end -= len(piece)
 
 
-BEGIN, END = b"RRF2", b"RRF2FOOT"
-"""What an .rrd begins with, and what stands in the last bytes of one that was finished."""
-
-
 def finished(path: Path) -> bool:
     """Whether a recording was closed when it ended; one that was cut is read as far as it goes."""
     with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - 4 * len(END)))
-        return END in file.read()
+        return whole_until(file, path.stat().st_size)[1]
 
 
 def _cut_short(path: Path) -> str | None:
@@ -170,8 +161,7 @@ def _cut_short(path: Path) -> str | None:
         length = MESSAGE_HEADER.unpack(message)[1] if len(message) == MESSAGE_HEADER.size else size
         # The first message names the program; Rerun writes it in plain letters.
         name = file.read(min(length, size))
-        file.seek(max(0, size - 4 * len(END)))
-        whole = END in file.read()
+        _, whole = whole_until(file, size)
     if whole or not rerun:
         return None
     if len(name) < length:
@@ -194,7 +184,7 @@ def _line(error: Exception) -> str:
 
 
 def _latest(chunks: list[tuple[np.ndarray, dict[str, np.ndarray]]]) -> tuple[int, dict[str, np.ndarray]]:
-    """The rows that hold at the end: the last one written under each index, nothing behind an index written anew."""
+    """The rows that hold at the end: of each index the last one, and none that comes after an index written anew."""
     if not chunks:
         return 0, {}
     index = np.concatenate([chunk for chunk, _ in chunks])
@@ -205,10 +195,6 @@ def _latest(chunks: list[tuple[np.ndarray, dict[str, np.ndarray]]]) -> tuple[int
     keep = np.append(index[:-1] < later[1:], True)
     kept = {name: column[keep] for name, column in columns.items()}
     return int(index[keep][0]), kept
-
-
-def _assemble(kind: Callable[..., Any], columns: dict[str, np.ndarray]) -> Any:
-    return kind(*(_column(name, columns) for name in kind._fields))  # type: ignore[attr-defined]
 
 
 def _column(name: str, columns: dict[str, np.ndarray]) -> np.ndarray:

@@ -20,6 +20,9 @@ TRUTH = (22, 163, 74)
 READING = (245, 158, 11)
 REFUSED = (220, 38, 38)
 PREVIOUS = (160, 160, 168)
+EVENTS = "/events"
+"""Where the lines for people are, whichever revision the charts show."""
+
 TIMELINE = "time"
 AT_ONCE = 3
 """Charts of states that are shown at the same time; more come in tabs, which cost nothing while they are hidden."""
@@ -95,7 +98,7 @@ def blueprint(
     )
     health = rrb.StateTimelineView(origin=f"{root}/health", name="health", time_view=axis)
     columns = rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["LogLevel", "Body"])
-    events = rrb.TextLogView(origin=f"{root}/events", name="events", columns=columns)
+    events = rrb.TextLogView(origin=EVENTS, name="events", columns=columns)
     ellipses = [
         rrb.Spatial2DView(
             origin=f"{root}/pair/{pair_name(model, pair)}",

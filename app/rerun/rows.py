@@ -14,7 +14,7 @@ from estimators.track import FAILED, GATED, HEALTH_NAMES, Track
 from ..drawing.direct_readings import observed
 from ..engine.counts import numbers
 from .field import FieldDrawing
-from .layout import HEALTH_COLORS, TIMELINE, blueprint, pair_name, styles
+from .layout import EVENTS, HEALTH_COLORS, TIMELINE, blueprint, pair_name, styles
 from .pairs import PairDrawing
 from .thin import last_of_each_time, thin
 
@@ -36,13 +36,14 @@ class RerunRows:
     while the lines keep showing what was concluded without it.
     """
 
-    def __init__(self, stream: rr.RecordingStream, engine: Any, *, series: int | None, layout: bool = True) -> None:
+    def __init__(self, stream: rr.RecordingStream, engine: Any, *, series: float | None, layout: bool = True) -> None:
         """Log layout and styles.
 
         Args:
             stream: Where to.
             engine: Whose rows these will be.
-            series: Stretches of time into which a long history is cut, each drawn by its extremes; None draws all.
+            series: Stretches of time into which a long history is cut, each drawn by its extremes; those of the
+                charts' window are never cut finer than its `PIXELS`, which is what infinity gives. None draws all.
             layout: Whether to log the blueprint.
         """
         self.stream = stream
@@ -174,7 +175,7 @@ class RerunRows:
             return
         times = np.maximum([notice.t for notice in notices], self._oldest)
         self.stream.send_columns(
-            f"{self.root}/events",
+            EVENTS,
             indexes=[self.times(times.astype(np.int64))],
             columns=rr.TextLog.columns(
                 text=[notice.text for notice in notices], level=[notice.level.upper() for notice in notices]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 import types
 import typing
 from pathlib import Path
@@ -100,7 +101,7 @@ def _recording(where: str, name: str) -> Path:
     path = Path(name)
     if path.suffix != ".rrd" or name != path.name or "\\" in name or name.startswith("."):
         raise ConfigError(f"{where}; it must be a file name that ends in .rrd, without folders")
-    if path.exists():
+    if os.path.lexists(path):
         raise ConfigError(f"{where}, which is there already; choose another name")
     return path
 

@@ -11,7 +11,6 @@ from app.drawing.direct_readings import observed
 from app.drawing.heatmap import ERROR, FAR, NOTHING, ODD, QUIET, SILENT, Frame, Scale, sensor_colors
 from app.engine import commands
 from app.engine.engine import Engine
-from app.recording.reader import read_recording
 from app.recording.writer import Recorder
 from app.rerun.feed import RerunFeed
 from app.rerun.rows import RerunRows
@@ -218,8 +217,6 @@ def test_a_recording_reviews_to_the_same_pictures(running, twin, batches, tmp_pa
     live.engine.submit(commands.Record(None))
     wait_for(lambda: live.recorder.finished)
     seen = live.pull()
-    recorded = read_recording(path)
-    np.testing.assert_array_equal(recorded.track.mean, seen.track.mean)
     session, _ = open_review(path, None)
     try:
         session.start()

@@ -121,7 +121,7 @@ def main() -> None:
     )
     session.stop()
     recorded = read_recording(folder / "live.rrd")
-    print(f"recorded readings {int((recorded.track.verdict > 0).sum())}, health of it: {engine.status().counts}")
+    print(f"recorded readings {int(np.sum(recorded.readings.kind == READING))}, health of it: {engine.status().counts}")
     if browser is not None and playwright is not None:
         browser.close()
         playwright.stop()

@@ -193,7 +193,7 @@ def test_a_slow_filter_folds_a_stated_span(monkeypatch):
         return count
 
     monkeypatch.setattr(Fold, "advance", counted)
-    monkeypatch.setattr(app.compare_fold.time, "process_time", lambda: 1e-4 * stepped)
+    monkeypatch.setattr(app.cli.compare_fold.time, "process_time", lambda: 1e-4 * stepped)
     row = fold_row(twin, "filterpy-ekf", [events], budget=0.06)
     assert row.span == tidy((events.t[599] - events.t[0]) * 1e-9)
     assert row.seconds_per_step == pytest.approx(1e-4)

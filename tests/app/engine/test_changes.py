@@ -49,7 +49,7 @@ def assert_same(track, expected):
 
 @pytest.fixture
 def review(tmp_path):
-    """A review of a session whose filter was turned while it was recorded; and what was recorded."""
+    """A review of a session whose filter was turned while it was recorded; and the track that it ended with."""
     source = Scripted()
     engine = Engine(load_twin("motor_winding"), lambda report: source)
     recorder = engine.recorder = Recorder(engine, lambda stream: lambda pull: None)
@@ -62,21 +62,22 @@ def review(tmp_path):
         source.put(readings(t, 40.0 + 0.05 * t + np.random.default_rng(1).normal(0.0, 1.5, 300)))
         wait_for(lambda: len(rows(engine).readings) == 300)
         carry_out(engine, *TURNED)
+        seen = rows(engine).track
         engine.submit(commands.Record(None))
         wait_for(lambda: path in recorder.finished)
     finally:
         engine.stop()
         recorder.stop()
-    session, recorded = open_review(path, None)
+    session, _ = open_review(path, None)
     session.start()
     wait_for(lambda: session.engine.status().finished)
-    yield session.engine, recorded
+    yield session.engine, seen
     session.stop()
 
 
 def test_a_review_goes_back_to_what_was_recorded(review):
-    engine, recorded = review
-    assert_same(rows(engine).track, recorded.track)
+    engine, seen = review
+    assert_same(rows(engine).track, seen)
     said = status_json(engine)
     assert (said["began_as"], said["turned"]) == ("recorded", {})
     assert (said["estimator"], said["options"]["alpha"]) == ("ukf", 0.5)
@@ -96,15 +97,15 @@ def test_a_review_goes_back_to_what_was_recorded(review):
     assert status_json(engine)["turned"] == {
         "estimator": "ukf", "R.winding": 2.25, "use.winding": True, "gate": 0.99,
     }  # fmt: skip
-    assert not np.array_equal(rows(engine).track.mean, recorded.track.mean)
+    assert not np.array_equal(rows(engine).track.mean, seen.mean)
 
     carry_out(engine, command_from_json({"command": "Restore"}, engine))
     assert status_json(engine)["turned"] == {}
-    assert_same(rows(engine).track, recorded.track)
+    assert_same(rows(engine).track, seen)
 
 
 def test_the_panel_says_what_was_recorded_and_has_the_way_back(review):
-    engine, recorded = review
+    engine, seen = review
     view = ViserView(engine, secret="s3cret")
     try:
         view.frame()
@@ -122,7 +123,7 @@ def test_the_panel_says_what_was_recorded_and_has_the_way_back(review):
         assert not began.button.visible
         assert view.panel.estimator.handle.value == "Unscented Kalman filter"
         assert view.panel.gate.handle.value == "99 %"
-        assert_same(rows(engine).track, recorded.track)
+        assert_same(rows(engine).track, seen)
     finally:
         view.stop()
 

@@ -118,9 +118,8 @@ def test_what_diverges_says_since_when_and_is_reset(name, start, tmp_path):
     again = Fold(estimator, MODEL, tuning, log, pairs=np.array([[0, 1]]), base=recorded.base)
     again.advance(37)
     again.advance()
-    for column, a, b, c in zip(track._fields, track, again.track, recorded.track, strict=True):
+    for column, a, b in zip(track._fields, track, again.track, strict=True):
         np.testing.assert_array_equal(a, b, err_msg=column)
-        np.testing.assert_array_equal(a, c, err_msg=column)
 
 
 def test_a_reset_stays_where_it_was_when_the_history_is_folded_again(start):

@@ -165,7 +165,7 @@ def test_a_session_on_the_page(browser, served, tmp_path, monkeypatch):
     panel.get_by_role("button", name="Stop").click()
     wait_for(lambda: engine.status().recording is None and session.recorder.finished, PATIENCE)
     recorded = read_recording(path)
-    np.testing.assert_array_equal(recorded.track.mean, final.track.mean)
+    np.testing.assert_array_equal(recorded.readings.value, final.readings.value)
 
     # Nothing was asked of anybody else. What the viewer tries, the page's policy stops before it leaves.
     own = f"http://127.0.0.1:{session.server.port}/"
