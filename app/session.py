@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import secrets
-import signal
 import sys
 import threading
 import time
@@ -20,6 +19,7 @@ from .engine.commands import Record
 from .engine.engine import Engine
 from .recording.writer import FINE, Recorder
 from .rerun.rows import RerunRows
+from .signals import restore, when_asked_to_end
 from .split import NEVER, Split
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ class Session:
             NisusError: If the page cannot be served, or, in the end, that `record` could not be written.
         """
         done = threading.Event()
-        previous = signal.signal(signal.SIGTERM, lambda *_: done.set())
+        previous = when_asked_to_end(done.set)
         try:
             self.start()
             if record is not None:
@@ -144,7 +144,7 @@ class Session:
         except KeyboardInterrupt:
             pass
         finally:
-            signal.signal(signal.SIGTERM, previous)
             self.stop()
+            restore(previous)
         if record is not None and self.recorder.failure:
             raise SourceError(self.recorder.failure)

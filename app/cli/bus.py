@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import threading
 import time
 from collections import Counter
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from estimators.errors import ConfigError
 
+from ..signals import restore, when_asked_to_end
 from ..twin.twin import Twin, load_twin
 from .main import settings
 from .stderr import complain
@@ -90,7 +90,7 @@ def _logger(path: Path) -> Any:
 def _play(player: Any, duration: float | None) -> None:
     """Until the asset has said all, the time is up, or a signal comes."""
     done = threading.Event()
-    previous = signal.signal(signal.SIGTERM, lambda *_: done.set())
+    previous = when_asked_to_end(done.set)
     end = time.monotonic() + duration if duration is not None else float("inf")
     try:
         player.start()
@@ -99,4 +99,4 @@ def _play(player: Any, duration: float | None) -> None:
     except KeyboardInterrupt:
         pass
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        restore(previous)

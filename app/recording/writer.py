@@ -115,7 +115,7 @@ class Recorder:
         if part.disk.free() < 0:
             self._finish(part, short=True)
             raise SourceError(f"{part.file.path}: the disk is nearly full; what was written until then can be reviewed")
-        if part.file.size >= self._split.size or time.monotonic() - part.begun >= self._split.seconds:
+        if part.due(self._split):
             self._finish(part, goes_on=True)
             self._open = _Part(self._engine, part.asked, self._draw, before=part)
             self._engine.notices.say(f"recording on into {self._open.file.path}")
@@ -174,7 +174,8 @@ class _Part:
         except BaseException:
             self.release()
             raise
-        self.begun = self._drawn = time.monotonic()
+        self._begun = self._drawn = time.monotonic()
+        self._opening = 0
 
     def write(self, *, last: bool = False) -> None:
         """Write everything that is there, in pieces; the charts too if their time has come or it is the last time."""
@@ -191,6 +192,13 @@ class _Part:
                 self._drawing(replace(pull, fresh=pull.fresh or self._undrawn))
                 self._undrawn = False
         self.file.flush()
+        self._opening = self._opening or self.file.size
+
+    def due(self, split: Split) -> bool:
+        """Whether the next part should begin; not while most of this one is what each part has to begin with."""
+        grown = self.file.size - self._opening
+        large = self.file.size >= split.size and grown >= split.size / 2
+        return large or time.monotonic() - self._begun >= split.seconds
 
     def _write_events(self) -> None:
         for pull in self._pulls(self._events):
