@@ -15,6 +15,9 @@ from .source import Source
 BATCH = 4096
 """Events given at once at most, so that whoever reads can breathe at full speed."""
 
+LAST = 2**62
+"""Nanoseconds: where the playhead stops, since times are int64."""
+
 
 class Pacer:
     """A source whose events come when the playhead reaches their time.
@@ -77,7 +80,8 @@ class Pacer:
             return self._playhead
         if self.paused:
             return self._playhead
-        return self._playhead + round((self._clock() - self._anchor) * self.speed)
+        gone = (self._clock() - self._anchor) * self.speed
+        return min(LAST, self._playhead + round(gone)) if gone < LAST else LAST
 
     def _settle(self) -> None:
         """Make the present position the anchor, before speed or pause change it."""

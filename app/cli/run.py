@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from estimators.errors import ConfigError
 
+from ..engine.playback import FASTEST
 from ..recording.format import TAKEN
 from ..server.port import check_port
 from ..session import Page, Session
@@ -47,8 +48,10 @@ SAID = 5
 
 def run_twin(arguments: Run) -> int:
     """Carry the command out."""
-    if not arguments.speed > 0 or math.isnan(arguments.speed):
-        raise ConfigError(f"--speed {arguments.speed:g}: must be positive, or inf for as fast as possible")
+    if not (0.0 < arguments.speed <= FASTEST or arguments.speed == math.inf):
+        raise ConfigError(
+            f"--speed {arguments.speed:g}: must be positive and at most {FASTEST:g}, or inf for as fast as possible"
+        )
     if arguments.record is not None and arguments.record.suffix != ".rrd":
         raise ConfigError(f"--record {arguments.record}: must end in .rrd")
     if arguments.record is not None and os.path.lexists(arguments.record):

@@ -16,7 +16,7 @@ from estimators.track import HEALTH_NAMES
 from ..engine import commands
 from ..engine.changes import began_as, turned
 from ..engine.execute import Refolding, retuned
-from ..engine.playback import LONGEST
+from ..engine.playback import PLAYBACK, check_playback
 
 
 def status_json(engine: Any) -> dict[str, Any]:
@@ -85,13 +85,10 @@ def command_from_json(body: Any, engine: Any) -> commands.Command:
 def _check(command: commands.Command, engine: Any) -> None:
     if isinstance(command, Refolding):
         retuned(command, engine)
-    elif isinstance(command, commands.Speed) and not command.factor > 0:
-        raise ConfigError(f'Speed: factor is {command.factor:g}; it must be positive, or "inf"')
-    elif isinstance(command, commands.Seek) and not abs(command.seconds) <= LONGEST:
-        raise ConfigError(f"Seek: seconds is {command.seconds:g}; it must lie within {LONGEST:g} s")
     elif isinstance(command, commands.Record) and engine.recorder is None:
         raise ConfigError("Record: this session cannot record")
-    if isinstance(command, (commands.Pause, commands.Speed, commands.Step, commands.Seek)):
+    if isinstance(command, PLAYBACK):
+        check_playback(command)
         if not engine.status().seekable:
             raise ConfigError("a live source cannot be paused, stepped or sought; only a replay or a simulation can")
 

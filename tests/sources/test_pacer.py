@@ -86,6 +86,17 @@ def test_as_fast_as_possible_is_everything_in_breaths():
     assert max(sizes) <= BATCH and sum(sizes) == 10_000
 
 
+@pytest.mark.parametrize(("speed", "seconds"), [(1e300, 1e-6), (1e300, 1e9), (1e9, 1e6)])
+def test_a_playhead_beyond_all_times_releases_everything(speed, seconds):
+    pacer, clock = player(speed=speed)
+    pacer.read(0.0)
+    clock.advance(seconds)
+    assert due(pacer) == [1, 2, 3, 4, 5]
+    pacer.pause()
+    pacer.seek(100 * S)
+    assert due(pacer) == [0]
+
+
 def test_pause_and_resume():
     pacer, clock = player()
     due(pacer)

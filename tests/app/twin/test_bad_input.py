@@ -7,6 +7,7 @@ import pytest
 import viser
 from viser import GuiEvent
 
+from app.cli.main import main
 from app.engine import commands
 from app.engine.engine import Engine
 from app.engine.playback import play
@@ -258,3 +259,20 @@ def test_a_seek_beyond_all_time_is_refused(seconds):
     source = SimpleNamespace(seek=lambda t: None, span=(0, SECOND))
     with pytest.raises(ConfigError, match="must lie within 1e\\+09 s"):
         play(source, commands.Seek(seconds), 0)
+
+
+@pytest.mark.parametrize("factor", [1e300, 1.1e9, 0.0, -1.0, -np.inf, np.nan])
+def test_a_speed_that_no_clock_can_follow_is_refused(factor):
+    speeds = []
+    source = SimpleNamespace(seek=None, set_speed=speeds.append)
+    with pytest.raises(ConfigError, match=r"Speed: factor is .* must be positive and at most 1e\+09, or inf"):
+        play(source, commands.Speed(factor), 0)
+    for good in (1e-3, 1e9, np.inf):
+        play(source, commands.Speed(good), 0)
+    assert speeds == [1e-3, 1e9, np.inf]
+
+
+@pytest.mark.parametrize("speed", ["1e300", "0", "nan"])
+def test_a_speed_on_the_command_line_is_held_to_the_same(speed, capsys):
+    assert main(["run", "motor_winding", "--headless", "--speed", speed]) == 2
+    assert "must be positive and at most 1e+09" in capsys.readouterr().err
