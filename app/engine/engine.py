@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import EstimatorError, NisusError
 from estimators.fold import SPARSE_EVERY, Base, Fold
 from estimators.log import TICK, Log, Readings
