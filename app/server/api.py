@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import os
 import types
@@ -10,13 +11,36 @@ import typing
 from pathlib import Path
 from typing import Any
 
+from starlette.responses import JSONResponse
+
 from estimators.errors import ConfigError
 from estimators.track import HEALTH_NAMES
 
+from ..cli.stderr import printable
 from ..engine import commands
 from ..engine.changes import began_as, turned
 from ..engine.execute import Refolding, retuned
 from ..engine.playback import PLAYBACK, check_playback
+
+LONGEST_NAME = 255
+"""Bytes of a file's name, on nearly all file systems."""
+
+LONGEST_LINE = 500
+"""Characters of a reason, which may quote what was asked."""
+
+
+class Json(JSONResponse):
+    """An answer in JSON. A file's name may hold what UTF-8 cannot, so everything that is not ASCII is escaped."""
+
+    def render(self, content: Any) -> bytes:
+        """The bytes of the answer."""
+        return json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
+
+
+def one_line(text: str) -> str:
+    """A reason as one line that can be shown anywhere."""
+    line = printable(text).replace("\n", " ")
+    return line if len(line) <= LONGEST_LINE else line[: LONGEST_LINE - 1] + "…"
 
 
 def status_json(engine: Any) -> dict[str, Any]:
@@ -98,6 +122,10 @@ def _recording(where: str, name: str) -> Path:
     path = Path(name)
     if path.suffix != ".rrd" or name != path.name or "\\" in name or name.startswith("."):
         raise ConfigError(f"{where}; it must be a file name that ends in .rrd, without folders")
+    if not name.isprintable():
+        raise ConfigError(f"{where}; it must have letters that can be shown, no control characters or half ones")
+    if len(os.fsencode(name)) > LONGEST_NAME:
+        raise ConfigError(f"{where}, which is too long; it may have {LONGEST_NAME} bytes")
     if os.path.lexists(path):
         raise ConfigError(f"{where}, which is there already; choose another name")
     return path

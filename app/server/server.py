@@ -18,15 +18,16 @@ from typing import Any
 import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket
 
 from estimators.errors import NisusError
 
 from ..rerun.feed import RerunFeed
-from .api import command_from_json, status_json
+from ..server_bounds import BODY, TooLarge, bounded_body, bounds
+from .api import Json, command_from_json, one_line, status_json
 from .gate import Gate, user_token
 from .port import listen
 from .viewer_assets import FILES, viewer_assets, viewer_version
@@ -89,7 +90,7 @@ class PageServer:
         self._viser = ViserProxy(viser_port, secret) if viser_port is not None else None
         config = uvicorn.Config(
             Gate(self._application(), self._token, self.port), log_config=None, log_level="critical", access_log=False,
-            server_header=False, lifespan="off", ws_per_message_deflate=False, timeout_graceful_shutdown=1,
+            server_header=False, lifespan="off", ws_per_message_deflate=False, timeout_graceful_shutdown=1, **bounds(),
         )  # fmt: skip
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(
@@ -150,21 +151,23 @@ class PageServer:
 
     async def _status(self, request: Request) -> Response:
         status = status_json(self._engine)
-        return JSONResponse({**status, "recordings": sorted(self._recordings())})
+        return Json({**status, "recordings": sorted(self._recordings())})
 
     async def _list_recordings(self, request: Request) -> Response:
         found = {name: path for name, path in self._recordings().items() if path.is_file()}
-        return JSONResponse([{"name": name, "bytes": path.stat().st_size} for name, path in sorted(found.items())])
+        return Json([{"name": name, "bytes": path.stat().st_size} for name, path in sorted(found.items())])
 
     async def _command(self, request: Request) -> Response:
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             return PlainTextResponse("Nisus: Content-Type must be application/json.\n", 415)
         try:
-            command = command_from_json(await request.json(), self._engine)
+            command = command_from_json(json.loads(await bounded_body(request)), self._engine)
+        except TooLarge as error:
+            return PlainTextResponse(f"Nisus: {error}.\n", 413)
         except (NisusError, ValueError, RecursionError) as error:
-            return JSONResponse({"error": str(error)}, 400)
+            return Json({"error": one_line(str(error))}, 400)
         self._engine.submit(command)
-        return JSONResponse({"submitted": type(command).__name__}, 202)
+        return Json({"submitted": type(command).__name__}, 202)
 
     async def _viewer_file(self, request: Request) -> Response:
         name = request.path_params["name"]
@@ -248,11 +251,9 @@ async def _given(feed: RerunFeed) -> AsyncIterator[str | bytes]:
 
 
 async def _listen_to(browser: WebSocket, drawn: asyncio.Event) -> None:
-    """A word from the browser says that it has drawn what it got."""
-    with contextlib.suppress(WebSocketDisconnect):
-        while True:
-            await browser.receive_text()
-            drawn.set()
+    """A word from the browser says that it has drawn what it got; whoever says anything longer is not the page."""
+    while (word := (await browser.receive()).get("text")) is not None and len(word) <= BODY:
+        drawn.set()
 
 
 class _WithHeaders:

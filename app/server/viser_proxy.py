@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import http.client
 from typing import Any
+from urllib.parse import quote
 
 import websockets
 from starlette.requests import Request
@@ -32,7 +33,7 @@ class ViserProxy:
 
     async def http(self, request: Request) -> Response:
         """Fetch a file of Viser's client."""
-        path = "/" + request.path_params["path"]
+        path = "/" + quote(request.path_params["path"])
         try:
             status, headers, body = await asyncio.to_thread(self._fetch, path, dict(request.headers))
         except (OSError, http.client.HTTPException) as error:
@@ -56,7 +57,7 @@ class ViserProxy:
     async def websocket(self, browser: WebSocket) -> None:
         """Couple a browser's WebSocket with one of Viser's, until either closes."""
         query = browser.scope["query_string"].decode("latin-1")
-        path = browser.path_params.get("path", "")
+        path = quote(browser.path_params.get("path", ""))
         url = f"ws://127.0.0.1:{self._port}/{path}" + (f"?{query}" if query else "")
         offered = [websockets.Subprotocol(name) for name in browser.scope.get("subprotocols", [])]
         try:

@@ -6,8 +6,10 @@ and each WebSocket upgrade must carry a secret that only the page's proxy knows,
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import http
+import logging
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,21 +19,30 @@ import rich
 import viser
 import websockets.asyncio.server
 from viser import _messages
+from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
+from websockets.protocol import State
+
+from ..server_bounds import BACKLOG
 
 HEADER = "X-Nisus-Secret"
+
+CONNECTIONS = 96
+"""Open at a time, as many as those of the page: only its server has business here, but anybody can connect."""
 
 _patching = threading.Lock()
 
 
 def guarded_server(secret: str, label: str) -> viser.ViserServer:
     """A Viser server on a free loopback port that answers 403 to whatever lacks the secret."""
+    logging.getLogger("websockets.server").addFilter(_worth_a_line)
     with _patching, unprinted():
         serve = websockets.asyncio.server.serve
 
         def guarded_serve(*args: Any, process_request: Callable, **options: Any) -> Any:
-            return serve(*args, process_request=_guard(process_request, secret), **options)
+            guard = _guard(process_request, secret)
+            return serve(*args, process_request=guard, create_connection=_Bounded, backlog=BACKLOG, **options)
 
         # Viser has no option for this, and its constructor returns once the port is bound: patch just that long.
         websockets.asyncio.server.serve = guarded_serve  # type: ignore[misc,assignment]
@@ -53,6 +64,23 @@ def unprinted() -> Iterator[None]:
         yield
     finally:
         console.quiet = before
+
+
+def _worth_a_line(record: logging.LogRecord) -> bool:
+    """Whether the log should have a record; that somebody connected and said nothing is no failure of ours."""
+    return record.getMessage() != "opening handshake failed"
+
+
+class _Bounded(ServerConnection):
+    """A connection for which, if there are too many, the oldest that has not said what it wants makes room."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        there = [other for other in self.server.handlers if not other.transport.is_closing()]
+        if len(there) > CONNECTIONS:
+            next(
+                other for other in there if other is self or other.protocol.state is State.CONNECTING
+            ).transport.abort()
 
 
 def _guard(inner: Callable, secret: str) -> Callable:
