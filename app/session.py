@@ -7,7 +7,6 @@ import secrets
 import sys
 import threading
 import time
-import webbrowser
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 from estimators.errors import SourceError
 
+from .cli.stderr import complain
 from .engine.commands import Record
 from .engine.engine import Engine
+from .opening import Opening
 from .recording.writer import FINE, Recorder
 from .rerun.rows import RerunRows
 from .signals import restore, when_asked_to_end
@@ -119,6 +120,16 @@ class Session:
             self.server.stop()
             self.view.stop()
 
+    def _open(self, url: str) -> Opening | None:
+        """Open the page in a browser; where that cannot be, the printed address is there."""
+        try:
+            opening = Opening(url)
+        except OSError as error:
+            complain(f"the browser is not opened ({error.strerror}: {error.filename}); open the address above")
+            return None
+        opening.show()
+        return opening
+
     def run(self, *, record: Path | None, duration: float | None, until_finished: bool) -> None:
         """Run until interrupted, for `duration` seconds, or (`until_finished`) until the source has ended.
 
@@ -126,6 +137,7 @@ class Session:
             NisusError: If the page cannot be served, or, in the end, that `record` could not be written.
         """
         done = threading.Event()
+        opening: Opening | None = None
         previous = when_asked_to_end(done.set)
         try:
             self.start()
@@ -135,15 +147,20 @@ class Session:
                 print(f"Nisus shows {self.engine.twin.name} at\n\n    {self.url}\n\nCtrl-C ends it.", flush=True)
                 assert self._page is not None
                 if self._page.open_browser:
-                    threading.Thread(target=webbrowser.open, args=(self.url,), daemon=True).start()
+                    opening = self._open(self.url)
             end = time.monotonic() + duration if duration is not None else float("inf")
             while not done.is_set() and time.monotonic() < end:
                 if until_finished and self.engine.status().finished:
                     break
+                if opening is not None and self.server.entered.is_set():
+                    opening.close()
+                    opening = None
                 done.wait(min(0.2, max(0.0, end - time.monotonic())))
         except KeyboardInterrupt:
             pass
         finally:
+            if opening is not None:
+                opening.close()
             self.stop()
             restore(previous)
         if record is not None and self.recorder.failure:

@@ -120,10 +120,11 @@ const CONNECTION = {
   waiting: "connection lost, trying again",
   hidden: "hidden",
   failed: "charts stopped",
+  ended: "this session has ended; open the address that Nisus printed last",
 };
 
 function connection(state) {
-  $("connection").dataset.state = state === "live" ? "live" : state === "waiting" || state === "failed" ? "lost" : "idle";
+  $("connection").dataset.state = state === "live" ? "live" : ["waiting", "failed", "ended"].includes(state) ? "lost" : "idle";
   $("connection").textContent = CONNECTION[state];
 }
 

@@ -7,7 +7,7 @@ const SLOW_SHARE = 0.2; // then the twin itself may need the processor
 const LONGEST_REST = 8000; // ms
 
 export class Stream {
-  // told(message): JSON messages; changed(state): "live", "waiting", "hidden"
+  // told(message): JSON messages; changed(state): "live", "waiting", "hidden", "ended", "failed"
   constructor({ viewer, told, changed }) {
     this.viewer = viewer;
     this.told = told;
@@ -39,7 +39,14 @@ export class Stream {
       this.changed("waiting");
       this.timer = setTimeout(() => this.open(), this.delay);
       this.delay = Math.min(SLOWEST, 2 * this.delay);
+      this.askWhy();
     };
+  }
+
+  // A browser does not say why a socket was refused. Each session has a token of its own: another one refuses ours.
+  async askWhy() {
+    const answer = await fetch("/api/status").catch(() => null);
+    if (answer?.status === 403) this.close("ended");
   }
 
   close(why) {

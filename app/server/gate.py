@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import os
 import re
 import secrets
+import threading
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any
 from urllib.parse import parse_qs
-
-from .viewer_assets import cache_folder
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -30,25 +28,9 @@ REFUSED_ORIGIN = "Nisus: requests from other sites are refused.\n"
 REFUSED_TOKEN = "Nisus: open the page at the address, with its token, that `nisus run` printed.\n"
 
 
-def user_token() -> str:
-    """The user's token: kept, so that an open page survives a restart, and readable by nobody else."""
-    path = cache_folder() / "token"
-    try:
-        token = path.read_text().strip()
-        if len(token) >= 32 and (os.name != "posix" or not path.stat().st_mode & 0o077):
-            return token
-    except OSError:
-        pass
-    token = secrets.token_urlsafe(32)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.unlink(missing_ok=True)
-        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with os.fdopen(handle, "w") as file:
-            file.write(token)
-    except OSError:
-        pass  # A folder that cannot be written: the token then holds for this run only.
-    return token
+def session_token() -> str:
+    """A token for one session: one that was seen somewhere is worth nothing from the next start on."""
+    return secrets.token_urlsafe(32)
 
 
 class Gate:
@@ -57,6 +39,8 @@ class Gate:
     def __init__(self, app: App, token: str, port: int) -> None:
         self._app = app
         self._token = token.encode()
+        self.entered = threading.Event()
+        """Set once a browser has come with the token."""
         self._cookie_name = f"nisus_{port}"
         # The cookie is not the token: whoever reads one cannot make the other's address of it.
         self._cookie = hmac.new(self._token, f"cookie {port}".encode(), hashlib.sha256).hexdigest().encode()
@@ -106,7 +90,8 @@ class Gate:
 
     async def _exchange(self, headers: _Headers, send: Send) -> None:
         """Put the token into a cookie and out of the address."""
-        cookie = f"{self._cookie_name}={self._cookie.decode()}; Path=/; HttpOnly; SameSite=Strict; Max-Age=2592000"
+        self.entered.set()
+        cookie = f"{self._cookie_name}={self._cookie.decode()}; Path=/; HttpOnly; SameSite=Strict"
         common = [
             (b"set-cookie", cookie.encode()), (b"cache-control", b"no-store"), (b"referrer-policy", b"no-referrer"),
         ]  # fmt: skip

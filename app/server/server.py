@@ -28,7 +28,7 @@ from estimators.errors import NisusError
 from ..rerun.feed import RerunFeed
 from ..server_bounds import BODY, TooLarge, bounded_body, bounds
 from .api import Json, command_from_json, one_line, status_json
-from .gate import Gate, user_token
+from .gate import Gate, session_token
 from .port import listen
 from .viewer_assets import FILES, viewer_assets, viewer_version
 from .viser_proxy import ViserProxy
@@ -85,11 +85,13 @@ class PageServer:
         self._boot = uuid.uuid4().hex
         self._socket = listen(port)
         self.port: int = self._socket.getsockname()[1]
-        self._token = user_token()
+        self._token = session_token()
         self._assets: Future[Path] = Future()
         self._viser = ViserProxy(viser_port, secret) if viser_port is not None else None
+        gate = Gate(self._application(), self._token, self.port)
+        self.entered = gate.entered
         config = uvicorn.Config(
-            Gate(self._application(), self._token, self.port), log_config=None, log_level="critical", access_log=False,
+            gate, log_config=None, log_level="critical", access_log=False,
             server_header=False, lifespan="off", ws_per_message_deflate=False, timeout_graceful_shutdown=1, **bounds(),
         )  # fmt: skip
         self._server = uvicorn.Server(config)

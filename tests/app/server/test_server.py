@@ -2,14 +2,12 @@
 
 import asyncio
 import gzip
-import os
-import stat
 
 import pytest
 
 from app.engine.engine import Engine
 from app.server import viewer_assets as assets_module
-from app.server.gate import Gate, user_token
+from app.server.gate import Gate
 from app.server.server import PageServer
 from app.server.viewer_assets import FILES, viewer_assets, viewer_version
 from estimators.errors import ConfigError
@@ -31,20 +29,25 @@ def served(monkeypatch, prepare):
     return server
 
 
-def test_the_token_is_kept_for_this_user_only(cache):
-    token = user_token()
-    assert len(token) >= 32 and user_token() == token
-    if os.name == "posix":
-        assert stat.S_IMODE((cache / "token").stat().st_mode) == 0o600
-        # One that others could have read is not used again.
-        (cache / "token").chmod(0o644)
-        assert user_token() != token
+def test_each_session_has_a_token_of_its_own(cache):
+    engine = Engine(shown_twin(), lambda report: Scripted())
+    tokens = {PageServer(engine, port=0, viser_port=None, secret=SECRET).url.partition("token=")[2] for _ in range(3)}
+    assert len(tokens) == 3 and all(len(token) >= 32 for token in tokens)
+    # Nothing of it stays: what the last session's browsers know opens nothing.
+    assert not cache.exists()
 
 
-def test_a_cache_that_cannot_be_written_still_gives_a_token(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert len(user_token()) >= 32
+def test_a_session_keeps_its_token_and_its_cookie(monkeypatch, tmp_path):
+    server = served(monkeypatch, lambda progress: tmp_path)
+    client = Client(server)
+    first = client.cookie
+    client._cookie = None
+    assert client.cookie == first and client.get("/").status == 200
+    assert client.token == Client(server).token
+    # It ends with the browser, as it is of no use to the next session.
+    marks = client.raw("GET", f"/?token={client.token}", [("Host", client.host)]).headers["set-cookie"].lower()
+    assert "max-age" not in marks and "expires" not in marks
+    server.stop()
 
 
 def ask(gate, path="/", query="", **headers):
