@@ -57,6 +57,8 @@ class Merged:
                 elif len(batch):
                     order = np.maximum(np.maximum.accumulate(batch.t), self._latest[k])
                     self._pending[k], self._order[k], self._latest[k] = batch, order, int(order[-1])
+                else:
+                    return batch  # It has more, but not yet; until then the others' order is not known.
         waiting = [k for k in range(len(self._sources)) if self._order[k].size]
         if not waiting:
             return None

@@ -125,15 +125,15 @@ class Pacer:
         """The events that are due; an empty batch if none becomes due within `timeout` seconds; None at the end."""
         with self._changed:
             self._obey_seek()
-            self._fill()
-            if self._pending is None:
+            nothing = self._fill(timeout)
+            if self._pending is None and self._ended:
                 self._changed.wait_for(lambda: self._seek is not None, timeout)
                 if self._seek is None:
                     return None
                 self._obey_seek()
-                self._fill()
-                if self._pending is None:
-                    return None
+                nothing = self._fill(timeout)
+            if self._pending is None:
+                return nothing
             count = self._due()
             if count == 0:
                 self._wait(timeout)
@@ -157,10 +157,11 @@ class Pacer:
             self.restarts += 1
         self._playhead, self._anchor = t, self._clock()
 
-    def _fill(self) -> None:
-        """Have at least one event waiting, unless the source has ended."""
-        while self._pending is None and not self._ended:
-            batch = self._source.read(0.0)
+    def _fill(self, timeout: float) -> Readings | None:
+        """Have at least one event waiting; else an empty batch if the source has none yet, and None at its end."""
+        batch: Readings | None = None
+        if self._pending is None and not self._ended:
+            batch = self._source.read(timeout)
             if batch is None:
                 self._ended = True
             elif len(batch):
@@ -171,6 +172,7 @@ class Pacer:
                     self._first = int(batch.t[0])
                 if self._playhead is None:
                     self._playhead, self._anchor = int(batch.t[0]), self._clock()
+        return batch
 
     def _due(self) -> int:
         """How many of the waiting events the playhead has reached."""

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from estimators.log import Readings
+if TYPE_CHECKING:
+    from estimators.log import Readings
 
 Report = Callable[[str, str], None]
 """report(key, text): counted under `key`, `text` shown among the events; called from the source's thread."""
+
+NEVER = "never seen"
+"""Key of what a channel is mapped to and the source does not give."""
+
+TRUNCATED = "truncated file"
+"""Key of a file of which something is lost."""
 
 
 class Source(Protocol):

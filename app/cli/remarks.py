@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sources.tables.order import REMARKS
+from sources.source import NEVER, TRUNCATED
+from sources.tables.order import REMARKS as ORDER
 
 from .stderr import complain
+
+REMARKS = (*ORDER, NEVER, TRUNCATED)
 
 
 def remarking(report: Callable[[str, str], None]) -> Callable[[str, str], None]:
@@ -14,8 +17,8 @@ def remarking(report: Callable[[str, str], None]) -> Callable[[str, str], None]:
     said: set[str] = set()
 
     def both(key: str, text: str) -> None:
-        if key in REMARKS and key not in said:
-            said.add(key)
+        if key in REMARKS and text not in said:
+            said.add(text)
             complain(text)
         report(key, text)
 

@@ -12,6 +12,7 @@ import can
 from estimators.errors import SourceError
 from estimators.log import Readings
 
+from ..heard import Heard
 from ..source import Report, ignore
 from .decoder import Decoder
 
@@ -51,7 +52,7 @@ class CanBus:
         channel: The bus, as the interface names it.
         decoder: What to take from the frames; its ids are set as the bus's filters.
         bus_options: Further arguments of the interface.
-        report: Told of error frames, and of the bus failing and coming back.
+        report: Told of error frames, of the bus failing and coming back, and of messages that do not come.
         connect: Opens the bus; for tests.
         clock: Seconds, for the waits between attempts; for tests.
 
@@ -82,6 +83,7 @@ class CanBus:
         self._next_attempt = 0.0
         self._failed_before = False
         self._bus: Any = self._connect()
+        self._heard = Heard(f"CAN bus {self._name}", decoder, clock, report)
 
     def read(self, timeout: float) -> Readings | None:
         """The events of the frames that are queued; waits up to `timeout` seconds for the first. None once closed."""
@@ -103,7 +105,9 @@ class CanBus:
         for message in messages:
             if message.is_error_frame:
                 self._report("error frame", f"CAN bus {self._name}: error frame")
-        return self._decoder.decode(self._decoder.gather(messages, arrivals))
+        batch = self._decoder.decode(self._decoder.gather(messages, arrivals))
+        self._heard.note(messages)
+        return batch
 
     def _failed(self, error: Exception) -> None:
         """Once may be one bad packet; twice in a row the bus is given up and opened again."""

@@ -11,9 +11,8 @@ import cantools
 
 from estimators.errors import SourceError, nearest
 
+from ..frames import BusName
 from ..source import Channel
-
-BusName = int | str | None
 
 
 def load_database(path: Path) -> Any:

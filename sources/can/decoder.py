@@ -9,16 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from estimators.errors import SourceError
-from estimators.log import Readings
+from estimators.log import READING, Readings
 
 from ..clock import second_ns
+from ..frames import EXTENDED, BusName, Raw
 from ..mapping import Mapping
 from ..source import Channel, Report, ignore
-from .databases import BusName, find_messages, load_database, same_bus
+from ..unseen import Expected, Seen, unheard, unsaid
+from .databases import find_messages, load_database, same_bus
 from .signals import ABSENT, PRESENT, SHORT, extract, ordered, tabulate, vectorises
-
-EXTENDED = 1 << 31
-"""Added to the arbitration id of an extended frame, so that one number names it."""
 
 
 class Frames(NamedTuple):
@@ -88,6 +87,8 @@ class Decoder:
             width=width,
             report=report,
         )
+        self._silent = {(channel.kind, channel.index) for *_, own in self._plans for channel in own}
+        """Channels that no value has come for."""
         self.decode(self.gather([], []))  # Compiles now, not when the first frame waits.
 
     def _check_unique(self) -> None:
@@ -112,6 +113,24 @@ class Decoder:
             for key in sorted(self.wanted)
         ]
 
+    @property
+    def expected(self) -> list[Expected]:
+        """The messages of which some channel has had no value yet, with these channels."""
+        found = []
+        for key, (message, bus, _, channels) in zip(self._keys, self._plans, strict=True):
+            feeds = {c.name: c.signals for c in channels if (c.kind, c.index) in self._silent}
+            if feeds:
+                found.append(Expected(message.name, key, bus, feeds, (message.cycle_time or 0) / 1000))
+        return found
+
+    @staticmethod
+    def missing(item: Expected, seen: Seen, *, least: int = 1) -> list[str]:
+        """What to say of a message whose channels have had no value; nothing if it came fewer than `least` times."""
+        count = sum(n for (bus, key), n in seen.items() if key == item.key and same_bus(item.bus, bus))
+        if not count:
+            return [unheard(item, seen)]
+        return [unsaid(item, channel, count) for channel in item.feeds] if count >= least else []
+
     def plan_of(self, key: int, bus: BusName) -> int:
         """The message that a frame is, or -1 if nobody needs it; `key` is its id, with EXTENDED added."""
         try:
@@ -123,6 +142,17 @@ class Decoder:
             if key in self.wanted:
                 self._plan_of[key, bus] = plan
             return plan
+
+    def frames_of(self, raw: Raw) -> Frames:
+        """Those frames of a log that are wanted."""
+        plan = np.full(raw.key.size, -1, np.int64)
+        for key in self.wanted:
+            rows = np.flatnonzero(raw.key == key)
+            for place in np.unique(raw.bus[rows]):
+                plan[rows[raw.bus[rows] == place]] = self.plan_of(key, raw.buses[place])
+        rows = np.flatnonzero(plan >= 0)
+        t = raw.t[rows]
+        return Frames(t, t, plan[rows], raw.length[rows], raw.data[rows])
 
     def gather(self, messages: Sequence[Any], arrivals: Sequence[int] | None) -> Frames:
         """Those of python-can's messages that are wanted, as arrays; `arrivals` (ns) None takes the frames' own times.
@@ -166,7 +196,10 @@ class Decoder:
                 self._by_cantools(frames, i, values, state, bad)
         if bad.any():
             self._tell(frames, bad)
-        return self._mapping.events(frames.plan, frames.t, frames.arrival, values, state, bad)
+        batch = self._mapping.events(frames.plan, frames.t, frames.arrival, values, state, bad)
+        if self._silent and len(batch):
+            self._silent = {item for item in self._silent if not _valued(batch, *item)}
+        return batch
 
     def _by_cantools(self, frames: Frames, i: int, values: np.ndarray, state: np.ndarray, bad: np.ndarray) -> None:
         """Decode one frame of a message with signals that the compiled loop does not know."""
@@ -205,3 +238,14 @@ class Decoder:
                 "undecodable frame",
                 f"{message.name} ({message.frame_id:#x}) with data {data} does not decode: {reason}",
             )
+
+
+def _valued(batch: Readings, kind: int, index: int) -> bool:
+    """Whether a batch has a value for the sensor, input or state `index`."""
+    rows = batch.kind == kind
+    if kind == READING:
+        rows = rows & (batch.channel == index)
+        return bool(np.isfinite(batch.value[rows]).any())
+    column = index - batch.channel[rows]
+    inside = np.flatnonzero((column >= 0) & (column < batch.value.shape[1]))
+    return bool(np.isfinite(batch.value[rows][inside, column[inside]]).any())

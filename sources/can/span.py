@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 from pathlib import Path
 
 import can
 
+from estimators.errors import SourceError
+
+from ..apart import ask
 from ..clock import second_ns
-from .mf4 import DamagedError, mf4_span
+from .mf4 import mf4_span
+
+PATIENCE = 5.0
+"""Seconds; who asks draws a slider, and can do without."""
 
 TAIL = 4096
 """Bytes at the end of a text log that hold its last lines."""
@@ -24,7 +31,8 @@ def _span(path: Path) -> tuple[int, int] | None:
     kind = path.suffix.lower()
     try:
         if kind == ".mf4":
-            return mf4_span(path)
+            stat = path.stat()
+            return _mf4(path, stat.st_mtime_ns, stat.st_size)
         if kind == ".blf":
             with can.BLFReader(path) as reader:
                 span = second_ns(reader.start_timestamp), second_ns(reader.stop_timestamp)
@@ -32,10 +40,16 @@ def _span(path: Path) -> tuple[int, int] | None:
             return span if span[1] > span[0] > 0 else None
         if kind == ".log":
             return _candump(path)
-    except (OSError, ValueError, DamagedError):
+    except (OSError, ValueError, SourceError):
         # Not known is an answer; what is wrong with the file is told when it is read.
         return None
     return None
+
+
+@lru_cache(maxsize=64)
+def _mf4(path: Path, stamp: int, size: int) -> tuple[int, int] | None:
+    """Kept while the file is unchanged: a replay that is sought back asks again."""
+    return next(iter(ask(mf4_span, path, patience=PATIENCE)), None)
 
 
 def _candump(path: Path) -> tuple[int, int] | None:

@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from estimators.errors import SourceError, nearest, quoted
+from estimators.errors import SourceError, quoted
+
+from ..source import TRUNCATED
 
 CHUNK = 4096
 
@@ -32,29 +34,6 @@ class Chunk(NamedTuple):
     time: Any
     values: np.ndarray
     blank: np.ndarray
-
-
-def missing_column(path: Path, name: str, names: Sequence[str]) -> SourceError:
-    """The error of a column that a file does not have."""
-    return SourceError(f"{path}: there is no column {name!r}; {nearest(name, names)}")
-
-
-def check_columns(path: Path, wanted: Sequence[str]) -> None:
-    """Refuse a file that lacks a column, or rows, or that is no table at all.
-
-    Raises:
-        SourceError: Naming the file, the column and those that are near.
-    """
-    if not path.is_file():
-        raise SourceError(f"{path}: there is no such file; check the path of the recording")
-    if path.stat().st_size == 0:
-        raise SourceError(f"{path}: the file is empty; record it again")
-    names = column_names(path)
-    for name in wanted:
-        if name not in names:
-            raise missing_column(path, name, names)
-    if path.suffix.lower() == ".csv" and not _has_rows(path):
-        raise SourceError(f"{path}: it has a header and no rows; record it again")
 
 
 def column_names(path: Path) -> list[str]:
@@ -81,6 +60,11 @@ def read_table(path: Path, time: str, columns: Sequence[str], problem: Problem) 
 
         return read_npz(path, time, columns, problem)
     return (read_parquet if is_parquet(path) else read_csv)(path, time, columns, problem)
+
+
+def is_text(path: Path) -> bool:
+    """Whether it is read as a CSV, whose reader cannot crash."""
+    return not (is_mat(path) or is_npz(path) or is_parquet(path))
 
 
 def is_mat(path: Path) -> bool:
@@ -112,13 +96,6 @@ def parquet_names(path: Path) -> list[str]:
     except (pyarrow.ArrowException, OSError) as error:
         gist = " ".join(str(error).split())[:160]
         raise SourceError(f"{path}: it cannot be read as Parquet ({gist}); check that it is whole") from None
-
-
-def _has_rows(path: Path) -> bool:
-    """Whether anything follows the first line of a CSV."""
-    with path.open("rb") as file:
-        file.readline()
-        return any(line.strip() for line in file)
 
 
 def _header(path: Path) -> tuple[list[str], str]:
@@ -158,7 +135,7 @@ def read_csv(path: Path, time: str, columns: Sequence[str], problem: Problem) ->
                 try:
                     row = next(reader, None)
                 except csv.Error as error:
-                    problem("truncated file", reader.line_num, f"{error}; the rest is left out")
+                    problem(TRUNCATED, reader.line_num, f"{error}; the rest is left out")
                     row = None
                 if row is None:
                     ended = True
@@ -176,7 +153,7 @@ def read_csv(path: Path, time: str, columns: Sequence[str], problem: Problem) ->
                     _numbers([row[place] for row in rows], columns[k], lines, values[:, k], blank[:, k], problem)
                 yield Chunk(np.array(lines), [row[at_time].strip() for row in rows], values, blank)
     if broken is not None:
-        problem("truncated file", broken[0], f"the last line has {broken[1]} cells, not {len(names)}")
+        problem(TRUNCATED, broken[0], f"the last line has {broken[1]} cells, not {len(names)}")
 
 
 def _numbers(
@@ -224,3 +201,5 @@ def read_parquet(path: Path, time: str, columns: Sequence[str], problem: Problem
                     values[:, k] = numbers.to_numpy(zero_copy_only=False)
             yield Chunk(np.array(lines), batch.column(time), values, blank)
             row += n
+        if row - 1 != file.metadata.num_rows:
+            problem(TRUNCATED, row, f"{row - 1} of {file.metadata.num_rows} rows are there")

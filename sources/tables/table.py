@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from estimators.errors import SourceError
+from estimators.errors import SourceError, nearest
 from estimators.log import Readings
 
 from ..can.signals import ABSENT, PRESENT
 from ..mapping import Mapping
-from ..source import Channel, Report, ignore
-from .files import check_columns, read_table
+from ..source import NEVER, TRUNCATED, Channel, Report, ignore
+from ..table_rows import Rows, names_of, rows_of
 from .order import Order
-from .time_column import UNITS, column_ns
+from .time_column import UNITS
 
 
 class Table:
@@ -65,36 +65,64 @@ class Table:
         self._shift = round(time_shift * 1e9)
         self._columns = list(dict.fromkeys(name for channel in channels for name in channel.needed))
         for path in self._files:
-            check_columns(path, [time_column, *self._columns])
+            _check(path, [time_column, *self._columns])
+        self._channels = channels
+        self._valued: set[str] = set()
+        self._count = 0
+        self._timeout = 0.0
         self._mapping = Mapping([(channels, self._columns, [None] * len(self._columns))], width=width, report=report)
         self._order = Order(time_column, time_unit, None if horizon is None else round(horizon * 1e9), report)
         self._batches = self._all()
 
     def _all(self) -> Generator[Readings, None, None]:
         for path in self._files:
+            yield from self._one(path)
+        if self._count:
+            for name in self._columns:
+                if name not in self._valued:
+                    self._report(NEVER, self._never(name))
 
-            def problem(key: str, line: int, text: str, path: Path = path) -> None:
-                self._report(key, f"{path.name}:{line}: {text}")
-
-            for chunk in read_table(path, self._time, self._columns, problem):
-                t, known = column_ns(chunk.time, self._unit)
-                for row in np.flatnonzero(~known):
-                    self._report(
-                        "undated row",
-                        f"{path.name}:{chunk.line[row]}: {self._time} is no time, or one that needs another unit; "
-                        "the row is left out",
-                    )
-                t = t + self._shift
-                self._order.look(path.name, chunk.line[known], t[known])
-                values = chunk.values
-                state = np.where(chunk.blank, ABSENT, PRESENT).astype(np.int8)
-                plan = np.zeros(t.size, np.int64)
-                batch = self._mapping.events(plan, t, t, values, state, (~known).astype(np.int8))
-                if len(batch):
+    def _one(self, path: Path) -> Generator[Readings, None, None]:
+        before = self._count
+        try:
+            for rows in rows_of(path, self._time, self._unit, self._columns, lambda: self._timeout):
+                batch = Readings.empty(self._width) if rows is None else self._events(path, rows)
+                if rows is None or len(batch):
                     yield batch
+        except SourceError as error:
+            if self._count == before:
+                raise
+            gist = str(error).removeprefix(f"{path}: ")
+            self._report(TRUNCATED, f"{path.name}: damaged after {self._count - before} rows: {gist}")
+
+    def _events(self, path: Path, rows: Rows) -> Readings:
+        for key, line, text in rows.problems:
+            self._report(key, f"{path.name}:{line}: {text}")
+        known = rows.known
+        for row in np.flatnonzero(~known):
+            self._report(
+                "undated row",
+                f"{path.name}:{rows.line[row]}: {self._time} is no time, or one that needs another unit; "
+                "the row is left out",
+            )
+        self._count += rows.t.size
+        if len(self._valued) < len(self._columns):
+            valued = np.flatnonzero(np.isfinite(rows.values).any(axis=0))
+            self._valued.update(self._columns[k] for k in valued)
+        t = rows.t + self._shift
+        self._order.look(path.name, rows.line[known], t[known])
+        state = np.where(rows.blank, ABSENT, PRESENT).astype(np.int8)
+        plan = np.zeros(t.size, np.int64)
+        return self._mapping.events(plan, t, t, rows.values, state, (~known).astype(np.int8))
+
+    def _never(self, name: str) -> str:
+        fed = ", ".join(channel.name for channel in self._channels if name in channel.needed)
+        files = self._files[0].name + (f" and {len(self._files) - 1} more" if len(self._files) > 1 else "")
+        return f"{files}: column {name!r} has no value in {self._count} rows; {fed} gets nothing from it"
 
     def read(self, timeout: float) -> Readings | None:
-        """The events of the next rows; None at the end."""
+        """The events of the next rows; none if there are none within `timeout` seconds; None at the end."""
+        self._timeout = timeout
         return next(self._batches, None)
 
     def now(self) -> int | None:
@@ -104,3 +132,28 @@ class Table:
     def close(self) -> None:
         """Close the file that is open."""
         self._batches.close()
+
+
+def _check(path: Path, wanted: Sequence[str]) -> None:
+    """Refuse a file that lacks a column, or rows, or that is no table at all.
+
+    Raises:
+        SourceError: Naming the file, the column and those that are near.
+    """
+    if not path.is_file():
+        raise SourceError(f"{path}: there is no such file; check the path of the recording")
+    if path.stat().st_size == 0:
+        raise SourceError(f"{path}: the file is empty; record it again")
+    names = names_of(path)
+    for name in wanted:
+        if name not in names:
+            raise SourceError(f"{path}: there is no column {name!r}; {nearest(name, names)}")
+    if path.suffix.lower() == ".csv" and not _has_rows(path):
+        raise SourceError(f"{path}: it has a header and no rows; record it again")
+
+
+def _has_rows(path: Path) -> bool:
+    """Whether anything follows the first line of a CSV."""
+    with path.open("rb") as file:
+        file.readline()
+        return any(line.strip() for line in file)

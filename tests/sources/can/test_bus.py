@@ -10,7 +10,7 @@ from estimators.errors import SourceError
 from estimators.log import Readings
 from sources.can.bus import WAITS, CanBus, open_bus
 from sources.can.decoder import Decoder
-from tests.sources.can.can_tools import Reports, dbc, frame, sensor
+from tests.sources.can.can_tools import DBC, Reports, dbc, frame, sensor
 
 DATA = bytes.fromhex("f4010fa000000080")
 GROUP = "239.74.163.2"
@@ -150,4 +150,38 @@ def test_multicast_stays_on_this_machine_and_arrives(decoder):
     got = listen(source, 1)
     assert got.value[0, 0] == 10.0
     sender.shutdown()
+    source.close()
+
+
+def test_a_message_that_never_comes_is_named_once(tmp_path):
+    """After some seconds in which others came, or after three of its periods if the DBC tells them."""
+    clock, reports = Clock(), Reports()
+    text = DBC + 'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;\nBA_DEF_DEF_ "GenMsgCycleTime" 0;\n'
+    slow = dbc(tmp_path, text + 'BA_ "GenMsgCycleTime" BO_ 258 10000;\n')
+    channels = [sensor(0, "ENGINE", "Temp"), sensor(1, "WIDE", "Ratio"), sensor(2, "FIX", "Lat")]
+    bus = FakeBus([])
+    source = CanBus(
+        "x", "y", Decoder([(slow, None)], channels, width=1), report=reports, connect=lambda: bus, clock=clock
+    )
+    source.read(0.0)
+    clock.now += 6.0
+    source.read(0.0)
+    assert reports.counts == {"never seen": 1}
+    assert reports.texts["never seen"].startswith(
+        "CAN bus x:y: none of ENGINE (0x100), WIDE (0x200x), FIX (0x102) came"
+    )
+    bus.script = [frame(256, DATA), None]
+    source.read(0.0)
+    reports.counts.clear()
+    for _ in range(4):
+        clock.now += 2.0
+        bus.script = [frame(256, DATA), None]
+        source.read(0.0)
+    assert reports.counts == {"never seen": 1}
+    assert reports.texts["never seen"].startswith("CAN bus x:y: after 6 s WIDE (0x200x) never came, so sensor1 gets")
+    for _ in range(20):
+        clock.now += 2.0
+        source.read(0.0)
+    assert reports.counts == {"never seen": 2}
+    assert "FIX (0x102) never came" in reports.texts["never seen"] and "after 30 s" in reports.texts["never seen"]
     source.close()

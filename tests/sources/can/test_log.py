@@ -173,7 +173,7 @@ def test_a_log_read_in_one_thread_is_closed_in_another(tmp_path, messages, suffi
     path = tmp_path / f"a{suffix}"
     write(path, messages)
     log = CanLog([path], decoder_of(tmp_path))
-    thread = threading.Thread(target=log.read, args=(0.0,))
+    thread = threading.Thread(target=log.read, args=(60.0,))
     thread.start()
     thread.join()
     log.close()

@@ -7,8 +7,10 @@ from app.twin.twin import load_twin
 from estimators.errors import ConfigError, SourceError
 from estimators.log import READING, TRUTH
 from sources.source import Channel
+from sources.table_rows import read_rows
 from sources.tables import npz
 from sources.tables.table import Table
+from tests.sources.can.can_tools import read_all
 
 T0 = np.datetime64("2019-03-01T00:00", "ns")
 RNG = np.random.default_rng(0)
@@ -33,13 +35,14 @@ def table(path, columns, kind=READING):
 def test_cells_and_vectors_come_as_they_were_saved(archive, monkeypatch):
     monkeypatch.setattr(npz, "VALUES", 6)  # two rows at once, so that there are several chunks
     assert len(npz.npz_names(archive)) == 12 + 3
-    source, rows = table(archive, ("t[2,1]", "one", "t[0,3]")), []
-    while (batch := source.read(0.0)) is not None:
-        assert len(batch) <= 2
-        rows.append(batch)
-    values = np.concatenate([batch.value for batch in rows])
-    np.testing.assert_array_equal(values[:, :3], np.column_stack((FIELD[:, 2, 1], np.arange(7.0), FIELD[:, 0, 3])))
-    t = np.concatenate([batch.t for batch in rows])
+    columns = ("t[2,1]", "one", "t[0,3]")
+    chunks = list(read_rows(archive, "time", "s", columns))
+    assert [chunk.t.size for chunk in chunks] == [2, 2, 2, 1]
+    cells = np.column_stack((FIELD[:, 2, 1], np.arange(7.0), FIELD[:, 0, 3]))
+    np.testing.assert_array_equal(np.concatenate([chunk.values for chunk in chunks]), cells)
+    batch = read_all(table(archive, columns))
+    np.testing.assert_array_equal(batch.value[:, :3], cells)
+    t = batch.t
     np.testing.assert_array_equal(t, (T0 + np.arange(7) * np.timedelta64(1, "h")).astype(np.int64))
 
 
@@ -49,7 +52,7 @@ def test_what_is_no_column_or_no_archive_is_refused(archive, tmp_path):
     with pytest.raises(SourceError, match="no column 'words'"):
         table(archive, ("words",))
     with pytest.raises(SourceError, match="short has 3 rows and time has 7; take arrays of one length"):
-        table(archive, ("short",)).read(0.0)
+        read_all(table(archive, ("short",)))
     bad = tmp_path / "bad.npz"
     bad.write_bytes(archive.read_bytes()[:200])
     with pytest.raises(SourceError, match="bad.npz: it cannot be read as a NumPy archive"):

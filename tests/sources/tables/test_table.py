@@ -95,7 +95,7 @@ def test_blank_says_nothing_and_what_is_no_number_is_missing_with_its_line(tmp_p
         (2 * 10**9, READING, 1, NAN, 1.0),
     ]
     np.testing.assert_array_equal(np.array(got), np.array(expected))
-    assert reports.counts == {"unreadable value": 2}
+    assert reports.counts == {"unreadable value": 2, "never seen": 3}  # temp, power and x have no number
     assert reports.texts["unreadable value"] == "drive.csv:4: x is 'oops', which is no number; the value is missing"
 
 

@@ -1,0 +1,308 @@
+"""Files of other programs are read in a process of their own.
+
+A damaged file can make the library that reads it abort, or run for ever, and neither may happen to the twin.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from estimators.errors import NisusError, SourceError
+
+PATIENCE = 30.0
+"""Seconds that a reader may take for its next item, and one more for each `BYTES_A_SECOND` of the file."""
+
+BYTES_A_SECOND = 2**20
+
+SHORTEST = 0.005
+"""Seconds of the shortest wait, so that who asks without waiting does not spin."""
+
+DRAIN = 0.1
+"""Seconds within which a reader that nobody listens to any more may come to its end and be used again."""
+
+SPARE = 2
+"""Readers without work that are kept; each has loaded its libraries, which takes longer than most files."""
+
+_BOOT = f"""
+import pickle, sys
+lifeline, sys.path[:] = pickle.load(sys.stdin.buffer)
+from {__name__} import serve
+serve(lifeline)
+"""
+
+GRACE = 5.0
+"""Seconds between the end of a process's pipe and its own."""
+
+_ITEM, _END, _FAULT = range(3)
+
+
+class ReaderError(SourceError):
+    """The reader of a file crashed, hung, or raised what is no error of ours."""
+
+
+class _Worker:
+    """A process that runs one generator after another and hands their items over a pipe, which bounds its lead."""
+
+    def __init__(self) -> None:
+        # The pipe is never written to: its end tells the worker, wherever it is, that this process has gone.
+        theirs, self._lifeline = os.pipe()
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-c", _BOOT],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            pass_fds=[theirs],
+        )
+        os.close(theirs)
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._requests = self._process.stdin
+        self._answers = Connection(os.dup(self._process.stdout.fileno()), writable=False)
+        self._process.stdout.close()
+        self._write((theirs, list(sys.path)))
+
+    def _write(self, *items: Any) -> None:
+        with suppress(BrokenPipeError):  # A worker that died says so where its answer is awaited.
+            for item in items:
+                pickle.dump(item, self._requests)
+            self._requests.flush()
+
+    def ask(self, function: Callable[..., Iterator[Any]], args: tuple[Any, ...]) -> None:
+        """Have it run `function(*args)`, which must be importable by name."""
+        # The path first and by itself: the function may be from a folder that was added to it since.
+        self._write(list(sys.path), (function, args))
+
+    def answer(self, timeout: float) -> tuple[int, Any] | None:
+        """The next answer; None if none comes in time.
+
+        Raises:
+            EOFError: If the process has ended.
+        """
+        try:
+            return pickle.loads(self._answers.recv_bytes()) if self._answers.poll(timeout) else None
+        except OSError as error:
+            raise EOFError from error
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process is still there."""
+        return self._process.poll() is None
+
+    def end(self, grace: float = 0.0) -> str:
+        """End it, and say how it had ended if it had: its status comes up to `grace` seconds after its pipe closed."""
+        _busy.discard(self)
+        self._answers.close()
+        with suppress(BrokenPipeError):
+            self._requests.close()
+        os.close(self._lifeline)
+        try:
+            code = self._process.wait(grace)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+            return "was ended"
+        if code >= 0:
+            return f"ended with status {code}"
+        try:
+            return f"was ended by {signal.Signals(-code).name}"
+        except ValueError:
+            return f"was ended by signal {-code}"
+
+
+_spare: list[_Worker] = []
+_busy: set[_Worker] = set()
+"""Held here too: a source that is left open is collected with all it holds in any order, and then closes its reader."""
+
+_lock = threading.RLock()  # A collection may close a reader wherever it happens, here as well.
+
+
+def _forget() -> None:
+    _spare.clear()
+    _busy.clear()
+
+
+# A process that forks keeps its readers; two that ask the same one would take each other's answers.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)
+
+
+def _hire() -> _Worker:
+    with _lock:
+        while _spare:
+            worker = _spare.pop()
+            if worker.alive:
+                break
+            worker.end()
+        else:
+            worker = _Worker()
+        _busy.add(worker)
+        return worker
+
+
+def _dismiss(worker: _Worker) -> None:
+    """Keep it for the next file, unless enough wait."""
+    with _lock:
+        _busy.discard(worker)
+        if len(_spare) < SPARE:
+            _spare.append(worker)
+            return
+    worker.end()
+
+
+@atexit.register
+def _end_spare() -> None:
+    with _lock:
+        for worker in (*_spare, *_busy):
+            worker.end()
+        _spare.clear()
+
+
+class Apart:
+    """The items of a generator that runs in a process of its own.
+
+    Args:
+        function: A generator function, importable by name, whose arguments and items can be pickled.
+        args: What it is called with.
+        patience: Seconds to wait for an item before the process is taken to hang.
+    """
+
+    def __init__(self, function: Callable[..., Iterator[Any]], *args: Any, patience: float = PATIENCE) -> None:
+        self._patience = patience
+        self._waited = 0.0
+        self._worker: _Worker | None = _hire()
+        self._worker.ask(function, args)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the last item has been taken."""
+        return self._worker is None
+
+    def take(self, timeout: float) -> Any:
+        """The next item, or None: at the end (`ended`), or if none came within `timeout` seconds.
+
+        Raises:
+            ReaderError: If the process ended, hung, or the generator raised.
+            NisusError: As the generator raised it.
+        """
+        worker = self._worker
+        if worker is None:
+            return None
+        timeout = max(timeout, SHORTEST)
+        begun = time.monotonic()
+        try:
+            answer = worker.answer(timeout)
+        except EOFError:
+            self._worker = None
+            raise ReaderError(f"its reader {worker.end(GRACE)}") from None
+        if answer is None:
+            # No more than was meant to be waited: a machine that was suspended meanwhile has not hung.
+            self._waited += min(time.monotonic() - begun, timeout)
+            if self._waited >= self._patience:
+                self._worker = None
+                worker.end()
+                raise ReaderError(f"its reader gave nothing for {self._patience:.0f} s and was ended")
+            return None
+        self._waited = 0.0
+        kind, item = answer
+        if kind == _ITEM:
+            return item
+        self._worker = None
+        _dismiss(worker)
+        if kind == _FAULT:
+            raise item
+        return None
+
+    def close(self) -> None:
+        """Let go of the process: it comes to its end very soon, or is ended."""
+        worker, self._worker = self._worker, None
+        if worker is None:
+            return
+        limit = time.monotonic() + DRAIN
+        with suppress(EOFError):
+            while (left := limit - time.monotonic()) > 0:
+                answer = worker.answer(left)
+                if answer is not None and answer[0] != _ITEM:
+                    _dismiss(worker)
+                    return
+        worker.end()
+
+
+def patience_for(path: Path) -> float:
+    """Seconds that the reader of a file may take for its next item."""
+    return PATIENCE + path.stat().st_size / BYTES_A_SECOND
+
+
+def ask(function: Callable[..., Iterator[Any]], *args: Any, patience: float = PATIENCE) -> list[Any]:
+    """All items at once.
+
+    Raises:
+        ReaderError: See `Apart.take`.
+    """
+    apart = Apart(function, *args, patience=patience)
+    items = []
+    try:
+        while not apart.ended:
+            if (item := apart.take(1.0)) is not None:
+                items.append(item)
+    finally:
+        apart.close()
+    return items
+
+
+def serve(lifeline: int) -> None:
+    """In the worker: run what is asked until the process that asks has gone."""
+    _end_with_parent(lifeline)
+    answers = Connection(os.dup(1), readable=False)
+    os.dup2(2, 1)  # What libraries print is no answer.
+    requests = sys.stdin.buffer
+    with suppress(EOFError, BrokenPipeError, KeyboardInterrupt):
+        while True:
+            sys.path[:] = pickle.load(requests)
+            function, args = pickle.load(requests)
+            try:
+                for item in function(*args):
+                    answers.send((_ITEM, item))
+                answers.send((_END, None))
+            except NisusError as error:
+                answers.send((_FAULT, error))
+            except (BrokenPipeError, KeyboardInterrupt):
+                raise
+            except BaseException as error:  # noqa: BLE001  libraries raise anything, some of it no Exception
+                gist = " ".join(str(error).split())[:160] or type(error).__name__
+                answers.send((_FAULT, ReaderError(gist)))
+
+
+def _end_with_parent(lifeline: int) -> None:
+    """Have the kernel end this process with its parent: a library that hangs would let no thread of Python see it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends this process in its time.
+    with suppress(ImportError, OSError):
+        import fcntl
+
+        signal.signal(signal.SIGIO, signal.SIG_DFL)
+        fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
+        fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
+        # The last end may have closed before the signal was asked for.
+        import select
+
+        if select.select([lifeline], [], [], 0)[0]:
+            os._exit(1)
+    with suppress(ImportError, OSError, ValueError):
+        # A damaged file may ask for all memory there is.
+        import resource
+
+        most = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 4 * 3
+        resource.setrlimit(resource.RLIMIT_DATA, (most, resource.getrlimit(resource.RLIMIT_DATA)[1]))
+    with suppress(OSError):
+        # And where that is more than is left, this process goes first, not the twin.
+        Path("/proc/self/oom_score_adj").write_text("1000")
