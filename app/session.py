@@ -17,11 +17,11 @@ from estimators.errors import SourceError
 from .cli.stderr import complain
 from .engine.commands import Record
 from .engine.engine import Engine
-from .opening import Opening
+from .recording.split import NEVER, Split
 from .recording.writer import FINE, Recorder
 from .rerun.rows import RerunRows
+from .server.open_browser import Opening
 from .signals import restore, when_asked_to_end
-from .split import NEVER, Split
 
 if TYPE_CHECKING:
     from estimators.fold import Base

@@ -18,22 +18,22 @@ from .compiled.model import compile_model
 from .diagnostics.failure_cause import Estimate, cause, failures
 from .diagnostics.field_pictures import Pictures
 from .diagnostics.health import Bounds, HealthPolicy, assess, assess_signature, chi_square_bounds
-from .door import admitted
 from .errors import EstimatorError, ModelError
 from .estimator import Code, Estimator, call_describe, call_predict, call_start, call_update, code_type
+from .events.checks import admitted
+from .fold_checks import check_base, check_pairs, check_prior, check_tuning, check_variances
 from .interpreted import fold_loop
 from .interpreted.black_box_filters import driven
 from .interpreted.fold_loop import LONGEST, UNSET
 from .interpreted.view import View
 from .log import BEFORE, INPUT, READING, RESET, TICK, TRUTH, Log
-from .meeting import check_base, check_pairs, check_prior, check_tuning, check_variances
 from .model.mode_as_number import indicator
 from .model.state_space import StateSpaceModel
 from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, jit, jit_brief
 from .numerics.peaks import Mode
 from .numerics.quantiles import chi_square_quantile
+from .numerics.steps import steps_of
 from .registry import find_estimator
-from .steps import steps_of
 from .track import MISSING, NONE, Track, track_type
 from .tuning import Tuning
 

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import series
-from .door import Layout, admitted
 from .errors import EventError
-from .events import BEFORE, INPUT, KIND_NAMES, READING, RESET, TICK, TRUTH, Readings, truth_of
-from .order import in_order, sorted_order
+from .events import arrays
+from .events.batch import BEFORE, INPUT, KIND_NAMES, READING, RESET, TICK, TRUTH, Readings, truth_of
+from .events.checks import Layout, admitted
+from .events.order import in_order, sorted_order
 
 if TYPE_CHECKING:
     from .model.state_space import StateSpaceModel
@@ -53,7 +53,7 @@ class Log:
         log = Log(model.width, capacity)
         log.model, log.layout = model, model.layout
         if start is not None:
-            log.start = log.floor = int(series.nanoseconds("start", start)[0])
+            log.start = log.floor = int(arrays.nanoseconds("start", start)[0])
         return log
 
     def _allocate(self, capacity: int, columns: int) -> None:
@@ -98,7 +98,7 @@ class Log:
         Raises:
             EventError: If the log is of no model, a name or a shape does not fit, or a time is before the start.
         """
-        return self._put(series.readings(self._named("add"), sensor, seconds, values, variance))
+        return self._put(arrays.readings(self._named("add"), sensor, seconds, values, variance))
 
     def add_inputs(self, seconds: Any, **inputs: Any) -> int:
         """Put inputs where they belong; each holds until its next value.
@@ -113,7 +113,7 @@ class Log:
         Raises:
             EventError: As `add`.
         """
-        return self._put(series.inputs(self._named("add_inputs"), seconds, inputs))
+        return self._put(arrays.inputs(self._named("add_inputs"), seconds, inputs))
 
     def add_truth(self, seconds: Any, **states: Any) -> int:
         """Put true states where they belong: the estimate is scored against them, and never sees them.
@@ -128,7 +128,7 @@ class Log:
         Raises:
             EventError: As `add`.
         """
-        return self._put(series.truth(self._named("add_truth"), seconds, states))
+        return self._put(arrays.truth(self._named("add_truth"), seconds, states))
 
     def add_ticks(self, seconds: Any) -> int:
         """Ask for the estimate at these times, s, shape (N,) or one number: each is a row of the track.
@@ -139,7 +139,7 @@ class Log:
         Raises:
             EventError: If a time is not finite or before the start.
         """
-        return self._put(series.ticks(self.width, seconds))
+        return self._put(arrays.ticks(self.width, seconds))
 
     def _named(self, method: str) -> StateSpaceModel:
         if self.model is None:

@@ -20,7 +20,6 @@ from estimators.errors import ConfigError, SourceError
 from estimators.log import Readings
 from estimators.registry import ESTIMATORS, find_estimator, unfit
 
-from ..scores import write_scores
 from ..twin.twin import Twin, load_twin
 from .compare_fold import BUDGET, Row, fold_row
 from .compare_table import cells, printed
@@ -28,6 +27,7 @@ from .fold import read_log
 from .main import settings
 from .prepare import prepare
 from .progress import progress
+from .scores import write_scores
 from .stderr import complain
 
 if TYPE_CHECKING:

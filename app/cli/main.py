@@ -214,7 +214,7 @@ def carry_out(command: Command) -> int:
 
         return play_bus(command)
     if isinstance(command, Twins):
-        from ..twins import show_twins
+        from .twins import show_twins
 
         return show_twins(command)
     if isinstance(command, Schema):

@@ -11,9 +11,9 @@ from estimators.errors import ConfigError
 
 from ..engine.playback import FASTEST
 from ..recording.format import TAKEN
+from ..recording.split import NEVER, parse_split
 from ..server.port import check_port
 from ..session import Page, Session
-from ..split import NEVER, parse_split
 from ..twin.twin import Twin, load_twin
 from .main import settings
 from .prepare import prepare

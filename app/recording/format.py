@@ -22,7 +22,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import Tuning
 
 from ..engine.outputs import Pull
-from ..rrd import RrdFile
+from .rrd import RrdFile
 
 FORMAT = 2
 READABLE = (1, 2)

@@ -20,8 +20,8 @@ from estimators.errors import SourceError
 from estimators.fold import Base
 from estimators.log import Readings
 
-from ..rrd import BEGIN, MESSAGE_HEADER, STREAM_HEADER, whole_until
 from .format import FORMAT, PREFIX, READABLE, TIMELINE, base_from_json
+from .rrd import BEGIN, MESSAGE_HEADER, STREAM_HEADER, whole_until
 
 
 @dataclass(frozen=True)

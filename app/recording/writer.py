@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any
 from estimators.diagnostics.health import FAR
 from estimators.errors import NisusError, SourceError
 
-from ..disk import Disk
 from ..engine.outputs import Cursor, Pull
 from ..rerun.rows import RerunRows
-from ..split import NEVER, Split, part_path
+from .disk import Disk
 from .format import RecordingFile
+from .split import NEVER, Split, part_path
 
 if TYPE_CHECKING:
     from estimators.diagnostics.field_pictures import Picture

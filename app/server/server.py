@@ -26,8 +26,8 @@ from starlette.websockets import WebSocket
 from estimators.errors import NisusError
 
 from ..rerun.feed import RerunFeed
-from ..server_bounds import BODY, TooLarge, bounded_body, bounds
 from .api import Json, command_from_json, one_line, status_json
+from .bounds import BODY, TooLarge, bounded_body, bounds
 from .gate import Gate, session_token
 from .port import listen
 from .viewer_assets import FILES, viewer_assets, viewer_version

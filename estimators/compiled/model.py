@@ -15,9 +15,9 @@ from typing import Any
 import numba
 import numpy as np
 
-from ..claims import check_parts
 from ..errors import ModelError
 from ..model.check import probe, probe_angles, probe_likelihoods, uncompilable
+from ..model.claims import check_parts
 from ..model.state_space import LARGE, Field, StateSpaceModel
 from ..numerics.jit import address, jit, plain
 from .black_box import ANSWER, BlackBox, answered_f, answered_h

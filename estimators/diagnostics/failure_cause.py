@@ -16,7 +16,7 @@ from ..compiled.model import CompiledModel
 from ..errors import ModelError
 from ..model.check import indefinite, numbers, place
 from ..model.state_space import SHOWN
-from ..steps import steps_of
+from ..numerics.steps import steps_of
 from ..track import FAILED, GATED, Track
 
 AWAY = (1.0, -1.0, 3.0, -3.0)

@@ -19,11 +19,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from .. import steps
 from ..compiled.context import options, sensor_rows, transition
 from ..errors import EstimatorError
 from ..estimator import Estimator, Option, Options
 from ..model.state_space import StateSpaceModel
+from ..numerics import steps
 from ..numerics.jit import jit, matrix
 from ..numerics.linalg import congruence
 from ..track import USED

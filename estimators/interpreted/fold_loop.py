@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import ModelError
 from ..log import INPUT, READING, RESET, TICK, TRUTH
-from ..steps import steps_of
+from ..numerics.steps import steps_of
 from ..track import FAILED, MISSING, NONE, Track
 
 UNSET = int(np.iinfo(np.int64).min)

@@ -16,8 +16,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ..door import Layout
 from ..errors import LARGEST, ModelError
+from ..events.checks import Layout
 from .field import CellNames, Field, State
 from .jump import Jump
 

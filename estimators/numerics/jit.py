@@ -32,7 +32,7 @@ f64 = types.float64
 i64 = types.int64
 
 
-CONSTANTS = ("errors.py", "events.py", "state_space.py")
+CONSTANTS = ("errors.py", "batch.py", "state_space.py")
 """Files from which compiled code takes constants, and nothing else."""
 
 
@@ -49,7 +49,7 @@ def cache_folder() -> Path:
     for path in sorted(package.rglob("*.py")):
         source = path.read_bytes()
         compiling = (
-            b"jit" in source or b"intrinsic" in source or path.name in ("errors.py", "events.py", "state_space.py")
+            b"jit" in source or b"intrinsic" in source or path.name in ("errors.py", "batch.py", "state_space.py")
         )
         if compiling and package / "models" not in path.parents:
             digest.update(source)

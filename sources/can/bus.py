@@ -12,9 +12,9 @@ import can
 from estimators.errors import SourceError
 from estimators.log import Readings
 
-from ..heard import Heard
 from ..source import Report, ignore
 from .decoder import Decoder
+from .heard import Heard
 
 MOST_FRAMES = 4096
 """Frames taken at once; what is queued beyond them comes next."""

@@ -11,8 +11,8 @@ import cantools
 
 from estimators.errors import SourceError, nearest
 
-from ..frames import BusName
 from ..source import Channel
+from .frames import BusName
 
 
 def load_database(path: Path) -> Any:

@@ -12,12 +12,12 @@ from estimators.errors import SourceError
 from estimators.log import READING, Readings
 
 from ..clock import second_ns
-from ..frames import EXTENDED, BusName, Raw
 from ..mapping import Mapping
 from ..source import Channel, Report, ignore
-from ..unseen import Expected, Seen, unheard, unsaid
 from .databases import find_messages, load_database, same_bus
+from .frames import EXTENDED, BusName, Raw
 from .signals import ABSENT, PRESENT, SHORT, extract, ordered, tabulate, vectorises
+from .unseen import Expected, Seen, unheard, unsaid
 
 
 class Frames(NamedTuple):

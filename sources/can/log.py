@@ -11,10 +11,10 @@ from pathlib import Path
 from estimators.errors import SourceError
 from estimators.log import Readings
 
-from ..apart import Apart, patience_for
-from ..frames import FORMATS, BusName, Found, Raw, open_reader, read_frames, suffix_of, unreadable
+from ..reader_process import Apart, patience_for
 from ..source import NEVER, TRUNCATED, Report, ignore
 from .decoder import Decoder
+from .frames import FORMATS, BusName, Found, Raw, open_reader, read_frames, suffix_of, unreadable
 from .span import log_span
 
 

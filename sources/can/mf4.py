@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from ..frames import CHUNK, EXTENDED, BusName, Found, Raw, unreadable
-from ..mf4_blocks import lost_records
+from .frames import CHUNK, EXTENDED, BusName, Found, Raw, unreadable
+from .mf4_blocks import lost_records
 
 
 @contextmanager

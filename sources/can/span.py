@@ -10,8 +10,8 @@ import can
 
 from estimators.errors import SourceError
 
-from ..apart import ask
 from ..clock import second_ns
+from ..reader_process import ask
 from .mf4 import mf4_span
 
 PATIENCE = 5.0

@@ -12,7 +12,7 @@ from estimators.errors import NisusError, SourceError
 from estimators.log import INPUT, READING, TICK, TRUTH, Readings
 from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.jit import plain
-from estimators.steps import steps_of
+from estimators.numerics.steps import steps_of
 
 from .faults import Fault, Faults
 from .profile import Constant, Profile

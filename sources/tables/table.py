@@ -14,8 +14,8 @@ from estimators.log import Readings
 from ..can.signals import ABSENT, PRESENT
 from ..mapping import Mapping
 from ..source import NEVER, TRUNCATED, Channel, Report, ignore
-from ..table_rows import Rows, names_of, rows_of
 from .order import Order
+from .rows import Rows, names_of, rows_of
 from .time_column import UNITS
 
 

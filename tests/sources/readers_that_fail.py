@@ -38,7 +38,7 @@ def fail():
 
 def frames_then_abort(path, wanted, longest):
     """A log's reader that dies after its first frames."""
-    from sources.frames import read_frames
+    from sources.can.frames import read_frames
 
     yield next(read_frames(path, wanted, longest))
     os.abort()

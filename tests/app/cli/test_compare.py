@@ -15,7 +15,7 @@ from app.cli.compare_fold import Figure, Row, fold_row, refold, tidy, within
 from app.cli.compare_table import Cell, cells, printed, read_cell, read_span
 from app.cli.fold import read_log
 from app.cli.main import main
-from app.scores import SCORES, read_scores, scores_file, write_scores
+from app.cli.scores import SCORES, read_scores, scores_file, write_scores
 from app.twin.twin import load_twin
 from config.loader import load, shipped
 from estimators.errors import ConfigError

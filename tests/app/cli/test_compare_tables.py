@@ -10,7 +10,7 @@ import pytest
 from app.cli.compare_fold import Outcome, draws, refold, within
 from app.cli.compare_table import COST, read_cell, read_span
 from app.cli.fold import read_log
-from app.scores import read_scores
+from app.cli.scores import read_scores
 from app.twin.twin import Twin, load_twin
 from config.loader import shipped
 from estimators.errors import SourceError

@@ -7,8 +7,8 @@ from app.twin.twin import load_twin
 from estimators.errors import ConfigError, SourceError
 from estimators.log import READING, TRUTH
 from sources.source import Channel
-from sources.table_rows import read_rows
 from sources.tables import npz
+from sources.tables.rows import read_rows
 from sources.tables.table import Table
 from tests.sources.can.can_tools import read_all
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .errors import EventError
-from .events import BEFORE, INPUT, READING, TICK, TRUTH, Readings
+from ..errors import EventError
+from .batch import BEFORE, INPUT, READING, TICK, TRUTH, Readings
 
 if TYPE_CHECKING:
-    from .model.state_space import StateSpaceModel
+    from ..model.state_space import StateSpaceModel
 
 
 def nanoseconds(name: str, seconds: Any) -> np.ndarray:

@@ -11,8 +11,8 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
-from app import opening as opening_module
-from app.opening import Opening
+from app.server import open_browser as opening_module
+from app.server.open_browser import Opening
 from tests.app.scripted import wait_for
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="permissions and command lines as on POSIX")

@@ -10,9 +10,9 @@ import numpy as np
 
 from estimators.errors import SourceError
 
-from .apart import Apart, ask, patience_for
-from .tables.files import column_names, is_text, read_table
-from .tables.time_column import column_ns
+from ..reader_process import Apart, ask, patience_for
+from .files import column_names, is_text, read_table
+from .time_column import column_ns
 
 
 class Rows(NamedTuple):

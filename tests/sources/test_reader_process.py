@@ -11,8 +11,8 @@ import time
 import pytest
 
 from estimators.errors import SourceError
-from sources import apart as module
-from sources.apart import Apart, ReaderError, ask
+from sources import reader_process as module
+from sources.reader_process import Apart, ReaderError, ask
 from tests.sources.readers_that_fail import abort, counting, fail, hang, leave, pid_then, shout
 
 
@@ -154,7 +154,7 @@ PARENT = """
 import sys
 sys.path[:0] = {paths!r}
 from readers_that_fail import hang, pid_then
-from sources.apart import Apart
+from sources.reader_process import Apart
 apart = Apart(pid_then, hang)
 while (pid := apart.take(1.0)) is None:
     pass

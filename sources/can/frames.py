@@ -15,7 +15,7 @@ import numpy as np
 
 from estimators.errors import SourceError
 
-from .clock import second_ns
+from ..clock import second_ns
 
 EXTENDED = 1 << 31
 """Added to the arbitration id of an extended frame, so that one number names it."""
@@ -80,7 +80,7 @@ def read_frames(path: Path, wanted: frozenset[int] | None, longest: int) -> Iter
         SourceError: If nothing can be read.
     """
     if suffix_of(path) == ".mf4":
-        from .can.mf4 import read_mf4
+        from .mf4 import read_mf4
 
         return read_mf4(path, wanted, longest)
     return _read_messages(path, wanted, longest)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from .numerics.jit import jit
+from .jit import jit
 
 SLACK = 1e-3
 """Share of a step by which a step may be longer than `max_step`.

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .errors import EventError
+from ..errors import EventError
 
 READING, INPUT, TRUTH, TICK, RESET = range(5)
 """Kinds of event: a sensor's reading; inputs; a true state (scored, never used); a query; back to the prior."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .events import INPUT, READING, RESET, TICK, TRUTH, Readings
+from .batch import INPUT, READING, RESET, TICK, TRUTH, Readings
 
 _ORDER = (INPUT, READING, TRUTH, TICK, RESET)
 _RANK = np.array([_ORDER.index(kind) for kind in range(len(_ORDER))], np.int64) << 32

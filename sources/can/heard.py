@@ -6,12 +6,12 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
+from ..source import NEVER, Report
 from .frames import EXTENDED, BusName
-from .source import NEVER, Report
 from .unseen import Expected, shown_id
 
 if TYPE_CHECKING:
-    from .can.decoder import Decoder
+    from .decoder import Decoder
 
 PATIENCE = 5.0
 """Seconds after which a message is missed, or so many of its periods:"""

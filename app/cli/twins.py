@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from config.loader import Loaded, load, shipped
 
-from .cli.compare_table import printed
+from .compare_table import printed
 from .scores import read_scores
 
 if TYPE_CHECKING:
-    from .cli.main import Twins as Arguments
+    from .main import Twins as Arguments
 
 
 def show_twins(arguments: Arguments) -> int:

@@ -9,7 +9,7 @@ import pytest
 from estimators import registry
 from estimators.fold import fold
 from estimators.log import TICK, Readings
-from estimators.steps import SLACK, steps_of
+from estimators.numerics.steps import SLACK, steps_of
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear
 from tests.estimators.test_fold import as_log, in_python

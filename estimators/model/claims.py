@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from .errors import ModelError
-from .model.check import refuse_writing
-from .model.state_space import StateSpaceModel
-from .numerics.jit import plain
+from ..errors import ModelError
+from ..numerics.jit import plain
+from .check import refuse_writing
+from .state_space import StateSpaceModel
 
 
 def check_parts(model: StateSpaceModel, f: Callable, h: Sequence[Callable]) -> None:

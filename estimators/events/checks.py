@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numba import types
 
-from .errors import LARGEST, EventError
-from .events import BEFORE, INPUT, KIND_NAMES, READING, TRUTH, Readings
-from .numerics.jit import i64, jit_brief
+from ..errors import LARGEST, EventError
+from ..numerics.jit import i64, jit_brief
+from .batch import BEFORE, INPUT, KIND_NAMES, READING, TRUTH, Readings
 
 
 class Layout:

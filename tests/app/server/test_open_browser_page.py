@@ -3,7 +3,7 @@
 import pytest
 
 from app.engine.engine import Engine
-from app.opening import Opening
+from app.server.open_browser import Opening
 from app.server.server import PageServer
 from tests.app.page.test_page import PATIENCE, browser  # noqa: F401  the fixture
 from tests.app.scripted import Scripted, wait_for

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-import app.disk
+import app.recording.disk
 from app.cli.main import main
 from app.engine import commands
 from app.engine.engine import Engine
 from app.recording.format import tuning_from_json
 from app.recording.reader import finished, read_recording
+from app.recording.split import NEVER, Split, parse_split
 from app.recording.writer import Recorder
 from app.server.api import command_from_json
-from app.split import NEVER, Split, parse_split
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import Log
@@ -239,11 +239,11 @@ def test_a_disk_that_fills_is_warned_of_and_the_recording_closed_in_time(start, 
     engine.submit(commands.Record(path))
     feed(source, engine, 0, 1000)
     assert not any(line.level != "info" for line in engine.notices.since(0))
-    free = app.disk.RESERVE + 500_000_000
+    free = app.recording.disk.RESERVE + 500_000_000
     wait_for(lambda: any("has room for 500 MB more" in line.text for line in engine.notices.since(0)))
     assert engine.recorder.path == path
     feed(source, engine, 1000, 1400)
-    free = app.disk.RESERVE - 1
+    free = app.recording.disk.RESERVE - 1
     wait_for(lambda: engine.recorder.failure)
     assert engine.recorder.failure.startswith(f"recording failed: {path}: the disk is nearly full; ")
     texts = [line.text for line in engine.notices.since(0) if line.level != "info"]
@@ -255,13 +255,13 @@ def test_a_disk_that_fills_is_warned_of_and_the_recording_closed_in_time(start, 
 
 
 def test_a_fast_growing_file_is_warned_of_by_its_rate(tmp_path, monkeypatch):
-    now, free = 0.0, app.disk.RESERVE + 9 * 10**9
+    now, free = 0.0, app.recording.disk.RESERVE + 9 * 10**9
     monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(0, 0, free))
-    disk = app.disk.Disk(tmp_path, clock=lambda: now)
+    disk = app.recording.disk.Disk(tmp_path, clock=lambda: now)
     assert disk.warning(10**9) is None
-    now = app.disk.SETTLED + 40.0
+    now = app.recording.disk.SETTLED + 40.0
     assert disk.warning(10**9 + 10**9 // 2) is None  # 5 MB/s fill 9 GB in 1800 s
-    now = app.disk.SETTLED + 60.0
+    now = app.recording.disk.SETTLED + 60.0
     line = disk.warning(10**9 + 12 * 10**8)  # 10 MB/s in 900 s
     assert line is not None and "9000 MB more, which lasts for about 15 min" in line
     assert disk.warning(10**9 + 13 * 10**8) is None
