@@ -9,7 +9,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-import readers_that_fail
 from scipy.io import savemat
 
 from estimators.errors import SourceError
@@ -19,6 +18,7 @@ from sources.can.decoder import Decoder
 from sources.can.log import CanLog
 from sources.source import Channel
 from sources.tables.table import Table
+from tests.sources import readers_that_fail
 from tests.sources.can.can_tools import Reports, dbc, read_all, sensor
 from tests.sources.can.test_log import decoder_of, messages, write  # noqa: F401  a fixture
 

@@ -153,7 +153,7 @@ def test_a_process_that_forks_keeps_its_readers():
 PARENT = """
 import sys
 sys.path[:0] = {paths!r}
-from readers_that_fail import hang, pid_then
+from tests.sources.readers_that_fail import hang, pid_then
 from sources.reader_process import Apart
 apart = Apart(pid_then, hang)
 while (pid := apart.take(1.0)) is None:

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
+from viser import GuiEvent
 
 from app.engine.engine import Engine
 from app.rerun.feed import RerunFeed
@@ -24,7 +25,6 @@ from estimators.fold import Fold
 from estimators.log import INPUT, READING, TICK, TRUTH, Log, Readings
 from estimators.registry import ESTIMATORS, unfit
 from tests.app.scripted import Scripted, wait_for
-from tests.app.viser import GuiEvent
 
 EVERY_FILTER = "motor_winding"
 HUGE = ("thermal_field_large",)

@@ -8,12 +8,12 @@ import sys
 from collections import namedtuple
 from pathlib import Path
 
-import app.recorder
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
 import app.recording.disk
+import app.recording.writer
 from app.cli.main import main
 from app.engine import commands
 from app.engine.engine import Engine
@@ -35,9 +35,9 @@ VALUES = 40 + np.random.default_rng(3).normal(size=COUNT)
 @pytest.fixture
 def start(monkeypatch):
     """start(estimator, ...): an engine with its source and recorder, and the pulls that its charts were given."""
-    monkeypatch.setattr(app.recorder, "PERIOD", 0.01)
-    monkeypatch.setattr(app.recorder, "CHARTS", 0.02)
-    monkeypatch.setattr(app.recorder, "REST", 0.02)
+    monkeypatch.setattr(app.recording.writer, "PERIOD", 0.01)
+    monkeypatch.setattr(app.recording.writer, "CHARTS", 0.02)
+    monkeypatch.setattr(app.recording.writer, "REST", 0.02)
     running = []
 
     def start(estimator="kf", split=NEVER, **options):
@@ -293,7 +293,7 @@ sys.path.insert(0, {root!r})
 import numpy as np
 from pathlib import Path
 from app.pull import Pull
-from app.recording import RecordingFile
+from app.recording.format import RecordingFile
 from estimators.log import READING, Readings
 from estimators.track import Track
 def resident():

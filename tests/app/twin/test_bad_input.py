@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import viser
+from viser import GuiEvent
 
 from app.cli.main import main
 from app.engine import commands
@@ -24,7 +25,6 @@ from estimators.registry import ESTIMATORS, unfit
 from estimators.track import DIVERGED, FAILED, GATED, USED
 from estimators.tuning import Tuning
 from tests.app.scripted import SECOND, Scripted, wait_for
-from tests.app.viser import GuiEvent
 from tests.conftest import ROOT
 
 BAD = {

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import viser
 import websockets
+from viser import _messages
 
 from app.engine.commands import Pause, Record, Reset, Seek, SetEstimator, SetOption, SetTuning, Speed, UseSensor
 from app.viser.coalescer import DRAG_INTERVAL, TYPING_PAUSE
@@ -24,7 +25,6 @@ from estimators.log import READING, TRUTH, Readings
 from estimators.models import MODELS
 from estimators.numerics.peaks import Mode
 from tests.app.fake_engine import FakeEngine, events
-from tests.app.viser import _messages
 
 WINDING = MODELS["motor_winding"]
 BROWSER = SimpleNamespace(client_id=0)
