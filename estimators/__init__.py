@@ -1,1 +1,72 @@
-"""Pure numerics: models, the log, the fold, the filters, diagnostics. No I/O, no clock."""
+"""Pure numerics: models, the log, the fold, the filters, diagnostics. No I/O, no clock.
+
+What a script needs is here by name, and loaded when it is first asked for: `import estimators` compiles nothing.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .diagnostics.health import HealthPolicy as HealthPolicy
+    from .errors import NisusError as NisusError
+    from .interface import fold as fold
+    from .interface import fold_many as fold_many
+    from .log import Log as Log
+    from .model.state_space import Field as Field
+    from .model.state_space import Input as Input
+    from .model.state_space import Jump as Jump
+    from .model.state_space import Noise as Noise
+    from .model.state_space import Parameter as Parameter
+    from .model.state_space import Row as Row
+    from .model.state_space import Sensor as Sensor
+    from .model.state_space import State as State
+    from .model.state_space import StateSpaceModel as StateSpaceModel
+    from .models import MODELS as MODELS
+    from .nees import mean_nees as mean_nees
+    from .registry import ESTIMATORS as ESTIMATORS
+    from .tuning import Tuning as Tuning
+
+_HOMES = {
+    "ESTIMATORS": "registry",
+    "HealthPolicy": "diagnostics",
+    "Log": "log",
+    "MODELS": "models",
+    "NisusError": "errors",
+    "Tuning": "tuning",
+    "fold_many": "interface",
+    "mean_nees": "nees",
+    **dict.fromkeys(
+        ("Field", "Input", "Jump", "Noise", "Parameter", "Row", "Sensor", "State", "StateSpaceModel"), "model"
+    ),
+}
+
+__all__ = ["fold", *_HOMES]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'estimators' has no attribute {name!r}")
+    return getattr(import_module(f".{_HOMES[name]}", __name__), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+class _Package(ModuleType):
+    """The package, whose `fold` is the function; importing the module estimators.fold would set its own name here."""
+
+    @property
+    def fold(self) -> Any:
+        return import_module(".interface", __name__).fold
+
+    @fold.setter
+    def fold(self, module: ModuleType) -> None:
+        """Leave the name to the function."""
+
+
+sys.modules[__name__].__class__ = _Package

@@ -59,13 +59,13 @@ def find_estimator(name: str, model: StateSpaceModel) -> Estimator:
     return entry
 
 
-def checked(entry: Estimator, model: StateSpaceModel, options: Mapping[str, float]) -> Options:
+def checked(entry: Estimator, model: StateSpaceModel, options: Mapping[str, float | str]) -> Options:
     """The options, completed, if the estimator can run with them on the model; nothing is compiled for the answer.
 
     Raises:
         EstimatorError: If one is unknown, breaks its rule, or asks for what the model does not say.
     """
-    values = entry.complete(dict(options))
+    values = entry.complete(options)
     try:
         check_placed(model, values.get("radius", 0.0))
     except EstimatorError as error:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 
 from estimators.diagnostics.failure_cause import failures
@@ -18,8 +17,9 @@ from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.score import Score, score
 from estimators.errors import ConfigError, SourceError
 from estimators.fold import Fold
-from estimators.log import KIND_NAMES, Log, truth_of
-from estimators.track import FAILED, HEALTH_NAMES, VERDICT_NAMES, Track
+from estimators.log import Log
+from estimators.tabular import table_of
+from estimators.track import FAILED, HEALTH_NAMES, Track
 from estimators.tuning import TOGETHER
 
 from ..twin.twin import Twin, load_twin
@@ -202,28 +202,4 @@ def _write(path: Path, twin: Twin, log: Log, track: Track, pictures: Sequence[Pi
 
         write_recording(path, twin, log, track, pictures)
         return
-    events = log.readings
-    model = twin.model
-    columns: dict[str, Any] = {
-        "t_ns": events.t,
-        "arrival_ns": events.arrival,
-        "event": np.array(KIND_NAMES)[events.kind],
-        "channel": events.channel,
-    }
-    columns |= {f"value_{k}": events.value[:, k] for k in range(model.width)}
-    # The track of a large field keeps some of its states.
-    shown = [model.state_names[j] for j in model.shown]
-    for j, name in zip(model.shown, shown, strict=True):
-        rows, values = truth_of(events, int(j))
-        true = np.full(len(events), np.nan)
-        true[rows] = values
-        columns[f"{name}_true"] = true
-    columns |= {name: track.mean[:, k] for k, name in enumerate(shown)}
-    columns |= {f"{name}_std": track.std[:, k] for k, name in enumerate(shown)}
-    columns |= {f"innovation_{k}": track.innovation[:, k] for k in range(model.ny)}
-    columns |= {f"innovation_std_{k}": track.innovation_std[:, k] for k in range(model.ny)}
-    for name in ("nis", "nis_mean", "nis_low", "nis_high", "log_likelihood"):
-        columns[name] = getattr(track, name)
-    columns["verdict"] = np.array(VERDICT_NAMES)[track.verdict]
-    columns["health"] = np.array(HEALTH_NAMES)[track.health]
-    pq.write_table(pa.table({name: np.ascontiguousarray(column) for name, column in columns.items()}), path)
+    pq.write_table(table_of(twin.model, log.readings, track), path)

@@ -14,7 +14,6 @@ from . import commands
 from .playback import PLAYBACK, play
 
 if TYPE_CHECKING:
-    from estimators.estimator import Estimator
     from estimators.tuning import Tuning
 
     from .engine import Engine
@@ -39,23 +38,13 @@ def retuned(command: Refolding, engine: Any) -> tuple[str, Tuning]:
         return entry.name, tuning.with_options(options)
     if isinstance(command, commands.SetOption):
         entry = find_estimator(estimator, engine.model)
-        options = {**tuning.options, command.name: _number(entry, command)}
+        number = entry.complete({command.name: command.value})[command.name]
+        options = {**tuning.options, command.name: number}
         checked(entry, engine.model, options)
         return estimator, tuning.with_options(options)
     if isinstance(command, commands.UseSensor):
         return estimator, tuning.set(f"use.{command.name}", command.used)
     return estimator, tuning.set(command.key, command.value)
-
-
-def _number(entry: Estimator, command: commands.SetOption) -> float:
-    """The value of an option; one of several words may be given as the word."""
-    if not isinstance(command.value, str):
-        return float(command.value)
-    choices = next((option.choices for option in entry.options if option.name == command.name), ())
-    if command.value not in choices:
-        wanted = f"one of {', '.join(choices)}" if choices else "a number"
-        raise ConfigError(f"estimator {entry.name}: {command.name} is {command.value!r}; it must be {wanted}")
-    return float(choices.index(command.value))
 
 
 def obey(command: commands.Command, engine: Engine) -> None:

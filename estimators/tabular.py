@@ -1,0 +1,51 @@
+"""A fold as a table: one row an event, one column a state."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .events.batch import KIND_NAMES, READING, Readings, truth_of
+from .model.state_space import StateSpaceModel
+from .track import HEALTH_NAMES, VERDICT_NAMES, Track
+
+
+def table_of(model: StateSpaceModel, events: Readings, track: Track) -> Any:
+    """A pyarrow.Table of events and track.
+
+    Columns: `t_ns` and `arrival_ns`; `seconds`; `event`, `channel`, and `sensor` (null unless it is a reading);
+    `value_k` and, where a reading brought its own, `variance_k`; for each state `NAME_true` (NaN where it is not
+    known), `NAME` and `NAME_std`; `innovation_k` and `innovation_std_k`; NIS with its windowed mean and bounds,
+    log-likelihood; verdict and health in words.
+    """
+    import pyarrow as pa
+
+    sensors = np.array([*model.sensor_names, None], object)
+    columns: dict[str, Any] = {
+        "t_ns": events.t,
+        "arrival_ns": events.arrival,
+        "seconds": events.t * 1e-9,
+        "event": np.array(KIND_NAMES)[events.kind],
+        "channel": events.channel,
+        "sensor": pa.array(sensors[np.where(events.kind == READING, events.channel, -1)], pa.string()),
+    }
+    columns |= {f"value_{k}": events.value[:, k] for k in range(model.width)}
+    columns |= {f"variance_{k}": events.value[:, model.width + k] for k in range(events.value.shape[1] - model.width)}
+    # The track of a large field keeps some of its states.
+    shown = [model.state_names[j] for j in model.shown]
+    for j, name in zip(model.shown, shown, strict=True):
+        rows, values = truth_of(events, int(j))
+        true = np.full(len(events), np.nan)
+        true[rows] = values
+        columns[f"{name}_true"] = true
+    columns |= {name: track.mean[:, k] for k, name in enumerate(shown)}
+    columns |= {f"{name}_std": track.std[:, k] for k, name in enumerate(shown)}
+    columns |= {f"innovation_{k}": track.innovation[:, k] for k in range(model.ny)}
+    columns |= {f"innovation_std_{k}": track.innovation_std[:, k] for k in range(model.ny)}
+    for name in ("nis", "nis_mean", "nis_low", "nis_high", "log_likelihood"):
+        columns[name] = getattr(track, name)
+    columns["verdict"] = np.array(VERDICT_NAMES)[track.verdict]
+    columns["health"] = np.array(HEALTH_NAMES)[track.health]
+    plain = {k: np.ascontiguousarray(c) if isinstance(c, np.ndarray) else c for k, c in columns.items()}
+    return pa.table(plain)
