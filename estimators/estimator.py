@@ -101,7 +101,8 @@ class Estimator:
     `model_runs` as a number: how often a step runs f. `prepare(model, options)` computes what depends on the model
     too, once for a fold, as int64s. `blocks(options, state, nx)` is a view of the members (N, nx) in a state, of a
     compiled filter that runs f and h at these alone and so can run on a black box (interpreted/). `fixed_r`
-    says that its gain is for one R, so that no reading can bring its own.
+    says that its gain is for one R, so that no reading can bring its own; `needs_factor` that it cannot start from a
+    covariance without a Cholesky factor.
     """
 
     name: str
@@ -126,6 +127,7 @@ class Estimator:
     recoveries: Callable[[np.ndarray], int] | None = None
     interpreted: bool = False
     fixed_r: bool = False
+    needs_factor: bool = False
     blocks: Callable[[Options, np.ndarray, int], np.ndarray] | None = None
 
     def complete(self, options: Mapping[str, float | str]) -> dict[str, float]:

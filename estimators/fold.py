@@ -244,7 +244,7 @@ class Fold:
         self.model, self.tuning, self.log = model, tuning, log
         self.pairs = check_pairs(pairs, model)
         check_tuning(tuning, model)
-        self._own_prior = None if prior is None else check_prior(prior, model)
+        self._own_prior = None if prior is None else check_prior(prior, model, self.estimator)
         self.policy = policy or HealthPolicy()
         self.options = self.estimator.complete(tuning.options)
         self.n = 0

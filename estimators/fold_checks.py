@@ -10,6 +10,7 @@ from .errors import LARGEST, EstimatorError
 from .estimator import Estimator, Options
 from .gaussian.robust import ADAPT_R
 from .model.state_space import LARGE, StateSpaceModel
+from .numerics.linalg import EPSILON
 from .tuning import Tuning
 
 if TYPE_CHECKING:
@@ -71,11 +72,12 @@ def check_base(base: Base, model: StateSpaceModel) -> None:
     _check_sizes("base", base.mean, base.cov, model)
 
 
-def check_prior(prior: tuple[Any, Any], model: StateSpaceModel) -> tuple[np.ndarray, np.ndarray]:
+def check_prior(prior: tuple[Any, Any], model: StateSpaceModel, entry: Estimator) -> tuple[np.ndarray, np.ndarray]:
     """A prior's mean (nx,) and covariance (nx, nx), or variances (1, nx) where the model's filters keep only these.
 
     Raises:
-        EstimatorError: If a size does not fit, a number is not finite, or the covariance is none.
+        EstimatorError: If a size does not fit, a number is not finite, the covariance is none, or is singular and the
+            estimator cannot start from it.
     """
     if not (isinstance(prior, (tuple, list)) and len(prior) == 2):
         raise EstimatorError(f"prior is {type(prior).__name__}; it must be (mean, cov)")
@@ -104,6 +106,13 @@ def check_prior(prior: tuple[Any, Any], model: StateSpaceModel) -> tuple[np.ndar
         raise EstimatorError(
             f"prior: the covariance has the eigenvalue {least:g} in units of its deviations; it must be positive "
             "semidefinite: lessen the correlations"
+        )
+    if entry.needs_factor and least <= 4.0 * model.nx * EPSILON:
+        exact = [name for name, s in zip(model.state_names, std, strict=True) if s == 0.0]
+        what = f"{exact[0]} is certain" if exact else "its states are perfectly correlated"
+        raise EstimatorError(
+            f"prior: {what}, so its covariance is singular and has no sigma points for {entry.name}; use sr-ukf or "
+            "ekf, or add a small variance"
         )
     if model.mode >= 0 and not 0.0 <= mean[model.mode] <= len(model.jump.modes) - 1:  # type: ignore[union-attr]
         raise EstimatorError(f"prior: the mean of the mode {model.state_names[model.mode]} is out of its range")

@@ -75,7 +75,7 @@ class Merged:
             parts.append(pending.select(slice(0, count)))
             orders.append(self._order[k][:count])
             self._pending[k], self._order[k] = pending.select(slice(count, None)), self._order[k][count:]
-        joined = Readings(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+        joined = Readings.concat(parts, 0)
         return joined.select(np.argsort(np.concatenate(orders), kind="stable"))
 
     def now(self) -> int | None:

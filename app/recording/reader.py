@@ -188,8 +188,12 @@ def _latest(chunks: list[tuple[np.ndarray, dict[str, np.ndarray]]]) -> tuple[int
     if not chunks:
         return 0, {}
     index = np.concatenate([chunk for chunk, _ in chunks])
-    names = chunks[0][1].keys()
-    columns = {name: np.concatenate([values[name] for _, values in chunks]) for name in names}
+    # Columns of variances begin with the first reading that brought its own.
+    names = dict.fromkeys(name for _, values in chunks for name in values)
+    columns = {
+        name: np.concatenate([values.get(name, np.full(rows.size, np.nan)) for rows, values in chunks])
+        for name in names
+    }
     # A row holds if no later row has an index that is not above its own.
     later = np.minimum.accumulate(index[::-1])[::-1]
     keep = np.append(index[:-1] < later[1:], True)

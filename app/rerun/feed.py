@@ -116,7 +116,7 @@ class RerunFeed:
             parts[-1],
             fresh=True,
             first=parts[0].first,
-            readings=Readings(*(np.concatenate(column) for column in zip(*readings, strict=True))),
+            readings=Readings.concat(readings, 0),
             track=Track(*(np.concatenate(column) for column in zip(*tracks, strict=True))),
             pictures=[pictures[index] for index in sorted(pictures)],
         )

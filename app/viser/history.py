@@ -70,7 +70,8 @@ class History:
             start -= self._drop(start - self.limit)
         for name, column in self._columns.items():
             batch = getattr(pull.readings if name in ("t", "kind", "channel", "value") else pull.track, name)
-            column[start : start + count] = batch
+            # Charts have no use for the variances that readings bring, in columns after the values.
+            column[start : start + count] = batch[:, : column.shape[1]] if name == "value" else batch
         self.n = start + count
         return start
 

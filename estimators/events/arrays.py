@@ -117,8 +117,8 @@ def _rows(name: str, values: Any, n: int, rows: int) -> np.ndarray:
     y = _numbers(name, values)
     if y.ndim == 0 and rows == 1:
         y = np.full((n, 1), float(y))
-    elif y.ndim == 1 and rows == 1 or (y.ndim == 1 and n == 1 and y.size == rows):
-        y = y.reshape(-1, rows)
+    elif y.shape == (n * rows,) and 1 in (n, rows):
+        y = y.reshape(n, rows)
     if y.shape != (n, rows):
         wanted = f"({n},)" if rows == 1 else f"({n}, {rows}), a column for each row of the sensor"
         raise EventError(f"{name} have shape {y.shape} for {n} times; the shape must be {wanted}")

@@ -44,6 +44,7 @@ CKF = Estimator(
     moments=moments,
     points=points,
     options=OPTIONS,
+    needs_factor=True,
     tune=tune,
     memory=memory,
 )

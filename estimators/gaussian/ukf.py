@@ -194,6 +194,7 @@ UKF = Estimator(
         Option("kappa", 0.0, -0.9, 10.0, "", "second spread; nx + kappa must stay positive"),
         *OPTIONS,
     ),
+    needs_factor=True,
     tune=tune,
     memory=memory,
 )

@@ -392,6 +392,7 @@ FILTERPY_UKF = _entry(
     fails_when="as ukf, and sooner: it subtracts K S Kᵀ and inverts S",
     runs=lambda options, nx: 2 * nx + 1,
     points=ukf.points,
+    needs_factor=True,
     options=tuple(option for option in ukf.UKF.options if option.name in ("alpha", "beta", "kappa")),
 )
 FILTERPY_ENKF = _entry(

@@ -28,6 +28,7 @@ from ..numerics.random import key_of, normal
 from ..numerics.simd import dot, total, weighted
 from ..numerics.simd_exp import exp_minus
 from .mode_draws import any_mode, jump_key, nearest_mode
+from .resampling import SCHEME_NAMES
 
 DRAWS, SETTLED, EQUAL, ESS, RECOVERIES, RESAMPLED, _SPARE, _SPARE_TOO = range(8)
 """Head of the state: predictions and updates so far; whether mean and covariance are up to date;
@@ -47,7 +48,7 @@ PROCESS, START, RESAMPLE, JITTER, RECOVER, PROPOSE = range(6)
 OPTIONS = (
     Option("particles", 2000, 2, 1e7, "", "number of particles"),
     Option("fraction", 0.5, 0.0, 1.0, "", "resample when the effective sample size falls under this part of them"),
-    Option("resampling", 0, 0, 3, "", "0 systematic, 1 stratified, 2 residual, 3 multinomial"),
+    Option.choice("resampling", SCHEME_NAMES, "how many children each particle gets"),
 )
 
 

@@ -24,7 +24,8 @@ PRIORS = {
     "all certain": np.zeros((3, 3)),
 }
 EXACT = [name for name, entry in ESTIMATORS.items() if entry.family == "Gaussian" and unfit(entry, MODEL) is None]
-EXACT += ["filterpy-kf", "filterpy-ekf"]
+EXACT += ["filterpy-kf", "filterpy-ekf", "filterpy-ukf"]
+FACTORED = ("ukf", "ckf", "filterpy-ukf")
 DRAWN = ["pf", "pf-reg", "apf", "enkf", "etkf", "ensrf", "letkf", "filterpy-enkf"]
 SIZE = 3000
 SIZES = {"particles": float(SIZE), "members": float(SIZE)}
@@ -51,6 +52,10 @@ def test_gaussian_filters_start_there_exactly(name, kind):
     P = PRIORS[kind]
     y = np.array([0.7, -0.4])
     log = one_reading(y, 1)
+    if name in FACTORED and kind != "correlated":
+        with pytest.raises(EstimatorError, match=f"singular and has no sigma points for {name}; use sr-ukf or ekf"):
+            Fold(name, MODEL, Tuning.of(MODEL), log, prior=(MEAN, P))
+        return
     growing = Fold(name, MODEL, Tuning.of(MODEL), log, prior=(MEAN, P))
     mean, cov = growing.moments()
     np.testing.assert_allclose(mean, MEAN, rtol=1e-14)
@@ -81,7 +86,7 @@ def test_particles_and_members_are_drawn_from_it(name, kind):
 def test_a_state_that_is_certain_stays_so_until_noise_comes():
     """Zero variance, no noise in no time: a reading moves the others only."""
     P = PRIORS["one state certain"]
-    for name in ("kf", "ukf", "sr-ukf", "enkf"):
+    for name in ("kf", "iekf", "sr-ukf", "enkf"):
         track = fold(name, MODEL, Tuning.of(MODEL), one_reading([5.0, 5.0], 1), prior=(MEAN, P))
         assert abs(track.mean[0, 1] - MEAN[1]) < 1e-9 and track.std[0, 1] < 1e-9, name
         assert abs(track.mean[0, 0] - MEAN[0]) > 1e-3, name

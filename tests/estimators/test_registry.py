@@ -76,7 +76,7 @@ def test_options_are_checked(name):
 
 def test_what_is_counted_is_whole_and_what_is_measured_is_not():
     whole = {option.name for entry in ESTIMATORS.values() for option in entry.options if option.whole}
-    assert whole == {"members", "particles", "resampling", "rotation", "iterations"}
+    assert whole == {"members", "particles", "rotation", "iterations"}
 
 
 def test_a_radius_is_refused_where_the_model_says_no_positions():

@@ -17,6 +17,7 @@ from app.engine.outputs import Pull
 from app.recording.format import RecordingFile, tuning_from_json
 from app.recording.reader import finished, read_recording
 from app.recording.writer import Recorder
+from app.viser.history import History
 from estimators.diagnostics.score import score
 from estimators.errors import SourceError
 from estimators.fold import Fold, fold
@@ -273,6 +274,35 @@ def test_recordings_with_one_true_value_an_event_read_back(tmp_path):
         score(fold("kf", MODEL, Tuning.of(MODEL), events), events.readings, MODEL).states for events in (log, blocks)
     ]
     assert scores[0] == scores[1] and list(scores[0]) == ["temperature", "rate"]
+
+
+def test_variances_that_readings_bring_are_recorded(running, tmp_path):
+    """From the first reading that brings one, in the middle of a file; charts go on."""
+    source, engine, recorder = running
+    path = tmp_path / "run.rrd"
+    history = History(MODEL.nx, MODEL.width)
+    cursor = engine.cursor()
+    engine.submit(commands.Record(path))
+    wait_for(lambda: recorder.path == path)
+    for first, variance in ((1.0, np.nan), (2.0, 0.25), (3.0, np.nan)):
+        plain = readings([first, first + 0.5], [40.0, 41.0])
+        own = np.full((2, 1), variance)
+        wide = np.hstack((plain.value, np.full((2, MODEL.width - plain.value.shape[1]), np.nan), own))
+        source.put(plain if np.isnan(variance) else plain._replace(value=wide))
+        # In the file before the next come: it has parts without variances, and parts with.
+        wait_for(lambda n=2 * first: recorder._open is not None and recorder._open.file.rows == n)
+        history.take(engine.pull(cursor))
+    seen = rows(engine)
+    engine.submit(commands.Record(None))
+    wait_for(lambda: recorder.finished == [path])
+    recorded = read_recording(path)
+    variances = recorded.readings.value[:, MODEL.width :]
+    np.testing.assert_array_equal(variances[:, 0], [np.nan, np.nan, 0.25, 0.25, np.nan, np.nan])
+    assert_same(recorded.track, seen.track)
+    assert_same(refold(recorded), seen.track)
+    innovation_std = recorded.track.innovation_std[:, 0]
+    assert innovation_std[2] < innovation_std[1] and innovation_std[2] < innovation_std[4]
+    np.testing.assert_array_equal(history.column("value")[:, 0], seen.readings.value[:, 0])
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_FSIZE stands in for a full disk")

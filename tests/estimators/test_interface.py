@@ -1,0 +1,300 @@
+"""The interface by name: the same fold beneath, errors that say what to write, and scores against their definitions."""
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from estimators import MODELS, Log, fold, fold_many, mean_nees
+from estimators.errors import EventError, NisusError
+from estimators.fold import Fold
+from estimators.fold import fold as fold_track
+from estimators.log import INPUT, READING, TICK, TRUTH, Readings
+from estimators.track import HELD_OUT, USED
+from estimators.tuning import Tuning
+from tests.estimators.test_fold import identical
+
+SECOND = 1_000_000_000
+MOTOR = MODELS["motor_winding"]
+DRIVE = MODELS["motor_drive"]
+ROAD = MODELS["road_car"]
+CELSIUS = [40.3, 41.0, np.nan, 41.2, 39.9]
+
+
+def motor_log(**given):
+    log = Log.of(MOTOR, **given)
+    log.add("winding", [1, 2, 3, 4, 5], CELSIUS)
+    return log
+
+
+def test_it_is_the_fold_of_events_and_a_tuning():
+    log = Log(MOTOR.width)
+    for second, celsius in enumerate(CELSIUS, start=1):
+        log.extend(Readings.one(second * SECOND, second * SECOND, READING, 0, celsius, MOTOR.width))
+    tuning = Tuning.of(MOTOR).set("R.winding", 9.0).set("gate", 0.99).with_options({"alpha": 0.5})
+    expected = fold_track("ukf", MOTOR, tuning, log)
+    got = fold("ukf", MOTOR, motor_log(), R={"winding": 9.0}, gate=0.99, alpha=0.5)
+    identical(got.track, expected)
+    np.testing.assert_array_equal(got.seconds, [1.0, 2.0, 3.0, 4.0, 5.0])
+    assert got.log_likelihood == pytest.approx(np.nansum(expected.log_likelihood))
+
+
+def test_any_order_and_any_pieces_give_the_same_log():
+    whole, pieces = motor_log(), Log.of(MOTOR)
+    for k in (3, 0, 4, 2, 1):
+        pieces.add("winding", k + 1.0, CELSIUS[k])
+    for a, b in zip(whole.readings, pieces.readings, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_the_prior_holds_at_the_start():
+    """The first reading comes 10 s after the prior, so its innovation is that much less certain."""
+    early, late = (Log.of(MOTOR, start=start) for start in (-9.0, None))
+    for log in (early, late):
+        log.add("winding", 1.0, 40.0)
+    early.add_ticks(-9.0)
+    track = fold("kf", MOTOR, early)
+    np.testing.assert_allclose(track.mean[0], MOTOR.prior_mean)
+    np.testing.assert_allclose(track.std[0], MOTOR.prior_std)
+    assert track.track.innovation_std[1, 0] > 1.5 * fold("kf", MOTOR, late).track.innovation_std[0, 0]
+    with pytest.raises(EventError, match="1 of 2 times are before -9 s, where the log starts"):
+        early.add("winding", [-10.0, 5.0], [40.0, 40.0])
+
+
+def test_inputs_and_truth_by_name():
+    log = Log.of(DRIVE)
+    u, x = DRIVE.input_names, DRIVE.state_names
+    log.add_inputs([1.0, 2.0], **{u[0]: [3.0, np.nan], u[-1]: 7.0})
+    log.add_truth([2.0, 3.0], **{x[0]: 5.0, x[-1]: [6.0, np.nan]})
+    events = log.readings
+    assert events.kind.tolist() == [INPUT, INPUT, TRUTH, TRUTH]
+    np.testing.assert_array_equal(events.value[:2, 0], [3.0, np.nan])
+    np.testing.assert_array_equal(events.value[:2, DRIVE.nu - 1], 7.0)
+    np.testing.assert_array_equal(events.value[2:, 0], 5.0)
+    np.testing.assert_array_equal(events.value[2:, DRIVE.nx - 1], [6.0, np.nan])
+
+
+def test_truth_of_far_apart_states_of_a_field_is_told_in_blocks():
+    model = MODELS["lorenz96"]
+    log = Log.of(model)
+    names = model.state_names
+    log.add_truth(1.0, **{names[39]: 9.0, names[0]: 1.0, names[31]: 3.0})
+    assert log.readings.channel.tolist() == ([0] if model.width >= 40 else [0, 39])
+    np.testing.assert_array_equal(np.sort(log.readings.value[np.isfinite(log.readings.value)]), [1.0, 3.0, 9.0])
+
+
+WRONG = {
+    "a sensor": (lambda log: log.add("windng", 1.0, 2.0), "no sensor 'windng'; near: winding"),
+    "an input": (lambda log: log.add_inputs(1.0, speed=2.0), "motor_winding has no input 'speed'; it has none"),
+    "no input": (lambda log: log.add_inputs(1.0), "no input is given; motor_winding has none"),
+    "a state": (lambda log: log.add_truth(1.0, temperatur=2.0), "no state 'temperatur'; near: temperature"),
+    "values": (
+        lambda log: log.add("winding", [1.0, 2.0], [1.0]),
+        "have shape .1,. for 2 times; the shape must be .2,.",
+    ),
+    "columns": (lambda log: log.add("winding", [1.0], [[1.0, 2.0]]), "the shape must be .1,."),
+    "a word": (lambda log: log.add("winding", [1.0], ["warm"]), "what is no number, such as 'warm'"),
+    "a time": (lambda log: log.add("winding", [1.0, np.nan], [1.0, 2.0]), r"seconds\[1\] is nan"),
+    "nanoseconds": (lambda log: log.add("winding", 1_700_000_000 * 10**9, 1.0), "in seconds"),
+    "times": (lambda log: log.add("winding", [[1.0]], [1.0]), "seconds has shape .1, 1."),
+    "a variance": (lambda log: log.add("winding", 1.0, 2.0, variance=0.0), "variance of winding is 0; it must be"),
+    "variances": (lambda log: log.add("winding", 1.0, 2.0, variance=[1.0, 2.0]), "variance of winding has shape"),
+    "R by itself": (
+        lambda log: fold("kf", MOTOR, log, R=9.0),
+        "R is 9.0; it must be given by name, such as {'winding'",
+    ),
+    "a name of R": (lambda log: fold("kf", MOTOR, log, R={"windng": 9.0}), "near: R.winding"),
+    "many of R": (lambda log: fold("kf", MOTOR, log, R={"winding": [1, 2]}), r"R\['winding'\] has shape .2,."),
+    "R of zero": (lambda log: fold("kf", MOTOR, log, R={"winding": 0.0}), "a variance must be positive"),
+    "a held out name": (lambda log: fold("kf", MOTOR, log, held_out="gnss"), "use.gnss"),
+    "a filter": (lambda log: fold("ufk", MOTOR, log), "near: ukf"),
+    "an option": (lambda log: fold("ukf", MOTOR, log, alhpa=0.5), "no option 'alhpa'; it has alpha"),
+    "a word for an option": (
+        lambda log: fold("pf", MOTOR, log, resampling="stratifed"),
+        "resampling is 'stratifed'; it must be one of .*stratified",
+    ),
+    "a word for a number": (
+        lambda log: fold("ukf", MOTOR, log, alpha="small"),
+        "alpha is 'small'; it must be a number",
+    ),
+    "nothing for an option": (lambda log: fold("ukf", MOTOR, log, alpha=None), "alpha is None; it must be a number"),
+    "a seed": (lambda log: fold("pf", MOTOR, log, seed=1.5), "seed is 1.5; it must be a whole number"),
+    "a negative seed": (lambda log: fold("pf", MOTOR, log, seed=-1), "seed is -1"),
+    "a log of another model": (lambda log: fold("ekf", ROAD, log), "the log has|1 value"),
+    "an executor": (lambda log: fold_many("kf", MOTOR, log, executor="cloud"), "executor is 'cloud'; it must be"),
+    "NEES without covariances": (lambda log: fold("kf", MOTOR, log).nees(), "covariance=True"),
+    "NEES without truth": (lambda log: fold("kf", MOTOR, log, covariance=True).nees(), "log.add_truth"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_errors_say_what_to_write(name):
+    call, text = WRONG[name]
+    log = motor_log()
+    with pytest.raises(NisusError, match=text) as told:
+        call(log)
+    assert "\n" not in str(told.value)
+    assert log.n == 5
+
+
+def test_a_log_of_no_model_knows_no_names():
+    with pytest.raises(EventError, match=r"add: this log is of no model.*Log.of\(model\)"):
+        Log(2).add("winding", 1.0, 2.0)
+
+
+def test_words_for_choices():
+    log = motor_log()
+    by_word = fold("pf", MOTOR, log, seed=3, resampling="stratified", particles=100)
+    by_number = fold("pf", MOTOR, log, seed=3, resampling=by_word.tuning.options["resampling"], particles=100)
+    assert isinstance(by_word.tuning.options["resampling"], float)
+    identical(by_word.track, by_number.track)
+    other = fold("pf", MOTOR, log, seed=4, resampling="stratified", particles=100)
+    assert not np.array_equal(other.mean, by_word.mean)
+
+
+def test_held_out_sensors_and_parts_of_r():
+    rows = ROAD.sensors[0]
+    log = Log.of(ROAD)
+    log.add(rows.name, [1.0, 2.0], np.zeros((2, len(rows.rows))))
+    kept = fold("ekf", ROAD, log, R={rows.name: 2.0})
+    held = fold("ekf", ROAD, log, R={rows.name: [2.0] * len(rows.rows)}, held_out=[rows.name])
+    assert kept.track.verdict.tolist() == [USED] * 2 and held.track.verdict.tolist() == [HELD_OUT] * 2
+    np.testing.assert_array_equal(kept.track.innovation_std[0], held.track.innovation_std[0])
+    assert kept.readings(rows.name).tolist() == [0, 1] and list(held.score().held_out)
+
+
+def test_the_table_has_a_column_a_state():
+    log = motor_log()
+    log.add("winding", 6.0, 40.0, variance=2.5)
+    log.add_truth(6.0, temperature=40.5)
+    log.add_ticks(7.0)
+    track = fold("ukf", MOTOR, log)
+    table = track.table()
+    frame = table.to_pandas()
+    assert len(frame) == len(track) == 8
+    for k, name in enumerate(MOTOR.state_names):
+        np.testing.assert_array_equal(frame[name], track.mean[:, k])
+        np.testing.assert_array_equal(frame[f"{name}_std"], track.std[:, k])
+    np.testing.assert_array_equal(frame["nis"], track.nis)
+    assert frame["verdict"].tolist()[:4] == ["used", "used", "missing", "used"]
+    assert frame["sensor"].isna().tolist() == [False] * 6 + [True, True]
+    assert frame["event"].tolist()[5:] == ["reading", "truth", "tick"]
+    assert frame["variance_0"].tolist()[5] == 2.5 and np.isnan(frame["variance_0"][0])
+    assert frame["temperature_true"][6] == 40.5
+
+
+def test_the_estimates_keep_what_was_folded():
+    log = motor_log()
+    track = fold("kf", MOTOR, log)
+    log.add("winding", 0.5, 40.0)
+    assert len(track.table()) == 5 and track.seconds[0] == 1.0
+
+
+def test_the_covariance_is_whole():
+    """The filter's own matrix: variances on its diagonal, and cov at the end is what the state holds."""
+    rng = np.random.default_rng(1)
+    log = Log.of(MODELS["lorenz63"])
+    log.add(MODELS["lorenz63"].sensor_names[0], np.arange(1, 6) * 0.1, rng.normal(0, 5, (5, 3)))
+    track = fold("ekf", MODELS["lorenz63"], log, covariance=True)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(track.cov, axis1=1, axis2=2)), track.std, rtol=1e-14)
+    np.testing.assert_array_equal(track.cov, np.transpose(track.cov, (0, 2, 1)))
+    growing = Fold("ekf", MODELS["lorenz63"], track.tuning, log)
+    growing.advance()
+    np.testing.assert_allclose(track.cov[-1], growing.moments()[1], rtol=1e-12)
+
+
+def test_nees_is_its_definition():
+    log = motor_log()
+    log.add_truth([1.5, 4.5], temperature=[39.0, 42.0], rate=[0.1, np.nan])
+    track = fold("kf", MOTOR, log, covariance=True)
+    got = track.nees()
+    rows = np.flatnonzero(track.events.kind == TRUTH)
+    error = np.array([39.0, 0.1]) - track.mean[rows[0]]
+    whole = error @ np.linalg.inv(track.cov[rows[0]]) @ error
+    part = ((42.0 - track.mean[rows[1], 0]) / track.std[rows[1], 0]) ** 2
+    np.testing.assert_allclose(got.value, [whole, part], rtol=1e-10)
+    assert got.dof.tolist() == [2, 1] and got.seconds.tolist() == [1.5, 4.5]
+    np.testing.assert_allclose(got.low, chi2.ppf(0.025, [2, 1]), rtol=1e-9)
+    np.testing.assert_allclose(got.high, chi2.ppf(0.975, [2, 1]), rtol=1e-9)
+    assert got.mean == pytest.approx((whole + part) / 3)
+    twice = mean_nees([got, got._replace(value=3.0 * got.value)])
+    np.testing.assert_allclose(twice.value, 2.0 * got.value)
+    np.testing.assert_allclose(twice.high, chi2.ppf(0.975, [4, 2]) / 2, rtol=1e-9)
+
+
+def simulated(seed):
+    """A motor by its own equations, x' = (T + r, r) + w a second: truth and readings that no fold had a part in."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(MOTOR.prior_mean, MOTOR.prior_std)
+    times, states, readings = np.arange(1.0, 31.0), [], []
+    for _ in times:
+        x = np.array([x[0] + x[1], x[1]]) + rng.normal(0.0, np.sqrt([noise.variance for noise in MOTOR.noises]))
+        states.append(x)
+        readings.append(x[0] + rng.normal(0.0, 3.0))
+    log = Log.of(MOTOR, start=0.0)
+    log.add("winding", times, readings)
+    log.add_truth(times, **dict(zip(MOTOR.state_names, np.array(states).T, strict=True)))
+    return log
+
+
+def test_a_consistent_filter_is_inside_its_bounds_and_a_confident_one_is_not():
+    """40 runs, 30 times: 95 % of the means within χ² bounds; with hardly any Q far fewer."""
+    logs = [simulated(seed) for seed in range(40)]
+    right = mean_nees([t.nees() for t in fold_many("kf", MOTOR, logs, R={"winding": 9.0}, covariance=True)])
+    # Of 30 correlated values at 95 % some may be outside; a third of them would be no chance.
+    assert right.runs == 40 and right.inside > 0.67 and 0.8 < right.mean < 1.2
+    small = {noise.name: noise.variance / 1e4 for noise in MOTOR.noises}
+    confident = fold_many("kf", MOTOR, logs, R={"winding": 9.0}, Q=small, covariance=True)
+    wrong = mean_nees([t.nees() for t in confident])
+    assert wrong.inside < 0.4 and wrong.mean > 1.4
+
+
+@pytest.mark.parametrize("executor", ["threads", None, "own"])
+def test_many_seeds_are_the_folds_one_by_one(executor):
+    log = motor_log()
+    pool = ThreadPoolExecutor(2) if executor == "own" else executor
+    many = fold_many("pf", MOTOR, log, seeds=range(5), executor=pool, particles=50)
+    for seed, track in enumerate(many):
+        assert track.tuning.seed == seed
+        identical(track.track, fold("pf", MOTOR, log, seed=seed, particles=50).track)
+    if executor == "own":
+        assert pool.submit(int, 3).result() == 3
+        pool.shutdown()
+
+
+def test_several_logs_and_processes():
+    logs = [motor_log(), motor_log(start=0.0)]
+    many = fold_many("enkf", MOTOR, logs, seeds=(1, 2), executor="processes", members=10)
+    assert [track.tuning.seed for track in many] == [1, 2, 1, 2]
+    expected = [fold("enkf", MOTOR, log, seed=seed, members=10) for log in logs for seed in (1, 2)]
+    for a, b in zip(many, expected, strict=True):
+        identical(a.track, b.track)
+
+
+def test_the_import_loads_no_numerics():
+    """A name loads what it needs; the package itself nothing, and its `fold` stays the function."""
+    code = """
+import sys
+import estimators
+assert not {"numba", "numpy", "scipy"} & set(sys.modules), "loaded"
+assert "fold" in dir(estimators)
+import estimators.fold
+from estimators import fold
+from estimators.fold import Fold
+assert callable(fold) and fold.__module__ == "estimators.interface"
+try:
+    estimators.nothing
+except AttributeError as error:
+    assert "nothing" in str(error)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_ticks_are_asked_by_seconds():
+    log = Log.of(MOTOR, start=0.0)
+    log.add_ticks(np.arange(3.0))
+    track = fold("kf", MOTOR, log)
+    assert log.readings.kind.tolist() == [TICK] * 3 and np.all(np.diff(track.std[:, 0]) > 0)
