@@ -2,11 +2,13 @@
 
     track = fold(estimator, model, tuning, log)
 
-Same log, same tuning, same seed: the same bits, in whatever pieces the events came.
+Same log, same tuning, same seed: the same bits, in whatever pieces the events came. It runs without the GIL, however
+brief: a model's function that never returns must not keep the interpreter with it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -15,7 +17,7 @@ from numba import types
 
 from .compiled.context import context_of, context_type, prior, sensor_rows
 from .compiled.model import compile_model
-from .diagnostics.failure_cause import Estimate, cause, failures
+from .diagnostics.failure_cause import Estimate, around, cause, failures, questions
 from .diagnostics.field_pictures import Pictures
 from .diagnostics.health import Bounds, HealthPolicy, assess, assess_signature, chi_square_bounds
 from .errors import EstimatorError, ModelError
@@ -29,7 +31,7 @@ from .interpreted.view import View
 from .log import BEFORE, INPUT, READING, RESET, TICK, TRUTH, Log
 from .model.mode_as_number import indicator
 from .model.state_space import StateSpaceModel
-from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, jit, jit_brief
+from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, jit
 from .numerics.peaks import Mode
 from .numerics.quantiles import chi_square_quantile
 from .numerics.steps import steps_of
@@ -44,9 +46,6 @@ SPARSE_EVERY = 1024
 """Events between the snapshots kept for ever."""
 
 RECENT = 4096
-
-BRIEF = 2048
-"""Events, times the numbers of a state, that are folded without letting other threads run meanwhile."""
 
 SNAPSHOT_MEMORY = 256 * 2**20
 """Bytes that the snapshots of a fold may take, half for the recent ones; large states are kept at wider steps."""
@@ -160,20 +159,6 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
         track.verdict[i] = verdict
 
 
-@jit_brief
-def run_brief(
-    code, context, first, start, end, t, kind, channel, value, width, clock, u, state, spare, work, score, track
-):
-    """`run`, with the GIL."""
-    run(code, context, first, start, end, t, kind, channel, value, width, clock, u, state, spare, work, score, track)
-
-
-@jit_brief
-def assess_brief(first, last, t, kind, track, policy, bounds):
-    """`assess`, with the GIL."""
-    assess(first, last, t, kind, track, policy, bounds)
-
-
 @jit
 def _begin(code, context, mean, cov, state):
     call_start(code.start, context, mean, cov, state)
@@ -269,10 +254,10 @@ class Fold:
         if base is not None:
             check_base(base, model)
             mean, cov, self._clock[0], self._u[:] = base.mean, base.cov, base.clock, base.u
-        self._run, self._assess, self._run_brief, self._assess_brief, begin = _compiled()
+        self._run, self._assess, begin = _compiled()
         if model.black_box or self.estimator.interpreted:
             self._context = View(self._compiled, self._context, tuning, self.options, self.pairs, self._held)
-            self._run = self._run_brief = fold_loop.run
+            self._run = fold_loop.run
             begin = fold_loop.begin
         begin(self._code, self._context, np.ascontiguousarray(mean), np.ascontiguousarray(cov), self._state)
         left = base.state if base is not None and base.estimator == estimator else None
@@ -393,6 +378,25 @@ class Fold:
             predicted = Estimate(track.mean[row].copy(), track.std[row])
         return cause(self._compiled, Estimate(x, std), u, self._held["p"], self._held["q"], dt, sensor, predicted)
 
+    def questions(self) -> Iterator[tuple[str, Callable[[], object]]]:
+        """What the model is probably being asked by a fold that is under way in another thread, to be tried one by one.
+
+        Each function at the filter's points, its mean and around it; nothing of a black box.
+        """
+        if self._compiled.box is not None or self.n >= self.log.n:
+            return iter(())
+        mean, cov = self.moments()
+        std = np.sqrt(np.maximum(cov[0] if cov.shape[0] == 1 else np.diag(cov), 0.0))
+        states = [mean, *self.points(), *around(self._compiled, Estimate(mean, std))]
+        finite = [np.ascontiguousarray(x) for x in states if x.size == mean.size and np.all(np.isfinite(x))]
+        later = self.log.t[self.n : self.log.n]
+        then = int(self._clock[0])
+        ahead = later[later > then]
+        dt = (int(ahead[0]) - then) * 1e-9 if ahead.size and then != UNSET else 0.0
+        # As the fold does: in equal steps that the model allows.
+        dt /= max(1, int(np.ceil(dt / self.model.max_step)))
+        return questions(self._compiled, finite, self._u, self._held["p"], self._held["q"], dt)
+
     def modes(self) -> list[Mode]:
         """The peaks of the estimate, the heaviest first; a Gaussian filter has one."""
         if self.estimator.modes is not None:
@@ -432,8 +436,6 @@ class Fold:
                 new[: self.n] = old[: self.n]
             self._rows = grown
         log = self.log
-        brief = (end - self.n) * self._state.size <= BRIEF
-        run_some = self._run_brief if brief else self._run
         while self.n < end:
             if self.pictures is not None and self.pictures.check(log, self.n):
                 self._take_picture()
@@ -444,7 +446,7 @@ class Fold:
             if self.pictures is not None:
                 stop = self.pictures.next(log, self.n, stop)
             try:
-                self._run_events(run_some, self.n, stop)
+                self._run_events(self.n, stop)
             except BaseException:
                 # Python was stopped between two events: back to where the state is known.
                 self._held["r"][:] = self.tuning.r
@@ -454,13 +456,12 @@ class Fold:
             if stop == boundary:
                 self._remember()
         if end > begun:
-            assess_some = self._assess_brief if brief else self._assess
-            assess_some(begun, end, log.t, log.kind, self._rows, self.policy, self._bounds)
+            self._assess(begun, end, log.t, log.kind, self._rows, self.policy, self._bounds)
         return end - begun
 
-    def _run_events(self, run_some: Any, start: int, stop: int) -> None:
+    def _run_events(self, start: int, stop: int) -> None:
         log = self.log
-        run_some(
+        self._run(
             self._code,
             self._context,
             log.first,
@@ -494,7 +495,7 @@ class Fold:
         last = self.n - 1
         query = self.log.kind[last] in (TRUTH, TICK)
         if query and self._asked != last:
-            self._run_events(self._run, last, self.n)
+            self._run_events(last, self.n)
         state = self._spare if query else self._state
         mean, cov = self.estimator.moments(self.options, state, self.model.nx)
         self.pictures.take(self.log, self.n, mean, cov[0] if cov.shape[0] == 1 else np.diag(cov))
@@ -608,8 +609,6 @@ def _scratch(size: int) -> np.ndarray:
 @lru_cache(maxsize=1)
 def _compiled() -> tuple[Any, ...]:
     """The entry points, compiled for their one signature (or loaded from the cache)."""
-    runs, assessments = (run, run_brief), (assess, assess_brief)
-    for functions, signature in ((runs, run_signature), (assessments, assess_signature), ((_begin,), begin_signature)):
-        for function in functions:
-            function.compile(signature.args)
-    return run, assess, run_brief, assess_brief, _begin
+    for function, signature in ((run, run_signature), (assess, assess_signature), (_begin, begin_signature)):
+        function.compile(signature.args)
+    return run, assess, _begin

@@ -22,6 +22,7 @@ from estimators.tabular import table_of
 from estimators.track import FAILED, HEALTH_NAMES, Track
 from estimators.tuning import TOGETHER
 
+from ..stall import interruptible
 from ..twin.twin import Twin, load_twin
 from .main import settings
 from .prepare import prepare
@@ -76,8 +77,12 @@ def fold_twin(arguments: Arguments) -> int:
     period = twin.picture if arguments.out is not None and arguments.out.suffix == ".rrd" else None
     fold = Fold(twin.estimator, twin.model, twin.tuning, log, pairs=twin.pairs, policy=twin.policy, picture=period)
     begun = time.perf_counter()
-    fold.advance()
-    fold.finish()
+
+    def work() -> None:
+        fold.advance()
+        fold.finish()
+
+    interruptible(fold, work)
     seconds = (time.perf_counter() - begun) / log.n
     pictures = fold.pictures.taken if fold.pictures is not None else []
     result = score(fold.track, log.readings, twin.model, pictures)

@@ -111,13 +111,20 @@ class CallWatch:
             self._seen = (frame, self._clock())
         elif self._clock() - self._seen[1] >= CALL_PATIENCE:
             self._seen = (frame, float("inf"))
-            code = frame.f_code
-            place = f"{shown_path(Path(code.co_filename))}:{frame.f_lineno}"
             return (
-                f"{place}: {self._names[code]} of the model {self._model} has not returned for {CALL_PATIENCE:g} s; "
-                "if it loops for ever, Ctrl-C ends the program"
+                f"{self._said(frame)} has not returned for {CALL_PATIENCE:g} s; if it loops for ever, Ctrl-C ends the "
+                "program"
             )
         return None
+
+    def where(self) -> str | None:
+        """The call that is under way now, and where it is."""
+        frame = self._call()
+        return None if frame is None else self._said(frame)
+
+    def _said(self, frame: Any) -> str:
+        code = frame.f_code
+        return f"{shown_path(Path(code.co_filename))}:{frame.f_lineno}: {self._names[code]} of the model {self._model}"
 
     def _call(self) -> Any:
         for thread_frame in sys._current_frames().values():

@@ -9,7 +9,8 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,8 @@ from estimators.numerics.peaks import modes_of
 from estimators.registry import find_estimator
 from estimators.track import TRACKING
 
+from ..cli.stderr import complain
+from ..stall import Stall
 from . import commands
 from .alerts import Watch
 from .counts import Latency, Tally, last_run
@@ -96,6 +99,7 @@ class Engine:
         self._silence = Silence(section.tick)
         self._latency = Latency()
         self._watch = Watch(self.notices)
+        self._stall = Stall(self._say_stalled)
         self._status: tuple[float, Status] | None = None
         self.recorder: Any = None
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
@@ -116,10 +120,22 @@ class Engine:
             estimator, self.model, tuning, log, pairs=self.pairs, policy=self._policy, base=base, picture=period
         )
 
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        """Nothing changes meanwhile; also not beneath a fold that never returns, which keeps the lock for ever."""
+        while not (held := self._lock.acquire(timeout=0.05)) and self._stall.text is None:
+            pass
+        try:
+            yield
+        finally:
+            if held:
+                self._lock.release()
+
     # For everybody, from any thread
 
     def start(self) -> None:
         """Begin to read and fold."""
+        self._stall.start()
         self._refolder.start()
         self._thread.start()
         self._feeder.start()
@@ -130,7 +146,8 @@ class Engine:
         self._feeder.stop()
         self._refolder.stop()
         if self._thread.is_alive():
-            self._thread.join(timeout=5.0)
+            self._thread.join(timeout=5.0 if self._stall.text is None else 0.1)
+        self._stall.stop()
 
     def submit(self, command: commands.Command) -> None:
         """Queue a command."""
@@ -139,18 +156,18 @@ class Engine:
     def cursor(self, *, follows_log: bool = False) -> Cursor:
         """A cursor for one consumer, for `pull`; give it back with `release`. See `Cursor` for `follows_log`."""
         cursor = Cursor(follows_log=follows_log)
-        with self._lock:
+        with self._reading():
             self._cursors.append(cursor)
         return cursor
 
     def release(self, cursor: Cursor) -> None:
         """Forget a cursor."""
-        with self._lock:
+        with self._reading():
             self._cursors = [item for item in self._cursors if item is not cursor]
 
     def pull(self, cursor: Cursor, limit: int | None = None) -> Pull:
         """Copies of the rows since the cursor, at most `limit`, and the notices since."""
-        with self._lock:
+        with self._reading():
             log, fold = self._log, self._fold
             fresh = cursor.log != self._logs or (cursor.revision != self._revision and not cursor.follows_log)
             cursor.log, cursor.revision = self._logs, self._revision
@@ -194,7 +211,7 @@ class Engine:
 
     def span(self) -> tuple[int, int]:
         """Times of the first and the last event, ns; zeros while there is none."""
-        with self._lock:
+        with self._reading():
             return (int(self._log.t[0]), int(self._log.t[self._log.n - 1])) if self._log.n else (0, 0)
 
     def base(self) -> Base | None:
@@ -207,14 +224,14 @@ class Engine:
         That is None for the prior. Revisions that follow have a snapshot there too, unless their state is so large
         that theirs are wider apart.
         """
-        with self._lock:
+        with self._reading():
             first = self._log.first
             at, base = self._fold.base_at(max(0, index // SPARSE_EVERY * SPARSE_EVERY - first))
             return first + at, base if at else self._base
 
     def folded_with(self) -> tuple[Tuning, str]:
         """Tuning and estimator of the fold that `pull` shows."""
-        with self._lock:
+        with self._reading():
             return self._fold.tuning, self._fold.estimator.name
 
     def previous(self) -> Pull | None:
@@ -223,7 +240,7 @@ class Engine:
 
     def belief(self) -> Belief:
         """The estimate now."""
-        with self._lock:
+        with self._reading():
             mean, cov = self._fold.moments()
             points, clock = self._fold.points(), self._fold.clock
             model, several = self._fold.model, self._fold.estimator.modes is not None
@@ -236,7 +253,7 @@ class Engine:
         kept = self._status
         if kept is not None and time.monotonic() - kept[0] < STATUS_AGE:
             return kept[1]
-        with self._lock:
+        with self._reading():
             log, fold = self._log, self._fold
             track = fold.track
             last = fold.n - 1
@@ -305,7 +322,7 @@ class Engine:
         if not batches:
             return
         batch = batches[0] if len(batches) == 1 else Readings.concat(batches, self.model.width)
-        with self._lock:
+        with self._lock, self._stall.watched(self._fold):
             stale = self._take(batch, self._horizon)
             self._silence.broken(self._log.newest)
             if self._log.n > self._history + 3 * SPARSE_EVERY:
@@ -352,6 +369,10 @@ class Engine:
         if now is not None:
             self.insert(Readings.one(now, time.time_ns(), TICK, 0, [], self.model.width))
 
+    def _say_stalled(self, text: str, level: str) -> None:
+        self.notices.say(text, level=level)
+        complain(text)
+
     def _obey(self, item: Any) -> None:
         """Carry one command out, or take a refold or a word from the feeder."""
         if isinstance(item, Refolded):
@@ -359,7 +380,7 @@ class Engine:
         elif isinstance(item, Restarted):
             self._restart()
         elif isinstance(item, Finished):
-            with self._lock:
+            with self._lock, self._stall.watched(self._fold):
                 self._fold.finish()
             self._finished = True
             self.notices.say("the source has ended; the estimate stays")
@@ -369,7 +390,7 @@ class Engine:
     def _restart(self) -> None:
         """The source began again: so does the log. The fold is a new revision of it; a refold is asked for again."""
         wanted = (self.estimator, self.tuning) if self._requests.waiting else None
-        with self._lock:
+        with self._lock, self._stall.watched(self._fold):
             self._previous = None
             self.estimator, self.tuning = self._fold.estimator.name, self._fold.tuning
             self._clear(self._first_base)
@@ -382,7 +403,7 @@ class Engine:
 
     def insert(self, event: Readings) -> None:
         """Put in an event of our own."""
-        with self._lock:
+        with self._lock, self._stall.watched(self._fold):
             self._take(event)
 
     def retune(self, estimator: str, tuning: Tuning) -> None:
@@ -404,7 +425,7 @@ class Engine:
             self._refuse(done.ticket, done.error)
             return
         fold = done.fold
-        with self._lock:
+        with self._lock, self._stall.watched(fold):
             old, log = self._fold, self._log
             # What the new revision says of the readings counts, also of those that it loses here; not what others said.
             lost = max(0, log.first - fold.log.first)

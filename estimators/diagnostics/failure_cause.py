@@ -7,7 +7,8 @@ estimate and from places around it, where sigma points and particles are.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -74,17 +75,47 @@ def cause(
                 return met
             if sensor is not None:
                 met = met if predicted is None else predicted.mean
-                asked = (_ask(compiled, sensor, x, u, p) for x in (met, *_around(compiled, predicted or before)))
+                asked = (_ask(compiled, sensor, x, u, p) for x in (met, *around(compiled, predicted or before)))
                 found = next((line for line in asked if line is not None), None)
                 if found is not None:
                     return found
-            walked = (_walk(compiled, x, u, p, q, dt) for x in _around(compiled, before))
+            walked = (_walk(compiled, x, u, p, q, dt) for x in around(compiled, before))
             return next((line for line in walked if isinstance(line, str)), None)
     except ModelError:
         return None
 
 
-def _around(compiled: CompiledModel, estimate: Estimate) -> Iterator[np.ndarray]:
+def questions(
+    compiled: CompiledModel, states: Sequence[np.ndarray], u: np.ndarray, p: np.ndarray, q: np.ndarray, dt: float
+) -> Iterator[tuple[str, Callable[[], object]]]:
+    """What a filter may have asked of a compiled model: each function at each of some states.
+
+    Args:
+        compiled: The model.
+        states: Where, (nx,) each.
+        u: Inputs, (nu,).
+        p: Parameters.
+        q: Noise variances.
+        dt: Seconds of the prediction.
+
+    Yields:
+        The question in words, and what asks it.
+    """
+    model = compiled.model
+    for x in states:
+        at = f"at x = {numbers(x)}, u = {numbers(u)}"
+        if dt > 0.0:
+            named = f"{place(model.f)}model {model.name}: f(x, u, dt) {at}, dt = {dt:.4g} s"
+            yield named, partial(compiled.f, x, u, p, dt, np.empty(x.size))
+            if model.Q is not None:
+                named = f"{place(model.Q)}model {model.name}: Q(x, u, dt) {at}, dt = {dt:.4g} s"
+                yield named, partial(compiled.Q, x, u, p, q, dt, np.zeros((x.size, x.size)))
+        for sensor, h in zip(model.sensors, compiled.h, strict=True):
+            named = f"{place(sensor.h)}model {model.name}: h(x, u) of sensor {sensor.name} {at}"
+            yield named, partial(h, x, u, p, np.empty(len(sensor.rows)))
+
+
+def around(compiled: CompiledModel, estimate: Estimate) -> Iterator[np.ndarray]:
     """States around an estimate, where asking there is cheap."""
     if estimate.mean.size <= SHOWN and compiled.box is None:
         for away in AWAY:
