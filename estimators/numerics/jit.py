@@ -71,6 +71,10 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 jit = partial(njit, cache=True, nogil=True, error_model="numpy")
 """Numba's njit as used here: cached, without the GIL, and with IEEE division (zero divisors give inf, no error)."""
 
+jit_brief = partial(njit, cache=True, error_model="numpy")
+"""The same with the GIL, for calls of microseconds that run none of a model's functions: giving the GIL up would mean
+to wait for it again, after other threads."""
+
 inlined = partial(jit, inline="always")
 """`jit` for helpers that stand inside a filter's step: a call that hands over context and arrays costs 50 to 100 ns."""
 

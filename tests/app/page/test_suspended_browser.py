@@ -3,7 +3,6 @@
 import os
 import signal
 import subprocess
-import time
 
 import numpy as np
 import pytest
@@ -23,8 +22,8 @@ FLAGS = (
     "--disable-component-update --disable-sync --no-first-run --disable-quic --remote-debugging-port=0"
 ).split()
 PATIENCE = 120.0
-SUSPENDED = 5.0
-"""Seconds; at sixty-fold speed the twin lives through five minutes meanwhile."""
+LIVED = 300
+"""Readings, one a second of the twin, that come while the browser is suspended."""
 
 
 @pytest.fixture
@@ -60,7 +59,7 @@ def test_a_suspended_browser_costs_nothing(suspendable, tmp_path):
             wait_for(lambda: page.evaluate("window.nisus?.drawn > 0"), PATIENCE)
             before = session.engine.status().counts["readings"]
             os.killpg(process.pid, signal.SIGSTOP)
-            time.sleep(SUSPENDED)
+            wait_for(lambda: session.engine.status().counts["readings"] > before + LIVED, PATIENCE)
             during = session.engine.status().counts["readings"]
             os.killpg(process.pid, signal.SIGCONT)
             drawn = page.evaluate("window.nisus.drawn")
@@ -70,7 +69,6 @@ def test_a_suspended_browser_costs_nothing(suspendable, tmp_path):
         wait_for(lambda: session.recorder.finished, PATIENCE)
     finally:
         session.stop()
-    assert during - before > 0.5 * SUSPENDED * 60.0
     recorded = read_recording(path)
     rows = recorded.readings.t[recorded.readings.kind == READING]
     assert rows.size > during

@@ -58,7 +58,7 @@ def test_without_a_runtime_folder_it_is_among_the_temporary_ones(tmp_path, monke
 
 
 BROWSER = """#!/bin/sh
-tr '\\\\0' ' ' < /proc/$$/cmdline > "$SEEN.part"
+tr '\\0' ' ' < /proc/$$/cmdline > "$SEEN.part"
 cat "${1#file://}" >> "$SEEN.part"
 mv "$SEEN.part" "$SEEN"
 """

@@ -71,15 +71,6 @@ def page(browser, view):
     assert errors == []
 
 
-def until(page, condition):
-    """Wait while the page and the engine work, without a fixed time: polled by the page's own clock."""
-    for _ in range(600):
-        if condition():
-            return
-        page.wait_for_function("() => new Promise(done => requestAnimationFrame(() => done(true)))")
-    pytest.fail("it did not happen")
-
-
 def inputs(page):
     """What the fields of the panel show now."""
     return page.evaluate("[...document.querySelectorAll('input')].map(input => input.value)")
@@ -110,7 +101,7 @@ def test_typed_variance_reaches_the_engine_and_the_history_is_redrawn(page, engi
     before = page.evaluate(f"Array.from({CHARTS}[0].data[1])")
     field = page.locator("input[value='0.01']")
     field.fill("0.5")
-    until(page, lambda: engine.commands)
+    wait_for(lambda: engine.commands)
     assert engine.commands == [SetTuning("Q.temperature", 0.5)]
     page.wait_for_function(f"Math.max(...{CHARTS}[0].data[1]) > {max(before) + 0.1}")
     # The previous revision is there too, as it was.
@@ -136,7 +127,7 @@ def test_dragged_slider_reaches_the_engine(page, engine):
 def test_chosen_estimator_reaches_the_engine(page, engine):
     page.get_by_role("combobox", name="Estimator").click()
     page.get_by_role("option", name="Unscented Kalman filter", exact=True).click()
-    until(page, lambda: engine.commands)
+    wait_for(lambda: engine.commands)
     assert engine.commands == [SetEstimator("ukf")]
     page.get_by_text("revision 1").wait_for()
 
@@ -171,9 +162,10 @@ def test_a_lost_filter_says_since_when_and_is_reset_by_hand(browser):
         # The 26th refused reading is more than half of the last fifty.
         page.get_by_text(f"diverged since {JUMP + 25}.0 s").wait_for()
         page.get_by_role("button", name="Reset").click()
+        wait_for(lambda: engine.status().health == TRACKING)
         page.get_by_text("tracking", exact=False).first.wait_for()
         source.put(readings(t[RESET_AT:], y[RESET_AT:]))
-        until(page, lambda: engine.status().counts["used"] >= JUMP + 10)
+        wait_for(lambda: engine.status().counts["used"] >= JUMP + 10)
         assert engine.status().health == TRACKING
         assert page.get_by_text("begins anew from the prior").count() <= 1
     finally:
