@@ -397,6 +397,7 @@ class Engine:
             self._revision += 1
             self._finished = False
             self._requests.forget()
+            self.notices.begin_again()
             self._watch.again()
         if wanted:
             self.retune(*wanted)

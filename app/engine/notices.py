@@ -16,12 +16,13 @@ KEPT = 1000
 
 @dataclass(frozen=True)
 class Notice:
-    """One line for people: when (ns, the twin's time), how bad, what."""
+    """One line for people: when (ns, the twin's time), how bad, what, and in which pass over the source."""
 
     number: int
     t: int
     level: str
     text: str
+    passage: int = 0
 
 
 class Notices:
@@ -35,6 +36,8 @@ class Notices:
         self._elsewhere: set[str] = set()
         self._lines: deque[Notice] = deque(maxlen=KEPT)
         self._next = 0
+        self.passage = 0
+        """How often the source has begun again; what was said before that is of another life of the twin."""
         self._last: dict[str, tuple[float, int]] = {}
 
     def report(self, key: str, text: str, level: str = "warn", *, counted: bool = True, times: int = 1) -> None:
@@ -59,6 +62,11 @@ class Notices:
         with self._lock:
             self._add(level, text, t)
 
+    def begin_again(self) -> None:
+        """The source has begun again: lines from here on belong to another pass over it."""
+        with self._lock:
+            self.passage += 1
+
     def restore(self, lines: Iterable[tuple[int, str, str]]) -> None:
         """Add lines (t, level, text) of an earlier run."""
         with self._lock:
@@ -66,7 +74,7 @@ class Notices:
                 self._add(level, text, t)
 
     def _add(self, level: str, text: str, t: int | None = None) -> None:
-        self._lines.append(Notice(self._next, self._now() if t is None else t, level, text))
+        self._lines.append(Notice(self._next, self._now() if t is None else t, level, text, self.passage))
         self._next += 1
 
     def since(self, number: int) -> list[Notice]:

@@ -100,7 +100,9 @@ export class Viewer {
     this.announced = false;
     const { id, kept } = this;
     this.kept = null;
-    if (kept?.timeline) await this.control(setTimeCursor(id, kept.timeline, kept.time, kept.play));
+    // After seeking back, the place where the user was is yet to come: then the charts follow.
+    const end = recordings.find((recording) => recording.id === id)?.ends[kept?.timeline] ?? 0n;
+    if (kept?.timeline && kept.time <= end) await this.control(setTimeCursor(id, kept.timeline, kept.time, kept.play));
     const old = recordings.map((recording) => recording.id).filter((other) => other !== id);
     if (old.length) await this.control(closeRecordings(old));
   }

@@ -150,8 +150,10 @@ class RerunFeed:
         if t.size:
             rows.begin(pull)
             draw(slice(cut, None), slice(grey_cut, None), past=False)
-        # The engine gives a line once; the viewer forgets it with the recording that it closes.
-        rows.notices(list(self._notices))
+        # The engine gives a line once; the viewer forgets it with the recording that it closes. Times of what was said
+        # before the source began again are yet to come.
+        here = self._engine.notices.passage
+        rows.notices([line for line in self._notices if line.passage == here])
         if cut:
             self._later = lambda: draw(slice(0, cut), slice(known, grey_cut), past=True)
         return [announcement, *self._read()]

@@ -24,6 +24,7 @@ EVENTS = "/events"
 """Where the lines for people are, whichever revision the charts show."""
 
 TIMELINE = "time"
+EVENTS = "/events"
 AT_ONCE = 3
 """Charts of states that are shown at the same time; more come in tabs, which cost nothing while they are hidden."""
 

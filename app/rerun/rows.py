@@ -56,6 +56,7 @@ class RerunRows:
         self._tells_field = bool(self.model.grid is not None and engine.twin.tells_field)
         self._calendar: bool | None = None
         self._revisions = 0
+        self._lines: list[Any] = []
         self._begin("")
 
     def _begin(self, root: str) -> None:
@@ -170,16 +171,22 @@ class RerunRows:
         self._line("/previous/nis", t[rows], track.nis_mean[rows, None], width, gaps=True)
 
     def notices(self, notices: list[Any]) -> None:
-        """Log lines for people."""
-        if not notices or self._oldest is None:
+        """Log lines for people, once the rows have come to their time: a viewer that follows goes to the last of all.
+
+        They are under one path in all revisions, so that the table of a recording has them all.
+        """
+        self._lines += notices
+        if self._newest is None or self._oldest is None:
             return
-        times = np.maximum([notice.t for notice in notices], self._oldest)
+        due = [line for line in self._lines if line.t <= self._newest]
+        self._lines = [line for line in self._lines if line.t > self._newest]
+        if not due:
+            return
+        times = np.maximum([line.t for line in due], self._oldest)
         self.stream.send_columns(
             EVENTS,
             indexes=[self.times(times.astype(np.int64))],
-            columns=rr.TextLog.columns(
-                text=[notice.text for notice in notices], level=[notice.level.upper() for notice in notices]
-            ),
+            columns=rr.TextLog.columns(text=[line.text for line in due], level=[line.level.upper() for line in due]),
         )
 
     def times(self, t: np.ndarray) -> rr.TimeColumn:

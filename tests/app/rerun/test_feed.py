@@ -10,11 +10,12 @@ from rerun.chunk import RrdReader
 
 from app.engine import commands
 from app.engine.engine import Engine
+from app.recording.writer import Recorder
 from app.rerun import feed
 from app.rerun.feed import AHEAD, RerunFeed
-from app.rerun.layout import pair_name
+from app.rerun.layout import blueprint, pair_name
 from app.rerun.pairs import ASIDE, BELOW, PANE, anchors, axis_scales, ellipse_points
-from app.rerun.rows import CALENDAR
+from app.rerun.rows import CALENDAR, RerunRows
 from app.rerun.thin import last_of_each_time, thin
 from estimators.log import READING, TRUTH, Readings
 from tests.app.scripted import Scripted, readings, twin, wait_for
@@ -354,3 +355,92 @@ def test_a_revision_that_begins_between_two_pieces_wins(fed, monkeypatch):
     assert fed.said[-1]["revision"] == 1
     np.testing.assert_array_equal(fed.column("/state/temperature")[1][:, 0], fed.track().track.mean[:, 0])
     assert fed.track().revision == 1
+
+
+# After a seek, and in a recording
+
+
+def seek_back(fed, batch):
+    """The source begins again, and gives a batch."""
+    revision, read = fed.engine.status().revision, fed.source.read
+
+    def begun_again(timeout):
+        fed.source.read = read
+        fed.source.restarts = 1
+        return batch
+
+    fed.source.restarts = 0
+    fed.source.read = begun_again
+    wait_for(lambda: fed.engine.status().revision > revision and fed.events() == len(batch))
+
+
+def newest_of(fed, timeline="time"):
+    """The last time at which anything is, ns: where a viewer that follows goes."""
+    times = []
+    for chunk in fed.chunks():
+        batch = chunk.to_record_batch()
+        if not chunk.is_static and timeline in batch.schema.names:
+            times.append(int(batch.column(batch.schema.names.index(timeline)).cast(pa.int64()).to_numpy().max()))
+    return max(times)
+
+
+def test_after_seeking_back_nothing_lies_beyond_the_rows(fed):
+    fed.put(readings(np.arange(1.0, 41.0), np.full(40, 40.0)))
+    fed.engine.notices.say("said at 40 s")
+    fed.next()
+    assert newest_of(fed) == 40 * 10**9
+    seek_back(fed, readings(np.arange(1.0, 6.0), np.full(5, 40.0)))
+    fed.next()
+    assert newest_of(fed) == 5 * 10**9
+    # Nor later: it was said of another pass over the recording.
+    fed.engine.notices.say("said at 5 s")
+    fed.put(readings(np.arange(6.0, 51.0), np.full(45, 40.0)))
+    fed.next()
+    assert newest_of(fed) == 50 * 10**9
+    times, texts = fed.column("/events", "TextLog:text")
+    assert list(zip(times.tolist(), texts.ravel().tolist(), strict=True)) == [(5 * 10**9, "said at 5 s")]
+
+
+def test_a_line_that_comes_before_its_row_waits_for_it(fed):
+    fed.put(readings([1.0, 2.0], [40.0, 41.0]))
+    fed.engine.notices.say("ahead", t=3 * 10**9)
+    fed.next()
+    assert newest_of(fed) == 2 * 10**9
+    fed.put(readings([3.0], [40.0]))
+    fed.next()
+    assert fed.column("/events", "TextLog:text")[1].ravel().tolist() == ["ahead"]
+
+
+def test_a_line_is_not_lost_while_there_are_no_rows(fed):
+    fed.engine.notices.say("the bus is silent")
+    fed.next()
+    fed.put(readings([1.0], [40.0]))
+    fed.next()
+    assert fed.column("/events", "TextLog:text")[1].ravel().tolist() == ["the bus is silent"]
+
+
+def test_a_recording_shows_its_events_whatever_was_turned_since(fed, tmp_path):
+    """In the stock viewer: the events' view of the last blueprint is where the lines are."""
+    path = tmp_path / "retuned.rrd"
+    recorder = Recorder(fed.engine, lambda stream: RerunRows(stream, fed.engine, series=None))
+    fed.engine.recorder = recorder
+    recorder.start()
+    fed.engine.submit(commands.Record(path))
+    fed.put(readings([1.0, 2.0], [40.0, 41.0]))
+    fed.engine.notices.say("before")
+    fed.submit(commands.SetTuning("Q.rate", 3.0))
+    fed.put(readings([3.0], [40.0]))
+    fed.engine.submit(commands.Record(None))
+    wait_for(lambda: path in recorder.finished)
+    recorder.stop()
+    chunks = list(RrdReader(str(path)).stream())
+    lines = {chunk.entity_path for chunk in chunks if "TextLog:text" in chunk.to_record_batch().schema.names}
+    assert lines == {"/events"}
+    shown = blueprint(fed.engine.model, fed.engine.pairs, window=WINDOW, root="/revision_1")
+    views = {view.name: view.origin for view in all_views(shown.root_container)}
+    assert views["events"] == "/events" and views["health"] == "/revision_1/health"
+
+
+def all_views(container):
+    for item in container.contents:
+        yield from all_views(item) if hasattr(item, "contents") and hasattr(item, "kind") else [item]
