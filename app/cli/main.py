@@ -1,4 +1,4 @@
-"""The command line: `nisus run`, `fold`, `compare`, `filters`, `review`, `bus`, `twins`, `schema`, `new`."""
+"""The command line: `nisus run`, `fold`, `compare`, `filters`, `review`, `bus`, `twins`, `schema`, `log`, `new`."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from .stderr import complain
 
 Twin = Annotated[str, tyro.conf.Positional]
 Settings = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+Files = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
 
 @dataclass(frozen=True)
@@ -156,16 +157,42 @@ class Schema:
 
 
 @dataclass(frozen=True)
+class Log:
+    """List what recordings hold: buses, messages, signals or columns, with rates, spans and holes."""
+
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """CAN logs (MF4, BLF, ASC, TRC, candump, CSV, SQLite) or tables (CSV, Parquet, MATLAB, NumPy), in their order."""
+    dbc: Files = ()
+    """DBC file that names messages and signals, repeatable; FILE@BUS where it holds on one bus only."""
+    time: str | None = None
+    """Column of a table that tells the time; default: the one of such a name."""
+    time_unit: str = "s"
+    """Its unit: s, ms, us, ns, min or h."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print one JSON object."""
+
+
+@dataclass(frozen=True)
 class New:
-    """Write a working pair NAME.yaml and NAME.py to start a twin of your own from."""
+    """Write a working pair NAME.yaml and NAME.py to start a twin of your own from: a pump, or a recording's signals."""
 
     name: Annotated[str, tyro.conf.Positional]
     """Of the twin."""
     folder: Path = field(default_factory=Path.cwd)
     """Where to."""
+    log: tuple[Path, ...] = ()
+    """Recordings whose signals become its sensors."""
+    dbc: Files = ()
+    """DBC file of their frames, repeatable; FILE@BUS where it holds on one bus only."""
+    signals: str = ""
+    """A,B: signals (SIGNAL or MESSAGE.SIGNAL) or columns to take; default: those that vary most finely, at most 6."""
+    time: str | None = None
+    """Column of a table that tells the time; default: the one of such a name."""
+    time_unit: str = "s"
+    """Its unit: s, ms, us, ns, min or h."""
 
 
-Command = Run | Fold | Compare | Filters | Review | Bus | Twins | Schema | New
+Command = Run | Fold | Compare | Filters | Review | Bus | Twins | Schema | Log | New
 COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in get_args(Command)}
 
 
@@ -226,9 +253,13 @@ def carry_out(command: Command) -> int:
         else:
             command.out.write_text(text + "\n", encoding="utf-8")
         return 0
-    from .new import write_twin
+    if isinstance(command, Log):
+        from ..log import show_log
 
-    for path in write_twin(command.name, command.folder):
+        return show_log(command)
+    from .new import new_twin
+
+    for path in new_twin(command):
         print(path)
     return 0
 

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from config.loader import shipped
 from estimators.errors import ConfigError
+
+if TYPE_CHECKING:
+    from .main import New as Arguments
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
@@ -120,6 +124,35 @@ def outflow(x, u, p, out):
 '''
 
 
+def new_twin(arguments: Arguments) -> tuple[Path, Path]:
+    """Carry the command out: a pump, or the signals of a recording.
+
+    Raises:
+        ConfigError: If the twin cannot be written so.
+        SourceError: If a recording cannot be read.
+    """
+    name, folder = arguments.name, arguments.folder
+    wanted = [text.strip() for text in arguments.signals.split(",") if text.strip()]
+    if not arguments.log:
+        if wanted or arguments.dbc:
+            raise ConfigError("--signals and --dbc say what to take from a recording; name it with --log FILE")
+        return write_twin(name, folder)
+    from ..log import database_of, look
+    from ..new_log import choose, python_text, yaml_text
+
+    check_new(name, folder)
+    found = look(arguments.log, arguments.dbc, arguments.time, arguments.time_unit)
+    chosen = choose(found, wanted)
+    databases = [database_of(text) for text in arguments.dbc]
+    model = model_of(name)
+    return write_pair(
+        name,
+        folder,
+        yaml_text(name, model, chosen, found, databases, arguments.time_unit, folder),
+        python_text(name, model, chosen),
+    )
+
+
 def write_twin(name: str, folder: Path) -> tuple[Path, Path]:
     """Write NAME.yaml and NAME.py, a pair that runs.
 
@@ -133,22 +166,46 @@ def write_twin(name: str, folder: Path) -> tuple[Path, Path]:
     Raises:
         ConfigError: If the name or the folder will not do, or one of the files is there already.
     """
+    check_new(name, folder)
+    model = model_of(name)
+    return write_pair(
+        name, folder, *(text.replace("{name}", name).replace("{model}", model) for text in (_YAML, _PYTHON))
+    )
+
+
+def check_new(name: str, folder: Path) -> None:
+    """Refuse a twin that could not be written.
+
+    Raises:
+        ConfigError: If the name or the folder will not do, or one of the files is there already.
+    """
     if not _NAME.fullmatch(name):
         raise ConfigError(f"the name {name!r} will not do; use letters, digits, _ and -, and begin with a letter")
     if name in shipped():
         raise ConfigError(f"the name {name!r} is that of a twin that ships; choose another")
     if not folder.is_dir():
         raise ConfigError(f"{folder}: there is no such folder; make it first")
-    texts = {folder / f"{name}.yaml": _YAML, folder / f"{name}.py": _PYTHON}
-    for path in texts:
+    for path in (folder / f"{name}.yaml", folder / f"{name}.py"):
         if path.exists():
             raise ConfigError(f"{path}: it is there already and is not overwritten; choose another name")
-    model = "".join(part[:1].upper() + part[1:] for part in re.split(r"[_-]+", name))
-    for path, text in texts.items():
+
+
+def model_of(name: str) -> str:
+    """The name of the model of a twin: MyPump of my-pump."""
+    return "".join(part[:1].upper() + part[1:] for part in re.split(r"[_-]+", name))
+
+
+def write_pair(name: str, folder: Path, yaml_text: str, python_text: str) -> tuple[Path, Path]:
+    """Write the two files of a twin.
+
+    Raises:
+        ConfigError: If the folder cannot be written to.
+    """
+    paths = folder / f"{name}.yaml", folder / f"{name}.py"
+    for path, text in zip(paths, (yaml_text, python_text), strict=True):
         try:
             with path.open("x", encoding="utf-8") as file:
-                file.write(text.replace("{name}", name).replace("{model}", model))
+                file.write(text)
         except OSError as error:
             raise ConfigError(f"{path}: it cannot be written: {error.strerror}; check the folder") from None
-    yaml_path, python_path = texts
-    return yaml_path, python_path
+    return paths

@@ -1,0 +1,255 @@
+"""What recordings hold, before any twin is there: messages and signals of CAN logs, columns of tables."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from estimators.errors import SourceError
+from estimators.log import READING
+
+from .can.databases import load_database, same_bus
+from .can.decoder import Decoder
+from .can.frames import EXTENDED, FORMATS, BusName, Found, Raw, read_frames, suffix_of
+from .can.log import CanLog, check_log
+from .reader_process import Apart, patience_for
+from .source import Channel
+from .tables.files import UNREADABLE
+from .tables.rows import Rows, names_of, rows_of
+
+LONGEST = 64
+"""Bytes of the longest frame, of CAN FD."""
+
+HOLE = 1.0
+"""Seconds without anything that are a hole, or so many usual intervals:"""
+
+INTERVALS = 20.0
+
+TIMES = ("t", "time", "timestamp", "seconds", "time_s", "t_s", "date", "datetime", "unix_time", "elapsed")
+"""Names of a column that tells the time."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """Values of one signal or column: times (ns) and finite values, (n,); `missing` were none."""
+
+    name: str
+    unit: str
+    t: np.ndarray
+    values: np.ndarray
+    missing: int = 0
+
+
+@dataclass(frozen=True)
+class Message:
+    """The frames of one id on one bus: their times (ns), and what a DBC says of them, if one does."""
+
+    bus: BusName
+    key: int
+    t: np.ndarray
+    name: str | None = None
+    signals: tuple[Series, ...] = ()
+
+
+@dataclass
+class Survey:
+    """What recordings of one kind hold; `t` (ns) is when anything was recorded, in order."""
+
+    files: list[Path]
+    kind: str
+    t: np.ndarray
+    messages: list[Message] = field(default_factory=list)
+    columns: list[Series] = field(default_factory=list)
+    time: str = ""
+    faults: list[str] = field(default_factory=list)
+
+    @property
+    def holes(self) -> list[tuple[int, int]]:
+        """When something should have come and nothing did: start and end, ns."""
+        return holes(self.t)
+
+
+def holes(t: np.ndarray) -> list[tuple[int, int]]:
+    """Gaps between times in order, far longer than is usual there."""
+    gaps = np.diff(t)
+    if not gaps.size:
+        return []
+    long = np.flatnonzero(gaps > max(HOLE * 1e9, INTERVALS * float(np.median(gaps))))
+    return [(int(t[k]), int(t[k + 1])) for k in long]
+
+
+def is_table(path: Path) -> bool:
+    """Whether a file is read as a table; a CSV is a CAN log if it looks like one of python-can's."""
+    if suffix_of(path) not in FORMATS:
+        return True
+    if suffix_of(path) != ".csv":
+        return False
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        return not file.readline().startswith("timestamp,arbitration_id,")
+
+
+def survey(
+    files: Sequence[Path], databases: Sequence[tuple[Path, BusName]] = (), time: str | None = None, unit: str = "s"
+) -> Survey:
+    """What recordings hold, all of one kind: CAN logs or tables.
+
+    Args:
+        files: In their order.
+        databases: DBC files with the bus on which each holds, None for every one.
+        time: The column of a table that tells the time; None looks for one.
+        unit: Its unit.
+
+    Raises:
+        SourceError: If a file cannot be read, or the kinds are mixed.
+    """
+    for path in files:
+        if not path.is_file():
+            raise SourceError(f"{path}: there is no such file; check the path")
+        if not path.stat().st_size:
+            raise SourceError(f"{path}: the file is empty; record it again")
+    kinds = [is_table(path) for path in files]
+    if any(kinds) != all(kinds):
+        raise SourceError(f"{files[kinds.index(True)]} is a table and {files[kinds.index(False)]} a log; give one kind")
+    if all(kinds):
+        return _tables(list(files), time, unit)
+    return _logs(list(files), list(databases))
+
+
+def _logs(files: list[Path], databases: list[tuple[Path, BusName]]) -> Survey:
+    found: dict[tuple[BusName, int], list[np.ndarray]] = defaultdict(list)
+    faults = []
+    errors = 0
+    for path in files:
+        check_log(path)
+        apart = Apart(read_frames, path, None, LONGEST, patience=patience_for(path))
+        try:
+            while not apart.ended:
+                item = apart.take(1.0)
+                if isinstance(item, Raw):
+                    for place, bus in enumerate(item.buses):
+                        rows = np.flatnonzero(item.bus == place)
+                        for key in np.unique(item.key[rows]).tolist():
+                            found[bus, key].append(item.t[rows[item.key[rows] == key]])
+                elif isinstance(item, Found):
+                    errors += item.errors
+                    if item.fault:
+                        faults.append(f"{path.name}: damaged: {item.fault}")
+        except SourceError as error:
+            text = str(error).removeprefix(f"{path}: ")
+            faults.append(f"{path.name}: {text}")
+        finally:
+            apart.close()
+    if not found:
+        raise SourceError("; ".join(faults) or f"{files[0]}: it holds no frames")
+    if errors:
+        faults.append(f"{errors} error frames")
+    messages = [
+        Message(bus, key, np.sort(np.concatenate(parts)))
+        for (bus, key), parts in sorted(found.items(), key=lambda entry: (str(entry[0][0]), entry[0][1]))
+    ]
+    if databases:
+        messages = _named(files, databases, messages, faults)
+    t = np.sort(np.concatenate([message.t for message in messages]))
+    return Survey(files, "can_log", t, messages, faults=faults)
+
+
+def _named(
+    files: list[Path], databases: list[tuple[Path, BusName]], messages: list[Message], faults: list[str]
+) -> list[Message]:
+    """The messages with the names and signals that the databases give them."""
+    told: set[str] = set()
+
+    def report(key: str, text: str) -> None:
+        if key not in told:
+            told.add(key)
+            faults.append(text)
+
+    named: dict[int, tuple[str, Path]] = {}
+    series: dict[tuple[str, str], Series] = {}
+    for path, bus in databases:
+        by_key = {m.frame_id | (EXTENDED if m.is_extended_frame else 0): m for m in load_database(path).messages}
+        mine = {}
+        for k, message in enumerate(messages):
+            if k not in named and message.key in by_key and same_bus(bus, message.bus):
+                named[k] = (by_key[message.key].name, path)
+                mine[message.key] = by_key[message.key]
+        channels = [
+            Channel(READING, k, f"{message.name}.{signal.name}", (signal.name,), message.name)
+            for k, (message, signal) in enumerate((m, s) for m in mine.values() for s in m.signals)
+        ]
+        if not channels:
+            continue
+        units = {(m.name, s.name): s.unit or "" for m in mine.values() for s in m.signals}
+        log = CanLog(files, Decoder([(path, bus)], channels, width=1, report=report))
+        parts = [(np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros(0))]
+        try:
+            while (batch := log.read(1.0)) is not None:
+                parts.append((batch.t, batch.channel, batch.value[:, 0]))
+        finally:
+            log.close()
+        t, index, values = (np.concatenate(column) for column in zip(*parts, strict=True))
+        order = np.argsort(index, kind="stable")
+        edges = np.searchsorted(index[order], np.arange(len(channels) + 1))
+        for k, channel in enumerate(channels):
+            assert channel.message is not None
+            rows = order[edges[k] : edges[k + 1]]
+            rows = rows[np.argsort(t[rows], kind="stable")]
+            name = (channel.message, channel.signals[0])
+            series[name] = _series(channel.signals[0], units[name], t[rows], values[rows])
+    return [
+        Message(
+            message.bus, message.key, message.t, named[k][0], tuple(v for n, v in series.items() if n[0] == named[k][0])
+        )
+        if k in named
+        else message
+        for k, message in enumerate(messages)
+    ]
+
+
+def _series(name: str, unit: str, t: np.ndarray, values: np.ndarray) -> Series:
+    known = np.isfinite(values)
+    return Series(name, unit, t[known], values[known], int(np.sum(~known)))
+
+
+def _tables(files: list[Path], time: str | None, unit: str) -> Survey:
+    names = names_of(files[0])
+    chosen = time if time is not None else _time_of(names)
+    if chosen is None or chosen not in names:
+        raise SourceError(
+            f"{files[0]}: which column tells the time is not known; name it with --time, one of {', '.join(names[:12])}"
+        )
+    columns = [name for name in dict.fromkeys(names) if name != chosen]
+    faults: list[str] = []
+    times, values = [], []
+    for path in files:
+        for rows in _rows(path, chosen, unit, columns, faults):
+            times.append(rows.t[rows.known])
+            values.append(rows.values[rows.known])
+    if not times:
+        raise SourceError("; ".join(faults) or f"{files[0]}: no row has a time")
+    t, v = np.concatenate(times), np.concatenate(values)
+    order = np.argsort(t, kind="stable")
+    t, v = t[order], v[order]
+    found = [_series(name, "", t, v[:, k]) for k, name in enumerate(columns)]
+    return Survey(files, "table", t, columns=found, time=chosen, faults=faults)
+
+
+def _rows(path: Path, time: str, unit: str, columns: list[str], faults: list[str]) -> Iterator[Rows]:
+    """The rows of one table as far as it can be read."""
+    try:
+        for rows in rows_of(path, time, unit, columns, lambda: 1.0):
+            if rows is not None:
+                faults += [f"{path.name}:{line}: {text}" for key, line, text in rows.problems if key != UNREADABLE]
+                yield rows
+    except SourceError as error:
+        faults.append(str(error))
+
+
+def _time_of(names: Sequence[str]) -> str | None:
+    """The column that tells the time, by its name."""
+    last = {name.lower().rpartition(".")[2].partition("[")[0].strip(): name for name in reversed(names)}
+    return next((last[name] for name in TIMES if name in last), None)

@@ -1,0 +1,155 @@
+"""`nisus log` tells what was written into a file, and `nisus new --log` writes a twin of it that runs."""
+
+import json
+
+import can
+import numpy as np
+import pytest
+
+from app.cli.main import main
+from app.new_log import noise_of
+from app.twin.twin import load_twin
+from sources.survey import Series
+
+DBC = """VERSION ""
+
+NS_ :
+
+BS_:
+
+BU_: ECU
+
+BO_ 256 ENGINE: 8 ECU
+ SG_ Temp : 0|16@1+ (0.1,-40) [0|0] "degC" ECU
+ SG_ Rpm : 16|16@1+ (0.25,0) [0|0] "rpm" ECU
+ SG_ Always m0 : 32|8@1+ (1,0) [0|0] "" ECU
+ SG_ Never m1 : 32|8@1+ (1,0) [0|0] "" ECU
+ SG_ Which M : 40|8@1+ (1,0) [0|0] "" ECU
+"""
+START = 1_700_000_000
+
+
+@pytest.fixture
+def drive(tmp_path):
+    """Ten a second for 60 s, with a hole of 5 s; another id twice a second on bus 1."""
+    rng = np.random.default_rng(5)
+    (tmp_path / "car.dbc").write_text(DBC)
+    seconds = np.arange(600) * 0.1 + np.where(np.arange(600) < 300, 0, 5)
+    temp, rpm = 90 + np.cumsum(rng.normal(0, 0.3, 600)), 2000 + 500 * np.sin(0.2 * seconds)
+    with can.Logger(tmp_path / "drive.blf") as log:
+        for k in range(600):
+            t = START + float(seconds[k])
+            words = [round((temp[k] + 40) / 0.1), round(rpm[k] / 0.25)]
+            data = b"".join(word.to_bytes(2, "little") for word in words) + bytes(4)
+            log(can.Message(timestamp=t, arbitration_id=256, is_extended_id=False, data=data, channel=0))
+            if k % 5 == 0:
+                log(can.Message(timestamp=t, arbitration_id=0x18FEF100, data=bytes(2), channel=1))
+    return tmp_path
+
+
+def test_what_was_written_is_listed(drive, capsys):
+    assert main(["log", str(drive / "drive.blf"), "--dbc", str(drive / "car.dbc"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["number"] == 720 and found["faults"] == []
+    assert found["start_ns"] // 10**6 == START * 1000 and round((found["end_ns"] - found["start_ns"]) / 1e8) == 649
+    [hole] = found["holes_ns"]
+    assert (hole[1] - hole[0]) / 1e9 == pytest.approx(5.1, abs=0.001)
+    assert [(m["bus"], m["id"], m["extended"], m["name"], m["number"]) for m in found["messages"]] == [
+        (0, 256, False, "ENGINE", 600),
+        (1, 0x18FEF100, True, None, 120),
+    ]
+    assert [m["rate"] for m in found["messages"]] == pytest.approx([10, 2], rel=1e-3)
+    signals = {item["name"]: item for item in found["messages"][0]["signals"]}
+    assert {name: item["number"] for name, item in signals.items()} == {
+        "Temp": 600, "Rpm": 600, "Always": 600, "Never": 0, "Which": 600,
+    }  # fmt: skip
+    assert signals["Rpm"]["high"] == pytest.approx(2500, abs=1) and signals["Rpm"]["unit"] == "rpm"
+    assert main(["log", str(drive / "drive.blf")]) == 0
+    text = capsys.readouterr().out
+    assert "720 frames in 64.9 s, from 2023-11-14 22:13:20 UTC" in text and "1 holes: 5.1 s at 29.9 s" in text
+    assert "0x18fef100x" in text
+
+
+def test_a_bus_that_a_database_is_not_for_stays_without_names(drive, capsys):
+    assert main(["log", str(drive / "drive.blf"), "--dbc", f"{drive / 'car.dbc'}@1", "--json"]) == 0
+    assert [m["name"] for m in json.loads(capsys.readouterr().out)["messages"]] == [None, None]
+
+
+@pytest.mark.parametrize("ending", [".csv", ".parquet", ".npz", ".mat"])
+def test_a_table_is_listed(tmp_path, capsys, ending):
+    path = tmp_path / f"a{ending}"
+    columns = {"time": np.arange(50) * 0.5, "x": np.arange(50.0), "y": np.full(50, np.nan)}
+    if ending == ".csv":
+        rows = zip(*columns.values(), strict=True)
+        path.write_text("time,x,y\n" + "".join(f"{t},{x},\n" for t, x, _ in rows))
+    elif ending == ".parquet":
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        pq.write_table(pa.table(columns), path)
+    elif ending == ".npz":
+        np.savez(path, **columns)
+    else:
+        from scipy.io import savemat
+
+        savemat(path, columns)
+    assert main(["log", str(path), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["kind"] == "table" and found["time"] == "time" and found["number"] == 50
+    x, y = found["columns"]
+    assert (x["name"], x["number"], x["rate"], x["low"], x["high"]) == ("x", 50, 2.0, 0.0, 49.0)
+    assert (y["name"], y["number"], y["missing"]) == ("y", 0, 50)
+    assert main(["log", str(path), "--time", "when"]) == 2
+    assert "which column tells the time is not known; name it with --time, one of time, x, y" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("suffix", "arguments"), [("", []), ("_two", ["--signals", "Rpm,ENGINE.Temp"])])
+def test_a_twin_of_a_recording_folds_as_it_stands(drive, capsys, suffix, arguments):
+    name = f"pump{suffix}"
+    given = ["--log", str(drive / "drive.blf"), "--dbc", str(drive / "car.dbc"), *arguments]
+    assert main(["new", name, "--folder", str(drive), *given]) == 0
+    path = drive / f"{name}.yaml"
+    assert capsys.readouterr().out.splitlines() == [str(path), str(drive / f"{name}.py")]
+    twin = load_twin(path)
+    assert set(twin.model.sensor_names) == {"rpm", "temp"}
+    assert twin.model.state_names == ("temp", "rpm", "rpm_rate") if not suffix else ("rpm", "rpm_rate", "temp")
+    assert main(["fold", str(path), "--json"]) == 0
+    score = json.loads(capsys.readouterr().out)
+    assert score["readings"] == 1200 and score["failed"] == 0
+    # The temperature is a random walk, 0.3² a step; the engine speed is none, and its rate has a noise all the same.
+    assert 0.5 < score["nis"]["mean"] < 1.5
+    assert main(["run", str(path), "--headless", "--speed", "inf"]) == 0
+    assert "readings 1200" in capsys.readouterr().out
+
+
+def test_what_cannot_be_taken_is_said(drive, capsys):
+    new = ["new", "pump", "--folder", str(drive), "--log", str(drive / "drive.blf")]
+    assert main([*new, "--dbc", str(drive / "car.dbc"), "--signals", "Tmp"]) == 2
+    assert "--signals Tmp: is not in the log; did you mean Temp?" in capsys.readouterr().err
+    assert main([*new, "--dbc", str(drive / "car.dbc"), "--signals", "Never"]) == 2
+    assert "Never: has 0 values" in capsys.readouterr().err
+    assert main(new) == 2
+    assert "give one that describes it with --dbc" in capsys.readouterr().err
+    assert main(["new", "pump", "--folder", str(drive), "--signals", "Temp"]) == 2
+    assert not list(drive.glob("pump*"))
+
+
+def series(values, dt=0.1):
+    t = (np.arange(values.size) * dt * 1e9).astype(np.int64)
+    return Series("x", "", t, values)
+
+
+def test_the_noise_of_a_signal_is_found_in_its_differences():
+    """Of walks that were made with a noise that is known; 20,000 values tell a variance to some percent."""
+    rng, n, dt = np.random.default_rng(1), 20_000, 0.1
+    walk = np.cumsum(rng.normal(0, np.sqrt(4.0 * dt), n)) + rng.normal(0, 0.5, n)
+    smooth, q, r = noise_of(series(walk))
+    assert not smooth and q == pytest.approx(4.0, rel=0.15) and r == pytest.approx(0.25, rel=0.1)
+    # A speed that is a random walk: the exact covariance of a step, so that ⅔ dt³ is right.
+    half = np.linalg.cholesky(np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]) * 9.0)
+    x, out = np.zeros(2), np.empty(n)
+    for k in range(n):
+        x = np.array([x[0] + dt * x[1], x[1]]) + half @ rng.normal(size=2)
+        out[k] = x[0]
+    smooth, q, r = noise_of(series(out + rng.normal(0, 0.01, n)))
+    assert smooth and q == pytest.approx(9.0, rel=0.15) and r == pytest.approx(1e-4, rel=0.3)
