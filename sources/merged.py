@@ -10,7 +10,7 @@ import numpy as np
 from estimators.errors import SourceError
 from estimators.log import Readings
 
-from .source import Source
+from .source import Endless, Source, span_of
 
 
 class Merged:
@@ -36,7 +36,7 @@ class Merged:
     @property
     def span(self) -> tuple[int, int] | None:
         """First and last time of all, ns; None if a source does not tell."""
-        spans = [getattr(source, "span", None) for source in self._sources]
+        spans = [span_of(source) for source in self._sources]
         if any(span is None for span in spans):
             return None
         known = [span for span in spans if span is not None]
@@ -45,7 +45,7 @@ class Merged:
     @property
     def endless(self) -> bool:
         """Whether one of them has no end."""
-        return any(getattr(source, "endless", False) for source in self._sources)
+        return any(isinstance(source, Endless) and source.endless for source in self._sources)
 
     def read(self, timeout: float) -> Readings | None:
         """The next events of all sources, up to the earliest time to which every one of them is known."""

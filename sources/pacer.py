@@ -10,7 +10,7 @@ import numpy as np
 
 from estimators.log import Readings
 
-from .source import Source
+from .source import Source, span_of
 
 BATCH = 4096
 """Events given at once at most, so that whoever reads can breathe at full speed."""
@@ -65,7 +65,7 @@ class Pacer:
     @property
     def span(self) -> tuple[int, int] | None:
         """Time of the first event and of the last one known, ns."""
-        span = getattr(self._source, "span", None)
+        span = span_of(self._source)
         if span is not None:
             return span
         return None if self._first is None or self._last is None else (self._first, self._last)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from estimators.log import Readings
@@ -35,6 +35,54 @@ class Source(Protocol):
 
     def close(self) -> None:
         """Let go of files and buses."""
+
+
+@runtime_checkable
+class Spanned(Protocol):
+    """A source that may know from when to when it lasts before it is read."""
+
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """First and last time, ns; None if it does not tell."""
+
+
+@runtime_checkable
+class Endless(Protocol):
+    """A source that may have no end of its own."""
+
+    @property
+    def endless(self) -> bool:
+        """Whether it has none."""
+
+
+@runtime_checkable
+class Paced(Source, Spanned, Protocol):
+    """A source whose time can be held, hurried and sought; from any thread, while another reads."""
+
+    speed: float
+    paused: bool
+    restarts: int
+    """How often it was begun again, by seeking back: what was read before no longer holds."""
+
+    def pause(self) -> None:
+        """Hold its time."""
+
+    def resume(self) -> None:
+        """Let it go on."""
+
+    def set_speed(self, speed: float) -> None:
+        """Go on at `speed` times real time."""
+
+    def step(self) -> None:
+        """Release the events of the next time at which there are any."""
+
+    def seek(self, t: int) -> None:
+        """Move to t, ns."""
+
+
+def span_of(source: Source) -> tuple[int, int] | None:
+    """First and last time of a source, ns; None if it does not tell."""
+    return source.span if isinstance(source, Spanned) else None
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from estimators.log import Log
 from estimators.tabular import table_of
 from estimators.track import FAILED, HEALTH_NAMES, Track
 from estimators.tuning import TOGETHER
+from sources.source import Endless
 
 from ..stall import interruptible
 from ..twin.twin import Twin, load_twin
@@ -44,7 +45,7 @@ def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
         counts[key] += 1
 
     source = twin.open_source(remarking(count), live=False)
-    if duration is None and getattr(source, "endless", False):
+    if duration is None and isinstance(source, Endless) and source.endless:
         source.close()
         raise SourceError(f"{twin.name}: its source has no end; give --duration SECONDS")
     log = Log.of(twin.model)

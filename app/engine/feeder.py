@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from estimators.errors import NisusError
+from sources.source import Paced
 
 if TYPE_CHECKING:
     from sources.source import Source
@@ -42,7 +43,7 @@ class Feeder:
         self._open = open_source
         self._inbox = inbox
         self._report = report
-        self.source = open_source()
+        self._take(open_source())
         self.live = self.source.live
         self._stop = threading.Event()
         self._room = threading.Semaphore(AHEAD)
@@ -71,7 +72,7 @@ class Feeder:
             try:
                 if self._read():
                     ended = False
-                elif not hasattr(self.source, "seek"):
+                elif self._paced is None:
                     self._inbox.put(Finished())
                     return
                 elif not ended:
@@ -94,17 +95,23 @@ class Feeder:
     def _reopen(self) -> None:
         try:
             self.source.close()
-            self.source = self._open()
+            self._take(self._open())
             self._report("source reopened", "source reopened")
         except Exception as error:  # noqa: BLE001  as above; the next round tries again
             self._report("source failed", f"source cannot be reopened: {error}")
 
+    def _take(self, source: Source) -> None:
+        self.source = source
+        self._paced = source if isinstance(source, Paced) else None
+
+    def _restarts(self) -> int:
+        return self._paced.restarts if self._paced is not None else 0
+
     def _read(self) -> bool:
         """Pass one batch on; False at the end of the source."""
-        before = getattr(self.source, "restarts", 0)
+        before = self._restarts()
         batch = self.source.read(READ_TIMEOUT)
-        after = getattr(self.source, "restarts", 0)
-        if after != before:
+        if self._restarts() != before:
             self._inbox.put(Restarted())
         if batch is None:
             return False

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
+
+from sources.source import Paced, Source
 
 
 class Silence:
@@ -22,7 +23,7 @@ class Silence:
         self._since = time.monotonic()
         self._newest = newest
 
-    def asks(self, source: Any, last: int) -> int | None:
+    def asks(self, source: Source, last: int) -> int | None:
         """The time (ns) for which to ask now, behind the log's last event at `last`; None for not yet."""
         silent = time.monotonic() - self._since
         if silent < self._tick:
@@ -31,7 +32,7 @@ class Silence:
             assert self._newest is not None
             # Counted from the newest reading: a driver's clock need not be this machine's.
             now: int | None = self._newest + int(silent * 1e9)
-        elif getattr(source, "paused", False) or getattr(source, "speed", 1.0) == np.inf:
+        elif isinstance(source, Paced) and (source.paused or source.speed == np.inf):
             # As fast as possible, the playhead is ahead of what has been read.
             now = None
         else:

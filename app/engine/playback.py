@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from estimators.errors import ConfigError
+from sources.source import Paced, Source, span_of
 
 from . import commands
 
@@ -33,24 +34,25 @@ def check_playback(command: Any) -> None:
         raise ConfigError(f"Seek: seconds is {command.seconds:g}; it must lie within {LONGEST:g} s")
 
 
-def playback_status(source: Any) -> dict[str, Any]:
+def playback_status(source: Source) -> dict[str, Any]:
     """What a panel shows of it: paused, speed, seekable, span (ns)."""
+    paced = source if isinstance(source, Paced) else None
     return {
-        "paused": bool(getattr(source, "paused", False)),
-        "speed": getattr(source, "speed", None),
-        "seekable": hasattr(source, "seek"),
-        "span": getattr(source, "span", None),
+        "paused": paced is not None and paced.paused,
+        "speed": paced.speed if paced is not None else None,
+        "seekable": paced is not None,
+        "span": span_of(source),
     }
 
 
-def play(source: Any, command: Any, first: int) -> None:
+def play(source: Source, command: Any, first: int) -> None:
     """Carry one of `PLAYBACK` out; `first` is the time of the first event, ns.
 
     Raises:
         ConfigError: If the source cannot be paused or sought, or as `check_playback`.
     """
     check_playback(command)
-    if not hasattr(source, "seek"):
+    if not isinstance(source, Paced):
         raise ConfigError("a live source cannot be paused, stepped or sought; only a replay or a simulation can")
     if isinstance(command, commands.Pause):
         source.pause() if command.paused else source.resume()
@@ -59,5 +61,5 @@ def play(source: Any, command: Any, first: int) -> None:
     elif isinstance(command, commands.Step):
         source.step()
     else:
-        span = getattr(source, "span", None)
+        span = source.span
         source.seek((span[0] if span else first) + round(command.seconds * 1e9))

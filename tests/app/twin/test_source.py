@@ -380,3 +380,13 @@ def test_conversions_that_make_no_sense_are_one_line() -> None:
     assert message(inputs, ConfigError) == "motor.yaml:10: source.inputs.accel.columns names 2; accel takes 1: accel"
     nothing = CAR[: CAR.index("  sensors")]
     assert message(nothing, ConfigError).startswith("motor.yaml:2: source feeds no sensor; name at least one of ")
+
+
+def test_every_type_of_the_schema_has_its_line_in_the_registry():
+    from typing import get_args
+
+    from app.source_registry import SOURCES
+    from config.source_schema import SourceSection
+
+    types = [get_args(section.model_fields["type"].annotation)[0] for section in get_args(get_args(SourceSection)[0])]
+    assert sorted(types) == sorted(SOURCES)

@@ -1,0 +1,162 @@
+"""A twin's simulated asset: its section checked against the model, and made."""
+
+from __future__ import annotations
+
+from math import inf
+from typing import TYPE_CHECKING
+
+from config.loader import Loaded
+from config.problems import nearest
+from config.source_schema import AssetSection, ProfileSection
+from config.yaml_lines import Key, dotted
+from estimators.model.state_space import StateSpaceModel
+
+from .twin.model import check_names, find_model, one_each
+
+if TYPE_CHECKING:
+    from sources.simulation.faults import Fault
+    from sources.simulation.profile import Profile
+    from sources.simulation.simulator import Simulator
+
+MOST_EVENTS = 1e8
+"""That a simulation may make; it makes some ten thousand a second."""
+
+WITHOUT_END = 100.0
+"""Seconds within which one without end may make that many."""
+
+
+def make_asset(loaded: Loaded, model: StateSpaceModel, section: AssetSection, key: Key) -> Simulator:
+    """The simulated asset.
+
+    Raises:
+        ConfigError: With file and line, if its true model does not fit the twin's.
+    """
+    from sources.simulation.simulator import SensorPlan, Simulator
+
+    truth = section.truth
+    truth_model = find_model(loaded, (*key, "truth", "model"), truth.model) if truth.model else None
+    if truth_model is not None:
+        _check_same(loaded, (*key, "truth", "model"), truth_model, model)
+        _check_truth(loaded, section, key, truth_model)
+    plans = {}
+    for sensor in model.sensors:
+        plan = section.sensors.get(sensor.name)
+        if plan is None:
+            continue
+        variances = plan.variances
+        if variances is not None:
+            place = (*key, "sensors", sensor.name, "std" if plan.std is not None else "variance")
+            variances = one_each(loaded, place, variances, [row.name for row in sensor.rows])
+        plans[sensor.name] = SensorPlan(every=plan.every, variances=variances, drop_every=plan.drop_every)
+    return Simulator(
+        model,
+        seed=section.seed,
+        step=section.step,
+        duration=section.duration,
+        initial=dict(section.initial),
+        truth_parameters=dict(truth.parameters),
+        truth_model=truth_model,
+        truth_noise={name: level.value for name, level in truth.noise.items()},
+        inputs={name: _profile(profiles) for name, profiles in section.inputs.items()},
+        sensors=plans,
+        faults=_faults(loaded, section, key, model),
+        truth_every=truth.every if model.grid is not None else None,
+    )
+
+
+def check_asset(loaded: Loaded, section: AssetSection, key: Key, model: StateSpaceModel) -> None:
+    """Refuse what names what the model lacks, or would never end.
+
+    Raises:
+        ConfigError: With file and line.
+    """
+    check_names(loaded, (*key, "initial"), section.initial, model.state_names, "state", model)
+    check_names(loaded, (*key, "inputs"), section.inputs, model.input_names, "input", model)
+    check_names(loaded, (*key, "sensors"), section.sensors, model.sensor_names, "sensor", model)
+    _faults(loaded, section, key, model)
+    _check_length(loaded, section, key, model)
+    if section.truth.model is None:
+        _check_truth(loaded, section, key, model)
+
+
+def _check_length(loaded: Loaded, section: AssetSection, key: Key, model: StateSpaceModel) -> None:
+    """Refuse a simulation that would not end, or not get on, in a person's time."""
+    step, duration = section.step, section.duration
+    seconds = max(WITHOUT_END, step) if duration is None else max(duration, step)
+    plans = [section.sensors.get(sensor.name) for sensor in model.sensors]
+    readings = sum(1.0 / (plan.every if plan else 1) for plan in plans)
+    runs = max(1.0, step / model.max_step)
+    count = seconds / step * max(runs, readings)
+    if count <= MOST_EVENTS:
+        return
+    other = dotted((*key, "duration"))
+    if duration is None:
+        name, value, remedy = "step", step, "shorten it" if runs > readings else "lengthen it"
+    elif step < 1.0 / duration:
+        name, value, remedy = "step", step, f"lengthen it, or shorten {other}"
+    else:
+        name, value, remedy = "duration", duration, f"shorten it, or lengthen {dotted((*key, 'step'))}"
+    raise loaded.error(
+        (*key, name),
+        f"is {value:g} s; the simulator would make {count:.3g} {'steps of f' if runs > readings else 'events'} in "
+        f"{seconds:g} s, and may make {MOST_EVENTS:.0e}; {remedy}",
+    )
+
+
+def _check_truth(loaded: Loaded, section: AssetSection, key: Key, model: StateSpaceModel) -> None:
+    """`model` is the asset's: the twin's own, or truth.model."""
+    truth = section.truth
+    parameters, noises = [item.name for item in model.parameters], [item.name for item in model.noises]
+    check_names(loaded, (*key, "truth", "parameters"), truth.parameters, parameters, "parameter", model)
+    check_names(loaded, (*key, "truth", "noise"), truth.noise, noises, "noise", model)
+
+
+def _check_same(loaded: Loaded, key: Key, truth: StateSpaceModel, model: StateSpaceModel) -> None:
+    for what in ("state_names", "input_names", "row_names"):
+        theirs, ours = getattr(truth, what), getattr(model, what)
+        if theirs != ours:
+            raise loaded.error(
+                key, f"has {what.replace('_names', 's')} {', '.join(theirs)}; they must be {', '.join(ours)}"
+            )
+
+
+def _faults(loaded: Loaded, section: AssetSection, key: Key, model: StateSpaceModel) -> list[Fault]:
+    from sources.simulation.faults import Fault
+
+    for k, item in enumerate(section.faults):
+        place = (*key, "faults", k)
+        if item.sensor not in model.sensor_names:
+            near = nearest(item.sensor, model.sensor_names)
+            raise loaded.error((*place, "sensor"), f"is {item.sensor!r}, no sensor of {model.name}; {near}")
+        rows = [row.name for row in model.sensors[model.sensor_names.index(item.sensor)].rows]
+        if item.row is not None and item.row not in rows:
+            raise loaded.error((*place, "row"), f"is {item.row!r}, no row of {item.sensor}; {nearest(item.row, rows)}")
+    return [
+        Fault(
+            item.sensor,
+            item.kind,
+            item.start,
+            inf if item.end is None else item.end,
+            item.size or 0.0,
+            1.0 if item.rate is None else item.rate,
+            item.row,
+        )
+        for item in section.faults
+    ]
+
+
+def _profile(sections: tuple[ProfileSection, ...]) -> Profile:
+    """The sum of an input's profiles."""
+    from sources.simulation.profile import Constant, Sine, Steps, Sum
+
+    parts: list[Profile] = []
+    for section in sections:
+        if section.steps is not None:
+            times, values = zip(*section.steps, strict=True)
+            parts.append(Steps(times, values, section.repeat))
+        elif section.sine is not None:
+            sine = section.sine
+            parts.append(Sine(sine.mean, sine.amplitude, sine.period, sine.phase))
+        else:
+            parts.append(Constant(section.constant or 0.0))
+    return parts[0] if len(parts) == 1 else Sum(tuple(parts))

@@ -1,0 +1,105 @@
+"""Sources of type can: a live bus, and the asset that may be played on it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from config.loader import Loaded
+from config.source_schema import CanSection
+from config.yaml_lines import Key
+from estimators.errors import NisusError
+from estimators.log import Readings
+from estimators.model.state_space import StateSpaceModel
+
+from .source_asset import check_asset, make_asset
+from .source_can_log import make_decoder, open_can_log
+from .source_kind import Kind, Opening
+from .twin.channels import channels
+from .twin.files import failure, find_databases
+
+if TYPE_CHECKING:
+    from sources.can.player import Player
+    from sources.source import Report, Source
+
+
+def _open(opening: Opening) -> Source:
+    from sources.can.bus import CanBus
+
+    if opening.log_files is not None or not opening.live:
+        return open_can_log(opening)
+    section: CanSection = opening.section
+    report = opening.report
+    decoder = make_decoder(opening)
+    bus = CanBus(section.interface, section.channel, decoder, bus_options=dict(section.options), report=report)
+    if section.interface != "virtual" or section.asset is None:
+        return bus
+    # Nobody outside this process could speak on it. The listener is there first, so it hears the first frame.
+    try:
+        return PlayedBus(bus, make_player(opening.loaded, opening.model, report))
+    except NisusError:
+        bus.close()
+        raise
+
+
+def _check(loaded: Loaded, model: StateSpaceModel, section: CanSection, key: Key) -> None:
+    if section.asset is not None:
+        check_asset(loaded, section.asset, (*key, "asset"), model)
+
+
+def make_player(
+    loaded: Loaded,
+    model: StateSpaceModel,
+    report: Report,
+    *,
+    interface: str | None = None,
+    channel: str | int | None = None,
+) -> Player:
+    """The twin's asset, ready to play on its bus, or on another one.
+
+    Raises:
+        SourceError: If the source is no bus, it has no `asset`, or the bus cannot be opened.
+    """
+    from sources.can.player import Player
+
+    section, key = loaded.config.source, ("source",)
+    if not isinstance(section, CanSection):
+        raise failure(loaded, key, f"is of type {section.type}; only one of type can has a bus to play an asset on")
+    if section.asset is None:
+        raise failure(loaded, key, "has no asset to play; describe one under source.asset")
+    same = interface in (None, section.interface)
+    return Player(
+        make_asset(loaded, model, section.asset, (*key, "asset")),
+        find_databases(loaded, section, key),
+        [item for _, item in channels(loaded, section, key, model)],
+        interface=interface or section.interface,
+        channel=section.channel if channel is None else channel,
+        bus_options=dict(section.options) if same else {},
+        report=report,
+    )
+
+
+class PlayedBus:
+    """A bus inside this process, and the asset that speaks on it."""
+
+    live = True
+
+    def __init__(self, bus: Source, player: Player) -> None:
+        self._bus = bus
+        self._player = player
+        player.start()
+
+    def read(self, timeout: float) -> Readings | None:
+        """The next events of the bus."""
+        return self._bus.read(timeout)
+
+    def now(self) -> int | None:
+        """The bus's time, ns."""
+        return self._bus.now()
+
+    def close(self) -> None:
+        """Silence the asset, then leave the bus."""
+        self._player.close()
+        self._bus.close()
+
+
+CAN = Kind(_open, check=_check)

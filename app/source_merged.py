@@ -1,0 +1,71 @@
+"""Sources of type merged: several recordings of one drive."""
+
+from __future__ import annotations
+
+import fnmatch
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from config.source_schema import CanLogSection, MergedSection, TableSection
+from config.yaml_lines import Key
+from estimators.errors import SourceError
+
+from .source_can_log import CAN_LOG
+from .source_kind import Kind, Opening
+from .source_table import TABLE
+
+if TYPE_CHECKING:
+    from sources.source import Source
+
+PARTS: dict[type, Kind] = {CanLogSection: CAN_LOG, TableSection: TABLE}
+"""What may be merged: recordings, whose clocks agree."""
+
+TABLES = (".csv", ".parquet", ".pq", ".mat", ".npz")
+"""File endings that `--log` gives to the tables."""
+
+
+def _open(opening: Opening) -> Source:
+    from sources.merged import Merged
+
+    section: MergedSection = opening.section
+    shares: list[list[Path] | None] = [None] * len(section.parts)
+    if opening.log_files is not None:
+        shares = _shares(opening)
+    parts = [
+        PARTS[type(part)].open(replace(opening, section=part, key=(*opening.key, "parts", k), log_files=share))
+        for k, (part, share) in enumerate(zip(section.parts, shares, strict=True))
+        if share != []
+    ]
+    return Merged(parts)
+
+
+def _shares(opening: Opening) -> list[list[Path] | None]:
+    """Which part reads which of the `--log` files: by name, else tables to the table and logs to the CAN log."""
+    section: MergedSection = opening.section
+    shares: list[list[Path] | None] = [[] for _ in section.parts]
+    for file in opening.log_files or ():
+        fits = [
+            k
+            for k, part in enumerate(section.parts)
+            if any(fnmatch.fnmatch(file.name, Path(pattern).name) for pattern in part.files)
+        ]
+        if not fits:
+            kind = TableSection if file.suffix.lower() in TABLES else CanLogSection
+            fits = [k for k, part in enumerate(section.parts) if isinstance(part, kind)]
+        if len(fits) != 1:
+            raise SourceError(
+                f"--log {file}: {len(fits)} parts of {opening.loaded.places.at(('source', 'parts'))} could read it; "
+                "give it the name of the file that it replaces"
+            )
+        share = shares[fits[0]]
+        assert share is not None
+        share.append(file)
+    return shares
+
+
+def _sections(section: MergedSection, key: Key) -> dict[Key, Any]:
+    return {(*key, "parts", k): part for k, part in enumerate(section.parts)}
+
+
+MERGED = Kind(_open, sections=_sections)
