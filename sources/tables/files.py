@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Generator, Sequence
+import re
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import suppress
+from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 
@@ -17,6 +20,9 @@ CHUNK = 4096
 
 LONGEST = 2**20
 """Letters in a line of column names."""
+
+FIRST = 100
+"""Lines in which a decimal comma is sought before a table is read."""
 
 UNREADABLE = "unreadable value"
 
@@ -124,19 +130,27 @@ def read_csv(path: Path, time: str, columns: Sequence[str], problem: Problem) ->
     at_time = names.index(time)
     places = [names.index(name) for name in columns]
     broken: tuple[int, int] | None = None
+    raw: list[str] = []
     with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
-        reader = csv.reader(file, delimiter=mark)
+        reader = csv.reader(_kept(file, raw), delimiter=mark)
         next(reader)
         ended = False
         while not ended:
             rows: list[list[str]] = []
             lines: list[int] = []
             while len(rows) < CHUNK and not ended:
+                raw.clear()
+                fault = ""
                 try:
                     row = next(reader, None)
                 except csv.Error as error:
-                    problem(TRUNCATED, reader.line_num, f"{error}; the rest is left out")
-                    row = None
+                    row, fault = None, f"{error}; the rest is left out"
+                if len(raw) > 1 and sum(line.count('"') for line in raw) % 2:
+                    # Quotes come in pairs, so that this one took all that follows for one cell.
+                    after = "all after it" if fault else f"the {len(raw) - 1} after it"
+                    row, fault = None, f"a quote is opened and not closed; this line and {after} are left out"
+                if fault:
+                    problem(TRUNCATED, reader.line_num - len(raw) + 1, fault)
                 if row is None:
                     ended = True
                 elif row:
@@ -156,26 +170,71 @@ def read_csv(path: Path, time: str, columns: Sequence[str], problem: Problem) ->
         problem(TRUNCATED, broken[0], f"the last line has {broken[1]} cells, not {len(names)}")
 
 
+def _kept(file: TextIO, raw: list[str]) -> Iterator[str]:
+    """The lines of a file; `raw` takes them too."""
+    for line in file:
+        raw.append(line)
+        yield line
+
+
+_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+
+
+def decimal_comma(cell: str) -> str | None:
+    """A number that is written with a decimal comma as one with a point; None of anything else."""
+    text = cell.strip()
+    return text.replace(",", ".") if _COMMA.fullmatch(text) else None
+
+
+def find_decimal_comma(path: Path, wanted: Sequence[str]) -> tuple[int, str, str, str] | None:
+    """Line, column, cell, and the cell with a point, of the first decimal comma among the first rows of a CSV."""
+    names, mark = _header(path)
+    if mark == ",":
+        return None
+    places = {name: names.index(name) for name in wanted}
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
+        reader = csv.reader(islice(file, FIRST), delimiter=mark)
+        with suppress(csv.Error):
+            for row in islice(reader, 1, None):
+                for name, place in places.items():
+                    point = decimal_comma(row[place]) if place < len(row) else None
+                    if point is not None:
+                        return reader.line_num, name, row[place].strip(), point
+    return None
+
+
+def number(cell: str) -> float:
+    """A cell as a number, as tables write them: 1_000 is one in a program only.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    if "_" in cell:
+        raise ValueError(cell)
+    return float(cell)
+
+
 def _numbers(
     cells: list[str], name: str, lines: list[int], values: np.ndarray, blank: np.ndarray, problem: Problem
 ) -> None:
     """Fill a column of values from text."""
     try:
-        values[:] = [float(cell) for cell in cells]
-        return
+        if "_" not in "".join(cells):
+            values[:] = [float(cell) for cell in cells]
+            return
     except ValueError:
         pass
     for k, cell in enumerate(cells):
         try:
-            values[k] = float(cell)
+            values[k] = number(cell)
         except ValueError:
             values[k] = np.nan
             if not cell.strip():
                 blank[k] = True
             elif cell.strip().lower() not in ("na", "n/a", "null", "none"):
-                problem(
-                    UNREADABLE, lines[k], f"{name} is {quoted(cell.strip())}, which is no number; the value is missing"
-                )
+                point = decimal_comma(cell)
+                why = "which is no number" if point is None else f"with a decimal comma; write {point}"
+                problem(UNREADABLE, lines[k], f"{name} is {quoted(cell.strip())}, {why}; the value is missing")
 
 
 def read_parquet(path: Path, time: str, columns: Sequence[str], problem: Problem) -> Generator[Chunk, None, None]:

@@ -14,6 +14,7 @@ from estimators.log import Readings
 from ..can.signals import ABSENT, PRESENT
 from ..mapping import Mapping
 from ..source import NEVER, TRUNCATED, Channel, Report, ignore
+from .files import find_decimal_comma, is_text
 from .order import Order
 from .rows import Rows, names_of, rows_of
 from .time_column import UNITS
@@ -148,8 +149,23 @@ def _check(path: Path, wanted: Sequence[str]) -> None:
     for name in wanted:
         if name not in names:
             raise SourceError(f"{path}: there is no column {name!r}; {nearest(name, names)}")
+        at = [k for k, other in enumerate(names, start=1) if other == name]
+        if len(at) > 1:
+            places = " and ".join(f"the {_ordinal(k)}" for k in at[:2])
+            raise SourceError(f"{path}: there are {len(at)} columns {name!r}, {places}; give each its own name")
     if path.suffix.lower() == ".csv" and not _has_rows(path):
         raise SourceError(f"{path}: it has a header and no rows; record it again")
+    if is_text(path):
+        comma = find_decimal_comma(path, wanted)
+        if comma is not None:
+            line, name, cell, point = comma
+            raise SourceError(
+                f"{path}:{line}: {name} is {cell!r}, with a decimal comma; write numbers with a point, {point}"
+            )
+
+
+def _ordinal(k: int) -> str:
+    return f"{k}{'th' if k % 100 in (11, 12, 13) else {1: 'st', 2: 'nd', 3: 'rd'}.get(k % 10, 'th')}"
 
 
 def _has_rows(path: Path) -> bool:

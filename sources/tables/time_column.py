@@ -20,6 +20,8 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 def _of_text(text: str, unit: int) -> int | None:
     """One cell as ns: a number in the unit, exactly as it is written, or a date; None if it is neither."""
+    if "_" in text:
+        return None  # 1_000 is a number in a program only.
     try:
         number = float(text)
     except ValueError:

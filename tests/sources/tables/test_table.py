@@ -268,3 +268,62 @@ def test_times_beyond_any_clock_are_left_out():
     time, known = column_ns(pa.array([0, 10**10, 2]), "s")
     np.testing.assert_array_equal(known, [True, False, True])
     np.testing.assert_array_equal(time[known], [0, 2_000_000_000])
+
+
+def read_reports(path, channels):
+    reports = Reports()
+    return read_all(table(path, channels=channels, report=reports)), reports
+
+
+ONE = (Channel(READING, 0, "x", ("x",)),)
+
+
+@pytest.mark.parametrize("ending", [".csv", ".parquet"])
+def test_a_column_that_is_there_twice_is_refused_if_it_is_needed(tmp_path, ending):
+    names, rows = ["t", "x", "y", "x", "y"], [[0, 1, 2, 3, 4], [1, 5, 6, 7, 8]]
+    path = tmp_path / f"a{ending}"
+    if ending == ".csv":
+        path.write_text("\n".join(",".join(map(str, row)) for row in [names, *rows]) + "\n")
+    else:
+        pq.write_table(pa.Table.from_arrays([pa.array(column) for column in zip(*rows, strict=True)], names), path)
+    with pytest.raises(SourceError) as caught:
+        table(path, channels=ONE)
+    assert str(caught.value) == f"{path}: there are 2 columns 'x', the 2nd and the 4th; give each its own name"
+    path.write_text("t,x,y,y\n0,1,2,3\n") if ending == ".csv" else None
+    if ending == ".csv":
+        assert len(read_all(table(path, channels=ONE))) == 1
+
+
+def test_a_quote_that_is_not_closed_is_named_with_its_line_and_what_it_takes(tmp_path):
+    lines = [f"{k},{k}.5,note" for k in range(20)]
+    lines[6] = '6,6.5,"note'
+    got, reports = read_reports(write(tmp_path, "t,x,words\n" + "\n".join(lines) + "\n"), ONE)
+    assert got.value[:, 0].tolist() == [k + 0.5 for k in range(6)]
+    assert reports.counts == {"truncated file": 1}
+    assert reports.texts["truncated file"] == (
+        "drive.csv:8: a quote is opened and not closed; this line and the 13 after it are left out"
+    )
+
+
+def test_a_quote_that_is_closed_may_hold_lines(tmp_path):
+    got, reports = read_reports(write(tmp_path, 't,x,words\n0,1,"two\nlines"\n1,2,one\n'), ONE)
+    assert got.value[:, 0].tolist() == [1, 2] and not reports.counts
+
+
+def test_a_decimal_comma_is_refused_with_what_to_write(tmp_path):
+    path = write(tmp_path, "t;x\n0;1\n0,5;2,25\n")
+    with pytest.raises(SourceError) as caught:
+        read_all(table(path, channels=ONE))
+    assert str(caught.value) == f"{path}:3: t is '0,5', with a decimal comma; write numbers with a point, 0.5"
+    path = write(tmp_path, "t;x\n" + "".join(f"{k};{k}\n" for k in range(5000)) + "5000;2,5\n")
+    _, reports = read_reports(path, ONE)
+    assert reports.counts == {"unreadable value": 1}
+    assert "x is '2,5', with a decimal comma; write 2.5; the value is missing" in reports.texts["unreadable value"]
+
+
+def test_what_only_python_takes_for_a_number_is_none(tmp_path):
+    """1_5 is fifteen in a program's text; in a table it is nobody knows what."""
+    got, reports = read_reports(write(tmp_path, "t,x\n0,1_5\n1_0,2\n2,3\n"), ONE)
+    assert reports.counts == {"unreadable value": 1, "undated row": 1}
+    np.testing.assert_array_equal(got.value[:, 0], [NAN, 3.0])
+    assert got.t.tolist() == [0, 2 * 10**9]
