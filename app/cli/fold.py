@@ -23,7 +23,7 @@ from estimators.track import FAILED, HEALTH_NAMES, Track
 from estimators.tuning import TOGETHER
 from sources.source import Endless
 
-from ..stall import interruptible
+from ..engine.stall import interruptible
 from ..twin.twin import Twin, load_twin
 from .main import settings
 from .prepare import prepare

@@ -254,7 +254,7 @@ def carry_out(command: Command) -> int:
             command.out.write_text(text + "\n", encoding="utf-8")
         return 0
     if isinstance(command, Log):
-        from ..log import show_log
+        from .log import show_log
 
         return show_log(command)
     from .new import new_twin

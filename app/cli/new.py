@@ -137,8 +137,8 @@ def new_twin(arguments: Arguments) -> tuple[Path, Path]:
         if wanted or arguments.dbc:
             raise ConfigError("--signals and --dbc say what to take from a recording; name it with --log FILE")
         return write_twin(name, folder)
-    from ..log import database_of, look
-    from ..new_log import choose, python_text, yaml_text
+    from .log import database_of, look
+    from .new_log import choose, python_text, yaml_text
 
     check_new(name, folder)
     found = look(arguments.log, arguments.dbc, arguments.time, arguments.time_unit)

@@ -25,7 +25,6 @@ from estimators.registry import find_estimator
 from estimators.track import TRACKING
 
 from ..cli.stderr import complain
-from ..stall import Stall
 from . import commands
 from .alerts import Watch
 from .counts import Latency, Tally, last_run
@@ -36,6 +35,7 @@ from .notices import Notices
 from .outputs import Belief, Cursor, Pull, Status
 from .playback import playback_status
 from .refolder import Refolded, Refolder, Requests
+from .stall import Stall
 
 if TYPE_CHECKING:
     from estimators.diagnostics.field_pictures import Picture

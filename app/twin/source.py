@@ -13,10 +13,10 @@ from estimators.errors import SourceError
 from estimators.log import READING
 from estimators.model.state_space import StateSpaceModel
 
-from ..source_can import make_player
-from ..source_kind import Opening
-from ..source_registry import SOURCES
 from .channels import channels
+from .sources.can import make_player
+from .sources.kind import Opening
+from .sources.registry import SOURCES
 
 if TYPE_CHECKING:
     from sources.can.player import Player

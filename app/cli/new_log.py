@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from config.problems import nearest
-from estimators.errors import ConfigError
+from estimators.errors import ConfigError, nearest
 from sources.can.frames import BusName
 from sources.survey import Series, Survey
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from config.source_schema import TableSection
 
-from .source_kind import Kind, Opening, blamed
-from .twin.files import find_recording
+from ..files import find_recording
+from .kind import Kind, Opening, blamed
 
 if TYPE_CHECKING:
     from sources.source import Source

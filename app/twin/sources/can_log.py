@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from config.source_schema import CanSection
 from estimators.errors import SourceError
 
-from .source_kind import Kind, Opening, about, blamed
-from .twin.files import find_databases, find_recording
+from ..files import find_databases, find_recording
+from .kind import Kind, Opening, about, blamed
 
 if TYPE_CHECKING:
     from sources.can.decoder import Decoder

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.engine.stall import LONG, PATIENCE, Stall, unanswered
 from app.recording.reader import finished, read_recording
-from app.stall import LONG, PATIENCE, Stall, unanswered
 from tests.app.scripted import wait_for
 
 MODEL = """

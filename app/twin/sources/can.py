@@ -11,11 +11,11 @@ from estimators.errors import NisusError
 from estimators.log import Readings
 from estimators.model.state_space import StateSpaceModel
 
-from .source_asset import check_asset, make_asset
-from .source_can_log import make_decoder, open_can_log
-from .source_kind import Kind, Opening
-from .twin.channels import channels
-from .twin.files import failure, find_databases
+from ..channels import channels
+from ..files import failure, find_databases
+from .asset import check_asset, make_asset
+from .can_log import make_decoder, open_can_log
+from .kind import Kind, Opening
 
 if TYPE_CHECKING:
     from sources.can.player import Player

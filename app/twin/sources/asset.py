@@ -6,12 +6,12 @@ from math import inf
 from typing import TYPE_CHECKING
 
 from config.loader import Loaded
-from config.problems import nearest
 from config.source_schema import AssetSection, ProfileSection
 from config.yaml_lines import Key, dotted
+from estimators.errors import nearest
 from estimators.model.state_space import StateSpaceModel
 
-from .twin.model import check_names, find_model, one_each
+from ..model import check_names, find_model, one_each
 
 if TYPE_CHECKING:
     from sources.simulation.faults import Fault

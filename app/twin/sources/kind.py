@@ -12,7 +12,7 @@ from config.yaml_lines import Key, dotted
 from estimators.errors import SourceError
 from estimators.model.state_space import StateSpaceModel
 
-from .twin.channels import channels
+from ..channels import channels
 
 if TYPE_CHECKING:
     from sources.source import Channel, Report, Source

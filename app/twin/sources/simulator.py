@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .source_asset import check_asset, make_asset
-from .source_kind import Kind, Opening
+from .asset import check_asset, make_asset
+from .kind import Kind, Opening
 
 if TYPE_CHECKING:
     from sources.source import Source

@@ -11,9 +11,9 @@ from config.source_schema import CanLogSection, MergedSection, TableSection
 from config.yaml_lines import Key
 from estimators.errors import SourceError
 
-from .source_can_log import CAN_LOG
-from .source_kind import Kind, Opening
-from .source_table import TABLE
+from .can_log import CAN_LOG
+from .kind import Kind, Opening
+from .table import TABLE
 
 if TYPE_CHECKING:
     from sources.source import Source

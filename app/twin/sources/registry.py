@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from .source_can import CAN
-from .source_can_log import CAN_LOG
-from .source_kind import Kind
-from .source_merged import MERGED
-from .source_simulator import SIMULATOR
-from .source_table import TABLE
+from .can import CAN
+from .can_log import CAN_LOG
+from .kind import Kind
+from .merged import MERGED
+from .simulator import SIMULATOR
+from .table import TABLE
 
 SOURCES: dict[str, Kind] = {
     "simulator": SIMULATOR,
