@@ -91,18 +91,18 @@ code_type = types.NamedUniTuple(i64, len(Code._fields), Code)
 class Estimator:
     """One entry of the catalogue.
 
-    `applies(model)` gives the reason why the estimator does not fit a model, or None. `options` below are complete
-    (see `complete`). `state_size(options, nx)` and `work_size(options, nx, ny)` count float64s; `moments(options,
-    state, nx)` gives mean and covariance, `points(options, state, nx)` what to draw beside the mean (sigma points,
-    particles) as (k, nx), `modes(options, state, nx)` the peaks where there can be several, `recoveries(state)` how
-    often the filter had to help itself since its start. `tune(options, model, tuning)` turns the options into the
-    numbers that the compiled functions read; it may raise EstimatorError.
-    `memory(options, model)` counts numbers that the state holds beyond `state_size`. `runs(options, nx)` is
-    `model_runs` as a number: how often a step runs f. `prepare(model, options)` computes what depends on the model
-    too, once for a fold, as int64s. `blocks(options, state, nx)` is a view of the members (N, nx) in a state, of a
-    compiled filter that runs f and h at these alone and so can run on a black box (interpreted/). `fixed_r`
-    says that its gain is for one R, so that no reading can bring its own; `needs_factor` that it cannot start from a
-    covariance without a Cholesky factor.
+    `applies(model)` gives the reason why the estimator does not fit a model, or None; `refuses(model, options)` why
+    it does not with these options. `options` are complete here (see `complete`). `state_size(options, nx)` and
+    `work_size(options, nx, ny)` count float64s; `moments(options, state, nx)` gives mean and covariance,
+    `points(options, state, nx)` what to draw beside the mean (sigma points, particles) as (k, nx), `modes(options,
+    state, nx)` the peaks where there can be several, `recoveries(state)` how often the filter had to recover since its
+    start. `tune(options, model, tuning)` turns the options into the numbers that the compiled functions read; it may
+    raise EstimatorError. `memory(options, model)` counts numbers that the state holds beyond `state_size`.
+    `runs(options, nx)` is `model_runs` as a number: how often a step runs f. `prepare(model, options)` computes what
+    depends on the model too, once for a fold, as int64s. `blocks(options, state, nx)` is a view of the members (N, nx)
+    in a state, of a compiled filter that runs f and h at these alone and so can run on a black box (interpreted/).
+    `fixed_r` says that its gain is for one R, so that no reading can bring its own; `needs_factor` that it cannot start
+    from a covariance without a Cholesky factor.
     """
 
     name: str
@@ -122,6 +122,7 @@ class Estimator:
     memory: Callable[[Options, StateSpaceModel], int] = lambda options, model: 0
     prepare: Callable[[StateSpaceModel, Options], np.ndarray] = lambda model, options: np.zeros(1, np.int64)
     applies: Callable[[StateSpaceModel], str | None] = lambda model: None
+    refuses: Callable[[StateSpaceModel, Options], str | None] = lambda model, options: None
     runs: Callable[[Options, int], float] = lambda options, nx: 1.0
     modes: Callable[[Options, np.ndarray, int], list[Mode]] | None = None
     recoveries: Callable[[np.ndarray], int] | None = None
@@ -172,6 +173,18 @@ class Estimator:
         except (TypeError, ValueError):
             wanted = f"one of {', '.join(option.choices)}" if option.choices else "a number"
             raise EstimatorError(f"estimator {self.name}: {option.name} is {given!r}; it must be {wanted}") from None
+
+    def complete_for(self, model: StateSpaceModel, options: Mapping[str, float | str]) -> dict[str, float]:
+        """The given options and the defaults of the others, for a model.
+
+        Raises:
+            EstimatorError: As `complete` does, or if the model refuses them.
+        """
+        values = self.complete(options)
+        reason = self.refuses(model, values)
+        if reason:
+            raise EstimatorError(f"estimator {self.name}: {reason}")
+        return values
 
     def code(self) -> Code:
         """Compile the four functions, or load them from the cache; or, if interpreted, the functions themselves."""

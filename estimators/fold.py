@@ -231,7 +231,7 @@ class Fold:
         check_tuning(tuning, model)
         self._own_prior = None if prior is None else check_prior(prior, model, self.estimator)
         self.policy = policy or HealthPolicy()
-        self.options = self.estimator.complete(tuning.options)
+        self.options = self.estimator.complete_for(model, tuning.options)
         self.n = 0
         self._checked = -1
         self._check_log()

@@ -65,7 +65,7 @@ def checked(entry: Estimator, model: StateSpaceModel, options: Mapping[str, floa
     Raises:
         EstimatorError: If one is unknown, breaks its rule, or asks for what the model does not say.
     """
-    values = entry.complete(options)
+    values = entry.complete_for(model, options)
     try:
         check_placed(model, values.get("radius", 0.0))
     except EstimatorError as error:

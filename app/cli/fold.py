@@ -19,7 +19,7 @@ from estimators.errors import ConfigError, SourceError
 from estimators.fold import Fold
 from estimators.log import Log
 from estimators.tabular import table_of
-from estimators.track import FAILED, HEALTH_NAMES, Track
+from estimators.track import FAILED, HEALTH_NAMES, USED, Track
 from estimators.tuning import TOGETHER
 from sources.source import Endless
 
@@ -90,7 +90,7 @@ def fold_twin(arguments: Arguments) -> int:
     if arguments.out is not None:
         _write(arguments.out, twin, log, fold.track, pictures)
     if arguments.json:
-        print(json.dumps(_as_dict(twin, result, seconds, fold)))
+        print(json.dumps(_as_dict(twin, result, seconds, counts, fold)))
     else:
         _print(twin, result, seconds, counts, fold)
     return 0
@@ -101,7 +101,14 @@ def _decimals(number: float) -> str:
     return f"{number:.4f}" if abs(number) < 1e6 else f"{number:.4g}"
 
 
-def _as_dict(twin: Twin, result: Score, seconds: float, fold: Fold) -> dict[str, Any]:
+def _as_dict(twin: Twin, result: Score, seconds: float, counts: Counter[str], fold: Fold) -> dict[str, Any]:
+    """What a script needs of a fold.
+
+    `rmse` and `coverage` (the share of errors inside their 95 % band) are by state and `held_out` by sensor row, in
+    their units; `stale` counts the readings that came too late to be among the `readings`, `conditioned` those that a
+    condition of the source's map refused; `health` is the share of the track's rows in each state of health.
+    """
+
     def number(value: float) -> float | None:
         return float(value) if np.isfinite(value) else None
 
@@ -111,6 +118,11 @@ def _as_dict(twin: Twin, result: Score, seconds: float, fold: Fold) -> dict[str,
         "readings": result.readings,
         **({"field": {"rmse": result.field.rmse, "coverage": result.field.coverage}} if result.field else {}),
         "rmse": {name: number(fit.rmse) for name, fit in result.states.items()},
+        "coverage": {name: number(fit.coverage) for name, fit in result.states.items()},
+        "held_out": {
+            name: {"rmse": number(fit.rmse), "bias": number(fit.bias), "coverage": number(fit.coverage)}
+            for name, fit in result.held_out.items()
+        },
         "nis": {
             "mean": number(result.nis),
             "low": number(result.nis_low),
@@ -118,10 +130,19 @@ def _as_dict(twin: Twin, result: Score, seconds: float, fold: Fold) -> dict[str,
             "n": result.nis_readings,
         },
         "log_likelihood": number(result.log_likelihood),
+        "used": int(np.sum(fold.track.verdict == USED)),
+        "stale": counts["stale"],
+        "conditioned": sum(count for key, count in counts.items() if key.startswith("condition ")),
         "gated": result.gated,
         "missing": result.missing,
         "failed": int(np.sum(fold.track.verdict == FAILED)),
         "failure": _why(fold),
+        "health": {
+            name: float(share)
+            for name, share in zip(
+                HEALTH_NAMES, np.bincount(fold.track.health, minlength=len(HEALTH_NAMES)) / len(fold.track), strict=True
+            )
+        },
         "seconds_per_event": seconds,
     }
 

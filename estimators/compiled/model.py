@@ -16,6 +16,7 @@ import numba
 import numpy as np
 
 from ..errors import ModelError
+from ..helpers import with_helpers
 from ..model.check import probe, probe_angles, probe_likelihoods, uncompilable
 from ..model.claims import check_parts
 from ..model.state_space import LARGE, Field, StateSpaceModel
@@ -90,7 +91,7 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
         if function is None:
             return 0
         try:
-            dispatcher = jit(plain(function))
+            dispatcher = jit(with_helpers(plain(function)))
             kept.append(dispatcher)
             return address(dispatcher, signature)
         except numba.core.errors.NumbaError as error:
@@ -105,7 +106,7 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                dispatcher = jit(plain(function))
+                dispatcher = jit(with_helpers(plain(function)))
                 kept.append(dispatcher)
                 return address(dispatcher, signature)
         except Exception as error:  # noqa: BLE001  Numba raises many kinds; each means the same here

@@ -16,10 +16,14 @@ from .health import PROBABILITY, nis_bounds
 
 
 class Fit(NamedTuple):
-    """How well something was predicted: RMSE in its unit, and the share of errors inside their 95 % band."""
+    """How well something was predicted: RMSE and mean error in its unit, share of errors inside their 95 % band.
+
+    An error is the estimate less the truth, or a prediction less the reading.
+    """
 
     rmse: float
     coverage: float
+    bias: float = np.nan
 
 
 class Score(NamedTuple):
@@ -96,10 +100,11 @@ def _held_out(track: Track, events: Readings, model: StateSpaceModel) -> dict[st
             error, std = track.innovation[rows, k], track.innovation_std[rows, k]
             finite = np.isfinite(error)
             if finite.any():
-                fits[model.row_names[model.row_start[i] + k]] = _fit(error[finite], std[finite])
+                fits[model.row_names[model.row_start[i] + k]] = _fit(-error[finite], std[finite])
     return fits
 
 
 def _fit(error: np.ndarray, std: np.ndarray) -> Fit:
     half = normal_quantile(0.5 + PROBABILITY / 2.0)
-    return Fit(float(np.sqrt(np.mean(error**2))), float(np.mean(np.abs(error) <= half * std)))
+    inside = float(np.mean(np.abs(error) <= half * std))
+    return Fit(float(np.sqrt(np.mean(error**2))), inside, float(np.mean(error)))

@@ -20,6 +20,7 @@ from ..compiled.context import sensor_rows
 from ..estimator import Estimator
 from ..numerics.jit import jit
 from ..numerics.simd import add_scaled
+from ..rotation import ROTATION, rotate
 from ..track import USED
 from .blocks import sweep_all
 from .localisation import between_rows, localised, prepare
@@ -89,7 +90,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     N = X.shape[0]
     _, ny = sensor_rows(context, sensor)
     parts = workspace(N, ny, ny if localised(context) else min(ny, N), work)
-    ZT, Z, B, G, U, _, _, _, d, rows, expected, v, where, _, _, rest = parts
+    ZT, Z, B, G, U, _, W, T, d, rows, expected, v, where, _, _, rest = parts
     m = observe(context, sensor, u, y, X, ZT, d, rows, expected, innovation, innovation_std)
     verdict = judge(context, sensor, m, ZT, Z, d, rows, G, U, v, score)
     if verdict != USED:
@@ -99,6 +100,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     row_by_row(context, sensor, m, ZT, d, rows, B)
     find_rows(m, rows, where)
     sweep_all(context, sensor, X, where, ZT, B, True, given[INFLATION], int(given[CREWS]), rest)
+    rotate(context, index, X, T, W, rest)
     add_spread(context, index, X, rest)
     settle(context, X)
     return USED
@@ -119,7 +121,7 @@ ENSRF = Estimator(
     moments=moments,
     blocks=block,
     points=points,
-    options=(MEMBERS, INFLATE, ADD, RADIUS),
+    options=(MEMBERS, INFLATE, ADD, RADIUS, ROTATION),
     tune=tune,
     prepare=prepare,
 )

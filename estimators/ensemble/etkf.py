@@ -18,11 +18,11 @@ import numpy as np
 
 from ..compiled.context import options as numbers
 from ..compiled.context import sensor_rows
-from ..estimator import Estimator, Option
+from ..estimator import Estimator
 from ..numerics.jit import jit
-from ..numerics.random import key_of, normal
 from ..numerics.simd import add_scaled
 from ..numerics.symmetric import gram, symmetric_eigen
+from ..rotation import ROTATION, rotate_members
 from ..track import FAILED, USED
 from .blocks import transform_all
 from .shared import (
@@ -32,7 +32,6 @@ from .shared import (
     INFLATION,
     MEMBERS,
     OWN,
-    ROTATE,
     add_spread,
     block,
     describe,
@@ -121,56 +120,6 @@ def symmetric_transform(m, ZT, Z, d, G, V, values, small, v, B, T):
 
 
 @jit
-def rotate_members(seed, index, T, W):
-    """T ← Ω T with a random orthogonal Ω that leaves the mean: Ω 1 = Ωᵀ 1 = 1; W is scratch (N, N + 1).
-
-    Ω = H diag(1, Q) H, where the reflection H turns the first unit vector into 1/√N and Q is a random rotation of the
-    other N - 1 axes, from the orthogonalisation of normal numbers.
-
-    Source: Sakov & Oke (2008), doi:10.1175/2007MWR2021.1.
-    """
-    N = T.shape[0]
-    key = key_of(seed, index, ROTATE)
-    Q = np.zeros((N, N))
-    Q[0, 0] = 1.0
-    for i in range(1, N):
-        for j in range(1, N):
-            Q[i, j] = normal(key, np.uint64(i * N + j))
-        # Twice: the second time takes away what rounding left.
-        for _ in range(2):
-            for k in range(1, i):
-                dot = 0.0
-                for j in range(1, N):
-                    dot += Q[i, j] * Q[k, j]
-                add_scaled(N, -dot, Q[k].ctypes.data, Q[i].ctypes.data)
-        norm = 0.0
-        for j in range(1, N):
-            norm += Q[i, j] * Q[i, j]
-        for j in range(1, N):
-            Q[i, j] /= np.sqrt(norm)
-    h = np.full(N, 1.0 / np.sqrt(N))
-    h[0] -= 1.0
-    half = 1.0 - 1.0 / np.sqrt(N)
-    for _ in range(2):
-        for i in range(N):
-            dot = 0.0
-            for j in range(N):
-                dot += Q[i, j] * h[j]
-            add_scaled(N, -dot / half, h.ctypes.data, Q[i].ctypes.data)
-        for i in range(N):
-            for j in range(i):
-                Q[i, j], Q[j, i] = Q[j, i], Q[i, j]
-    for i in range(N):
-        for j in range(N):
-            W[i, j] = 0.0
-        for k in range(N):
-            add_scaled(N, Q[i, k], T[k].ctypes.data, W[i].ctypes.data)
-    for i in range(N):
-        for j in range(N):
-            T[i, j] = W[i, j]
-
-
-@jit
 def global_analysis(context, index, m, ZT, Z, d, G, V, values, small, v, B, T, W, X, rest):
     """Turn all states by one transform; False, and nothing is changed, if a number is not finite."""
     N = X.shape[0]
@@ -231,7 +180,7 @@ ETKF = Estimator(
         MEMBERS,
         INFLATE,
         ADD,
-        Option("rotation", 0, 0, 1, "", "1 turns the members at random after each reading; mean and spread stay"),
+        ROTATION,
     ),
     tune=tune,
 )

@@ -20,6 +20,7 @@ from ..numerics.inverse_root import root_action
 from ..numerics.jit import ints, jit, matrix
 from ..numerics.simd import WIDE, add_scaled, combine, dot
 from ..numerics.symmetric import gram
+from ..rotation import ROTATION, rotate
 from ..track import FAILED, USED
 from .blocks import block_at, load, store
 from .etkf import global_analysis
@@ -183,6 +184,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
             _columns_on_threads(context, sensor, X, where, ZT, d, U, given[INFLATION], crews, rest, each)
         else:
             columns(context, sensor, X, where, ZT, d, U, given[INFLATION], 0, 1, rest)
+        rotate(context, index, X, T, W, rest)
     elif not global_analysis(context, index, m, ZT, Z, d, G, V, values, small, v, B, T, W, X, rest):
         return FAILED
     add_spread(context, index, X, rest)
@@ -205,7 +207,7 @@ LETKF = Estimator(
     moments=moments,
     blocks=block,
     points=points,
-    options=(MEMBERS, INFLATE, ADD, RADIUS),
+    options=(MEMBERS, INFLATE, ADD, RADIUS, ROTATION),
     tune=tune,
     prepare=prepare,
 )

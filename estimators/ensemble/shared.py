@@ -56,8 +56,8 @@ THREADED_FROM = 65_536
 """Numbers in an ensemble from which threads gain more than they cost."""
 
 MEMBERS = Option("members", 50, 2, 10_000, "", "number of members")
-INFLATE = Option("inflation", 1.0, 1.0, 2.0, "", "factor on the anomalies after each reading that is used")
-ADD = Option("additive", 0.0, 0.0, 1.0, "", "noise added after each reading, in standard deviations of the prior")
+INFLATE = Option("inflation", 1.0, 1.0, 10.0, "", "factor on the anomalies after each reading that is used")
+ADD = Option("additive", 0.0, 0.0, 10.0, "", "noise added after each reading, in standard deviations of the prior")
 RADIUS = Option("radius", 0.0, 0.0, 1e9, "", "distance at which a reading's influence ends; 0: it has no end")
 
 

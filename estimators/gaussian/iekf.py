@@ -114,7 +114,7 @@ IEKF = Estimator(
     moments=moments,
     points=no_points,
     options=(
-        Option("iterations", 3, 1, 20, "", "linearisations of a reading; 1 is the EKF"),
+        Option("iterations", 3, 1, 100, "", "linearisations of a reading; 1 is the EKF"),
         JOSEPH_OPTION,
         *OPTIONS,
     ),

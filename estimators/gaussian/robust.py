@@ -25,13 +25,13 @@ OFF, ADAPT_R, ADAPT_Q = range(3)
 
 JOSEPH_OPTION = Option.choice("joseph", ("off", "on"), "update P by the Joseph form; off subtracts K S Kᵀ, faster", 1)
 
-INFLATION_OPTION = Option("inflation", 1.0, 1.0, 100.0, "1/s", "factor by which P grows in a second, beside Q; 1: none")
+INFLATION_OPTION = Option("inflation", 1.0, 1.0, 1e12, "1/s", "factor by which P grows in a second, beside Q; 1: none")
 
 OPTIONS = (
     INFLATION_OPTION,
     Option.choice("robust", ("none", "huber", "student-t"), "how the weight of a reading falls with its distance"),
     Option("huber", 1.345, 0.1, 10.0, "std", "distance from which Huber's weight falls"),
-    Option("dof", 4.0, 1.0, 100.0, "", "degrees of freedom of Student's t; fewer have heavier tails"),
+    Option("dof", 4.0, 1.0, 1e4, "", "degrees of freedom of Student's t; fewer have heavier tails"),
     Option.choice("adapt", ("off", "R", "Q"), "what follows the innovations: each sensor row's variance, or all of Q"),
     Option("memory", 200.0, 10.0, 1e5, "readings", "over how many readings an adaptation averages"),
     Option("bound", 10.0, 1.0, 1e4, "", "an adapted variance stays within this factor of the tuned one"),

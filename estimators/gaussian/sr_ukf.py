@@ -136,4 +136,5 @@ SR_UKF = Estimator(
     options=UKF.options,
     tune=tune,
     memory=memory,
+    refuses=UKF.refuses,
 )

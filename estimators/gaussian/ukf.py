@@ -53,6 +53,17 @@ def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     return np.array(shared_options(values) + weights(values["alpha"], values["beta"], values["kappa"], model.nx))
 
 
+def refuses(model: StateSpaceModel, values: Options) -> str | None:
+    """nx + kappa is what the spread is the root of; kappa = 3 - nx, of Julier & Uhlmann, leaves 3 of it."""
+    kappa = values["kappa"]
+    if model.nx + kappa > 0.0:
+        return None
+    return (
+        f"kappa is {kappa:g}, and {model.name} has {model.nx} states; nx + kappa must be positive: give more than "
+        f"{-model.nx}, as 3 - nx = {3 - model.nx}"
+    )
+
+
 def sigma_points(x: np.ndarray, P: np.ndarray, spread: float) -> np.ndarray:
     """The sigma points (2 nx + 1, nx) of a mean and covariance; none where the covariance has no factor."""
     try:
@@ -191,10 +202,11 @@ UKF = Estimator(
     options=(
         Option("alpha", 1.0, 1e-4, 2.0, "", "spread of the sigma points"),
         Option("beta", 2.0, 0.0, 10.0, "", "knowledge of the distribution; 2 is best for a Gaussian"),
-        Option("kappa", 0.0, -0.9, 10.0, "", "second spread; nx + kappa must stay positive"),
+        Option("kappa", 0.0, -1024.0, 1e4, "", "second spread; nx + kappa must be positive; 3 - nx fits a Gaussian"),
         *OPTIONS,
     ),
     needs_factor=True,
     tune=tune,
     memory=memory,
+    refuses=refuses,
 )

@@ -394,6 +394,7 @@ FILTERPY_UKF = _entry(
     points=ukf.points,
     needs_factor=True,
     options=tuple(option for option in ukf.UKF.options if option.name in ("alpha", "beta", "kappa")),
+    refuses=ukf.refuses,
 )
 FILTERPY_ENKF = _entry(
     "enkf",

@@ -52,9 +52,15 @@ def uncompilable(model: StateSpaceModel, what: str, function: Callable | None, e
     """What Numba says of a function, in one line: of its long message, what went wrong, and where."""
     where = re.findall(r'File "([^"]+)", line (\d+)', str(error))
     at = _shown(str(Path(where[-1][0]).resolve()), int(where[-1][1])) if where else place(function)
-    return ModelError(
-        f"{at}model {model.name}: {what} cannot be compiled: {_gist(error)}; keep to numbers, math and loops"
-    )
+    return ModelError(f"{at}model {model.name}: {what} cannot be compiled: {_gist(error)}; {_compilable(error)}")
+
+
+def _compilable(error: Exception) -> str:
+    """What to do about a function that Numba does not take."""
+    text = str(error)
+    if "of type Module" in text:
+        return "import the function that it calls by its name (from helpers import decay), so that it is compiled too"
+    return "keep to numbers, math and loops, in the functions that it calls too"
 
 
 def _gist(error: Exception) -> str:

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import ModelError
+from ..helpers import with_helpers
 from ..numerics.jit import jit, plain
 from .state_space import Noise, State, StateSpaceModel
 
@@ -96,7 +97,7 @@ def as_inner(function: Callable) -> Any:
     The cache tells closures apart by what they hold, and a compiled function by an identifier that is random in every
     process; one made from the source finds the code that another process compiled, and never code of another source.
     """
-    python = plain(function)
+    python = with_helpers(plain(function))
     inner = jit(python)
     file = inspect.getsourcefile(python)
     source = Path(file).read_bytes() if file and Path(file).is_file() else uuid.uuid4().bytes

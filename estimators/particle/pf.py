@@ -5,7 +5,8 @@ mean and covariance of h(x_i), so it means the same as a Gaussian filter's; the 
 log Σ w_i' p(y | x_i), whose exponential, multiplied up over the readings, is unbiased.
 
 Regularised: after resampling each particle moves by a draw from a Gaussian kernel, h times the cloud's covariance
-root, with the bandwidth h that is best for a Gaussian cloud, times the option `bandwidth`.
+root, with the bandwidth h that is best for a Gaussian cloud, times the option `bandwidth`. Or only those move that have
+a sibling, so that a particle that stayed alone is not disturbed.
 
 Sources: Gordon, Salmond & Smith (1993), doi:10.1049/ip-f-2.1993.0015; Musso, Oudjane & Le Gland (2001), Improving
 regularised particle filters, in Sequential Monte Carlo Methods in Practice, doi:10.1007/978-1-4757-3437-9_12.
@@ -27,6 +28,7 @@ from ..numerics.random import key_of
 from ..track import FAILED, MISSING, USED
 from ..tuning import Tuning
 from .shared import (
+    DUPLICATES,
     EQUAL,
     EXTRA,
     JITTER,
@@ -156,7 +158,11 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     return verdict
 
 
-BANDWIDTH = Option("bandwidth", 0.5, 0.01, 2.0, "", "kernel width as a part of the best for a Gaussian cloud")
+BANDWIDTH = Option("bandwidth", 0.5, 0.0, 100.0, "", "kernel width as a part of the best for a Gaussian cloud")
+
+JITTERED = Option.choice(
+    "jitter", ("all", "duplicates"), "particles that the kernel moves: all, or those with a sibling"
+)
 
 
 def tune_regularised(options: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
@@ -168,6 +174,7 @@ def tune_regularised(options: Options, model: StateSpaceModel, tuning: Tuning) -
     values = tune(options, model, tuning)
     power = 1.0 / (nx + 4)
     values[EXTRA] = options["bandwidth"] * (4.0 / (nx + 2)) ** power * values[MEMBERS] ** -power
+    values[DUPLICATES] = options["jitter"]
     return values
 
 
@@ -208,7 +215,7 @@ PF_REG = Estimator(
     points=points,
     modes=modes,
     recoveries=recoveries,
-    options=(*OPTIONS, BANDWIDTH),
+    options=(*OPTIONS, BANDWIDTH, JITTERED),
     blocks=block,
     tune=tune_regularised,
 )

@@ -39,8 +39,8 @@ BLOCK = 1024
 THREADED_FROM = 16_384
 """Members from which threads gain more than they cost."""
 
-MEMBERS, FRACTION, SCHEME, THREADS, BLOCK_CODE, EXTRA = range(6)
-"""Positions in the context's options; `EXTRA` is the kernel's width or a proposal."""
+MEMBERS, FRACTION, SCHEME, THREADS, BLOCK_CODE, EXTRA, DUPLICATES = range(7)
+"""Positions in the context's options; `EXTRA` is the kernel's width or a proposal, `DUPLICATES` whom a kernel moves."""
 
 PROCESS, START, RESAMPLE, JITTER, RECOVER, PROPOSE = range(6)
 """Streams of randomness; see numerics/random.py."""

@@ -43,6 +43,7 @@ from .shared import (
     BLOCK,
     BLOCK_CODE,
     CHUNK,
+    DUPLICATES,
     EQUAL,
     ESS,
     EXTRA,
@@ -92,7 +93,7 @@ def tune(options: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray
     n = members(options)
     threads = n >= THREADED_FROM and threaded()
     fraction, scheme = options.get("fraction", 1.0), round(options["resampling"])
-    return np.array([n, fraction, scheme, threads, block_code(), 0.0], float)
+    return np.array([n, fraction, scheme, threads, block_code(), 0.0, 0.0], float)
 
 
 def work_size(options: dict[str, float], nx: int, ny: int) -> int:
@@ -335,6 +336,21 @@ def weigh_block(context, state, joint, w, first, last, top, reference, D, sums):
 
 
 @jit
+def _spread_duplicates(context, root, key, first, last, ancestors, records):
+    """Move those of the members `first` to `last` that have a sibling, which stands beside them."""
+    n = ancestors.size
+    begin = first
+    for i in range(first, last + 1):
+        alone = i == last or not (
+            (i > 0 and ancestors[i - 1] == ancestors[i]) or (i + 1 < n and ancestors[i + 1] == ancestors[i])
+        )
+        if alone:
+            if i > begin:
+                spread_by(context, root, key, begin, records[begin:i])
+            begin = i + 1
+
+
+@jit
 def _block(phase, context, u, dt, sensor, y, key, value, state, work, b):
     nx, ny = context.nx, context.width
     n = int(numbers(context)[MEMBERS])
@@ -384,7 +400,10 @@ def _block(phase, context, u, dt, sensor, y, key, value, state, work, b):
         for i in range(first, last):
             log_w[i] = joint[i] - value
     elif phase == JITTER:
-        spread_by(context, L, key, first, records_of(state, nx, n)[first:last])
+        if numbers(context)[DUPLICATES] != 0.0:
+            _spread_duplicates(context, L, key, first, last, ints(work.ctypes.data, n), records_of(state, nx, n))
+        else:
+            spread_by(context, L, key, first, records_of(state, nx, n)[first:last])
 
 
 block_signature = types.void(i64, context_type, F1, f64, i64, F1, types.uint64, f64, F1, F1, i64)

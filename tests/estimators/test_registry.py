@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from estimators.errors import EstimatorError
-from estimators.fold import Fold
+from estimators.fold import Fold, fold
 from estimators.log import READING, Log, Readings
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS, checked, find_estimator, unfit
 from estimators.tuning import Tuning
 from tests.estimators.interpreted.test_filterpy import PENDULUM
+from tests.estimators.linear_models import random_linear, random_log
 
 WINDING = MODELS["motor_winding"]
 ANYBODYS = replace(WINDING, conditionally_linear=WINDING.state_names)
@@ -89,6 +90,46 @@ def test_a_radius_is_refused_where_the_model_says_no_positions():
     blind = replace(model.sensors[0], rows=tuple(replace(row, position=None) for row in model.sensors[0].rows))
     with pytest.raises(EstimatorError, match="does not say where its sensor rows are; give them positions"):
         checked(letkf, replace(model, sensors=(blind, *model.sensors[1:])), {"radius": 4.0})
+
+
+@pytest.mark.parametrize("name", ("ukf", "sr-ukf", "filterpy-ukf"))
+def test_kappa_is_judged_by_the_number_of_states(name):
+    """Julier & Uhlmann's kappa = 3 - n is below zero for more than three states: n + kappa alone must be above it."""
+    entry, model = ESTIMATORS[name], MODELS["lorenz96"]
+    assert checked(entry, model, {"kappa": 3.0 - model.nx})["kappa"] == -37.0
+    said = (
+        rf"{name}: kappa is -40, and lorenz96 has 40 states; .* must be positive: give more than -40, as 3 - nx = -37"
+    )
+    with pytest.raises(EstimatorError, match=said):
+        checked(entry, model, {"kappa": -40.0})
+    with pytest.raises(EstimatorError, match="kappa is -2, and motor_winding has 2 states"):
+        Fold(name, WINDING, Tuning.of(WINDING).with_options({"kappa": -2.0}), Log(WINDING.width))
+
+
+@pytest.mark.parametrize("name", ("ukf", "sr-ukf"))
+def test_a_negative_kappa_is_the_kalman_filter_on_a_linear_model(name):
+    """The central weight is negative then: 1 - n / 3."""
+    matrices = random_linear(np.random.default_rng(3), 5, 2)
+    log = random_log(np.random.default_rng(4), matrices, 12)
+    tuning = Tuning.of(matrices.model)
+    expected = fold("kf", matrices.model, tuning, log)
+    track = fold(name, matrices.model, tuning.with_options({"kappa": -2.0}), log)
+    np.testing.assert_allclose(track.mean, expected.mean, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(track.std, expected.std, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("ukf", {"kappa": -1.0}),  # 3 - n of four states: Julier, Uhlmann & Durrant-Whyte (2000)
+        ("ekf", {"inflation": 180.0}),  # per second: 1.053 a step of 0.01 s
+        ("pf-reg", {"bandwidth": 2.48}),  # DAPPER's scripts for Lorenz63
+        ("iekf", {"iterations": 50}),
+        ("letkf", {"inflation": 2.5}),
+    ],
+)
+def test_settings_as_published_are_within_the_limits(name, options):
+    assert options.items() <= ESTIMATORS[name].complete(options).items()
 
 
 def test_kf_refuses_a_nonlinear_model_and_names_what_to_use():

@@ -116,3 +116,52 @@ def test_what_of_the_model_made_a_reading_fail_is_told(tmp_path: Path, capsys: p
     assert re.search(rf"\nbecause +{re.escape(str(tmp_path))}/box.py:7: model box: {said}", printed)
     assert fold_twin(Fold(str(tmp_path / "box.yaml"), json=True)) == 0
     assert re.search(said, json.loads(capsys.readouterr().out)["failure"])
+
+
+def test_the_json_says_what_a_script_needs(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Beside figures that are found from the events and the estimates in the table of `--out`."""
+    rng = np.random.default_rng(2)
+    t = np.arange(400) + 0.0
+    true = 40.0 + 0.02 * t
+    read = true + 3.0 * rng.standard_normal(t.size)
+    read[50] = 200.0
+    good = rng.random(t.size) > 0.1
+    good[50] = True
+    lines = [f"{a},{b},{c},0.02,{d:d}" for a, b, c, d in zip(t, read, true, good, strict=True)]
+    # One reading long after its time, and a silence of a minute at the end.
+    lines += ["30.5,41.0,,,1", "460,49.0,49.2,0.02,1"]
+    (tmp_path / "drive.csv").write_text("\n".join(["t,y,temperature,rate,good", *lines]))
+    yaml = (
+        DRIVE.replace("{columns: y}", "{columns: y, where: {good: 1}}") + "gate: 0.9999\nsensors: {winding: {std: 3}}\n"
+    )
+    (tmp_path / "drive.yaml").write_text(yaml)
+    figures = {}
+    for used in (True, False):
+        (tmp_path / "drive.yaml").write_text(yaml.replace("{std: 3}", f"{{std: 3, use: {str(used).lower()}}}"))
+        out = tmp_path / "track.parquet"
+        assert fold_twin(Fold(str(tmp_path / "drive.yaml"), out=out, json=True)) == 0
+        figures[used] = json.loads(capsys.readouterr().out), pq.read_table(out).to_pandas()
+    told, table = figures[True]
+    truth = table[table.event == "truth"]
+    for state in ("temperature", "rate"):
+        error = truth[state] - truth[f"{state}_true"]
+        assert told["rmse"][state] == pytest.approx(np.sqrt(np.mean(error**2)))
+        assert told["coverage"][state] == np.mean(np.abs(error) <= 1.959963984540054 * truth[f"{state}_std"])
+    assert told["stale"] == 1 and told["readings"] == 401 and told["gated"] == 1
+    assert told["conditioned"] == told["missing"] == np.sum(~good) > 20
+    assert told["used"] == np.sum(good) == np.sum(table.verdict == "used")
+    assert set(told["health"]) == {"tracking", "degraded", "diverged", "stale"}
+    for name, share in told["health"].items():
+        assert share == np.mean(table.health == name)
+    assert told["health"]["tracking"] > 0.5 and sum(told["health"].values()) == pytest.approx(1.0)
+    assert told["held_out"] == {}
+    told, table = figures[False]
+    rows = table[(table.event == "reading") & np.isfinite(table.value_0)]
+    # What is held out is never used: the prediction is the temperature, as h says.
+    error = rows.temperature - rows.value_0
+    assert told["used"] == 0
+    fit = told["held_out"]["winding"]
+    assert fit["bias"] == pytest.approx(error.mean()) and abs(error.mean()) > 0.1
+    assert fit["rmse"] == pytest.approx(np.sqrt(np.mean(error**2)))
+    inside = np.abs(error) <= 1.959963984540054 * np.sqrt(rows.temperature_std**2 + 9.0)
+    assert fit["coverage"] == inside.mean()

@@ -62,7 +62,7 @@ def kalman(X, H, offset, R, y):
 @pytest.mark.parametrize("rotation", [0, 1])
 def test_square_root_filters_are_kalmans_update_of_the_sample_moments(name, members, sensor, rotation):
     """An identity, for one row and several, with fewer members than rows and with more; rounding alone is between."""
-    options = {"members": members} | ({"rotation": rotation} if name == "etkf" else {})
+    options = {"members": members, "rotation": rotation}
     y = np.array([1.3, -0.4, 2.2])[: ROWS[sensor]]
     before, after, fold = analysed(name, MATRICES.model, options, sensor, y)
     offset = MATRICES.D[sensor] @ MATRICES.u
@@ -81,11 +81,30 @@ def test_members_start_about_the_priors_mean_exactly(name):
     np.testing.assert_allclose(members_of(fold).mean(0), MATRICES.mean, rtol=0, atol=1e-14)
 
 
-def test_rotation_moves_the_members():
+@pytest.mark.parametrize("name", EXACT)
+def test_rotation_moves_the_members(name):
     y = np.array([0.5])
-    _, plain, _ = analysed("etkf", MATRICES.model, {"members": 6}, 0, y)
-    _, turned, _ = analysed("etkf", MATRICES.model, {"members": 6, "rotation": 1}, 0, y)
+    _, plain, _ = analysed(name, MATRICES.model, {"members": 6}, 0, y)
+    _, turned, _ = analysed(name, MATRICES.model, {"members": 6, "rotation": 1}, 0, y)
     assert np.max(np.abs(plain - turned)) > 0.1
+
+
+@pytest.mark.parametrize("name", ("letkf", "ensrf"))
+def test_rotation_turns_all_states_of_a_localised_ensemble_alike(name):
+    """Anomalies after it are Ω times those before it, with one orthogonal Ω of all states that keeps the mean."""
+    model = LORENZ96
+    y = model.prior_mean[: len(model.sensors[0].rows)] + 0.7
+    options = {"members": 12, "radius": 4.0}
+    _, plain, _ = analysed(name, model, options, 0, y)
+    _, turned, _ = analysed(name, model, options | {"rotation": 1}, 0, y)
+    np.testing.assert_allclose(turned.mean(0), plain.mean(0), rtol=0, atol=1e-11)
+    A, B = plain - plain.mean(0), turned - turned.mean(0)
+    np.testing.assert_allclose(B.T @ B, A.T @ A, rtol=0, atol=1e-9)
+    # Twelve members of forty states: their anomalies give Ω but for the ones, which it leaves.
+    Omega = B @ np.linalg.pinv(A) + np.full((12, 12), 1 / 12)
+    np.testing.assert_allclose(Omega @ Omega.T, np.eye(12), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(Omega.sum(axis=0), 1.0, rtol=0, atol=1e-8)
+    assert np.max(np.abs(Omega - np.eye(12))) > 0.1
 
 
 @pytest.mark.parametrize("members", [3, 5, 40])

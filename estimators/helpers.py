@@ -1,0 +1,87 @@
+"""A model's function with the plain Python functions that it calls compiled too.
+
+Numba compiles what it is given, and what that calls only if it has been compiled before. A function is therefore built
+again from the same code, with compiled functions in place of the plain ones that its globals and its closure hold.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import CellType, CodeType, FunctionType
+from typing import Any
+
+from .numerics.jit import jit
+
+LIBRARIES = ("numpy", "scipy", "numba", "math", "cmath")
+"""Packages whose functions Numba knows by itself, or not at all."""
+
+
+def with_helpers(function: Callable) -> Callable:
+    """The function itself if it calls no plain ones, else one that calls them compiled.
+
+    Numba keeps machine code under a function's file, line and name, and does not look into other files: so the sources
+    of what it calls are part of the new name.
+    """
+    return _with_helpers(function, {})
+
+
+def _with_helpers(function: Any, known: dict[Any, Any]) -> Any:
+    if not isinstance(function, FunctionType):
+        return function
+    used = {name: function.__globals__[name] for name in _names(function.__code__) if name in function.__globals__}
+    helpers = {name: item for name, item in used.items() if _plain(item) and item is not function}
+    cells = [cell.cell_contents for cell in function.__closure__ or ()]
+    inner = [item for item in cells if _plain(item) and item is not function]
+    if not helpers and not inner:
+        return function
+    world = dict(function.__globals__)
+    closure = tuple(CellType(item) for item in cells) if cells else None
+    made = FunctionType(function.__code__, world, function.__name__, function.__defaults__, closure)
+    made.__kwdefaults__, made.__module__ = function.__kwdefaults__, function.__module__
+    made.__qualname__ = f"{function.__qualname__}_{_digest([*helpers.values(), *inner])}"
+    for name, item in helpers.items():
+        world[name] = _compiled(item, known)
+    for cell, item in zip(closure or (), cells, strict=True):
+        if item in inner:
+            cell.cell_contents = _compiled(item, known)
+    return made
+
+
+def _compiled(helper: Any, known: dict[Any, Any]) -> Any:
+    if helper not in known:
+        # First itself as it is: one that is reached again through its own helpers must not be followed for ever.
+        known[helper] = helper
+        known[helper] = jit(_with_helpers(helper, known))
+    return known[helper]
+
+
+def _plain(item: Any) -> bool:
+    return isinstance(item, FunctionType) and str(item.__module__).split(".")[0] not in LIBRARIES
+
+
+def _names(code: CodeType) -> Iterator[str]:
+    """Names that the code, and what is defined in it, looks up."""
+    yield from code.co_names
+    for item in code.co_consts:
+        if isinstance(item, CodeType):
+            yield from _names(item)
+
+
+def _digest(helpers: list[Any]) -> str:
+    """Of the sources of helpers and of all that they call."""
+    digest = hashlib.sha256()
+    seen: list[Any] = []
+    while helpers:
+        helper = helpers.pop()
+        if helper in seen:
+            continue
+        seen.append(helper)
+        path = Path(helper.__code__.co_filename)
+        digest.update(helper.__qualname__.encode() + helper.__code__.co_code)
+        digest.update(path.read_bytes() if path.is_file() else repr(helper.__code__.co_consts).encode())
+        names = [helper.__globals__.get(name) for name in _names(helper.__code__)]
+        helpers += [item for item in names if _plain(item)]
+        helpers += [cell.cell_contents for cell in helper.__closure__ or () if _plain(cell.cell_contents)]
+    return digest.hexdigest()[:12]
