@@ -25,7 +25,7 @@ OFF, ADAPT_R, ADAPT_Q = range(3)
 
 JOSEPH_OPTION = Option.choice("joseph", ("off", "on"), "update P by the Joseph form; off subtracts K S Kᵀ, faster", 1)
 
-INFLATION_OPTION = Option("inflation", 1.0, 1.0, 1e12, "1/s", "factor by which P grows in a second, beside Q; 1: none")
+INFLATION_OPTION = Option("inflation", 1.0, 1.0, 1e9, "1/s", "factor by which P grows in a second, beside Q; 1: none")
 
 OPTIONS = (
     INFLATION_OPTION,
