@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,6 +10,8 @@ from typing import Any
 
 from estimators.errors import NisusError
 from estimators.fold import Fold
+
+from .stall import Stall
 
 CHUNK = 16384
 """Events between two looks at whether the twin is stopping."""
@@ -60,6 +63,9 @@ class Requests:
         self._open.clear()
 
 
+GIVEN_UP = "what ran before goes on. Mend the model, or choose another tuning"
+
+
 class Refolder:
     """One thread, one fold at a time; of the requests that come meanwhile only the latest counts."""
 
@@ -69,11 +75,15 @@ class Refolder:
         self._pending: tuple[int, Callable[[], Fold]] | None = None
         self._busy = False
         self._stopping = False
+        self._ticket = 0
+        # A long history may take minutes: only a function that does not answer ends a refold.
+        self._stall = Stall(self._give_up, then=GIVEN_UP, long=math.inf)
         self._thread = threading.Thread(target=self._run, name="refold", daemon=True)
 
     def start(self) -> None:
         """Wait for requests."""
         self._thread.start()
+        self._stall.start()
 
     def stop(self) -> None:
         """Give up what is under way."""
@@ -82,6 +92,16 @@ class Refolder:
             self._wake.notify()
         if self._thread.is_alive():
             self._thread.join(timeout=2.0)
+        self._stall.stop()
+
+    def _give_up(self, text: str, level: str) -> None:
+        """A function of the model never returns: leave the thread in it, and go on with another."""
+        if level != "error":
+            return
+        with self._wake:
+            self._thread = threading.Thread(target=self._run, name="refold", daemon=True)
+            self._thread.start()
+        self._done(Refolded(self._ticket, None, text))
 
     def request(self, ticket: int, make: Callable[[], Fold]) -> None:
         """Fold what `make` prepares (in this thread: it may have to compile), as soon as the present one is done."""
@@ -105,15 +125,20 @@ class Refolder:
                     return
                 assert self._pending is not None
                 ticket, make = self._pending
-                self._pending = None
+                self._pending, self._ticket = None, ticket
                 self._busy = True
-            self._done(self._fold(ticket, make))
+            answer = self._fold(ticket, make)
+            with self._wake:
+                if threading.current_thread() is not self._thread:
+                    return
+            self._done(answer)
 
     def _fold(self, ticket: int, make: Callable[[], Any]) -> Refolded:
         try:
             fold = make()
-            while fold.advance(CHUNK) and not self._stopping:
-                pass
+            with self._stall.watched(fold):
+                while fold.advance(CHUNK) and not self._stopping:
+                    pass
         except NisusError as error:
             return Refolded(ticket, None, str(error))
         except Exception as error:  # noqa: BLE001  a user's model may raise anything; the running fold goes on

@@ -28,17 +28,31 @@ ANSWER = 1.0
 """Seconds for one of them to answer."""
 
 
+LOST = "nothing more is estimated. Ctrl-C ends the program; mend the model"
+
+
 class Stall:
     """Watches the work of one thread from another."""
 
-    def __init__(self, say: Callable[[str, str], Any], clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        say: Callable[[str, str], Any],
+        *,
+        then: str = LOST,
+        long: float = LONG,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         """Begin to watch.
 
         Args:
             say: Called with a line and how bad it is ("error", "info").
+            then: What becomes of it, at the end of the line.
+            long: Seconds after which a fold is said not to return although each function answers.
             clock: Seconds that only rise.
         """
         self._say = say
+        self._then = then
+        self._long = long
         self._clock = clock
         self._work: tuple[float, Fold] | None = None
         self._asked: tuple[float, Fold] | None = None
@@ -81,15 +95,12 @@ class Stall:
         if self._asked is None:
             self._asked = work
             guilty = _in_python(work[1]) or unanswered(work[1].questions())
-        elif gone >= LONG:
+        elif gone >= self._long:
             guilty = "a fold"
         else:
             return
         if guilty is not None and self._work is work:
-            self.text = (
-                f"{guilty} has not returned for {gone:.0f} s; nothing more is estimated. Ctrl-C ends the program; mend "
-                "the model"
-            )
+            self.text = f"{guilty} has not returned for {gone:.0f} s; {self._then}"
             self._say(self.text, "error")
 
 
@@ -127,8 +138,8 @@ def _in_python(fold: Fold) -> str | None:
     return CallWatch(fold.model).where() if fold.model.black_box else None
 
 
-def unanswered(questions: Iterable[tuple[str, Callable[[], Any]]], patience: float = ANSWER) -> str | None:
-    """The first question that is not answered within `patience` seconds; None if all are.
+def unanswered(questions: Iterable[tuple[str, Callable[[], Any]]], patience: float | None = None) -> str | None:
+    """The first question that is not answered within `patience` seconds (default: `ANSWER`); None if all are.
 
     They are asked in a thread of its own, which is lost with the one that is not.
     """
@@ -145,7 +156,7 @@ def unanswered(questions: Iterable[tuple[str, Callable[[], Any]]], patience: flo
 
     threading.Thread(target=ask, name="asking", daemon=True).start()
     known = -1
-    while not over.wait(patience):
+    while not over.wait(ANSWER if patience is None else patience):
         if asking and len(asking) == known:
             return asking[-1]
         known = len(asking)

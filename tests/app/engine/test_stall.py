@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import app.engine.stall
+from app.engine.refolder import Refolder
 from app.engine.stall import LONG, PATIENCE, Stall, unanswered
 from app.recording.reader import finished, read_recording
 from tests.app.scripted import wait_for
@@ -156,3 +158,30 @@ def test_questions_are_asked_until_one_is_not_answered():
     assert unanswered([*questions, ("loop", leave.wait), ("after", lambda: asked.append("after"))], 0.2) == "loop"
     leave.set()
     assert np.all(np.array(asked[:10]) == [*range(5)] * 2)
+
+
+def test_a_refold_that_never_returns_is_given_up_and_the_next_one_made(monkeypatch):
+    monkeypatch.setattr(app.engine.stall, "PATIENCE", 0.0)
+    monkeypatch.setattr(app.engine.stall, "ANSWER", 0.1)
+    leave, answers = threading.Event(), []
+    stuck = Work(("f at x", leave.wait))
+    stuck.advance = lambda limit: leave.wait()
+    good = Work()
+    good.advance = lambda limit: 0
+    refolder = Refolder(answers.append)
+    refolder.start()
+    try:
+        refolder.request(1, lambda: stuck)
+        wait_for(lambda: answers)
+        assert (answers[0].ticket, answers[0].fold) == (1, None)
+        assert answers[0].error.startswith("f at x has not returned for ") and "what ran before" in answers[0].error
+        refolder.request(2, lambda: good)
+        wait_for(lambda: len(answers) == 2)
+        assert (answers[1].ticket, answers[1].fold, answers[1].error) == (2, good, "")
+        leave.set()
+        refolder.request(3, lambda: good)
+        wait_for(lambda: len(answers) == 3)
+        assert [answer.ticket for answer in answers] == [1, 2, 3]
+    finally:
+        leave.set()
+        refolder.stop()
