@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -59,6 +60,7 @@ class Recorder:
         self._split = split
         self._wake = threading.Event()
         self._wanted: Path | None = None
+        self._asked: deque[Path | None] = deque()
         self._stopping = False
         self._open: _Part | None = None
         self.finished: list[Path] = []
@@ -77,19 +79,21 @@ class Recorder:
     def record(self, path: Path | None) -> None:
         """Record into a new file from now on (the history included), or finish the one that is open."""
         self._wanted = path
+        self._asked.append(path)
         self._wake.set()
 
     def stop(self) -> None:
         """Finish the file and end."""
-        self._wanted = None
         self._stopping = True
-        self._wake.set()
+        self.record(None)
         if self._thread.is_alive():
             self._thread.join(timeout=10.0)
 
     def _run(self) -> None:
+        wanted: Path | None = None
         while True:
-            wanted = self._wanted
+            # One after the other: a recording that is stopped at once is one too.
+            wanted = self._asked.popleft() if self._asked else wanted
             try:
                 if self._open is not None and wanted != self._open.asked:
                     self._finish(self._open)
@@ -99,9 +103,13 @@ class Recorder:
                 if self._open is not None:
                     self._go_on(self._open)
             except NisusError as error:
+                wanted = None
                 self._fail(str(error))
             except Exception as error:  # noqa: BLE001  a full disk or a driver's fault must not stop the twin
+                wanted = None
                 self._fail(self._reason(error))
+            if self._asked:
+                continue
             if self._stopping and self._open is None:
                 return
             self._wake.wait(PERIOD if self._open is not None else None)
@@ -138,7 +146,8 @@ class Recorder:
     def _fail(self, text: str) -> None:
         self.failure = f"recording failed: {text}"
         self._engine.notices.report("recording failed", self.failure, level="error")
-        self._wanted = None
+        if not self._asked:
+            self._wanted = None
         if self._open is not None:
             self._open.abandon()
             self._open = None
