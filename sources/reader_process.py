@@ -80,8 +80,8 @@ class _Worker:
 
     def ask(self, function: Callable[..., Iterator[Any]], args: tuple[Any, ...]) -> None:
         """Have it run `function(*args)`, which must be importable by name."""
-        # The path first and by itself: the function may be from a folder that was added to it since.
-        self._write(list(sys.path), (function, args))
+        # Where this process is now comes first and by itself: a function may be from a folder that was added since.
+        self._write((list(sys.path), os.getcwd()), (function, args))
 
     def answer(self, timeout: float) -> tuple[int, Any] | None:
         """The next answer; None if none comes in time.
@@ -268,7 +268,8 @@ def serve(lifeline: int) -> None:
     requests = sys.stdin.buffer
     with suppress(EOFError, BrokenPipeError, KeyboardInterrupt):
         while True:
-            sys.path[:] = pickle.load(requests)
+            sys.path[:], folder = pickle.load(requests)
+            os.chdir(folder)
             function, args = pickle.load(requests)
             try:
                 for item in function(*args):

@@ -8,6 +8,10 @@ def counting(n):
     yield from range(n)
 
 
+def folder():
+    yield os.getcwd()
+
+
 def pid_then(function):
     """The process's id, then whatever `function` does."""
     yield os.getpid()

@@ -13,7 +13,7 @@ import pytest
 from estimators.errors import SourceError
 from sources import reader_process as module
 from sources.reader_process import Apart, ReaderError, ask
-from tests.sources.readers_that_fail import abort, counting, fail, hang, leave, pid_then, shout
+from tests.sources.readers_that_fail import abort, counting, fail, folder, hang, leave, pid_then, shout
 
 
 def item_of(apart):
@@ -105,6 +105,12 @@ def test_a_reader_is_used_again_and_one_that_is_left_is_not_waited_for():
     assert ask(counting, 3) == [0, 1, 2]
 
 
+def test_a_reader_that_is_used_again_follows_its_parent_to_another_folder(tmp_path, monkeypatch):
+    ask(folder)
+    monkeypatch.chdir(tmp_path)
+    assert ask(folder) == [str(tmp_path)]
+
+
 def test_a_reader_that_is_left_with_its_source_is_ended():
     """Whatever order a collection of circular garbage takes: no descriptor is closed twice."""
 
@@ -167,8 +173,8 @@ while True:
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere a reader ends at its next item")
 def test_a_reader_that_hangs_ends_with_its_parent():
     """Though no thread of it can run, and the parent was killed and could do nothing."""
-    folder = os.path.dirname(__file__)
-    paths = [folder, os.path.dirname(os.path.dirname(folder))]
+    here = os.path.dirname(__file__)
+    paths = [here, os.path.dirname(os.path.dirname(here))]
     with subprocess.Popen([sys.executable, "-c", PARENT.format(paths=paths)], stdout=subprocess.PIPE) as parent:
         pid = int(parent.stdout.readline())
         assert os.path.exists(f"/proc/{pid}")
