@@ -8,6 +8,7 @@ import pytest
 
 from app.cli import bus
 from app.cli.main import Bus, main
+from app.twin.sources.asset import make_asset
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from estimators.log import INPUT, READING, TRUTH, Readings, truth_of
@@ -51,7 +52,7 @@ def test_what_is_recorded_is_what_the_asset_said(suffix: str, tmp_path: Path, mo
     got = events(log=file)
     twin = load_twin("motor_can", overrides={"source.asset.duration": "12"})
     section: Any = twin.config.source
-    simulator = twin.plan.simulator(section.asset, ("source", "asset"))
+    simulator = make_asset(twin.loaded, twin.model, section.asset, ("source", "asset"))
     batches = []
     while (batch := simulator.read(0.0)) is not None:
         batches.append(batch)
