@@ -1,9 +1,15 @@
-# Two commands: `make run` and `make test`. Both set up what they need.
+# `make run`, `make test`, `make fast`; all set up what they need.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: run test fast bench clean
+# A file's tests stay on one worker, which keeps what they share (servers, recordings, folded logs).
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+
+# Tests of what is written in vector instructions, which LLVM splits where a processor's vectors are shorter.
+VECTORS := simd_rows simd_exp linalg inverse_root symmetric
+
+.PHONY: run test fast generic versions bench clean
 
 run: $(VENV)/.installed
 	$(BIN)/nisus run motor_can
@@ -12,10 +18,20 @@ test: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest
+	$(BIN)/python -m tests.warm
+	$(PYTEST)
 
+# The quickest tests, so many that they take 100 s of a processor by the runs before; all, if there was none.
 fast: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -m "not browser" -x -q
+	$(PYTEST) -m "not browser" --quickest 100 -x -q
+
+# On a processor without AVX or FMA; Numba's cache keeps its machine code apart.
+generic: $(VENV)/.installed-dev
+	NUMBA_CPU_NAME=generic $(PYTEST) -q $(foreach name,$(VECTORS),$(or $(shell find tests -name test_$(name).py),tests/test_$(name).py))
+
+# The lowest versions that pyproject.toml allows on the oldest Python here, and the newest on the newest.
+versions: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.versions
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.benchmarks

@@ -1,4 +1,7 @@
-"""What tests share: recordings and browser, which a machine may lack, but not the one that judges (CI=true)."""
+"""What tests share: recordings and browser, which a machine may lack, but not the one that judges (CI=true).
+
+How long each test takes is kept between runs, for `--quickest`.
+"""
 
 import os
 import shutil
@@ -9,6 +12,56 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+
+DURATIONS = "nisus/durations"
+"""In pytest's cache: seconds of each test, the least of all runs, so that neither compiling nor other work counts."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    text = "run only the quickest tests, as many as take so many seconds together by earlier runs, and all new ones"
+    parser.addoption("--quickest", type=float, metavar="SECONDS", help=text)
+
+
+def within(budget: float, names: list[str], took: dict[str, float]) -> set[str]:
+    """The quickest of the tests that take `budget` seconds together at most; those of unknown duration are in."""
+    chosen = {name for name in names if name not in took}
+    for name in sorted(set(names) - chosen, key=lambda name: (took[name], name)):
+        budget -= took[name]
+        if budget < 0.0:
+            break
+        chosen.add(name)
+    return chosen
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    budget, cache = config.getoption("--quickest"), getattr(config, "cache", None)
+    if budget is None or cache is None:
+        return
+    chosen = within(budget, [item.nodeid for item in items], cache.get(DURATIONS, {}))
+    config.hook.pytest_deselected(items=[item for item in items if item.nodeid not in chosen])
+    items[:] = [item for item in items if item.nodeid in chosen]
+
+
+class Durations:
+    """Adds up what setup, call and teardown of each test take, and keeps the least of all runs."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self.config, self.took = config, dict[str, float]()
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self.took[report.nodeid] = self.took.get(report.nodeid, 0.0) + report.duration
+
+    def pytest_sessionfinish(self) -> None:
+        cache = self.config.cache
+        before = cache.get(DURATIONS, {})
+        least = {name: round(min(took, before.get(name, took)), 3) for name, took in self.took.items()}
+        cache.set(DURATIONS, before | least)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # Workers of xdist send their reports to the process that started them, which alone keeps them.
+    if getattr(config, "cache", None) is not None and not hasattr(config, "workerinput"):
+        config.pluginmanager.register(Durations(config), "durations")
 
 
 def absent(reason: str) -> None:

@@ -1,0 +1,112 @@
+"""`make versions`: the cheap tests with the lowest versions that pyproject.toml allows, and with the newest.
+
+The lowest are tried on the oldest interpreter of this machine, the newest on its newest, each in a venv that is thrown
+away. What depends on other packages is tried: sources, schema, page, views, command line, what Numba offers to compile
+with, pickling, and one filter. The arithmetic of the other filters is the same machine code from the same Numba.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+
+MINORS = range(11, 15)
+"""Of Python 3, that are looked for."""
+
+SECONDS = 900
+"""That one of the two may take at most."""
+
+FOLDERS = ("config", "sources")
+MODULES = (
+    "test_imports", "test_readme", "test_jit", "test_log", "test_simd_rows", "test_server", "test_page_door",
+    "test_simd_exp", "test_rerun_view", "test_viser_view", "test_viser_numbers", "test_new", "test_port",
+    "test_progress", "test_conftest",
+    "test_black_box::test_a_function_that_processes_cannot_import",
+)  # fmt: skip
+"""Files by name, wherever they lie under tests/; the last with one test of it."""
+
+
+def chosen() -> list[str]:
+    """The arguments for pytest; ends with a message if a module is not there (renamed, say)."""
+    found = [str(ROOT / "tests" / folder) for folder in FOLDERS]
+    for module in MODULES:
+        name, colons, test = module.partition("::")
+        paths = list((ROOT / "tests").rglob(f"{name}.py"))
+        if len(paths) != 1:
+            sys.exit(f"tests/versions.py: there are {len(paths)} files {name}.py under tests/, not one; mend MODULES")
+        found.append(f"{paths[0]}{colons}{test}")
+    return found
+
+
+def interpreters() -> dict[tuple[int, int], str]:
+    """Those of this machine that run, by version: on the path, or under pyenv."""
+    pyenv = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
+    candidates = [sys.executable]
+    for minor in MINORS:
+        candidates += [found for found in [shutil.which(f"python3.{minor}")] if found]
+        candidates += map(str, sorted(pyenv.glob(f"3.{minor}.*/bin/python")))
+    found: dict[tuple[int, int], str] = {}
+    for path in candidates:
+        ask = [path, "-c", "import sys, venv; print(*sys.version_info[:2])"]
+        said = subprocess.run(ask, capture_output=True, text=True).stdout.split()
+        if len(said) == 2 and int(said[1]) in MINORS:
+            found.setdefault((int(said[0]), int(said[1])), path)
+    return found
+
+
+def attempt(python: str, resolution: str, tests: list[str]) -> int:
+    """Install with uv, run the tests; the exit status of the first that fails."""
+    with tempfile.TemporaryDirectory(prefix="nisus-versions-") as folder:
+        venv = Path(folder) / "venv"
+        inside = str(venv / "bin" / "python")
+        uv = [sys.executable, "-m", "uv", "--quiet", "--no-python-downloads"]
+        run = [
+            inside,
+            "-m",
+            "pytest",
+            "-q",
+            "-n",
+            "2",
+            "--dist",
+            "loadfile",
+            "-m",
+            "not browser",
+            "-p",
+            "no:cacheprovider",
+        ]
+        steps = (
+            [*uv, "venv", "--python", python, str(venv)],
+            [*uv, "pip", "install", "--python", inside, "--resolution", resolution, "-e", f"{ROOT}[dev]"],
+            [*run, *tests],
+        )
+        for step in steps:
+            try:
+                status = subprocess.run(step, cwd=ROOT, timeout=SECONDS).returncode
+            except subprocess.TimeoutExpired:
+                print(f"not done after {SECONDS} s: {' '.join(step[:4])} ...", file=sys.stderr)
+                return 1
+            if status:
+                return status
+    return 0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("which", nargs="*", default=["lowest", "newest"], help="lowest, newest, or both")
+    tests, found, failed = chosen(), interpreters(), 0
+    for which in parser.parse_args().which:
+        version, python = (min if which == "lowest" else max)(found.items())
+        print(f"{which} versions on Python {version[0]}.{version[1]}", flush=True)
+        if attempt(python, "lowest-direct" if which == "lowest" else "highest", tests):
+            print(f"failed: {which} versions on Python {version[0]}.{version[1]}", file=sys.stderr)
+            failed = 1
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main())
