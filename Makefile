@@ -1,4 +1,4 @@
-# `make run`, `make test`, `make fast`; all set up what they need.
+# Two commands: `make run` and `make test`. Both set up what they need, as do the others.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin

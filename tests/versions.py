@@ -34,6 +34,9 @@ MODULES = (
 def chosen() -> list[str]:
     """The arguments for pytest; ends with a message if a module is not there (renamed, say)."""
     found = [str(ROOT / "tests" / folder) for folder in FOLDERS]
+    for folder in found:
+        if not Path(folder).is_dir():
+            sys.exit(f"tests/versions.py: there is no folder {folder}; mend FOLDERS")
     for module in MODULES:
         name, colons, test = module.partition("::")
         paths = list((ROOT / "tests").rglob(f"{name}.py"))
