@@ -136,7 +136,7 @@ function note(text) {
 // The right pane
 
 try {
-  const viewer = await Viewer.open($("rerun"), settings.viewer, theme);
+  const viewer = await Viewer.open($("rerun"), $("before"), settings.viewer, theme);
   window.nisus = { viewer, revision: null, drawn: 0, status: null };
   new Stream({
     viewer,

@@ -25,10 +25,11 @@ async function fetched(url) {
 }
 
 export class Viewer {
-  static async open(canvas, base, theme) {
+  // cover: a canvas over the viewer's, hidden; see `hold`.
+  static async open(canvas, cover, base, theme) {
     const wasm = await fetched(`${base}/re_viewer_bg.wasm`);
     await loadScript(`${base}/re_viewer.js`);
-    const viewer = new Viewer();
+    const viewer = new Viewer(canvas, cover);
     await wasm_bindgen({ module_or_path: wasm });
     viewer.handle = new wasm_bindgen.WebHandle({
       url: [],
@@ -46,7 +47,9 @@ export class Viewer {
     return viewer;
   }
 
-  constructor() {
+  constructor(canvas, cover) {
+    this.canvas = canvas;
+    this.cover = cover;
     this.id = null;
     this.frames = 0n;
     this.announced = false;
@@ -62,7 +65,8 @@ export class Viewer {
   }
 
   // Another recording follows: note where the user is, to come back to it.
-  announce(id) {
+  async announce(id) {
+    if (this.id !== null) await this.hold();
     const { active, recordings } = this.state();
     const shown = recordings.find((recording) => recording.id === active);
     // Once only: a revision that is overtaken by the next has no place of its own yet.
@@ -70,6 +74,16 @@ export class Viewer {
     this.id = id;
     this.frames = 0n;
     this.announced = true;
+  }
+
+  // The viewer shows another recording before it has its rows and colours: until then, what was shown last covers it,
+  // or, where the browser no longer has that, a blank page.
+  async hold() {
+    await frame();
+    this.cover.width = this.canvas.width;
+    this.cover.height = this.canvas.height;
+    this.cover.getContext("2d").drawImage(this.canvas, 0, 0);
+    this.cover.hidden = false;
   }
 
   // Hand bytes over and wait until the viewer has drawn them. Resolves to the milliseconds that took.
@@ -92,6 +106,7 @@ export class Viewer {
       }
     }
     await frame();
+    this.cover.hidden = true;
     return performance.now() - begun;
   }
 

@@ -79,6 +79,10 @@ class RerunFeed:
             return self._read()
         pull = self._engine.pull(self._cursor, ROWS)
         self._notices.extend(pull.notices)
+        if pull.fresh and self._rows is not None and not len(pull.readings):
+            # The source has just begun again: the charts stay as they are until there is something to show.
+            self._cursor.revision = -1
+            return []
         if pull.fresh:
             return self._begin(self._whole(pull))
         if self._rows is None or not (len(pull.readings) or pull.notices or pull.pictures):

@@ -401,6 +401,20 @@ def test_after_seeking_back_nothing_lies_beyond_the_rows(fed):
     assert list(zip(times.tolist(), texts.ravel().tolist(), strict=True)) == [(5 * 10**9, "said at 5 s")]
 
 
+def test_a_revision_without_rows_does_not_empty_the_pane(fed):
+    fed.put(readings([1.0, 2.0], [40.0, 41.0]))
+    fed.next()
+    seek_back(fed, Readings.empty(fed.engine.model.width))
+    assert fed.next() == [] and fed.next() == []
+    fed.engine.notices.say("still said")
+    assert fed.next() == []
+    fed.put(readings([1.0], [40.0]))
+    fed.next()
+    assert [said["revision"] for said in fed.said] == [0, 1]
+    assert fed.column("/state/temperature")[0].tolist() == [10**9]
+    assert fed.column("/events", "TextLog:text")[1].ravel().tolist() == ["still said"]
+
+
 def test_a_line_that_comes_before_its_row_waits_for_it(fed):
     fed.put(readings([1.0, 2.0], [40.0, 41.0]))
     fed.engine.notices.say("ahead", t=3 * 10**9)

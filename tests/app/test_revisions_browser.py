@@ -1,0 +1,45 @@
+"""Between two revisions a real browser shows the picture before, not a viewer that has neither rows nor colours yet."""
+
+import numpy as np
+import pytest
+
+from app.engine import commands
+from app.engine.engine import Engine
+from app.server.server import PageServer
+from tests.app.page.test_page import PATIENCE, browser, until  # noqa: F401  the fixture
+from tests.app.scripted import Scripted, readings, wait_for
+from tests.app.served import SECRET, shown_twin
+
+pytestmark = pytest.mark.browser
+
+NOTE = """() => {
+    window.covered = [];
+    const cover = document.getElementById("before");
+    const note = () => window.covered.push([!cover.hidden, window.nisus.viewer.announced, cover.width]);
+    new MutationObserver(note).observe(cover, { attributes: true, attributeFilter: ["hidden"] });
+}"""
+
+
+def test_the_picture_before_covers_the_viewer_until_it_has_drawn_the_next(browser):  # noqa: F811
+    source = Scripted()
+    engine = Engine(shown_twin(), lambda report: source)
+    server = PageServer(engine, port=0, viser_port=None, secret=SECRET)
+    engine.start()
+    server.start()
+    page = browser.new_context(viewport={"width": 800, "height": 600}).new_page()
+    try:
+        t = np.arange(1.0, 101.0)
+        source.put(readings(t, 40 + np.sin(t)))
+        page.goto(server.url, timeout=PATIENCE * 1000)
+        until(page, "window.nisus?.drawn > 0")
+        page.evaluate(NOTE)
+        engine.submit(commands.SetTuning("Q.temperature", 0.5))
+        wait_for(lambda: engine.status().revision == 1, PATIENCE)
+        until(page, "window.nisus.revision === 1 && !window.nisus.viewer.announced && window.covered.length > 1")
+        covered = page.evaluate("window.covered")
+        assert [shown for shown, *_ in covered] == [True, False]
+        assert not covered[-1][1] and covered[0][2] > 0
+    finally:
+        page.context.close()
+        engine.stop()
+        server.stop()
