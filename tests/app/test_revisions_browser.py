@@ -1,4 +1,4 @@
-"""Between two revisions a real browser shows the picture before, not a viewer that has neither rows nor colours yet."""
+"""Between two revisions a real browser covers the viewer, which has neither rows nor colours of the next one yet."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ NOTE = """() => {
 }"""
 
 
-def test_the_picture_before_covers_the_viewer_until_it_has_drawn_the_next(browser):  # noqa: F811
+def test_the_viewer_is_covered_until_it_has_drawn_the_next(browser):  # noqa: F811
     source = Scripted()
     engine = Engine(shown_twin(), lambda report: source)
     server = PageServer(engine, port=0, viser_port=None, secret=SECRET)
