@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from estimators.errors import SourceError
 
-from .cli.stderr import complain
 from .engine.commands import Record
 from .engine.engine import Engine
 from .recording.split import NEVER, Split
@@ -22,6 +21,7 @@ from .recording.writer import FINE, Recorder
 from .rerun.rows import RerunRows
 from .server.open_browser import Opening
 from .signals import restore, when_asked_to_end
+from .stderr import complain
 
 if TYPE_CHECKING:
     from estimators.fold import Base

@@ -37,6 +37,11 @@ MOST = 60
 """Characters of a text from a file that a message shows."""
 
 
+def printable(text: str) -> str:
+    """The text with control characters escaped: bytes of a file must not reach a terminal or a page."""
+    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
+
+
 def quoted(text: str) -> str:
     """A text from a file as a message shows it: shortened, in quotes, with unprintable characters escaped."""
     return repr(text if len(text) <= MOST else text[: MOST - 3] + "...")

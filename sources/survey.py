@@ -14,8 +14,9 @@ from estimators.log import READING
 
 from .can.databases import load_database, same_bus
 from .can.decoder import Decoder
-from .can.frames import EXTENDED, FORMATS, BusName, Found, Raw, read_frames, suffix_of
+from .can.frames import EXTENDED, FORMATS, BusName, Found, Raw, suffix_of
 from .can.log import CanLog, check_log
+from .can.readers import read_frames
 from .reader_process import Apart, patience_for
 from .source import Channel
 from .tables.files import UNREADABLE

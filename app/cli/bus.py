@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 from estimators.errors import ConfigError
 
 from ..signals import restore, when_asked_to_end
+from ..stderr import complain
 from ..twin.twin import Twin, load_twin
-from .main import settings
-from .stderr import complain
+from .arguments import settings
 
 if TYPE_CHECKING:
-    from .main import Bus
+    from .arguments import Bus
 
 GROUP = "239.74.163.2"
 """python-can's own multicast address."""

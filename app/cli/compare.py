@@ -20,18 +20,18 @@ from estimators.errors import ConfigError, SourceError
 from estimators.log import Readings
 from estimators.registry import ESTIMATORS, find_estimator, unfit
 
+from ..stderr import complain
 from ..twin.twin import Twin, load_twin
+from .arguments import settings
 from .compare_fold import BUDGET, Row, fold_row
 from .compare_table import cells, printed
 from .fold import read_log
-from .main import settings
 from .prepare import prepare
 from .progress import progress
 from .scores import write_scores
-from .stderr import complain
 
 if TYPE_CHECKING:
-    from .main import Compare as Arguments
+    from .arguments import Compare as Arguments
 
 ALL = "all"
 """In place of a twin's name: each that ships."""

@@ -16,7 +16,7 @@ from .fold import read_log
 from .prepare import attend
 
 if TYPE_CHECKING:
-    from .main import Filters as Arguments
+    from .arguments import Filters as Arguments
 
 WIDTH = 150
 """Columns of the output where it is no terminal."""

@@ -25,12 +25,12 @@ from sources.source import Endless
 
 from ..engine.stall import interruptible
 from ..twin.twin import Twin, load_twin
-from .main import settings
+from .arguments import settings
 from .prepare import prepare
 from .remarks import remarking
 
 if TYPE_CHECKING:
-    from .main import Fold as Arguments
+    from .arguments import Fold as Arguments
 
 
 def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:

@@ -19,10 +19,10 @@ from sources.can.unseen import shown_id
 from sources.survey import Message, Series, Survey, survey
 from sources.tables.time_column import UNITS
 
-from .stderr import complain
+from ..stderr import complain
 
 if TYPE_CHECKING:
-    from .main import Log as Arguments
+    from .arguments import Log as Arguments
 
 WIDTH = 160
 """Columns of the output where it is no terminal."""

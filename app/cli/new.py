@@ -10,7 +10,7 @@ from config.loader import shipped
 from estimators.errors import ConfigError
 
 if TYPE_CHECKING:
-    from .main import New as Arguments
+    from .arguments import New as Arguments
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 

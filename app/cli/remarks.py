@@ -7,7 +7,7 @@ from collections.abc import Callable
 from sources.source import NEVER, TRUNCATED
 from sources.tables.order import REMARKS as ORDER
 
-from .stderr import complain
+from ..stderr import complain
 
 REMARKS = (*ORDER, NEVER, TRUNCATED)
 

@@ -10,16 +10,16 @@ from ..recording.format import tuning_from_json
 from ..recording.reader import read_recording
 from ..server.port import check_port
 from ..session import Page, Session
+from ..stderr import complain
 from ..twin.twin import Twin, restore_twin
 from .prepare import prepare
-from .stderr import complain
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
     from ..recording.reader import Recorded
-    from .main import Review
+    from .arguments import Review
 
 
 def recorded_twin(recorded: Recorded) -> Twin:

@@ -14,16 +14,16 @@ from ..recording.format import TAKEN
 from ..recording.split import NEVER, parse_split
 from ..server.port import check_port
 from ..session import Page, Session
+from ..stderr import complain
 from ..twin.twin import Twin, load_twin
-from .main import settings
+from .arguments import settings
 from .prepare import prepare
 from .remarks import remarking
-from .stderr import complain
 
 if TYPE_CHECKING:
     from sources.source import Source
 
-    from .main import Run
+    from .arguments import Run
 
 
 def live_source(twin: Twin, speed: float) -> Callable[[Callable[[str, str], None]], Source]:

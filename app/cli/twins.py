@@ -11,7 +11,7 @@ from .compare_table import printed
 from .scores import read_scores
 
 if TYPE_CHECKING:
-    from .main import Twins as Arguments
+    from .arguments import Twins as Arguments
 
 
 def show_twins(arguments: Arguments) -> int:

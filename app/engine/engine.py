@@ -24,7 +24,7 @@ from estimators.numerics.peaks import modes_of
 from estimators.registry import find_estimator
 from estimators.track import TRACKING
 
-from ..cli.stderr import complain
+from ..stderr import complain
 from . import commands
 from .alerts import Watch
 from .counts import Latency, Tally, last_run

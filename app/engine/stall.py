@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from ..cli.prepare import CallWatch
-from ..cli.stderr import complain
+from ..stderr import complain
 
 if TYPE_CHECKING:
     from estimators.fold import Fold

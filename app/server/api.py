@@ -13,10 +13,9 @@ from typing import Any
 
 from starlette.responses import JSONResponse
 
-from estimators.errors import ConfigError
+from estimators.errors import ConfigError, printable
 from estimators.track import HEALTH_NAMES
 
-from ..cli.stderr import printable
 from ..engine import commands
 from ..engine.changes import began_as, turned
 from ..engine.execute import Refolding, retuned

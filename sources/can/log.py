@@ -14,7 +14,8 @@ from estimators.log import Readings
 from ..reader_process import Apart, patience_for
 from ..source import NEVER, TRUNCATED, Report, ignore
 from .decoder import Decoder
-from .frames import FORMATS, BusName, Found, Raw, open_reader, read_frames, suffix_of, unreadable
+from .frames import FORMATS, BusName, Found, Raw, suffix_of, unreadable
+from .readers import open_reader, read_frames
 from .span import log_span
 
 

@@ -50,7 +50,7 @@ def _open(path: Path) -> tuple[Any, BytesIO]:
 
 
 def read_mf4(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | Found]:
-    """The wanted frames of a file in order of time, and at last what was found; see `frames.read_frames`.
+    """The wanted frames of a file in order of time, and at last what was found; see `readers.read_frames`.
 
     Raises:
         SourceError: If nothing can be read.

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO
+from typing import TextIO
 
 import numpy as np
 
 from estimators.errors import SourceError, quoted
 
 from ..source import TRUNCATED
-
-CHUNK = 4096
+from .chunk import CHUNK, Chunk, Problem
 
 LONGEST = 2**20
 """Letters in a line of column names."""
@@ -25,21 +24,6 @@ FIRST = 100
 """Lines in which a decimal comma is sought before a table is read."""
 
 UNREADABLE = "unreadable value"
-
-Problem = Callable[[str, int, str], None]
-"""problem(key, line or row number, text)."""
-
-
-class Chunk(NamedTuple):
-    """Rows of a table: the raw time column, and the values (n, columns) with masks of what is blank.
-
-    `line` is the line (CSV) or row (of the others) of each, counted from 1.
-    """
-
-    line: np.ndarray
-    time: Any
-    values: np.ndarray
-    blank: np.ndarray
 
 
 def column_names(path: Path) -> list[str]:

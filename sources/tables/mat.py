@@ -13,7 +13,7 @@ import numpy as np
 
 from estimators.errors import SourceError
 
-from .files import CHUNK, Chunk, Problem
+from .chunk import CHUNK, Chunk, Problem
 
 
 def mat_names(path: Path) -> list[str]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from estimators.errors import SourceError
 
-from .files import Chunk, Problem
+from .chunk import Chunk, Problem
 
 VALUES = 65_536
 """Values that are handed on at once; a row of a field has thousands."""

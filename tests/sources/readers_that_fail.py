@@ -42,7 +42,7 @@ def fail():
 
 def frames_then_abort(path, wanted, longest):
     """A log's reader that dies after its first frames."""
-    from sources.can.frames import read_frames
+    from sources.can.readers import read_frames
 
     yield next(read_frames(path, wanted, longest))
     os.abort()

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from app.cli import bus
-from app.cli.main import Bus, main
+from app.cli.arguments import Bus
+from app.cli.main import main
 from app.twin.sources.asset import make_asset
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from app.cli.main import main
-from app.cli.stderr import printable
+from app.stderr import printable
 from tests.app.cli.test_fold import DRIVE, ROWS
 
 

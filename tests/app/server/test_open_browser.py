@@ -75,7 +75,7 @@ def test_two_runs_have_two_tokens_and_show_neither(tmp_path, runtime):
     for k in range(2):
         seen = tmp_path / f"seen{k}"
         settings = {**os.environ, "BROWSER": f"{browser} %s", "SEEN": str(seen)}
-        code = "import sys; from app.cli import main; sys.exit(main(['run', 'motor_winding', '--port', '0']))"
+        code = "import sys; from app.cli.main import main; sys.exit(main(['run', 'motor_winding', '--port', '0']))"
         run = subprocess.Popen([sys.executable, "-c", code], env=settings, stdout=subprocess.PIPE, text=True)
         try:
             printed = next(found for line in run.stdout if (found := re.search(r"http://127\.0\.0\.1:(\d+)/\S+", line)))
@@ -101,6 +101,6 @@ def test_two_runs_have_two_tokens_and_show_neither(tmp_path, runtime):
 def test_the_file_goes_with_the_session_that_nobody_looked_at(tmp_path, runtime):
     settings = {**os.environ, "BROWSER": "true %s"}
     words = ["run", "motor_winding", "--port", "0", "--duration", "1"]
-    code = f"import sys; from app.cli import main; sys.exit(main({words!r}))"
+    code = f"import sys; from app.cli.main import main; sys.exit(main({words!r}))"
     subprocess.run([sys.executable, "-c", code], env=settings, check=True, stdout=subprocess.DEVNULL)
     assert not list(runtime.iterdir())

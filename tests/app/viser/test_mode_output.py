@@ -1,7 +1,7 @@
 """A discrete mode is shown as a probability in what `nisus fold` prints."""
 
+from app.cli.arguments import Fold
 from app.cli.fold import fold_twin
-from app.cli.main import Fold
 from app.twin.twin import load_twin
 
 

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import sys
 
-
-def printable(text: str) -> str:
-    """The text with everything escaped that is not shown as it is: bytes of a file must not reach the terminal."""
-    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
+from estimators.errors import printable
 
 
 def complain(text: object) -> None:

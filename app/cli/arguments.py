@@ -1,0 +1,208 @@
+"""What can be asked on the command line: a dataclass for each command, and `--set KEY=VALUE`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, get_args
+
+import tyro
+
+from estimators.errors import ConfigError
+
+Twin = Annotated[str, tyro.conf.Positional]
+Settings = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+Files = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+
+
+@dataclass(frozen=True)
+class Run:
+    """Run a twin, and show it in the browser."""
+
+    twin: Twin
+    """Name of a twin that ships (see `nisus twins`), or path of a YAML file."""
+    estimator: str | None = None
+    """Estimator in place of the twin's own: kf, ekf, ukf."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable: Q.temperature=0.02, R.winding=9, p.NAME, use.SENSOR=false, gate, or a dotted YAML key."""
+    log: tuple[Path, ...] = ()
+    """Recordings in place of the twin's own."""
+    record: Path | None = None
+    """Record into this .rrd file from the start."""
+    record_split: str | None = None
+    """Go on in another file, run-2.rrd after run.rrd, when one has grown so large or so long: 1GB, 10min."""
+    speed: float = 1.0
+    """Times real time for replays and simulations; inf is as fast as possible."""
+    duration: float | None = None
+    """Stop after so many seconds."""
+    port: int = 9900
+    """Of the page, on 127.0.0.1; 0 takes a free one."""
+    no_browser: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the URL, open nothing."""
+    headless: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """No page at all: run, and record if asked."""
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Fold a twin's readings as fast as possible, and print what the estimate was worth."""
+
+    twin: Twin
+    """Name of a twin that ships, or path of a YAML file."""
+    estimator: str | None = None
+    """Estimator in place of the twin's own."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable, as for `run`."""
+    log: tuple[Path, ...] = ()
+    """Recordings in place of the twin's own."""
+    duration: float | None = None
+    """Take only so many seconds of the source."""
+    out: Path | None = None
+    """Write the track to this .parquet, or a recording to this .rrd."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print one JSON object."""
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Fold every filter that applies over the same log, in parallel, and print what each estimate was worth.
+
+    A filter that draws its members folds eight times, with another seed each; its figures are mean ± standard
+    deviation of one fold. A step is one event of the log; its cost is that of one processor.
+    """
+
+    twin: Twin
+    """Name of a twin that ships, path of a YAML file, or `all`: each that ships."""
+    estimators: tuple[str, ...] = ()
+    """Only these filters."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable, as for `run`."""
+    log: tuple[Path, ...] = ()
+    """Recordings in place of the twin's own."""
+    duration: float | None = None
+    """Take only so many seconds of the source."""
+    logs: int = 1
+    """So many logs of a simulated twin, with seeds from its own on; figures are mean ± standard deviation over them."""
+    budget: float = 20.0
+    """Seconds of one processor for the folds of one filter; a slower one folds a shorter span, which its row states."""
+    jobs: int | None = None
+    """Processes; default: one a processor."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print one JSON list."""
+    write: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Keep the table as CSV: config/scores/NAME.csv for a twin that ships, NAME.scores.csv beside any other YAML."""
+
+
+@dataclass(frozen=True)
+class Filters:
+    """List the estimators: what they assume, their options, what they cost and when they fail."""
+
+    twin: str | None = None
+    """Name or YAML file of a twin: which of them apply to it, what they cost there, and why the others do not."""
+
+
+@dataclass(frozen=True)
+class Review:
+    """Open a recording on the page, with the panel that folds its readings again."""
+
+    file: Annotated[Path, tyro.conf.Positional]
+    """The .rrd file."""
+    port: int = 9900
+    """Of the page, on 127.0.0.1; 0 takes a free one."""
+    no_browser: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the URL, open nothing."""
+    duration: float | None = None
+    """Stop after so many seconds."""
+
+
+@dataclass(frozen=True)
+class Bus:
+    """Play a twin's asset on its CAN bus, in a process of its own."""
+
+    twin: Twin
+    """Name of a twin with a CAN source that has an `asset`, or path of a YAML file."""
+    interface: str = "udp_multicast"
+    """python-can's name of the bus: udp_multicast reaches other processes of this machine, socketcan a real bus."""
+    channel: str | None = None
+    """Channel of the interface; default: the twin's where it suits, else the interface's own."""
+    set: Settings = ()
+    """KEY=VALUE of the YAML, repeatable."""
+    duration: float | None = None
+    """Stop after so many seconds."""
+    record: Path | None = None
+    """Also write the frames to this log, in any format python-can writes (.blf, .asc, .log, .csv, .mf4)."""
+
+
+@dataclass(frozen=True)
+class Twins:
+    """List the twins that ship, or describe one: what to expect of it, and how every filter scored."""
+
+    name: Annotated[str | None, tyro.conf.Positional] = None
+    """Of a twin that ships, or path of a YAML file."""
+
+
+@dataclass(frozen=True)
+class Schema:
+    """Write the JSON Schema of a twin's YAML, for editors that complete and check."""
+
+    out: Path | None = None
+    """File; without it, standard output."""
+
+
+@dataclass(frozen=True)
+class Log:
+    """List what recordings hold: buses, messages, signals or columns, with rates, spans and holes."""
+
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """CAN logs (MF4, BLF, ASC, TRC, candump, CSV, SQLite) or tables (CSV, Parquet, MATLAB, NumPy), in their order."""
+    dbc: Files = ()
+    """DBC file that names messages and signals, repeatable; FILE@BUS where it holds on one bus only."""
+    time: str | None = None
+    """Column of a table that tells the time; default: the one of such a name."""
+    time_unit: str = "s"
+    """Its unit: s, ms, us, ns, min or h."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print one JSON object."""
+
+
+@dataclass(frozen=True)
+class New:
+    """Write a working pair NAME.yaml and NAME.py to start a twin of your own from: a pump, or a recording's signals."""
+
+    name: Annotated[str, tyro.conf.Positional]
+    """Of the twin."""
+    folder: Path = field(default_factory=Path.cwd)
+    """Where to."""
+    log: tuple[Path, ...] = ()
+    """Recordings whose signals become its sensors."""
+    dbc: Files = ()
+    """DBC file of their frames, repeatable; FILE@BUS where it holds on one bus only."""
+    signals: str = ""
+    """A,B: signals (SIGNAL or MESSAGE.SIGNAL) or columns to take; default: those that vary most finely, at most 6."""
+    time: str | None = None
+    """Column of a table that tells the time; default: the one of such a name."""
+    time_unit: str = "s"
+    """Its unit: s, ms, us, ns, min or h."""
+
+
+Command = Run | Fold | Compare | Filters | Review | Bus | Twins | Schema | Log | New
+COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in get_args(Command)}
+
+
+def settings(given: Sequence[str], estimator: str | None = None) -> dict[str, str]:
+    """The KEY=VALUE pairs of `--set`, and `--estimator` as one more.
+
+    Raises:
+        ConfigError: If one has no `=`, or no key before it.
+    """
+    pairs: dict[str, str] = {}
+    for text in given:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip():
+            lacks = "key" if equals else "value"
+            raise ConfigError(f"--set {text}: has no {lacks}; write KEY=VALUE, for example --set R.winding=9")
+        pairs[key.strip()] = value.strip()
+    if estimator is not None:
+        pairs["estimator"] = estimator
+    return pairs

@@ -1,0 +1,158 @@
+"""Reads the frames of a CAN log of any format: what runs in the process that reads the file."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..clock import second_ns
+from .frames import CHUNK, EXTENDED, BusName, Found, Raw, suffix_of, unreadable
+
+FIRST_CHUNK = 256
+"""Frames read before the first are given, so that they come at once."""
+
+FARTHEST = 2.0**62 / 1e9
+"""Seconds from 1970 that a time may lie; beyond, it is none."""
+
+
+def read_frames(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | Found]:
+    """Frames of a log in their order, and at last what was found.
+
+    Args:
+        path: The log.
+        wanted: Ids of the frames to give, EXTENDED added; None is all.
+        longest: Bytes of a frame to give.
+
+    Raises:
+        SourceError: If nothing can be read.
+    """
+    if suffix_of(path) == ".mf4":
+        from .mf4 import read_mf4
+
+        return read_mf4(path, wanted, longest)
+    return _read_messages(path, wanted, longest)
+
+
+def open_reader(path: Path) -> Any:
+    """python-can's reader of a file.
+
+    Raises:
+        SourceError: If it is not of the format that its name says.
+    """
+    import can
+
+    try:
+        return can.LogReader(path)
+    except Exception as error:  # noqa: BLE001  a damaged file makes python-can's readers raise anything
+        raise unreadable(path, error) from None
+
+
+def _read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | Found]:
+    reader = open_reader(path)
+    seen: Counter[tuple[BusName, int]] = Counter()
+    buses: dict[BusName, int] = {}
+    count = errors = broken = 0
+    fault = ""
+    try:
+        messages = iter(reader)
+        size = FIRST_CHUNK
+        while True:
+            chunk: list[Any] = []
+            try:
+                # One by one into the list, so that what came before the fault is kept.
+                for message in islice(messages, size):
+                    chunk.append(message)
+            except Exception as error:  # noqa: BLE001  as above
+                fault = " ".join(str(error).split())[:160] or type(error).__name__
+            count += len(chunk)
+            errors += sum(message.is_error_frame for message in chunk)
+            raw, lost = _columns(chunk, wanted, longest, buses, seen)
+            broken += lost
+            yield raw
+            if fault or len(chunk) < size:
+                break
+            size = CHUNK
+        fault = fault or _missing_end(path, reader)
+        if broken:
+            fault = fault or f"{broken} frames hold no numbers"
+    finally:
+        # SQLite lets only the thread that opened a file close it; else it is closed with its last reference.
+        with suppress(sqlite3.ProgrammingError):
+            reader.stop()
+    if fault and not count:
+        raise unreadable(path, fault)
+    yield Found(dict(seen), errors, fault)
+
+
+def _columns(
+    messages: list[Any],
+    wanted: frozenset[int] | None,
+    longest: int,
+    buses: dict[BusName, int],
+    seen: Counter[tuple[BusName, int]],
+) -> tuple[Raw, int]:
+    """python-can's messages as columns, and how many are damaged; error and remote frames carry no data."""
+    t, keys, places, length, chunks = [], [], [], [], []
+    broken = 0
+    for message in messages:
+        if message.is_error_frame or message.is_remote_frame:
+            continue
+        try:
+            # A damaged database holds numbers of other kinds, or none.
+            key = int(message.arbitration_id) & 0x1FFFFFFF
+            if message.is_extended_id:
+                key |= EXTENDED
+            bus = message.channel
+            seen[bus, key] += 1
+            if wanted is not None and key not in wanted:
+                continue
+            if not abs(message.timestamp) <= FARTHEST:
+                raise ValueError("no time")
+            time, data = second_ns(message.timestamp), bytes(message.data[:longest])
+        except (TypeError, ValueError, OverflowError):
+            broken += 1
+            continue
+        t.append(time)
+        keys.append(key)
+        places.append(buses.setdefault(bus, len(buses)))
+        length.append(len(data))
+        chunks.append(data.ljust(longest, b"\0"))
+    raw = Raw(
+        np.array(t, np.int64),
+        np.array(keys, np.int64),
+        np.array(places, np.int64),
+        np.array(length, np.int64),
+        np.frombuffer(bytearray().join(chunks), np.uint8).reshape(len(chunks), longest),
+        tuple(buses),
+        len(messages),
+    )
+    return raw, broken
+
+
+def _missing_end(path: Path, reader: Any) -> str:
+    """Why a file that was read without a fault is not whole, or nothing."""
+    import can
+
+    if isinstance(reader, can.BLFReader):
+        size = path.stat().st_size
+        return f"{size} of {reader.file_size} bytes are there" if reader.file_size > size else ""
+    if path.suffix.lower() == ".db":
+        # SQLite takes what a cut last page lacks for zeros, and gives rows of them without a word.
+        with path.open("rb") as file:
+            header = file.read(100)
+        page, pages = int.from_bytes(header[16:18], "big"), int.from_bytes(header[28:32], "big")
+        size, whole = path.stat().st_size, (65536 if page == 1 else page) * pages
+        return f"{size} of {whole} bytes are there" if whole > size else ""
+    if path.suffix.lower() in (".asc", ".csv", ".log", ".trc"):
+        with path.open("rb") as file:
+            file.seek(-1, os.SEEK_END)
+            return "" if file.read(1) in (b"\n", b"\r") else "its last line has no end"
+    return ""
