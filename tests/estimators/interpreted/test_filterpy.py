@@ -100,7 +100,7 @@ def H_of(sensor, x):
 def log():
     """200 readings of a simulated pendulum: irregular times, some equal, some rows and some readings missing."""
     rng = np.random.default_rng(11)
-    x, t = np.array([0.9, 0.1, 1.2]), 0
+    x, t = np.array([0.9, 0.1, 1.2]), 17_000_003
     batch = [Readings.one(0, 0, TICK, 0, (), 2)]
     for _ in range(200):
         step = int(rng.choice([0, 1, 2, 3], p=[0.2, 0.5, 0.2, 0.1])) * 17_000_003
