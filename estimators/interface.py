@@ -88,6 +88,7 @@ def fold(
         ModelError: If the model's functions disagree with its declaration, or those of a black box fail.
     """
     tuned = tuned_by_name(estimator, model, tuning, R, Q, p, held_out, gate, seed, options)
+    _check_named(log, model)
     pairs = all_pairs(model) if covariance else None
     track = fold_track(estimator, model, tuned, log, pairs=pairs, policy=policy, prior=prior)
     return _estimates(estimator, model, tuned, _copied(log), track, covariance)
@@ -144,6 +145,7 @@ def fold_many(
     first = tuned_by_name(estimator, model, tuning, R, Q, p, held_out, gate, 0, options)
     jobs = [(each, _seeded(first, seed)) for each in logs for seed in list(seeds)]
     for each in logs:
+        _check_named(each, model)
         # Compiles, and finds what is wrong, before anybody waits for it.
         Fold(estimator, model, first, each, pairs=pairs, policy=policy, prior=prior)
     given = [(estimator, model, tuned, each, pairs, policy, prior) for each, tuned in jobs]
@@ -193,6 +195,25 @@ def _pool(executor: Executor | str | None) -> Any:
     raise EstimatorError(
         f"fold_many: executor is {executor!r}; it must be 'threads', 'processes', None or a concurrent.futures.Executor"
     )
+
+
+def _check_named(log: Log, model: StateSpaceModel) -> None:
+    """Refuse a log whose names mean other channels; a model with other states may well fold it.
+
+    Raises:
+        EstimatorError: If its sensors or inputs are not the model's.
+    """
+    if log.model is None or log.model is model:
+        return
+    for what, names, wanted in (
+        ("sensors", log.model.sensor_names, model.sensor_names),
+        ("inputs", log.model.input_names, model.input_names),
+    ):
+        if names != wanted:
+            raise EstimatorError(
+                f"the log is of {log.model.name}, with the {what} {', '.join(names[:8]) or 'none'}; {model.name} has "
+                f"{', '.join(wanted[:8]) or 'none'}: make the log by Log.of(model)"
+            )
 
 
 def _copied(log: Log) -> Readings:

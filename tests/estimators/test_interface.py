@@ -123,7 +123,10 @@ WRONG = {
     "nothing for an option": (lambda log: fold("ukf", MOTOR, log, alpha=None), "alpha is None; it must be a number"),
     "a seed": (lambda log: fold("pf", MOTOR, log, seed=1.5), "seed is 1.5; it must be a whole number"),
     "a negative seed": (lambda log: fold("pf", MOTOR, log, seed=-1), "seed is -1"),
-    "a log of another model": (lambda log: fold("ekf", ROAD, log), "the log has|1 value"),
+    "a log of another model": (
+        lambda log: fold("ekf", ROAD, log),
+        "the log is of motor_winding, with the sensors winding; road_car has",
+    ),
     "an executor": (lambda log: fold_many("kf", MOTOR, log, executor="cloud"), "executor is 'cloud'; it must be"),
     "NEES without covariances": (lambda log: fold("kf", MOTOR, log).nees(), "covariance=True"),
     "NEES without truth": (lambda log: fold("kf", MOTOR, log, covariance=True).nees(), "log.add_truth"),
