@@ -249,10 +249,11 @@ def test_a_consistent_filter_is_inside_its_bounds_and_a_confident_one_is_not():
     right = mean_nees([t.nees() for t in fold_many("kf", MOTOR, logs, R={"winding": 9.0}, covariance=True)])
     # Of 30 correlated values at 95 % some may be outside; a third of them would be no chance.
     assert right.runs == 40 and right.inside > 0.67 and 0.8 < right.mean < 1.2
-    small = {noise.name: noise.variance / 1e4 for noise in MOTOR.noises}
+    small = {noise.name: noise.variance / 100 for noise in MOTOR.noises}
     confident = fold_many("kf", MOTOR, logs, R={"winding": 9.0}, Q=small, covariance=True)
     wrong = mean_nees([t.nees() for t in confident])
-    assert wrong.inside < 0.4 and wrong.mean > 1.4
+    # The prior's share of the error goes; then what Q leaves out counts.
+    assert np.all(wrong.value[-10:] > wrong.high[-10:]) and wrong.mean > 1.4
 
 
 @pytest.mark.parametrize("executor", ["threads", None, "own"])
