@@ -72,7 +72,7 @@ import math
 from estimators.model import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 
 # Every function is written for ONE state and fills `out`. x: states, u: inputs, p: parameters, in the order below.
-# They are compiled, so keep to numbers, math and loops; names outside the function must be constants.
+# They are compiled, with the functions that they call: keep to numbers, math and loops; other names must be constants.
 
 
 def tank(x, u, p, dt, out):
