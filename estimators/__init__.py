@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .diagnostics.health import HealthPolicy as HealthPolicy
+    from .diagnostics.nees import mean_nees as mean_nees
     from .errors import NisusError as NisusError
-    from .interface import fold as fold
-    from .interface import fold_many as fold_many
+    from .interface.by_name import fold as fold
+    from .interface.by_name import fold_many as fold_many
     from .log import Log as Log
     from .model.state_space import Field as Field
     from .model.state_space import Input as Input
@@ -26,19 +27,18 @@ if TYPE_CHECKING:
     from .model.state_space import State as State
     from .model.state_space import StateSpaceModel as StateSpaceModel
     from .models import MODELS as MODELS
-    from .nees import mean_nees as mean_nees
     from .registry import ESTIMATORS as ESTIMATORS
     from .tuning import Tuning as Tuning
 
 _HOMES = {
     "ESTIMATORS": "registry",
-    "HealthPolicy": "diagnostics",
+    "HealthPolicy": "diagnostics.health",
     "Log": "log",
     "MODELS": "models",
     "NisusError": "errors",
     "Tuning": "tuning",
-    "fold_many": "interface",
-    "mean_nees": "nees",
+    "fold_many": "interface.by_name",
+    "mean_nees": "diagnostics.nees",
     **dict.fromkeys(
         ("Field", "Input", "Jump", "Noise", "Parameter", "Row", "Sensor", "State", "StateSpaceModel"), "model"
     ),
@@ -62,7 +62,7 @@ class _Package(ModuleType):
 
     @property
     def fold(self) -> Any:
-        return import_module(".interface", __name__).fold
+        return import_module(".interface.by_name", __name__).fold
 
     @fold.setter
     def fold(self, module: ModuleType) -> None:

@@ -17,8 +17,8 @@ from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.score import Score, score
 from estimators.errors import ConfigError, SourceError
 from estimators.fold import Fold
+from estimators.interface.table import table_of
 from estimators.log import Log
-from estimators.tabular import table_of
 from estimators.track import FAILED, HEALTH_NAMES, USED, Track
 from estimators.tuning import TOGETHER
 from sources.source import Endless

@@ -16,10 +16,10 @@ import numba
 import numpy as np
 
 from ..errors import ModelError
-from ..helpers import with_helpers
 from ..model.check import probe, probe_angles, probe_likelihoods, uncompilable
 from ..model.claims import check_parts
 from ..model.state_space import LARGE, Field, StateSpaceModel
+from ..numerics.helpers import with_helpers
 from ..numerics.jit import address, jit, plain
 from .black_box import ANSWER, BlackBox, answered_f, answered_h
 from .context import (

@@ -20,10 +20,10 @@ from ..compiled.context import sensor_rows
 from ..estimator import Estimator
 from ..numerics.jit import jit
 from ..numerics.simd import add_scaled
-from ..rotation import ROTATION, rotate
 from ..track import USED
 from .blocks import sweep_all
 from .localisation import between_rows, localised, prepare
+from .rotation import ROTATION, rotate
 from .shared import (
     ADD,
     CREWS,

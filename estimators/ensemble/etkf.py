@@ -22,9 +22,9 @@ from ..estimator import Estimator
 from ..numerics.jit import jit
 from ..numerics.simd import add_scaled
 from ..numerics.symmetric import gram, symmetric_eigen
-from ..rotation import ROTATION, rotate_members
 from ..track import FAILED, USED
 from .blocks import transform_all
+from .rotation import ROTATION, rotate_members
 from .shared import (
     ADD,
     CREWS,

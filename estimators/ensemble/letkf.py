@@ -20,11 +20,11 @@ from ..numerics.inverse_root import root_action
 from ..numerics.jit import ints, jit, matrix
 from ..numerics.simd import WIDE, add_scaled, combine, dot
 from ..numerics.symmetric import gram
-from ..rotation import ROTATION, rotate
 from ..track import FAILED, USED
 from .blocks import block_at, load, store
 from .etkf import global_analysis
 from .localisation import localised, prepare, reached
+from .rotation import ROTATION, rotate
 from .shared import (
     ADD,
     CREWS,

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import ModelError
-from ..helpers import with_helpers
+from ..numerics.helpers import with_helpers
 from ..numerics.jit import jit, plain
 from .state_space import Noise, State, StateSpaceModel
 

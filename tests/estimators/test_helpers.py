@@ -10,10 +10,10 @@ import pytest
 from estimators.compiled.model import compile_model
 from estimators.errors import ModelError
 from estimators.fold import fold
-from estimators.helpers import with_helpers
 from estimators.log import READING, Log, Readings
 from estimators.model.joint import Unknown, joint
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from estimators.numerics.helpers import with_helpers
 from estimators.tuning import Tuning
 
 LIMIT = 41.0

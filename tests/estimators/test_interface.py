@@ -288,7 +288,7 @@ assert "fold" in dir(estimators)
 import estimators.fold
 from estimators import fold
 from estimators.fold import Fold
-assert callable(fold) and fold.__module__ == "estimators.interface"
+assert callable(fold) and fold.__module__ == "estimators.interface.by_name"
 try:
     estimators.nothing
 except AttributeError as error:

@@ -23,17 +23,17 @@ from typing import Any
 import numba
 import numpy as np
 
-from .compiled.orphan import leave_with_parent
-from .diagnostics.health import HealthPolicy
-from .errors import ConfigError, EstimatorError
+from ..compiled.orphan import leave_with_parent
+from ..diagnostics.health import HealthPolicy
+from ..errors import ConfigError, EstimatorError
+from ..fold import Fold
+from ..fold import fold as fold_track
+from ..log import Log, Readings
+from ..model.state_space import StateSpaceModel
+from ..registry import checked, find_estimator
+from ..track import Track
+from ..tuning import Tuning
 from .estimates import Estimates
-from .fold import Fold
-from .fold import fold as fold_track
-from .log import Log, Readings
-from .model.state_space import StateSpaceModel
-from .registry import checked, find_estimator
-from .track import Track
-from .tuning import Tuning
 
 __all__ = ["fold", "fold_many"]
 

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from .diagnostics.health import PROBABILITY
-from .errors import EstimatorError
-from .events.batch import TRUTH, Readings
-from .model.state_space import StateSpaceModel
-from .numerics.quantiles import chi_square_quantile
+from ..errors import EstimatorError
+from ..events.batch import TRUTH, Readings
+from ..model.state_space import StateSpaceModel
+from ..numerics.quantiles import chi_square_quantile
+from .health import PROBABILITY
 
 
 class Nees(NamedTuple):

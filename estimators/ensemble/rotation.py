@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from .compiled.context import options as numbers
-from .ensemble.blocks import transform_all
-from .ensemble.shared import CREWS, OWN, ROTATE
-from .estimator import Option
-from .numerics.jit import jit
-from .numerics.random import key_of, normal
-from .numerics.simd import add_scaled
+from ..compiled.context import options as numbers
+from ..estimator import Option
+from ..numerics.jit import jit
+from ..numerics.random import key_of, normal
+from ..numerics.simd import add_scaled
+from .blocks import transform_all
+from .shared import CREWS, OWN, ROTATE
 
 ROTATION = Option("rotation", 0, 0, 1, "", "1 turns the members at random after each reading; mean and spread stay")
 

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from .diagnostics.score import Score, score
-from .errors import EstimatorError
-from .events.batch import READING, Readings
-from .model.state_space import StateSpaceModel
-from .nees import Nees, nees
-from .tabular import table_of
-from .track import Track
-from .tuning import Tuning
+from ..diagnostics.nees import Nees, nees
+from ..diagnostics.score import Score, score
+from ..errors import EstimatorError
+from ..events.batch import READING, Readings
+from ..model.state_space import StateSpaceModel
+from ..track import Track
+from ..tuning import Tuning
+from .table import table_of
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import CellType, CodeType, FunctionType
 from typing import Any
 
-from .numerics.jit import jit
+from .jit import jit
 
 LIBRARIES = ("numpy", "scipy", "numba", "math", "cmath")
 """Packages whose functions Numba knows by itself, or not at all."""

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from .events.batch import KIND_NAMES, READING, Readings, truth_of
-from .model.state_space import StateSpaceModel
-from .track import HEALTH_NAMES, VERDICT_NAMES, Track
+from ..events.batch import KIND_NAMES, READING, Readings, truth_of
+from ..model.state_space import StateSpaceModel
+from ..track import HEALTH_NAMES, VERDICT_NAMES, Track
 
 
 def table_of(model: StateSpaceModel, events: Readings, track: Track) -> Any:
