@@ -24,7 +24,7 @@ from .signals import restore, when_asked_to_end
 from .stderr import complain
 
 if TYPE_CHECKING:
-    from estimators.fold import Base
+    from estimators.snapshots import Base
     from sources.source import Source
 
     from .twin.twin import Twin

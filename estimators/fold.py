@@ -9,182 +9,33 @@ brief: a model's function that never returns must not keep the interpreter with 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numba import types
 
-from .compiled.context import context_of, context_type, prior, sensor_rows
+from .compiled.context import context_of
 from .compiled.model import compile_model
 from .diagnostics.failure_cause import Estimate, around, cause, failures, questions
 from .diagnostics.field_pictures import Pictures
-from .diagnostics.health import Bounds, HealthPolicy, assess, assess_signature, chi_square_bounds
+from .diagnostics.health import Bounds, HealthPolicy, chi_square_bounds
 from .errors import EstimatorError, ModelError
-from .estimator import Code, Estimator, call_describe, call_predict, call_start, call_update, code_type
+from .estimator import Code, Estimator
 from .events.checks import admitted
 from .fold_checks import check_base, check_pairs, check_prior, check_tuning, check_variances
+from .fold_kernel import compiled
 from .interpreted import fold_loop
 from .interpreted.black_box_filters import driven
 from .interpreted.fold_loop import LONGEST, UNSET
 from .interpreted.view import View
-from .log import BEFORE, INPUT, READING, RESET, TICK, TRUTH, Log
+from .log import BEFORE, INPUT, READING, TICK, TRUTH, Log
 from .model.mode_as_number import indicator
 from .model.state_space import StateSpaceModel
-from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, jit
 from .numerics.peaks import Mode
 from .numerics.quantiles import chi_square_quantile
-from .numerics.steps import steps_of
 from .registry import find_estimator
-from .track import MISSING, NONE, Track, track_type
+from .snapshots import Base, Snapshot, Snapshots
+from .track import Track
 from .tuning import Tuning
-
-SNAPSHOT_EVERY = 64
-"""Events between snapshots of the last `RECENT` events, where late readings fall."""
-
-SPARSE_EVERY = 1024
-"""Events between the snapshots kept for ever."""
-
-RECENT = 4096
-
-SNAPSHOT_MEMORY = 256 * 2**20
-"""Bytes that the snapshots of a fold may take, half for the recent ones; large states are kept at wider steps."""
-
-
-@jit
-def _advance_to(code, context, u, clock, t, index, state, work):
-    """Predict from the clock to time t, in steps no longer than the model allows.
-
-    After `LONGEST` of them the model alone says no more than the prior does, so the state is the prior again.
-    """
-    if clock == UNSET or t <= clock:
-        return
-    dt = (t - clock) * 1e-9
-    if dt > LONGEST * context.max_step:
-        prior_mean, prior_cov = prior(context)
-        call_start(code.start, context, prior_mean, prior_cov, state)
-        return
-    steps = steps_of(dt, context.max_step)
-    for _ in range(steps):
-        call_predict(code.predict, context, u, dt / steps, index, state, work)
-
-
-@jit
-def _exchange(r, own, kept):
-    """r (ny,) ← what a reading brought of its own, where it brought any; `kept` (ny,) gets what stood there."""
-    for k in range(r.size):
-        kept[k] = r[k]
-        if k < own.size and np.isfinite(own[k]):
-            r[k] = own[k]
-
-
-@jit
-def run(code, context, first, start, end, t, kind, channel, value, width, clock, u, state, spare, work, score, track):
-    """Fold events `start` to `end`: clock (1,), u (nu,) and state move on in place, one track row is filled an event.
-
-    A tick or a truth is a query: it is answered from a copy of the state, so it never changes the estimate. Variances
-    that a reading brings (columns of `value` from `width` on) take the place of the tuned R while it is folded, so
-    every filter honours them.
-    """
-    nu = u.size
-    variances = value.shape[1] > width
-    kept = np.empty(context.n_rows if variances else 0)
-    u = borrowed(u)
-    state = borrowed(state)
-    spare = borrowed(spare)
-    work = borrowed(work)
-    score = borrowed(score)
-    value = borrowed_rows(value)
-    mean = borrowed_rows(track.mean)
-    std = borrowed_rows(track.std)
-    cross = borrowed_rows(track.cross)
-    innovation = borrowed_rows(track.innovation)
-    innovation_std = borrowed_rows(track.innovation_std)
-    for i in range(start, end):
-        what = kind[i]
-        index = first + i
-        for j in range(innovation.shape[1]):
-            innovation[i, j] = np.nan
-            innovation_std[i, j] = np.nan
-        score[0] = np.nan
-        score[1] = 0.0
-        score[2] = np.nan
-        verdict = NONE
-        if what == READING or what == INPUT:
-            _advance_to(code, context, u, clock[0], t[i], index, state, work)
-            clock[0] = t[i]
-            if what == INPUT:
-                for j in range(nu):
-                    if np.isfinite(value[i, j]):
-                        u[j] = value[i, j]
-            else:
-                if variances:
-                    row, rows = sensor_rows(context, channel[i])
-                    r = floats(context.r, context.n_rows)[row : row + rows]
-                    _exchange(r, value[i, width:], kept)
-                verdict = call_update(
-                    code.update,
-                    context,
-                    u,
-                    channel[i],
-                    value[i],
-                    index,
-                    state,
-                    work,
-                    innovation[i],
-                    innovation_std[i],
-                    score,
-                )
-                if variances:
-                    for k in range(rows):
-                        r[k] = kept[k]
-            call_describe(code.describe, context, state, mean[i], std[i], cross[i])
-        elif what == RESET:
-            prior_mean, prior_cov = prior(context)
-            call_start(code.start, context, prior_mean, prior_cov, state)
-            clock[0] = t[i]
-            call_describe(code.describe, context, state, mean[i], std[i], cross[i])
-        else:
-            if clock[0] == UNSET:
-                clock[0] = t[i]
-            # Several true states at one time are one query: `spare` still holds its answer.
-            if i == start or kind[i - 1] < TRUTH or kind[i - 1] > TICK or t[i] != t[i - 1]:
-                for j in range(state.size):
-                    spare[j] = state[j]
-                _advance_to(code, context, u, clock[0], t[i], index, spare, work)
-            call_describe(code.describe, context, spare, mean[i], std[i], cross[i])
-        track.nis[i] = score[0] if verdict != MISSING else np.nan
-        track.dof[i] = int(score[1])
-        track.log_likelihood[i] = score[2]
-        track.verdict[i] = verdict
-
-
-@jit
-def _begin(code, context, mean, cov, state):
-    call_start(code.start, context, mean, cov, state)
-
-
-I4 = types.int32[::1]
-begin_signature = types.void(code_type, context_type, F1, F2, F1)
-run_signature = types.void(
-    code_type, context_type, i64, i64, i64, I1, B1, I4, F2, i64, I1, F1, F1, F1, F1, F1, track_type
-)
-
-
-class Base(NamedTuple):
-    """Where a fold starts whose log has lost its oldest events: clock, inputs, and what the dropped events left.
-
-    mean (nx,) and cov (nx, nx), or the variances (1, nx) of a large state, stand for it in any filter. `state` is all
-    that the filter `estimator` had (modes, members, particles, what an adaptation learned), for that filter alone.
-    """
-
-    mean: np.ndarray
-    cov: np.ndarray
-    clock: int
-    u: np.ndarray
-    estimator: str = ""
-    state: np.ndarray | None = None
-    first: int = 0
 
 
 class Fold:
@@ -254,7 +105,7 @@ class Fold:
         if base is not None:
             check_base(base, model)
             mean, cov, self._clock[0], self._u[:] = base.mean, base.cov, base.clock, base.u
-        self._run, self._assess, begin = _compiled()
+        self._run, self._assess, begin = compiled()
         if model.black_box or self.estimator.interpreted:
             self._context = View(self._compiled, self._context, tuning, self.options, self.pairs, self._held)
             self._run = fold_loop.run
@@ -263,13 +114,7 @@ class Fold:
         left = base.state if base is not None and base.estimator == estimator else None
         if left is not None and left.size == self._state.size:
             self._state[:] = left
-        # At least one old snapshot (the start) and one recent, however large the state is.
-        self._most = max(1, SNAPSHOT_MEMORY // 2 // self._state.nbytes)
-        self._every = SNAPSHOT_EVERY
-        while RECENT // self._every > self._most:
-            self._every *= 2
-        self._sparse = max(SPARSE_EVERY, self._every)
-        self._snapshots: dict[int, tuple[int, np.ndarray, np.ndarray]] = {}
+        self._snapshots = Snapshots(self._state.nbytes)
         self.pictures = Pictures(model.grid, picture) if model.grid is not None else None
         self._asked = -1
         self._remember()
@@ -439,9 +284,7 @@ class Fold:
         while self.n < end:
             if self.pictures is not None and self.pictures.check(log, self.n):
                 self._take_picture()
-            # Far behind the end, only the snapshots that are kept for ever are worth stopping for.
-            stride = self._sparse if end - self.n > RECENT else self._every
-            boundary = self.n + stride - (log.first + self.n) % stride
+            boundary = self._snapshots.next_stop(log.first + self.n, log.first + end) - log.first
             stop = min(end, boundary)
             if self.pictures is not None:
                 stop = self.pictures.next(log, self.n, stop)
@@ -501,28 +344,17 @@ class Fold:
         self.pictures.take(self.log, self.n, mean, cov[0] if cov.shape[0] == 1 else np.diag(cov))
 
     def _remember(self) -> None:
-        at = self.log.first + self.n
-        self._snapshots[at] = (int(self._clock[0]), self._u.copy(), self._state.copy())
-        old = at - RECENT
-        if old % self._sparse and old in self._snapshots and old != self.log.first:
-            del self._snapshots[old]
-        for_ever = [key for key in self._snapshots if key <= old]
-        if len(for_ever) > self._most + 1:
-            self._sparse *= 2
-            for key in for_ever:
-                if key % self._sparse and key != self.log.first:
-                    del self._snapshots[key]
+        snapshot = Snapshot(int(self._clock[0]), self._u.copy(), self._state.copy())
+        self._snapshots.keep(self.log.first + self.n, self.log.first, snapshot)
 
     def rewind(self, index: int) -> None:
-        """Go back so that the event at `index` (and all behind it) will be folded again."""
+        """Go back so that the event at `index` (and all after it) will be folded again."""
         if index < self.n:
             self._restore(index)
 
     def _restore(self, index: int) -> None:
-        limit = self.log.first + index
-        at = max(key for key in self._snapshots if key <= limit)
-        for key in [key for key in self._snapshots if key > at]:
-            del self._snapshots[key]
+        at = self._snapshots.last(self.log.first + index)
+        self._snapshots.forget_after(at)
         clock, u, state = self._snapshots[at]
         self._clock[0], self._u[:], self._state[:] = clock, u, state
         self.n = at - self.log.first
@@ -532,7 +364,7 @@ class Fold:
 
     def base_at(self, index: int) -> tuple[int, Base]:
         """The last snapshot at or before the event `index`: its index, and the base of a fold that starts there."""
-        at = max(key for key in self._snapshots if key <= self.log.first + index)
+        at = self._snapshots.last(self.log.first + index)
         clock, u, state = self._snapshots[at]
         mean, cov = self.estimator.moments(self.options, state, self.model.nx)
         return at - self.log.first, Base(mean, cov, clock, u.copy(), self.estimator.name, state.copy(), at)
@@ -569,8 +401,7 @@ class Fold:
         self._asked = -1
         if self.pictures is not None:
             self.pictures.drop_front(self.log.first + count)
-        for key in [key for key in self._snapshots if key < self.log.first + count]:
-            del self._snapshots[key]
+        self._snapshots.forget_before(self.log.first + count)
 
 
 def fold(
@@ -604,11 +435,3 @@ def _scratch(size: int) -> np.ndarray:
     numbers = np.full(size + 8, np.nan)
     first = -numbers.ctypes.data % 64 // 8
     return numbers[first : first + size]
-
-
-@lru_cache(maxsize=1)
-def _compiled() -> tuple[Any, ...]:
-    """The entry points, compiled for their one signature (or loaded from the cache)."""
-    for function, signature in ((run, run_signature), (assess, assess_signature), (_begin, begin_signature)):
-        function.compile(signature.args)
-    return run, assess, _begin

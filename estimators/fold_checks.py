@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,10 +11,8 @@ from .estimator import Estimator, Options
 from .gaussian.robust import ADAPT_R
 from .model.state_space import LARGE, StateSpaceModel
 from .numerics.linalg import EPSILON
+from .snapshots import Base
 from .tuning import Tuning
-
-if TYPE_CHECKING:
-    from .fold import Base
 
 ROUNDING = 1e-12
 """Share of the largest variance by which an eigenvalue of a covariance may be below zero, and two halves may differ."""

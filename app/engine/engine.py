@@ -18,10 +18,11 @@ import numpy as np
 
 from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import EstimatorError, NisusError
-from estimators.fold import SPARSE_EVERY, Base, Fold
+from estimators.fold import Fold
 from estimators.log import TICK, Log, Readings
 from estimators.numerics.peaks import modes_of
 from estimators.registry import find_estimator
+from estimators.snapshots import SPARSE_EVERY, Base
 from estimators.track import TRACKING
 
 from ..stderr import complain

@@ -17,8 +17,8 @@ import pyarrow as pa
 import rerun as rr
 
 from estimators.errors import SourceError
-from estimators.fold import Base
 from estimators.model.state_space import StateSpaceModel
+from estimators.snapshots import Base
 from estimators.tuning import Tuning
 
 from ..engine.outputs import Pull

@@ -17,8 +17,8 @@ import numpy as np
 from rerun.chunk import RrdReader
 
 from estimators.errors import SourceError
-from estimators.fold import Base
 from estimators.log import Readings
+from estimators.snapshots import Base
 
 from .format import FORMAT, PREFIX, READABLE, TIMELINE, base_from_json
 from .rrd import BEGIN, MESSAGE_HEADER, STREAM_HEADER, whole_until

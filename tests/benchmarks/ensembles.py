@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from estimators.compiled.model import compile_model
-from estimators.fold import Base, Fold
+from estimators.fold import Fold
 from estimators.log import READING, Log, Readings
 from estimators.model.state_space import StateSpaceModel
 from estimators.models.lorenz96 import LORENZ96
 from estimators.models.thermal_field import thermal_field
+from estimators.snapshots import Base
 from estimators.tuning import Tuning
 
 from .timing import both, compare, judged

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from estimators.errors import EstimatorError
-from estimators.fold import RECENT, Fold, fold
+from estimators.fold import Fold, fold
 from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Log, Readings
 from estimators.registry import ESTIMATORS
+from estimators.snapshots import RECENT
 from estimators.track import FAILED, GATED, HELD_OUT, MISSING, NONE, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, random_linear, random_log

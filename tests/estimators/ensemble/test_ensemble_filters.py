@@ -9,12 +9,13 @@ from estimators.compiled.model import compile_model
 from estimators.ensemble import localisation, shared
 from estimators.ensemble.localisation import gaspari_cohn
 from estimators.errors import EstimatorError
-from estimators.fold import Base, Fold
+from estimators.fold import Fold
 from estimators.log import READING, TICK, Log, Readings
 from estimators.model.state_space import Field, Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models.lorenz96 import LORENZ96
 from estimators.models.motor_winding import MOTOR_WINDING
 from estimators.numerics.random import key_of, normal
+from estimators.snapshots import Base
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, JointGaussian, random_linear, random_log
 

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from estimators.errors import EstimatorError, EventError
-from estimators.fold import Base, Fold, fold
+from estimators.fold import Fold, fold
 from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Log, Readings
 from estimators.model.state_space import Input, Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
+from estimators.snapshots import Base
 from estimators.tuning import Tuning
 
 SECOND = 1_000_000_000

@@ -1,0 +1,147 @@
+"""The fold's loop over the events, compiled once for every filter and model."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numba import types
+
+from .compiled.context import context_type, prior, sensor_rows
+from .diagnostics.health import assess, assess_signature
+from .estimator import call_describe, call_predict, call_start, call_update, code_type
+from .interpreted.fold_loop import LONGEST, UNSET
+from .log import INPUT, READING, RESET, TICK, TRUTH
+from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, jit
+from .numerics.steps import steps_of
+from .track import MISSING, NONE, track_type
+
+
+@jit
+def advance_to(code, context, u, clock, t, index, state, work):
+    """Predict from the clock to time t, in steps no longer than the model allows.
+
+    After `LONGEST` of them the model alone says no more than the prior does, so the state is the prior again.
+    """
+    if clock == UNSET or t <= clock:
+        return
+    dt = (t - clock) * 1e-9
+    if dt > LONGEST * context.max_step:
+        prior_mean, prior_cov = prior(context)
+        call_start(code.start, context, prior_mean, prior_cov, state)
+        return
+    steps = steps_of(dt, context.max_step)
+    for _ in range(steps):
+        call_predict(code.predict, context, u, dt / steps, index, state, work)
+
+
+@jit
+def exchange(r, own, kept):
+    """r (ny,) ← what a reading brought of its own, where it brought any; `kept` (ny,) gets what stood there."""
+    for k in range(r.size):
+        kept[k] = r[k]
+        if k < own.size and np.isfinite(own[k]):
+            r[k] = own[k]
+
+
+@jit
+def run(code, context, first, start, end, t, kind, channel, value, width, clock, u, state, spare, work, score, track):
+    """Fold events `start` to `end`: clock (1,), u (nu,) and state move on in place, one track row is filled an event.
+
+    A tick or a truth is a query: it is answered from a copy of the state, so it never changes the estimate. Variances
+    that a reading brings (columns of `value` from `width` on) take the place of the tuned R while it is folded, so
+    every filter honours them.
+    """
+    nu = u.size
+    variances = value.shape[1] > width
+    kept = np.empty(context.n_rows if variances else 0)
+    u = borrowed(u)
+    state = borrowed(state)
+    spare = borrowed(spare)
+    work = borrowed(work)
+    score = borrowed(score)
+    value = borrowed_rows(value)
+    mean = borrowed_rows(track.mean)
+    std = borrowed_rows(track.std)
+    cross = borrowed_rows(track.cross)
+    innovation = borrowed_rows(track.innovation)
+    innovation_std = borrowed_rows(track.innovation_std)
+    for i in range(start, end):
+        what = kind[i]
+        index = first + i
+        for j in range(innovation.shape[1]):
+            innovation[i, j] = np.nan
+            innovation_std[i, j] = np.nan
+        score[0] = np.nan
+        score[1] = 0.0
+        score[2] = np.nan
+        verdict = NONE
+        if what == READING or what == INPUT:
+            advance_to(code, context, u, clock[0], t[i], index, state, work)
+            clock[0] = t[i]
+            if what == INPUT:
+                for j in range(nu):
+                    if np.isfinite(value[i, j]):
+                        u[j] = value[i, j]
+            else:
+                if variances:
+                    row, rows = sensor_rows(context, channel[i])
+                    r = floats(context.r, context.n_rows)[row : row + rows]
+                    exchange(r, value[i, width:], kept)
+                verdict = call_update(
+                    code.update,
+                    context,
+                    u,
+                    channel[i],
+                    value[i],
+                    index,
+                    state,
+                    work,
+                    innovation[i],
+                    innovation_std[i],
+                    score,
+                )
+                if variances:
+                    for k in range(rows):
+                        r[k] = kept[k]
+            call_describe(code.describe, context, state, mean[i], std[i], cross[i])
+        elif what == RESET:
+            prior_mean, prior_cov = prior(context)
+            call_start(code.start, context, prior_mean, prior_cov, state)
+            clock[0] = t[i]
+            call_describe(code.describe, context, state, mean[i], std[i], cross[i])
+        else:
+            if clock[0] == UNSET:
+                clock[0] = t[i]
+            # Several true states at one time are one query: `spare` still holds its answer.
+            if i == start or kind[i - 1] < TRUTH or kind[i - 1] > TICK or t[i] != t[i - 1]:
+                for j in range(state.size):
+                    spare[j] = state[j]
+                advance_to(code, context, u, clock[0], t[i], index, spare, work)
+            call_describe(code.describe, context, spare, mean[i], std[i], cross[i])
+        track.nis[i] = score[0] if verdict != MISSING else np.nan
+        track.dof[i] = int(score[1])
+        track.log_likelihood[i] = score[2]
+        track.verdict[i] = verdict
+
+
+@jit
+def begin(code, context, mean, cov, state):
+    """The state that stands for N(mean, cov)."""
+    call_start(code.start, context, mean, cov, state)
+
+
+I4 = types.int32[::1]
+begin_signature = types.void(code_type, context_type, F1, F2, F1)
+run_signature = types.void(
+    code_type, context_type, i64, i64, i64, I1, B1, I4, F2, i64, I1, F1, F1, F1, F1, F1, track_type
+)
+
+
+@lru_cache(maxsize=1)
+def compiled() -> tuple[Any, ...]:
+    """The entry points, compiled for their one signature (or loaded from the cache)."""
+    for function, signature in ((run, run_signature), (assess, assess_signature), (begin, begin_signature)):
+        function.compile(signature.args)
+    return run, assess, begin

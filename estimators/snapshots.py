@@ -1,0 +1,97 @@
+"""Snapshots of a fold: where it can go back to, and where one begins whose oldest events were dropped."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+EVERY = 64
+"""Events between snapshots of the last `RECENT` events, where late readings fall."""
+
+RECENT = 4096
+
+SPARSE_EVERY = 1024
+"""Events between the snapshots kept for ever."""
+
+MEMORY = 256 * 2**20
+"""Bytes that the snapshots of a fold may take, half for the recent ones; large states are kept at wider steps."""
+
+
+class Base(NamedTuple):
+    """Where a fold starts whose log has lost its oldest events: clock, inputs, and what the dropped events left.
+
+    mean (nx,) and cov (nx, nx), or the variances (1, nx) of a large state, stand for it in any filter. `state` is all
+    that the filter `estimator` had (modes, members, particles, what an adaptation learned), for that filter alone.
+    `first` is the absolute index of the first event that is folded from here.
+    """
+
+    mean: np.ndarray
+    cov: np.ndarray
+    clock: int
+    u: np.ndarray
+    estimator: str = ""
+    state: np.ndarray | None = None
+    first: int = 0
+
+
+class Snapshot(NamedTuple):
+    """Clock (ns), inputs (nu,) and state of a filter before an event."""
+
+    clock: int
+    u: np.ndarray
+    state: np.ndarray
+
+
+class Snapshots:
+    """Snapshots by the absolute index of the event before which they were taken: dense lately, sparse for ever."""
+
+    def __init__(self, nbytes: int) -> None:
+        """`nbytes`: of one state. At least one old snapshot, the start, and a recent one are kept, however large."""
+        self._most = max(1, MEMORY // 2 // nbytes)
+        self._every = EVERY
+        while RECENT // self._every > self._most:
+            self._every *= 2
+        self._sparse = max(SPARSE_EVERY, self._every)
+        self._kept: dict[int, Snapshot] = {}
+
+    def __contains__(self, at: int) -> bool:
+        """Whether there is one before the event at an absolute index."""
+        return at in self._kept
+
+    def __getitem__(self, at: int) -> Snapshot:
+        """The one before the event at an absolute index."""
+        return self._kept[at]
+
+    def next_stop(self, at: int, end: int) -> int:
+        """The absolute index, after `at`, at which a fold on its way to `end` should take the next one."""
+        # Far before the end, only the snapshots that are kept for ever are worth stopping for.
+        stride = self._sparse if end - at > RECENT else self._every
+        return at + stride - at % stride
+
+    def keep(self, at: int, first: int, snapshot: Snapshot) -> None:
+        """Keep one; drop what is neither recent nor kept for ever. `first`: absolute index of the log's first event."""
+        self._kept[at] = snapshot
+        old = at - RECENT
+        if old % self._sparse and old in self._kept and old != first:
+            del self._kept[old]
+        for_ever = [key for key in self._kept if key <= old]
+        if len(for_ever) > self._most + 1:
+            self._sparse *= 2
+            for key in for_ever:
+                if key % self._sparse and key != first:
+                    del self._kept[key]
+
+    def last(self, at: int) -> int:
+        """The absolute index of the last one at or before `at`."""
+        return max(key for key in self._kept if key <= at)
+
+    def forget_after(self, at: int) -> None:
+        """Drop those after `at`: their events will be folded again."""
+        for key in [key for key in self._kept if key > at]:
+            del self._kept[key]
+
+    def forget_before(self, at: int) -> None:
+        """Drop those before `at`: their events are gone."""
+        for key in [key for key in self._kept if key < at]:
+            del self._kept[key]
