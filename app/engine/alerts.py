@@ -8,14 +8,14 @@ from estimators.diagnostics.failure_cause import failures
 from estimators.fold import Fold
 from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
 
-from .counts import UNSETTLED, complaints, last_run, numbers
+from .counts import UNSETTLED, complaints, estimated_rows, last_run
 from .notices import Notices
 
 TRIES = 3
 """Failures of one fold whose cause is sought; a reading of 1e300 has none in the model, so more than one."""
 
 
-class Watch:
+class Alerts:
     """Reports the rows of a fold as they come."""
 
     def __init__(self, notices: Notices) -> None:
@@ -69,14 +69,18 @@ class Watch:
         """The first of the last rows without a number: its absolute index, and its time; None if the last has one."""
         track, log = fold.track, fold.log
         end = len(track)
-        if not end or numbers(track.select(slice(end - 1, end)))[0]:
+        if not end or estimated_rows(track.select(slice(end - 1, end)))[0]:
             return None
         known = self._lost
-        if known is not None and known[0] < log.first + before and not numbers(track.select(slice(before, end))).any():
+        if (
+            known is not None
+            and known[0] < log.first + before
+            and not estimated_rows(track.select(slice(before, end))).any()
+        ):
             return known
         while end > 0:
             start = max(0, end - UNSETTLED)
-            good = np.flatnonzero(numbers(track.select(slice(start, end))))
+            good = np.flatnonzero(estimated_rows(track.select(slice(start, end))))
             if good.size:
                 end = start + int(good[-1]) + 1
                 break

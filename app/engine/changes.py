@@ -11,13 +11,15 @@ from estimators.registry import ESTIMATORS
 if TYPE_CHECKING:
     from estimators.tuning import Tuning
 
+    from ..twin.twin import Twin
 
-def began_as(twin: Any) -> str:
+
+def began_as(twin: Twin) -> str:
     """Where the first settings come from, in a word."""
     return "recorded" if twin.recorded else "configured"
 
 
-def turned(twin: Any, estimator: str, tuning: Tuning) -> dict[str, Any]:
+def turned(twin: Twin, estimator: str, tuning: Tuning) -> dict[str, Any]:
     """What differs from the beginning, with the value that it had there.
 
     Keys are `estimator`, those of the tuning, and `options.<name>` while the estimator is still the same.

@@ -12,12 +12,12 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.track import FAILED, GATED, MISSING, VERDICT_NAMES, Track
 
 UNSETTLED = 8192
-"""Rows at the end that the tally counts each time; a late reading rarely reaches behind them."""
+"""Rows at the end that are counted each time; a late reading rarely reaches behind them."""
 
 LATENCIES = 4096
 
 
-class Tally:
+class RowCounts:
     """Rows by verdict, of each sensor, since the start; those that are settled are counted once."""
 
     def __init__(self, model: StateSpaceModel) -> None:
@@ -72,7 +72,7 @@ def complaints(model: StateSpaceModel, channel: np.ndarray, track: Track, first:
             yield f"{VERDICT_NAMES[code]} {sensor}", f"{sensor}: reading {what}{nis}"
 
 
-def numbers(track: Track) -> np.ndarray:
+def estimated_rows(track: Track) -> np.ndarray:
     """Which rows hold an estimate: one state that is not a number leaves none, whatever the others say."""
     return np.asarray(np.isfinite(track.mean).all(axis=1) & np.isfinite(track.std).all(axis=1))
 

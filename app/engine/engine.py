@@ -27,11 +27,12 @@ from estimators.track import TRACKING
 
 from ..stderr import complain
 from . import commands
-from .alerts import Watch
-from .counts import Latency, Tally, last_run
-from .execute import Remembered, obey
+from .alerts import Alerts
+from .counts import Latency, RowCounts, last_run
+from .execute import Remembered, execute
 from .feeder import Feeder, Finished, Restarted
-from .idle_ticks import Silence
+from .idle_ticks import IdleTicks
+from .interface import Records
 from .notices import Notices
 from .outputs import Belief, Cursor, Pull, Status
 from .playback import playback_status
@@ -97,12 +98,12 @@ class Engine:
         self._revision = 0
         self._stopping = threading.Event()
         self._finished = False
-        self._silence = Silence(section.tick)
+        self._idle_ticks = IdleTicks(section.tick)
         self._latency = Latency()
-        self._watch = Watch(self.notices)
+        self._alerts = Alerts(self.notices)
         self._stall = Stall(self._say_stalled)
         self._status: tuple[float, Status] | None = None
-        self.recorder: Any = None
+        self.recorder: Records | None = None
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
 
     def _clear(self, base: Base | None) -> None:
@@ -113,7 +114,7 @@ class Engine:
         self._logs += 1
         self._base = base
         self._fold = self._make_fold(self.estimator, self.tuning, self._log, base)
-        self._tally = Tally(self.model)
+        self._row_counts = RowCounts(self.model)
 
     def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
         period = self.twin.picture if self.model.grid is not None else None
@@ -267,10 +268,10 @@ class Engine:
                 t=int(log.t[last]) if last >= 0 else None,
                 health=int(track.health[last]) if last >= 0 else TRACKING,
                 since=int(log.t[last_run(track.health)]) if last >= 0 else None,
-                lost=self._watch.lost,
+                lost=self._alerts.lost,
                 counts={
                     **self.notices.counts(),
-                    **self._tally.count(track.verdict, log.channel),
+                    **self._row_counts.count(track.verdict, log.channel),
                     **({"recovered": fold.recoveries()} if fold.recoveries() else {}),
                 },
                 nis=float(track.nis_mean[last]) if last >= 0 else np.nan,
@@ -312,7 +313,7 @@ class Engine:
             else:
                 self._accept(batches)
                 batches = []
-                self._obey(item)
+                self._execute(item)
             try:
                 item = self._inbox.get_nowait() if sum(map(len, batches)) < SPARSE_EVERY else None
             except queue.Empty:
@@ -325,7 +326,7 @@ class Engine:
         batch = batches[0] if len(batches) == 1 else Readings.concat(batches, self.model.width)
         with self._lock, self._stall.watched(self._fold):
             stale = self._take(batch, self._horizon)
-            self._silence.broken(self._log.newest)
+            self._idle_ticks.broken(self._log.newest)
             if self._log.n > self._history + 3 * SPARSE_EVERY:
                 self._forget()
         if stale:
@@ -341,13 +342,13 @@ class Engine:
         if first < self._fold.n:
             self._go_back(first)
         self._fold.advance()
-        self._watch.look(self._fold, before)
+        self._alerts.look(self._fold, before)
         return stale
 
     def _go_back(self, index: int) -> None:
         """Events at and behind `index` changed: fold them again, and let every cursor fetch them again."""
         self._fold.rewind(index)
-        self._tally.changed(index)
+        self._row_counts.changed(index)
         absolute = self._log.first + index
         self._requests.changed(absolute)
         for cursor in self._cursors:
@@ -359,14 +360,14 @@ class Engine:
         count = (self._log.n - self._history) // SPARSE_EVERY * SPARSE_EVERY
         count, self._base = self._fold.base_at(count)
         if count:
-            self._tally.forget(self._fold.track.verdict[:count], self._log.channel[:count])
+            self._row_counts.forget(self._fold.track.verdict[:count], self._log.channel[:count])
             self._fold.drop_front(count)
             self._log.drop_front(count)
 
     def _when_silent(self) -> None:
         if self._finished or not self._log.n:
             return
-        now = self._silence.asks(self._feeder.source, int(self._log.t[self._log.n - 1]))
+        now = self._idle_ticks.asks(self._feeder.source, int(self._log.t[self._log.n - 1]))
         if now is not None:
             self.insert(Readings.one(now, time.time_ns(), TICK, 0, [], self.model.width))
 
@@ -374,7 +375,7 @@ class Engine:
         self.notices.say(text, level=level)
         complain(text)
 
-    def _obey(self, item: Any) -> None:
+    def _execute(self, item: Any) -> None:
         """Carry one command out, or take a refold or a word from the feeder."""
         if isinstance(item, Refolded):
             self._adopt(item)
@@ -386,7 +387,7 @@ class Engine:
             self._finished = True
             self.notices.say("the source has ended; the estimate stays")
         else:
-            obey(item, self)
+            execute(item, self)
 
     def _restart(self) -> None:
         """The source began again: so does the log. The fold is a new revision of it; a refold is asked for again."""
@@ -399,7 +400,7 @@ class Engine:
             self._finished = False
             self._requests.forget()
             self.notices.begin_again()
-            self._watch.again()
+            self._alerts.again()
         if wanted:
             self.retune(*wanted)
 
@@ -431,8 +432,8 @@ class Engine:
             old, log = self._fold, self._log
             # What the new revision says of the readings counts, also of those that it loses here; not what others said.
             lost = max(0, log.first - fold.log.first)
-            tally = Tally(self.model)
-            tally.forget(fold.track.verdict[:lost], fold.log.channel[:lost])
+            row_counts = RowCounts(self.model)
+            row_counts.forget(fold.track.verdict[:lost], fold.log.channel[:lost])
             try:
                 fold.follow(log, changed_from)
             except EstimatorError:
@@ -452,10 +453,10 @@ class Engine:
                     Readings(*(column[: old.n].copy() for column in log.readings)),
                     old.track,
                 )
-                self._fold, self._tally = fold, tally
+                self._fold, self._row_counts = fold, row_counts
                 self._revision += 1
-                self._watch.again()
-                self._watch.look(fold, fold.n)
+                self._alerts.again()
+                self._alerts.look(fold, fold.n)
         if stale:
             self.retune(self.estimator, self.tuning)
 

@@ -4,25 +4,27 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from estimators.errors import ConfigError
 from estimators.log import RESET, Readings
 from estimators.registry import checked, find_estimator
 
 from . import commands
+from .interface import Running
 from .playback import PLAYBACK, play
 
 if TYPE_CHECKING:
     from estimators.tuning import Tuning
 
-    from .engine import Engine
+    from ..twin.twin import Twin
+
 
 Refolding = commands.SetEstimator | commands.SetTuning | commands.SetOption | commands.UseSensor | commands.Restore
 """Commands that fold the history again."""
 
 
-def retuned(command: Refolding, engine: Any) -> tuple[str, Tuning]:
+def retuned(command: Refolding, engine: Running) -> tuple[str, Tuning]:
     """The estimator and the tuning that a command asks for.
 
     Raises:
@@ -47,7 +49,7 @@ def retuned(command: Refolding, engine: Any) -> tuple[str, Tuning]:
     return estimator, tuning.set(command.key, command.value)
 
 
-def obey(command: commands.Command, engine: Engine) -> None:
+def execute(command: commands.Command, engine: Running) -> None:
     """Carry one command out.
 
     Raises:
@@ -66,7 +68,7 @@ def obey(command: commands.Command, engine: Engine) -> None:
         play(engine.source, command, engine.span()[0])
 
 
-def _reset_now(engine: Engine) -> Readings:
+def _reset_now(engine: Running) -> Readings:
     """A reset now: an event of the log, so that refolds and recordings have it where it was."""
     now = engine.span()[1]
     if not now:
@@ -77,7 +79,7 @@ def _reset_now(engine: Engine) -> Readings:
 class Remembered:
     """The options with which each filter was left, for when it is chosen again; at first those of the YAML."""
 
-    def __init__(self, twin: Any) -> None:
+    def __init__(self, twin: Twin) -> None:
         self._twin = twin
         self._left: dict[str, Mapping[str, float]] = {}
 

@@ -1,4 +1,4 @@
-"""Silence: when nothing arrives, the estimate is asked what it is now, so that its growing uncertainty shows."""
+"""IdleTicks: when nothing arrives, the estimate is asked what it is now, so that its growing uncertainty shows."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from sources.source import Paced, Source
 
 
-class Silence:
+class IdleTicks:
     """How long the source has said nothing, and when to ask."""
 
     def __init__(self, tick: float) -> None:

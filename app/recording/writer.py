@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from estimators.log import Log
     from estimators.track import Track
 
-    from ..engine.engine import Engine
+    from ..engine.interface import Running
     from ..twin.twin import Twin
 
 PERIOD = 0.4
@@ -54,7 +54,7 @@ FINE = math.inf
 class Recorder:
     """Starts and stops recordings of one engine. `draw(stream)` gives what logs the charts' entities of a pull."""
 
-    def __init__(self, engine: Engine, draw: Any, split: Split = NEVER) -> None:
+    def __init__(self, engine: Running, draw: Any, split: Split = NEVER) -> None:
         self._engine = engine
         self._draw = draw
         self._split = split
@@ -156,7 +156,7 @@ class Recorder:
 class _Part:
     """A file that is being written: how far its events and charts have come, and where a fold of them starts."""
 
-    def __init__(self, engine: Engine, asked: Path, draw: Any, *, before: _Part | None = None) -> None:
+    def __init__(self, engine: Running, asked: Path, draw: Any, *, before: _Part | None = None) -> None:
         """Begin a recording at the path that was asked for; or the part after another, from which it goes on."""
         twin = engine.twin
         self._engine = engine

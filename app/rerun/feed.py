@@ -27,6 +27,7 @@ from ..engine.notices import KEPT
 from .rows import RerunRows
 
 if TYPE_CHECKING:
+    from ..engine.interface import Running
     from ..engine.notices import Notice
     from ..engine.outputs import Pull
 
@@ -48,7 +49,7 @@ Message = str | bytes
 class RerunFeed:
     """Gives what the viewer of one browser needs next. Not to be called by two threads at once."""
 
-    def __init__(self, engine: Any, *, layout: bool = True) -> None:
+    def __init__(self, engine: Running, *, layout: bool = True) -> None:
         """Prepare; nothing is pulled yet.
 
         Args:

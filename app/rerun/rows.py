@@ -12,7 +12,8 @@ from estimators.log import READING, Readings, truth_of
 from estimators.track import FAILED, GATED, HEALTH_NAMES, Track
 
 from ..drawing.direct_readings import observed
-from ..engine.counts import numbers
+from ..engine.counts import estimated_rows
+from ..engine.interface import Running
 from .field import FieldDrawing
 from .layout import EVENTS, HEALTH_COLORS, TIMELINE, blueprint, pair_name, styles
 from .pairs import PairDrawing
@@ -36,7 +37,9 @@ class RerunRows:
     while the lines keep showing what was concluded without it.
     """
 
-    def __init__(self, stream: rr.RecordingStream, engine: Any, *, series: float | None, layout: bool = True) -> None:
+    def __init__(
+        self, stream: rr.RecordingStream, engine: Running, *, series: float | None, layout: bool = True
+    ) -> None:
         """Log layout and styles.
 
         Args:
@@ -164,7 +167,7 @@ class RerunRows:
         """Log another revision's rows as the thin grey lines behind this one's."""
         rows = last_of_each_time(t)
         width = self.width(t)
-        known = numbers(track)[rows]
+        known = estimated_rows(track)[rows]
         for j, name in enumerate(state.name for state in self.model.shown_states):
             mean = np.where(known, track.mean[rows, j], np.nan)
             self._line(f"/previous/state/{name}", t[rows], mean[:, None], width, gaps=True)
@@ -197,7 +200,7 @@ class RerunRows:
 
     def _states(self, t: np.ndarray, track: Track, width: int) -> None:
         rows = last_of_each_time(t)
-        known = numbers(track)[rows]
+        known = estimated_rows(track)[rows]
         for j, name in enumerate(state.name for state in self.model.shown_states):
             # A probability has no band.
             mean, twice = track.mean[rows, j], 2.0 * track.std[rows, j] * (j != self.model.mode)

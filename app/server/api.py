@@ -19,6 +19,7 @@ from estimators.track import HEALTH_NAMES
 from ..engine import commands
 from ..engine.changes import began_as, turned
 from ..engine.execute import Refolding, retuned
+from ..engine.interface import Running
 from ..engine.playback import PLAYBACK, check_playback
 
 LONGEST_NAME = 255
@@ -42,7 +43,7 @@ def one_line(text: str) -> str:
     return line if len(line) <= LONGEST_LINE else line[: LONGEST_LINE - 1] + "…"
 
 
-def status_json(engine: Any) -> dict[str, Any]:
+def status_json(engine: Running) -> dict[str, Any]:
     """What the page's header shows, and more for whoever asks."""
     status = engine.status()
     return {
@@ -59,9 +60,9 @@ def status_json(engine: Any) -> dict[str, Any]:
         "health": HEALTH_NAMES[status.health],
         "since": status.since,
         "lost": status.lost,
-        "nis": _plain(getattr(status, "nis", None)),
-        "nis_low": _plain(getattr(status, "nis_low", None)),
-        "nis_high": _plain(getattr(status, "nis_high", None)),
+        "nis": _plain(status.nis),
+        "nis_low": _plain(status.nis_low),
+        "nis_high": _plain(status.nis_high),
         "counts": dict(status.counts),
         "paused": status.paused,
         "finished": status.finished,
@@ -82,7 +83,7 @@ def _plain(value: Any) -> Any:
     return number if math.isfinite(number) else str(number) if math.isinf(number) else None
 
 
-def command_from_json(body: Any, engine: Any) -> commands.Command:
+def command_from_json(body: Any, engine: Running) -> commands.Command:
     """The command that `{"command": NAME, field: value, ...}` stands for; infinity is written "inf".
 
     Raises:
@@ -105,7 +106,7 @@ def command_from_json(body: Any, engine: Any) -> commands.Command:
     return command
 
 
-def _check(command: commands.Command, engine: Any) -> None:
+def _check(command: commands.Command, engine: Running) -> None:
     if isinstance(command, Refolding):
         retuned(command, engine)
     elif isinstance(command, commands.Record) and engine.recorder is None:

@@ -25,6 +25,7 @@ from starlette.websockets import WebSocket
 
 from estimators.errors import NisusError
 
+from ..engine.interface import Running
 from ..rerun.feed import RerunFeed
 from .api import Json, command_from_json, one_line, status_json
 from .bounds import BODY, TooLarge, bounded_body, bounds
@@ -61,7 +62,7 @@ class PageServer:
 
     def __init__(
         self,
-        engine: Any,
+        engine: Running,
         *,
         port: int,
         viser_port: int | None,
@@ -189,8 +190,11 @@ class PageServer:
 
     def _recordings(self) -> dict[str, Path]:
         """What may be fetched: recordings that this process wrote, and the one it reviews."""
-        recorder = getattr(self._engine, "recorder", None)
-        paths = [*getattr(recorder, "finished", []), *([self._review] if self._review is not None else [])]
+        recorder = self._engine.recorder
+        paths = [
+            *(recorder.finished if recorder is not None else ()),
+            *([self._review] if self._review is not None else []),
+        ]
         return {path.name: path for path in paths}
 
     async def _recording(self, request: Request) -> Response:

@@ -12,7 +12,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.track import GATED
 
 from ..drawing.direct_readings import observed
-from ..engine.counts import numbers
+from ..engine.counts import estimated_rows
 from .decimate import Buckets, bridge, extended, runs
 from .history import History
 from .series import BLUE, DOTS, GREEN, GREY, HEIGHT, RED, axes, frame, nis_series, no_data, send, state_series
@@ -98,7 +98,10 @@ class Charts:
         if pull is None:
             self._previous = None
         else:
-            self._previous = pull.readings.t.copy(), np.where(numbers(pull.track)[:, None], pull.track.mean, np.nan)
+            self._previous = (
+                pull.readings.t.copy(),
+                np.where(estimated_rows(pull.track)[:, None], pull.track.mean, np.nan),
+            )
 
     def clear(self) -> None:
         """Forget all rows: another revision begins."""

@@ -14,7 +14,9 @@ import viser
 
 from estimators.registry import ESTIMATORS, unfit
 
-from ..engine.commands import Pause, Record, Reset, Seek, SetEstimator, SetTuning, Speed, Step, UseSensor
+from ..engine.commands import Command, Pause, Record, Reset, Seek, SetEstimator, SetTuning, Speed, Step, UseSensor
+from ..engine.interface import Running
+from ..engine.outputs import Status
 from .coalescer import Coalescer
 from .options import OptionRows
 from .restore import BeganRows
@@ -30,7 +32,7 @@ PAUSE, RESUME, STEP, RESET = "Pause", "Resume", "Step", "Reset"
 class Panel:
     """Builds the panel once; `sync` brings it up to what the engine says."""
 
-    def __init__(self, server: viser.ViserServer, engine: Any, coalescer: Coalescer) -> None:
+    def __init__(self, server: viser.ViserServer, engine: Running, coalescer: Coalescer) -> None:
         self._engine, self._coalescer = engine, coalescer
         self._configured = engine.twin.tuning
         self._events: deque[Any] = deque(maxlen=8)
@@ -58,7 +60,7 @@ class Panel:
         with tabs.add_tab("Events"):
             self._events_list = gui.add_html("")
 
-    def _build_estimator(self, gui: viser.GuiApi, status: Any) -> None:
+    def _build_estimator(self, gui: viser.GuiApi, status: Status) -> None:
         model = self._engine.model
         reasons = {name: unfit(entry, model) for name, entry in ESTIMATORS.items()}
         self._titles = {name: entry.title for name, entry in ESTIMATORS.items() if reasons[name] is None}
@@ -76,7 +78,7 @@ class Panel:
                 style = "font-size:0.75em;padding:0 0.9em 0.5em"
                 gui.add_html(f'<div style="{style}">{"<br>".join(refused)}</div>')
 
-    def _build_tuning(self, gui: viser.GuiApi, status: Any) -> None:
+    def _build_tuning(self, gui: viser.GuiApi, status: Status) -> None:
         configured = {item.key: item.value for item in self._configured.items()}
         titles = {"Q": "Process noise Q", "R": "Sensor noise R", "p": "Parameters"}
         room = len(configured) <= 4
@@ -109,11 +111,11 @@ class Panel:
         self.gate.handle.options = tuple(self._gates)
         return f"{gate:.6g}"
 
-    def _sensor(self, gui: viser.GuiApi, name: str, status: Any) -> ChoiceRow:
+    def _sensor(self, gui: viser.GuiApi, name: str, status: Status) -> ChoiceRow:
         box = gui.add_checkbox(name.replace("_", " "), bool(status.tuning.get(f"use.{name}")))
         return ChoiceRow(box, lambda used: self._engine.submit(UseSensor(name, used)))
 
-    def _build_play(self, gui: viser.GuiApi, status: Any) -> None:
+    def _build_play(self, gui: viser.GuiApi, status: Status) -> None:
         speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1×")
         self.speed = ChoiceRow(speed, lambda text: self._engine.submit(Speed(SPEEDS[text])))
         self.seek = gui.add_slider("Position [s]", 0.0, 1.0, 1.0, 0.0, marks=(), visible=False)
@@ -135,7 +137,7 @@ class Panel:
             self._events.extend(notices)
             self._events_changed = True
 
-    def sync(self, status: Any, origin: int | None, unit: Unit = SECONDS) -> None:
+    def sync(self, status: Status, origin: int | None, unit: Unit = SECONDS) -> None:
         """Show what the engine says; whoever changed it, a browser, the API, or the engine itself."""
         self.began.sync(status)
         self.estimator.sync(self._titles.get(status.estimator, self.estimator.handle.value))
@@ -158,7 +160,7 @@ class Panel:
             self._events_changed, self._unit = False, unit
             self._show(self._events_list, "events", events_html(list(self._events), origin, unit))
 
-    def _sync_play(self, status: Any) -> None:
+    def _sync_play(self, status: Status) -> None:
         labels = _buttons(status)
         if tuple(self.run_buttons.options) != labels:
             self.run_buttons.options = labels
@@ -186,7 +188,8 @@ class Panel:
     def _pressed(self, event: viser.GuiEvent) -> None:
         if event.client is None:
             return
-        command = {PAUSE: Pause(True), RESUME: Pause(False), STEP: Step(), RESET: Reset()}.get(event.target.value)
+        buttons: dict[str, Command] = {PAUSE: Pause(True), RESUME: Pause(False), STEP: Step(), RESET: Reset()}
+        command = buttons.get(event.target.value)
         if command is not None:
             self._engine.submit(command)
 
@@ -209,6 +212,6 @@ class Panel:
         self._engine.submit(Record(Path(name if name.endswith(".rrd") else f"{name}.rrd")))
 
 
-def _buttons(status: Any) -> tuple[str, ...]:
+def _buttons(status: Status) -> tuple[str, ...]:
     """What can be done: a live source cannot be held up."""
     return (RESUME if status.paused else PAUSE, STEP, RESET) if status.seekable else (RESET,)

@@ -11,6 +11,9 @@ from estimators.registry import ESTIMATORS
 
 from ..engine.changes import began_as, turned
 from ..engine.commands import Restore
+from ..engine.interface import Running
+from ..engine.outputs import Status
+from ..twin.twin import Twin
 
 NAMED = 6
 """Settings that are named; of more it is said how many."""
@@ -19,7 +22,7 @@ NAMED = 6
 class BeganRows:
     """One line and, while something differs, a button."""
 
-    def __init__(self, gui: viser.GuiApi, engine: Any) -> None:
+    def __init__(self, gui: viser.GuiApi, engine: Running) -> None:
         self._engine = engine
         self._estimator: str | None = None
         self._tuning: Any = None
@@ -27,7 +30,7 @@ class BeganRows:
         self.button = gui.add_button(f"Back to as {began_as(engine.twin)}", visible=False)
         self.button.on_click(self._pressed)
 
-    def sync(self, status: Any) -> None:
+    def sync(self, status: Status) -> None:
         """Show what the engine says."""
         if status.estimator == self._estimator and status.tuning is self._tuning:
             return
@@ -42,7 +45,7 @@ class BeganRows:
             self._engine.submit(Restore())
 
 
-def began_html(twin: Any, found: dict[str, Any]) -> str:
+def began_html(twin: Twin, found: dict[str, Any]) -> str:
     """The line; of a twin that runs as its YAML says, nothing."""
     word = began_as(twin)
     title = html.escape(ESTIMATORS[twin.estimator].title)
@@ -62,7 +65,7 @@ def _name(key: str) -> str:
     return key.removeprefix("options.").replace("_", " ")
 
 
-def _text(twin: Any, key: str, value: Any) -> str:
+def _text(twin: Twin, key: str, value: Any) -> str:
     """A setting for people."""
     if key == "estimator":
         return ESTIMATORS[value].title

@@ -7,6 +7,7 @@ from typing import Any
 
 from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
 
+from ..engine.outputs import Status
 from .time_units import SECONDS, Unit
 
 COLORS = {"tracking": "#16a34a", "degraded": "#d97706", "diverged": "#dc2626", "stale": "#6b7280"}
@@ -14,11 +15,12 @@ LEVELS = {"info": "#6b7280", "warn": "#d97706", "error": "#dc2626"}
 COUNTED = ("readings", "gated", "missing", "stale")
 
 
-def status_html(status: Any, origin: int | None, unit: Unit = SECONDS) -> str:
+def status_html(status: Status, origin: int | None, unit: Unit = SECONDS) -> str:
     """Health, revision and counts in two lines that keep their places while the numbers run; times as in the charts."""
     health = HEALTH_NAMES[status.health]
-    lasting = status.health != TRACKING and status.since is not None and origin is not None
-    since = f" since {unit.text((status.since - origin) * 1e-9)}" if lasting else ""
+    since = ""
+    if status.health != TRACKING and status.since is not None and origin is not None:
+        since = f" since {unit.text((status.since - origin) * 1e-9)}"
     remedy = ""
     if status.lost is not None:
         when = "" if origin is None else f" since {unit.text((status.lost - origin) * 1e-9)}"

@@ -8,6 +8,7 @@ from typing import Any
 
 import viser
 
+from ..engine.interface import Running
 from ..engine.notices import Notice
 from .belief_scene import BeliefScene
 from .charts import Charts
@@ -42,7 +43,7 @@ class ViserView:
     `port` is known once the view is built; browsers reach it through the page's server only, which knows `secret`.
     """
 
-    def __init__(self, engine: Any, *, secret: str) -> None:
+    def __init__(self, engine: Running, *, secret: str) -> None:
         self.engine = engine
         view = engine.twin.config.view
         model = engine.model

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from app.engine import commands
-from app.engine.alerts import Watch
+from app.engine.alerts import Alerts
 from app.engine.engine import Engine
 from app.engine.notices import Notices
 from app.twin.twin import load_twin
@@ -446,7 +446,7 @@ def test_the_same_failure_is_said_once_however_long_it_lasts():
     log = Log(model.width)
     growing = Fold("filterpy-ukf", model, Tuning.of(model), log)
     notices = Notices(lambda: 0, clock=itertools.count(0, 60).__next__)
-    watch = Watch(notices)
+    watch = Alerts(notices)
     for k, away in enumerate([False, True, True, False, True]):
         solver.away = away
         log.extend(readings([k + 1.0], [40.0]))

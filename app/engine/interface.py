@@ -1,0 +1,99 @@
+"""What a running twin offers to commands, views, recorder and API. The engine is one; tests may bring another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from estimators.diagnostics.health import HealthPolicy
+from estimators.log import Readings
+from estimators.model.state_space import StateSpaceModel
+from estimators.snapshots import Base
+from estimators.tuning import Tuning
+from sources.source import Source
+
+from .commands import Command
+from .notices import Notices
+from .outputs import Belief, Cursor, Pull, Status
+
+if TYPE_CHECKING:
+    from ..twin.twin import Twin
+
+
+class Records(Protocol):
+    """What records a running twin."""
+
+    finished: list[Path]
+    failure: str
+
+    @property
+    def path(self) -> Path | None:
+        """The file that is being written."""
+
+    def record(self, path: Path | None) -> None:
+        """Record into a new file from now on, or finish the one that is open."""
+
+
+class Running(Protocol):
+    """A running twin. Everything here may be called from any thread, and never waits for a viewer."""
+
+    twin: Twin
+    model: StateSpaceModel
+    pairs: np.ndarray
+    estimator: str
+    tuning: Tuning
+    notices: Notices
+    recorder: Records | None
+
+    @property
+    def source(self) -> Source:
+        """Where the readings come from; it may be reopened."""
+
+    @property
+    def policy(self) -> HealthPolicy:
+        """When the estimate may be trusted."""
+
+    def submit(self, command: Command) -> None:
+        """Queue a command."""
+
+    def status(self) -> Status:
+        """What a panel shows."""
+
+    def cursor(self, *, follows_log: bool = False) -> Cursor:
+        """A cursor for one consumer, for `pull`; give it back with `release`."""
+
+    def release(self, cursor: Cursor) -> None:
+        """Forget a cursor."""
+
+    def pull(self, cursor: Cursor, limit: int | None = None) -> Pull:
+        """Copies of the rows since the cursor, at most `limit`, and the notices since."""
+
+    def previous(self) -> Pull | None:
+        """The whole previous revision, for comparison."""
+
+    def belief(self) -> Belief:
+        """The estimate now."""
+
+    def span(self) -> tuple[int, int]:
+        """Times of the first and the last event, ns; zeros while there is none."""
+
+    def base(self) -> Base | None:
+        """Where a fold of the present log starts, if its oldest events were dropped."""
+
+    def origin(self, index: int) -> tuple[int, Base | None]:
+        """Where a fold that gives the rows from `index` on can start."""
+
+    def folded_with(self) -> tuple[Tuning, str]:
+        """Tuning and estimator of the fold that `pull` shows."""
+
+    def options_of(self, estimator: str) -> Mapping[str, float]:
+        """The options with which an estimator starts."""
+
+    def retune(self, estimator: str, tuning: Tuning) -> None:
+        """Fold the history again with another estimator or tuning; on the engine's own thread."""
+
+    def insert(self, event: Readings) -> None:
+        """Put in an event of our own; on the engine's own thread."""
