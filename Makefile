@@ -27,7 +27,7 @@ fast: $(VENV)/.installed-dev
 
 # On a processor without AVX or FMA; Numba's cache keeps its machine code apart.
 generic: $(VENV)/.installed-dev
-	NUMBA_CPU_NAME=generic $(PYTEST) -q $(foreach name,$(VECTORS),$(or $(shell find tests -name test_$(name).py),tests/test_$(name).py))
+	NUMBA_CPU_NAME=generic $(PYTEST) -q $(VECTORS:%=tests/estimators/numerics/test_%.py)
 
 # The lowest versions that pyproject.toml allows on the oldest Python here, and the newest on the newest.
 versions: $(VENV)/.installed-dev

@@ -23,12 +23,13 @@ SECONDS = 900
 
 FOLDERS = ("config", "sources")
 MODULES = (
-    "test_imports", "test_readme", "test_jit", "test_log", "test_simd_rows", "test_server", "test_page_door",
-    "test_simd_exp", "test_rerun_view", "test_viser_view", "test_viser_numbers", "test_new", "test_port",
-    "test_progress", "test_conftest",
-    "test_black_box::test_a_function_that_processes_cannot_import",
+    "test_imports.py", "test_readme.py", "test_conftest.py", "estimators/numerics/test_jit.py",
+    "estimators/numerics/test_simd_rows.py", "estimators/numerics/test_simd_exp.py", "estimators/test_log.py",
+    "app/server/test_server.py", "app/server/test_door.py", "app/server/test_port.py", "app/rerun/test_feed.py",
+    "app/viser/test_view.py", "app/viser/test_numbers.py", "app/cli/test_new.py", "app/cli/test_progress.py",
+    "estimators/compiled/test_black_box.py::test_a_function_that_processes_cannot_import",
 )  # fmt: skip
-"""Files by name, wherever they lie under tests/; the last with one test of it."""
+"""Files under tests/; the last with one test of it."""
 
 
 def chosen() -> list[str]:
@@ -39,10 +40,10 @@ def chosen() -> list[str]:
             sys.exit(f"tests/versions.py: there is no folder {folder}; mend FOLDERS")
     for module in MODULES:
         name, colons, test = module.partition("::")
-        paths = list((ROOT / "tests").rglob(f"{name}.py"))
-        if len(paths) != 1:
-            sys.exit(f"tests/versions.py: there are {len(paths)} files {name}.py under tests/, not one; mend MODULES")
-        found.append(f"{paths[0]}{colons}{test}")
+        path = ROOT / "tests" / name
+        if not path.is_file():
+            sys.exit(f"tests/versions.py: there is no file tests/{name}; mend MODULES")
+        found.append(f"{path}{colons}{test}")
     return found
 
 
