@@ -11,10 +11,12 @@ from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TRUTH, Readings
 from estimators.numerics.jit import jit
 
-from .can.signals import ABSENT, PRESENT, SHORT
 from .geodesy import east_north
 from .source import Channel, Report
 from .units import conversion
+
+PRESENT, ABSENT, SHORT = range(3)
+"""A value is there; the frame does not carry the signal (multiplexing); the frame ends before it."""
 
 
 class _Tables(NamedTuple):

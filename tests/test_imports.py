@@ -66,6 +66,60 @@ def test_estimators_are_pure(path):
     assert not touched - allowed
 
 
+def edges() -> dict[str, set[str]]:
+    """Every module, and the modules that it imports: at the top, in a function, or for its types only."""
+    names = {}
+    for path in modules():
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        names[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    found: dict[str, set[str]] = {}
+    for name, path in names.items():
+        package = ".".join(path.relative_to(ROOT).parent.parts)
+        found[name] = set()
+        for item in imported(path.read_text(), package):
+            whole = [item, item.rpartition(".")[0]]
+            found[name] |= {next((known for known in whole if known in names), name)} - {name}
+    return found
+
+
+def room(name: str) -> str:
+    """The folder of a module; a module that stands in no room of its package is a room by itself."""
+    parts = name.split(".")
+    return ".".join(parts[:-1]) if len(parts) > 2 else name
+
+
+def circles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """Groups that import one another, directly or through others: what is left once nobody else can be taken away."""
+    left = {name: set(to) for name, to in graph.items()}
+    while free := [name for name, to in left.items() if not to & left.keys()]:
+        for name in free:
+            del left[name]
+    while free := [name for name in left if not any(name in to for to in left.values())]:
+        for name in free:
+            del left[name]
+    return [sorted(left)] if left else []
+
+
+def test_no_module_imports_in_a_circle():
+    assert circles(edges()) == []
+
+
+def test_no_room_imports_in_a_circle():
+    graph: dict[str, set[str]] = {}
+    for name, to in edges().items():
+        here = room(name)
+        # An inner room belongs to the one around it.
+        graph.setdefault(here, set()).update(
+            there for there in map(room, to) if not within(there, here) and not within(here, there)
+        )
+    assert circles(graph) == []
+
+
+def test_circles_are_found():
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}) == [["b", "c"]]
+    assert circles({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
+
+
 def test_the_reader_of_imports_sees_every_form():
     source = """
 import app.engine

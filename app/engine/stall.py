@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from ..cli.prepare import CallWatch
 from ..stderr import complain
+from .call_watch import CallWatch
 
 if TYPE_CHECKING:
     from estimators.fold import Fold

@@ -138,7 +138,7 @@ class RerunFeed:
         self._frame = 0
         announcement = json.dumps({"recording": f"Recording:{self.application}:{name}", "revision": pull.revision})
         t = pull.readings.t
-        cut = int(np.searchsorted(t, t[-1] - int(AHEAD * rows.window * 1e9))) if t.size and pull.revision else 0
+        cut = int(np.searchsorted(t, t[-1] - int(AHEAD * rows.sink.window * 1e9))) if t.size and pull.revision else 0
         before = self._engine.previous() if pull.revision and t.size else None
         # A recording's timeline must not begin before its rows; they may have been forgotten meanwhile.
         grey = before.readings.t if before is not None else t[:0]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import rerun as rr
 
@@ -13,12 +11,8 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.track import Track
 
 from ..drawing.heatmap import RIM, Frame, Scale, image_of, kinds, palette, positioned, sensor_colors
-
-if TYPE_CHECKING:
-    from .rows import RerunRows
-
-GAP = 0.05
-"""Between the picture and its scale, and the width of the scale, of the picture's width."""
+from .sink import Sink
+from .style import GAP
 
 
 class FieldDrawing:
@@ -38,37 +32,37 @@ class FieldDrawing:
         self._probes = self._frame.pixels(cells)
         self._normalised = np.full(len(places), np.nan)
 
-    def static(self, rows: RerunRows) -> None:
+    def static(self, sink: Sink) -> None:
         """Log what stays: the scale's place, the sensors' rims, the charted cells with their names."""
         bar = np.linspace(254, 0, self._frame.height).round().astype(np.uint8)[:, None].repeat(self._bar, axis=1)
         names = [state.name.removeprefix(f"{self._model.grid.name}") for state in self._model.shown_states]  # type: ignore[union-attr]
         for kind in self._kinds:
             beside = rr.Transform3D(translation=[self._frame.width + self._bar, 0.0, 0.0])
-            rows.log_static(f"/field/{kind.name}/bar", beside)
+            sink.static(f"/field/{kind.name}/bar", beside)
             colors = self._palettes[kind.name]
-            rows.log_static(f"/field/{kind.name}/bar", rr.Image(colors[bar], opacity=1.0))
+            sink.static(f"/field/{kind.name}/bar", rr.Image(colors[bar], opacity=1.0))
             # A picture is one byte a pixel, and the colours belong to it. (An encoded image would be drawn faded
             # until it is decoded, at every change.)
-            rows.log_static(
+            sink.static(
                 f"/field/{kind.name}",
                 rr.AnnotationContext([rr.AnnotationInfo(id=k, color=color) for k, color in enumerate(colors.tolist())]),
             )
             size = rr.components.ImageFormat(
                 width=self._frame.width, height=self._frame.height, channel_datatype=rr.ChannelDatatype.U8
             )
-            rows.log_static(f"/field/{kind.name}/image", rr.SegmentationImage.from_fields(format=size, opacity=1.0))
+            sink.static(f"/field/{kind.name}/image", rr.SegmentationImage.from_fields(format=size, opacity=1.0))
             if len(self._dots):
                 rims = rr.Points2D(self._dots, radii=-3.0, colors=[RIM], draw_order=20.0)
-                rows.log_static(f"/field/{kind.name}/rims", rims)
-                rows.log_static(f"/field/{kind.name}/sensors", rr.Points2D.from_fields(draw_order=30.0))
-            rows.log_static(
+                sink.static(f"/field/{kind.name}/rims", rims)
+                sink.static(f"/field/{kind.name}/sensors", rr.Points2D.from_fields(draw_order=30.0))
+            sink.static(
                 f"/field/{kind.name}/cells",
                 rr.Points2D(
                     self._probes, radii=-3.0, colors=[(16, 185, 129)], labels=names, show_labels=False, draw_order=40.0
                 ),
             )
 
-    def readings(self, rows: RerunRows, readings: Readings, track: Track, width: int) -> None:
+    def readings(self, sink: Sink, readings: Readings, track: Track, width: int) -> None:
         """Log of each sensor with many rows the size of its innovations, in units of their deviations."""
         is_reading = readings.kind == READING
         for k, sensor in enumerate(self._model.sensors):
@@ -83,7 +77,7 @@ class FieldDrawing:
             rms = np.sqrt(np.where(known, sizes, 0.0).__pow__(2).sum(axis=1) / number)
             values = np.stack((rms, np.where(known, sizes, 0.0).max(axis=1)), axis=1)
             values[~known.any(axis=1)] = np.nan
-            rows.line(f"/innovation/{sensor.name}", readings.t[mask], values, width)
+            sink.line(f"/innovation/{sensor.name}", readings.t[mask], values, width, by_first=True)
 
     def note(self, readings: Readings, track: Track) -> None:
         """Remember the newest innovation of each sensor row, for the dots on the pictures."""
@@ -96,56 +90,46 @@ class FieldDrawing:
                     ratio = track.innovation[last] / track.innovation_std[last]
                 self._normalised[of] = ratio[self._which[of, 1]]
 
-    def pictures(self, rows: RerunRows, pictures: list[Picture], *, current: bool) -> None:
+    def pictures(self, sink: Sink, pictures: list[Picture], *, current: bool) -> None:
         """Log pictures; the sensors' colours with the last one, if it is the newest."""
         if not pictures:
             return
         t = np.array([picture.t for picture in pictures], np.int64)
         spread = np.array([picture.spread for picture in pictures])
         rmse = np.array([picture.rmse for picture in pictures])
-        rows.line("/field/spread", t, spread[:, None], 0, gaps=True)
-        rows.line("/field/rmse", t, rmse[:, None], 0)
+        sink.line("/field/spread", t, spread[:, None], 0, by_first=True, gaps=True)
+        sink.line("/field/rmse", t, rmse[:, None], 0, by_first=True)
         for picture in pictures:
             for kind in self._kinds:
                 image = image_of(picture, kind)
                 if image is not None:
-                    self._draw(rows, picture.t, kind.name, image)
+                    self._draw(sink, picture.t, kind.name, image)
         if current:
-            self._sensors(rows, int(t[-1]))
+            self._sensors(sink, int(t[-1]))
 
-    def _draw(self, rows: RerunRows, t: int, name: str, image: np.ndarray) -> None:
+    def _draw(self, sink: Sink, t: int, name: str, image: np.ndarray) -> None:
         scale, frame = self._scales[name], self._frame
         scale.fit(image)
         canvas = frame.enlarge(scale.indices(image))
-        at = [rows.times(np.array([t]))]
-        rows.stream.send_columns(
-            f"{rows.root}/field/{name}/image",
-            indexes=at,
-            columns=rr.SegmentationImage.columns(buffer=[canvas.tobytes()]),
-        )
+        at = np.array([t])
+        sink.columns(f"/field/{name}/image", at, rr.SegmentationImage.columns(buffer=[canvas.tobytes()]))
         ticks = scale.ticks()
         # A label stands below its point, in its middle.
         across, above = frame.width + 2.0 * self._bar + 0.09 * frame.width, 0.035 * frame.height
         positions = np.array([[across, (1.0 - place) * frame.height - above] for place, _ in ticks]).reshape(-1, 2)
-        rows.stream.send_columns(
-            f"{rows.root}/field/{name}/scale",
-            indexes=at,
-            columns=rr.Points2D.columns(
-                positions=positions.astype(np.float32), labels=[text for _, text in ticks],
-                colors=[(120, 120, 128)] * len(ticks), radii=np.full(len(ticks), -0.1, np.float32),
-            ).partition([len(ticks)]),
+        labels = rr.Points2D.columns(
+            positions=positions.astype(np.float32), labels=[text for _, text in ticks],
+            colors=[(120, 120, 128)] * len(ticks), radii=np.full(len(ticks), -0.1, np.float32),
         )  # fmt: skip
+        sink.columns(f"/field/{name}/scale", at, labels.partition([len(ticks)]))
 
-    def _sensors(self, rows: RerunRows, t: int) -> None:
+    def _sensors(self, sink: Sink, t: int) -> None:
         count = len(self._dots)
         if not count:
             return
         for kind in self._kinds:
-            rows.stream.send_columns(
-                f"{rows.root}/field/{kind.name}/sensors",
-                indexes=[rows.times(np.array([t]))],
-                columns=rr.Points2D.columns(
-                    positions=self._dots.astype(np.float32), colors=sensor_colors(self._normalised),
-                    radii=np.full(count, -2.0, np.float32),
-                ).partition([count]),
+            dots = rr.Points2D.columns(
+                positions=self._dots.astype(np.float32), colors=sensor_colors(self._normalised),
+                radii=np.full(count, -2.0, np.float32),
             )  # fmt: skip
+            sink.columns(f"/field/{kind.name}/sensors", np.array([t]), dots.partition([count]))

@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 from estimators.model.state_space import StateSpaceModel
 
 from ..drawing.heatmap import Frame, kinds
-from .field import GAP
+from .style import GAP
 
 RMSE, SPREAD = (22, 163, 74), (37, 99, 235)
 

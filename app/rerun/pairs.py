@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pyarrow as pa
 import rerun as rr
@@ -12,12 +10,10 @@ from estimators.log import Readings, truth_of
 from estimators.model.state_space import StateSpaceModel
 from estimators.track import Track
 
-from .layout import ESTIMATE, PREVIOUS
-from .layout import TRUTH as TRUTH_COLOR
+from .sink import Sink
+from .style import ESTIMATE, PREVIOUS
+from .style import TRUTH as TRUTH_COLOR
 from .thin import last_of_stretch
-
-if TYPE_CHECKING:
-    from .rows import RerunRows
 
 CORNERS = 65
 """Points of an ellipse's line, its first one again at the end."""
@@ -125,9 +121,9 @@ class PairDrawing:
         self._way = np.zeros((0, 2), np.float32)
         self._way_t = np.zeros(0, np.int64)
 
-    def draw(self, rows: RerunRows, t: np.ndarray, track: Track, readings: Readings, past: bool) -> None:
+    def draw(self, sink: Sink, t: np.ndarray, track: Track, readings: Readings, past: bool) -> None:
         """Log the pictures of some rows of the track."""
-        step = int(max(rows.window * 1e9, int(t[-1]) - int(t[0])) / PICTURES)
+        step = int(max(sink.window * 1e9, int(t[-1]) - int(t[0])) / PICTURES)
         pick = last_of_stretch(t, step)
         if past or self._last is None:
             self._last = None
@@ -143,54 +139,38 @@ class PairDrawing:
         known = np.isfinite(np.column_stack(columns)).all(axis=1)
         for run in np.split(pick, np.flatnonzero(known[1:] != known[:-1]) + 1):
             if known[np.searchsorted(pick, run[0])]:
-                self._pictures(rows, t[run], track.select(run), past)
+                self._pictures(sink, t[run], track.select(run), past)
             else:
-                self._blank(rows, t[run[:1]], past)
+                self._blank(sink, t[run[:1]], past)
         if not past:
             self._last = int(t[pick[-1]])
-        self._truth(rows, readings, t[pick])
+        self._truth(sink, readings, t[pick])
 
-    def _blank(self, rows: RerunRows, t: np.ndarray, past: bool) -> None:
+    def _blank(self, sink: Sink, t: np.ndarray, past: bool) -> None:
         """Show nothing from a time (1,) on, at which the estimate is not a number."""
         for name in ("ellipse", "mean", "numbers", "way"):
-            rows.gap(f"{self._path}/{name}", t)
+            sink.gap(f"{self._path}/{name}", t)
         if not past:
             self._way, self._way_t = self._way[:0], self._way_t[:0]
 
-    def _pictures(self, rows: RerunRows, t: np.ndarray, track: Track, past: bool) -> None:
+    def _pictures(self, sink: Sink, t: np.ndarray, track: Track, past: bool) -> None:
         mean = track.mean[:, self._columns] / self._scale
         var = (track.std[:, self._columns] / self._scale) ** 2
         cross = track.cross[:, self._index] / self._scale.prod()
         points = ellipse_points(mean, var, cross).astype(np.float32)
-        at = [rows.times(t)]
         count = np.full(t.size, 1)
-        stream = rows.stream
-        stream.send_columns(
-            f"{self._path}/ellipse",
-            indexes=at,
-            columns=_lines(list(points), ESTIMATE, 1.0).partition(count),
+        sink.columns(f"{self._path}/ellipse", t, _lines(list(points), ESTIMATE, 1.0).partition(count))
+        dots = rr.Points2D.columns(
+            positions=mean.astype(np.float32), colors=[ESTIMATE] * t.size, radii=np.full(t.size, -3.0, np.float32)
         )
-        stream.send_columns(
-            f"{self._path}/mean",
-            indexes=at,
-            columns=rr.Points2D.columns(
-                positions=mean.astype(np.float32), colors=[ESTIMATE] * t.size, radii=np.full(t.size, -3.0, np.float32)
-            ).partition(count),
+        sink.columns(f"{self._path}/mean", t, dots.partition(count))
+        way = self._trail(sink, t, mean.astype(np.float32), past)
+        numbers = rr.Points2D.columns(
+            positions=anchors(mean, points, way).astype(np.float32), colors=[ESTIMATE] * t.size,
+            labels=self._labels(track), radii=np.full(t.size, -0.01, np.float32),
         )  # fmt: skip
-        way = self._trail(rows, t, mean.astype(np.float32), past)
-        stream.send_columns(
-            f"{self._path}/numbers",
-            indexes=at,
-            columns=rr.Points2D.columns(
-                positions=anchors(mean, points, way).astype(np.float32), colors=[ESTIMATE] * t.size,
-                labels=self._labels(track), radii=np.full(t.size, -0.01, np.float32),
-            ).partition(count),
-        )  # fmt: skip
-        stream.send_columns(
-            f"{self._path}/way",
-            indexes=at,
-            columns=_lines(way, PREVIOUS, 0.5).partition(count),
-        )
+        sink.columns(f"{self._path}/numbers", t, numbers.partition(count))
+        sink.columns(f"{self._path}/way", t, _lines(way, PREVIOUS, 0.5).partition(count))
 
     def _labels(self, track: Track) -> list[str]:
         units = [self._model.states[j].unit.replace("1", "") for j in self._pair]
@@ -200,16 +180,16 @@ class PairDrawing:
             for m, s in zip(means, stds, strict=True)
         ]
 
-    def _trail(self, rows: RerunRows, t: np.ndarray, mean: np.ndarray, past: bool) -> list[np.ndarray]:
+    def _trail(self, sink: Sink, t: np.ndarray, mean: np.ndarray, past: bool) -> list[np.ndarray]:
         """For each row the way that led there, within the charts' window."""
         before, before_t = (self._way[:0], self._way_t[:0]) if past else (self._way, self._way_t)
-        keep = last_of_stretch(t, int(rows.window * 1e9 / TRAIL))
+        keep = last_of_stretch(t, int(sink.window * 1e9 / TRAIL))
         way = np.concatenate((before, mean[keep]))
         way_t = np.concatenate((before_t, t[keep]))
-        start = np.searchsorted(way_t, t - int(rows.window * 1e9))
+        start = np.searchsorted(way_t, t - int(sink.window * 1e9))
         end = np.searchsorted(way_t, t)
         if not past:
-            recent = way_t >= t[-1] - int(rows.window * 1e9)
+            recent = way_t >= t[-1] - int(sink.window * 1e9)
             self._way, self._way_t = way[recent], way_t[recent]
         # A strip needs two points; the first row has nothing behind it.
         return [
@@ -217,18 +197,15 @@ class PairDrawing:
             for i, j, here in zip(start, end, mean, strict=True)
         ]
 
-    def _truth(self, rows: RerunRows, readings: Readings, wanted: np.ndarray) -> None:
+    def _truth(self, sink: Sink, readings: Readings, wanted: np.ndarray) -> None:
         (in_a, a), (in_b, b) = (truth_of(readings, int(j)) for j in self._pair)
         times, of_a, of_b = np.intersect1d(readings.t[in_a], readings.t[in_b], return_indices=True)
         if not times.size:
             return
         near = np.unique(np.clip(np.searchsorted(times, wanted), 0, times.size - 1))
         values = np.stack((a[of_a], b[of_b]), axis=1)[near] / self._scale
-        rows.stream.send_columns(
-            f"{self._path}/truth",
-            indexes=[rows.times(times[near])],
-            columns=rr.Points2D.columns(
-                positions=values.astype(np.float32), colors=[TRUTH_COLOR] * near.size,
-                radii=np.full(near.size, -4.0, np.float32),
-            ).partition(np.full(near.size, 1)),
+        dots = rr.Points2D.columns(
+            positions=values.astype(np.float32), colors=[TRUTH_COLOR] * near.size,
+            radii=np.full(near.size, -4.0, np.float32),
         )  # fmt: skip
+        sink.columns(f"{self._path}/truth", times[near], dots.partition(np.full(near.size, 1)))

@@ -13,7 +13,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from websockets.asyncio.client import ClientConnection, connect
 
-from ..viser.private_server import HEADER
+from .private_viser import HEADER
 
 PASSED_ON = ("content-type", "content-encoding", "etag", "last-modified", "cache-control")
 ASKED = ("accept", "accept-encoding", "if-none-match")

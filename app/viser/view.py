@@ -10,6 +10,7 @@ import viser
 
 from ..engine.interface import Running
 from ..engine.notices import Notice
+from ..server.private_viser import guarded_server, unprinted
 from .belief_scene import BeliefScene
 from .charts import Charts
 from .coalescer import Coalescer
@@ -17,7 +18,6 @@ from .field_chart import FieldChart
 from .field_scene import FieldScene
 from .history import History
 from .panel import Panel
-from .private_server import guarded_server, unprinted
 from .time_units import unit_for
 from .vehicle_scene import VehicleScene
 

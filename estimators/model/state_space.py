@@ -17,9 +17,9 @@ from functools import cached_property
 import numpy as np
 
 from ..errors import LARGEST, ModelError
-from ..events.checks import Layout
 from .field import CellNames, Field, State
 from .jump import Jump
+from .layout import Layout
 
 LARGE = 1024
 """States beyond which no filter forms an (nx, nx) matrix: priors are diagonal, moments are means and variances."""

@@ -12,11 +12,11 @@ from estimators.errors import SourceError
 from estimators.log import READING, Readings
 
 from ..clock import second_ns
-from ..mapping import Mapping
+from ..mapping import ABSENT, PRESENT, SHORT, Mapping
 from ..source import Channel, Report, ignore
 from .databases import find_messages, load_database, same_bus
 from .frames import EXTENDED, BusName, Raw
-from .signals import ABSENT, PRESENT, SHORT, extract, ordered, tabulate, vectorises
+from .signals import extract, ordered, tabulate, vectorises
 from .unseen import Expected, Seen, unheard, unsaid
 
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from estimators.numerics.jit import jit
 
+from ..mapping import ABSENT, PRESENT, SHORT
+
 UNSIGNED, SIGNED, FLOAT32, FLOAT64 = range(4)
-PRESENT, ABSENT, SHORT = range(3)
-"""A value is there; the frame does not carry the signal (multiplexing); the frame ends before it."""
 
 
 class Signals(NamedTuple):

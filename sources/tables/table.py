@@ -11,8 +11,7 @@ import numpy as np
 from estimators.errors import SourceError, nearest
 from estimators.log import Readings
 
-from ..can.signals import ABSENT, PRESENT
-from ..mapping import Mapping
+from ..mapping import ABSENT, PRESENT, Mapping
 from ..source import NEVER, TRUNCATED, Channel, Report, ignore
 from .files import find_decimal_comma, is_text
 from .order import Order

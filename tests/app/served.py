@@ -13,7 +13,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Response
 from websockets.sync.server import serve
 
-from app.viser.private_server import HEADER
+from app.server.private_viser import HEADER
 from tests.app.scripted import twin
 
 SECRET = "the secret between the servers"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from app.engine.engine import Engine
+from app.server.private_viser import HEADER
 from app.twin.twin import load_twin
-from app.viser.private_server import HEADER
 from app.viser.view import ViserView
 from tests.app.scripted import Scripted, wait_for
 from tests.app.test_field_views import PLATE, SHAPE

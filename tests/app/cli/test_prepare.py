@@ -8,7 +8,8 @@ import time
 import pytest
 
 import app.cli.prepare
-from app.cli.prepare import CALL_PATIENCE, CallWatch, attend
+from app.cli.prepare import attend
+from app.engine.call_watch import CALL_PATIENCE, CallWatch
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 
 ENTERED, LEAVE = threading.Event(), threading.Event()

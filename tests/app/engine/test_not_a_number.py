@@ -19,7 +19,7 @@ from app.engine.commands import SetEstimator
 from app.engine.engine import Engine
 from app.rerun.feed import RerunFeed
 from app.rerun.field import FieldDrawing
-from app.rerun.layout import pair_name
+from app.rerun.style import pair_name
 from app.server.api import status_json
 from app.viser.decimate import extended, runs
 from app.viser.field_chart import FieldChart

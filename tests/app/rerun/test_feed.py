@@ -13,9 +13,11 @@ from app.engine.engine import Engine
 from app.recording.writer import Recorder
 from app.rerun import feed
 from app.rerun.feed import AHEAD, RerunFeed
-from app.rerun.layout import blueprint, pair_name
+from app.rerun.layout import blueprint
 from app.rerun.pairs import ASIDE, BELOW, PANE, anchors, axis_scales, ellipse_points
-from app.rerun.rows import CALENDAR, RerunRows
+from app.rerun.rows import RerunRows
+from app.rerun.sink import CALENDAR
+from app.rerun.style import pair_name
 from app.rerun.thin import last_of_each_time, thin
 from estimators.log import READING, TRUTH, Readings
 from tests.app.scripted import Scripted, readings, twin, wait_for

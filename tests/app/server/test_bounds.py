@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from app.server import bounds
+from app.server import bounds, private_viser
 from app.server.bounds import BODY, CONNECTIONS
-from app.viser import private_server as viser_guard
 from tests.app.scripted import readings, wait_for
 from tests.app.served import PATIENCE
 from tests.app.server.test_door import STREAM, page  # noqa: F401  the fixture
@@ -102,8 +101,8 @@ def test_a_body_that_does_not_end_is_not_waited_for(page, monkeypatch):  # noqa:
 
 
 def test_the_private_viser_server_is_not_crowded_out_either(monkeypatch, capfd):
-    monkeypatch.setattr(viser_guard, "CONNECTIONS", 8)
-    server = viser_guard.guarded_server("s3cret", "crowded")
+    monkeypatch.setattr(private_viser, "CONNECTIONS", 8)
+    server = private_viser.guarded_server("s3cret", "crowded")
     crowd = []
     try:
         crowd = [half_open(server.get_port()) for _ in range(40)]

@@ -5,7 +5,7 @@ import pytest
 
 from app.engine.commands import SetEstimator, SetTuning
 from app.engine.engine import Engine
-from app.viser.private_server import HEADER
+from app.server.private_viser import HEADER
 from app.viser.view import ViserView
 from estimators.log import READING, TRUTH, Readings
 from estimators.models import MODELS

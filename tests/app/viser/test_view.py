@@ -14,9 +14,9 @@ import websockets
 from viser import _messages
 
 from app.engine.commands import Pause, Record, Reset, Seek, SetEstimator, SetOption, SetTuning, Speed, UseSensor
+from app.server.private_viser import HEADER, guarded_server
 from app.viser.coalescer import DRAG_INTERVAL, TYPING_PAUSE
 from app.viser.history import History
-from app.viser.private_server import HEADER, guarded_server
 from app.viser.rows import PATIENCE
 from app.viser.vehicle_scene import VehicleScene
 from app.viser.view import ViserView

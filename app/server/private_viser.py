@@ -24,7 +24,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 from websockets.protocol import State
 
-from ..server.bounds import BACKLOG
+from .bounds import BACKLOG
 
 HEADER = "X-Nisus-Secret"
 

@@ -1,0 +1,73 @@
+"""Where drawings go: columns of one Rerun stream, on one timeline, below one root."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from .style import TIMELINE
+from .thin import thin
+
+CALENDAR = 10**18
+"""Nanoseconds from which on times are dates (this one is in 2001), and before which they are durations."""
+
+
+class Sink:
+    """Logs columns over time. `root` is the path before all others, `window` the seconds that the charts show."""
+
+    def __init__(self, stream: rr.RecordingStream, *, window: float) -> None:
+        self.stream = stream
+        self.window = window
+        self.root = ""
+        self._calendar: bool | None = None
+
+    def started(self, t: int) -> None:
+        """The first time (ns) decides whether all are dates or durations."""
+        if self._calendar is None:
+            self._calendar = t >= CALENDAR
+
+    def times(self, t: np.ndarray) -> rr.TimeColumn:
+        """Times (ns) as a column of the timeline."""
+        if self._calendar:
+            return rr.TimeColumn(TIMELINE, timestamp=t.astype("datetime64[ns]"))
+        return rr.TimeColumn(TIMELINE, duration=t.astype("timedelta64[ns]"))
+
+    def static(self, path: str, what: Any) -> None:
+        """Log what holds at every time."""
+        self.stream.log(f"{self.root}{path}", what, static=True)
+
+    def gap(self, path: str, t: np.ndarray) -> None:
+        """Log that under a path there is nothing from each of some times on, until something is logged."""
+        if t.size:
+            clear = rr.Clear.columns(is_recursive=np.zeros(t.size, bool))
+            self.stream.send_columns(f"{self.root}{path}", indexes=[self.times(t)], columns=clear)
+
+    def line(
+        self,
+        path: str,
+        t: np.ndarray,
+        values: np.ndarray,
+        width: int,
+        *,
+        by_first: bool = False,
+        gaps: bool | np.ndarray = False,
+    ) -> None:
+        """Log values (n, k) that are finite, thinned by their lowest and highest, or by those of the first column.
+
+        Where they are not finite, the line leads on to the next; but where `gaps` says so, it ends and starts again.
+        """
+        good = np.isfinite(values).all(axis=1)
+        ends = ~good & gaps
+        self.gap(path, t[ends & ~np.append(False, ends[:-1])])
+        t, values = t[good], values[good]
+        if not t.size:
+            return
+        key = values[:, :1] if by_first else values
+        rows = thin(t, key.min(axis=1), key.max(axis=1), width)
+        self.columns(path, t[rows], rr.Scalars.columns(scalars=np.ascontiguousarray(values[rows])))
+
+    def columns(self, path: str, t: np.ndarray, what: Any) -> None:
+        """Log columns of one component, a row for each time."""
+        self.stream.send_columns(f"{self.root}{path}", indexes=[self.times(t)], columns=what)
