@@ -101,6 +101,7 @@ class Estimator:
     `model_runs` as a number: how often a step runs f. `prepare(model, options)` computes what depends on the model
     too, once for a fold, as int64s. `blocks(options, state, nx)` is a view of the members (N, nx) in a state, of a
     compiled filter that runs f and h at these alone and so can run on a black box (interpreted/black_box_filters.py).
+    `singular` says that P and R may be singular: states that are certain at first, rows of a sensor without noise.
     """
 
     name: str
@@ -125,6 +126,7 @@ class Estimator:
     recoveries: Callable[[np.ndarray], int] | None = None
     interpreted: bool = False
     blocks: Callable[[Options, np.ndarray, int], np.ndarray] | None = None
+    singular: bool = False
 
     def complete(self, options: dict[str, float]) -> dict[str, float]:
         """The given options and the defaults of the others.

@@ -93,6 +93,11 @@ def unfit(entry: Estimator, model: StateSpaceModel) -> str | None:
             f"the rows of {model.name}'s sensor {model.correlated} are correlated, and {entry.name} takes the noise of "
             f"each row as independent; use {', '.join(e.name for e in GAUSSIAN)}"
         )
+    if model.certain and not entry.singular:
+        return (
+            f"in {model.name} {model.certain}, and {entry.name} takes no singular covariance; give it a small "
+            f"variance, or use {', '.join(e.name for e in ESTIMATORS.values() if e.singular)}"
+        )
     if entry.family == "ensemble":
         return entry.applies(model)
     if model.nx > LARGE:

@@ -199,4 +199,5 @@ EKF = Estimator(
     options=(JOSEPH_OPTION, *OPTIONS),
     tune=tune,
     memory=memory,
+    singular=True,
 )

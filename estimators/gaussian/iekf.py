@@ -152,4 +152,5 @@ IEKF = Estimator(
     ),
     tune=tune,
     memory=memory,
+    singular=True,
 )

@@ -96,5 +96,6 @@ KF = Estimator(
     options=(JOSEPH_OPTION, *OPTIONS),
     tune=ekf.tune,
     memory=memory,
+    singular=True,
     applies=applies,
 )

@@ -148,4 +148,5 @@ SR_EKF = Estimator(
     options=OPTIONS,
     tune=tune,
     memory=memory,
+    singular=True,
 )

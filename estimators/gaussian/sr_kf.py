@@ -50,5 +50,6 @@ SR_KF = Estimator(
     options=OPTIONS,
     tune=sr_ekf.tune,
     memory=memory,
+    singular=True,
     applies=applies,
 )

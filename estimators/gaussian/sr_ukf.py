@@ -192,4 +192,5 @@ SR_UKF = Estimator(
     options=UKF.options,
     tune=tune,
     memory=memory,
+    singular=True,
 )

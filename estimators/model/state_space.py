@@ -162,10 +162,10 @@ class StateSpaceModel:
             if twice:
                 raise ModelError(f"model {self.name}: {kind} names {twice[0]!r} twice; every name must differ")
         for state in () if field else self.states:
-            if not (0.0 < state.std <= LARGEST and abs(state.mean) <= LARGEST):
+            if not (0.0 <= state.std <= LARGEST and abs(state.mean) <= LARGEST):
                 raise ModelError(
                     f"model {self.name}: the prior of {state.name} is {state.mean} ± {state.std}; "
-                    f"both must be finite, {LARGEST:g} at most, and the second positive"
+                    f"both must be finite, {LARGEST:g} at most, and the second zero or positive"
                 )
         for item in self.parameters:
             if not item.low <= item.high:
@@ -189,10 +189,10 @@ class StateSpaceModel:
                 )
         for sensor in self.sensors:
             for row in sensor.rows:
-                if not (row.variance > 0 and np.isfinite(row.variance)):
+                if not (row.variance >= 0 and np.isfinite(row.variance)):
                     raise ModelError(
                         f"model {self.name}: sensor {sensor.name}.{row.name} has variance {row.variance}; "
-                        "it must be positive"
+                        "it must be positive, or zero of a row without noise"
                     )
         if self.Q is None:
             strays = [noise.name for noise in self.noises if not self.acts_on(noise.name)]
@@ -362,6 +362,13 @@ class StateSpaceModel:
     def correlated(self) -> str | None:
         """Name of the first sensor whose rows are correlated, if there is one."""
         return next((sensor.name for sensor in self.sensors if sensor.correlation is not None), None)
+
+    @cached_property
+    def certain(self) -> str | None:
+        """What the model takes for certain, so that covariances may be singular; None if it is nothing."""
+        exact = [f"{sensor.name}.{row.name}" for sensor in self.sensors for row in sensor.rows if row.variance == 0.0]
+        known = [] if isinstance(self.states, Field) else [state.name for state in self.states if state.std == 0.0]
+        return f"{exact[0]} reads without noise" if exact else f"{known[0]} is certain at first" if known else None
 
     @cached_property
     def input_names(self) -> tuple[str, ...]:

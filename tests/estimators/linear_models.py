@@ -94,8 +94,10 @@ class Matrices:
     C: tuple[np.ndarray, ...]
 
 
-def random_linear(rng: np.random.Generator, nx: int, nu: int, *, correlated: bool = False) -> Matrices:
-    """`correlated`: the rows of each sensor are; `Matrices.C` has how."""
+def random_linear(
+    rng: np.random.Generator, nx: int, nu: int, *, correlated: bool = False, certain: bool = False
+) -> Matrices:
+    """`correlated`: the rows of each sensor are; `certain`: a state is known at first, a row read without noise."""
     A = rng.normal(0, 0.3, (nx, nx)) - 0.2 * np.eye(nx)
     B = rng.normal(0, 1, (nx, nu))
     root = rng.normal(0, 1, (nx, nx))
@@ -105,6 +107,8 @@ def random_linear(rng: np.random.Generator, nx: int, nu: int, *, correlated: boo
     R = tuple(rng.uniform(0.2, 2.0, m) for m in ROWS)
     mean, std, u = rng.normal(0, 2, nx), rng.uniform(0.5, 2.0, nx), rng.normal(0, 1, nu)
     C = tuple(random_correlation(rng, m) if correlated else np.eye(m) for m in ROWS)
+    if certain:
+        std[0] = R[2][1] = 0.0
     numbers = [A, B, W, *(np.hstack(pair) for pair in zip(H, D, strict=True))]
     p = np.concatenate([block.ravel() for block in numbers])
     model = StateSpaceModel(
