@@ -51,7 +51,7 @@ class Iterating(NamedTuple):
     predicted: Any
     """(n,): x̂, the prediction."""
     innovation: Any
-    """(m,): y - h(xᵢ), which the track does not keep."""
+    """(m,): y - h(xᵢ), of which the track keeps the first."""
     innovation_std: Any
     """(m,): its deviations."""
     end: int
@@ -77,34 +77,6 @@ def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     return np.array([*shared_options(values), values["iterations"]])
 
 
-@inlined
-def iterate(context, u, sensor, y, m, work, x, P):
-    """Linearise again where the update leads; ν becomes y - h(xᵢ) - Hᵢ (x̂ - xᵢ), whitened. False if S has no factor."""
-    own, predicted = work.own, work.predicted
-    reading, H = own.reading, own.H
-    nu = reading.nu
-    n = x.size
-    for i in range(n):
-        predicted[i] = x[i]
-    good = True
-    for _ in range(int(options(context)[ITERATIONS]) - 1):
-        for i in range(n):
-            x[i] = predicted[i]
-        move_mean(m, reading.C, reading.chol_S, nu, x)
-        linearise(context, sensor, x, u, P, reading, H, own.jacobian)
-        compare(context, sensor, y, reading, H, P, work.innovation, work.innovation_std)
-        for k in range(m):
-            for j in range(n):
-                nu[k] -= H[k, j] * (predicted[j] - x[j])
-        if not factor(reading.S, reading.chol_S, m, n):
-            good = False
-            break
-        solve_transposed(reading.chol_S, m, nu)
-    for i in range(n):
-        x[i] = predicted[i]
-    return good
-
-
 @jit
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """The Gauss-Newton minimum of ½ |x - x̂|²_P⁻¹ + ½ |y - h(x)|²_R⁻¹, then P by the Joseph form with its last H.
@@ -116,19 +88,53 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     """
     x, P = moments_of(state, context.nx)
     places = iterating(start_of(work), context.nx, row_count(context, sensor))
-    own = places.own
-    reading = own.reading
-    linearise(context, sensor, x, u, P, reading, own.H, own.jacobian)
+    predicted, own = places.predicted, places.own
+    reading, H = own.reading, own.H
     reading_variances(context, sensor, state, reading.r)
-    m = compare(context, sensor, y, reading, own.H, P, innovation, innovation_std)
-    verdict = admit_weighted(context, sensor, m, reading, score)
-    if verdict == USED and not iterate(context, u, sensor, y, m, places, x, P):
-        verdict = FAILED
+    for i in range(x.size):
+        predicted[i] = x[i]
+    iterations = int(options(context)[ITERATIONS])
+    verdict = USED
+    m = 0
+    for iteration in range(iterations):
+        linearise(context, sensor, x, u, P, reading, H, own.jacobian)
+        m = compare(context, sensor, y, reading, H, P, places.innovation, places.innovation_std)
+        back_to(predicted, m, H, x, reading.nu)
+        if iteration == 0:
+            tell(y, places.innovation, places.innovation_std, innovation, innovation_std)
+            verdict = admit_weighted(context, sensor, m, reading, score)
+        elif factor(reading.S, reading.chol_S, m, x.size):
+            solve_transposed(reading.chol_S, m, reading.nu)
+        else:
+            verdict = FAILED
+        if verdict != USED:
+            break
+        if iteration < iterations - 1:
+            move_mean(m, reading.C, reading.chol_S, reading.nu, x)
     if verdict == USED:
         correct(context, m, own, x, P)
         if is_adaptive(context):
             adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict
+
+
+@inlined
+def back_to(predicted, m, H, x, nu):
+    """ν ← ν - Hᵢ (x̂ - xᵢ);  xᵢ ← x̂."""
+    for k in range(m):
+        for j in range(x.size):
+            nu[k] -= H[k, j] * (predicted[j] - x[j])
+    for j in range(x.size):
+        x[j] = predicted[j]
+
+
+@inlined
+def tell(y, nu, nu_std, innovation, innovation_std):
+    """Fill the track's innovation and its deviations, in the rows of the reading that are there."""
+    for i in range(nu.size):
+        if np.isfinite(y[i]):
+            innovation[i] = nu[i]
+            innovation_std[i] = nu_std[i]
 
 
 IEKF = Estimator(

@@ -305,7 +305,7 @@ def move_mean(m, C, U, nu, x):
             x[i] += C[i, j] * nu[j]
 
 
-@inlined
+@jit
 def joseph(m, d, C, H, K, P, N):
     """P ← (I - K H) P (I - K H)ᵀ + K R Kᵀ, in O(n² m); C = P Hᵀ, R = diag(d), N (nx, nx) is scratch.
 
@@ -342,7 +342,7 @@ def joseph(m, d, C, H, K, P, N):
     mirror(P)
 
 
-@inlined
+@jit
 def downdate(m, C, U, P, W):
     """P ← P - K S Kᵀ, as P - Wᵀ W with W = U⁻ᵀ Cᵀ, in scratch of (m or more, nx in whole vectors)."""
     n = P.shape[0]
