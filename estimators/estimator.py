@@ -102,7 +102,8 @@ class Estimator:
     depends on the model too, once for a fold, as int64s. `blocks(options, state, nx)` is a view of the members (N, nx)
     in a state, of a compiled filter that runs f and h at these alone and so can run on a black box (interpreted/).
     `fixed_r` says that its gain is for one R, so that no reading can bring its own; `needs_factor` that it cannot start
-    from a covariance without a Cholesky factor.
+    from a covariance without a Cholesky factor; `singular` that P and R may be singular: states that are certain at
+    first, rows of a sensor without noise.
     """
 
     name: str
@@ -130,6 +131,7 @@ class Estimator:
     fixed_r: bool = False
     needs_factor: bool = False
     blocks: Callable[[Options, np.ndarray, int], np.ndarray] | None = None
+    singular: bool = False
 
     def complete(self, options: Mapping[str, float | str]) -> dict[str, float]:
         """The given options and the defaults of the others; one of several words may be given as the word.

@@ -118,8 +118,11 @@ class Tuning:
                 raise ConfigError(f"{key} is {value}; it must be {LARGEST:g} at most")
             if group == "q" and number < 0:
                 raise ConfigError(f"{key} is {number:g}; a variance must be zero or positive")
-            if group == "r" and number <= 0:
-                raise ConfigError(f"{key} is {number:g}; a variance must be positive")
+            if group == "r" and not (number > 0 or number == 0 and self._without_noise(index)):
+                raise ConfigError(
+                    f"{key} is {number:g}; a variance must be positive, or zero where the model says that there is no "
+                    "noise"
+                )
             if group == "p":
                 parameter = self.model.parameters[index]
                 if not parameter.low <= number <= parameter.high:
@@ -135,6 +138,11 @@ class Tuning:
     def with_options(self, options: Mapping[str, float]) -> Tuning:
         """A new tuning with other estimator options."""
         return replace(self, options=dict(options), version=next(_versions))
+
+    def _without_noise(self, rows: Any) -> bool:
+        """Whether the model declares these rows to be without noise; only then are filters chosen that bear it."""
+        declared = np.array([row.variance for sensor in self.model.sensors for row in sensor.rows])
+        return not np.any(declared[rows])
 
     def _locate(self, key: str) -> tuple[str, Any]:
         model = self.model

@@ -45,9 +45,10 @@ def observed(model: StateSpaceModel) -> list[Observed]:
         slopes = np.zeros((len(sensor.rows), len(charted)))
         for column, (j, state) in enumerate(charted):
             moved = points[0].copy()
-            moved[j] += STEP * state.std
+            step = STEP * (state.std or 1.0)  # of a state that is certain at first, in its unit
+            moved[j] += step
             _expect(model, sensor, moved, u, p, there)
-            slopes[:, column] = (there - values[0]) / (STEP * state.std)
+            slopes[:, column] = (there - values[0]) / step
         for r, row in enumerate(sensor.rows):
             # A distance to a wall grows as the vehicle moves, but is not where the vehicle is; and a sum of two states
             # may be one of them by chance, as long as the other is zero.
@@ -56,7 +57,9 @@ def observed(model: StateSpaceModel) -> list[Observed]:
                 for column, (j, state) in enumerate(charted)
                 if state.unit == row.unit
                 and abs(slopes[r, column] - 1.0) < NEAR
-                and np.all(np.abs(values[:, r] - points[:, j]) < share * np.maximum(np.abs(points[:, j]), state.std))
+                and np.all(
+                    np.abs(values[:, r] - points[:, j]) < share * np.maximum(np.abs(points[:, j]), state.std or 1.0)
+                )
             ]
             likely.sort(key=lambda j: model.state_names[j] not in (row.name, sensor.name))
             if likely:

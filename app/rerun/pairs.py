@@ -101,7 +101,7 @@ def axis_scales(model: StateSpaceModel, pair: np.ndarray) -> np.ndarray:
     a, b = (model.states[j] for j in pair)
     if a.unit == b.unit:
         return np.ones(2)
-    widths = np.array([a.std, b.std])
+    widths = np.array([a.std or 1.0, b.std or 1.0])
     return 10.0 ** np.round(np.log10(widths))
 
 

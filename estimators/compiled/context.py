@@ -34,7 +34,8 @@ call_log_likelihood = caller(log_likelihood_signature)
 
 _FIELDS = """
     nx nu n_parameters n_noises f f_complex F F_mode Q Q_varies each_state shape h h_complex H H_mode
-    log_likelihood n_sensors row_start row_count n_rows circular_x circular_y noise_state noise_states max_step
+    log_likelihood n_sensors row_start row_count n_rows circular_x circular_y correlation
+    noise_state noise_states max_step
     prior_mean prior_cov prior_rows linear_states n_linear sampled_states n_sampled jump mode n_modes p q r used
     gate width options n_options pairs n_pairs shown n_shown prepared n_prepared seed
 """.split()
@@ -104,6 +105,12 @@ def sensor_rows(context, sensor):
 
 
 @jit
+def row_count(context, sensor):
+    """How many rows a sensor has."""
+    return ints(context.row_count, context.n_sensors)[sensor]
+
+
+@jit
 def sensor_variances(context, sensor):
     """r (ny,): the variances of one sensor's rows."""
     first, count = sensor_rows(context, sensor)
@@ -142,6 +149,13 @@ def transition_rows(context, X, stride, n, u, dt, out):
 
 
 @jit
+def transition_points(context, X, u, dt, out):
+    """Rows of `out` (N, nx or more) = f of the rows of X (N, nx or more)."""
+    rows, stride = X.shape
+    call_f_rows(context.f, X.ctypes.data, stride, rows, u.ctypes.data, context.p, dt, out.ctypes.data, out.shape[1])
+
+
+@jit
 def expect(context, sensor, x, u, out):
     """out = h(x, u, p) of one sensor."""
     h = ints(context.h, context.n_sensors)[sensor]
@@ -153,6 +167,14 @@ def expect_rows(context, sensor, X, stride, n, u, out):
     """h of one sensor at n states that begin at the address X, `stride` numbers apart, into rows of `out`."""
     h = ints(context.h, context.n_sensors)[sensor]
     call_h_rows(h, X, stride, n, u.ctypes.data, context.p, out.ctypes.data, out.shape[1])
+
+
+@jit
+def expect_points(context, sensor, X, u, out):
+    """Rows of `out` (N, ny or more) = h of one sensor at the rows of X (N, nx or more)."""
+    h = ints(context.h, context.n_sensors)[sensor]
+    rows, stride = X.shape
+    call_h_rows(h, X.ctypes.data, stride, rows, u.ctypes.data, context.p, out.ctypes.data, out.shape[1])
 
 
 @inlined

@@ -16,12 +16,13 @@ from ..model.state_space import StateSpaceModel
 from ..tuning import Tuning
 from .robust import OPTIONS, memory, shared_options
 from .shared import describe, moments, start, state_size
-from .ukf import predict, sigma_points, update, weights, work_size
+from .sigma_points import sigma_points, weights
+from .ukf import predict, update, work_size
 
 
 def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     """The shared options, and the weights of the cubature rule."""
-    return np.array(shared_options(values) + weights(1.0, 0.0, 0.0, model.nx))
+    return np.array([*shared_options(values), *weights(1.0, 0.0, 0.0, model.nx)])
 
 
 def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:

@@ -2,52 +2,106 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
-from ..compiled.context import expect, options, sensor_rows, transition
+from ..compiled.context import expect, options, row_count, transition
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..estimator import Estimator, Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import inlined, jit, matrix
+from ..numerics.jit import inlined, jit
 from ..numerics.linalg import congruence
-from ..track import FAILED, USED
+from ..numerics.workspace import layout, size_of, start_of, take_matrix, take_vector
+from ..track import USED
 from ..tuning import Tuning
-from . import shared
 from .robust import (
-    ADAPT,
     JOSEPH,
     JOSEPH_OPTION,
-    NONE,
-    OFF,
     OPTIONS,
-    ROBUST,
     adapt,
     add_noise,
+    is_adaptive,
     memory,
     reading_variances,
-    reweigh,
     shared_options,
 )
 from .shared import (
-    admit,
+    Reading,
+    admit_weighted,
     compare,
     describe,
     downdate,
     gain,
     joseph,
     moments,
+    moments_of,
     move_mean,
+    move_to,
     no_points,
+    reading_of,
     start,
     state_size,
     wrap_mean,
 )
 
 
+class Predicting(NamedTuple):
+    """What `predict` works in."""
+
+    forward: Any
+    """(n,): f(x, u)."""
+    F: Any
+    """(n, n): df/dx."""
+    products: Any
+    """(2n, n): scratch of F P Fᵀ."""
+    Q: Any
+    """(n, n): scratch of the noise, once the products are needed no more."""
+    jacobian: Any
+    """Scratch of a Jacobian."""
+    end: int
+
+
+@layout
+def predicting(at, n):
+    """The layout of `predict`."""
+    forward, at = take_vector(at, n)
+    F, at = take_matrix(at, n, n)
+    Q, _ = take_matrix(at, n, n)
+    products, at = take_matrix(at, 2 * n, n)
+    jacobian, at = take_vector(at, scratch_size(n, n))
+    return Predicting(forward, F, products, Q, jacobian, at)
+
+
+class Updating(NamedTuple):
+    """What `update` works in."""
+
+    reading: Reading
+    K: Any
+    """(n, m): the gain."""
+    H: Any
+    """(m, n): dh/dx."""
+    N: Any
+    """(n, n): scratch of the Joseph form."""
+    jacobian: Any
+    """Scratch of a Jacobian."""
+    end: int
+
+
+@layout
+def updating(at, n, m):
+    """The layout of `update`."""
+    reading = reading_of(at, n, m)
+    K, at = take_matrix(reading.end, n, m)
+    H, at = take_matrix(at, m, n)
+    N, at = take_matrix(at, n, n)
+    jacobian, at = take_vector(at, scratch_size(n, m))
+    return Updating(reading, K, H, N, jacobian, at)
+
+
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch: x', F and twice the square for the congruence; or an update's, with K, H, a square; a Jacobian's."""
-    filters = max(nx + 3 * nx * nx, shared.scratch_size(nx, ny) + 2 * nx * ny + nx * nx)
-    return filters + scratch_size(nx, ny)
+    """Scratch of a prediction or an update."""
+    return max(size_of(predicting, nx), size_of(updating, nx, ny))
 
 
 def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
@@ -61,29 +115,23 @@ def predict(context, u, dt, index, state, work):
 
     Source: Jazwinski (1970), Stochastic Processes and Filtering Theory, chapter 8.
     """
-    n = context.nx
-    x = state[:n]
-    P = matrix(state, n, n, n)
-    forward = work[:n]
-    F = matrix(work, n, n, n)
-    scratch = matrix(work, n + n * n, 2 * n, n)
-    state_jacobian(context, x, u, dt, F, work[n + 3 * n * n :])
-    transition(context, x, u, dt, forward)
-    congruence(F, P, scratch)
+    x, P = moments_of(state, context.nx)
+    own = predicting(start_of(work), context.nx)
+    state_jacobian(context, x, u, dt, own.F, own.jacobian)
+    transition(context, x, u, dt, own.forward)
+    congruence(own.F, P, own.products)
     # Noise that depends on the state does so where the step began.
-    add_noise(context, x, u, dt, state, P, scratch[:n])
-    for i in range(n):
-        x[i] = forward[i]
-    wrap_mean(context, x)
+    add_noise(context, x, u, dt, state, P, own.Q)
+    move_to(context, own.forward, x)
 
 
 @inlined
-def linearise(context, sensor, x, u, P, expected, C, S, H, scratch):
-    """Fill h(x) (ny,), H = dh/dx (ny, nx), C = P Hᵀ and S = H P Hᵀ."""
-    n = x.size
-    m = expected.size
+def linearise(context, sensor, x, u, P, reading, H, scratch):
+    """Fill ŷ = h(x), H = dh/dx (ny, nx), and for the reading C = P Hᵀ and S = H P Hᵀ."""
+    C, S = reading.C, reading.S
+    n, m = C.shape
     sensor_jacobian(context, sensor, x, u, H, scratch)
-    expect(context, sensor, x, u, expected)
+    expect(context, sensor, x, u, reading.nu)
     for i in range(n):
         for k in range(m):
             s = 0.0
@@ -99,15 +147,17 @@ def linearise(context, sensor, x, u, P, expected, C, S, H, scratch):
 
 
 @inlined
-def correct(context, y, r, m, nu, U, C, W, K, H, N, x, P):
-    """x ← x + K ν;  P by the Joseph form, or as P - K S Kᵀ; from the whitened nu, S = Uᵀ U and C = P Hᵀ."""
+def correct(context, m, own, x, P):
+    """x ← x + K ν;  P by the Joseph form, or as P - K S Kᵀ."""
+    reading = own.reading
+    C, chol_S = reading.C, reading.chol_S
     if options(context)[JOSEPH] != 0.0:
-        gain(m, C, U, K)
-        move_mean(m, C, U, nu, x)
-        joseph(y, r, m, C, H, K, P, N)
+        gain(m, C, chol_S, own.K)
+        move_mean(m, C, chol_S, reading.nu, x)
+        joseph(m, reading.d, C, own.H, own.K, P, own.N)
     else:
-        move_mean(m, C, U, nu, x)
-        downdate(m, C, U, P, W)
+        move_mean(m, C, chol_S, reading.nu, x)
+        downdate(m, C, chol_S, P, reading.W)
     wrap_mean(context, x)
 
 
@@ -118,23 +168,16 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     Diverges when h curves strongly within the spread of the prediction: P then shrinks faster than the error.
     Source: Jazwinski (1970), chapter 8.
     """
-    n = context.nx
-    _, m = sensor_rows(context, sensor)
-    x = state[:n]
-    P = matrix(state, n, n, n)
-    nu, r, S, U, C, W, room, at = shared.scratch(work, n, m)
-    K = matrix(work, at, n, m)
-    H = matrix(work, at + n * m, m, n)
-    N = matrix(work, at + 2 * n * m, n, n)
-    linearise(context, sensor, x, u, P, nu, C, S, H, work[at + 2 * n * m + n * n :])
-    reading_variances(context, sensor, state, r)
-    m = compare(context, sensor, y, r, nu, C, S, H, P, innovation, innovation_std)
-    verdict = admit(context, sensor, m, nu, S, U, score)
-    if verdict == USED and options(context)[ROBUST] != NONE:
-        verdict = USED if reweigh(context, y, r, innovation, m, nu, S, U, room) else FAILED
+    x, P = moments_of(state, context.nx)
+    own = updating(start_of(work), context.nx, row_count(context, sensor))
+    reading = own.reading
+    linearise(context, sensor, x, u, P, reading, own.H, own.jacobian)
+    reading_variances(context, sensor, state, reading.r)
+    m = compare(context, sensor, y, reading, own.H, P, innovation, innovation_std)
+    verdict = admit_weighted(context, sensor, m, reading, score)
     if verdict == USED:
-        correct(context, y, r, m, nu, U, C, W, K, H, N, x, P)
-        if options(context)[ADAPT] != OFF:
+        correct(context, m, own, x, P)
+        if is_adaptive(context):
             adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict
 
@@ -156,4 +199,5 @@ EKF = Estimator(
     options=(JOSEPH_OPTION, *OPTIONS),
     tune=tune,
     memory=memory,
+    singular=True,
 )

@@ -2,40 +2,74 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
-from ..compiled.context import options, sensor_rows
+from ..compiled.context import options, row_count
 from ..estimator import Estimator, Option, Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import jit, matrix
+from ..numerics.jit import inlined, jit
 from ..numerics.linalg import solve_transposed
+from ..numerics.workspace import layout, size_of, start_of, take_vector
 from ..track import FAILED, USED
 from ..tuning import Tuning
-from . import ekf, shared
-from .ekf import correct, linearise, predict
+from . import ekf
+from .ekf import Updating, correct, linearise, predict, predicting
 from .robust import (
-    ADAPT,
     JOSEPH_OPTION,
-    NONE,
-    OFF,
     OPTIONS,
     OWN,
-    ROBUST,
     adapt,
+    is_adaptive,
     memory,
     reading_variances,
-    reweigh,
     shared_options,
 )
-from .shared import admit, compare, describe, factor, moments, move_mean, no_points, start, state_size
+from .shared import (
+    admit_weighted,
+    compare,
+    describe,
+    factor,
+    moments,
+    moments_of,
+    move_mean,
+    no_points,
+    start,
+    state_size,
+)
 
 ITERATIONS = OWN
 """Position in the context's options."""
 
 
+class Iterating(NamedTuple):
+    """What `update` works in."""
+
+    own: Updating
+    """What the EKF's works in."""
+    predicted: Any
+    """(n,): x̂, the prediction."""
+    innovation: Any
+    """(m,): y - h(xᵢ), of which the track keeps the first."""
+    innovation_std: Any
+    """(m,): its deviations."""
+    end: int
+
+
+@layout
+def iterating(at, n, m):
+    """The layout of `update`."""
+    own = ekf.updating(at, n, m)
+    predicted, at = take_vector(own.end, n)
+    innovation, at = take_vector(at, m)
+    innovation_std, at = take_vector(at, m)
+    return Iterating(own, predicted, innovation, innovation_std, at)
+
+
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch: the EKF's, and the prediction."""
-    return ekf.work_size(options, nx, ny) + nx + 2 * ny
+    """Scratch of a prediction or an update."""
+    return max(size_of(predicting, nx), size_of(iterating, nx, ny))
 
 
 def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
@@ -52,51 +86,55 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
 
     Source: Bell & Cathey (1993), doi:10.1109/9.250476.
     """
-    n = context.nx
-    _, ny = sensor_rows(context, sensor)
-    x = state[:n]
-    P = matrix(state, n, n, n)
-    nu, r, S, U, C, W, room, at = shared.scratch(work, n, ny)
-    K = matrix(work, at, n, ny)
-    H = matrix(work, at + n * ny, ny, n)
-    at += 2 * n * ny
-    N = matrix(work, at, n, n)
-    at += n * n
-    predicted = work[at : at + n]
-    at += n
-    aside = work[at : at + ny]
-    aside_std = work[at + ny : at + 2 * ny]
-    scratch = work[at + 2 * ny :]
-    linearise(context, sensor, x, u, P, nu, C, S, H, scratch)
-    reading_variances(context, sensor, state, r)
-    m = compare(context, sensor, y, r, nu, C, S, H, P, innovation, innovation_std)
-    verdict = admit(context, sensor, m, nu, S, U, score)
-    if verdict == USED and options(context)[ROBUST] != NONE:
-        verdict = USED if reweigh(context, y, r, innovation, m, nu, S, U, room) else FAILED
-    if verdict != USED:
-        return verdict
-    for i in range(n):
+    x, P = moments_of(state, context.nx)
+    places = iterating(start_of(work), context.nx, row_count(context, sensor))
+    predicted, own = places.predicted, places.own
+    reading, H = own.reading, own.H
+    reading_variances(context, sensor, state, reading.r)
+    for i in range(x.size):
         predicted[i] = x[i]
-    for _ in range(int(options(context)[ITERATIONS]) - 1):
-        for i in range(n):
-            x[i] = predicted[i]
-        move_mean(m, C, U, nu, x)
-        linearise(context, sensor, x, u, P, nu, C, S, H, scratch)
-        compare(context, sensor, y, r, nu, C, S, H, P, aside, aside_std)
-        for k in range(m):
-            for j in range(n):
-                nu[k] -= H[k, j] * (predicted[j] - x[j])
-        if not factor(S, U, m, n):
+    iterations = int(options(context)[ITERATIONS])
+    verdict = USED
+    m = 0
+    for iteration in range(iterations):
+        linearise(context, sensor, x, u, P, reading, H, own.jacobian)
+        m = compare(context, sensor, y, reading, H, P, places.innovation, places.innovation_std)
+        back_to(predicted, m, H, x, reading.nu)
+        if iteration == 0:
+            tell(y, places.innovation, places.innovation_std, innovation, innovation_std)
+            verdict = admit_weighted(context, sensor, m, reading, score)
+        elif factor(reading.S, reading.chol_S, m, x.size):
+            solve_transposed(reading.chol_S, m, reading.nu)
+        else:
             verdict = FAILED
+        if verdict != USED:
             break
-        solve_transposed(U, m, nu)
-    for i in range(n):
-        x[i] = predicted[i]
+        if iteration < iterations - 1:
+            move_mean(m, reading.C, reading.chol_S, reading.nu, x)
     if verdict == USED:
-        correct(context, y, r, m, nu, U, C, W, K, H, N, x, P)
-        if options(context)[ADAPT] != OFF:
+        correct(context, m, own, x, P)
+        if is_adaptive(context):
             adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict
+
+
+@inlined
+def back_to(predicted, m, H, x, nu):
+    """ν ← ν - Hᵢ (x̂ - xᵢ);  xᵢ ← x̂."""
+    for k in range(m):
+        for j in range(x.size):
+            nu[k] -= H[k, j] * (predicted[j] - x[j])
+    for j in range(x.size):
+        x[j] = predicted[j]
+
+
+@inlined
+def tell(y, nu, nu_std, innovation, innovation_std):
+    """Fill the track's innovation and its deviations, in the rows of the reading that are there."""
+    for i in range(nu.size):
+        if np.isfinite(y[i]):
+            innovation[i] = nu[i]
+            innovation_std[i] = nu_std[i]
 
 
 IEKF = Estimator(
@@ -120,4 +158,5 @@ IEKF = Estimator(
     ),
     tune=tune,
     memory=memory,
+    singular=True,
 )

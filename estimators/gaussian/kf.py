@@ -2,32 +2,60 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 from ..compiled.context import transition
 from ..compiled.jacobians import state_jacobian
 from ..estimator import Estimator, Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import floats, inlined, jit, matrix
+from ..numerics.jit import floats, inlined, jit
 from ..numerics.linalg import congruence
+from ..numerics.workspace import layout, size_of, start_of, take_matrix, take_vector
 from . import ekf
+from .ekf import predicting
 from .robust import JOSEPH_OPTION, OPTIONS, add_noise, memory
-from .shared import describe, moments, no_points, start, state_size, wrap_mean
+from .shared import describe, moments, moments_of, move_to, no_points, start, state_size
 
 
-def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch: the EKF's for the update; behind it F and the dt for which it holds, kept from step to step."""
-    return ekf.work_size(options, nx, ny) + nx * nx + 1
+class Kept(NamedTuple):
+    """What stays from step to step."""
+
+    F: Any
+    """(n, n): the transition matrix."""
+    dt: Any
+    """(1,): the step for which F holds; NaN at first."""
+    end: int
+
+
+@layout
+def kept(at, n):
+    """The layout of what stays."""
+    F, at = take_matrix(at, n, n)
+    dt, at = take_vector(at, 1)
+    return Kept(F, dt, at)
 
 
 @inlined
-def constant_jacobian(context, u, dt, F, last, scratch):
-    """Fill F (nx, nx) for this dt, unless it holds it: `last` (1,) is the dt for which it does.
+def kept_in(work, n):
+    """What stays, at the end of the scratch: no step works there."""
+    return kept(start_of(work[work.size - (n * n + 1) :]), n)
+
+
+def work_size(options: Options, nx: int, ny: int) -> int:
+    """Scratch: the EKF's, and what stays."""
+    return ekf.work_size(options, nx, ny) + size_of(kept, nx)
+
+
+@inlined
+def constant_jacobian(context, u, dt, kept, scratch):
+    """Fill F for this dt, unless it holds for it.
 
     F is the same at every x of a linear model, so it is found once for each dt, unless inputs may change it.
     """
-    if last[0] != dt or u.size > 0:
+    if kept.dt[0] != dt or u.size > 0:
         # At the prior, not at x: differences round differently at each x, and F must not depend on when it was found.
-        state_jacobian(context, floats(context.prior_mean, context.nx), u, dt, F, scratch)
-        last[0] = dt
+        state_jacobian(context, floats(context.prior_mean, context.nx), u, dt, kept.F, scratch)
+        kept.dt[0] = dt
 
 
 @jit
@@ -37,19 +65,14 @@ def predict(context, u, dt, index, state, work):
     Source: Kalman (1960), doi:10.1115/1.3662552.
     """
     n = context.nx
-    x = state[:n]
-    P = matrix(state, n, n, n)
-    forward = work[:n]
-    scratch = matrix(work, n + n * n, 2 * n, n)
-    last = work.size - 1
-    F = matrix(work, last - n * n, n, n)
-    constant_jacobian(context, u, dt, F, work[last:], work[n + 3 * n * n :])
-    transition(context, x, u, dt, forward)
-    congruence(F, P, scratch)
-    add_noise(context, x, u, dt, state, P, scratch[:n])
-    for i in range(n):
-        x[i] = forward[i]
-    wrap_mean(context, x)
+    x, P = moments_of(state, n)
+    own = predicting(start_of(work), n)
+    constant = kept_in(work, n)
+    constant_jacobian(context, u, dt, constant, own.jacobian)
+    transition(context, x, u, dt, own.forward)
+    congruence(constant.F, P, own.products)
+    add_noise(context, x, u, dt, state, P, own.Q)
+    move_to(context, own.forward, x)
 
 
 def applies(model: StateSpaceModel) -> str | None:
@@ -73,5 +96,6 @@ KF = Estimator(
     options=(JOSEPH_OPTION, *OPTIONS),
     tune=ekf.tune,
     memory=memory,
+    singular=True,
     applies=applies,
 )

@@ -16,27 +16,29 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..compiled.context import options, sensor_rows, transition
+from ..compiled.context import options, row_count, transition
 from ..errors import EstimatorError
 from ..estimator import Estimator, Option, Options
+from ..model.correlation import covariance_of
 from ..model.state_space import StateSpaceModel
 from ..numerics import steps
-from ..numerics.jit import jit, matrix
-from ..numerics.linalg import congruence
+from ..numerics.jit import inlined, jit
+from ..numerics.linalg import congruence, unit_factor
+from ..numerics.workspace import layout, start_of, take_matrix
 from ..track import USED
 from ..tuning import Tuning
 from . import kf, shared
-from .ekf import linearise
-from .kf import constant_jacobian
+from .ekf import linearise, predicting, updating
+from .kf import constant_jacobian, kept_in
 from .robust import INFLATION_OPTION, OWN, add_noise, reading_variances, shared_options
-from .shared import admit, compare, describe, gain, joseph, no_points, wrap_mean
+from .shared import admit, compare, describe, gain, joseph, moments_of, move_to, no_points, wrap_mean
 
-STEP, WHOLE, GAIN = range(OWN, OWN + 3)
-"""Positions in the context's options: a step of the period, whether that is all of it, and K (nx, ny); behind K stand
-P after and P before a reading, (nx, nx) each."""
+STEP, WHOLE, STEADY = range(OWN, OWN + 3)
+"""Positions in the context's options: a step of the period, whether that is all of it, and what `Steady` lists."""
 
 NEAR = 0.01
 """Share of a step by which it may be shorter or longer and count, for P, as the one that the gain was found for."""
@@ -50,39 +52,62 @@ def state_size(values: Options, nx: int) -> int:
     return nx + nx * nx + 1
 
 
-def work_size(values: Options, nx: int, ny: int) -> int:
-    """Scratch: the Kalman filter's."""
-    return kf.work_size(values, nx, ny)
+class Steady(NamedTuple):
+    """What the filter settles to."""
+
+    K: Any
+    """(n, m): the gain."""
+    after: Any
+    """(n, n): P after a reading."""
+    before: Any
+    """(n, n): P before a reading."""
+    end: int
 
 
-def moments(values: Options, state: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (nx,) and covariance (nx, nx) of a state."""
-    return shared.moments(values, state, nx)
+@layout
+def steady(at, n, m):
+    """The layout of what the filter settles to."""
+    K, at = take_matrix(at, n, m)
+    after, at = take_matrix(at, n, n)
+    before, at = take_matrix(at, n, n)
+    return Steady(K, after, before, at)
+
+
+@inlined
+def steady_of(context):
+    """What `tune` found; the model has one sensor."""
+    return steady(start_of(options(context)[STEADY:]), context.nx, row_count(context, 0))
+
+
+@inlined
+def phase_of(state):
+    """(1,): what P is."""
+    return state[state.size - 1 :]
 
 
 @jit
 def start(context, mean, cov, state):
     """The state that stands for N(mean, cov)."""
     shared.start(context, mean, cov, state)
-    state[state.size - 1] = MOVING
+    phase_of(state)[0] = MOVING
 
 
 @jit
-def copy(numbers, at, P):
-    """Fill P (n, n) from `numbers`."""
+def copy(A, P):
+    """P ← A."""
     n = P.shape[0]
     for i in range(n):
         for j in range(n):
-            P[i, j] = numbers[at + i * n + j]
+            P[i, j] = A[i, j]
 
 
 @jit
-def settled(numbers, at, P):
-    """Whether P is the one in `numbers` within 1e-12, relative to the deviations."""
+def settled(A, P):
+    """Whether P is A within 1e-12, relative to the deviations."""
     n = P.shape[0]
     for i in range(n):
         for j in range(i + 1):
-            error = P[i, j] - numbers[at + i * n + j]
+            error = P[i, j] - A[i, j]
             if not error * error <= 1e-24 * P[i, i] * P[j, j]:
                 return False
     return True
@@ -96,27 +121,22 @@ def predict(context, u, dt, index, state, work):
     """
     n = context.nx
     numbers = options(context)
-    x = state[:n]
-    P = matrix(state, n, n, n)
-    forward = work[:n]
-    transition(context, x, u, dt, forward)
-    phase = state.size - 1
+    x, P = moments_of(state, n)
+    phase = phase_of(state)
+    own = predicting(start_of(work), n)
+    transition(context, x, u, dt, own.forward)
     near = abs(dt - numbers[STEP]) <= NEAR * numbers[STEP]
-    if near and state[phase] == AFTER and numbers[WHOLE] == 1.0:
-        copy(numbers, numbers.size - n * n, P)
-        state[phase] = BEFORE
+    if near and phase[0] == AFTER and numbers[WHOLE] == 1.0:
+        copy(steady_of(context).before, P)
+        phase[0] = BEFORE
     else:
-        last = work.size - 1
-        F = matrix(work, last - n * n, n, n)
-        scratch = matrix(work, n + n * n, 2 * n, n)
+        constant = kept_in(work, n)
         counted = numbers[STEP] if near else dt
-        constant_jacobian(context, u, counted, F, work[last:], work[n + 3 * n * n :])
-        congruence(F, P, scratch)
-        add_noise(context, x, u, counted, state, P, scratch[:n])
-        state[phase] = MOVING
-    for i in range(n):
-        x[i] = forward[i]
-    wrap_mean(context, x)
+        constant_jacobian(context, u, counted, constant, own.jacobian)
+        congruence(constant.F, P, own.products)
+        add_noise(context, x, u, counted, state, P, own.Q)
+        phase[0] = MOVING
+    move_to(context, own.forward, x)
 
 
 @jit
@@ -126,42 +146,36 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     Source: Anderson & Moore (1979), Optimal Filtering, chapter 4; P by the Joseph form, which holds for any gain.
     """
     n = context.nx
-    _, ny = sensor_rows(context, sensor)
-    x = state[:n]
-    P = matrix(state, n, n, n)
-    nu, r, S, U, C, _, _, at = shared.scratch(work, n, ny)
-    K = matrix(work, at, n, ny)
-    H = matrix(work, at + n * ny, ny, n)
-    N = matrix(work, at + 2 * n * ny, n, n)
-    linearise(context, sensor, x, u, P, nu, C, S, H, work[at + 2 * n * ny + n * n :])
-    reading_variances(context, sensor, state, r)
-    m = compare(context, sensor, y, r, nu, C, S, H, P, innovation, innovation_std)
-    verdict = admit(context, sensor, m, nu, S, U, score)
+    ny = row_count(context, sensor)
+    x, P = moments_of(state, n)
+    phase = phase_of(state)
+    own = updating(start_of(work), n, ny)
+    reading = own.reading
+    linearise(context, sensor, x, u, P, reading, own.H, own.jacobian)
+    reading_variances(context, sensor, state, reading.r)
+    m = compare(context, sensor, y, reading, own.H, P, innovation, innovation_std)
+    verdict = admit(context, sensor, m, reading.nu, reading.S, reading.chol_S, score)
     if verdict != USED:
         return verdict
-    numbers = options(context)
-    phase = state.size - 1
-    after = numbers.size - 2 * n * n
+    found = steady_of(context)
+    K = own.K
     if m == ny:
-        K = matrix(numbers, GAIN, n, ny)
+        K = found.K
     else:
-        gain(m, C, U, K)
+        gain(m, reading.C, reading.chol_S, K)
     for i in range(n):
-        k = 0
-        for row in range(ny):
-            if np.isfinite(y[row]):
-                x[i] += K[i, k] * innovation[row]
-                k += 1
+        for k in range(m):
+            x[i] += K[i, k] * reading.raw[k]
     wrap_mean(context, x)
-    if m == ny and state[phase] == BEFORE:
-        copy(numbers, after, P)
-        state[phase] = AFTER
+    if m == ny and phase[0] == BEFORE:
+        copy(found.after, P)
+        phase[0] = AFTER
         return verdict
-    joseph(y, r, m, C, H, K, P, N)
-    state[phase] = MOVING
-    if settled(numbers, after, P):
-        copy(numbers, after, P)
-        state[phase] = AFTER
+    joseph(m, reading.d, reading.C, own.H, K, P, own.N)
+    phase[0] = MOVING
+    if settled(found.after, P):
+        copy(found.after, P)
+        phase[0] = AFTER
     return verdict
 
 
@@ -177,7 +191,9 @@ def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     u = np.array([item.default for item in model.inputs], float)
     steps = steps_of(model, period)
     F, Q, H = matrices(model, u, tuning.p, tuning.q, period, rate)
-    R = np.diag(np.asarray(tuning.r, float))
+    R = covariance_of(model.sensors[0].correlation, np.asarray(tuning.r, float))
+    if model.correlated:
+        H, R = independent(H, R)
     if reason := undetectable(model, F, H):
         raise EstimatorError(f"estimator kf-steady does not apply: {reason}")
     if (mode := unseen(F.T, Q)) is not None:
@@ -200,6 +216,13 @@ def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     return np.concatenate(
         (shared_options(values), [period / steps, steps == 1], K.ravel(), after.ravel(), before.ravel())
     )
+
+
+def independent(H: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """H and R of the rows L⁻¹ y, which are independent: those that `update` conditions on, as `compare` leaves them."""
+    L, d = R.copy(), np.diag(R).copy()
+    unit_factor(L, d, d.size)
+    return np.linalg.solve(np.tril(L, -1) + np.eye(d.size), H), np.diag(d)
 
 
 def matrices(
@@ -307,8 +330,8 @@ KF_STEADY = Estimator(
     source="Anderson & Moore (1979), Optimal Filtering, chapter 4",
     functions=(start, predict, update, describe),
     state_size=state_size,
-    work_size=work_size,
-    moments=moments,
+    work_size=kf.work_size,
+    moments=shared.moments,
     points=no_points,
     options=(
         Option("period", 1.0, 1e-6, 1e6, "s", "time between readings, for which the gain is found"),

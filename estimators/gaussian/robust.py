@@ -11,7 +11,7 @@ import numpy as np
 from ..compiled.context import add_process_noise, options, sensor_rows, sensor_variances
 from ..estimator import Option, Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import floats, inlined, jit, matrix
+from ..numerics.jit import floats, inlined, jit
 from ..numerics.linalg import cholesky, solve_transposed, solve_upper
 
 JOSEPH, INFLATION, ROBUST, ROBUST_AT, ADAPT, ADAPT_RATE, ADAPT_BOUND, OWN = range(8)
@@ -62,9 +62,23 @@ def memory(values: Options, model: StateSpaceModel) -> int:
     return {OFF: 0, ADAPT_R: 2 * rows, ADAPT_Q: 1}[int(values["adapt"])]
 
 
-def scratch_size(ny: int) -> int:
-    """Numbers that `reweigh` takes to work in."""
-    return ny * ny + 4 * ny
+@inlined
+def is_robust(context):
+    """Whether readings are weighted."""
+    return options(context)[ROBUST] != NONE
+
+
+@inlined
+def is_adaptive(context):
+    """Whether R or Q follows the innovations."""
+    return options(context)[ADAPT] != OFF
+
+
+@inlined
+def adapted_variances(context, state):
+    """What the adaptation of R keeps: the mean of each sensor row's samples, and its variance in use, (rows,) each."""
+    rows = context.n_rows
+    return state[state.size - 2 * rows : state.size - rows], state[state.size - rows :]
 
 
 @jit
@@ -72,12 +86,11 @@ def forget(context, state):
     """Set what an adaptation remembers to the tuned values."""
     kind = options(context)[ADAPT]
     if kind == ADAPT_R:
-        rows = context.n_rows
-        r = floats(context.r, rows)
-        at = state.size - 2 * rows
-        for i in range(rows):
-            state[at + i] = r[i]
-            state[at + rows + i] = r[i]
+        mean, used = adapted_variances(context, state)
+        r = floats(context.r, context.n_rows)
+        for i in range(r.size):
+            mean[i] = r[i]
+            used[i] = r[i]
     elif kind == ADAPT_Q:
         state[state.size - 1] = 1.0
 
@@ -124,9 +137,9 @@ def reading_variances(context, sensor, state, r):
     """Fill r (ny,) with the variances of one sensor's rows, as adapted."""
     first, count = sensor_rows(context, sensor)
     if options(context)[ADAPT] == ADAPT_R:
-        first += state.size - context.n_rows
+        _, used = adapted_variances(context, state)
         for i in range(count):
-            r[i] = state[first + i]
+            r[i] = used[first + i]
     else:
         tuned = floats(context.r, context.n_rows)
         for i in range(count):
@@ -137,7 +150,8 @@ def reading_variances(context, sensor, state, r):
 def weight(kind, at, m, nu, r, S, V, z):
     """The weight w by which a reading counts: as if its noise were N(0, R / w). NaN if S + R (1/w - 1) has no factor.
 
-    nu, r (m,): raw innovation and variances; S (m, m) includes R; V (m, m) and z (2 m,) are scratch.
+    nu, r (m,): raw innovation and variances of independent rows (a full R is factored before, see sensor_noise.py, and
+    scaled as a whole); S (m, m) includes R; V (m, m) and z (2 m,) are scratch.
     """
     return huber(at, m, nu, r, S, V, z) if kind == HUBER else student_t(at, m, nu, r, S, V, z)
 
@@ -216,37 +230,32 @@ def precision_times(s, m, nu, r, S, V, z):
 
 
 @jit
-def reweigh(context, y, r, innovation, m, nu, S, U, room):
-    """Weight the noise of a reading: r (ny,) is divided by w; S, its factor U and the whitened nu then belong to it.
+def reweigh(context, m, nu, raw, d, S, U, V, z):
+    """Weight the noise of a reading: d is divided by w; S, its factor U and the whitened nu then belong to that noise.
+
+    Args:
+        context: The context.
+        m: Rows of the reading that are there.
+        nu: Gets the whitened innovation (m,).
+        raw: The innovation (m,), its rows' noise independent.
+        d: Variances of that noise (m,).
+        S: Covariance of the innovation (m, m), which includes d.
+        U: Gets the factor of S.
+        V: Scratch (m, m).
+        z: Scratch (2 m,).
 
     Returns:
-        Whether S still has a factor.
+        The weight w; NaN if S has no factor with it.
     """
-    raw = room[:m]
-    variance = room[m : 2 * m]
-    rows(y, innovation, raw)
-    rows(y, r, variance)
-    V = matrix(room, 4 * m, m, m)
-    w = weight(options(context)[ROBUST], options(context)[ROBUST_AT], m, raw, variance, S, V, room[2 * m : 4 * m])
+    w = weight(options(context)[ROBUST], options(context)[ROBUST_AT], m, raw, d, S, V, z)
     for i in range(m):
-        S[i, i] += (1.0 / w - 1.0) * variance[i]
+        S[i, i] += (1.0 / w - 1.0) * d[i]
         nu[i] = raw[i]
-    for i in range(r.size):
-        r[i] /= w
+        d[i] /= w
     if not cholesky(S, U, m):
-        return False
+        return np.nan
     solve_transposed(U, m, nu)
-    return True
-
-
-@jit
-def rows(y, full, finite):
-    """Fill `finite` (m,) with the entries of `full` (ny,) whose row of the reading is there."""
-    k = 0
-    for i in range(full.size):
-        if np.isfinite(y[i]):
-            finite[k] = full[i]
-            k += 1
+    return w
 
 
 @jit
@@ -258,8 +267,9 @@ def adapt(context, sensor, y, state, innovation, innovation_std, score):
     them fits as well. What is in use stays within the bound. The spread of an adapted r is about
     S √(2 / (2N - 1)), that of ln s about 1 / √(N m γ) with γ the share of S that scales with s.
 
-    An outlier is taken at its face value: use the gate. Sources: Mohamed & Schwarz (1999), doi:10.1007/s001900050236,
-    for R (there over a window); Bar-Shalom, Li & Kirubarajan (2001), 11.2, for the level of Q.
+    Of rows that are correlated the correlation stays, and their variances follow. An outlier is taken at its face
+    value: use the gate. Sources: Mohamed & Schwarz (1999), doi:10.1007/s001900050236, for R (there over a window);
+    Bar-Shalom, Li & Kirubarajan (2001), 11.2, for the level of Q.
     """
     kind = options(context)[ADAPT]
     rate = options(context)[ADAPT_RATE]
@@ -268,13 +278,12 @@ def adapt(context, sensor, y, state, innovation, innovation_std, score):
         scale = noise_scale(context, state) * (1.0 + rate * (score[0] / score[1] - 1.0))
         state[state.size - 1] = min(max(scale, 1.0 / bound), bound)
         return
-    n_rows = context.n_rows
     first, count = sensor_rows(context, sensor)
     tuned = sensor_variances(context, sensor)
-    mean = state.size - 2 * n_rows + first
-    used = state.size - n_rows + first
+    mean, used = adapted_variances(context, state)
     for i in range(count):
         if np.isfinite(y[i]):
-            sample = innovation[i] ** 2 - innovation_std[i] ** 2 + state[used + i]
-            state[mean + i] += rate * (sample - state[mean + i])
-            state[used + i] = min(max(state[mean + i], tuned[i] / bound), tuned[i] * bound)
+            row = first + i
+            sample = innovation[i] ** 2 - innovation_std[i] ** 2 + used[row]
+            mean[row] += rate * (sample - mean[row])
+            used[row] = min(max(mean[row], tuned[i] / bound), tuned[i] * bound)

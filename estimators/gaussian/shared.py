@@ -3,22 +3,25 @@
 The state is x (nx,) followed by P (nx, nx). The filters differ only in how mean and covariance pass through f and h;
 gate, verdict, NIS and likelihood are here.
 
-Behind P stands what an adaptation remembers (robust.py), if it is on.
+After P stands what an adaptation remembers (robust.py), if it is on.
 """
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from ..compiled.context import circular_rows, circular_states, shown_states
+from ..compiled.sensor_noise import has_correlated_rows, independent_rows
 from ..estimator import Options
-from ..numerics.jit import flags, floats, inlined, ints, jit, matrix
-from ..numerics.linalg import EPSILON, cholesky, mirror, solve_transposed, solve_upper, wrap
+from ..numerics.jit import flags, floats, inlined, ints, jit
+from ..numerics.linalg import EPSILON, cholesky, mirror, solve_transposed, solve_unit, solve_upper, wrap
+from ..numerics.padded_rows import subtract_squares
 from ..numerics.simd_ir import padded
-from ..numerics.simd_rows import subtract_squares
+from ..numerics.workspace import layout, start_of, take_matrix, take_vector
 from ..track import FAILED, GATED, HELD_OUT, MISSING, USED
-from . import robust
-from .robust import forget
+from .robust import forget, is_robust, reweigh
 
 LOG_2PI = float(np.log(2.0 * np.pi))
 
@@ -28,9 +31,12 @@ def state_size(options: Options, nx: int) -> int:
     return nx + nx * nx
 
 
-def scratch_size(nx: int, ny: int) -> int:
-    """Numbers in the views of `scratch`."""
-    return 2 * ny + 2 * ny * ny + nx * ny + ny * padded(nx) + robust.scratch_size(ny)
+@inlined
+def moments_of(state, n):
+    """Views of the mean x (n,) and the covariance P (n, n), or the factor of it that takes its place, in a state."""
+    x, at = take_vector(start_of(state), n)
+    P, at = take_matrix(at, n, n)
+    return x, P
 
 
 def moments(options: Options, state: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray]:
@@ -47,26 +53,26 @@ def no_points(options: Options, state: np.ndarray, nx: int) -> np.ndarray:
 def start(context, mean, cov, state):
     """The state that stands for N(mean, cov)."""
     n = mean.size
+    x, P = moments_of(state, n)
     for i in range(n):
-        state[i] = mean[i]
+        x[i] = mean[i]
         for j in range(n):
-            state[n + i * n + j] = cov[i, j]
+            P[i, j] = cov[i, j]
     forget(context, state)
 
 
 @jit
 def describe(context, state, mean, std, cross):
     """Mean, standard deviation and the configured covariances."""
-    n = context.nx
+    x, P = moments_of(state, context.nx)
     shown = shown_states(context)
     for k in range(mean.size):
         i = shown[k]
-        mean[k] = state[i]
-        variance = state[n + i * n + i]
-        std[k] = np.sqrt(variance) if variance >= 0.0 else np.nan
+        mean[k] = x[i]
+        std[k] = np.sqrt(P[i, i]) if P[i, i] >= 0.0 else np.nan
     pairs = ints(context.pairs, 2 * context.n_pairs)
     for k in range(cross.size):
-        cross[k] = state[n + pairs[2 * k] * n + pairs[2 * k + 1]]
+        cross[k] = P[pairs[2 * k], pairs[2 * k + 1]]
 
 
 @inlined
@@ -79,50 +85,107 @@ def wrap_mean(context, x):
 
 
 @inlined
-def scratch(work, n, m):
-    """What an update works in: ŷ or ν, r (m,), S and its factor (m, m), C (n, m), W, room for `reweigh`; where it ends.
+def move_to(context, forward, x):
+    """x ← forward, its angles within ±π."""
+    for i in range(x.size):
+        x[i] = forward[i]
+    wrap_mean(context, x)
 
-    C is the covariance of state and predicted reading, W (m, padded n) is for `downdate`.
+
+class Reading(NamedTuple):
+    """What an update works in: a reading of m rows, of n states.
+
+    `compare` moves the rows that are there to the front and makes their noise independent; all but `r` are then about
+    these.
     """
-    W = matrix(work, 0, m, padded(n))
-    start = work.ctypes.data + 8 * W.size
-    S = matrix(work, W.size + 2 * m, m, m)
-    U = matrix(work, W.size + 2 * m + m * m, m, m)
-    C = matrix(work, W.size + 2 * m + 2 * m * m, n, m)
-    at = W.size + 2 * m + 2 * m * m + n * m
-    room = m * m + 4 * m
-    return floats(start, m), floats(start + 8 * m, m), S, U, C, W, work[at : at + room], at + room
+
+    W: Any
+    """(m, padded n): for `downdate`."""
+    nu: Any
+    """(m,): predicted reading, then innovation ν, then whitened, S^-½ ν."""
+    r: Any
+    """(m,): variances of all rows, as they are in use."""
+    S: Any
+    """(m, m): covariance of the predicted reading, then of the innovation."""
+    chol_S: Any
+    """(m, m): upper, chol_Sᵀ chol_S = S."""
+    C: Any
+    """(n, m): covariance of state and predicted reading."""
+    raw: Any
+    """(m,): the innovation, not whitened."""
+    d: Any
+    """(m,): variances of the rows that are there, independent."""
+    z: Any
+    """(2 m,): scratch of a weight."""
+    V: Any
+    """(m, m): scratch of a weight."""
+    end: int
+
+
+@layout
+def reading_of(at, n, m):
+    """The layout of a reading's workspace."""
+    W, at = take_matrix(at, m, padded(n))
+    nu, at = take_vector(at, m)
+    r, at = take_vector(at, m)
+    S, at = take_matrix(at, m, m)
+    chol_S, at = take_matrix(at, m, m)
+    C, at = take_matrix(at, n, m)
+    raw, at = take_vector(at, m)
+    d, at = take_vector(at, m)
+    z, at = take_vector(at, 2 * m)
+    V, at = take_matrix(at, m, m)
+    return Reading(W, nu, r, S, chol_S, C, raw, d, z, V, at)
 
 
 @inlined
-def compare(context, sensor, y, r, predicted, C, S, H, P, innovation, innovation_std):
-    """The innovation and its covariance, over the rows of the reading that are finite.
+def compare(context, sensor, y, reading, H, P, innovation, innovation_std):
+    """The innovation ν = y - ŷ and its covariance S = S_ŷ + R, over the rows of the reading that are there.
 
-    On entry S (ny, ny) holds the spread of the predicted reading, C (nx, ny) its covariance with the state and H
-    (ny, nx) the Jacobian (or nothing). On return the leading rows and columns of all three, and of `predicted`, which
-    then holds the innovation, belong to the finite rows, and S includes R. `innovation` and `innovation_std` keep the
-    reading's own rows. An S that is nothing but the rounding of H P Hᵀ becomes NaN, so that the reading fails.
+    On entry reading.nu holds ŷ, S (ny, ny) its covariance, C (nx, ny) that with the state, r the variances of the
+    rows, and H (ny, nx) is the Jacobian (or has no columns). On return the leading rows and columns of all but r belong
+    to the rows that are there, made independent. `innovation` and `innovation_std` keep the reading's own rows. An S
+    that is nothing but the rounding of H P Hᵀ becomes NaN, so that the reading fails.
 
     Returns:
-        The number of finite rows.
+        The number of rows that are there.
     """
+    m = gather(context, sensor, y, reading, H, P, innovation, innovation_std)
+    if has_correlated_rows(context, sensor):
+        # The factor of R is needed no more when that of S is found, and stands in its place.
+        L = reading.chol_S
+        independent_rows(context, sensor, y, reading.r, L, reading.d)
+        make_independent(m, L, reading.nu, reading.S, reading.C, H)
+    for i in range(m):
+        reading.S[i, i] += reading.d[i]
+        reading.raw[i] = reading.nu[i]
+    return m
+
+
+@inlined
+def gather(context, sensor, y, reading, H, P, innovation, innovation_std):
+    """Fill ν and d, and move what belongs to rows that are there to the front; how many there are."""
+    nu, S, C = reading.nu, reading.S, reading.C
     circular = circular_rows(context, sensor)
     m = 0
-    for i in range(r.size):
+    for i in range(reading.r.size):
         if not np.isfinite(y[i]):
             continue
-        residual = y[i] - predicted[i]
+        residual = y[i] - nu[i]
         if circular[i] != 0:
             residual = wrap(residual)
-        variance = S[i, i] + r[i]
+        own = S[i, i]
+        variance = own + reading.r[i]
         terms = 0.0
         for j in range(H.shape[1]):
             terms += H[i, j] * H[i, j] * P[j, j]
-        if not variance > 4.0 * (H.shape[1] + r.size) * EPSILON * terms:
+        if not variance > 4.0 * (H.shape[1] + reading.r.size) * EPSILON * terms:
+            own = np.nan
             variance = np.nan
         innovation[i] = residual
         innovation_std[i] = np.sqrt(variance) if variance >= 0.0 else np.nan
-        predicted[m] = residual
+        nu[m] = residual
+        reading.d[m] = reading.r[i]
         if m < i:
             # Row i moves up: what it overwrites has been read.
             column = 0
@@ -135,9 +198,25 @@ def compare(context, sensor, y, r, predicted, C, S, H, P, innovation, innovation
                 C[j, m] = C[j, i]
             for j in range(H.shape[1]):
                 H[m, j] = H[i, j]
-        S[m, m] = variance
+        S[m, m] = own
         m += 1
     return m
+
+
+@jit
+def make_independent(m, L, nu, S, C, H):
+    """ν ← L⁻¹ ν, S ← L⁻¹ S L⁻ᵀ, C ← C L⁻ᵀ, H ← L⁻¹ H, in their leading m rows of a reading: see sensor_noise.py."""
+    solve_unit(L, m, nu)
+    for i in range(m):
+        solve_unit(L, m, S[i])
+    for i in range(C.shape[0]):
+        solve_unit(L, m, C[i])
+    for i in range(m):
+        for j in range(i):
+            for k in range(m):
+                S[i, k] -= L[i, j] * S[j, k]
+            for k in range(H.shape[1]):
+                H[i, k] -= L[i, j] * H[j, k]
 
 
 @inlined
@@ -195,6 +274,19 @@ def admit(context, sensor, m, nu, S, U, score):
 
 
 @inlined
+def admit_weighted(context, sensor, m, reading, score):
+    """Judge the innovation of a reading, and weight the noise of one that is used: the verdict."""
+    verdict = admit(context, sensor, m, reading.nu, reading.S, reading.chol_S, score)
+    if verdict == USED and is_robust(context):
+        w = reweigh(context, m, reading.nu, reading.raw, reading.d, reading.S, reading.chol_S, reading.V, reading.z)
+        for i in range(reading.r.size):
+            reading.r[i] /= w
+        if not w > 0.0:
+            verdict = FAILED
+    return verdict
+
+
+@inlined
 def gain(m, C, U, K):
     """K = C S⁻¹ for the leading m columns, with S = Uᵀ U."""
     for i in range(C.shape[0]):
@@ -213,9 +305,9 @@ def move_mean(m, C, U, nu, x):
             x[i] += C[i, j] * nu[j]
 
 
-@inlined
-def joseph(y, r, m, C, H, K, P, N):
-    """P ← (I - K H) P (I - K H)ᵀ + K R Kᵀ, in O(n² m); C = P Hᵀ, N (nx, nx) is scratch.
+@jit
+def joseph(m, d, C, H, K, P, N):
+    """P ← (I - K H) P (I - K H)ᵀ + K R Kᵀ, in O(n² m); C = P Hᵀ, R = diag(d), N (nx, nx) is scratch.
 
     Symmetric and positive semidefinite whatever the gain. Source: Bucy & Joseph (1968), Filtering for Stochastic
     Processes with Applications to Guidance.
@@ -242,19 +334,15 @@ def joseph(y, r, m, C, H, K, P, N):
             a = C[i, k]
             for j in range(i + 1):
                 P[i, j] -= a * K[j, k]
-    k = 0
-    for row in range(r.size):
-        if np.isfinite(y[row]):
-            variance = r[row]
-            for i in range(n):
-                a = K[i, k] * variance
-                for j in range(i + 1):
-                    P[i, j] += a * K[j, k]
-            k += 1
+    for k in range(m):
+        for i in range(n):
+            a = K[i, k] * d[k]
+            for j in range(i + 1):
+                P[i, j] += a * K[j, k]
     mirror(P)
 
 
-@inlined
+@jit
 def downdate(m, C, U, P, W):
     """P ← P - K S Kᵀ, as P - Wᵀ W with W = U⁻ᵀ Cᵀ, in scratch of (m or more, nx in whole vectors)."""
     n = P.shape[0]
@@ -265,4 +353,4 @@ def downdate(m, C, U, P, W):
             for j in range(k):
                 s -= U[j, k] * W[j, i]
             W[k, i] = s * inverse
-    subtract_squares(n, m, W.ctypes.data, W.shape[1], P.ctypes.data)
+    subtract_squares(W, m, P)

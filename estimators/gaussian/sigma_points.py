@@ -1,27 +1,57 @@
-"""Sigma points and what becomes of them: rows of 2n + 1 points, as wide as whole vectors.
+"""Sigma points: where they stand, what they weigh, and their mean where a coordinate is an angle.
 
-What stands behind a row's own numbers is never read.
+x and x ± √(n+λ) U[i] with P = Uᵀ U and λ = α² (n + κ) - n; weights 1/(2(n+λ)), the central one λ/(n+λ) for the mean
+and λ/(n+λ) + 1 - α² + β for the covariance.
+
+Sources: Julier & Uhlmann (2004), doi:10.1109/JPROC.2003.823141; Wan & van der Merwe (2000),
+doi:10.1109/ASSPCC.2000.882463.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
+from ..compiled.context import options
 from ..numerics.jit import inlined
 from ..numerics.linalg import wrap
-from ..numerics.simd_rows import around, centre, factor_rows, product
+from ..numerics.padded_rows import centre
+from .robust import OWN
+
+CENTRAL_COV, OUTER, SPREAD = range(OWN, OWN + 3)
+"""Positions in the context's options: the central covariance weight, the outer weight, √(n+λ)."""
+
+
+class Weights(NamedTuple):
+    """`central` is the covariance weight of the central point, `outer` that of the others, `spread` is √(n+λ)."""
+
+    central: float
+    outer: float
+    spread: float
+
+
+def weights(alpha: float, beta: float, kappa: float, nx: int) -> Weights:
+    """The weights and the spread that alpha, beta and kappa give for nx states."""
+    total = alpha**2 * (nx + kappa)
+    central = 1.0 - nx / total
+    return Weights(central + 1.0 - alpha**2 + beta, 0.5 / total, float(np.sqrt(total)))
 
 
 @inlined
-def factor(P, U):
-    """Upper U (n, padded n) with Uᵀ U = P (n, n); False if P is not positive definite."""
-    return factor_rows(P.shape[0], P.ctypes.data, U.ctypes.data, U.shape[1]) != 0
+def weights_of(context):
+    """The weights and the spread that the filter's `tune` found."""
+    numbers = options(context)
+    return Weights(numbers[CENTRAL_COV], numbers[OUTER], numbers[SPREAD])
 
 
-@inlined
-def spread_points(x, U, spread, points):
-    """Fill `points` (2n+1, padded n) with x and x ± spread·U[k]."""
-    around(x.size, x.ctypes.data, U.ctypes.data, U.shape[1], spread, points.ctypes.data, points.shape[1])
+def sigma_points(x: np.ndarray, P: np.ndarray, spread: float) -> np.ndarray:
+    """The sigma points (2 nx + 1, nx) of a mean and covariance; none where the covariance has no factor."""
+    try:
+        U = np.linalg.cholesky(P).T * spread
+    except np.linalg.LinAlgError:
+        return np.zeros((0, x.size))
+    return np.vstack((x, x + U, x - U))
 
 
 @inlined
@@ -36,19 +66,4 @@ def deviations(D, w, circular, mean):
                 d = D[i, j] - D[0, j]
                 if abs(d) > np.pi:
                     D[i, j] = D[0, j] + wrap(d)
-    centre(D.shape[0], circular.size, D.shape[1], D.ctypes.data, w, mean.ctypes.data)
-
-
-@inlined
-def covariance(D, first, w, P):
-    """P (k, k) = first D₀ᵀ D₀ + w Σ Dᵢᵀ Dᵢ, from deviations D (2n+1, padded k)."""
-    rows, width = D.shape
-    k = P.shape[0]
-    product(k, rows, D.ctypes.data, width, D.ctypes.data, width, first, w, P.ctypes.data, k)
-
-
-@inlined
-def cross_covariance(U, across, w, C):
-    """C (n, m) = w Σ U[k]ᵀ across[k], with differences `across` (n, padded m) between opposite points."""
-    n, m = C.shape
-    product(n, n, U.ctypes.data, U.shape[1], across.ctypes.data, across.shape[1], w, w, C.ctypes.data, m)
+    centre(D, circular.size, w, mean)

@@ -1,22 +1,26 @@
 """What the square-root filters share: a mean and a factor of P as state, and conditioning by one triangularisation.
 
 The state is x (nx,) followed by upper U (nx, nx) with P = Uᵀ U. P and S are never formed, so a spread of 1e-9 beside
-one of 1 keeps half its digits, where P itself would hold none of 1e-18 beside 1. Behind U stands what an adaptation
+one of 1 keeps half its digits, where P itself would hold none of 1e-18 beside 1. After U stands what an adaptation
 remembers, as in shared.py.
 """
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from ..compiled.context import add_process_noise, circular_rows, options, shown_states
+from ..compiled.sensor_noise import has_correlated_rows, independent_rows
 from ..estimator import Options
-from ..numerics.jit import inlined, ints, jit, matrix
-from ..numerics.linalg import EPSILON, remove, root, solve_transposed, triangularise, wrap
+from ..numerics.jit import inlined, ints, jit
+from ..numerics.linalg import EPSILON, remove, root, solve_transposed, solve_unit, triangularise, wrap
+from ..numerics.workspace import layout, start_of, take_matrix, take_vector
 from ..track import FAILED, MISSING, USED
 from . import robust
-from .robust import ADAPT, NONE, OFF, ROBUST, ROBUST_AT, adapt, forget, reading_variances, rows, weight
-from .shared import judge, wrap_mean
+from .robust import ROBUST, ROBUST_AT, adapt, forget, is_adaptive, is_robust, reading_variances, weight
+from .shared import judge, moments_of, move_to, wrap_mean
 
 
 def moments(options: Options, state: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray]:
@@ -25,19 +29,56 @@ def moments(options: Options, state: np.ndarray, nx: int) -> tuple[np.ndarray, n
     return state[:nx].copy(), U.T @ U
 
 
-def condition_size(nx: int, ny: int, extra: int) -> int:
-    """Scratch of `condition` for a spread with `extra` rows beyond nx."""
-    return (nx + extra + ny) * (nx + ny) + 2 * nx + 3 * ny + ny * ny + robust.scratch_size(ny)
+class Conditioning(NamedTuple):
+    """What `condition` works in: a reading of m rows, of n states whose spread has k rows."""
+
+    A: Any
+    """(k + m, m + n): the joint factor of reading and state."""
+    w: Any
+    """(m + n,): scratch of a triangularisation."""
+    v: Any
+    """(m + n,): a row that is taken off the joint factor."""
+    r: Any
+    """(m,): variances of all rows, as they are in use."""
+    d: Any
+    """(m,): variances of the rows that are there, independent."""
+    raw: Any
+    """(m,): the innovation, not whitened."""
+    L: Any
+    """(m, m): unit lower, R = L diag(d) Lᵀ, where rows are correlated."""
+    S: Any
+    """(m, m): for a weight, the covariance of the innovation; in the place of L."""
+    z: Any
+    """(2 m,): scratch of a weight."""
+    V: Any
+    """(m, m): scratch of a weight."""
+    end: int
+
+
+@layout
+def conditioning(at, n, m, k):
+    """The layout of `condition`."""
+    A, at = take_matrix(at, k + m, m + n)
+    w, at = take_vector(at, m + n)
+    v, at = take_vector(at, m + n)
+    r, at = take_vector(at, m)
+    d, at = take_vector(at, m)
+    raw, at = take_vector(at, m)
+    L, _ = take_matrix(at, m, m)
+    S, at = take_matrix(at, m, m)
+    z, at = take_vector(at, 2 * m)
+    V, at = take_matrix(at, m, m)
+    return Conditioning(A, w, v, r, d, raw, L, S, z, V, at)
 
 
 @jit
 def start(context, mean, cov, state):
     """The state that stands for N(mean, cov); NaN if cov is indefinite."""
     n = mean.size
-    U = matrix(state, n, n, n)
+    x, U = moments_of(state, n)
     good = root(cov, U, n)
     for i in range(n):
-        state[i] = mean[i]
+        x[i] = mean[i]
         for j in range(n):
             U[i, j] = U[i, j] if good else np.nan
     forget(context, state)
@@ -46,12 +87,11 @@ def start(context, mean, cov, state):
 @jit
 def describe(context, state, mean, std, cross):
     """Mean, standard deviation and the configured covariances."""
-    n = context.nx
-    U = matrix(state, n, n, n)
+    x, U = moments_of(state, context.nx)
     shown = shown_states(context)
     for k in range(mean.size):
         i = shown[k]
-        mean[k] = state[i]
+        mean[k] = x[i]
         variance = 0.0
         for j in range(i + 1):
             variance += U[j, i] * U[j, i]
@@ -85,18 +125,20 @@ def noise_root(context, x, u, dt, state, V, scratch):
 
 
 @inlined
-def settle(context, forward, U, A, good, state):
+def settle(context, forward, A, good, state):
     """Take the mean `forward` and the leading rows of A as the new state; NaN, which is seen, if there is none."""
     n = context.nx
+    x, U = moments_of(state, n)
     for i in range(n):
-        state[i] = forward[i] if good else np.nan
         for j in range(n):
             U[i, j] = (A[i, j] if j >= i else 0.0) if good else np.nan
-    wrap_mean(context, state[:n])
+        if not good:
+            forward[i] = np.nan
+    move_to(context, forward, x)
 
 
 @jit
-def triangularise_joint(y, r, m, Y, U, lost, A, scratch):
+def triangularise_joint(d, m, Y, U, lost, A, w, v):
     """Fill A (k + m, m + n) with the factor of the joint covariance of reading and state; False if S has none.
 
         A ← [ Y  U ]          Aᵀ A = [ S  Cᵀ ]          [ S^½  W ]
@@ -104,8 +146,9 @@ def triangularise_joint(y, r, m, Y, U, lost, A, scratch):
             [ 0 √R ] (in the reading's columns)
 
     Y (k, ny) holds n rows that go with U's, then rows E of the reading alone; `lost` (m,) is a row whose square is
-    taken off (a negative weight), or empty. W = S^-½ᵀ C, so x⁺ = x + Wᵀ S^-½ᵀ ν, and U⁺ᵀ U⁺ = P - C S⁻¹ Cᵀ.
-    Rows of U come before those of √R: a tiny √R then keeps its digits.
+    taken off (a negative weight), or empty; R = diag(d). W = S^-½ᵀ C, so x⁺ = x + Wᵀ S^-½ᵀ ν, and
+    U⁺ᵀ U⁺ = P - C S⁻¹ Cᵀ. Rows of U come before those of √R: a tiny √R then keeps its digits. w and v (m + n,) are
+    scratch.
     """
     n = U.shape[0]
     k = Y.shape[0]
@@ -117,14 +160,9 @@ def triangularise_joint(y, r, m, Y, U, lost, A, scratch):
     for i in range(m):
         for j in range(m + n):
             A[k + i, j] = 0.0
-    row = 0
-    for i in range(r.size):
-        if np.isfinite(y[i]):
-            A[k + row, row] = np.sqrt(r[i])
-            row += 1
-    triangularise(A, scratch[: m + n])
+        A[k + i, i] = np.sqrt(d[i])
+    triangularise(A, w)
     if lost.size > 0:
-        v = scratch[m + n : 2 * (m + n)]
         for j in range(m + n):
             v[j] = lost[j] if j < m else 0.0
         if not remove(A, m + n, v):
@@ -140,7 +178,48 @@ def triangularise_joint(y, r, m, Y, U, lost, A, scratch):
 
 
 @inlined
-def condition(context, sensor, y, state, expected, Y, lost, work, innovation, innovation_std, score):
+def gather(context, sensor, y, own, expected, Y, lost, innovation):
+    """Fill the innovation ν, in place of ŷ, and d; move what belongs to rows that are there to the front; how many."""
+    circular = circular_rows(context, sensor)
+    m = 0
+    for i in range(expected.size):
+        if np.isfinite(y[i]):
+            residual = y[i] - expected[i]
+            innovation[i] = wrap(residual) if circular[i] != 0 else residual
+            expected[m] = innovation[i]
+            own.d[m] = own.r[i]
+            for j in range(Y.shape[0]):
+                Y[j, m] = Y[j, i]
+            if lost.size > 0:
+                lost[m] = lost[i]
+            m += 1
+    return m
+
+
+@jit
+def make_independent(m, L, nu, Y, lost):
+    """ν ← L⁻¹ ν, Y ← Y L⁻ᵀ, lost ← L⁻¹ lost: see sensor_noise.py."""
+    solve_unit(L, m, nu)
+    for i in range(Y.shape[0]):
+        solve_unit(L, m, Y[i])
+    if lost.size > 0:
+        solve_unit(L, m, lost)
+
+
+@jit
+def dependent_variance(A, L, k):
+    """S_kk of a reading's own rows, from the factor A of that of its independent ones: S = L Aᵀ A Lᵀ."""
+    variance = 0.0
+    for i in range(k + 1):
+        a = A[i, k]
+        for j in range(i, k):
+            a += A[i, j] * L[k, j]
+        variance += a * a
+    return variance
+
+
+@inlined
+def condition(context, sensor, y, state, expected, Y, lost, own, innovation, innovation_std, score):
     """Condition on a reading whose prediction is `expected` (ny,), and return the verdict.
 
     Y (k, ny) and lost are those of `triangularise_joint`, for all rows of the reading; they and `expected` are lost.
@@ -149,51 +228,50 @@ def condition(context, sensor, y, state, expected, Y, lost, work, innovation, in
     whose (D₊ - D₋) take the place of U Hᵀ, Arasaratnam, Haykin & Hurd (2010), doi:10.1109/TSP.2010.2056923.
     """
     n = context.nx
-    x = state[:n]
-    U = matrix(state, n, n, n)
-    circular = circular_rows(context, sensor)
-    ny = expected.size
-    k = Y.shape[0]
-    at = (k + ny) * (ny + n)
-    scratch = work[at : at + 2 * (ny + n)]
-    at += 2 * (ny + n)
-    r = work[at : at + ny]
-    at += ny
-    reading_variances(context, sensor, state, r)
-    m = 0
-    for i in range(ny):
-        if np.isfinite(y[i]):
-            residual = y[i] - expected[i]
-            innovation[i] = wrap(residual) if circular[i] != 0 else residual
-            expected[m] = innovation[i]
-            for j in range(k):
-                Y[j, m] = Y[j, i]
-            if lost.size > 0:
-                lost[m] = lost[i]
-            m += 1
+    x, U = moments_of(state, n)
+    reading_variances(context, sensor, state, own.r)
+    m = gather(context, sensor, y, own, expected, Y, lost, innovation)
     if m == 0:
         return MISSING
     score[1] = m
     nu = expected[:m]
+    correlated = has_correlated_rows(context, sensor)
+    if correlated:
+        independent_rows(context, sensor, y, own.r, own.L, own.d)
+        make_independent(m, own.L, nu, Y, lost)
     gone = lost[: min(m, lost.size)]
-    A = matrix(work, 0, k + m, m + n)
-    if not triangularise_joint(y, r, m, Y, U, gone, A, scratch):
+    # Rows that are missing make it smaller.
+    A, _ = take_matrix(start_of(own.A), Y.shape[0] + m, m + n)
+    if not triangularise_joint(own.d, m, Y, U, gone, A, own.w, own.v):
         return FAILED
     row = 0
-    for i in range(ny):
+    for i in range(expected.size):
         if np.isfinite(y[i]):
             variance = 0.0
-            for j in range(row + 1):
-                variance += A[j, row] * A[j, row]
+            if correlated:
+                variance = dependent_variance(A, own.L, row)
+            else:
+                for j in range(row + 1):
+                    variance += A[j, row] * A[j, row]
             innovation_std[i] = np.sqrt(variance)
             row += 1
+    for i in range(m):
+        own.raw[i] = nu[i]
     verdict = judge(context, sensor, m, nu, A, score)
-    if verdict != USED:
-        return verdict
-    if options(context)[ROBUST] != NONE:
-        S = matrix(work, at, m, m)
-        if not reweigh_joint(context, y, r, m, innovation, Y, U, gone, A, S, nu, scratch, work[at + m * m :]):
-            return FAILED
+    if verdict == USED and is_robust(context) and not reweigh_joint(context, m, nu, own, Y, U, gone, A):
+        verdict = FAILED
+    if verdict == USED:
+        take_over(m, nu, A, x, U)
+        wrap_mean(context, x)
+        if is_adaptive(context):
+            adapt(context, sensor, y, state, innovation, innovation_std, score)
+    return verdict
+
+
+@inlined
+def take_over(m, nu, A, x, U):
+    """x ← x + Wᵀ ν̃ with the whitened ν̃, U ← U⁺, from the joint factor A."""
+    n = x.size
     for i in range(m):
         a = nu[i]
         for j in range(n):
@@ -201,36 +279,27 @@ def condition(context, sensor, y, state, expected, Y, lost, work, innovation, in
     for i in range(n):
         for j in range(i, n):
             U[i, j] = A[m + i, m + j]
-    wrap_mean(context, x)
-    if options(context)[ADAPT] != OFF:
-        adapt(context, sensor, y, state, innovation, innovation_std, score)
-    return verdict
 
 
 @jit
-def reweigh_joint(context, y, r, m, innovation, Y, U, lost, A, S, nu, scratch, room):
+def reweigh_joint(context, m, nu, own, Y, U, lost, A):
     """Weight the reading's noise and triangularise again; A and the whitened nu then belong to the weighted noise.
 
     The weight alone is found from S itself.
     """
+    S = own.S
     for i in range(m):
         for j in range(m):
             S[i, j] = 0.0
             for k in range(min(i, j) + 1):
                 S[i, j] += A[k, i] * A[k, j]
-    raw = room[:m]
-    variance = room[m : 2 * m]
-    rows(y, innovation, raw)
-    rows(y, r, variance)
-    V = matrix(room, 4 * m, m, m)
-    w = weight(options(context)[ROBUST], options(context)[ROBUST_AT], m, raw, variance, S, V, room[2 * m : 4 * m])
+    w = weight(options(context)[ROBUST], options(context)[ROBUST_AT], m, own.raw, own.d, S, own.V, own.z)
     if not w > 0.0:
         return False
     for i in range(m):
-        nu[i] = raw[i]
-    for i in range(r.size):
-        r[i] /= w
-    if not triangularise_joint(y, r, m, Y, U, lost, A, scratch):
+        nu[i] = own.raw[i]
+        own.d[i] /= w
+    if not triangularise_joint(own.d, m, Y, U, lost, A, own.w, own.v):
         return False
     solve_transposed(A, m, nu)
     return True

@@ -2,40 +2,104 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
-from ..compiled.context import expect, sensor_rows, transition
+from ..compiled.context import expect, row_count, transition
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..estimator import Estimator, Options
-from ..numerics.jit import inlined, jit, matrix
+from ..numerics.jit import inlined, jit
 from ..numerics.linalg import triangularise
+from ..numerics.workspace import layout, size_of, start_of, take_matrix, take_vector
 from .ekf import tune
 from .robust import OPTIONS, growth, memory
-from .shared import no_points, state_size
-from .square_root import condition, condition_size, describe, moments, noise_root, settle, start
+from .shared import moments_of, no_points, state_size
+from .square_root import Conditioning, condition, conditioning, describe, moments, noise_root, settle, start
+
+
+class Predicting(NamedTuple):
+    """What `predict` works in."""
+
+    forward: Any
+    """(n,): f(x, u)."""
+    F: Any
+    """(n, n): df/dx."""
+    A: Any
+    """(2n, n): U Fᵀ over Q^½."""
+    scratch: Any
+    """(n, n): Q, then scratch of a triangularisation."""
+    jacobian: Any
+    """Scratch of a Jacobian."""
+    end: int
+
+
+@layout
+def predicting(at, n):
+    """The layout of `predict`."""
+    forward, at = take_vector(at, n)
+    F, at = take_matrix(at, n, n)
+    A, at = take_matrix(at, 2 * n, n)
+    scratch, at = take_matrix(at, n, n)
+    jacobian, at = take_vector(at, scratch_size(n, n))
+    return Predicting(forward, F, A, scratch, jacobian, at)
+
+
+class Updating(NamedTuple):
+    """What `update` works in."""
+
+    expected: Any
+    """(m,): h(x)."""
+    H: Any
+    """(m, n): dh/dx."""
+    Y: Any
+    """(n, m): U Hᵀ."""
+    nothing: Any
+    """(0,): no weight is negative."""
+    jacobian: Any
+    """Scratch of a Jacobian."""
+    conditioning: Conditioning
+    end: int
+
+
+@layout
+def updating(at, n, m):
+    """The layout of `update`."""
+    expected, at = take_vector(at, m)
+    H, at = take_matrix(at, m, n)
+    Y, at = take_matrix(at, n, m)
+    nothing, at = take_vector(at, 0)
+    jacobian, at = take_vector(at, scratch_size(n, m))
+    own = conditioning(at, n, m, n)
+    return Updating(expected, H, Y, nothing, jacobian, own, own.end)
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch: x', F and two squares; or ŷ, H, U Hᵀ, what conditioning takes; a Jacobian's."""
-    return max(nx + 4 * nx * nx, ny + 2 * nx * ny + condition_size(nx, ny, 0)) + scratch_size(nx, ny)
+    """Scratch of a prediction or an update."""
+    return max(size_of(predicting, nx), size_of(updating, nx, ny))
 
 
 @inlined
-def advance(context, u, dt, state, forward, F, A, scratch):
-    """x ← forward;  U ← triangle of [U Fᵀ; Q^½], in A (2n, n); scratch is (nx, nx)."""
-    n = context.nx
-    U = matrix(state, n, n, n)
-    V = A[n:]
-    good = noise_root(context, state[:n], u, dt, state, V, scratch)
-    grown = np.sqrt(growth(context, dt))
+def turn(U, F, a, out):
+    """Leading rows of `out` = a U Fᵀ, with upper U (n, n) and F (k, n)."""
+    n = U.shape[0]
     for i in range(n):
-        for k in range(n):
+        for k in range(F.shape[0]):
             s = 0.0
             for j in range(i, n):
                 s += U[i, j] * F[k, j]
-            A[i, k] = grown * s
-    triangularise(A, scratch[0])
-    settle(context, forward, U, A, good, state)
+            out[i, k] = a * s
+
+
+@inlined
+def advance(context, u, dt, state, own, F):
+    """x ← f(x, u);  U ← triangle of [U Fᵀ; Q^½]."""
+    n = context.nx
+    x, U = moments_of(state, n)
+    good = noise_root(context, x, u, dt, state, own.A[n:], own.scratch)
+    turn(U, F, np.sqrt(growth(context, dt)), own.A)
+    triangularise(own.A, own.scratch[0])
+    settle(context, own.forward, own.A, good, state)
 
 
 @jit
@@ -44,13 +108,11 @@ def predict(context, u, dt, index, state, work):
 
     Source: Kailath, Sayed & Hassibi, Linear Estimation (2000), chapter 12.
     """
-    n = context.nx
-    x = state[:n]
-    forward = work[:n]
-    F = matrix(work, n, n, n)
-    state_jacobian(context, x, u, dt, F, work[n + 4 * n * n :])
-    transition(context, x, u, dt, forward)
-    advance(context, u, dt, state, forward, F, matrix(work, n + n * n, 2 * n, n), matrix(work, n + 3 * n * n, n, n))
+    x, _ = moments_of(state, context.nx)
+    own = predicting(start_of(work), context.nx)
+    state_jacobian(context, x, u, dt, own.F, own.jacobian)
+    transition(context, x, u, dt, own.forward)
+    advance(context, u, dt, state, own, own.F)
 
 
 @jit
@@ -59,23 +121,14 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
 
     Source: Kailath, Sayed & Hassibi, Linear Estimation (2000), chapter 12.
     """
-    n = context.nx
-    _, m = sensor_rows(context, sensor)
-    x = state[:n]
-    U = matrix(state, n, n, n)
-    expected = work[:m]
-    H = matrix(work, m, m, n)
-    Y = matrix(work, m + n * m, n, m)
-    at = m + 2 * n * m
-    sensor_jacobian(context, sensor, x, u, H, work[at:])
-    expect(context, sensor, x, u, expected)
-    for i in range(n):
-        for k in range(m):
-            s = 0.0
-            for j in range(i, n):
-                s += U[i, j] * H[k, j]
-            Y[i, k] = s
-    return condition(context, sensor, y, state, expected, Y, work[:0], work[at:], innovation, innovation_std, score)
+    x, U = moments_of(state, context.nx)
+    own = updating(start_of(work), context.nx, row_count(context, sensor))
+    sensor_jacobian(context, sensor, x, u, own.H, own.jacobian)
+    expect(context, sensor, x, u, own.expected)
+    turn(U, own.H, 1.0, own.Y)
+    return condition(
+        context, sensor, y, state, own.expected, own.Y, own.nothing, own.conditioning, innovation, innovation_std, score
+    )
 
 
 SR_EKF = Estimator(
@@ -95,4 +148,5 @@ SR_EKF = Estimator(
     options=OPTIONS,
     tune=tune,
     memory=memory,
+    singular=True,
 )

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from ..compiled.context import transition
 from ..estimator import Estimator, Options
-from ..numerics.jit import jit, matrix
+from ..numerics.jit import jit
+from ..numerics.workspace import size_of, start_of
 from . import sr_ekf
-from .kf import applies, constant_jacobian
+from .kf import applies, constant_jacobian, kept, kept_in
 from .robust import OPTIONS, memory
-from .shared import no_points, state_size
+from .shared import moments_of, no_points, state_size
 from .square_root import describe, moments, start
+from .sr_ekf import advance, predicting
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch: the square-root EKF's; behind it F and the dt for which it holds, kept from step to step."""
-    return sr_ekf.work_size(options, nx, ny) + nx * nx + 1
+    """Scratch: the square-root EKF's, and what stays from step to step."""
+    return sr_ekf.work_size(options, nx, ny) + size_of(kept, nx)
 
 
 @jit
@@ -24,13 +26,12 @@ def predict(context, u, dt, index, state, work):
     Source: Kailath, Sayed & Hassibi, Linear Estimation (2000), chapter 12.
     """
     n = context.nx
-    forward = work[:n]
-    last = work.size - 1
-    F = matrix(work, last - n * n, n, n)
-    constant_jacobian(context, u, dt, F, work[last:], work[n + 4 * n * n :])
-    transition(context, state[:n], u, dt, forward)
-    A = matrix(work, n + n * n, 2 * n, n)
-    sr_ekf.advance(context, u, dt, state, forward, F, A, matrix(work, n + 3 * n * n, n, n))
+    x, _ = moments_of(state, n)
+    own = predicting(start_of(work), n)
+    constant = kept_in(work, n)
+    constant_jacobian(context, u, dt, constant, own.jacobian)
+    transition(context, x, u, dt, own.forward)
+    advance(context, u, dt, state, own, constant.F)
 
 
 SR_KF = Estimator(
@@ -49,5 +50,6 @@ SR_KF = Estimator(
     options=OPTIONS,
     tune=sr_ekf.tune,
     memory=memory,
+    singular=True,
     applies=applies,
 )

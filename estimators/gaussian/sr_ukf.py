@@ -1,7 +1,7 @@
 """The square-root unscented Kalman filter: sigma points from a factor of P that is never multiplied out.
 
-Sigma points and weights as in ukf.py. A negative central weight takes a square off the others: that is a rank-one
-downdate, which fails visibly where nothing positive definite is left.
+Sigma points and weights as in sigma_points.py. A negative central weight takes a square off the others: that is a
+rank-one downdate, which fails visibly where nothing positive definite is left.
 
 Source: van der Merwe & Wan (2001), doi:10.1109/ICASSP.2001.940586. Their m downdates by the columns of K S^½, which
 break where P⁺ is nearly singular, are replaced by one triangularisation of reading and state together.
@@ -9,32 +9,105 @@ break where P⁺ is nearly singular, are replaced by one triangularisation of re
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
-from ..compiled.context import circular_rows, circular_states, expect_rows, options, sensor_rows, transition_rows
+from ..compiled.context import circular_rows, circular_states, expect_points, row_count, transition_points
 from ..estimator import Estimator, Options
-from ..numerics.jit import jit, matrix
+from ..numerics.jit import inlined, jit
 from ..numerics.linalg import remove, triangularise
+from ..numerics.padded_rows import spread_points
 from ..numerics.simd_ir import padded
+from ..numerics.workspace import layout, size_of, start_of, take_matrix, take_vector
 from .robust import growth, memory
-from .shared import state_size
-from .sigma_points import deviations, spread_points
-from .square_root import condition, condition_size, describe, moments, noise_root, settle, start
-from .ukf import CENTRAL_COV, OUTER, SPREAD, UKF, tune, weights
+from .shared import moments_of, state_size
+from .sigma_points import deviations, weights, weights_of
+from .square_root import Conditioning, condition, conditioning, describe, moments, noise_root, settle, start
+from .ukf import UKF, tune
 
 
 def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
     """The sigma points (2 nx + 1, nx) of a state."""
     U = state[nx : nx + nx * nx].reshape(nx, nx)
-    spread = weights(values["alpha"], values["beta"], values["kappa"], nx)[2]
+    spread = weights(values["alpha"], values["beta"], values["kappa"], nx).spread
     return np.vstack((state[:nx], state[:nx] + spread * U, state[:nx] - spread * U))
 
 
+class Predicting(NamedTuple):
+    """What `predict` works in."""
+
+    sigma: Any
+    """(2n + 1, padded n): the sigma points."""
+    moved: Any
+    """(2n + 1, padded n): the same through f, then their deviations from the mean."""
+    mean: Any
+    """(padded n,)."""
+    lost: Any
+    """(n,): the weighted deviation of the central point."""
+    D: Any
+    """(3n + 1, n): all weighted deviations over Q^½."""
+    scratch: Any
+    """(n, n): Q, then scratch of a triangularisation."""
+    end: int
+
+
+@layout
+def predicting(at, n):
+    """The layout of `predict`."""
+    sigma, at = take_matrix(at, 2 * n + 1, padded(n))
+    moved, at = take_matrix(at, 2 * n + 1, padded(n))
+    mean, at = take_vector(at, padded(n))
+    lost, at = take_vector(at, n)
+    D, at = take_matrix(at, 3 * n + 1, n)
+    scratch, at = take_matrix(at, n, n)
+    return Predicting(sigma, moved, mean, lost, D, scratch, at)
+
+
+class Updating(NamedTuple):
+    """What `update` works in."""
+
+    sigma: Any
+    """(2n + 1, padded n): the sigma points."""
+    D: Any
+    """(2n + 1, padded m): the same through h, then their deviations from the mean."""
+    mean: Any
+    """(padded m,)."""
+    expected: Any
+    """(m,): the same, without what pads it."""
+    lost: Any
+    """(m,): the weighted deviation of the central point."""
+    Y: Any
+    """(2n + 1, m): the deviations, those of opposite points turned by 45°."""
+    conditioning: Conditioning
+    end: int
+
+
+@layout
+def updating(at, n, m):
+    """The layout of `update`."""
+    sigma, at = take_matrix(at, 2 * n + 1, padded(n))
+    D, at = take_matrix(at, 2 * n + 1, padded(m))
+    expected, _ = take_vector(at, m)
+    mean, at = take_vector(at, padded(m))
+    lost, at = take_vector(at, m)
+    Y, at = take_matrix(at, 2 * n + 1, m)
+    own = conditioning(at, n, m, 2 * n + 1)
+    return Updating(sigma, D, mean, expected, lost, Y, own, own.end)
+
+
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch: sigma points; and the same through f, Q^½ and a square; or ŷ, points through h, conditioning."""
-    n, m, points = padded(nx), padded(ny), 2 * nx + 1
-    predicting = points * n + n + nx + (3 * nx + 1) * nx + nx * nx
-    return points * n + max(predicting, points * m + m + ny + points * ny + condition_size(nx, ny, nx + 1))
+    """Scratch of a prediction or an update."""
+    return max(size_of(predicting, nx), size_of(updating, nx, ny))
+
+
+@inlined
+def weigh_central(central, a, deviation, lost, row):
+    """The row of the central point, a √|w| D₀: in `row` if its weight w is positive, otherwise to be taken off."""
+    w = a * np.sqrt(abs(central))
+    for j in range(lost.size):
+        lost[j] = w * deviation[j]
+        row[j] = lost[j] if central > 0.0 else 0.0
 
 
 @jit
@@ -45,37 +118,35 @@ def predict(context, u, dt, index, state, work):
     divergence. Source: van der Merwe & Wan (2001), the time update.
     """
     n = context.nx
-    U = matrix(state, n, n, n)
-    sigma = matrix(work, 0, 2 * n + 1, padded(n))
-    at = sigma.size
-    moved = matrix(work, at, 2 * n + 1, padded(n))
-    at += moved.size
-    forward = work[at : at + padded(n)]
-    at += forward.size
-    row = work[at : at + n]
-    at += n
-    # From row 0: the central point, the 2n others, the factor of Q; one after the other, so that all are one matrix.
-    D = matrix(work, at, 3 * n + 1, n)
-    scratch = matrix(work, at + (3 * n + 1) * n, n, n)
-    numbers = options(context)
-    spread_points(state[:n], U, numbers[SPREAD], sigma)
-    transition_rows(context, sigma.ctypes.data, sigma.shape[1], 2 * n + 1, u, dt, moved)
-    deviations(moved, numbers[OUTER], circular_states(context), forward)
-    good = noise_root(context, state[:n], u, dt, state, D[2 * n + 1 :], scratch)
+    x, U = moments_of(state, n)
+    own = predicting(start_of(work), n)
+    # One matrix from row 0: the central point, the 2n others, the factor of Q.
+    D = own.D
+    w = weights_of(context)
+    spread_points(x, U, w.spread, own.sigma)
+    transition_points(context, own.sigma, u, dt, own.moved)
+    deviations(own.moved, w.outer, circular_states(context), own.mean)
+    good = noise_root(context, x, u, dt, state, D[2 * n + 1 :], own.scratch)
     grown = np.sqrt(growth(context, dt))
-    w = grown * np.sqrt(numbers[OUTER])
+    outer = grown * np.sqrt(w.outer)
     for i in range(1, 2 * n + 1):
         for j in range(n):
-            D[i, j] = w * moved[i, j]
-    central = numbers[CENTRAL_COV]
-    w = grown * np.sqrt(abs(central))
-    for j in range(n):
-        row[j] = w * moved[0, j]
-        D[0, j] = row[j] if central > 0.0 else 0.0
-    triangularise(D, scratch[0])
-    if central < 0.0 and good:
-        good = remove(D, n, row)
-    settle(context, forward, U, D, good, state)
+            D[i, j] = outer * own.moved[i, j]
+    weigh_central(w.central, grown, own.moved[0], own.lost, D[0])
+    triangularise(D, own.scratch[0])
+    if w.central < 0.0 and good:
+        good = remove(D, n, own.lost)
+    settle(context, own.mean, D, good, state)
+
+
+@inlined
+def turn_pairs(D, n, w, Y):
+    """Rows of Y (2n, m) = √(w/2) (D₊ - D₋), then √(w/2) (D₊ + D₋), of opposite points' deviations."""
+    a = np.sqrt(0.5 * w)
+    for k in range(n):
+        for j in range(Y.shape[1]):
+            Y[k, j] = a * (D[1 + k, j] - D[1 + n + k, j])
+            Y[n + k, j] = a * (D[1 + k, j] + D[1 + n + k, j])
 
 
 @jit
@@ -88,35 +159,20 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     Source: van der Merwe & Wan (2001), the measurement update.
     """
     n = context.nx
-    _, m = sensor_rows(context, sensor)
-    U = matrix(state, n, n, n)
-    sigma = matrix(work, 0, 2 * n + 1, padded(n))
-    at = sigma.size
-    D = matrix(work, at, 2 * n + 1, padded(m))
-    at += D.size
-    expected = work[at : at + padded(m)]
-    at += expected.size
-    lost = work[at : at + m]
-    at += m
-    Y = matrix(work, at, 2 * n + 1, m)
-    at += Y.size
-    numbers = options(context)
-    spread_points(state[:n], U, numbers[SPREAD], sigma)
-    expect_rows(context, sensor, sigma.ctypes.data, sigma.shape[1], 2 * n + 1, u, D)
-    deviations(D, numbers[OUTER], circular_rows(context, sensor), expected)
-    w = np.sqrt(0.5 * numbers[OUTER])
-    for k in range(n):
-        for j in range(m):
-            Y[k, j] = w * (D[1 + k, j] - D[1 + n + k, j])
-            Y[n + k, j] = w * (D[1 + k, j] + D[1 + n + k, j])
-    central = numbers[CENTRAL_COV]
-    w = np.sqrt(abs(central))
-    for j in range(m):
-        lost[j] = w * D[0, j]
-        Y[2 * n, j] = lost[j] if central > 0.0 else 0.0
-    if central >= 0.0:
+    x, U = moments_of(state, n)
+    own = updating(start_of(work), n, row_count(context, sensor))
+    w = weights_of(context)
+    spread_points(x, U, w.spread, own.sigma)
+    expect_points(context, sensor, own.sigma, u, own.D)
+    deviations(own.D, w.outer, circular_rows(context, sensor), own.mean)
+    turn_pairs(own.D, n, w.outer, own.Y)
+    lost = own.lost
+    weigh_central(w.central, 1.0, own.D[0], lost, own.Y[2 * n])
+    if w.central >= 0.0:
         lost = lost[:0]
-    return condition(context, sensor, y, state, expected[:m], Y, lost, work[at:], innovation, innovation_std, score)
+    return condition(
+        context, sensor, y, state, own.expected, own.Y, lost, own.conditioning, innovation, innovation_std, score
+    )
 
 
 SR_UKF = Estimator(
@@ -137,4 +193,5 @@ SR_UKF = Estimator(
     tune=tune,
     memory=memory,
     refuses=UKF.refuses,
+    singular=True,
 )

@@ -1,56 +1,43 @@
-"""The unscented Kalman filter: 2n + 1 sigma points through the true f and h, no derivatives.
-
-Sigma points x, x ± √(n+λ) U[i] with P = Uᵀ U and λ = α² (n + κ) - n; weights 1/(2(n+λ)), the central one λ/(n+λ) for
-the mean and λ/(n+λ) + 1 - α² + β for the covariance.
-
-Sources: Julier & Uhlmann (2004), doi:10.1109/JPROC.2003.823141; Wan & van der Merwe (2000),
-doi:10.1109/ASSPCC.2000.882463.
-"""
+"""The unscented Kalman filter: 2n + 1 sigma points through the true f and h, no derivatives (see sigma_points.py)."""
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
-from ..compiled.context import circular_rows, circular_states, expect_rows, options, sensor_rows, transition_rows
+from ..compiled.context import circular_rows, circular_states, expect_points, row_count, transition_points
 from ..estimator import Estimator, Option, Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import jit, matrix
+from ..numerics.jit import inlined, jit
 from ..numerics.linalg import EPSILON
+from ..numerics.padded_rows import covariance, cross_covariance, factor, spread_points
 from ..numerics.simd_ir import padded
+from ..numerics.workspace import layout, size_of, start_of, take_matrix, take_vector
 from ..track import FAILED, USED
 from ..tuning import Tuning
-from . import shared
-from .robust import (
-    ADAPT,
-    NONE,
-    OFF,
-    OPTIONS,
-    OWN,
-    ROBUST,
-    adapt,
-    add_noise,
-    memory,
-    reading_variances,
-    reweigh,
-    shared_options,
+from .robust import OPTIONS, adapt, add_noise, is_adaptive, memory, reading_variances, shared_options
+from .shared import (
+    Reading,
+    admit_weighted,
+    compare,
+    describe,
+    downdate,
+    moments,
+    moments_of,
+    move_mean,
+    move_to,
+    reading_of,
+    start,
+    state_size,
+    wrap_mean,
 )
-from .shared import admit, compare, describe, downdate, moments, move_mean, start, state_size, wrap_mean
-from .sigma_points import covariance, cross_covariance, deviations, factor, spread_points
-
-CENTRAL_COV, OUTER, SPREAD = range(OWN, OWN + 3)
-"""Positions in the context's options: the central covariance weight, the outer weight, √(n+λ)."""
-
-
-def weights(alpha: float, beta: float, kappa: float, nx: int) -> list[float]:
-    """Central covariance weight, outer weight and spread that alpha, beta and kappa give for nx states."""
-    total = alpha**2 * (nx + kappa)
-    central = 1.0 - nx / total
-    return [central + 1.0 - alpha**2 + beta, 0.5 / total, float(np.sqrt(total))]
+from .sigma_points import deviations, sigma_points, weights, weights_of
 
 
 def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     """The shared options, and the weights."""
-    return np.array(shared_options(values) + weights(values["alpha"], values["beta"], values["kappa"], model.nx))
+    return np.array([*shared_options(values), *weights(values["alpha"], values["beta"], values["kappa"], model.nx)])
 
 
 def refuses(model: StateSpaceModel, values: Options) -> str | None:
@@ -64,24 +51,75 @@ def refuses(model: StateSpaceModel, values: Options) -> str | None:
     )
 
 
-def sigma_points(x: np.ndarray, P: np.ndarray, spread: float) -> np.ndarray:
-    """The sigma points (2 nx + 1, nx) of a mean and covariance; none where the covariance has no factor."""
-    try:
-        U = np.linalg.cholesky(P).T * spread
-    except np.linalg.LinAlgError:
-        return np.zeros((0, x.size))
-    return np.vstack((x, x + U, x - U))
-
-
 def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
     """The sigma points (2 nx + 1, nx) of a state."""
-    return sigma_points(*moments(values, state, nx), weights(values["alpha"], values["beta"], values["kappa"], nx)[2])
+    spread = weights(values["alpha"], values["beta"], values["kappa"], nx).spread
+    return sigma_points(*moments(values, state, nx), spread)
+
+
+class Predicting(NamedTuple):
+    """What `predict` works in."""
+
+    D: Any
+    """(2n + 1, padded n): sigma points through f, then their deviations from the mean."""
+    sigma: Any
+    """(2n + 1, padded n): the sigma points."""
+    mean: Any
+    """(padded n,)."""
+    chol_P: Any
+    """(n, padded n): upper, chol_Pᵀ chol_P = P."""
+    Q: Any
+    """(n, n): scratch of the noise, once the factor is needed no more."""
+    end: int
+
+
+@layout
+def predicting(at, n):
+    """The layout of `predict`."""
+    D, at = take_matrix(at, 2 * n + 1, padded(n))
+    sigma, at = take_matrix(at, 2 * n + 1, padded(n))
+    mean, at = take_vector(at, padded(n))
+    Q, _ = take_matrix(at, n, n)
+    chol_P, at = take_matrix(at, n, padded(n))
+    return Predicting(D, sigma, mean, chol_P, Q, at)
+
+
+class Updating(NamedTuple):
+    """What `update` works in."""
+
+    D: Any
+    """(2n + 1, padded m): sigma points through h, then their deviations from the mean."""
+    across: Any
+    """(n, padded m): the differences between opposite ones, in the place of the first of each pair."""
+    mean: Any
+    """(padded m,)."""
+    sigma: Any
+    """(2n + 1, padded n): the sigma points."""
+    chol_P: Any
+    """(n, padded n): upper, chol_Pᵀ chol_P = P."""
+    no_H: Any
+    """(m, 0): there is no Jacobian."""
+    reading: Reading
+    end: int
+
+
+@layout
+def updating(at, n, m):
+    """The layout of `update`."""
+    _, second = take_vector(at, padded(m))
+    across, _ = take_matrix(second, n, padded(m))
+    D, at = take_matrix(at, 2 * n + 1, padded(m))
+    mean, at = take_vector(at, padded(m))
+    sigma, at = take_matrix(at, 2 * n + 1, padded(n))
+    chol_P, at = take_matrix(at, n, padded(n))
+    no_H, at = take_matrix(at, m, 0)
+    reading = reading_of(at, n, m)
+    return Updating(D, across, mean, sigma, chol_P, no_H, reading, reading.end)
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch: an update's; the factor, sigma points, the same through f or h, their mean and covariance."""
-    n, m = padded(nx), padded(ny)
-    return shared.scratch_size(nx, ny) + nx * n + (2 * nx + 1) * (n + max(n, m)) + max(n, m)
+    """Scratch of a prediction or an update."""
+    return max(size_of(predicting, nx), size_of(updating, nx, ny))
 
 
 @jit
@@ -89,31 +127,22 @@ def predict(context, u, dt, index, state, work):
     """x, P ← mean and covariance of the propagated sigma points, plus Q.
 
     Fails when P loses positive definiteness; the state then becomes NaN and the twin reports divergence.
-    Source: Julier & Uhlmann (2004), as above.
+    Source: Julier & Uhlmann (2004), doi:10.1109/JPROC.2003.823141.
     """
     n = context.nx
-    width = padded(n)
-    x = state[:n]
-    P = matrix(state, n, n, n)
-    D = matrix(work, 0, 2 * n + 1, width)
-    at = D.size
-    sigma = matrix(work, at, 2 * n + 1, width)
-    at += sigma.size
-    forward = work[at : at + width]
-    U = matrix(work, at + width, n, width)
-    numbers = options(context)
-    if not factor(P, U):
+    x, P = moments_of(state, n)
+    own = predicting(start_of(work), n)
+    w = weights_of(context)
+    if not factor(P, own.chol_P):
         for i in range(n + n * n):
             state[i] = np.nan
         return
-    spread_points(x, U, numbers[SPREAD], sigma)
-    transition_rows(context, sigma.ctypes.data, width, 2 * n + 1, u, dt, D)
-    deviations(D, numbers[OUTER], circular_states(context), forward)
-    covariance(D, numbers[CENTRAL_COV], numbers[OUTER], P)
-    add_noise(context, x, u, dt, state, P, matrix(work, at + width, n, n))
-    for i in range(n):
-        x[i] = forward[i]
-    wrap_mean(context, x)
+    spread_points(x, own.chol_P, w.spread, own.sigma)
+    transition_points(context, own.sigma, u, dt, own.D)
+    deviations(own.D, w.outer, circular_states(context), own.mean)
+    covariance(own.D, w.central, w.outer, P)
+    add_noise(context, x, u, dt, state, P, own.Q)
+    move_to(context, own.mean, x)
 
 
 @jit
@@ -134,53 +163,45 @@ def only_rounding(U, P, across, S, r, w, y):
     return False
 
 
+@inlined
+def subtract_opposite(D, m, across):
+    """Fill `across` with the differences between the images (m,) of opposite points; it is the first half of D."""
+    n = across.shape[0]
+    for k in range(n):
+        for j in range(m):
+            across[k, j] -= D[1 + n + k, j]
+
+
 @jit
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """x ← x + C S⁻¹ ν;  P ← P - C S⁻¹ Cᵀ, with C and S from fresh sigma points through h.
 
-    Source: Julier & Uhlmann (2004), as above; sigma points are drawn anew from the prediction, so that they carry Q.
+    Source: Julier & Uhlmann (2004), as above; sigma points are drawn again from the prediction, so that they carry Q.
     """
-    n = context.nx
-    _, m = sensor_rows(context, sensor)
-    x = state[:n]
-    P = matrix(state, n, n, n)
-    D = matrix(work, 0, 2 * n + 1, padded(m))
-    at = D.size
-    mean = work[at : at + D.shape[1]]
-    at += mean.size
-    sigma = matrix(work, at, 2 * n + 1, padded(n))
-    at += sigma.size
-    U = matrix(work, at, n, padded(n))
-    nu, r, S, V, C, W, room, _ = shared.scratch(work[at + U.size :], n, m)
-    numbers = options(context)
-    w = numbers[OUTER]
-    spread = numbers[SPREAD]
-    if not factor(P, U):
+    x, P = moments_of(state, context.nx)
+    own = updating(start_of(work), context.nx, row_count(context, sensor))
+    reading = own.reading
+    w = weights_of(context)
+    if not factor(P, own.chol_P):
         return FAILED
-    spread_points(x, U, spread, sigma)
-    expect_rows(context, sensor, sigma.ctypes.data, sigma.shape[1], 2 * n + 1, u, D)
-    deviations(D, w, circular_rows(context, sensor), mean)
-    covariance(D, numbers[CENTRAL_COV], w, S)
-    for i in range(m):
-        nu[i] = mean[i]
+    spread_points(x, own.chol_P, w.spread, own.sigma)
+    expect_points(context, sensor, own.sigma, u, own.D)
+    deviations(own.D, w.outer, circular_rows(context, sensor), own.mean)
+    covariance(own.D, w.central, w.outer, reading.S)
     # The sigma deviations of the state are ± spread·U[k], so C = w·spread Σ U[k] (D₊ₖ - D₋ₖ).
-    across = D[1 : n + 1]
-    for k in range(n):
-        for j in range(m):
-            across[k, j] -= D[1 + n + k, j]
-    cross_covariance(U, across, w * spread, C)
-    nothing = D[:, :0]
-    reading_variances(context, sensor, state, r)
-    drowned = only_rounding(U, P, across, S, r, w, y)
-    m = compare(context, sensor, y, r, nu, C, S, nothing, P, innovation, innovation_std)
-    verdict = FAILED if drowned else admit(context, sensor, m, nu, S, V, score)
-    if verdict == USED and numbers[ROBUST] != NONE:
-        verdict = USED if reweigh(context, y, r, innovation, m, nu, S, V, room) else FAILED
+    subtract_opposite(own.D, reading.nu.size, own.across)
+    cross_covariance(own.chol_P, own.across, w.outer * w.spread, reading.C)
+    for i in range(reading.nu.size):
+        reading.nu[i] = own.mean[i]
+    reading_variances(context, sensor, state, reading.r)
+    drowned = only_rounding(own.chol_P, P, own.across, reading.S, reading.r, w.outer, y)
+    m = compare(context, sensor, y, reading, own.no_H, P, innovation, innovation_std)
+    verdict = FAILED if drowned else admit_weighted(context, sensor, m, reading, score)
     if verdict == USED:
-        move_mean(m, C, V, nu, x)
+        move_mean(m, reading.C, reading.chol_S, reading.nu, x)
         wrap_mean(context, x)
-        downdate(m, C, V, P, W)
-        if numbers[ADAPT] != OFF:
+        downdate(m, reading.C, reading.chol_S, P, reading.W)
+        if is_adaptive(context):
             adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict
 

@@ -17,6 +17,7 @@ from ..compiled.model import CompiledModel
 from ..errors import ModelError
 from ..estimator import Options
 from ..gaussian.shared import admit
+from ..model.correlation import covariance_of
 from ..model.state_space import StateSpaceModel
 from ..track import FAILED
 from ..tuning import Tuning
@@ -54,6 +55,7 @@ class View:
         angles = np.array([row.circular for sensor in model.sensors for row in sensor.rows], bool)
         self._r = [held["r"][part] for part in rows]
         self._angles = [angles[part] for part in rows]
+        self._R = [covariance_of(sensor.correlation, r) for sensor, r in zip(model.sensors, self._r, strict=True)]
         self._scratch = np.empty(scratch_size(model.nx, model.width))
         self.kept: dict[Any, Any] = {}
         self.failures = 0
@@ -69,9 +71,9 @@ class View:
         """Mean (nx,) and covariance (nx, nx) of the prior."""
         return self._prior
 
-    def variances(self, sensor: int) -> np.ndarray:
-        """r (ny,): the variances of a sensor's rows."""
-        return self._r[sensor]
+    def covariance(self, sensor: int) -> np.ndarray:
+        """R (ny, ny): the covariance of a sensor's rows."""
+        return self._R[sensor]
 
     @contextmanager
     def brought(self, sensor: int, own: np.ndarray) -> Iterator[None]:

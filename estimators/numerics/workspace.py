@@ -23,12 +23,15 @@ from collections.abc import Callable
 from typing import Any
 
 from numba import carray
-from numba.extending import overload
+from numba.extending import overload, register_jitable
 
 from .jit import _to_float, inlined, plain
 
 WORD = 8
 """Bytes of a float64."""
+
+layout = register_jitable
+"""Decorator of a layout that stands in others: in Python a plain function, within a kernel compiled."""
 
 
 def take_matrix(at: int, rows: int, columns: int) -> tuple[Any, int]:
@@ -41,7 +44,9 @@ def take_vector(at: int, n: int) -> tuple[Any, int]:
     return None, at + WORD * n
 
 
-@overload(take_matrix, inline="always")
+# Not inlined: where Numba inlines an overload it looks for dead code, and takes a write through a field of a tuple,
+# `own.mean[i] = ...`, for dead.
+@overload(take_matrix)
 def _take_matrix(at, rows, columns):
     def take(at, rows, columns):
         return carray(_to_float(at), (rows, columns)), at + WORD * rows * columns
@@ -49,7 +54,7 @@ def _take_matrix(at, rows, columns):
     return take
 
 
-@overload(take_vector, inline="always")
+@overload(take_vector)
 def _take_vector(at, n):
     def take(at, n):
         return carray(_to_float(at), (n,)), at + WORD * n

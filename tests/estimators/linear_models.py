@@ -91,9 +91,13 @@ class Matrices:
     q: float
     u: np.ndarray
     model: StateSpaceModel
+    C: tuple[np.ndarray, ...]
 
 
-def random_linear(rng: np.random.Generator, nx: int, nu: int) -> Matrices:
+def random_linear(
+    rng: np.random.Generator, nx: int, nu: int, *, correlated: bool = False, certain: bool = False
+) -> Matrices:
+    """`correlated`: the rows of each sensor are; `certain`: a state is known at first, a row read without noise."""
     A = rng.normal(0, 0.3, (nx, nx)) - 0.2 * np.eye(nx)
     B = rng.normal(0, 1, (nx, nu))
     root = rng.normal(0, 1, (nx, nx))
@@ -102,6 +106,9 @@ def random_linear(rng: np.random.Generator, nx: int, nu: int) -> Matrices:
     D = tuple(rng.normal(0, 1, (m, nu)) for m in ROWS)
     R = tuple(rng.uniform(0.2, 2.0, m) for m in ROWS)
     mean, std, u = rng.normal(0, 2, nx), rng.uniform(0.5, 2.0, nx), rng.normal(0, 1, nu)
+    C = tuple(random_correlation(rng, m) if correlated else np.eye(m) for m in ROWS)
+    if certain:
+        std[0] = R[2][1] = 0.0
     numbers = [A, B, W, *(np.hstack(pair) for pair in zip(H, D, strict=True))]
     p = np.concatenate([block.ravel() for block in numbers])
     model = StateSpaceModel(
@@ -112,14 +119,27 @@ def random_linear(rng: np.random.Generator, nx: int, nu: int) -> Matrices:
         parameters=tuple(Parameter(f"p{i}", "1", value) for i, value in enumerate(p)),
         noises=(Noise("all", "m²/s", variance=0.3),),
         sensors=tuple(
-            Sensor(name, tuple(Row(f"r{j}", "m", variance=r) for j, r in enumerate(variances)), h=h)
-            for name, variances, h in zip(("first", "second", "third"), R, (first, second, third), strict=True)
+            Sensor(
+                name,
+                tuple(Row(f"r{j}", "m", variance=r) for j, r in enumerate(variances)),
+                h=h,
+                correlation=c if correlated else None,
+            )
+            for name, variances, h, c in zip(("first", "second", "third"), R, (first, second, third), C, strict=True)
         ),
         f=f,
         Q=Q,
         linear=True,
     )
-    return Matrices(A, B, W, H, D, R, mean, std, 0.3, u, model)
+    return Matrices(A, B, W, H, D, R, mean, std, 0.3, u, model, C)
+
+
+def random_correlation(rng: np.random.Generator, m: int) -> np.ndarray:
+    """A correlation matrix (m, m), its entries of all sizes."""
+    root = rng.normal(0, 1, (m, m))
+    c = root @ root.T + 0.1 * np.eye(m)
+    c /= np.sqrt(np.outer(np.diag(c), np.diag(c)))
+    return 0.5 * (c + c.T) - np.diag(np.diag(c)) + np.eye(m)
 
 
 def random_log(rng: np.random.Generator, matrices: Matrices, events: int, *, missing: float = 0.2) -> Log:
@@ -156,7 +176,7 @@ class JointGaussian:
         c = np.zeros(n * K)
         E = np.zeros((n * K, n * K))
         u = matrices.u.copy()
-        rows, offsets, values, noise, self.owner = [], [], [], [], []
+        rows, offsets, values, places, self.owner = [], [], [], [], []
         for k in range(K):
             here = slice(n * k, n * (k + 1))
             if k == 0:
@@ -178,12 +198,22 @@ class JointGaussian:
                         rows.append(line)
                         offsets.append(matrices.D[sensor][row] @ u)
                         values.append(events.value[k, row])
-                        noise.append(matrices.R[sensor][row])
+                        places.append((sensor, row))
                         self.owner.append(k)
         inverse = np.linalg.inv(M)
         self.n, self.owner = n, np.array(self.owner)
         self.mean, self.cov = inverse @ c, inverse @ E @ inverse.T
-        self.H, self.offset, self.y, self.R = np.array(rows), np.array(offsets), np.array(values), np.diag(noise)
+        self.H, self.offset, self.y, self.R = (
+            np.array(rows),
+            np.array(offsets),
+            np.array(values),
+            np.zeros((len(values),) * 2),
+        )
+        for i, (sensor, row) in enumerate(places):
+            for j, (_, other) in enumerate(places):
+                if self.owner[i] == self.owner[j]:
+                    r = matrices.R[sensor]
+                    self.R[i, j] = r[row] if i == j else matrices.C[sensor][row, other] * np.sqrt(r[row] * r[other])
         self.channel = events.channel[self.owner]
         self.events = np.unique(self.owner)
         self._kept: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}

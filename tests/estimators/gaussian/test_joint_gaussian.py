@@ -20,6 +20,9 @@ from tests.estimators.linear_models import JointGaussian, random_linear, random_
 
 GAUSSIAN = [name for name, entry in ESTIMATORS.items() if entry.family == "Gaussian" and name != "kf-steady"]
 CASES = [(nx, nu, seed) for nx, nu in ((1, 0), (1, 1), (2, 0), (3, 2), (4, 0), (5, 1)) for seed in range(2)]
+CORRELATED = 2
+"""The seed of a case whose sensors' rows are correlated."""
+CASES += [(nx, nu, CORRELATED) for nx, nu in ((1, 0), (3, 2), (5, 1))]
 
 
 def close(actual, expected, what):
@@ -31,7 +34,7 @@ def close(actual, expected, what):
 @cache
 def case(nx, nu, seed):
     rng = np.random.default_rng([nx, nu, seed])
-    matrices = random_linear(rng, nx, nu)
+    matrices = random_linear(rng, nx, nu, correlated=seed == CORRELATED)
     log = random_log(rng, matrices, events=40)
     return matrices, log, JointGaussian(matrices, log)
 

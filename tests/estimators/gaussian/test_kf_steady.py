@@ -198,3 +198,31 @@ def test_it_refuses_a_state_that_is_known_ever_better():
     with pytest.raises(EstimatorError, match="drift has no steady gain, as speed neither decays.*raise its Q"):
         Fold("kf-steady", model, tuning.with_options({"period": 2.0}), Log(1))
     assert ESTIMATORS["kf-steady"].applies(model) is None
+
+
+def test_the_steady_gain_of_correlated_rows():
+    """After a long run of all rows it is where the Kalman filter ends, and a lost row is the Kalman filter's too."""
+    declared = StateSpaceModel(
+        name="pair",
+        title="temperature and rate, read by one instrument",
+        states=MOTOR.states,
+        noises=MOTOR.noises,
+        sensors=(Sensor("y", (Row("a", "1", 0.5), Row("b", "1", 2.0)), h=both, correlation=((1.0, 0.8), (0.8, 1.0))),),
+        f=MOTOR.f,
+        Q=MOTOR.Q,
+        linear=True,
+    )
+    y = np.random.default_rng(5).normal(0, 1.0, (1500, 2)) + [36.0, 0.0]
+    log = Log(declared.width)
+    log.extend(
+        Readings.concat([Readings.one(k * SECOND, 0, READING, 0, row, 2) for k, row in enumerate(y)], declared.width)
+    )
+    steady, kalman = (folded(name, log, model=declared) for name in ("kf-steady", "kf"))
+    for a, b in zip(steady.moments(), kalman.moments(), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9)
+    assert steady._state[-1] == AFTER
+
+
+def both(x, u, p, out):
+    out[0] = x[0]
+    out[1] = x[1] + 0.1 * x[0]

@@ -1,5 +1,7 @@
 """Inflation, robust weights and adaptation, in every Gaussian filter, against numbers worked out by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import brentq, minimize
@@ -7,7 +9,7 @@ from scipy.optimize import brentq, minimize
 from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
 from estimators.log import READING, Log, Readings
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.registry import ESTIMATORS
 from estimators.track import GATED, USED
 from estimators.tuning import Tuning
@@ -342,3 +344,56 @@ def test_joseph_takes_the_weighted_noise_too(name, robust, y):
 def test_a_choice_that_does_not_exist_is_named():
     with pytest.raises(EstimatorError, match=r"robust is 1.5; it must be one of 0 \(none\), 1 \(huber\), 2 \(student"):
         ESTIMATORS["ekf"].complete({"robust": 1.5})
+
+
+CORRELATION = ((1.0, -0.7), (-0.7, 1.0))
+
+
+def turned_rows(x, u, p, out):
+    """The rows of `mixed`, turned so that their noise is independent: p holds the eigenvectors of R, by rows."""
+    first = x[0] + 0.5 * x[1]
+    second = x[1] - x[0]
+    out[0] = p[0] * first + p[1] * second
+    out[1] = p[2] * first + p[3] * second
+
+
+def as_independent(model):
+    """The same model with independent rows Vᵀ y, from R = V diag(values) Vᵀ; and Vᵀ."""
+    std = np.sqrt([row.variance for row in model.sensors[0].rows])
+    values, V = np.linalg.eigh(np.array(CORRELATION) * np.outer(std, std))
+    rows = tuple(Row(f"z{i}", "m", variance=value) for i, value in enumerate(values))
+    parameters = tuple(Parameter(f"p{i}", "1", value) for i, value in enumerate(V.T.ravel()))
+    return replace(model, sensors=(Sensor("y", rows, h=turned_rows),), parameters=parameters), V.T
+
+
+@pytest.mark.parametrize("options", [{}, {"robust": 1, "huber": 0.7}, {"robust": 2, "dof": 3.0}])
+def test_weights_of_correlated_rows_are_those_of_independent_ones(estimator, options):
+    """A weight scales R as a whole; turned to its axes the reading says the same, whatever outlier it holds."""
+    related = replace(PLANE, sensors=(replace(PLANE.sensors[0], correlation=CORRELATION),))
+    apart, turn = as_independent(related)
+    values = [[0.5, -0.3], [9.0, -2.0], [0.2, 0.4], [-20.0, 30.0]]
+    one = folded(estimator, related, values, options)
+    other = folded(estimator, apart, [turn @ value for value in values], options)
+    for a, b in zip(one.moments(), other.moments(), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(one.track.nis, other.track.nis, rtol=1e-9)
+    np.testing.assert_allclose(one.track.log_likelihood, other.track.log_likelihood, rtol=1e-9)
+
+
+def test_adapted_variances_keep_the_correlation(estimator):
+    """One reading: each row's variance moves as if alone, r ← r + (ν² - S) / N; the next S has c √(r₁ r₂) beside it."""
+    related = replace(PLANE, sensors=(replace(PLANE.sensors[0], correlation=CORRELATION),))
+    y = np.array([[3.0, -4.0], [1.0, 2.0]])
+    fold = folded(estimator, related, y, {"adapt": 1, "memory": 10.0, "bound": 100.0})
+    H = np.array([[1.0, 0.5], [-1.0, 1.0]])
+    P, r = np.diag([4.0, 1.0]), np.array([0.25, 0.5])
+    x = np.zeros(2)
+    for k in range(2):
+        R = np.array(CORRELATION) * np.sqrt(np.outer(r, r))
+        S, nu = H @ P @ H.T + R, y[k] - H @ x
+        np.testing.assert_allclose(fold.track.nis[k], nu @ np.linalg.solve(S, nu), rtol=1e-11)
+        np.testing.assert_allclose(fold.track.innovation_std[k], np.sqrt(np.diag(S)), rtol=1e-12)
+        K = P @ H.T @ np.linalg.inv(S)
+        x, P = x + K @ nu, P - K @ S @ K.T
+        r = r + 0.1 * (nu**2 - np.diag(S))
+    np.testing.assert_allclose(fold.moments()[0], x, rtol=1e-10)

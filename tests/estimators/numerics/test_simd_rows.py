@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from estimators.gaussian.sigma_points import covariance, cross_covariance, factor, spread_points
+from estimators.numerics.padded_rows import covariance, cross_covariance, factor, spread_points
 from estimators.numerics.simd_ir import padded
 from estimators.numerics.simd_rows import subtract_squares
 
