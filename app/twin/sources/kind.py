@@ -13,6 +13,7 @@ from estimators.errors import SourceError
 from estimators.model.state_space import StateSpaceModel
 
 from ..channels import channels
+from ..files import find_recording
 
 if TYPE_CHECKING:
     from sources.source import Channel, Report, Source
@@ -76,6 +77,19 @@ def blamed(opening: Opening, build: Callable[[list[Channel]], T]) -> T:
         except SourceError as error:
             raise about(loaded, place, str(error).removeprefix(f"{channel.name}: ")) from None
     raise about(loaded, key, reason)
+
+
+def recording(make: Callable[[Opening, list[Path], list[Channel]], Source]) -> Kind:
+    """A type whose sections are recordings: `make(opening, files, channels)` gives the source.
+
+    Its section has `folder`, `files` and `get` (config/source_schema.py, RecordingSection) beside maps of channels.
+    """
+
+    def open_recording(opening: Opening) -> Source:
+        files = find_recording(opening.loaded, opening.section, opening.key, opening.log_files)
+        return blamed(opening, lambda channels: make(opening, files, channels))
+
+    return Kind(open_recording)
 
 
 def about(loaded: Loaded, key: Key, text: str) -> SourceError:
