@@ -1,4 +1,4 @@
-"""What a command says on standard error: one line each, and nothing in it that a terminal would obey."""
+"""What a command says on standard error: one line each, with control characters escaped."""
 
 from __future__ import annotations
 

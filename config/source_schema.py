@@ -251,7 +251,7 @@ class TruthSection(Section):
     """The asset's true process noise. Default: that of the twin, or of `model` if it is given."""
     every: Count | None = None
     """Steps between two tellings of every cell of a large field, by which the estimate is scored and its error drawn;
-    the cells that are charted are told at each step. Default: null, never."""
+    the cells that are charted are given at each step. Default: null, never."""
 
 
 class AssetSection(Section):
@@ -292,7 +292,7 @@ class SignalMaps(Section):
     inputs: dict[str, SignalSection] = {}
     """Inputs of the model and the signals that feed them."""
     truth: dict[str, SignalSection] = {}
-    """States whose true value the bus tells. They are scored and never used."""
+    """States whose true value the bus carries. They are scored, never used."""
 
 
 class CanSection(SignalMaps):
@@ -332,7 +332,7 @@ class CanLogSection(SignalMaps, RecordingSection):
 
 
 class TimeColumnSection(Section):
-    """The column that tells the time."""
+    """The column that holds the time."""
 
     column: Text
     """Its name."""
@@ -353,13 +353,13 @@ class TableSection(RecordingSection):
     type: Literal["table"]
     """table"""
     time: TimeColumnSection
-    """The column that tells the time: {column, unit}."""
+    """The column that holds the time: {column, unit}."""
     sensors: dict[str, ColumnSection] = {}
     """Sensors of the model and the columns that feed them."""
     inputs: dict[str, ColumnSection] = {}
     """Inputs of the model and the columns that feed them."""
     truth: dict[str, ColumnSection] = {}
-    """States whose true value the table tells. They are scored and never used. Of a field under its name: the array
+    """States whose true value the table holds. They are scored, never used. Of a field under its name: the array
     with a cell for each of its own; cells that a sensor reads are left out."""
 
 

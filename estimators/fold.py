@@ -182,7 +182,7 @@ class Fold:
         return self.estimator.points(self.options, self._state, self.model.nx)
 
     def recoveries(self) -> int:
-        """How often the filter had to help itself since it started, as a cloud of particles that lost the asset."""
+        """Number of recoveries since the filter started: a cloud of particles that had lost the asset was widened."""
         return 0 if self.estimator.recoveries is None else self.estimator.recoveries(self._state)
 
     @property
@@ -196,7 +196,7 @@ class Fold:
         return getattr(self._context, "failure", None)
 
     def cause(self, row: int) -> str | None:
-        """What of the model is to blame for a row whose reading failed or whose estimate is no number, in one line.
+        """What in the model is to blame for a row whose reading failed or whose estimate is not a number, in one line.
 
         Tried anew from the last estimate before it that is a number; None if nothing is found. Takes milliseconds.
         """

@@ -11,7 +11,7 @@ from estimators.log import Readings
 
 
 class Batch:
-    """Events that grow one by one; `take` gives them as arrays and starts anew."""
+    """Events that grow one by one; `take` gives them as arrays and starts again."""
 
     def __init__(self, width: int) -> None:
         self.width = width

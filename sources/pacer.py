@@ -38,7 +38,7 @@ class Pacer:
         """Open the source; the playhead starts at its first event.
 
         Args:
-            open_source: Called again to begin anew.
+            open_source: Called again to start again.
             speed: Times real time; inf is as fast as possible.
             clock: Nanoseconds that only rise.
 
@@ -116,7 +116,7 @@ class Pacer:
             self._changed.notify_all()
 
     def seek(self, t: int) -> None:
-        """Move the playhead to t (ns): ahead, what lies between is released at once; back, the source begins anew."""
+        """Move the playhead to t (ns): ahead, what lies between is released at once; back, the source starts again."""
         with self._changed:
             self._seek = t
             self._changed.notify_all()

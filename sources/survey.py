@@ -251,6 +251,6 @@ def _rows(path: Path, time: str, unit: str, columns: list[str], faults: list[str
 
 
 def _time_of(names: Sequence[str]) -> str | None:
-    """The column that tells the time, by its name."""
+    """The column that holds the time, by its name."""
     last = {name.lower().rpartition(".")[2].partition("[")[0].strip(): name for name in reversed(names)}
     return next((last[name] for name in TIMES if name in last), None)

@@ -23,25 +23,25 @@ class Run:
     twin: Twin
     """Name of a twin that ships (see `nisus twins`), or path of a YAML file."""
     estimator: str | None = None
-    """Estimator in place of the twin's own: kf, ekf, ukf."""
+    """Estimator to use instead of the twin's own; `nisus filters` lists all of them."""
     set: Settings = ()
     """KEY=VALUE, repeatable: Q.temperature=0.02, R.winding=9, p.NAME, use.SENSOR=false, gate, or a dotted YAML key."""
     log: tuple[Path, ...] = ()
-    """Recordings in place of the twin's own."""
+    """Recordings to read instead of the twin's own."""
     record: Path | None = None
     """Record into this .rrd file from the start."""
     record_split: str | None = None
     """Go on in another file, run-2.rrd after run.rrd, when one has grown so large or so long: 1GB, 10min."""
     speed: float = 1.0
-    """Times real time for replays and simulations; inf is as fast as possible."""
+    """Speed of replays and simulations, as a multiple of real time; inf is as fast as possible."""
     duration: float | None = None
-    """Stop after so many seconds."""
+    """Stop after this many seconds."""
     port: int = 9900
-    """Of the page, on 127.0.0.1; 0 takes a free one."""
+    """Port of the page, on 127.0.0.1; 0 picks a free one."""
     no_browser: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print the URL, open nothing."""
+    """Print the URL without opening a browser."""
     headless: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """No page at all: run, and record if asked."""
+    """Run without a page; record if asked to."""
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,13 @@ class Fold:
     twin: Twin
     """Name of a twin that ships, or path of a YAML file."""
     estimator: str | None = None
-    """Estimator in place of the twin's own."""
+    """Estimator to use instead of the twin's own; `nisus filters` lists all of them."""
     set: Settings = ()
     """KEY=VALUE, repeatable, as for `run`."""
     log: tuple[Path, ...] = ()
-    """Recordings in place of the twin's own."""
+    """Recordings to read instead of the twin's own."""
     duration: float | None = None
-    """Take only so many seconds of the source."""
+    """Take only this many seconds of the source."""
     out: Path | None = None
     """Write the track to this .parquet, or a recording to this .rrd."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -75,19 +75,19 @@ class Compare:
     twin: Twin
     """Name of a twin that ships, path of a YAML file, or `all`: each that ships."""
     estimators: tuple[str, ...] = ()
-    """Only these filters."""
+    """Compare only these filters."""
     set: Settings = ()
     """KEY=VALUE, repeatable, as for `run`."""
     log: tuple[Path, ...] = ()
-    """Recordings in place of the twin's own."""
+    """Recordings to read instead of the twin's own."""
     duration: float | None = None
-    """Take only so many seconds of the source."""
+    """Take only this many seconds of the source."""
     logs: int = 1
-    """So many logs of a simulated twin, with seeds from its own on; figures are mean ± standard deviation over them."""
+    """Number of logs of a simulated twin, with consecutive seeds; figures are mean ± standard deviation over them."""
     budget: float = 20.0
-    """Seconds of one processor for the folds of one filter; a slower one folds a shorter span, which its row states."""
+    """CPU seconds allowed for one filter; a slower filter folds a shorter span, which its row states."""
     jobs: int | None = None
-    """Processes; default: one a processor."""
+    """Number of processes; default: one for each processor."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print one JSON list."""
     write: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -99,21 +99,21 @@ class Filters:
     """List the estimators: what they assume, their options, what they cost and when they fail."""
 
     twin: str | None = None
-    """Name or YAML file of a twin: which of them apply to it, what they cost there, and why the others do not."""
+    """Name or YAML file of a twin: which filters apply to it, what they cost there, and why the others do not apply."""
 
 
 @dataclass(frozen=True)
 class Review:
-    """Open a recording on the page, with the panel that folds its readings again."""
+    """Open a recording on the page, with a panel that can fold its readings again."""
 
     file: Annotated[Path, tyro.conf.Positional]
     """The .rrd file."""
     port: int = 9900
-    """Of the page, on 127.0.0.1; 0 takes a free one."""
+    """Port of the page, on 127.0.0.1; 0 picks a free one."""
     no_browser: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print the URL, open nothing."""
+    """Print the URL without opening a browser."""
     duration: float | None = None
-    """Stop after so many seconds."""
+    """Stop after this many seconds."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class Bus:
     set: Settings = ()
     """KEY=VALUE of the YAML, repeatable."""
     duration: float | None = None
-    """Stop after so many seconds."""
+    """Stop after this many seconds."""
     record: Path | None = None
     """Also write the frames to this log, in any format python-can writes (.blf, .asc, .log, .csv, .mf4)."""
 
@@ -159,7 +159,7 @@ class Log:
     dbc: Files = ()
     """DBC file that names messages and signals, repeatable; FILE@BUS where it holds on one bus only."""
     time: str | None = None
-    """Column of a table that tells the time; default: the one of such a name."""
+    """Column of a table that holds the time; default: the one of such a name."""
     time_unit: str = "s"
     """Its unit: s, ms, us, ns, min or h."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -171,9 +171,9 @@ class New:
     """Write a working pair NAME.yaml and NAME.py to start a twin of your own from: a pump, or a recording's signals."""
 
     name: Annotated[str, tyro.conf.Positional]
-    """Of the twin."""
+    """Name of the twin."""
     folder: Path = field(default_factory=Path.cwd)
-    """Where to."""
+    """Folder to write to."""
     log: tuple[Path, ...] = ()
     """Recordings whose signals become its sensors."""
     dbc: Files = ()
@@ -181,7 +181,7 @@ class New:
     signals: str = ""
     """A,B: signals (SIGNAL or MESSAGE.SIGNAL) or columns to take; default: those that vary most finely, at most 6."""
     time: str | None = None
-    """Column of a table that tells the time; default: the one of such a name."""
+    """Column of a table that holds the time; default: the one of such a name."""
     time_unit: str = "s"
     """Its unit: s, ms, us, ns, min or h."""
 

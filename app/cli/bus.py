@@ -83,7 +83,7 @@ def _logger(path: Path) -> Any:
     if not path.absolute().parent.is_dir():
         raise ConfigError(f"--record {path}: there is no folder {path.parent}; create it first")
     if path.suffix.lower() not in FORMATS:
-        raise ConfigError(f"--record {path}: is no CAN log format; end it in {', '.join(FORMATS)}")
+        raise ConfigError(f"--record {path}: is not a CAN log format; end it in {', '.join(FORMATS)}")
     return can.Logger(path)
 
 

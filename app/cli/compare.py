@@ -154,7 +154,7 @@ def compare(
     context = multiprocessing.get_context("spawn")
     given = (twin, dict(overrides), [tuple(log) for log in logs])
     with ProcessPoolExecutor(jobs, mp_context=context, initializer=_share, initargs=given) as pool:
-        # The filters behind in the catalogue are the slow ones.
+        # The last filters of the catalogue are the slow ones.
         futures = [pool.submit(_fold, name, budget) for name in reversed(names)]
         for future in as_completed(futures):
             yield future.result()

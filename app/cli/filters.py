@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .arguments import Filters as Arguments
 
 WIDTH = 150
-"""Columns of the output where it is no terminal."""
+"""Columns of the output where it is not a terminal."""
 
 SAMPLE = 60.0
 """Seconds of a twin's source from which its rate is taken."""

@@ -166,7 +166,7 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], fold
     if result.field is not None and grid is not None:
         fit = result.field
         inside = f"in the 95 % band: {100 * fit.coverage:.1f} %"
-        rows.append((f"RMSE {grid.name}, all told cells", f"{fit.rmse:.5g} {grid.unit}   {inside}"))
+        rows.append((f"RMSE {grid.name}, all cells whose truth is known", f"{fit.rmse:.5g} {grid.unit}   {inside}"))
     rows += [
         (model.label(name), f"{track.mean[-1, k]:.3f} at the end   Brier score (mean square error): {fit.rmse**2:.5g}")
         if model.mode >= 0 and name == model.state_names[model.mode]

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from .arguments import Log as Arguments
 
 WIDTH = 160
-"""Columns of the output where it is no terminal."""
+"""Columns of the output where it is not a terminal."""
 
 SHOWN = 5
 """Holes and faults that are listed; of the rest their number."""

@@ -20,7 +20,7 @@ MOST = 6
 """Signals that are taken where none are named."""
 
 FEWEST = 20
-"""Values from which a noise can be told."""
+"""Values needed to estimate a noise."""
 
 _SKIPPED = re.compile(r"time|epoch|date|count|check|crc|valid|status|mode|error|alive|_id$|^id$|parity", re.IGNORECASE)
 """Names of what is no measurement."""
@@ -104,7 +104,7 @@ def choose(found: Survey, wanted: Sequence[str]) -> list[Chosen]:
     for message, series in picked:
         if series.values.size < FEWEST:
             raise ConfigError(
-                f"--signals {series.name}: has {series.values.size} values; its noise can be told from {FEWEST} on"
+                f"--signals {series.name}: has {series.values.size} values; its noise can be estimated from {FEWEST} on"
             )
         smooth, q, r = noise_of(series)
         chosen.append(Chosen(_identifier(series.name, names), message, series, smooth, q, r))

@@ -41,7 +41,7 @@ def attend(model: StateSpaceModel, work: Callable[[], Any], doing: str, done: st
         model: Whose function is named on standard error if it does not return.
         work: What to do.
         doing: What is shown meanwhile, if it takes long.
-        done: What is said behind it then.
+        done: Message printed when it has finished.
 
     Returns:
         What the work returns.

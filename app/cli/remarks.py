@@ -1,4 +1,4 @@
-"""What concerns a recording as a whole is said on standard error too, whatever else is counted or shown."""
+"""Remarks about a recording as a whole go to standard error too, besides being counted and shown."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def live_source(twin: Twin, speed: float) -> Callable[[Callable[[str, str], None
 
 
 SAID = 5
-"""Failures that a run without a page tells at its end; it has no list of events."""
+"""Failures that a run without a page prints at its end, since it has no list of events."""
 
 
 def run_twin(arguments: Run) -> int:

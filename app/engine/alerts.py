@@ -1,4 +1,4 @@
-"""What new rows mean for people: readings that could not be used, clouds that were lost, changes of health."""
+"""Alerts from new rows: readings that could not be used, clouds that were lost, changes of health."""
 
 from __future__ import annotations
 
@@ -56,11 +56,11 @@ class Alerts:
         was_lost = self._lost is not None
         self._lost = self._look_for_numbers(fold, before)
         if self._lost is not None and not was_lost:
-            text = "the estimate is not a number; Reset or another filter may mend it"
+            text = "the estimate is not a number; Reset, or another filter, may help"
             self._notices.say(text, level="error", t=self._lost[1])
         if len(track) and track.health[-1] != self._health:
             self._health = int(track.health[-1])
-            more = "; Reset begins anew from the prior" if self._health == DIVERGED and self._lost is None else ""
+            more = "; Reset starts again from the prior" if self._health == DIVERGED and self._lost is None else ""
             level = "info" if self._health == TRACKING else "warn"
             since = int(log.t[last_run(track.health)])
             self._notices.say(f"health: {HEALTH_NAMES[self._health]}{more}", level=level, t=since)

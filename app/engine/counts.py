@@ -12,7 +12,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.track import FAILED, GATED, MISSING, VERDICT_NAMES, Track
 
 UNSETTLED = 8192
-"""Rows at the end that are counted each time; a late reading rarely reaches behind them."""
+"""Rows at the end that are counted each time; a late reading rarely reaches back beyond them."""
 
 LATENCIES = 4096
 
@@ -26,7 +26,7 @@ class RowCounts:
         self.again()
 
     def again(self) -> None:
-        """Rows moved or changed: count them anew, on top of what the forgotten ones held."""
+        """Rows moved or changed: count them again, on top of what the forgotten ones held."""
         self._settled, self._counts = 0, self._forgotten.copy()
 
     def changed(self, index: int) -> None:

@@ -199,7 +199,7 @@ class Engine:
 
     @property
     def source(self) -> Source:
-        """Where the readings come from; it may be opened anew."""
+        """Where the readings come from; it may be reopened."""
         return self._feeder.source
 
     @property
@@ -251,7 +251,7 @@ class Engine:
         return Belief(clock, mean, cov, points, tuple(modes) if len(modes) > 1 else ())
 
     def status(self) -> Status:
-        """What a panel shows; found anew at most ten times a second."""
+        """What a panel shows; computed at most ten times a second."""
         kept = self._status
         if kept is not None and time.monotonic() - kept[0] < STATUS_AGE:
             return kept[1]
@@ -346,7 +346,7 @@ class Engine:
         return stale
 
     def _go_back(self, index: int) -> None:
-        """Events at and behind `index` changed: fold them again, and let every cursor fetch them again."""
+        """Events at and after `index` changed: fold them again, and let every cursor fetch them again."""
         self._fold.rewind(index)
         self._row_counts.changed(index)
         absolute = self._log.first + index

@@ -24,7 +24,7 @@ class IdleTicks:
         self._newest = newest
 
     def asks(self, source: Source, last: int) -> int | None:
-        """The time (ns) for which to ask now, behind the log's last event at `last`; None for not yet."""
+        """The time (ns) for which to ask now, after the log's last event at `last`; None for not yet."""
         silent = time.monotonic() - self._since
         if silent < self._tick:
             return None

@@ -1,4 +1,4 @@
-"""What happened: counters, and a bounded list of lines for people."""
+"""Counters and messages about the running twin; the messages are bounded in number."""
 
 from __future__ import annotations
 

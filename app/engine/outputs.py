@@ -20,7 +20,7 @@ from .notices import Notice
 class Cursor:
     """How far one consumer has read. `next` is the absolute index of the next row; a rewritten row moves it back.
 
-    `picture` is the index of the last picture of a large field that was read. One that `follows_log` starts anew with
+    `picture` is the index of the last picture of a large field that was read. One that `follows_log` starts again with
     another log only; for the others another revision does so too.
     """
 
@@ -36,7 +36,7 @@ class Cursor:
 class Pull:
     """Rows since the cursor.
 
-    `fresh`: these rows start anew (another revision or log, or the first pull): forget what was drawn. `first` is the
+    `fresh`: these rows start afresh (another revision or log, or the first pull): forget what was drawn. `first` is the
     absolute index of the first row; if it is below what was pulled before, a late reading rewrote the rows from there.
     `pictures` are those of a large field since the cursor; one with an index that was seen before takes its place.
     """
@@ -65,10 +65,9 @@ class Belief:
 class Status:
     """The state of the running twin, for panels and the API.
 
-    `t` is the time of the last event (ns), `since` that of the first from which on the health is what it is now, `lost`
-    that of the first from which on the estimate is not a number (None if it is one). `counts` are those of the rows of
-    this revision, and of what befell the twin beside them. `latency_ms` is the 99th percentile from a reading's arrival
-    to its row.
+    `t` is the time of the last event (ns), `since` the time when the present health began, `lost` the time from which
+    the estimate has not been a number (None if it is one). `counts` are those of the rows of this revision, and of
+    other things that happened to the twin. `latency_ms` is the 99th percentile from a reading's arrival to its row.
     """
 
     estimator: str

@@ -58,7 +58,7 @@ class Requests:
         return wanted, changed
 
     def forget(self) -> None:
-        """The log begins anew: no answer fits it."""
+        """The log has started again, so no answer fits it."""
         self._answered = self.newest
         self._open.clear()
 

@@ -184,7 +184,7 @@ def _line(error: Exception) -> str:
 
 
 def _latest(chunks: list[tuple[np.ndarray, dict[str, np.ndarray]]]) -> tuple[int, dict[str, np.ndarray]]:
-    """The rows that hold at the end: of each index the last one, and none that comes after an index written anew."""
+    """The rows that hold at the end: of each index the last one, and none that comes after an index written again."""
     if not chunks:
         return 0, {}
     index = np.concatenate([chunk for chunk, _ in chunks])

@@ -46,7 +46,7 @@ def blueprint(
         pairs: Indices of the states of each ellipse, shape (k, 2).
         window: Seconds that the charts show.
         root: Path before all entities.
-        truth: Whether the truth of a whole large field is told.
+        truth: Whether the truth of a whole large field is known.
     """
     span = rr.TimeRange(
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-window),

@@ -23,7 +23,7 @@ def listen(port: int) -> socket.socket:
         listener.listen(128)
     except (OSError, OverflowError) as error:
         listener.close()
-        reason = getattr(error, "strerror", None) or "is no port"
+        reason = getattr(error, "strerror", None) or "is not a port"
         raise ConfigError(f"port {port}: {reason}; choose another with --port") from None
     listener.setblocking(False)
     return listener

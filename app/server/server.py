@@ -38,7 +38,7 @@ PERIOD = 0.2
 """Seconds between two frames that one Rerun viewer is fed, at least."""
 
 STATUS_PERIOD = 0.5
-"""Seconds between two words on the twin's status."""
+"""Seconds between two status messages."""
 
 PAGE = Path(__file__).parent.parent / "page"
 FOR_EVER = "public, max-age=31536000, immutable"

@@ -47,7 +47,7 @@ class Plan:
         """The twin's asset, ready to play on its bus, or on another one.
 
         Raises:
-            SourceError: If the source is no bus, it has no `asset`, or the bus cannot be opened.
+            SourceError: If the source is not a bus, it has no `asset`, or the bus cannot be opened.
         """
         return make_player(self.loaded, self.model, report, interface=interface, channel=channel)
 

@@ -114,7 +114,7 @@ class Twin:
         """The asset of a twin on a CAN bus, ready to play there, or on another `interface` and `channel`.
 
         Raises:
-            SourceError: If the source is no bus, it has no `asset`, or the bus cannot be opened.
+            SourceError: If the source is not a bus, it has no `asset`, or the bus cannot be opened.
         """
         return self.plan.player(report, interface=interface, channel=channel)
 
@@ -129,7 +129,7 @@ def load_twin(
 
     Args:
         name_or_path: Name of a twin that ships, or path of a YAML file.
-        log_files: Recordings in place of the twin's own.
+        log_files: Recordings to read instead of the twin's own.
         overrides: The command line's `--set KEY=VALUE`: a tuning key (Q.temperature), or a dotted key of the YAML.
 
     Raises:

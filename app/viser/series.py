@@ -67,7 +67,7 @@ def nis_series(count: int) -> tuple[dict[str, Any], ...]:
 
 
 def send(chart: viser.GuiUplotHandle, data: list[np.ndarray], series: tuple[dict[str, Any], ...]) -> None:
-    """Give a chart its columns; the series too where they changed, which builds it anew."""
+    """Give a chart its columns; the series too where they changed, which rebuilds it."""
     if chart.series != series:
         chart.series = series  # type: ignore[assignment]
     chart.data = tuple(data)

@@ -25,10 +25,10 @@ def status_html(status: Status, origin: int | None, unit: Unit = SECONDS) -> str
     if status.lost is not None:
         when = "" if origin is None else f" since {unit.text((status.lost - origin) * 1e-9)}"
         remedy = (
-            f"The estimate is not a number{when}. <b>Reset</b> begins anew from the prior; or choose another filter."
+            f"The estimate is not a number{when}. <b>Reset</b> starts again from the prior; or choose another filter."
         )
     elif status.health == DIVERGED:
-        remedy = "The readings contradict the estimate. <b>Reset</b> begins anew from the prior."
+        remedy = "The readings contradict the estimate. <b>Reset</b> starts again from the prior."
     at = "" if status.t is None or origin is None else unit.text((status.t - origin) * 1e-9)
     state = "ended" if status.finished else "paused" if status.paused else ""
     fold = "⟳ refolding" if status.refolding else f"revision {status.revision}"

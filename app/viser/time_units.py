@@ -1,4 +1,4 @@
-"""The unit in which the left pane tells the time: seconds of ten, days of a fortnight."""
+"""The unit of a time axis, chosen by its span: seconds for ten seconds, days for a fortnight."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ class Estimate(NamedTuple):
 
 
 def failures(track: Track, first: int = 0) -> np.ndarray:
-    """Rows from `first` on whose reading failed (or was refused without a NIS), or whose estimate is no number."""
+    """Rows from `first` on whose reading failed (or was refused without a NIS), or whose estimate is not a number."""
     rows = track.select(slice(first, len(track)))
     known = np.all(np.isfinite(rows.mean), axis=1) & np.all(np.isfinite(rows.std), axis=1)
     failed = (rows.verdict == FAILED) | (rows.verdict == GATED) & ~np.isfinite(rows.nis)

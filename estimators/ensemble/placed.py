@@ -1,4 +1,4 @@
-"""Whether a model says where its states and sensors are, as a filter must know that lets a reading act only near it."""
+"""Checks for the positions that localisation needs."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ def _remedy(error: Exception, function: Any, takes: str, sizes: str, at: str) ->
 
 
 def indefinite(Q: np.ndarray) -> str | None:
-    """Why a matrix of finite numbers is no covariance; None if it is one."""
+    """Why a matrix of finite numbers is not a covariance; None if it is one."""
     # Beside its own variances: a Q of nanometres may be lopsided too.
     if np.any(np.abs(Q - Q.T) > 1e-9 * np.sqrt(np.abs(np.outer(np.diag(Q), np.diag(Q))))):
         return "is not symmetric (fill both triangles)"

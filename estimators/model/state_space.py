@@ -243,7 +243,7 @@ class StateSpaceModel:
         if last < 1 or not 0 <= state.mean <= last or state.circular:
             raise ModelError(
                 f"model {self.name}: the mode {state.name} has {last + 1} values and the prior mean {state.mean:g}; it "
-                f"needs at least 2, a mean between 0 and {max(1, last)}, and is no angle"
+                f"needs at least 2, a mean between 0 and {max(1, last)}, and must not be an angle"
             )
         if self.Q is None and any(noise.name == state.name for noise in self.noises):
             raise ModelError(f"model {self.name}: a noise acts on the mode {state.name}, which jumps; leave it out")

@@ -1,4 +1,4 @@
-"""What the vector instructions of this package are spelled with: LLVM's, on vectors of `LANES` numbers.
+"""Building blocks for vector code: LLVM instructions on vectors of `LANES` numbers.
 
 The compiler splits them where the processor's vectors are shorter.
 """

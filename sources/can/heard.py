@@ -23,7 +23,7 @@ MANY = 20
 
 
 class Heard:
-    """Watches what comes until every message has come, or its absence has been told."""
+    """Watches what comes until every message has come, or its absence has been reported."""
 
     def __init__(self, name: str, decoder: Decoder, clock: Callable[[], float], report: Report) -> None:
         """Watch from now on; `name` begins each line, `clock` gives seconds."""

@@ -195,7 +195,7 @@ def _wanted(
             item = np.frombuffer(bytes(given[row]), np.uint8)[:longest]
             data[i, : item.size] = item
     length = np.minimum(np.asarray(_field(signal, "DataLength"), np.int64)[rows], longest)
-    # What is stored behind a frame's end is not part of it.
+    # What is stored after a frame's end is not part of it.
     data[np.arange(longest) >= length[:, None]] = 0
     t = start + np.round(np.asarray(signal.timestamps, np.float64)[rows] * 1e9).astype(np.int64)
     return Raw(t, keys[rows], places, length, data, names, len(signal))

@@ -67,7 +67,7 @@ def extract(signals, plan, length, data, values, state, bad):
         signals: The tables.
         plan: Message of each frame, (n,); frames with -1 are left out.
         length: Bytes of each frame, (n,).
-        data: Their bytes, (n, at least the longest message), zeros behind the end.
+        data: Their bytes, (n, at least the longest message), zeros after the end.
         values: Filled, (n, signals of a message): physical value, NaN where there is none.
         state: Filled, same shape: PRESENT, ABSENT or SHORT.
         bad: Filled, (n,): 1 where a multiplexer has a value that the database does not know, 2 where the frame ends

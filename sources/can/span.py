@@ -41,7 +41,7 @@ def _span(path: Path) -> tuple[int, int] | None:
         if kind == ".log":
             return _candump(path)
     except (OSError, ValueError, SourceError):
-        # Not known is an answer; what is wrong with the file is told when it is read.
+        # Not known is an answer; what is wrong with the file is reported when it is read.
         return None
     return None
 

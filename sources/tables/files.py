@@ -98,7 +98,7 @@ def _header(path: Path) -> tuple[list[str], str]:
         head = binary.read(CHUNK)
     if any(byte < 9 or 13 < byte < 32 for byte in head):
         raise SourceError(
-            f"{path}:1: it begins with {head[:20]!r} and is no text; give a CSV in UTF-8, or name the file by what it "
+            f"{path}:1: it begins with {head[:20]!r} and is not text; give a CSV in UTF-8, or name the file by what it "
             "is (.parquet, .mat, .npz)"
         )
     with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
@@ -109,7 +109,7 @@ def _header(path: Path) -> tuple[list[str], str]:
 
 
 def read_csv(path: Path, time: str, columns: Sequence[str], problem: Problem) -> Generator[Chunk, None, None]:
-    """Rows of a CSV; text that is no number is missing and told to `problem`, and so is a row that is cut short."""
+    """Rows of a CSV; text that is not a number counts as missing and goes to `problem`, as a row cut short does."""
     names, mark = _header(path)
     at_time = names.index(time)
     places = [names.index(name) for name in columns]

@@ -12,14 +12,14 @@ MANY = 100_000
 """Rows one after the other at one time from which on the time is doubted."""
 
 BACKWARDS, STANDING = REMARKS = ("times run backwards", "time stands still")
-"""Keys under which it is told."""
+"""Keys under which it is reported."""
 
 
 class Order:
     """Looks at the times of the rows as they are read.
 
     A row that is older than one before it by more than the horizon is dropped as stale by the log; the first of them
-    is told with its line. Late rows within the horizon are as recorded, and put where they belong.
+    is reported with its line. Late rows within the horizon are as recorded, and put where they belong.
     """
 
     def __init__(self, column: str, unit: str, horizon: int | None, report: Report) -> None:

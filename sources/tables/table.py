@@ -23,17 +23,17 @@ class Table:
     """Reads tables of the same columns one after the other, as one recording.
 
     A row gives an event for its inputs, then its readings, then its true values. An empty cell (null in Parquet) says
-    nothing: a row without any cell of a sensor is no reading of it. NaN, or text that is no number, is a value that is
-    missing.
+    nothing: a row without any cell of a sensor is no reading of it. NaN, or text that is not a number, is a
+    missing value.
 
     Args:
         files: Tables in their order.
-        time_column: The column that tells the time: numbers in `time_unit`, or dates in ISO 8601 (UTC without a zone).
+        time_column: The column that holds the time: numbers in `time_unit`, or dates in ISO 8601 (UTC without a zone).
         time_unit: s, ms, us, ns, min or h.
         time_shift: Seconds added to it.
         channels: What feeds the model.
         width: Value columns of an event.
-        report: Told of rows without a time and of values that are no numbers, with file and line; and once of times
+        report: Called for rows without a time and values that are not numbers, with file and line; and once of times
             that run backwards or stand still.
         horizon: Seconds by which a row may be older than one before it; None for any.
 
@@ -102,8 +102,7 @@ class Table:
         for row in np.flatnonzero(~known):
             self._report(
                 "undated row",
-                f"{path.name}:{rows.line[row]}: {self._time} is no time, or one that needs another unit; "
-                "the row is left out",
+                f"{path.name}:{rows.line[row]}: {self._time} is not a time, or needs another unit; the row is left out",
             )
         self._count += rows.t.size
         if len(self._valued) < len(self._columns):

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sources.simulation.simulator import Simulator
 
 MOST_EVENTS = 1e8
-"""That a simulation may make; it makes some ten thousand a second."""
+"""The most events that a simulation may produce; it makes some ten thousand a second."""
 
 WITHOUT_END = 100.0
 """Seconds within which one without end may make that many."""

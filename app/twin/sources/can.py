@@ -57,7 +57,7 @@ def make_player(
     """The twin's asset, ready to play on its bus, or on another one.
 
     Raises:
-        SourceError: If the source is no bus, it has no `asset`, or the bus cannot be opened.
+        SourceError: If the source is not a bus, it has no `asset`, or the bus cannot be opened.
     """
     from sources.can.player import Player
 

@@ -69,7 +69,7 @@ def blamed(opening: Opening, build: Callable[[list[Channel]], T]) -> T:
     try:
         build([])
     except SourceError as error:
-        if str(error) == reason:  # No channel's fault: a file, or the column that tells the time.
+        if str(error) == reason:  # No channel's fault: a file, or the column that holds the time.
             raise about(loaded, key, reason) from None
     for place, channel in named:
         try:

@@ -167,7 +167,7 @@ def test_a_lost_filter_says_since_when_and_is_reset_by_hand(browser):
         source.put(readings(t[RESET_AT:], y[RESET_AT:]))
         wait_for(lambda: engine.status().counts["used"] >= JUMP + 10)
         assert engine.status().health == TRACKING
-        assert page.get_by_text("begins anew from the prior").count() <= 1
+        assert page.get_by_text("starts again from the prior").count() <= 1
     finally:
         context.close()
         view.stop()

@@ -148,7 +148,7 @@ def test_a_database_whose_last_page_is_cut_says_so(tmp_path, messages):
     [
         ("absent.blf", None, "there is no such file; check the path of the recording"),
         ("empty.blf", b"", "the file is empty; record it again"),
-        ("log.xyz", b"abc", ".xyz is no CAN log format; choose from .asc, .blf"),
+        ("log.xyz", b"abc", ".xyz is not a CAN log format; choose from .asc, .blf"),
         ("bad.blf", b"LOGX" + bytes(400), "it cannot be read as BLF"),
         ("bad.mf4", b"nonsense" * 100, "it cannot be read as MF4"),
         ("worse.mf4", b"MDF     4.10    " + bytes(400), "it cannot be read as MF4"),

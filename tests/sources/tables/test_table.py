@@ -96,7 +96,7 @@ def test_blank_says_nothing_and_what_is_no_number_is_missing_with_its_line(tmp_p
     ]
     np.testing.assert_array_equal(np.array(got), np.array(expected))
     assert reports.counts == {"unreadable value": 2, "never seen": 3}  # temp, power and x have no number
-    assert reports.texts["unreadable value"] == "drive.csv:4: x is 'oops', which is no number; the value is missing"
+    assert reports.texts["unreadable value"] == "drive.csv:4: x is 'oops', which is not a number; the value is missing"
 
 
 def test_rows_without_a_time_or_with_missing_cells_are_left_out_and_counted(tmp_path):
@@ -105,9 +105,7 @@ def test_rows_without_a_time_or_with_missing_cells_are_left_out_and_counted(tmp_
     got = read_all(table(path, report=reports))
     assert set(got.t.tolist()) == {2 * 10**9}
     assert reports.counts == {"undated row": 1, "unreadable value": 1, "truncated file": 1}
-    assert (
-        reports.texts["undated row"] == "drive.csv:2: t is no time, or one that needs another unit; the row is left out"
-    )
+    assert reports.texts["undated row"] == "drive.csv:2: t is not a time, or needs another unit; the row is left out"
     assert reports.texts["unreadable value"] == "drive.csv:3: has 3 cells, not 7; the row is left out"
     assert reports.texts["truncated file"] == "drive.csv:5: the last line has 3 cells, not 7"
 
@@ -183,9 +181,7 @@ def test_parquet_times(tmp_path, column, unit, expected):
     pq.write_table(pa.table({"t": column, "x": [1.0, 2.0, 3.0]}), tmp_path / "a.parquet")
     got = read_all(table(tmp_path / "a.parquet", unit=unit, channels=X, report=reports))
     assert got.t.tolist() == expected and got.value[:, 0].tolist() == [1.0, 3.0]
-    assert (
-        reports.texts["undated row"] == "a.parquet:2: t is no time, or one that needs another unit; the row is left out"
-    )
+    assert reports.texts["undated row"] == "a.parquet:2: t is not a time, or needs another unit; the row is left out"
 
 
 def test_parquet_and_csv_of_one_table_agree(tmp_path):
