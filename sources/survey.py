@@ -31,7 +31,7 @@ HOLE = 1.0
 INTERVALS = 20.0
 
 TIMES = ("t", "time", "timestamp", "seconds", "time_s", "t_s", "date", "datetime", "unix_time", "elapsed")
-"""Names of a column that tells the time."""
+"""Names of a column that holds the time."""
 
 
 @dataclass(frozen=True)
@@ -221,7 +221,7 @@ def _tables(files: list[Path], time: str | None, unit: str) -> Survey:
     chosen = time if time is not None else _time_of(names)
     if chosen is None or chosen not in names:
         raise SourceError(
-            f"{files[0]}: which column tells the time is not known; name it with --time, one of {', '.join(names[:12])}"
+            f"{files[0]}: which column holds the time is not known; name it with --time, one of {', '.join(names[:12])}"
         )
     columns = [name for name in dict.fromkeys(names) if name != chosen]
     faults: list[str] = []

@@ -118,7 +118,7 @@ def check_log(path: Path) -> None:
         raise SourceError(f"{path}: the file is empty; record it again")
     if suffix_of(path) not in FORMATS:
         raise SourceError(
-            f"{path}: {path.suffix or 'a name without ending'} is not a CAN log format; choose from {', '.join(FORMATS)}"
+            f"{path}: {path.suffix or 'a bare name'} is not a CAN log format; choose from {', '.join(FORMATS)}"
         )
     if suffix_of(path) == ".mf4":
         with path.open("rb") as file:

@@ -107,7 +107,10 @@ def test_the_channel(interface: str, channel: str | None, expected: str | int) -
         (["motor_can", "--interface", "virtual"], "stay in this process; use udp_multicast, or give --record"),
         (["motor_can", "--interface", "socketcan"], "which bus is not known; give --channel, for example can0"),
         (["motor_winding"], "source is of type simulator"),
-        (["motor_can", "--interface", "virtual", "--record", "drive.txt"], "--record drive.txt: is not a CAN log format"),
+        (
+            ["motor_can", "--interface", "virtual", "--record", "drive.txt"],
+            "--record drive.txt: is not a CAN log format",
+        ),
         (
             ["motor_can", "--interface", "virtual", "--record", "drive.db"],
             "end it in .asc, .blf, .csv, .log, .mf4, .trc",

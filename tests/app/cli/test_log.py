@@ -100,7 +100,7 @@ def test_a_table_is_listed(tmp_path, capsys, ending):
     assert (x["name"], x["number"], x["rate"], x["low"], x["high"]) == ("x", 50, 2.0, 0.0, 49.0)
     assert (y["name"], y["number"], y["missing"]) == ("y", 0, 50)
     assert main(["log", str(path), "--time", "when"]) == 2
-    assert "which column tells the time is not known; name it with --time, one of time, x, y" in capsys.readouterr().err
+    assert "which column holds the time is not known; name it with --time, one of time, x, y" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("suffix", "arguments"), [("", []), ("_two", ["--signals", "Rpm,ENGINE.Temp"])])
