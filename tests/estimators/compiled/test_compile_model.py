@@ -153,7 +153,7 @@ def test_it_is_said_of_the_line_in_the_models_file(function, culprit, line, monk
         ({"states": ()}, "states is empty"),
         ({"sensors": ()}, "sensors is empty"),
         ({"states": (State("a", "1"), State("a", "1"))}, "names 'a' twice"),
-        ({"states": (State("a", "1", std=0.0),)}, "prior of a"),
+        ({"states": (State("a", "1", std=-0.1),)}, "prior of a"),
         ({"states": (State("a", "1", mean=np.nan),)}, "prior of a"),
         ({"noises": (Noise("a", "1", -0.1),)}, "variance -0.1"),
         ({"noises": (Noise("elsewhere", "1", 0.1),)}, "'elsewhere' is not a state"),
