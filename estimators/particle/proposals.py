@@ -25,8 +25,8 @@ from ..compiled.context import (
 from ..compiled.context import options as numbers
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..compiled.noise import add_noise, semidefinite_root
+from ..compiled.verdict import LOG_2PI
 from ..estimator import Options
-from ..gaussian.shared import LOG_2PI
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import address, floats, jit, matrix
 from ..numerics.linalg import cholesky, congruence, solve_transposed, wrap

@@ -23,8 +23,9 @@ from ..compiled.context import (
 )
 from ..compiled.context import options as numbers
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
+from ..compiled.verdict import LOG_2PI
 from ..estimator import Options
-from ..gaussian.shared import LOG_2PI, factor
+from ..gaussian.shared import factor
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import address, floats, jit, matrix
 from ..numerics.linalg import solve_transposed, wrap

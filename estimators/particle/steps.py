@@ -27,8 +27,8 @@ from ..compiled.context import (
 )
 from ..compiled.context import options as numbers
 from ..compiled.noise import add_noise, noise_root
+from ..compiled.verdict import LOG_2PI
 from ..estimator import Options
-from ..gaussian.shared import LOG_2PI
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import F1, address, caller, f64, floats, i64, ints, jit, matrix
 from ..numerics.linalg import wrap
