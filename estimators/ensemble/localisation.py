@@ -135,8 +135,8 @@ def reached(context, sensor):
     count = head[0]
     start = table[head[2] : head[2] + count + 1]
     entries = start[count]
-    tapers = floats(context.prepared + 8 * head[4], entries * WIDE)
-    return table[head[1] : head[1] + count], start, table[head[3] : head[3] + entries], matrix(tapers, 0, entries, WIDE)
+    tapers = matrix(floats(context.prepared, context.n_prepared), head[4], entries, WIDE)
+    return table[head[1] : head[1] + count], start, table[head[3] : head[3] + entries], tapers
 
 
 @jit
@@ -147,4 +147,4 @@ def between_rows(context, sensor):
     table = ints(context.prepared, context.n_prepared)
     ny = ints(context.row_count, context.n_sensors)[sensor]
     at = table[1 + _FIELDS * sensor + 5]
-    return matrix(floats(context.prepared + 8 * at, ny * ny), 0, ny, ny)
+    return matrix(floats(context.prepared, context.n_prepared), at, ny, ny)
