@@ -34,7 +34,8 @@ call_log_likelihood = caller(log_likelihood_signature)
 
 _FIELDS = """
     nx nu n_parameters n_noises f f_complex F F_mode Q Q_varies each_state shape h h_complex H H_mode
-    log_likelihood n_sensors row_start row_count n_rows circular_x circular_y noise_state noise_states max_step
+    log_likelihood n_sensors row_start row_count n_rows circular_x circular_y correlation
+    noise_state noise_states max_step
     prior_mean prior_cov prior_rows linear_states n_linear sampled_states n_sampled jump mode n_modes p q r used
     gate width options n_options pairs n_pairs shown n_shown prepared n_prepared seed
 """.split()

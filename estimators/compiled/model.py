@@ -142,6 +142,9 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
         0 if sensor.H or not derivable else complex_code(sensor.h, h_complex_signature) for sensor in model.sensors
     ]
 
+    correlations = [np.array(sensor.correlation) if sensor.correlation else None for sensor in model.sensors]
+    kept.append(correlations)
+
     acts_on = [model.acts_on(noise.name) for noise in model.noises] if model.Q is None else []
 
     def q_function(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
@@ -187,6 +190,8 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
             "row_count": np.array([len(sensor.rows) for sensor in model.sensors], np.int64),
             "circular_x": model.circular,
             "circular_y": np.array([row.circular for sensor in model.sensors for row in sensor.rows], np.int8),
+            # The address of each sensor's correlation, or 0.
+            "correlation": np.array([0 if c is None else c.ctypes.data for c in correlations], np.int64),
             "max_step": float(model.max_step),
             "noise_state": np.array([states.start for states in acts_on], np.int64),
             "noise_states": np.array([len(states) for states in acts_on], np.int64),

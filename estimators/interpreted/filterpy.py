@@ -216,13 +216,13 @@ def _update(
     score: np.ndarray,
 ) -> int:
     """Let FilterPy update a copy by the rows that came; judge its innovation; take the copy over if it is used."""
-    r = view.variances(sensor)
-    rows = np.flatnonzero(np.isfinite(y[: r.size]))
+    R = view.covariance(sensor)
+    rows = np.flatnonzero(np.isfinite(y[: len(R)]))
     if not rows.size:
         return MISSING
     x, P = moments_of(view, state)
     try:
-        filter_ = step(x.copy(), P.copy(), rows, np.diag(r[rows]))
+        filter_ = step(x.copy(), P.copy(), rows, R[np.ix_(rows, rows)])
     except ValueError:  # S or P is singular or not finite
         score[1] = rows.size
         return FAILED
@@ -313,8 +313,8 @@ def update_enkf(
     score: np.ndarray,
 ) -> int:
     """xᵢ ← xᵢ + K (y + vᵢ - h(xᵢ)), vᵢ ~ N(0, R), with the covariances of the members."""
-    r = view.variances(sensor)
-    rows = np.flatnonzero(np.isfinite(y[: r.size]))
+    R = view.covariance(sensor)
+    rows = np.flatnonzero(np.isfinite(y[: len(R)]))
     if not rows.size:
         return MISSING
     X, filter_ = _members(view, state), _enkf(view)
@@ -328,7 +328,7 @@ def update_enkf(
     filter_.sigmas, filter_.x, filter_.P = X.copy(), X.mean(axis=0), np.zeros((view.nx, view.nx))
     filter_.hx, filter_._mean_z = in_turn(expected), np.zeros(rows.size)
     try:
-        filter_.update(centre + nu, R=np.diag(r[rows]))
+        filter_.update(centre + nu, R=R[np.ix_(rows, rows)])
     except ValueError:  # S is singular or not finite
         score[1] = rows.size
         return FAILED

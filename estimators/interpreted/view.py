@@ -15,6 +15,7 @@ from ..compiled.model import CompiledModel
 from ..errors import ModelError
 from ..estimator import Options
 from ..gaussian.shared import admit
+from ..model.correlation import covariance_of
 from ..model.state_space import StateSpaceModel
 from ..track import FAILED
 from ..tuning import Tuning
@@ -45,6 +46,7 @@ class View:
         angles = np.array([row.circular for sensor in model.sensors for row in sensor.rows], bool)
         self._r = [np.ascontiguousarray(tuning.r[part], float) for part in rows]
         self._angles = [angles[part] for part in rows]
+        self._R = [covariance_of(sensor.correlation, r) for sensor, r in zip(model.sensors, self._r, strict=True)]
         self._scratch = np.empty(scratch_size(model.nx, model.width))
         self.kept: dict[Any, Any] = {}
         self.failures = 0
@@ -60,9 +62,9 @@ class View:
         """Mean (nx,) and covariance (nx, nx) of the prior."""
         return self.compiled.static["prior_mean"], self.compiled.static["prior_cov"]
 
-    def variances(self, sensor: int) -> np.ndarray:
-        """r (ny,): the variances of a sensor's rows."""
-        return self._r[sensor]
+    def covariance(self, sensor: int) -> np.ndarray:
+        """R (ny, ny): the covariance of a sensor's rows."""
+        return self._R[sensor]
 
     def circular_rows(self, sensor: int) -> np.ndarray:
         """For each row of a sensor, whether it is an angle."""

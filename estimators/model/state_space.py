@@ -17,6 +17,7 @@ from functools import cached_property
 import numpy as np
 
 from ..errors import LARGEST, ModelError
+from .correlation import Correlation, as_correlation, flaw
 from .field import CellNames, Field, State
 from .jump import Jump
 
@@ -82,6 +83,10 @@ class Sensor:
     h(x, u, p, out) fills `out` (ny,). The optional H(x, u, p, out) fills the Jacobian (ny, nx). A sensor whose noise is
     not Gaussian gives log_likelihood(y, x, u, p, r) -> log p(y | x), with r (ny,) the rows' variances as they are tuned
     now; rows of y that are missing are NaN. Particle filters use it; the others use h and r.
+
+    `correlation` is the correlation matrix (ny, ny) of the rows' noise, where they are not independent: anything that
+    NumPy takes for a matrix. R_ij = correlation_ij √(r_i r_j), so the rows' variances are tuned as ever. Of a
+    covariance R, give the rows its diagonal and the sensor `correlation_of(R)`.
     """
 
     name: str
@@ -89,6 +94,12 @@ class Sensor:
     h: Callable
     H: Callable | None = None
     log_likelihood: Callable | None = None
+    correlation: Correlation | None = None
+
+    def __post_init__(self) -> None:
+        """Hold a matrix, which cannot be hashed, as its rows."""
+        if self.correlation is not None:
+            object.__setattr__(self, "correlation", as_correlation(self.correlation))
 
 
 @dataclass(frozen=True)
@@ -168,6 +179,9 @@ class StateSpaceModel:
                 raise ModelError(f"model {self.name}: sensor {sensor.name} has no rows; name at least one")
             if len(set(rows)) < len(rows):
                 raise ModelError(f"model {self.name}: sensor {sensor.name} names a row twice; every name must differ")
+            wrong = flaw(sensor.correlation, len(rows)) if sensor.correlation is not None else None
+            if wrong:
+                raise ModelError(f"model {self.name}: the correlation of sensor {sensor.name} {wrong}")
         for noise in self.noises:
             if not (noise.variance >= 0 and np.isfinite(noise.variance)):
                 raise ModelError(
@@ -343,6 +357,11 @@ class StateSpaceModel:
     def sensor_names(self) -> tuple[str, ...]:
         """Names of the sensors, in order."""
         return tuple(sensor.name for sensor in self.sensors)
+
+    @cached_property
+    def correlated(self) -> str | None:
+        """Name of the first sensor whose rows are correlated, if there is one."""
+        return next((sensor.name for sensor in self.sensors if sensor.correlation is not None), None)
 
     @cached_property
     def input_names(self) -> tuple[str, ...]:

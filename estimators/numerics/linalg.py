@@ -164,6 +164,33 @@ def solve_upper(U, m, b):
 
 
 @jit
+def unit_factor(A, d, m):
+    """Overwrite the strictly lower triangle of A (m, m) with that of unit lower L, and its diagonal d (m,) with D's.
+
+    A = L diag(d) Lᵀ for a positive semidefinite A; a row without variance has no covariance, and a column of zeros.
+
+    Source: Golub & Van Loan, Matrix Computations, 4th ed., 4.1.3 (LDLᵀ, outer product form).
+    """
+    for k in range(m):
+        inverse = 1.0 / d[k] if d[k] > 0.0 else 0.0
+        for i in range(k + 1, m):
+            a = A[i, k] * inverse
+            for j in range(k + 1, i):
+                A[i, j] -= a * A[j, k]
+            d[i] -= a * A[i, k]
+        for i in range(k + 1, m):
+            A[i, k] *= inverse
+
+
+@inlined
+def solve_unit(L, m, b):
+    """Overwrite b (m,) with L⁻¹ b for unit lower L (m, m), whose strictly lower triangle alone is read."""
+    for i in range(1, m):
+        for j in range(i):
+            b[i] -= L[i, j] * b[j]
+
+
+@jit
 def congruence(F, P, T):
     """Overwrite symmetric P with F P Fᵀ; T is scratch of twice the shape (2n, n)."""
     n = P.shape[0]

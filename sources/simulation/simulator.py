@@ -104,6 +104,11 @@ class Simulator:
             np.sqrt(plan.variances if plan.variances is not None else [row.variance for row in sensor.rows])
             for plan, sensor in zip(self._plans, model.sensors, strict=True)
         ]
+        # By what white noise becomes the sensor's, correlated as the model says.
+        self._roots = [
+            None if sensor.correlation is None else np.linalg.cholesky(np.array(sensor.correlation))
+            for sensor in model.sensors
+        ]
         self._faults = Faults(faults, model.sensors, seed)
         self._spoken = [0] * len(self._plans)
         self._circular = np.flatnonzero(truth.circular)
@@ -177,7 +182,11 @@ class Simulator:
                 continue
             y = np.empty(self._std[i].size)
             truth.h[i](self._x, self._u, self._p, y)
-            y += self._rng.normal(0.0, self._std[i], size=y.size)
+            root = self._roots[i]
+            if root is None:
+                y += self._rng.normal(0.0, self._std[i], size=y.size)
+            else:
+                y += self._std[i] * (root @ self._rng.standard_normal(y.size))
             y = self._faults.spoil(i, self._k * self._step, y)
             lost = plan.drop_every is not None and self._spoken[i] % plan.drop_every == plan.drop_every - 1
             self._spoken[i] += 1

@@ -10,8 +10,10 @@ from estimators.numerics.linalg import (
     remove,
     root,
     solve_transposed,
+    solve_unit,
     solve_upper,
     triangularise,
+    unit_factor,
     wrap,
 )
 
@@ -183,3 +185,24 @@ def test_remove_refuses_what_is_not_there():
     assert not remove(np.eye(2), 2, np.array([0.8, 0.8]))
     assert not remove(np.eye(2), 2, np.array([0.0, np.nan]))
     assert remove(np.eye(2), 2, np.array([0.6, 0.6]))
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_unit_factor(n):
+    rng = np.random.default_rng(n)
+    A = spd(rng, n)
+    b = rng.normal(0, 1, n)
+    L, d, solved = A.copy(), np.diag(A).copy(), b.copy()
+    unit_factor(L, d, n)
+    L = np.tril(L, -1) + np.eye(n)
+    np.testing.assert_allclose(L @ np.diag(d) @ L.T, A, rtol=TOLERANCE, atol=TOLERANCE)
+    solve_unit(L, n, solved)
+    np.testing.assert_allclose(solved, np.linalg.solve(L, b), rtol=TOLERANCE, atol=TOLERANCE)
+
+
+def test_unit_factor_of_rows_without_variance():
+    A = np.array([[4.0, 0.0, 2.0], [0.0, 0.0, 0.0], [2.0, 0.0, 9.0]])
+    L, d = A.copy(), np.diag(A).copy()
+    unit_factor(L, d, 3)
+    np.testing.assert_array_equal(d, [4.0, 0.0, 8.0])
+    np.testing.assert_array_equal(np.tril(L, -1), [[0, 0, 0], [0, 0, 0], [0.5, 0, 0]])
