@@ -143,6 +143,13 @@ def transition_rows(context, X, stride, n, u, dt, out):
 
 
 @jit
+def transition_points(context, X, u, dt, out):
+    """Rows of `out` (N, nx or more) = f of the rows of X (N, nx or more)."""
+    rows, stride = X.shape
+    call_f_rows(context.f, X.ctypes.data, stride, rows, u.ctypes.data, context.p, dt, out.ctypes.data, out.shape[1])
+
+
+@jit
 def expect(context, sensor, x, u, out):
     """out = h(x, u, p) of one sensor."""
     h = ints(context.h, context.n_sensors)[sensor]
@@ -154,6 +161,14 @@ def expect_rows(context, sensor, X, stride, n, u, out):
     """h of one sensor at n states that begin at the address X, `stride` numbers apart, into rows of `out`."""
     h = ints(context.h, context.n_sensors)[sensor]
     call_h_rows(h, X, stride, n, u.ctypes.data, context.p, out.ctypes.data, out.shape[1])
+
+
+@jit
+def expect_points(context, sensor, X, u, out):
+    """Rows of `out` (N, ny or more) = h of one sensor at the rows of X (N, nx or more)."""
+    h = ints(context.h, context.n_sensors)[sensor]
+    rows, stride = X.shape
+    call_h_rows(h, X.ctypes.data, stride, rows, u.ctypes.data, context.p, out.ctypes.data, out.shape[1])
 
 
 @inlined

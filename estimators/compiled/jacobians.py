@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from ..numerics.jit import complexes, ints, jit
 from ..numerics.linalg import wrap
+from ..numerics.workspace import layout
 from .context import (
     call_F,
     call_f_complex,
@@ -24,6 +25,7 @@ ANALYTIC, COMPLEX_STEP, CENTRAL = range(3)
 """How a Jacobian is found: the model's own function, complex step, central differences."""
 
 
+@layout
 def scratch_size(nx: int, ny: int) -> int:
     """Numbers that a Jacobian takes to work in: two complex vectors, or three real ones."""
     return 2 * nx + 2 * max(nx, ny)

@@ -57,7 +57,9 @@ def take_integers(at: int, n: int) -> tuple[Any, int]:
     return Part(at, (n,)), at + WORD * n
 
 
-@overload(take_matrix, inline="always")
+# Not inlined: where Numba inlines an overload it looks for dead code, and takes a write through a field of a tuple,
+# `own.mean[i] = ...`, for dead.
+@overload(take_matrix)
 def _take_matrix(at, rows, columns):
     def take(at, rows, columns):
         return carray(_to_float(at), (rows, columns)), at + WORD * rows * columns
@@ -65,7 +67,7 @@ def _take_matrix(at, rows, columns):
     return take
 
 
-@overload(take_vector, inline="always")
+@overload(take_vector)
 def _take_vector(at, n):
     def take(at, n):
         return carray(_to_float(at), (n,)), at + WORD * n
@@ -73,7 +75,7 @@ def _take_vector(at, n):
     return take
 
 
-@overload(take_integers, inline="always")
+@overload(take_integers)
 def _take_integers(at, n):
     def take(at, n):
         return carray(_to_int(at), (n,)), at + WORD * n
