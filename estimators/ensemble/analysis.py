@@ -27,10 +27,11 @@ def side_of(options: Options, ny: int) -> int:
 class Analysis(NamedTuple):
     """What an analysis works in, of N members and ny rows, with matrices of order `side`, the smaller of the two.
 
-    ZT (ny, N) and Z (N, ny) are the whitened anomalies of the expected reading, d (ny,) the whitened innovation, and
-    `rows` (ny,) says which row of the reading each is, `places` (ny,) the other way round; G and U (side, side) are a
-    Gram matrix and the Cholesky factor of I + G. The others are a filter's own: B (ny, N + 1), V (side, side), values
-    (side,), small (3 side,), v (ny + N,), T (N, N) and W (N, N + 1). expected (ny,) is scratch.
+    ZT (ny, N) and Z (N, ny) are the whitened anomalies of the expected reading, d (ny,) the whitened innovation, r
+    (ny,) variances whose product is det R; `rows` (ny,) says which row of the reading each is, `places` (ny,) the other
+    way round. G and U (side, side) are a Gram matrix and the Cholesky factor of I + G. The others are a filter's own: B
+    (ny, N + 1), V (side, side), values (side,), small (3 side,), v (ny + N,), T (N, N) and W (N, N + 1). expected (ny,)
+    is scratch.
     """
 
     ZT: Any
@@ -42,6 +43,7 @@ class Analysis(NamedTuple):
     W: Any
     T: Any
     d: Any
+    r: Any
     rows: Any
     expected: Any
     v: Any
@@ -63,13 +65,14 @@ def analysis_at(at, N, ny, side):
     W, at = take_matrix(at, N, N + 1)
     T, at = take_matrix(at, N, N)
     d, at = take_vector(at, ny)
+    r, at = take_vector(at, ny)
     rows, at = take_integers(at, ny)
     expected, at = take_vector(at, ny)
     v, at = take_vector(at, ny + N)
     places, at = take_integers(at, ny)
     values, at = take_vector(at, side)
     small, at = take_vector(at, 3 * side)
-    return Analysis(ZT, Z, B, G, U, V, W, T, d, rows, expected, v, places, values, small, at)
+    return Analysis(ZT, Z, B, G, U, V, W, T, d, r, rows, expected, v, places, values, small, at)
 
 
 def work_size(options: Options, nx: int, ny: int) -> int:

@@ -126,6 +126,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     index = next_draw(context, state)
     given = numbers(context)
     crews = int(given[CREWS])
+    # B = R^(-1/2) (y + vᵢ - h(xᵢ)), then xᵢ ← xᵢ + C_xy R^(-1/2) (I + Zᵀ Z)⁻¹ B, tapered or in the members' space.
     perturbed_innovations(context.seed, index, m, a.ZT, a.d, a.B)
     if localised(context):
         gains(m, a)

@@ -89,6 +89,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         return verdict
     index = next_draw(context, state)
     given = numbers(context)
+    # The rows among themselves: zₖ and dₖ as row k finds them; then every state: aᵢ ← aᵢ - α K zₖᵢ, x̄ ← x̄ + K dₖ.
     row_by_row(context, sensor, m, a)
     find_places(m, a.rows, a.places)
     regress_all(context, sensor, X, a.places, a.ZT, a.B, True, given[INFLATION], int(given[CREWS]), rest)

@@ -163,11 +163,13 @@ def transform_members(context, index, m, a, X, rest):
     """x̄ + A ← x̄ + (T + 1 wᵀ) A for all states; False, and nothing is changed, if a number is not finite."""
     N = X.shape[0]
     T, W, v = a.T, a.W, a.v
+    # T = (I + Z Zᵀ)^(-1/2),  w = (I + Z Zᵀ)⁻¹ Z d / √(N - 1)
     if not symmetric_transform(m, a):
         return False
     given = numbers(context)
     if given[OWN] > 0.0:
         rotate_members(context.seed, index, T, W)
+    # W = T + 1 wᵀ, by which x̄ + W A are the members
     for i in range(N):
         for j in range(N):
             W[i, j] = given[INFLATION] * T[i, j] + v[j] / np.sqrt(N - 1.0)
@@ -186,6 +188,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     """
     X = ensemble(context, state)
     a, rest = begin_analysis(context, sensor, X.shape[0], work)
+    # Z = (h(xᵢ) - ȳ) R^(-1/2) / √(N - 1),  d = R^(-1/2) (y - ȳ)
     m = observe(context, sensor, u, y, X, a, innovation, innovation_std)
     verdict = judge_reading(context, sensor, m, a, score)
     if verdict != USED:

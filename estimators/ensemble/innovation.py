@@ -1,6 +1,7 @@
 """What the members say of a reading, in whitened anomalies, and the judgement of it.
 
-Z = (h(xᵢ) - ȳ) / √(r (N - 1)) and d = (y - ȳ) / √r, so that S = √R (I + Zᵀ Z) √R.
+Z = (h(xᵢ) - ȳ) / √(r (N - 1)) and d = (y - ȳ) / √r, so that S = √R (I + Zᵀ Z) √R. Where the rows are correlated, they
+are made independent by the Cholesky factor of R over those that are there; whatever follows is the same.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from ..compiled.context import (
     expect,
     sensor_variances,
 )
+from ..compiled.sensor_noise import has_correlated_rows, independent_rows
 from ..compiled.verdict import verdict_of
 from ..numerics.jit import jit
 from ..numerics.linalg import solve_transposed, solve_upper, wrap
@@ -31,7 +33,8 @@ def observe(context, sensor, u, y, X, a, innovation, innovation_std):
         u: Inputs (nu,).
         y: The reading (ny,).
         X: Members (N, nx).
-        a: The analysis; gets Zᵀ, d, and the row of the reading that each of the m is.
+        a: The analysis; gets Zᵀ, d, the row of the reading that each of the m is, and the variances r whose product is
+            det R.
         innovation: Gets the innovation itself, by row of the reading.
         innovation_std: Gets the square root of its variance, by row of the reading.
 
@@ -73,7 +76,28 @@ def observe(context, sensor, u, y, X, a, innovation, innovation_std):
         innovation[row] = residual
         innovation_std[row] = np.sqrt(r[row] * (1.0 + square))
         d[k] = residual / np.sqrt(r[row])
+        a.r[k] = r[row]
+    if has_correlated_rows(context, sensor):
+        decorrelate(context, sensor, y, m, a)
     return m
+
+
+@jit
+def decorrelate(context, sensor, y, m, a):
+    """Make rows independent that are whitened but for their correlation c = F D Fᵀ: Z ← Z F⁻ᵀ D^(-1/2), d likewise."""
+    ny, N = a.rows.size, a.ZT.shape[1]
+    F, D = np.empty((ny, ny)), np.empty(ny)
+    independent_rows(context, sensor, y, np.ones(ny), F, D)
+    for k in range(m):
+        for j in range(k):
+            add_scaled(N, -F[k, j], a.ZT[j], a.ZT[k])
+            a.d[k] -= F[k, j] * a.d[j]
+    for k in range(m):
+        scale = 1.0 / np.sqrt(D[k])
+        for i in range(N):
+            a.ZT[k, i] *= scale
+        a.d[k] *= scale
+        a.r[k] *= D[k]
 
 
 @jit
@@ -139,7 +163,6 @@ def judge_reading(context, sensor, m, a, score):
     log_det = 0.0
     for k in range(m if in_rows else N):
         log_det += 2.0 * np.log(U[k, k])
-    r = sensor_variances(context, sensor)
     for k in range(m):
-        log_det += np.log(r[rows[k]])
+        log_det += np.log(a.r[k])
     return verdict_of(context, sensor, m, nis, log_det, score)

@@ -57,6 +57,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     index = next_draw(context, state)
     given = numbers(context)
     if localised(context):
+        # Of each state: a ← (I + Z ρ Zᵀ)^(-1/2) a and x̄ ← x̄ + aᵀ (I + Z ρ Zᵀ)⁻¹ Z ρ d / √(N - 1).
         find_places(m, a.rows, a.places)
         gram(a.Z, X.shape[0], m, a.U)
         transform_locally(context, sensor, X, a, given[INFLATION], int(given[CREWS]), rest)
