@@ -8,7 +8,7 @@ from .ensemble.enkf import ENKF
 from .ensemble.ensrf import ENSRF
 from .ensemble.etkf import ETKF
 from .ensemble.letkf import LETKF
-from .ensemble.placed import check_placed
+from .ensemble.localisation import check_placed
 from .errors import EstimatorError, nearest
 from .estimator import Estimator, Options
 from .gaussian.ckf import CKF

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..numerics.jit import floats, ints, jit
 from ..numerics.linalg import unit_factor
-from .context import sensor_rows
+from .context import sensor_rows, sensor_variances
 
 
 @jit
@@ -66,3 +66,22 @@ def independent_rows(context, sensor, y, r, L, d):
             row += 1
     unit_factor(L, d, m)
     return m
+
+
+@jit
+def add_covariances(context, sensor, y, factor, S):
+    """Add `factor` times what is off the diagonal of R, over the rows of y that are there, to S (m, m)."""
+    if not has_correlated_rows(context, sensor):
+        return
+    r, c = sensor_variances(context, sensor), sensor_correlation(context, sensor)
+    row = 0
+    for i in range(r.size):
+        if np.isfinite(y[i]):
+            column = 0
+            for j in range(i):
+                if np.isfinite(y[j]):
+                    covariance = factor * c[i * r.size + j] * np.sqrt(r[i]) * np.sqrt(r[j])
+                    S[row, column] += covariance
+                    S[column, row] += covariance
+                    column += 1
+            row += 1

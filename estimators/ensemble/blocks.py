@@ -6,17 +6,21 @@ once and writes it once, in place; its cost is that of the memory, and its scrat
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 from numba import prange
 
 from ..compiled.context import context_at, place_of
 from ..numerics.jit import jit, matrix
-from ..numerics.simd import WIDE, add_scaled, combine_narrow, combine_wide, spread_narrow, spread_wide
+from ..numerics.simd import WIDE
 from ..numerics.simd_ir import LANES
+from ..numerics.vectors import add_scaled, combine_rows, spread_rows
+from ..numerics.workspace import layout, share, start_of, take_matrix, take_vector
 from .localisation import localised, reached
 
 
 @jit
-def block_count(n):
+def blocks_of(n):
     """Blocks that n states make: of `WIDE` columns, and of `LANES` behind them."""
     return n // WIDE + (n % WIDE + LANES - 1) // LANES
 
@@ -31,22 +35,40 @@ def block_at(b, n):
     return first, min(LANES, n - first), LANES
 
 
-@jit
-def combine(width, weights, count, x, out):
-    """out = Σ_k weights[k] x[k] over the rows of a block (addresses)."""
-    if width == WIDE:
-        combine_wide(weights, count, x, WIDE, out)
-    else:
-        combine_narrow(weights, count, x, LANES, out)
+class Transform(NamedTuple):
+    """What a crew transforms a block in: the block (N + 1, width), and a row of the result (width,)."""
+
+    block: Any
+    out: Any
+    end: int
 
 
-@jit
-def spread(width, weights, count, x, out):
-    """out[k] += weights[k] x over the rows of a block (addresses)."""
-    if width == WIDE:
-        spread_wide(weights, count, x, out, WIDE)
-    else:
-        spread_narrow(weights, count, x, out, LANES)
+@layout
+def transform_at(at, N, width):
+    """Lay it out."""
+    block, at = take_matrix(at, N + 1, width)
+    out, at = take_vector(at, width)
+    return Transform(block, out, at)
+
+
+class Regression(NamedTuple):
+    """What a crew regresses a block in: the block (N + 1, width), the forecast's anomalies, a row's c, its reach."""
+
+    block: Any
+    seen: Any
+    c: Any
+    reach: Any
+    end: int
+
+
+@layout
+def regression_at(at, N, width):
+    """Lay it out."""
+    block, at = take_matrix(at, N + 1, width)
+    seen, at = take_matrix(at, N, width)
+    c, at = take_vector(at, width)
+    reach, at = take_vector(at, width)
+    return Regression(block, seen, c, reach, at)
 
 
 @jit
@@ -64,10 +86,10 @@ def load(X, first, count, width, block):
             row[j] = 0.0
         # About the first member, so that a spread far below the size of the numbers keeps its digits.
         if i > 0:
-            add_scaled(width, -1.0, block[0].ctypes.data, row.ctypes.data)
-            add_scaled(width, 1.0 / N, row.ctypes.data, mean.ctypes.data)
+            add_scaled(width, -1.0, block[0], row)
+            add_scaled(width, 1.0 / N, row, mean)
     for i in range(1, N):
-        add_scaled(width, -1.0, mean.ctypes.data, block[i].ctypes.data)
+        add_scaled(width, -1.0, mean, block[i])
     for j in range(width):
         shift = mean[j]
         mean[j] += block[0, j]
@@ -87,48 +109,47 @@ def store(X, first, count, block):
 def transform(X, W, crew, crews, scratch):
     """One crew's share of X ← x̄ + W A, with W (N, N + 1): its last column, of ones, takes the mean along."""
     N, n = X.shape
-    blocks = block_count(n)
-    out = scratch[(N + 1) * WIDE :]
+    blocks = blocks_of(n)
     for b in range(crew * blocks // crews, (crew + 1) * blocks // crews):
         first, count, width = block_at(b, n)
-        block = matrix(scratch, 0, N + 1, width)
+        block, out, _ = transform_at(start_of(scratch), N, width)
         load(X, first, count, width, block)
         for i in range(N):
             if count == width:
-                combine(width, W[i].ctypes.data, N + 1, block.ctypes.data, X[i, first:].ctypes.data)
+                combine_rows(W[i], N + 1, block, X[i, first:])
             else:
-                combine(width, W[i].ctypes.data, N + 1, block.ctypes.data, out.ctypes.data)
+                combine_rows(W[i], N + 1, block, out)
                 for j in range(count):
                     X[i, first + j] = out[j]
 
 
 @jit(parallel=True)
-def _transform_on_threads(X, W, crews, scratch, each):
+def _transform_on_threads(X, W, crews, scratch):
     for crew in prange(crews):
-        transform(X, W, crew, crews, scratch[crew * each : (crew + 1) * each])
+        transform(X, W, crew, crews, share(scratch, crew, crews))
 
 
 @jit
 def transform_all(X, W, crews, scratch):
     """X ← x̄ + W A for all states."""
     if crews > 1:
-        _transform_on_threads(X, W, crews, scratch, scratch.size // crews)
+        _transform_on_threads(X, W, crews, scratch)
     else:
         transform(X, W, 0, 1, scratch)
 
 
 @jit
-def sweep(context, sensor, X, where, ZT, B, serial, inflation, crew, crews, scratch):
+def regress(context, sensor, X, places, ZT, B, serial, inflation, crew, crews, scratch):
     """One crew's share of a regression on the rows of a reading, tapered state by state.
 
     For each row k that reaches a state: c = ρ Σᵢ aᵢ ZT[k, i], then aᵢ += B[k, i] c and the mean += B[k, N] c. In a
-    serial sweep a row sees what the rows before it left of the anomalies, else all see the forecast.
+    serial one a row sees what the rows before it left of the anomalies, else all see the forecast.
 
     Args:
         context: The context.
         sensor: Its index.
         X: Members (N, n).
-        where: For each row of the reading its index k, or -1 where it is missing.
+        places: For each row of the reading its index k, or -1 where it is missing.
         ZT: Whitened anomalies (m, N).
         B: What a regression coefficient does to members and mean, (m, N + 1).
         serial: Whether rows are assimilated one after the other.
@@ -141,36 +162,34 @@ def sweep(context, sensor, X, where, ZT, B, serial, inflation, crew, crews, scra
     local = localised(context)
     if local:
         blocks, starts, entry_rows, tapers = reached(context, sensor)
-        count_blocks = blocks.size
+        how_many = blocks.size
     else:
         # Every block, all rows, no taper; the arrays are not looked at.
-        blocks, starts, entry_rows, tapers = where, where, where, matrix(scratch, 0, 0, WIDE)
-        count_blocks = block_count(n)
-    c = scratch[2 * (N + 1) * WIDE :]
-    reach = c[WIDE:]
-    for e in range(crew * count_blocks // crews, (crew + 1) * count_blocks // crews):
+        blocks, starts, entry_rows, tapers = places, places, places, matrix(scratch, 0, 0, WIDE)
+        how_many = blocks_of(n)
+    for e in range(crew * how_many // crews, (crew + 1) * how_many // crews):
         first, count, width = block_at(blocks[e] if local else e, n)
-        block = matrix(scratch, 0, N + 1, width)
-        seen = block
+        block, forecast, c, reach, _ = regression_at(start_of(scratch), N, width)
         load(X, first, count, width, block)
+        seen = block
         if not serial:
-            seen = matrix(scratch, (N + 1) * WIDE, N, width)
+            seen = forecast
             for i in range(N):
                 for j in range(width):
                     seen[i, j] = block[i, j]
         for j in range(width):
             reach[j] = 0.0 if local else 1.0
-        begin, end = (starts[e], starts[e + 1]) if local else (0, where.size)
+        begin, end = (starts[e], starts[e + 1]) if local else (0, places.size)
         for entry in range(begin, end):
-            k = where[entry_rows[entry] if local else entry]
+            k = places[entry_rows[entry] if local else entry]
             if k < 0:
                 continue
-            combine(width, ZT[k].ctypes.data, N, seen.ctypes.data, c.ctypes.data)
+            combine_rows(ZT[k], N, seen, c)
             if local:
                 for j in range(width):
                     c[j] *= tapers[entry, j]
                     reach[j] = max(reach[j], tapers[entry, j])
-            spread(width, B[k].ctypes.data, N + 1, c.ctypes.data, block.ctypes.data)
+            spread_rows(B[k], N + 1, c, block)
         if inflation != 1.0:
             for j in range(width):
                 reach[j] = 1.0 + (inflation - 1.0) * reach[j]
@@ -181,18 +200,17 @@ def sweep(context, sensor, X, where, ZT, B, serial, inflation, crew, crews, scra
 
 
 @jit(parallel=True)
-def _sweep_on_threads(context, sensor, X, where, ZT, B, serial, inflation, crews, scratch, each):
+def _regress_on_threads(context, sensor, X, places, ZT, B, serial, inflation, crews, scratch):
     place = place_of(context)
     for crew in prange(crews):
-        own = scratch[crew * each : (crew + 1) * each]
-        sweep(context_at(place), sensor, X, where, ZT, B, serial, inflation, crew, crews, own)
+        own = share(scratch, crew, crews)
+        regress(context_at(place), sensor, X, places, ZT, B, serial, inflation, crew, crews, own)
 
 
 @jit
-def sweep_all(context, sensor, X, where, ZT, B, serial, inflation, crews, scratch):
-    """The regression of `sweep` for all states."""
+def regress_all(context, sensor, X, places, ZT, B, serial, inflation, crews, scratch):
+    """The regression of `regress` for all states."""
     if crews > 1:
-        each = scratch.size // crews
-        _sweep_on_threads(context, sensor, X, where, ZT, B, serial, inflation, crews, scratch, each)
+        _regress_on_threads(context, sensor, X, places, ZT, B, serial, inflation, crews, scratch)
     else:
-        sweep(context, sensor, X, where, ZT, B, serial, inflation, 0, 1, scratch)
+        regress(context, sensor, X, places, ZT, B, serial, inflation, 0, 1, scratch)

@@ -15,14 +15,16 @@ from __future__ import annotations
 import numpy as np
 
 from ..compiled.context import options as numbers
-from ..compiled.context import sensor_rows
 from ..estimator import Estimator
 from ..numerics.jit import jit
 from ..numerics.random import key_of, normal
-from ..numerics.simd import add_scaled
 from ..numerics.symmetric import solve_rows
+from ..numerics.vectors import add_scaled
 from ..track import USED
-from .blocks import sweep_all, transform_all
+from .analysis import begin_analysis, find_places, work_size
+from .blocks import regress_all, transform_all
+from .forecast import add_spread, predict
+from .innovation import judge_reading, observe
 from .localisation import localised, prepare
 from .shared import (
     ADD,
@@ -32,23 +34,16 @@ from .shared import (
     MEMBERS,
     PERTURB,
     RADIUS,
-    add_spread,
     block,
     describe,
     ensemble,
-    find_rows,
-    judge,
     moments,
     next_draw,
-    observe,
     points,
-    predict,
     settle,
     start,
     state_size,
     tune,
-    work_size,
-    workspace,
 )
 
 
@@ -71,8 +66,9 @@ def perturbed_innovations(seed, index, m, ZT, d, B):
 
 
 @jit
-def weights(m, ZT, Z, B, U, T, W, inflation):
+def weights(m, a, inflation):
     """W (N, N + 1) with x̄ + W A the updated members: W = I + ((I + Z Zᵀ)⁻¹ Z B)ᵀ / √(N - 1)."""
+    ZT, Z, B, U, T, W = a.ZT, a.Z, a.B, a.U, a.T, a.W
     N = ZT.shape[1]
     if m <= N:
         solve_rows(U, m, B, N)
@@ -80,7 +76,7 @@ def weights(m, ZT, Z, B, U, T, W, inflation):
         for i in range(N):
             T[j, i] = 0.0
         for k in range(m):
-            add_scaled(N, Z[j, k], B[k].ctypes.data, T[j].ctypes.data)
+            add_scaled(N, Z[j, k], B[k], T[j])
     if m > N:
         solve_rows(U, N, T, N)
     scale = 1.0 / np.sqrt(N - 1.0)
@@ -99,6 +95,22 @@ def weights(m, ZT, Z, B, U, T, W, inflation):
 
 
 @jit
+def gains(m, a):
+    """B[k, i] becomes what a covariance with row k does to anomaly i, B[k, N] what it does to the mean."""
+    B, N = a.B, a.ZT.shape[1]
+    solve_rows(a.U, m, B, N)
+    scale = 1.0 / np.sqrt(N - 1.0)
+    for k in range(m):
+        total = 0.0
+        for i in range(N):
+            total += B[k, i]
+        for i in range(N):
+            B[k, i] = (B[k, i] - total / N) * scale
+        B[k, N] = total / N * scale
+    find_places(m, a.rows, a.places)
+
+
+@jit
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """Condition the ensemble on a reading; see the module's equations.
 
@@ -106,34 +118,22 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     over many readings where members are few, unless it is inflated.
     """
     X = ensemble(context, state)
-    N = X.shape[0]
-    _, ny = sensor_rows(context, sensor)
-    local = localised(context)
-    parts = workspace(N, ny, ny if local else min(ny, N), work)
-    ZT, Z, B, G, U, _, W, T, d, rows, expected, v, where, _, _, rest = parts
-    m = observe(context, sensor, u, y, X, ZT, d, rows, expected, innovation, innovation_std)
-    verdict = judge(context, sensor, m, ZT, Z, d, rows, G, U, v, score)
+    a, rest = begin_analysis(context, sensor, X.shape[0], work)
+    m = observe(context, sensor, u, y, X, a, innovation, innovation_std)
+    verdict = judge_reading(context, sensor, m, a, score)
     if verdict != USED:
         return verdict
-    index = next_draw(X, state)
+    index = next_draw(context, state)
     given = numbers(context)
     crews = int(given[CREWS])
-    perturbed_innovations(context.seed, index, m, ZT, d, B)
-    if local:
-        solve_rows(U, m, B, N)
-        scale = 1.0 / np.sqrt(N - 1.0)
-        for k in range(m):
-            total = 0.0
-            for i in range(N):
-                total += B[k, i]
-            for i in range(N):
-                B[k, i] = (B[k, i] - total / N) * scale
-            B[k, N] = total / N * scale
-        find_rows(m, rows, where)
-        sweep_all(context, sensor, X, where, ZT, B, False, given[INFLATION], crews, rest)
+    # B = R^(-1/2) (y + vᵢ - h(xᵢ)), then xᵢ ← xᵢ + C_xy R^(-1/2) (I + Zᵀ Z)⁻¹ B, tapered or in the members' space.
+    perturbed_innovations(context.seed, index, m, a.ZT, a.d, a.B)
+    if localised(context):
+        gains(m, a)
+        regress_all(context, sensor, X, a.places, a.ZT, a.B, False, given[INFLATION], crews, rest)
     else:
-        weights(m, ZT, Z, B, U, T, W, given[INFLATION])
-        transform_all(X, W, crews, rest)
+        weights(m, a, given[INFLATION])
+        transform_all(X, a.W, crews, rest)
     add_spread(context, index, X, rest)
     settle(context, X)
     return USED

@@ -16,13 +16,15 @@ from __future__ import annotations
 import numpy as np
 
 from ..compiled.context import options as numbers
-from ..compiled.context import sensor_rows
 from ..estimator import Estimator
 from ..numerics.jit import jit
-from ..numerics.simd import add_scaled
+from ..numerics.vectors import add_scaled
 from ..track import USED
-from .blocks import sweep_all
-from .localisation import between_rows, localised, prepare
+from .analysis import begin_analysis, find_places, work_size
+from .blocks import regress_all
+from .forecast import add_spread, predict
+from .innovation import judge_reading, observe
+from .localisation import between_rows, prepare
 from .rotation import ROTATION, rotate
 from .shared import (
     ADD,
@@ -31,33 +33,27 @@ from .shared import (
     INFLATION,
     MEMBERS,
     RADIUS,
-    add_spread,
     block,
     describe,
     ensemble,
-    find_rows,
-    judge,
     moments,
     next_draw,
-    observe,
     points,
-    predict,
     settle,
     start,
     state_size,
     tune,
-    work_size,
-    workspace,
 )
 
 
 @jit
-def row_by_row(context, sensor, m, ZT, d, rows, B):
+def row_by_row(context, sensor, m, a):
     """Assimilate the rows among themselves, in whitened anomalies: s = 1 + |zₖ|².
 
     On return ZT[k] and B[k] hold what row k is when its turn comes: zₖ, and what a regression coefficient on it does to
     the anomalies, -α zₖ / s, and to the mean, dₖ / (s √(N - 1)).
     """
+    ZT, d, rows, B = a.ZT, a.d, a.rows, a.B
     N = ZT.shape[1]
     taper = between_rows(context, sensor)
     for k in range(m):
@@ -74,9 +70,9 @@ def row_by_row(context, sensor, m, ZT, d, rows, B):
             for i in range(N):
                 dot += ZT[j, i] * z[i]
             if taper.size > 0:
-                dot *= taper[int(rows[j]), int(rows[k])]
+                dot *= taper[rows[j], rows[k]]
             d[j] -= dot * d[k] / s
-            add_scaled(N, -alpha * dot / s, z.ctypes.data, ZT[j].ctypes.data)
+            add_scaled(N, -alpha * dot / s, z, ZT[j])
 
 
 @jit
@@ -87,20 +83,18 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     is linear. With it, and many rows, they depend a little on the order of the rows.
     """
     X = ensemble(context, state)
-    N = X.shape[0]
-    _, ny = sensor_rows(context, sensor)
-    parts = workspace(N, ny, ny if localised(context) else min(ny, N), work)
-    ZT, Z, B, G, U, _, W, T, d, rows, expected, v, where, _, _, rest = parts
-    m = observe(context, sensor, u, y, X, ZT, d, rows, expected, innovation, innovation_std)
-    verdict = judge(context, sensor, m, ZT, Z, d, rows, G, U, v, score)
+    a, rest = begin_analysis(context, sensor, X.shape[0], work)
+    m = observe(context, sensor, u, y, X, a, innovation, innovation_std)
+    verdict = judge_reading(context, sensor, m, a, score)
     if verdict != USED:
         return verdict
-    index = next_draw(X, state)
+    index = next_draw(context, state)
     given = numbers(context)
-    row_by_row(context, sensor, m, ZT, d, rows, B)
-    find_rows(m, rows, where)
-    sweep_all(context, sensor, X, where, ZT, B, True, given[INFLATION], int(given[CREWS]), rest)
-    rotate(context, index, X, T, W, rest)
+    # The rows among themselves: zₖ and dₖ as row k finds them; then every state: aᵢ ← aᵢ - α K zₖᵢ, x̄ ← x̄ + K dₖ.
+    row_by_row(context, sensor, m, a)
+    find_places(m, a.rows, a.places)
+    regress_all(context, sensor, X, a.places, a.ZT, a.B, True, given[INFLATION], int(given[CREWS]), rest)
+    rotate(context, index, X, a, rest)
     add_spread(context, index, X, rest)
     settle(context, X)
     return USED

@@ -1,6 +1,6 @@
 """The ensemble transform Kalman filter: all members are turned at once so that their moments are the posterior's.
 
-In whitened anomalies Z (N, m) of the expected reading and d of the reading itself (see shared.py),
+In whitened anomalies Z (N, m) of the expected reading and d of the reading itself (see innovation.py),
 
     x̄ ← x̄ + Aᵀ w,   w = (I + Z Zᵀ)⁻¹ Z d / √(N - 1);      A ← T A,   T = (I + Z Zᵀ)^(-1/2)
 
@@ -17,13 +17,15 @@ from __future__ import annotations
 import numpy as np
 
 from ..compiled.context import options as numbers
-from ..compiled.context import sensor_rows
 from ..estimator import Estimator
 from ..numerics.jit import jit
-from ..numerics.simd import add_scaled
 from ..numerics.symmetric import gram, symmetric_eigen
+from ..numerics.vectors import add_scaled
 from ..track import FAILED, USED
+from .analysis import begin_analysis, work_size
 from .blocks import transform_all
+from .forecast import add_spread, predict
+from .innovation import judge_reading, observe
 from .rotation import ROTATION, rotate_members
 from .shared import (
     ADD,
@@ -32,47 +34,33 @@ from .shared import (
     INFLATION,
     MEMBERS,
     OWN,
-    add_spread,
     block,
     describe,
     ensemble,
-    judge,
     moments,
     next_draw,
-    observe,
     points,
-    predict,
     settle,
     start,
     state_size,
     tune,
-    work_size,
-    workspace,
 )
 
 
 @jit
-def symmetric_transform(m, ZT, Z, d, G, V, values, small, v, B, T):
-    """T = (I + Z Zᵀ)^(-1/2) and √(N - 1) w, from the eigenvectors of Zᵀ Z or Z Zᵀ, whichever is smaller.
+def symmetric_transform(m, a):
+    """T = (I + Z Zᵀ)^(-1/2) and v = √(N - 1) w, from the eigenvectors of Zᵀ Z or Z Zᵀ, whichever is smaller.
 
     With Zᵀ Z = V Λ Vᵀ,  T = I - Z V φ(Λ) Vᵀ Zᵀ,  φ(λ) = (1 - 1/√(1+λ))/λ = 1 / (1 + λ + √(1+λ)), which is good at 0.
 
     Args:
         m: Rows of the reading.
-        ZT: Whitened anomalies (m, N).
-        Z: Their transpose (N, m).
-        d: Whitened innovation (m,).
-        G: Scratch (side, side), side = min(m, N).
-        V: Scratch (side, side).
-        values: Scratch (side,).
-        small: Scratch (3 side,).
-        v: Gets √(N - 1) w, (N,).
-        B: Scratch (m, at least N).
-        T: Gets T (N, N).
+        a: The analysis, after `observe`; gets T and v.
 
     Returns:
         False if a number is not finite.
     """
+    ZT, Z, d, G, V, values, small, v, B, T = a.ZT, a.Z, a.d, a.G, a.V, a.values, a.small, a.v, a.B, a.T
     N = ZT.shape[1]
     for i in range(N):
         v[i] = 0.0
@@ -90,13 +78,13 @@ def symmetric_transform(m, ZT, Z, d, G, V, values, small, v, B, T):
                 b[i] = 0.0
             innovation = 0.0
             for j in range(m):
-                add_scaled(N, V[k, j], ZT[j].ctypes.data, b.ctypes.data)
+                add_scaled(N, V[k, j], ZT[j], b)
                 innovation += V[k, j] * d[j]
             grown = 1.0 + max(values[k], 0.0)
-            add_scaled(N, innovation / grown, b.ctypes.data, v.ctypes.data)
+            add_scaled(N, innovation / grown, b, v)
             phi = 1.0 / (grown + np.sqrt(grown))
             for i in range(N):
-                add_scaled(N, -phi * b[i], b.ctypes.data, T[i].ctypes.data)
+                add_scaled(N, -phi * b[i], b, T[i])
         return True
     gram(ZT, m, N, G)
     if not symmetric_eigen(G, N, values, V, small):
@@ -105,29 +93,32 @@ def symmetric_transform(m, ZT, Z, d, G, V, values, small, v, B, T):
     for i in range(N):
         g[i] = 0.0
     for k in range(m):
-        add_scaled(N, d[k], ZT[k].ctypes.data, g.ctypes.data)
+        add_scaled(N, d[k], ZT[k], g)
     for k in range(N):
         b = V[k]
         innovation = 0.0
         for i in range(N):
             innovation += b[i] * g[i]
         grown = 1.0 + max(values[k], 0.0)
-        add_scaled(N, innovation / grown, b.ctypes.data, v.ctypes.data)
+        add_scaled(N, innovation / grown, b, v)
         root = 1.0 / np.sqrt(grown)
         for i in range(N):
-            add_scaled(N, root * b[i], b.ctypes.data, T[i].ctypes.data)
+            add_scaled(N, root * b[i], b, T[i])
     return True
 
 
 @jit
-def global_analysis(context, index, m, ZT, Z, d, G, V, values, small, v, B, T, W, X, rest):
-    """Turn all states by one transform; False, and nothing is changed, if a number is not finite."""
+def transform_members(context, index, m, a, X, rest):
+    """x̄ + A ← x̄ + (T + 1 wᵀ) A for all states; False, and nothing is changed, if a number is not finite."""
     N = X.shape[0]
-    if not symmetric_transform(m, ZT, Z, d, G, V, values, small, v, B, T):
+    T, W, v = a.T, a.W, a.v
+    # T = (I + Z Zᵀ)^(-1/2),  w = (I + Z Zᵀ)⁻¹ Z d / √(N - 1)
+    if not symmetric_transform(m, a):
         return False
     given = numbers(context)
     if given[OWN] > 0.0:
         rotate_members(context.seed, index, T, W)
+    # W = T + 1 wᵀ, by which x̄ + W A are the members
     for i in range(N):
         for j in range(N):
             W[i, j] = given[INFLATION] * T[i, j] + v[j] / np.sqrt(N - 1.0)
@@ -145,16 +136,14 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     no covariance.
     """
     X = ensemble(context, state)
-    N = X.shape[0]
-    _, ny = sensor_rows(context, sensor)
-    parts = workspace(N, ny, min(ny, N), work)
-    ZT, Z, B, G, U, V, W, T, d, rows, expected, v, _, values, small, rest = parts
-    m = observe(context, sensor, u, y, X, ZT, d, rows, expected, innovation, innovation_std)
-    verdict = judge(context, sensor, m, ZT, Z, d, rows, G, U, v, score)
+    a, rest = begin_analysis(context, sensor, X.shape[0], work)
+    # Z = (h(xᵢ) - ȳ) R^(-1/2) / √(N - 1),  d = R^(-1/2) (y - ȳ)
+    m = observe(context, sensor, u, y, X, a, innovation, innovation_std)
+    verdict = judge_reading(context, sensor, m, a, score)
     if verdict != USED:
         return verdict
-    index = next_draw(X, state)
-    if not global_analysis(context, index, m, ZT, Z, d, G, V, values, small, v, B, T, W, X, rest):
+    index = next_draw(context, state)
+    if not transform_members(context, index, m, a, X, rest):
         return FAILED
     add_spread(context, index, X, rest)
     settle(context, X)

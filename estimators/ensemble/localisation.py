@@ -14,12 +14,12 @@ import numpy as np
 
 from ..errors import EstimatorError
 from ..estimator import Options
+from ..model.field import Field
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import floats, ints, jit, matrix
 from ..numerics.simd import WIDE
 from ..numerics.simd_ir import LANES
 from ..numerics.threads import threaded
-from .placed import check_placed
 
 _FIELDS = 6
 """Numbers a sensor in the table: how many blocks, and where they, their rows' starts, rows, tapers and the tapers
@@ -52,6 +52,30 @@ def apart(a: np.ndarray, b: np.ndarray, periods: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore"):
         difference = np.where(np.isfinite(periods), np.minimum(difference, periods - difference), difference)
     return np.sqrt(np.sum(difference**2, axis=-1))
+
+
+def check_placed(model: StateSpaceModel, radius: float) -> None:
+    """Refuse a radius of localisation on a model without positions; 0 is none.
+
+    Raises:
+        EstimatorError: If the radius is positive and a state or a sensor row has no position, or rows are correlated:
+            what makes them independent mixes rows that stand in different places.
+    """
+    if not radius > 0:
+        return
+    if model.correlated:
+        raise EstimatorError(
+            f"radius is {radius:g}, but the rows of {model.name}'s sensor {model.correlated} are correlated: made "
+            "independent, none of them has a place of its own; set radius to 0, or leave the correlation out"
+        )
+    states = isinstance(model.states, Field) or all(state.position is not None for state in model.states)
+    if states and all(row.position is not None for sensor in model.sensors for row in sensor.rows):
+        return
+    what = "sensor rows" if states else "states"
+    raise EstimatorError(
+        f"radius is {radius:g}, but model {model.name} does not say where its {what} are; "
+        "give them positions, or set radius to 0"
+    )
 
 
 def prepare(model: StateSpaceModel, options: Options) -> np.ndarray:
@@ -135,8 +159,8 @@ def reached(context, sensor):
     count = head[0]
     start = table[head[2] : head[2] + count + 1]
     entries = start[count]
-    tapers = floats(context.prepared + 8 * head[4], entries * WIDE)
-    return table[head[1] : head[1] + count], start, table[head[3] : head[3] + entries], matrix(tapers, 0, entries, WIDE)
+    tapers = matrix(floats(context.prepared, context.n_prepared), head[4], entries, WIDE)
+    return table[head[1] : head[1] + count], start, table[head[3] : head[3] + entries], tapers
 
 
 @jit
@@ -147,4 +171,4 @@ def between_rows(context, sensor):
     table = ints(context.prepared, context.n_prepared)
     ny = ints(context.row_count, context.n_sensors)[sensor]
     at = table[1 + _FIELDS * sensor + 5]
-    return matrix(floats(context.prepared + 8 * at, ny * ny), 0, ny, ny)
+    return matrix(floats(context.prepared, context.n_prepared), at, ny, ny)

@@ -14,7 +14,7 @@ from ..compiled.context import options as numbers
 from ..estimator import Option
 from ..numerics.jit import jit
 from ..numerics.random import key_of, normal
-from ..numerics.simd import add_scaled
+from ..numerics.vectors import add_scaled
 from .blocks import transform_all
 from .shared import CREWS, OWN, ROTATE
 
@@ -43,7 +43,7 @@ def rotate_members(seed, index, T, W):
                 dot = 0.0
                 for j in range(1, N):
                     dot += Q[i, j] * Q[k, j]
-                add_scaled(N, -dot, Q[k].ctypes.data, Q[i].ctypes.data)
+                add_scaled(N, -dot, Q[k], Q[i])
         norm = 0.0
         for j in range(1, N):
             norm += Q[i, j] * Q[i, j]
@@ -57,7 +57,7 @@ def rotate_members(seed, index, T, W):
             dot = 0.0
             for j in range(N):
                 dot += Q[i, j] * h[j]
-            add_scaled(N, -dot / half, h.ctypes.data, Q[i].ctypes.data)
+            add_scaled(N, -dot / half, h, Q[i])
         for i in range(N):
             for j in range(i):
                 Q[i, j], Q[j, i] = Q[j, i], Q[i, j]
@@ -65,19 +65,20 @@ def rotate_members(seed, index, T, W):
         for j in range(N):
             W[i, j] = 0.0
         for k in range(N):
-            add_scaled(N, Q[i, k], T[k].ctypes.data, W[i].ctypes.data)
+            add_scaled(N, Q[i, k], T[k], W[i])
     for i in range(N):
         for j in range(N):
             T[i, j] = W[i, j]
 
 
 @jit
-def rotate(context, index, X, T, W, rest):
-    """Turn the members X (N, n), where the option says so; T (N, N) and W (N, N + 1) are scratch."""
+def rotate(context, index, X, a, rest):
+    """Turn the members X (N, n), where the option says so; T (N, N) and W (N, N + 1) of the analysis are scratch."""
     given = numbers(context)
     if given[OWN] == 0.0:
         return
     N = X.shape[0]
+    T, W = a.T, a.W
     for i in range(N):
         for j in range(N):
             T[i, j] = 1.0 if i == j else 0.0

@@ -14,16 +14,15 @@ import numpy as np
 
 from ..compiled.context import circular_rows, circular_states, shown_states
 from ..compiled.sensor_noise import has_correlated_rows, independent_rows
+from ..compiled.verdict import verdict_of
 from ..estimator import Options
-from ..numerics.jit import flags, floats, inlined, ints, jit
+from ..numerics.jit import inlined, ints, jit
 from ..numerics.linalg import EPSILON, cholesky, mirror, solve_transposed, solve_unit, solve_upper, wrap
 from ..numerics.padded_rows import subtract_squares
 from ..numerics.simd_ir import padded
 from ..numerics.workspace import layout, start_of, take_matrix, take_vector
-from ..track import FAILED, GATED, HELD_OUT, MISSING, USED
+from ..track import FAILED, MISSING, USED
 from .robust import forget, is_robust, reweigh
-
-LOG_2PI = float(np.log(2.0 * np.pi))
 
 
 def state_size(options: Options, nx: int) -> int:
@@ -238,28 +237,16 @@ def factor(S, U, m, n):
 def judge(context, sensor, m, nu, U, score):
     """NIS, log-likelihood and verdict of an innovation with covariance Uᵀ U; nu (m,) becomes U⁻ᵀ nu.
 
-    NIS = νᵀ S⁻¹ ν;  log-likelihood = -½ (NIS + log det S + m log 2π)
-
-    Sources: Bar-Shalom, Li & Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), 5.4.2, for
-    the NIS; Schweppe (1965), doi:10.1109/TIT.1965.1053737, for the likelihood as that of the innovations.
+    NIS = νᵀ S⁻¹ ν. Source: Bar-Shalom, Li & Kirubarajan, Estimation with Applications to Tracking and Navigation
+    (2001), 5.4.2.
     """
-    score[1] = m
     solve_transposed(U, m, nu)
     nis = 0.0
     log_det = 0.0
     for i in range(m):
         nis += nu[i] * nu[i]
         log_det += 2.0 * np.log(U[i, i])
-    score[0] = nis
-    score[2] = -0.5 * (nis + log_det + m * LOG_2PI)
-    if flags(context.used, context.n_sensors)[sensor] == 0:
-        return HELD_OUT
-    limit = floats(context.gate, context.width + 1)[m]
-    if nis <= limit:
-        # A reading that far off would leave an estimate that is no number.
-        return USED if nis < np.inf else FAILED
-    # Of a NIS that is no number the model is the reason.
-    return GATED if limit < nis else FAILED
+    return verdict_of(context, sensor, m, nis, log_det, score)
 
 
 @inlined

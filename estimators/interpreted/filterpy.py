@@ -260,7 +260,7 @@ def _enkf(view: View) -> Any:
 
 
 def _members(view: View, state: np.ndarray) -> np.ndarray:
-    return state[: -ensemble.HEAD].reshape(-1, view.nx)
+    return ensemble.block(view.options, state, view.nx)
 
 
 def _settle(view: View, X: np.ndarray) -> None:

@@ -29,6 +29,7 @@ from .jit import jit
 from .simd import add_scaled, dot
 from .simd_ir import LANES
 from .symmetric import begin, tridiagonal
+from .workspace import layout
 
 _i64 = types.int64
 
@@ -78,6 +79,7 @@ _SHRINKS = _WEIGHTS / (1.0 + _SHIFTS)
 _NO_SHIFT, _ONE = np.zeros(LANES), np.eye(LANES)[0]
 
 
+@layout
 def scratch_of(n: int) -> int:
     """Numbers of scratch that `root_action` takes at order n."""
     return n * (4 + 3 * LANES) + LANES

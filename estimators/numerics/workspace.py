@@ -7,7 +7,7 @@ A filter declares its workspace as one function that takes arrays one after the 
         mean: Any
         end: int
 
-    @inlined
+    @layout
     def workspace(at, n, m):
         D, at = take_matrix(at, 2 * n + 1, m)
         mean, at = take_vector(at, m)
@@ -20,12 +20,13 @@ in Python from address zero without touching memory: `size_of(workspace, n, m)`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 from numba import carray
 from numba.extending import overload, register_jitable
 
-from .jit import _to_float, inlined, plain
+from .jit import _to_float, _to_int, floats, inlined, jit, plain
 
 WORD = 8
 """Bytes of a float64."""
@@ -34,14 +35,26 @@ layout = register_jitable
 """Decorator of a layout that stands in others: in Python a plain function, within a kernel compiled."""
 
 
+class Part(NamedTuple):
+    """What a layout hands out in Python: where an array begins, in bytes, and its shape."""
+
+    at: int
+    shape: tuple[int, ...]
+
+
 def take_matrix(at: int, rows: int, columns: int) -> tuple[Any, int]:
     """A matrix (rows, columns) that begins at the address `at`, and the address after it."""
-    return None, at + WORD * rows * columns
+    return Part(at, (rows, columns)), at + WORD * rows * columns
 
 
 def take_vector(at: int, n: int) -> tuple[Any, int]:
     """A vector (n,) that begins at the address `at`, and the address after it."""
-    return None, at + WORD * n
+    return Part(at, (n,)), at + WORD * n
+
+
+def take_integers(at: int, n: int) -> tuple[Any, int]:
+    """A vector (n,) of int64s that begins at the address `at`, and the address after it."""
+    return Part(at, (n,)), at + WORD * n
 
 
 # Not inlined: where Numba inlines an overload it looks for dead code, and takes a write through a field of a tuple,
@@ -62,6 +75,14 @@ def _take_vector(at, n):
     return take
 
 
+@overload(take_integers)
+def _take_integers(at, n):
+    def take(at, n):
+        return carray(_to_int(at), (n,)), at + WORD * n
+
+    return take
+
+
 @inlined
 def start_of(work):
     """The address at which a scratch array begins."""
@@ -71,3 +92,23 @@ def start_of(work):
 def size_of(workspace: Callable[..., Any], *sizes: int) -> int:
     """How many float64s a workspace of these sizes takes; its last field is where it ends."""
     return int(plain(workspace)(0, *sizes)[-1]) // WORD
+
+
+def view(part: Part, array: np.ndarray) -> np.ndarray:
+    """A part of a layout, called from address zero, as a view of the float64s that it lays out."""
+    begin = part.at // WORD
+    return array[begin : begin + int(np.prod(part.shape))].reshape(part.shape)
+
+
+@jit
+def after(work, end):
+    """What of a scratch array follows a workspace that ends at the address `end`."""
+    used = (end - work.ctypes.data) // WORD
+    return floats(end, work.size - used)
+
+
+@jit
+def share(work, crew, crews):
+    """The part of a scratch array that belongs to one of several crews."""
+    each = work.size // crews
+    return floats(work.ctypes.data + WORD * crew * each, each)

@@ -18,71 +18,96 @@ import numpy as np
 
 from ..compiled.context import options as numbers
 from ..compiled.context import sensor_variances
+from ..compiled.noise import semidefinite_root
+from ..compiled.sensor_noise import independent_rows
 from ..estimator import Estimator
-from ..gaussian.shared import admit
-from ..numerics.jit import ints, jit, matrix
-from ..numerics.random import key_of
+from ..numerics.jit import jit, matrix
+from ..numerics.random import ONE, key_of, normal
 from ..track import FAILED, MISSING, USED
-from .pf import finite_rows, predicted
-from .proposals import EXPECT, PROPOSE_PRIOR, predict, predictive, tune, work_size
-from .resampling import ancestors_of, take_ancestors
-from .shared import (
-    MEMBERS,
-    OPTIONS,
+from .cloud import DRAW, MEMBERS, OPTIONS, RESAMPLE, RESAMPLED, cloud_of, own_covariance, sized, tune, weigh_equally
+from .describe import describe, modes, moments, points, recoveries
+from .innovation import finite_rows
+from .proposals import (
     PROPOSE,
-    RESAMPLE,
-    RESAMPLED,
-    SETTLED,
-    describe,
-    modes,
-    moments,
-    next_draw,
-    points,
-    records_of,
-    recover,
-    recoveries,
-    sized,
-    start,
-    weigh_equally,
+    ahead_of,
+    expect_block,
+    expected_reading,
+    move_block,
+    place_draw,
+    predict,
+    room_of,
+    settle_draw,
+    work_size,
 )
-from .steps import children_of, keep, normalise, shared, sweep, total
+from .recovery import recover, start
+from .resampling import ancestors_of, take_ancestors
+from .steps import add_up, block_of, range_of, sweep, work_of
+from .weights import children_of, keep, normalise, phases
+
+
+@jit
+def propose_block(context, u, dt, sensor, y, key, value, state, work, number):
+    """Draw each member from its own N(x, P), that is x + L z, z ~ N(0, I); the weight is p(y | x) / p̂(y).
+
+    p̂ is the predictive density by which the particle was chosen.
+    """
+    nx = context.nx
+    n = int(numbers(context)[MEMBERS])
+    shared, cloud = work_of(context, work), cloud_of(state, nx, n)
+    room, sums = room_of(context, shared, number), block_of(context, shared, number).sums
+    ahead, L, z = ahead_of(context, shared).densities, room.L, room.z
+    G, d, seen = room.G, room.d, room.seen
+    independent_rows(context, sensor, y, sensor_variances(context, sensor), G, d)
+    records, log_w, joints = cloud.records, cloud.log_w, shared.joint
+    first, last = range_of(number, n)
+    place = np.uint64(first) * np.uint64(nx)
+    sums[2] = -np.inf
+    for i in range(first, last):
+        x, P = records[i, :nx], own_covariance(records[i], nx)
+        semidefinite_root(P, L)
+        sound = True
+        for a in range(nx):
+            z[a] = normal(key, place)
+            place += ONE
+            sound &= np.isfinite(z[a])
+        joint = -np.inf
+        if sound:
+            joint = place_draw(context, sensor, u, y, x, L, z, G, d, seen)
+            joint += log_w[i] - ahead[i]
+        settle_draw(P, joint, i, joints, sums)
+
+
+@jit
+def choose(context, key, state, work):
+    """Let each particle of the first stage's weights have its children, with the density by which it was chosen."""
+    nx = context.nx
+    n = int(numbers(context)[MEMBERS])
+    shared = work_of(context, work)
+    children = children_of(context, key, state, work)
+    ancestors_of(children, shared.ancestors)
+    take_ancestors(shared.ancestors, cloud_of(state, nx, n).records)
+    take_ancestors(shared.ancestors, matrix(ahead_of(context, shared).densities, 0, n, 1))
+    weigh_equally(state, nx, n)
+    state[RESAMPLED] += 1.0
 
 
 @jit
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """Choose by the predictive density, move, weigh by what it got wrong."""
-    nx = context.nx
-    n = int(numbers(context)[MEMBERS])
     if finite_rows(y, sensor_variances(context, sensor).size) == 0:
         return MISSING
-    sums, _, _, S_flat, U_flat, nu, _ = shared(context, work, n)
-    rows = sensor_variances(context, sensor).size
-    S = matrix(S_flat, 0, rows, rows)
-    settled = state[SETTLED]
-    index = next_draw(state)
-    sweep(EXPECT, context, u, 0.0, sensor, y, np.uint64(0), 0.0, state, work)
-    total(context, work, sums)
-    x = records_of(state, nx, n)[0, :nx]
-    m = predicted(context, u, sensor, y, x, sums, S, nu, innovation, innovation_std)
-    state[SETTLED] = settled
-    verdict = admit(context, sensor, m, nu, S, matrix(U_flat, 0, rows, rows), score)
-    log_sum = normalise(context, u, sensor, y, state, work, sums)
+    index, verdict = expected_reading(context, u, sensor, y, state, work, innovation, innovation_std, score)
+    # First stage: λ_j = w_j p̂_j(y), the log weights that `expected_reading` left
+    log_sum = normalise(context, state, work)
     if verdict == USED and log_sum > -np.inf:
-        key = key_of(context.seed, index, RESAMPLE)
-        children = children_of(context, u, sensor, y, key, sums, state, work)
-        ancestors = ints(work.ctypes.data, n)
-        ancestors_of(children, ancestors)
-        take_ancestors(ancestors, records_of(state, nx, n))
-        take_ancestors(ancestors, matrix(predictive(context, work, n), 0, n, 1))
-        weigh_equally(state, nx, n)
-        state[RESAMPLED] += 1.0
-        key = key_of(context.seed, index, PROPOSE)
-        sweep(PROPOSE_PRIOR, context, u, 0.0, sensor, y, key, 0.0, state, work)
-        total(context, work, sums)
-        second = normalise(context, u, sensor, y, state, work, sums)
+        choose(context, key_of(context.seed, index, RESAMPLE), state, work)
+        # Second: x_i ~ p(x | x_j'), w_i = p(y | x_i) / p̂_j(y)
+        sweep(PROPOSE, context, u, 0.0, sensor, y, key_of(context.seed, index, DRAW), 0.0, state, work)
+        add_up(context, work)
+        second = normalise(context, state, work)
         log_sum += second
         if log_sum > -np.inf:
-            keep(context, u, sensor, y, second, sums, state, work)
+            keep(context, second, state, work)
     score[2] = log_sum if log_sum > -np.inf else np.nan
     if verdict == FAILED or (verdict == USED and not log_sum > -np.inf):
         verdict = FAILED
@@ -108,4 +133,5 @@ APF = Estimator(
     recoveries=recoveries,
     options=tuple(option for option in OPTIONS if option.name != "fraction"),
     tune=tune,
+    prepare=phases(move_block, expect_block, propose_block),
 )

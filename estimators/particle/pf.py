@@ -16,42 +16,42 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled.context import circular_rows, sensor_variances
 from ..compiled.context import options as numbers
+from ..compiled.context import sensor_variances
 from ..compiled.noise import belief_root, noise_root
 from ..estimator import Estimator, Option, Options
 from ..gaussian.shared import admit
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import jit, matrix
-from ..numerics.linalg import wrap
+from ..numerics.jit import jit
 from ..numerics.random import key_of
 from ..track import FAILED, MISSING, USED
 from ..tuning import Tuning
-from .shared import (
+from .cloud import (
     DUPLICATES,
     EQUAL,
-    EXTRA,
     JITTER,
     MEMBERS,
     OPTIONS,
     PROCESS,
     RESAMPLE,
     SETTLED,
+    WIDTH,
     block,
-    describe,
-    modes,
-    moments,
+    cloud_of,
     next_draw,
-    points,
-    records_of,
-    recover,
-    recoveries,
-    settled_moments,
     sized,
-    start,
+    tune,
 )
-from .steps import JITTER as MOVE
-from .steps import PROPAGATE, WEIGH, first_residual, keep_or_resample, normalise, shared, sweep, total, tune, work_size
+from .describe import describe, modes, moments, points, recoveries
+from .innovation import finite_rows, predicted
+from .propagate import propagate_block, smooth_block, work_size
+from .recovery import recover, start
+from .steps import NO_KEY, add_up, sweep, work_of
+from .weigh import weigh_block
+from .weights import OWN, keep_or_resample, normalise, phases
+
+PROPAGATE, WEIGH, SMOOTH = range(OWN, OWN + 3)
+"""Phases of its own: x_i ~ p(x | x_i'); p(y | x_i); the kernel of the regularised filter."""
 
 
 @jit
@@ -60,59 +60,15 @@ def predict(context, u, dt, index, state, work):
     nx = context.nx
     n = int(numbers(context)[MEMBERS])
     index = next_draw(state)
-    sums, L, spare, _, _, _, _ = shared(context, work, n)
+    shared = work_of(context, work)
     if context.Q_varies == 0:
-        noise_root(context, records_of(state, nx, n)[0], u, dt, L, spare)
+        noise_root(context, cloud_of(state, nx, n).records[0], u, dt, shared.L, shared.spare)
     sweep(PROPAGATE, context, u, dt, 0, u, key_of(context.seed, index, PROCESS), 0.0, state, work)
-    total(context, work, sums)
-    if sums[0] > 0.0:
+    lost = add_up(context, work)[0]
+    if lost > 0.0:
         state[EQUAL] = 0.0
-        if sums[0] >= n:
+        if lost >= n:
             recover(context, index, state)
-
-
-@jit
-def finite_rows(y, rows):
-    """How many of the reading's rows are there."""
-    m = 0
-    for row in range(rows):
-        if np.isfinite(y[row]):
-            m += 1
-    return m
-
-
-@jit
-def predicted(context, u, sensor, y, x, sums, S, nu, innovation, innovation_std):
-    """Innovation and its covariance from the sums of `weigh`; S and ν hold the finite rows, x is the first particle.
-
-    Returns:
-        The number of finite rows.
-    """
-    r = sensor_variances(context, sensor)
-    circular = circular_rows(context, sensor)
-    m = finite_rows(y, r.size)
-    first_residual(context, u, sensor, y, x, innovation[: r.size])
-    k = 0
-    for row in range(r.size):
-        if not np.isfinite(y[row]):
-            innovation[row] = np.nan
-            continue
-        nu[k] = sums[4 + k] / sums[0]
-        for j in range(k + 1):
-            S[k, j] = sums[4 + m + k * m + j] / sums[0] - nu[k] * nu[j]
-            S[j, k] = S[k, j]
-        S[k, k] = max(S[k, k], 0.0) + r[row]
-        innovation[row] += nu[k]
-        if circular[row] != 0:
-            innovation[row] = wrap(innovation[row])
-        innovation_std[row] = np.sqrt(S[k, k])
-        k += 1
-    k = 0
-    for row in range(r.size):
-        if np.isfinite(y[row]):
-            nu[k] = innovation[row]
-            k += 1
-    return m
 
 
 @jit
@@ -122,34 +78,24 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     When no particle explains the reading, the verdict is `FAILED`, the reading is not used, and the cloud is widened
     (see `recover`).
     """
-    nx = context.nx
-    n = int(numbers(context)[MEMBERS])
-    sums, L, _, S_flat, U_flat, nu, _ = shared(context, work, n)
-    rows = sensor_variances(context, sensor).size
-    if finite_rows(y, rows) == 0:
+    if finite_rows(y, sensor_variances(context, sensor).size) == 0:
         return MISSING
+    shared, cloud = work_of(context, work), cloud_of(state, context.nx, int(numbers(context)[MEMBERS]))
     settled = state[SETTLED]
     index = next_draw(state)
-    sweep(WEIGH, context, u, 0.0, sensor, y, np.uint64(0), 0.0, state, work)
-    total(context, work, sums)
-    S = matrix(S_flat, 0, rows, rows)
-    U = matrix(U_flat, 0, rows, rows)
-    x = records_of(state, nx, n)[0]
-    m = predicted(context, u, sensor, y, x, sums, S, nu, innovation, innovation_std)
-    verdict = admit(context, sensor, m, nu, S, U, score)
+    # log w_i + log p(y | x_i), and ν = y - Σ w h(x), S = Σ w (h(x) - ȳ)(h(x) - ȳ)ᵀ + R for the gate
+    sweep(WEIGH, context, u, 0.0, sensor, y, NO_KEY, 0.0, state, work)
+    add_up(context, work)
+    m = predicted(context, u, sensor, y, cloud.records[0], shared, innovation, innovation_std)
+    verdict = admit(context, sensor, m, shared.nu, shared.S, shared.U, score)
     state[SETTLED] = settled
-    log_sum = normalise(context, u, sensor, y, state, work, sums)
+    # w_i ← w_i p(y | x_i) / Σ w p(y | x), and log p(y) = log Σ w p(y | x)
+    log_sum = normalise(context, state, work)
     score[2] = log_sum
     if verdict == USED and log_sum > -np.inf:
-        key = key_of(context.seed, index, RESAMPLE)
-        drawn = keep_or_resample(context, u, sensor, y, key, log_sum, sums, state, work)
-        if drawn and numbers(context)[EXTRA] > 0.0:
-            _, cov = settled_moments(state, nx)
-            belief_root(cov, L)
-            for i in range(nx):
-                for j in range(nx):
-                    L[i, j] *= numbers(context)[EXTRA]
-            sweep(MOVE, context, u, 0.0, sensor, y, key_of(context.seed, index, JITTER), 0.0, state, work)
+        drawn = keep_or_resample(context, key_of(context.seed, index, RESAMPLE), log_sum, state, work)
+        if drawn and numbers(context)[WIDTH] > 0.0:
+            smooth(context, key_of(context.seed, index, JITTER), cloud.cov, shared.L, state, work)
     elif verdict == USED or verdict == FAILED:
         verdict = FAILED
         recover(context, index, state)
@@ -157,6 +103,18 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         score[2] = np.nan
     return verdict
 
+
+@jit
+def smooth(context, key, cov, L, state, work):
+    """Move each particle by a draw from the kernel, whose root L is h times that of the cloud's covariance."""
+    belief_root(cov, L)
+    for i in range(L.shape[0]):
+        for j in range(L.shape[0]):
+            L[i, j] *= numbers(context)[WIDTH]
+    sweep(SMOOTH, context, state, 0.0, 0, state, key, 0.0, state, work)
+
+
+prepare = phases(propagate_block, weigh_block, smooth_block)
 
 BANDWIDTH = Option("bandwidth", 0.5, 0.0, 100.0, "", "kernel width as a part of the best for a Gaussian cloud")
 
@@ -173,8 +131,8 @@ def tune_regularised(options: Options, model: StateSpaceModel, tuning: Tuning) -
     nx = model.nx
     values = tune(options, model, tuning)
     power = 1.0 / (nx + 4)
-    values[EXTRA] = options["bandwidth"] * (4.0 / (nx + 2)) ** power * values[MEMBERS] ** -power
     values[DUPLICATES] = options["jitter"]
+    values[WIDTH] = options["bandwidth"] * (4.0 / (nx + 2)) ** power * values[MEMBERS] ** -power
     return values
 
 
@@ -197,6 +155,7 @@ PF = Estimator(
     options=OPTIONS,
     blocks=block,
     tune=tune,
+    prepare=prepare,
 )
 
 PF_REG = Estimator(
@@ -218,4 +177,5 @@ PF_REG = Estimator(
     options=(*OPTIONS, BANDWIDTH, JITTERED),
     blocks=block,
     tune=tune_regularised,
+    prepare=prepare,
 )

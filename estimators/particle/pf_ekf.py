@@ -13,31 +13,94 @@ import numpy as np
 
 from ..compiled.context import options as numbers
 from ..compiled.context import sensor_variances
+from ..compiled.noise import add_noise, semidefinite_root
+from ..compiled.sensor_noise import independent_rows
 from ..estimator import Estimator
-from ..gaussian.shared import admit
-from ..numerics.jit import jit, matrix
-from ..numerics.random import key_of
+from ..numerics.jit import jit
+from ..numerics.random import ONE, key_of, normal
 from ..track import FAILED, MISSING, USED
-from .pf import finite_rows, predicted
-from .proposals import EXPECT, PROPOSE_EKF, predict, tune, work_size
-from .shared import (
-    MEMBERS,
-    OPTIONS,
+from .cloud import DRAW, MEMBERS, OPTIONS, RESAMPLE, cloud_of, own_covariance, sized, tune
+from .describe import describe, modes, moments, points, recoveries
+from .innovation import finite_rows
+from .proposals import (
     PROPOSE,
-    RESAMPLE,
-    SETTLED,
-    describe,
-    modes,
-    moments,
-    next_draw,
-    points,
-    records_of,
-    recover,
-    recoveries,
-    sized,
-    start,
+    expect_block,
+    expected_reading,
+    look,
+    move_block,
+    place_draw,
+    predict,
+    room_of,
+    settle_draw,
+    work_size,
 )
-from .steps import keep_or_resample, normalise, shared, sweep, total
+from .recovery import recover, start
+from .steps import add_up, block_of, range_of, sweep, work_of
+from .weights import keep_or_resample, normalise, phases
+
+
+@jit
+def propose_block(context, u, dt, sensor, y, key, value, state, work, number):
+    """Draw each member from its EKF's posterior and set its joint log weight.
+
+    In coordinates z of P = L Lᵀ: z ~ N(ẑ, Σ) with ẑ = (H L)ᵀ S⁻¹ e, Σ = I - (H L)ᵀ S⁻¹ H L, and the weight
+    w' p(y | x) N(z; 0, I) / N(z; ẑ, Σ).
+    """
+    nx = context.nx
+    n = int(numbers(context)[MEMBERS])
+    shared, cloud = work_of(context, work), cloud_of(state, nx, n)
+    room, sums = room_of(context, shared, number), block_of(context, shared, number).sums
+    L, C, z, xi, HL, S, U = room.L, room.C, room.z, room.xi, room.HL, room.S, room.U
+    G, d, e, seen, scratch = room.G, room.d, room.e, room.seen, room.scratch
+    r = sensor_variances(context, sensor)
+    H = room.H[: r.size]
+    m = independent_rows(context, sensor, y, r, G, d)
+    records, log_w, joints = cloud.records, cloud.log_w, shared.joint
+    first, last = range_of(number, n)
+    place = np.uint64(first) * np.uint64(nx)
+    sums[2] = -np.inf
+    for i in range(first, last):
+        x, P = records[i, :nx], own_covariance(records[i], nx)
+        density = look(context, sensor, u, y, x, P, L, H, HL, S, U, e, seen, scratch)
+        # Where h or its slope is NaN there is no proposal: the particle stays and gets weight zero.
+        sound = -np.inf < density < np.inf
+        posterior(m, HL, U, seen, z, P)
+        semidefinite_root(P, C)
+        ratio = 0.0
+        for a in range(nx):
+            xi[a] = normal(key, place)
+            place += ONE
+            ratio += 0.5 * xi[a] * xi[a] + np.log(C[a, a])
+        add_noise(C, xi, z)
+        for a in range(nx):
+            ratio -= 0.5 * z[a] * z[a]
+        for a in range(nx):
+            sound &= np.isfinite(z[a])
+        joint = -np.inf
+        if sound:
+            joint = place_draw(context, sensor, u, y, x, L, z, G, d, seen)
+            joint += log_w[i] + ratio
+        settle_draw(P, joint, i, joints, sums)
+
+
+@jit
+def posterior(m, HL, U, seen, z, P):
+    """z = ẑ and the lower triangle of P = Σ, from what `look` left of m rows; H L becomes U⁻ᵀ H L."""
+    nx = z.size
+    for k in range(m):
+        for j in range(nx):
+            HL[k, j] /= U[k, k]
+            for below in range(k + 1, m):
+                HL[below, j] -= U[k, below] * HL[k, j]
+    for a in range(nx):
+        z[a] = 0.0
+        for k in range(m):
+            z[a] += HL[k, a] * seen[k]
+        for b in range(a + 1):
+            s = 1.0 if a == b else 0.0
+            for k in range(m):
+                s -= HL[k, a] * HL[k, b]
+            P[a, b] = s
 
 
 @jit
@@ -46,29 +109,17 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
 
     The log-likelihood of a reading that is not used is that of the particles' Gaussians, Σ w' N(y; h(x), S).
     """
-    n = int(numbers(context)[MEMBERS])
     if finite_rows(y, sensor_variances(context, sensor).size) == 0:
         return MISSING
-    sums, _, _, S_flat, U_flat, nu, _ = shared(context, work, n)
-    rows = sensor_variances(context, sensor).size
-    S = matrix(S_flat, 0, rows, rows)
-    settled = state[SETTLED]
-    index = next_draw(state)
-    sweep(EXPECT, context, u, 0.0, sensor, y, np.uint64(0), 0.0, state, work)
-    total(context, work, sums)
-    x = records_of(state, context.nx, n)[0, : context.nx]
-    m = predicted(context, u, sensor, y, x, sums, S, nu, innovation, innovation_std)
-    state[SETTLED] = settled
-    verdict = admit(context, sensor, m, nu, S, matrix(U_flat, 0, rows, rows), score)
+    index, verdict = expected_reading(context, u, sensor, y, state, work, innovation, innovation_std, score)
     if verdict == USED:
-        key = key_of(context.seed, index, PROPOSE)
-        sweep(PROPOSE_EKF, context, u, 0.0, sensor, y, key, 0.0, state, work)
-        total(context, work, sums)
-    log_sum = normalise(context, u, sensor, y, state, work, sums)
+        # x_i ~ q, log w_i + log p(y | x_i) p(x_i | x_i') / q(x_i)
+        sweep(PROPOSE, context, u, 0.0, sensor, y, key_of(context.seed, index, DRAW), 0.0, state, work)
+        add_up(context, work)
+    log_sum = normalise(context, state, work)
     score[2] = log_sum if log_sum > -np.inf else np.nan
     if verdict == USED and log_sum > -np.inf:
-        key = key_of(context.seed, index, RESAMPLE)
-        keep_or_resample(context, u, sensor, y, key, log_sum, sums, state, work)
+        keep_or_resample(context, key_of(context.seed, index, RESAMPLE), log_sum, state, work)
     elif verdict == USED or verdict == FAILED:
         verdict = FAILED
         recover(context, index, state)
@@ -93,4 +144,5 @@ PF_EKF = Estimator(
     recoveries=recoveries,
     options=OPTIONS,
     tune=tune,
+    prepare=phases(move_block, expect_block, propose_block),
 )

@@ -8,7 +8,7 @@ for the choice: in coordinates z of P = L Lᵀ, x + L z, so that a singular P is
 
 from __future__ import annotations
 
-from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,97 +25,134 @@ from ..compiled.context import (
 from ..compiled.context import options as numbers
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..compiled.noise import add_noise, semidefinite_root
+from ..compiled.sensor_noise import add_covariances
+from ..compiled.verdict import LOG_2PI
 from ..estimator import Options
-from ..gaussian.shared import LOG_2PI
-from ..model.state_space import StateSpaceModel
-from ..numerics.jit import address, floats, jit, matrix
+from ..gaussian.shared import admit
+from ..numerics.jit import jit
 from ..numerics.linalg import cholesky, congruence, solve_transposed, wrap
-from ..numerics.random import ONE, key_of, normal
-from ..tuning import Tuning
+from ..numerics.random import key_of
+from ..numerics.workspace import layout, size_of, take_matrix, take_vector
+from .cloud import EQUAL, MEMBERS, PROCESS, SETTLED, cloud_of, members, next_draw, own_covariance, wrap_record
+from .innovation import about, first_residual, predicted
 from .mode_draws import jump, jump_key
-from .shared import (
-    BLOCK,
-    EQUAL,
-    EXTRA,
-    MEMBERS,
-    PROCESS,
-    blocks_of,
-    log_weights,
-    members,
-    next_draw,
-    records_of,
-    recover,
-    wrap_record,
-)
-from .steps import (
-    OWN,
-    about,
-    block_count,
-    block_signature,
-    block_size,
-    blocks_start,
-    first_residual,
-    shared,
-    sums_size,
-    sweep,
-    total,
-)
-from .steps import tune as tune_cloud
-from .steps import work_size as cloud_work_size
+from .recovery import recover
+from .steps import NO_KEY, add_up, block_of, blocks_of, range_of, sweep, work_at, work_of
+from .weigh import log_density
+from .weights import OWN
 
-MOVE, EXPECT, PROPOSE_EKF, PROPOSE_PRIOR = range(OWN, OWN + 4)
-"""Phases: N(x, P) one step on; what it says of the reading; a draw from the EKF's posterior; a draw from N(x, P)."""
+MOVE, EXPECT, PROPOSE = range(OWN, OWN + 3)
+"""Phases: N(x, P) one step on; what it says of the reading; the filter's own draw."""
 
 
-def own_numbers(nx: int, ny: int) -> int:
-    """Scratch of a block: F, twice its square, L, C; H, H L, S, U; e, ŷ, ν̃; x', z, ξ; a Jacobian's."""
-    return 5 * nx * nx + 2 * ny * nx + 2 * ny * ny + 3 * ny + 3 * nx + scratch_size(nx, ny)
+class Room(NamedTuple):
+    """What a block's particles are worked on in, one after the other.
+
+    F (nx, nx) and T (2 nx, nx) for F P Fᵀ; roots L and C (nx, nx); H and H L (ny, nx), S and its factor U (ny, ny), e
+    and `seen` (ny,) of a look at the reading; the next state, z and ξ (nx,); R = G diag(d) Gᵀ of the rows that are
+    there; what a Jacobian takes.
+    """
+
+    F: Any
+    T: Any
+    L: Any
+    C: Any
+    H: Any
+    HL: Any
+    S: Any
+    U: Any
+    e: Any
+    seen: Any
+    forward: Any
+    z: Any
+    xi: Any
+    G: Any
+    d: Any
+    scratch: Any
+    end: int
 
 
-def work_size(options: dict[str, float], nx: int, ny: int) -> int:
-    """Scratch: the cloud's, the predictive log densities (N,), and each block's own."""
+@layout
+def room_at(at, nx, ny):
+    """Lay it out."""
+    F, at = take_matrix(at, nx, nx)
+    T, at = take_matrix(at, 2 * nx, nx)
+    L, at = take_matrix(at, nx, nx)
+    C, at = take_matrix(at, nx, nx)
+    H, at = take_matrix(at, ny, nx)
+    HL, at = take_matrix(at, ny, nx)
+    S, at = take_matrix(at, ny, ny)
+    U, at = take_matrix(at, ny, ny)
+    e, at = take_vector(at, ny)
+    seen, at = take_vector(at, ny)
+    forward, at = take_vector(at, nx)
+    z, at = take_vector(at, nx)
+    xi, at = take_vector(at, nx)
+    G, at = take_matrix(at, ny, ny)
+    d, at = take_vector(at, ny)
+    scratch, at = take_vector(at, scratch_size(nx, ny))
+    return Room(F, T, L, C, H, HL, S, U, e, seen, forward, z, xi, G, d, scratch, at)
+
+
+class Ahead(NamedTuple):
+    """What follows the cloud's scratch: the particles' predictive log densities (N,), and where the rooms begin."""
+
+    densities: Any
+    rooms: int
+    end: int
+
+
+@layout
+def ahead_at(at, nx, ny, n):
+    """Lay it out."""
+    densities, at = take_vector(at, n)
+    return Ahead(densities, at, at + blocks_of(n) * room_at(0, nx, ny).end)
+
+
+def work_size(options: Options, nx: int, ny: int) -> int:
+    """Scratch: the cloud's, the predictive log densities, and a room for each block."""
     n = members(options)
-    return cloud_work_size(options, nx, ny) + n + blocks_of(n) * own_numbers(nx, ny)
-
-
-@lru_cache(maxsize=1)
-def _own_code() -> float:
-    return float(address(_block, block_signature))
-
-
-def tune(options: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
-    """The cloud's numbers, and where the code of the phases above starts."""
-    values = tune_cloud(options, model, tuning)
-    values[EXTRA] = _own_code()
-    return values
+    return size_of(work_at, nx, ny, n) + size_of(ahead_at, nx, ny, n)
 
 
 @jit
-def predictive(context, work, n):
-    """The predictive log densities (N,) that `EXPECT` leaves."""
-    return floats(work.ctypes.data + 8 * (blocks_start(context, n) + block_count(n) * block_size(context)), n)
+def ahead_of(context, shared):
+    """What follows the cloud's scratch."""
+    return ahead_at(shared.end, context.nx, context.width, int(numbers(context)[MEMBERS]))
 
 
 @jit
-def _move(context, u, dt, key, log_w, records, first, last, F, T, forward, scratch):
-    """Predict N(x, P) of the members `first` to `last`; return how many left the numbers."""
+def room_of(context, shared, b):
+    """The room of block b."""
+    nx, ny = context.nx, context.width
+    return room_at(ahead_of(context, shared).rooms + b * room_at(0, nx, ny).end, nx, ny)
+
+
+@jit
+def move_block(context, u, dt, sensor, y, key, value, state, work, number):
+    """Predict N(x, P) of a block's members; its first sum is how many became infinite or NaN."""
     nx = context.nx
+    n = int(numbers(context)[MEMBERS])
+    shared, cloud = work_of(context, work), cloud_of(state, nx, n)
+    room = room_of(context, shared, number)
+    records, log_w, forward = cloud.records, cloud.log_w, room.forward
     circular = circular_states(context)
+    first, last = range_of(number, n)
     lost = 0
     chances = np.empty(context.n_modes)
     for i in range(first, last):
         x = records[i, :nx]
         if context.jump != 0:
             jump(context, x, u, dt, jump_key(key), i, chances)
-        P = matrix(records[i], nx, nx, nx)
+        P = own_covariance(records[i], nx)
         certain = True
         for j in range(nx):
             certain &= P[j, j] == 0.0
         if not certain:
-            state_jacobian(context, x, u, dt, F, scratch)
-            congruence(F, P, T)
+            state_jacobian(context, x, u, dt, room.F, room.scratch)
+            congruence(room.F, P, room.T)
         transition(context, x, u, dt, forward)
-        add_process_noise(context, x, u, dt, P, T[:nx])
+        add_process_noise(context, x, u, dt, P, room.T[:nx])
         finite = True
         for j in range(nx):
             finite &= np.isfinite(forward[j]) and np.isfinite(P[j, j])
@@ -129,21 +166,23 @@ def _move(context, u, dt, key, log_w, records, first, last, F, T, forward, scrat
             for j in range(nx):
                 for k in range(nx):
                     P[j, k] = 0.0
-    return lost
+    block_of(context, shared, number).sums[0] = lost
 
 
 @jit
-def _see(context, sensor, u, y, x, P, L, H, HL, S, U, e, expected, scratch):
-    """Residual e, L, H L and S = H P Hᵀ + R = Uᵀ U of one particle, over the finite rows.
+def look(context, sensor, u, y, x, P, room):
+    """Residual e, L, H L and S = H P Hᵀ + R = Uᵀ U of one particle, over the finite rows; `seen` gets U⁻ᵀ e.
 
     Returns:
         log N(e; 0, S), or NaN if it has none.
     """
     nx = x.size
+    L, HL, S, U, e, expected = room.L, room.HL, room.S, room.U, room.e, room.seen
     r = sensor_variances(context, sensor)
     circular = circular_rows(context, sensor)
+    H = room.H[: r.size]
     expect(context, sensor, x, u, expected)
-    sensor_jacobian(context, sensor, x, u, H, scratch)
+    sensor_jacobian(context, sensor, x, u, H, room.scratch)
     semidefinite_root(P, L)
     m = 0
     for row in range(r.size):
@@ -166,6 +205,7 @@ def _see(context, sensor, u, y, x, P, L, H, HL, S, U, e, expected, scratch):
         S[m, m] += r[row]
         expected[m] = e[m]
         m += 1
+    add_covariances(context, sensor, y, 1.0, S)
     if not cholesky(S, U, m):
         return np.nan
     solve_transposed(U, m, expected)
@@ -176,15 +216,18 @@ def _see(context, sensor, u, y, x, P, L, H, HL, S, U, e, expected, scratch):
 
 
 @jit
-def _expect(context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S, U, e, expected, scratch, sums):
-    """joint = log w + log N(y; h(x), H P Hᵀ + R), the second kept in `ahead`, and the sums of residuals and S - R.
+def expect_block(context, u, dt, sensor, y, key, value, state, work, number):
+    """joint = log w + log N(y; h(x), H P Hᵀ + R), the second kept ahead, and the sums of residuals and S - R.
 
     The sums are about `first_residual`.
     """
     nx = context.nx
-    n = joint.size
-    log_w = log_weights(state, nx, n)
-    records = records_of(state, nx, n)
+    n = int(numbers(context)[MEMBERS])
+    shared, cloud = work_of(context, work), cloud_of(state, nx, n)
+    room, sums = room_of(context, shared, number), block_of(context, shared, number).sums
+    joint, ahead = shared.joint, ahead_of(context, shared).densities
+    records, log_w, S, e = cloud.records, cloud.log_w, room.S, room.e
+    first, last = range_of(number, n)
     r = sensor_variances(context, sensor)
     own = has_own_likelihood(context, sensor)
     equal = state[EQUAL] != 0.0
@@ -196,14 +239,14 @@ def _expect(context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S
     sums[2] = -np.inf
     for i in range(first, last):
         x = records[i, :nx]
-        value = _see(context, sensor, u, y, x, matrix(records[i], nx, nx, nx), L, H, HL, S, U, e, expected, scratch)
-        sound = value < np.inf and log_w[i] > -np.inf
+        density = look(context, sensor, u, y, x, own_covariance(records[i], nx), room)
+        sound = density < np.inf and log_w[i] > -np.inf
         if own:
-            value = own_likelihood(context, sensor, y, x, u)
-        ahead[i] = value
-        if not -np.inf < value < np.inf:
-            value = -np.inf
-        joint[i] = log_w[i] + value
+            density = own_likelihood(context, sensor, y, x, u)
+        ahead[i] = density
+        if not -np.inf < density < np.inf:
+            density = -np.inf
+        joint[i] = log_w[i] + density
         if joint[i] > sums[2]:
             sums[2] = joint[i]
             sums[3] = i
@@ -217,6 +260,7 @@ def _expect(context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S
                 S[m, m] -= r[row]
                 e[m] = about(e[m], reference[row], circular[row])
                 m += 1
+        add_covariances(context, sensor, y, -1.0, S)
         for a in range(m):
             sums[4 + a] += w * e[a]
             for b in range(a + 1):
@@ -224,159 +268,25 @@ def _expect(context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S
 
 
 @jit
-def _log_density(context, sensor, u, y, x, expected):
-    """log p(y | x): Gaussian over the finite rows, or the sensor's own; -inf if it is no number."""
-    if has_own_likelihood(context, sensor):
-        value = own_likelihood(context, sensor, y, x, u)
-    else:
-        r = sensor_variances(context, sensor)
-        circular = circular_rows(context, sensor)
-        expect(context, sensor, x, u, expected)
-        value = 0.0
-        for row in range(r.size):
-            if np.isfinite(y[row]):
-                d = y[row] - expected[row]
-                if circular[row] != 0:
-                    d = wrap(d)
-                value -= 0.5 * (d * d / r[row] + LOG_2PI + np.log(r[row]))
-    return value if -np.inf < value < np.inf else -np.inf
+def place_draw(context, sensor, u, y, x, L, z, room):
+    """x ← x + L z, certain of itself; returns log p(y | x)."""
+    add_noise(L, z, x)
+    wrap_record(circular_states(context), x)
+    return log_density(context, sensor, u, y, x, room.G, room.d, room.seen)
 
 
 @jit
-def _propose(
-    context, sensor, u, y, key, ekf, state, joint, ahead, first, last, L, C, H, HL, S, U, e, expected, z, xi, scratch,
-    sums,
-):  # fmt: skip
-    """Move the members `first` to `last` into the reading and set their joint log weights.
-
-    EKF: z ~ N(ẑ, Σ) with ẑ = (H L)ᵀ S⁻¹ e, Σ = I - (H L)ᵀ S⁻¹ H L, and the weight
-    w' p(y | x) N(z; 0, I) / N(z; ẑ, Σ). Otherwise z ~ N(0, I), and the weight p(y | x) / p̂(y), with the predictive
-    density by which the particle was chosen.
-    """
-    nx = context.nx
-    n = joint.size
-    log_w = log_weights(state, nx, n)
-    records = records_of(state, nx, n)
-    circular = circular_states(context)
-    place = np.uint64(first) * np.uint64(nx)
-    finite_rows = 0
-    for row in range(sensor_variances(context, sensor).size):
-        finite_rows += np.isfinite(y[row])
-    sums[2] = -np.inf
-    for i in range(first, last):
-        x = records[i, :nx]
-        P = matrix(records[i], nx, nx, nx)
-        correction = 0.0
-        sound = True
-        if ekf:
-            seen = _see(context, sensor, u, y, x, P, L, H, HL, S, U, e, expected, scratch)
-            # Where h or its slope is no number there is no proposal: the particle stays and weighs nothing.
-            sound = -np.inf < seen < np.inf
-            # HL becomes U⁻ᵀ H L, `expected` holds U⁻ᵀ e.
-            for k in range(finite_rows):
-                for j in range(nx):
-                    HL[k, j] /= U[k, k]
-                    for below in range(k + 1, finite_rows):
-                        HL[below, j] -= U[k, below] * HL[k, j]
-            for a in range(nx):
-                z[a] = 0.0
-                for k in range(finite_rows):
-                    z[a] += HL[k, a] * expected[k]
-                for b in range(a + 1):
-                    s = 1.0 if a == b else 0.0
-                    for k in range(finite_rows):
-                        s -= HL[k, a] * HL[k, b]
-                    P[a, b] = s
-            semidefinite_root(P, C)
-            for a in range(nx):
-                xi[a] = normal(key, place)
-                place += ONE
-                correction += 0.5 * xi[a] * xi[a] + np.log(C[a, a])
-            add_noise(C, xi, z)
-            for a in range(nx):
-                correction -= 0.5 * z[a] * z[a]
-        else:
-            semidefinite_root(P, L)
-            for a in range(nx):
-                z[a] = normal(key, place)
-                place += ONE
-        for a in range(nx):
-            sound &= np.isfinite(z[a])
+def settle_draw(P, value, i, joint, sums):
+    """Member i has drawn: its covariance is zero, its joint log weight `value`, or zero weight if that is NaN."""
+    for a in range(P.shape[0]):
+        for b in range(P.shape[0]):
+            P[a, b] = 0.0
+    if not -np.inf < value < np.inf:
         value = -np.inf
-        if sound:
-            add_noise(L, z, x)
-            wrap_record(circular, x)
-            value = _log_density(context, sensor, u, y, x, expected)
-            value += log_w[i] + (correction if ekf else -ahead[i])
-        for a in range(nx):
-            for b in range(nx):
-                P[a, b] = 0.0
-        if not -np.inf < value < np.inf:
-            value = -np.inf
-        joint[i] = value
-        if value > sums[2]:
-            sums[2] = value
-            sums[3] = i
-
-
-@jit
-def _block(phase, context, u, dt, sensor, y, key, value, state, work, b):
-    nx, ny = context.nx, context.width
-    n = int(numbers(context)[MEMBERS])
-    first, last = b * BLOCK, min(n, (b + 1) * BLOCK)
-    joint = floats(work.ctypes.data + 8 * n, n)
-    ahead = predictive(context, work, n)
-    sums = floats(work.ctypes.data + 8 * (blocks_start(context, n) + b * block_size(context)), sums_size(context))
-    most = max(nx, ny)
-    own = 5 * nx * nx + 2 * ny * nx + 2 * ny * ny + 3 * ny + 3 * nx + 2 * nx + 2 * most
-    at = blocks_start(context, n) + block_count(n) * block_size(context) + n + b * own
-    F = matrix(work, at, nx, nx)
-    at += nx * nx
-    T = matrix(work, at, 2 * nx, nx)
-    at += 2 * nx * nx
-    L = matrix(work, at, nx, nx)
-    at += nx * nx
-    C = matrix(work, at, nx, nx)
-    at += nx * nx
-    m = sensor_variances(context, sensor).size
-    H = matrix(work, at, m, nx)
-    at += ny * nx
-    HL = matrix(work, at, m, nx)
-    at += ny * nx
-    S = matrix(work, at, m, m)
-    at += ny * ny
-    U = matrix(work, at, m, m)
-    at += ny * ny
-    e = floats(work.ctypes.data + 8 * at, m)
-    expected = floats(work.ctypes.data + 8 * (at + ny), m)
-    at += 3 * ny
-    forward = floats(work.ctypes.data + 8 * at, nx)
-    z = floats(work.ctypes.data + 8 * (at + nx), nx)
-    xi = floats(work.ctypes.data + 8 * (at + 2 * nx), nx)
-    at += 3 * nx
-    scratch = floats(work.ctypes.data + 8 * at, 2 * nx + 2 * most)
-    if phase == MOVE:
-        sums[0] = _move(
-            context,
-            u,
-            dt,
-            key,
-            log_weights(state, nx, n),
-            records_of(state, nx, n),
-            first,
-            last,
-            F,
-            T,
-            forward,
-            scratch,
-        )
-    elif phase == EXPECT:
-        _expect(context, sensor, u, y, state, joint, ahead, first, last, L, H, HL, S, U, e, expected, scratch, sums)
-    else:
-        _propose(
-            context, sensor, u, y, key, phase == PROPOSE_EKF, state, joint, ahead, first, last, L, C, H, HL, S, U, e,
-            expected, z, xi, scratch, sums,
-        )  # fmt: skip
+    joint[i] = value
+    if value > sums[2]:
+        sums[2] = value
+        sums[3] = i
 
 
 @jit
@@ -384,10 +294,23 @@ def predict(context, u, dt, index, state, work):
     """N(x, P) of every particle one step on: x ← f(x), P ← F P Fᵀ + Q."""
     n = int(numbers(context)[MEMBERS])
     index = next_draw(state)
-    sums, _, _, _, _, _, _ = shared(context, work, n)
     sweep(MOVE, context, u, dt, 0, u, key_of(context.seed, index, PROCESS), 0.0, state, work)
-    total(context, work, sums)
-    if sums[0] > 0.0:
+    lost = add_up(context, work)[0]
+    if lost > 0.0:
         state[EQUAL] = 0.0
-        if sums[0] >= n:
+        if lost >= n:
             recover(context, index, state)
+
+
+@jit
+def expected_reading(context, u, sensor, y, state, work, innovation, innovation_std, score):
+    """What the particles' Gaussians say of the reading, and the verdict on it."""
+    shared, cloud = work_of(context, work), cloud_of(state, context.nx, int(numbers(context)[MEMBERS]))
+    settled = state[SETTLED]
+    index = next_draw(state)
+    sweep(EXPECT, context, u, 0.0, sensor, y, NO_KEY, 0.0, state, work)
+    add_up(context, work)
+    x = cloud.records[0, : context.nx]
+    m = predicted(context, u, sensor, y, x, shared, innovation, innovation_std)
+    state[SETTLED] = settled
+    return index, admit(context, sensor, m, shared.nu, shared.S, shared.U, score)

@@ -17,21 +17,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled.context import circular_rows, circular_states, expect, sensor_variances
+from ..compiled.context import circular_states, sensor_variances
 from ..compiled.context import options as numbers
 from ..estimator import Estimator, Option, Options
 from ..gaussian.shared import admit
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import floats, jit, matrix
-from ..numerics.linalg import wrap
 from ..numerics.peaks import Mode, modes_of
 from ..numerics.random import key_of, normal
 from ..track import FAILED, MISSING, USED
-from .mode_draws import any_mode, jump_key, nearest_mode
-from .pf import finite_rows
-from .rbpf_steps import ADOPT, CONDITION, PREDICT, fix_mode, sample, tune, work_size
-from .shared import (
-    DRAWN,
+from .cloud import (
     EQUAL,
     HEAD,
     MEMBERS,
@@ -41,19 +36,26 @@ from .shared import (
     RESAMPLE,
     SETTLED,
     START,
-    cloud,
-    cloud_moments,
-    describe,
-    moments,
+    cloud_of,
     next_draw,
-    records_of,
-    recoveries,
+    own_covariance,
     sized,
+    views,
     weigh_equally,
+    weights_of,
     wrap_record,
 )
-from .shared import OPTIONS as CLOUD_OPTIONS
-from .steps import keep_or_resample, normalise, shared, sweep, total
+from .cloud import OPTIONS as CLOUD_OPTIONS
+from .describe import DRAWN, describe, moments, recoveries
+from .innovation import finite_rows
+from .mode_draws import any_mode, jump_key, nearest_mode
+from .moments import cloud_moments
+from .rbpf_condition import adopt_block, condition_block, mixture, refer
+from .rbpf_predict import predict_block
+from .rbpf_sampling import fix_mode, sample
+from .rbpf_work import ADOPT, CONDITION, PREDICT, tune, work_size
+from .steps import NO_KEY, add_up, sweep, work_of
+from .weights import keep_or_resample, normalise, phases
 
 
 @jit
@@ -73,7 +75,7 @@ def _begin(context, mean, cov, index, stream, state):
     """The cloud that stands for N(mean, cov), of equal weights; the head's counters stay."""
     nx = context.nx
     n = int(numbers(context)[MEMBERS])
-    records = records_of(state, nx, n)
+    records = cloud_of(state, nx, n).records
     key = key_of(context.seed, index, stream)
     C, column, before = np.empty((nx, nx)), np.empty(nx), np.empty(nx)
     mode = 0.0
@@ -87,7 +89,7 @@ def _begin(context, mean, cov, index, stream, state):
             j = context.mode
             std = np.sqrt(cov[j, j])
             mode = nearest_mode(context, mean[j] + std * normal(jump_key(key), np.uint64(i)), mean[j], std)
-        _spread(context, C, True, key, i, mode, x, matrix(records[i], nx, nx, nx), column, before)
+        _spread(context, C, True, key, i, mode, x, own_covariance(records[i], nx), column, before)
     weigh_equally(state, nx, n)
     state[SETTLED] = 0.0
 
@@ -98,14 +100,15 @@ def start(context, mean, cov, state):
     circular = circular_states(context)
     for i in range(HEAD):
         state[i] = 0.0
+    cloud = cloud_of(state, mean.size, int(numbers(context)[MEMBERS]))
     for j in range(mean.size):
-        state[HEAD + j] = circular[j]
+        cloud.circular[j] = circular[j]
     _begin(context, mean, cov, 0, START, state)
 
 
 @jit
 def _recover(context, index, state):
-    """Widen a cloud in which no particle explains the reading, as `particle.recover` does: any mode, twice the spread.
+    """Widen a cloud in which no particle explains the reading, as `recover` does: any mode, twice the spread.
 
     The sampled states move by a draw from the cloud's covariance, the linear ones get it added to theirs.
     """
@@ -121,7 +124,7 @@ def _recover(context, index, state):
         prior = matrix(floats(context.prior_cov, nx * nx), 0, nx, nx)
         _begin(context, floats(context.prior_mean, nx), prior, index, RECOVER, state)
         return
-    records = records_of(state, nx, n)
+    records = cloud_of(state, nx, n).records
     key = key_of(context.seed, index, RECOVER)
     C, column, before = np.empty((nx, nx)), np.empty(nx), np.empty(nx)
     mode = 0.0
@@ -134,7 +137,7 @@ def _recover(context, index, state):
                 C[a, context.mode] = 0.0
                 C[context.mode, a] = 0.0
             mode = any_mode(context, jump_key(key), i)
-        _spread(context, C, False, key, i, mode, records[i, :nx], matrix(records[i], nx, nx, nx), column, before)
+        _spread(context, C, False, key, i, mode, records[i, :nx], own_covariance(records[i], nx), column, before)
     state[SETTLED] = 0.0
 
 
@@ -146,60 +149,12 @@ def predict(context, u, dt, index, state, work):
     """
     n = int(numbers(context)[MEMBERS])
     index = next_draw(state)
-    sums, _, _, _, _, _, _ = shared(context, work, n)
     sweep(PREDICT, context, u, dt, 0, u, key_of(context.seed, index, PROCESS), 0.0, state, work)
-    total(context, work, sums)
-    if sums[0] > 0.0:
+    lost = add_up(context, work)[0]
+    if lost > 0.0:
         state[EQUAL] = 0.0
-        if sums[0] >= n:
+        if lost >= n:
             _recover(context, index, state)
-
-
-@jit
-def _refer(context, sensor, u, state, reference):
-    """What the first particle that can tell expects of the sensor: close to what all do, as a place to sum from."""
-    n = int(numbers(context)[MEMBERS])
-    records = records_of(state, context.nx, n)
-    for i in range(n):
-        expect(context, sensor, records[i, : context.nx], u, reference)
-        finite = True
-        for k in range(reference.size):
-            finite &= np.isfinite(reference[k])
-        if finite:
-            return
-    for k in range(reference.size):
-        reference[k] = 0.0
-
-
-@jit
-def _mixture(context, sensor, y, sums, S, nu, innovation, innovation_std):
-    """Innovation and its covariance, those of the mixture of the particles' predictions; `nu` holds the reference.
-
-    ν = y - Σ w ŷ,  S = Σ w (S_i + ŷ ŷᵀ) - (Σ w ŷ)(Σ w ŷ)ᵀ
-
-    Returns:
-        The number of finite rows.
-    """
-    r = sensor_variances(context, sensor)
-    angles = circular_rows(context, sensor)
-    m = finite_rows(y, r.size)
-    k = 0
-    for row in range(r.size):
-        if not np.isfinite(y[row]):
-            continue
-        shift = sums[4 + k] / sums[0]
-        # Row `row` moves up to k ≤ row.
-        nu[k] = y[row] - nu[row] - shift
-        if angles[row] != 0:
-            nu[k] = wrap(nu[k])
-        for j in range(k + 1):
-            S[k, j] = sums[4 + m + k * m + j] / sums[0] - shift * sums[4 + j] / sums[0]
-            S[j, k] = S[k, j]
-        S[k, k] = max(S[k, k], r[row])
-        innovation[row] = nu[k]
-        innovation_std[row] = np.sqrt(S[k, k])
-        k += 1
-    return m
 
 
 @jit
@@ -207,32 +162,30 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     """Each particle a Kalman update; w ← w N(y; h(x), H P Hᵀ + R); resampling where few carry the weight.
 
     NIS is that of the mixture's mean and covariance, the log-likelihood the mixture's own, log Σ w N. When no particle
-    explains the reading the verdict is `FAILED`, the reading is not used, and the cloud is widened. A reading beyond
-    the numbers fails alone.
+    explains the reading the verdict is `FAILED`, the reading is not used, and the cloud is widened. A reading that
+    is infinite fails alone.
     """
-    n = int(numbers(context)[MEMBERS])
     rows = sensor_variances(context, sensor).size
     if finite_rows(y, rows) == 0:
         return MISSING
-    sums, _, _, S_flat, U_flat, nu, _ = shared(context, work, n)
-    S = matrix(S_flat, 0, rows, rows)
+    shared = work_of(context, work)
     settled = state[SETTLED]
     index = next_draw(state)
-    _refer(context, sensor, u, state, nu[:rows])
-    sweep(CONDITION, context, u, 0.0, sensor, y, np.uint64(0), 0.0, state, work)
-    total(context, work, sums)
-    m = _mixture(context, sensor, y, sums, S, nu, innovation, innovation_std)
-    verdict = admit(context, sensor, m, nu, S, matrix(U_flat, 0, rows, rows), score)
+    refer(context, sensor, u, state, shared.nu[:rows])
+    # Each particle's Kalman update, aside, and log w_i + log N(y; h(x_i), H P_i Hᵀ + R)
+    sweep(CONDITION, context, u, 0.0, sensor, y, NO_KEY, 0.0, state, work)
+    add_up(context, work)
+    m = mixture(context, sensor, y, shared, innovation, innovation_std)
+    verdict = admit(context, sensor, m, shared.nu, shared.S, shared.U, score)
     state[SETTLED] = settled
     score[2] = np.nan
     if verdict == USED:
-        sweep(ADOPT, context, u, 0.0, sensor, y, np.uint64(0), 0.0, state, work)
-    log_sum = normalise(context, u, sensor, y, state, work, sums)
+        sweep(ADOPT, context, u, 0.0, sensor, y, NO_KEY, 0.0, state, work)
+    log_sum = normalise(context, state, work)
     if log_sum > -np.inf:
         score[2] = log_sum
     if verdict == USED and log_sum > -np.inf:
-        key = key_of(context.seed, index, RESAMPLE)
-        keep_or_resample(context, u, sensor, y, key, log_sum, sums, state, work)
+        keep_or_resample(context, key_of(context.seed, index, RESAMPLE), log_sum, state, work)
     elif verdict == USED or (verdict == FAILED and not score[0] == np.inf):
         verdict = FAILED
         state[SETTLED] = 0.0
@@ -242,7 +195,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
 
 def points(options: Options, state: np.ndarray, nx: int) -> np.ndarray:
     """Draws of the mixture (`DRAWN`, nx): particles picked by weight at even steps, and one of each's Gaussian."""
-    w, records = cloud(options, state, nx)
+    w, records = weights_of(options, state, nx)
     picked = np.minimum(np.searchsorted(np.cumsum(w), (np.arange(DRAWN) + 0.5) / DRAWN), len(w) - 1)
     P = records[picked, nx:].reshape(DRAWN, nx, nx)
     values, vectors = np.linalg.eigh(np.where(np.isfinite(P), P, 0.0))
@@ -252,7 +205,7 @@ def points(options: Options, state: np.ndarray, nx: int) -> np.ndarray:
 
 def modes(options: Options, state: np.ndarray, nx: int) -> list[Mode]:
     """The peaks of the mixture."""
-    return modes_of(points(options, state, nx), state[HEAD : HEAD + nx] != 0.0)
+    return modes_of(points(options, state, nx), views(options, state, nx).circular != 0.0)
 
 
 def applies(model: StateSpaceModel) -> str | None:
@@ -288,5 +241,6 @@ RBPF = Estimator(
     recoveries=recoveries,
     options=OPTIONS,
     tune=tune,
+    prepare=phases(predict_block, condition_block, adopt_block),
     applies=applies,
 )

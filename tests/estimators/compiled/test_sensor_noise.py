@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 
 from estimators.compiled.sensor_noise import has_correlated_rows, independent_rows
-from estimators.errors import EstimatorError, ModelError
+from estimators.errors import ModelError
 from estimators.fold import Fold
 from estimators.log import READING, Log
 from estimators.model.correlation import correlation_of, covariance_of
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
-from estimators.registry import find_estimator
 from estimators.tuning import Tuning
 from sources.simulation.simulator import Simulator
 from tests.sources.can.can_tools import read_all
@@ -104,12 +103,6 @@ def test_a_sensor_holds_any_matrix_so_that_models_compare():
 def test_what_is_no_correlation_is_refused(correlation, message):
     with pytest.raises(ModelError, match=rf"model three: the correlation of sensor three .*{message}"):
         model(correlation)
-
-
-def test_filters_that_take_rows_as_independent_say_so():
-    with pytest.raises(EstimatorError, match="sensor three are correlated, and pf takes .* independent; use kf"):
-        find_estimator("pf", model(C))
-    assert find_estimator("pf", model(None))
 
 
 def test_the_simulator_draws_correlated_noise():

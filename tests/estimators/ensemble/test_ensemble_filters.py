@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from estimators.compiled.model import compile_model
-from estimators.ensemble import localisation, shared
+from estimators.ensemble import analysis, localisation, shared
 from estimators.ensemble.localisation import gaspari_cohn
 from estimators.errors import EstimatorError
 from estimators.fold import Fold
@@ -388,7 +388,8 @@ def test_bits_are_the_same_on_any_number_of_threads(name, monkeypatch):
     options = {"members": 11, "inflation": 1.02, "additive": 0.01} | ({} if name == "etkf" else {"radius": 8.0})
     states = []
     for crews in (1, 2, 5):
-        monkeypatch.setattr(shared, "crews", lambda numbers, start, crews=crews: crews)
+        for module in (shared, analysis):
+            monkeypatch.setattr(module, "crews", lambda numbers, start, crews=crews: crews)
         fold = Fold(name, LORENZ96, Tuning.of(LORENZ96).with_options(options), log)
         fold.advance()
         states.append(fold._state.copy())

@@ -11,7 +11,7 @@ from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
 from estimators.log import READING, TICK, Log, Readings
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
-from estimators.particle.shared import RECOVERIES, block, members
+from estimators.particle.cloud import RECOVERIES, block, members
 from estimators.track import FAILED, GATED, HELD_OUT, MISSING, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import SECOND, JointGaussian, random_linear, random_log

@@ -11,7 +11,7 @@ from estimators.errors import EstimatorError, ModelError
 from estimators.fold import Fold, fold
 from estimators.log import READING, TICK, Log, Readings
 from estimators.model.state_space import Jump, Noise, Row, Sensor, State, StateSpaceModel
-from estimators.particle.shared import RECOVERIES
+from estimators.particle.cloud import RECOVERIES
 from estimators.track import FAILED, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import SECOND, random_linear, random_log

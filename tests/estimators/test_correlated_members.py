@@ -1,0 +1,122 @@
+"""Correlated rows of a sensor in particle and ensemble filters, against the dense Gaussian solution."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from estimators.errors import EstimatorError
+from estimators.fold import Fold, fold
+from estimators.log import READING, Log, Readings
+from estimators.model.correlation import covariance_of
+from estimators.models.lorenz96 import LORENZ96
+from estimators.registry import ESTIMATORS, checked
+from estimators.tuning import Tuning
+from tests.estimators.linear_models import random_linear
+
+C = ((1.0, 0.8, -0.5), (0.8, 1.0, -0.2), (-0.5, -0.2, 1.0))
+MATRICES = random_linear(np.random.default_rng(3), 4, 1)
+MODEL = replace(
+    MATRICES.model,
+    sensors=(*MATRICES.model.sensors[:2], replace(MATRICES.model.sensors[2], correlation=C)),
+    conditionally_linear=MATRICES.model.state_names,
+)
+Y = np.array([1.3, -0.4, 2.2])
+H, OFFSET, R = MATRICES.H[2], MATRICES.D[2] @ MATRICES.u, covariance_of(C, MATRICES.R[2])
+THERE = [[0, 1, 2], [0, 2], [1, 2], [2]]
+
+
+def log_of(there):
+    y = np.full(3, np.nan)
+    y[there] = Y[there]
+    log = Log(MODEL.width)
+    log.extend(Readings.one(0, 0, READING, 2, y, MODEL.width))
+    return log
+
+
+def update(mean, P, there):
+    """Mean, covariance, NIS, log-likelihood and √diag S of N(mean, P) given the rows that are there."""
+    h = H[there]
+    S = h @ P @ h.T + R[np.ix_(there, there)]
+    K = P @ h.T @ np.linalg.inv(S)
+    nu = Y[there] - h @ mean - OFFSET[there]
+    nis = nu @ np.linalg.solve(S, nu)
+    log_likelihood = -0.5 * (nis + np.linalg.slogdet(S)[1] + nu.size * np.log(2 * np.pi))
+    return mean + K @ nu, P - K @ S @ K.T, nis, log_likelihood, np.sqrt(np.diag(S))
+
+
+@pytest.mark.parametrize("there", THERE)
+@pytest.mark.parametrize("members", [2, 3, 40])
+@pytest.mark.parametrize("name", ["enkf", "etkf", "ensrf", "letkf"])
+def test_ensembles_take_the_whole_r(name, members, there):
+    """Kalman's update of the sample moments: an identity, but for the covariance of enkf, which is right on average."""
+    run = Fold(name, MODEL, Tuning.of(MODEL).with_options({"members": members}), log_of(there))
+    before = run.points()
+    run.advance()
+    after = run.points()
+    mean, P, nis, log_likelihood, std = update(before.mean(0), np.cov(before.T), there)
+    np.testing.assert_allclose(after.mean(0), mean, rtol=0, atol=1e-10)
+    if name != "enkf":
+        np.testing.assert_allclose(np.cov(after.T), P, rtol=0, atol=1e-10)
+    assert run.track.nis[0] == pytest.approx(nis, rel=1e-9)
+    assert run.track.log_likelihood[0] == pytest.approx(log_likelihood, rel=1e-9)
+    np.testing.assert_allclose(run.track.innovation_std[0, there], std, rtol=1e-9)
+
+
+def test_perturbations_are_correlated():
+    """The spread of enkf is Kalman's on average over the draws of v ~ N(0, R).
+
+    For Gaussian perturbations a sample covariance from N = 2000 members is off by P √(2 / N), 3 %; five of these.
+    """
+    run = Fold("enkf", MODEL, Tuning.of(MODEL).with_options({"members": 2000}), log_of([0, 1, 2]))
+    before = run.points()
+    run.advance()
+    _, P, *_ = update(before.mean(0), np.cov(before.T), [0, 1, 2])
+    scale = np.sqrt(np.diag(P))
+    off = (np.cov(run.points().T) - P) / np.outer(scale, scale)
+    assert np.max(np.abs(off)) < 5 * np.sqrt(2 / 2000)
+
+
+@pytest.mark.parametrize("there", THERE)
+def test_rbpf_with_nothing_to_sample_is_the_kalman_filter(there):
+    track = fold("rbpf", MODEL, Tuning.of(MODEL).with_options({"particles": 2}), log_of(there))
+    mean, P, nis, log_likelihood, std = update(MATRICES.mean, np.diag(MATRICES.std**2), there)
+    np.testing.assert_allclose(track.mean[0], mean, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(track.std[0], np.sqrt(np.diag(P)), rtol=1e-9)
+    assert track.nis[0] == pytest.approx(nis, rel=1e-9)
+    assert track.log_likelihood[0] == pytest.approx(log_likelihood, rel=1e-9)
+    np.testing.assert_allclose(track.innovation_std[0, there], std, rtol=1e-9)
+
+
+@pytest.mark.parametrize("there", THERE)
+@pytest.mark.parametrize("name", ["pf", "pf-ekf", "apf"])
+def test_particles_are_weighed_by_the_whole_r(name, there):
+    """The mean of 40 clouds is right to its standard error, but for a bias of 1/N of the posterior's spread.
+
+    The likelihood is unbiased, so its mean over the clouds is right to its standard error too.
+    """
+    tuning = Tuning.of(MODEL).with_options({"particles": 4000})
+    runs = [fold(name, MODEL, replace(tuning, seed=seed), log_of(there)) for seed in range(40)]
+    mean, P, nis, log_likelihood, std = update(MATRICES.mean, np.diag(MATRICES.std**2), there)
+    means = np.array([run.mean[0] for run in runs])
+    error = means.std(axis=0, ddof=1) / np.sqrt(len(runs))
+    assert np.all(np.abs(means.mean(axis=0) - mean) < 5 * error + 20 / 4000 * np.sqrt(np.diag(P)))
+    ratio = np.array([np.exp(run.log_likelihood[0] - log_likelihood) for run in runs])
+    assert ratio.std() < 0.5 and abs(ratio.mean() - 1) < 5 * ratio.std(ddof=1) / np.sqrt(len(runs))
+    # S is a sample covariance of 40 × 4000 draws.
+    assert abs(np.mean([run.nis[0] for run in runs]) / nis - 1) < 0.05
+    stds = np.mean([run.innovation_std[0, there] for run in runs], axis=0)
+    np.testing.assert_allclose(stds, std, rtol=5 / np.sqrt(2 * 40 * 4000))
+
+
+def test_correlated_rows_cannot_be_localised():
+    sensor = LORENZ96.sensors[0]
+    n = len(sensor.rows)
+    correlation = np.eye(n) + 0.3 * (np.eye(n, k=1) + np.eye(n, k=-1))
+    model = replace(LORENZ96, sensors=(replace(sensor, correlation=correlation), *LORENZ96.sensors[1:]))
+    for name in ("enkf", "ensrf", "letkf"):
+        assert checked(ESTIMATORS[name], model, {"radius": 0.0})
+        with pytest.raises(EstimatorError, match="radius is 4, but the rows of lorenz96's sensor .* set radius to 0"):
+            checked(ESTIMATORS[name], model, {"radius": 4.0})
+        with pytest.raises(EstimatorError, match="are correlated: made independent, none of them has a place"):
+            Fold(name, model, Tuning.of(model).with_options({"radius": 4.0}), Log(model.width))
