@@ -279,7 +279,8 @@ def test_a_model_from_a_file_beside_the_yaml(monkeypatch: pytest.MonkeyPatch) ->
             PUMP.replace("0.01", "-1.0"),
             "./pump.py:Pump",
             ModelError,
-            "pump.py:13: model pump: sensor level.level has variance -1.0; it must be positive",
+            "pump.py:13: model pump: sensor level.level has variance -1.0; it must be positive, or zero of a row without "
+            "noise",
         ),
     ],
 )
