@@ -56,12 +56,14 @@ def propose_block(context, u, dt, sensor, y, key, value, state, work, number):
     shared, cloud = work_of(context, work), cloud_of(state, nx, n)
     room, sums = room_of(context, shared, number), block_of(context, shared, number).sums
     ahead, L, z = ahead_of(context, shared).densities, room.L, room.z
-    independent_rows(context, sensor, y, sensor_variances(context, sensor), room.G, room.d)
+    G, d, seen = room.G, room.d, room.seen
+    independent_rows(context, sensor, y, sensor_variances(context, sensor), G, d)
+    records, log_w, joints = cloud.records, cloud.log_w, shared.joint
     first, last = range_of(number, n)
     place = np.uint64(first) * np.uint64(nx)
     sums[2] = -np.inf
     for i in range(first, last):
-        x, P = cloud.records[i, :nx], own_covariance(cloud.records[i], nx)
+        x, P = records[i, :nx], own_covariance(records[i], nx)
         semidefinite_root(P, L)
         sound = True
         for a in range(nx):
@@ -70,9 +72,9 @@ def propose_block(context, u, dt, sensor, y, key, value, state, work, number):
             sound &= np.isfinite(z[a])
         joint = -np.inf
         if sound:
-            joint = place_draw(context, sensor, u, y, x, L, z, room)
-            joint += cloud.log_w[i] - ahead[i]
-        settle_draw(P, joint, i, shared.joint, sums)
+            joint = place_draw(context, sensor, u, y, x, L, z, G, d, seen)
+            joint += log_w[i] - ahead[i]
+        settle_draw(P, joint, i, joints, sums)
 
 
 @jit

@@ -50,18 +50,21 @@ def propose_block(context, u, dt, sensor, y, key, value, state, work, number):
     n = int(numbers(context)[MEMBERS])
     shared, cloud = work_of(context, work), cloud_of(state, nx, n)
     room, sums = room_of(context, shared, number), block_of(context, shared, number).sums
-    L, C, z, xi = room.L, room.C, room.z, room.xi
+    L, C, z, xi, HL, S, U = room.L, room.C, room.z, room.xi, room.HL, room.S, room.U
+    G, d, e, seen, scratch = room.G, room.d, room.e, room.seen, room.scratch
     r = sensor_variances(context, sensor)
-    m = independent_rows(context, sensor, y, r, room.G, room.d)
+    H = room.H[: r.size]
+    m = independent_rows(context, sensor, y, r, G, d)
+    records, log_w, joints = cloud.records, cloud.log_w, shared.joint
     first, last = range_of(number, n)
     place = np.uint64(first) * np.uint64(nx)
     sums[2] = -np.inf
     for i in range(first, last):
-        x, P = cloud.records[i, :nx], own_covariance(cloud.records[i], nx)
-        seen = look(context, sensor, u, y, x, P, room)
+        x, P = records[i, :nx], own_covariance(records[i], nx)
+        density = look(context, sensor, u, y, x, P, L, H, HL, S, U, e, seen, scratch)
         # Where h or its slope is NaN there is no proposal: the particle stays and gets weight zero.
-        sound = -np.inf < seen < np.inf
-        posterior(m, room, z, P)
+        sound = -np.inf < density < np.inf
+        posterior(m, HL, U, seen, z, P)
         semidefinite_root(P, C)
         ratio = 0.0
         for a in range(nx):
@@ -75,15 +78,14 @@ def propose_block(context, u, dt, sensor, y, key, value, state, work, number):
             sound &= np.isfinite(z[a])
         joint = -np.inf
         if sound:
-            joint = place_draw(context, sensor, u, y, x, L, z, room)
-            joint += cloud.log_w[i] + ratio
-        settle_draw(P, joint, i, shared.joint, sums)
+            joint = place_draw(context, sensor, u, y, x, L, z, G, d, seen)
+            joint += log_w[i] + ratio
+        settle_draw(P, joint, i, joints, sums)
 
 
 @jit
-def posterior(m, room, z, P):
+def posterior(m, HL, U, seen, z, P):
     """z = ẑ and the lower triangle of P = Σ, from what `look` left of m rows; H L becomes U⁻ᵀ H L."""
-    HL, U, seen = room.HL, room.U, room.seen
     nx = z.size
     for k in range(m):
         for j in range(nx):
