@@ -29,7 +29,7 @@ from ..compiled.sensor_noise import add_covariances, has_correlated_rows
 from ..compiled.verdict import LOG_2PI
 from ..estimator import Options
 from ..gaussian.shared import admit
-from ..numerics.jit import jit
+from ..numerics.jit import inlined, jit
 from ..numerics.linalg import cholesky, congruence, solve_transposed, wrap
 from ..numerics.random import key_of
 from ..numerics.workspace import layout, size_of, take_matrix, take_vector
@@ -272,7 +272,7 @@ def expect_block(context, u, dt, sensor, y, key, value, state, work, number):
                 sums[4 + m + a * m + b] += w * (e[a] * e[b] + S[a, b])
 
 
-@jit
+@inlined
 def place_draw(context, sensor, u, y, x, L, z, G, d, seen):
     """x ← x + L z, certain of itself; returns log p(y | x)."""
     add_noise(L, z, x)
@@ -280,7 +280,7 @@ def place_draw(context, sensor, u, y, x, L, z, G, d, seen):
     return log_density(context, sensor, u, y, x, G, d, seen)
 
 
-@jit
+@inlined
 def settle_draw(P, value, i, joint, sums):
     """Member i has drawn: its covariance is zero, its joint log weight `value`, or zero weight if that is NaN."""
     for a in range(P.shape[0]):
