@@ -16,7 +16,7 @@ from ..compiled.context import sensor_variances
 from ..compiled.noise import add_noise, semidefinite_root
 from ..compiled.sensor_noise import independent_rows
 from ..estimator import Estimator
-from ..numerics.jit import jit
+from ..numerics.jit import inlined, jit
 from ..numerics.random import ONE, key_of, normal
 from ..track import FAILED, MISSING, USED
 from .cloud import DRAW, MEMBERS, OPTIONS, RESAMPLE, cloud_of, own_covariance, sized, tune
@@ -83,7 +83,7 @@ def propose_block(context, u, dt, sensor, y, key, value, state, work, number):
         settle_draw(P, joint, i, joints, sums)
 
 
-@jit
+@inlined
 def posterior(m, HL, U, seen, z, P):
     """z = ẑ and the lower triangle of P = Σ, from what `look` left of m rows; H L becomes U⁻ᵀ H L."""
     nx = z.size

@@ -25,11 +25,11 @@ from ..compiled.context import (
 from ..compiled.context import options as numbers
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..compiled.noise import add_noise, semidefinite_root
-from ..compiled.sensor_noise import add_covariances
+from ..compiled.sensor_noise import add_covariances, has_correlated_rows
 from ..compiled.verdict import LOG_2PI
 from ..estimator import Options
 from ..gaussian.shared import admit
-from ..numerics.jit import jit
+from ..numerics.jit import inlined, jit
 from ..numerics.linalg import cholesky, congruence, solve_transposed, wrap
 from ..numerics.random import key_of
 from ..numerics.workspace import layout, size_of, take_matrix, take_vector
@@ -136,6 +136,7 @@ def move_block(context, u, dt, sensor, y, key, value, state, work, number):
     shared, cloud = work_of(context, work), cloud_of(state, nx, n)
     room = room_of(context, shared, number)
     records, log_w, forward = cloud.records, cloud.log_w, room.forward
+    F, T, scratch = room.F, room.T, room.scratch
     circular = circular_states(context)
     first, last = range_of(number, n)
     lost = 0
@@ -149,10 +150,10 @@ def move_block(context, u, dt, sensor, y, key, value, state, work, number):
         for j in range(nx):
             certain &= P[j, j] == 0.0
         if not certain:
-            state_jacobian(context, x, u, dt, room.F, room.scratch)
-            congruence(room.F, P, room.T)
+            state_jacobian(context, x, u, dt, F, scratch)
+            congruence(F, P, T)
         transition(context, x, u, dt, forward)
-        add_process_noise(context, x, u, dt, P, room.T[:nx])
+        add_process_noise(context, x, u, dt, P, T[:nx])
         finite = True
         for j in range(nx):
             finite &= np.isfinite(forward[j]) and np.isfinite(P[j, j])
@@ -170,19 +171,17 @@ def move_block(context, u, dt, sensor, y, key, value, state, work, number):
 
 
 @jit
-def look(context, sensor, u, y, x, P, room):
-    """Residual e, L, H L and S = H P Hᵀ + R = Uᵀ U of one particle, over the finite rows; `seen` gets U⁻ᵀ e.
+def look(context, sensor, u, y, x, P, L, H, HL, S, U, e, expected, scratch):
+    """Residual e, L, H L and S = H P Hᵀ + R = Uᵀ U of one particle, over the finite rows; `expected` gets U⁻ᵀ e.
 
     Returns:
         log N(e; 0, S), or NaN if it has none.
     """
     nx = x.size
-    L, HL, S, U, e, expected = room.L, room.HL, room.S, room.U, room.e, room.seen
     r = sensor_variances(context, sensor)
     circular = circular_rows(context, sensor)
-    H = room.H[: r.size]
     expect(context, sensor, x, u, expected)
-    sensor_jacobian(context, sensor, x, u, H, room.scratch)
+    sensor_jacobian(context, sensor, x, u, H, scratch)
     semidefinite_root(P, L)
     m = 0
     for row in range(r.size):
@@ -205,7 +204,8 @@ def look(context, sensor, u, y, x, P, room):
         S[m, m] += r[row]
         expected[m] = e[m]
         m += 1
-    add_covariances(context, sensor, y, 1.0, S)
+    if has_correlated_rows(context, sensor):
+        add_covariances(context, sensor, y, 1.0, S)
     if not cholesky(S, U, m):
         return np.nan
     solve_transposed(U, m, expected)
@@ -226,10 +226,13 @@ def expect_block(context, u, dt, sensor, y, key, value, state, work, number):
     shared, cloud = work_of(context, work), cloud_of(state, nx, n)
     room, sums = room_of(context, shared, number), block_of(context, shared, number).sums
     joint, ahead = shared.joint, ahead_of(context, shared).densities
-    records, log_w, S, e = cloud.records, cloud.log_w, room.S, room.e
+    records, log_w = cloud.records, cloud.log_w
+    H = room.H[: sensor_variances(context, sensor).size]
+    L, HL, S, U, e, seen, scratch = room.L, room.HL, room.S, room.U, room.e, room.seen, room.scratch
     first, last = range_of(number, n)
     r = sensor_variances(context, sensor)
     own = has_own_likelihood(context, sensor)
+    correlated = has_correlated_rows(context, sensor)
     equal = state[EQUAL] != 0.0
     circular = circular_rows(context, sensor)
     reference = np.empty(r.size)
@@ -239,7 +242,8 @@ def expect_block(context, u, dt, sensor, y, key, value, state, work, number):
     sums[2] = -np.inf
     for i in range(first, last):
         x = records[i, :nx]
-        density = look(context, sensor, u, y, x, own_covariance(records[i], nx), room)
+        P = own_covariance(records[i], nx)
+        density = look(context, sensor, u, y, x, P, L, H, HL, S, U, e, seen, scratch)
         sound = density < np.inf and log_w[i] > -np.inf
         if own:
             density = own_likelihood(context, sensor, y, x, u)
@@ -260,22 +264,23 @@ def expect_block(context, u, dt, sensor, y, key, value, state, work, number):
                 S[m, m] -= r[row]
                 e[m] = about(e[m], reference[row], circular[row])
                 m += 1
-        add_covariances(context, sensor, y, -1.0, S)
+        if correlated:
+            add_covariances(context, sensor, y, -1.0, S)
         for a in range(m):
             sums[4 + a] += w * e[a]
             for b in range(a + 1):
                 sums[4 + m + a * m + b] += w * (e[a] * e[b] + S[a, b])
 
 
-@jit
-def place_draw(context, sensor, u, y, x, L, z, room):
+@inlined
+def place_draw(context, sensor, u, y, x, L, z, G, d, seen):
     """x ← x + L z, certain of itself; returns log p(y | x)."""
     add_noise(L, z, x)
     wrap_record(circular_states(context), x)
-    return log_density(context, sensor, u, y, x, room.G, room.d, room.seen)
+    return log_density(context, sensor, u, y, x, G, d, seen)
 
 
-@jit
+@inlined
 def settle_draw(P, value, i, joint, sums):
     """Member i has drawn: its covariance is zero, its joint log weight `value`, or zero weight if that is NaN."""
     for a in range(P.shape[0]):
