@@ -56,9 +56,11 @@ def nearest(name: str, names: Iterable[str]) -> str:
     """The remedy for a name that is not among `names`: the near ones, or all of them if they are few."""
     names = [str(item) for item in names]
     near = get_close_matches(name, names, n=3, cutoff=0.6)
+    lower = name.lower()
     if not near and len(name) > 2:
-        lower = name.lower()
         near = [item for item in names if lower in item.lower() or (len(item) > 2 and item.lower() in lower)][:3]
+    elif not near and name:
+        near = [item for item in names if item.lower().startswith(lower)][:3]
     if near:
         *others, last = map(shown_name, near)
         return f"did you mean {', '.join(others)}{' or ' if others else ''}{last}?"

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import EventError
+from ..errors import EventError, nearest
 from .batch import BEFORE, INPUT, READING, TICK, TRUTH, Readings
 
 if TYPE_CHECKING:
@@ -139,12 +138,5 @@ def _index(what: str, name: str, names: Sequence[str], model: StateSpaceModel) -
     try:
         return names.index(name)
     except ValueError:
-        near = get_close_matches(str(name), list(names[:1000]), n=3, cutoff=0.4)
-        rule = f"near: {', '.join(near)}" if near else f"it has {_listed(names)}"
-        raise EventError(f"{model.name} has no {what} {name!r}; {rule}") from None
-
-
-def _listed(names: Sequence[str]) -> str:
-    if not len(names):
-        return "none"
-    return ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+        remedy = nearest(str(name), names[:1000])
+        raise EventError(f"{model.name} has no {what} {name!r}; {remedy}") from None

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from estimators.diagnostics.health import HealthPolicy
 from estimators.log import READING, Readings
 from estimators.models import MODELS
 from estimators.tuning import Tuning
@@ -37,6 +38,7 @@ def twin(history=200_000, horizon=2.0, tick=1000.0, model=MODEL, estimator="kf")
         recorded=False,
         pairs=np.array([[0, 1]]),
         config=config,
+        policy=HealthPolicy(degraded_after=time.degraded_after, stale_after=time.stale_after),
     )
 
 

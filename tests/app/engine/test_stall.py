@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from app.engine.refolder import Refolder
 from app.engine.stall import LONG, PATIENCE, Stall, unanswered
 from app.recording.reader import finished, read_recording
 from tests.app.scripted import wait_for
+from tests.conftest import ROOT
 
 MODEL = """
 from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
@@ -74,7 +74,7 @@ class Child:
         self.lines = []
         self.process = subprocess.Popen(
             [sys.executable, "-m", "app.cli.main", *map(str, words)],
-            cwd=Path(__file__).parents[2],
+            cwd=ROOT,
             stderr=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             text=True,

@@ -21,6 +21,7 @@ from app.rerun.feed import RerunFeed
 from app.twin.twin import load_twin
 from app.viser.view import ViserView
 from config.loader import shipped
+from estimators.events.order import sorted_order
 from estimators.fold import Fold
 from estimators.log import INPUT, READING, TICK, TRUTH, Log, Readings
 from estimators.registry import ESTIMATORS, unfit
@@ -110,7 +111,8 @@ def asset(model, count, seed=0):
             values += np.sqrt([row.variance for row in rows]) * rng.standard_normal(len(rows))
         now = round(t * 1e9)
         batches.append(Readings.one(now, now, kind, channel, values, model.width))
-    return Readings.concat(batches, model.width)
+    events = Readings.concat(batches, model.width)
+    return events.select(sorted_order(events))
 
 
 class Running:

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 from collections import namedtuple
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +26,7 @@ from estimators.fold import Fold
 from estimators.log import Log
 from sources.memory import MemorySource
 from tests.app.scripted import MODEL, Scripted, readings, twin, wait_for
+from tests.conftest import ROOT
 
 COUNT = 6000
 TIMES = np.arange(1, COUNT + 1) * 0.01
@@ -308,7 +308,7 @@ import sys
 sys.path.insert(0, {root!r})
 import numpy as np
 from pathlib import Path
-from app.pull import Pull
+from app.engine.outputs import Pull
 from app.recording.format import RecordingFile
 from estimators.log import READING, Readings
 from estimators.track import Track
@@ -332,7 +332,7 @@ file.close()
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_memory_does_not_grow_with_what_was_written(tmp_path):
     """6000 writes are those of forty minutes; Rerun's own sink keeps 2 kB of each for the footer."""
-    code = GROWTH.format(root=str(Path(__file__).parents[2]), path=str(tmp_path / "x.rrd"))
+    code = GROWTH.format(root=str(ROOT), path=str(tmp_path / "x.rrd"))
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert int(child.stdout) < 2_000_000
 
@@ -342,7 +342,7 @@ def test_memory_does_not_grow_with_what_was_written(tmp_path):
 def test_a_terminal_that_closes_leaves_a_whole_recording(name, tmp_path):
     path = tmp_path / "run.rrd"
     words = ["run", "motor_winding", "--headless", "--record", str(path)]
-    child = subprocess.Popen([sys.executable, "-m", "app.cli.main", *words], cwd=Path(__file__).parents[2])
+    child = subprocess.Popen([sys.executable, "-m", "app.cli.main", *words], cwd=ROOT)
     try:
         wait_for(lambda: path.exists() and path.stat().st_size > 2000, 120.0)
         os.kill(child.pid, getattr(signal, name))

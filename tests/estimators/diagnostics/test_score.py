@@ -77,7 +77,9 @@ def test_sensors_held_out_are_judged_row_by_row(result):
         result.held_out["sonar.near"].rmse == pytest.approx(np.sqrt(12.5))
         and result.held_out["sonar.near"].coverage == 0.5
     )
-    assert result.held_out["sonar.far"] == (0.5, 0.0)
+    assert result.held_out["sonar.far"] == (0.5, 0.0, -0.5)
+    # The prediction is 3 too low once and 4 too high once.
+    assert result.held_out["sonar.near"].bias == 0.5
 
 
 def test_pictures_of_a_field_weigh_as_many_cells_as_they_knew():

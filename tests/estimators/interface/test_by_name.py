@@ -87,10 +87,10 @@ def test_truth_of_far_apart_states_of_a_field_is_told_in_blocks():
 
 
 WRONG = {
-    "a sensor": (lambda log: log.add("windng", 1.0, 2.0), "no sensor 'windng'; near: winding"),
+    "a sensor": (lambda log: log.add("windng", 1.0, 2.0), "no sensor 'windng'; did you mean winding"),
     "an input": (lambda log: log.add_inputs(1.0, speed=2.0), "motor_winding has no input 'speed'; it has none"),
     "no input": (lambda log: log.add_inputs(1.0), "no input is given; motor_winding has none"),
-    "a state": (lambda log: log.add_truth(1.0, temperatur=2.0), "no state 'temperatur'; near: temperature"),
+    "a state": (lambda log: log.add_truth(1.0, temperatur=2.0), "no state 'temperatur'; did you mean temperature"),
     "values": (
         lambda log: log.add("winding", [1.0, 2.0], [1.0]),
         "have shape .1,. for 2 times; the shape must be .2,.",
@@ -106,11 +106,11 @@ WRONG = {
         lambda log: fold("kf", MOTOR, log, R=9.0),
         "R is 9.0; it must be given by name, such as {'winding'",
     ),
-    "a name of R": (lambda log: fold("kf", MOTOR, log, R={"windng": 9.0}), "near: R.winding"),
+    "a name of R": (lambda log: fold("kf", MOTOR, log, R={"windng": 9.0}), "did you mean R.winding"),
     "many of R": (lambda log: fold("kf", MOTOR, log, R={"winding": [1, 2]}), r"R\['winding'\] has shape .2,."),
     "R of zero": (lambda log: fold("kf", MOTOR, log, R={"winding": 0.0}), "a variance must be positive"),
     "a held out name": (lambda log: fold("kf", MOTOR, log, held_out="gnss"), "use.gnss"),
-    "a filter": (lambda log: fold("ufk", MOTOR, log), "near: ukf"),
+    "a filter": (lambda log: fold("ufk", MOTOR, log), "did you mean ukf"),
     "an option": (lambda log: fold("ukf", MOTOR, log, alhpa=0.5), "no option 'alhpa'; it has alpha"),
     "a word for an option": (
         lambda log: fold("pf", MOTOR, log, resampling="stratifed"),
