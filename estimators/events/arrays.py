@@ -60,7 +60,7 @@ def readings(model: StateSpaceModel, sensor: str, seconds: Any, values: Any, var
 def inputs(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Readings:
     """Inputs by name; see `Log.add_inputs`."""
     if not named:
-        raise EventError(f"add_inputs: no input is given; {model.name} has {_listed(model.input_names)}")
+        raise EventError(f"add_inputs: no input is given; {nearest('', model.input_names)}")
     t = nanoseconds("seconds", seconds)
     batch = _blank(t, INPUT, 0, model.width)
     for name, values in named.items():
@@ -71,7 +71,7 @@ def inputs(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Re
 def truth(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Readings:
     """True states by name, in as few events a time as their places in the state allow; see `Log.add_truth`."""
     if not named:
-        raise EventError(f"add_truth: no state is given; {model.name} has {_listed(model.state_names)}")
+        raise EventError(f"add_truth: no state is given; {nearest('', model.state_names)}")
     t = nanoseconds("seconds", seconds)
     known = {
         _index("state", name, model.state_names, model): _column(name, values, t.size) for name, values in named.items()
