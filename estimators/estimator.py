@@ -31,7 +31,7 @@ from .compiled.context import context_type
 from .errors import EstimatorError
 from .model.state_space import StateSpaceModel
 from .numerics.jit import F1, F2, address, caller, f64, i64
-from .numerics.peaks import Mode
+from .numerics.peaks import Peak
 from .tuning import Tuning
 
 start_signature = types.void(context_type, F1, F2, F1)
@@ -94,7 +94,7 @@ class Estimator:
     `applies(model)` gives the reason why the estimator does not fit a model, or None; `refuses(model, options)` why
     it does not with these options. `options` are complete here (see `complete`). `state_size(options, nx)` and
     `work_size(options, nx, ny)` count float64s; `moments(options, state, nx)` gives mean and covariance,
-    `points(options, state, nx)` what to draw beside the mean (sigma points, particles) as (k, nx), `modes(options,
+    `points(options, state, nx)` what to draw beside the mean (sigma points, particles) as (k, nx), `peaks(options,
     state, nx)` the peaks where there can be several, `recoveries(state)` how often the filter had to recover since its
     start. `tune(options, model, tuning)` turns the options into the numbers that the compiled functions read; it may
     raise EstimatorError. `memory(options, model)` counts numbers that the state holds beyond `state_size`.
@@ -125,7 +125,7 @@ class Estimator:
     applies: Callable[[StateSpaceModel], str | None] = lambda model: None
     refuses: Callable[[StateSpaceModel, Options], str | None] = lambda model, options: None
     runs: Callable[[Options, int], float] = lambda options, nx: 1.0
-    modes: Callable[[Options, np.ndarray, int], list[Mode]] | None = None
+    peaks: Callable[[Options, np.ndarray, int], list[Peak]] | None = None
     recoveries: Callable[[np.ndarray], int] | None = None
     interpreted: bool = False
     fixed_r: bool = False

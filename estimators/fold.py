@@ -30,7 +30,7 @@ from .interpreted.view import View
 from .log import BEFORE, INPUT, READING, TICK, TRUTH, Log
 from .model.mode_as_number import indicator
 from .model.state_space import StateSpaceModel
-from .numerics.peaks import Mode
+from .numerics.peaks import Peak
 from .numerics.quantiles import chi_square_quantile
 from .registry import find_estimator
 from .snapshots import Base, Snapshot, Snapshots
@@ -242,11 +242,11 @@ class Fold:
         dt /= max(1, int(np.ceil(dt / self.model.max_step)))
         return questions(self._compiled, finite, self._u, self._held["p"], self._held["q"], dt)
 
-    def modes(self) -> list[Mode]:
+    def peaks(self) -> list[Peak]:
         """The peaks of the estimate, the heaviest first; a Gaussian filter has one."""
-        if self.estimator.modes is not None:
-            return self.estimator.modes(self.options, self._state, self.model.nx)
-        return [Mode(1.0, *self.moments())]
+        if self.estimator.peaks is not None:
+            return self.estimator.peaks(self.options, self._state, self.model.nx)
+        return [Peak(1.0, *self.moments())]
 
     def _check_log(self) -> None:
         """Where log and model meet: refuse what the model has no place for, and variances that cannot be honoured."""
@@ -259,7 +259,7 @@ class Fold:
                 "by Log.of(model)"
             )
         if not layout.same(log.layout):
-            admitted(log.readings.select(slice(self.n, None)), log.width, layout)
+            admitted(log.events.select(slice(self.n, None)), log.width, layout)
         if log.has_variances:
             check_variances(self.estimator, self.options)
         self._checked = log.changes

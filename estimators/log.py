@@ -8,14 +8,14 @@ import numpy as np
 
 from .errors import EventError
 from .events import arrays
-from .events.batch import BEFORE, INPUT, KIND_NAMES, READING, RESET, TICK, TRUTH, Readings, truth_of
+from .events.batch import BEFORE, INPUT, KIND_NAMES, READING, RESET, TICK, TRUTH, Events, truth_of
 from .events.checks import Layout, admitted
 from .events.order import in_order, sorted_order
 
 if TYPE_CHECKING:
     from .model.state_space import StateSpaceModel
 
-__all__ = ["BEFORE", "INPUT", "KIND_NAMES", "READING", "RESET", "TICK", "TRUTH", "Log", "Readings", "truth_of"]
+__all__ = ["BEFORE", "INPUT", "KIND_NAMES", "READING", "RESET", "TICK", "TRUTH", "Log", "Events", "truth_of"]
 
 
 class Log:
@@ -70,9 +70,9 @@ class Log:
         return self.t.size
 
     @property
-    def readings(self) -> Readings:
+    def events(self) -> Events:
         """Views of the valid rows."""
-        return Readings(*(column[: self.n] for column in self._columns()))
+        return Events(*(column[: self.n] for column in self._columns()))
 
     @property
     def has_variances(self) -> bool:
@@ -146,7 +146,7 @@ class Log:
             raise EventError(f"{method}: this log is of no model, so it knows no names; make it by Log.of(model)")
         return self.model
 
-    def _put(self, batch: Readings) -> int:
+    def _put(self, batch: Events) -> int:
         early = int(np.sum(batch.t < self.floor))
         if early:
             raise EventError(
@@ -156,11 +156,11 @@ class Log:
         self.extend(batch)
         return self.n
 
-    def extend(self, batch: Readings, horizon: int | None = None) -> tuple[int, int]:
+    def extend(self, batch: Events, horizon: int | None = None) -> tuple[int, int]:
         """Put a batch where it belongs in time.
 
         Args:
-            batch: Events in any order. Value columns beyond `width` hold variances, see `Readings`.
+            batch: Events in any order. Value columns beyond `width` hold variances, see `Events`.
             horizon: Nanoseconds; an event older than the newest before it by more than this is dropped as stale.
                 Judged event by event, so the outcome does not depend on how arrivals were cut into batches. One
                 before `floor` is stale with any horizon.
@@ -194,14 +194,14 @@ class Log:
         self.changes += 1
         return self._insert(batch), stale
 
-    def _insert(self, batch: Readings) -> int:
+    def _insert(self, batch: Events) -> int:
         """Merge a batch that is in order; the lowest index that changed."""
         n, end = self.n, self.n + len(batch)
         start = n
         if n and batch.t[0] <= self.t[n - 1]:
             start = int(np.searchsorted(self.t[:n], batch.t[0], side="left"))
         columns = self._columns()
-        tail = batch if start == n else Readings(*(np.concatenate((a[start:n], b)) for a, b in zip(columns, batch)))
+        tail = batch if start == n else Events(*(np.concatenate((a[start:n], b)) for a, b in zip(columns, batch)))
         changed = n
         if start < n:
             order = sorted_order(tail)

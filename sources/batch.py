@@ -7,7 +7,7 @@ from itertools import chain
 
 import numpy as np
 
-from estimators.log import Readings
+from estimators.log import Events
 
 
 class Batch:
@@ -37,11 +37,11 @@ class Batch:
         row[: len(values)] = values
         self._value.append(row)
 
-    def take(self) -> Readings:
+    def take(self) -> Events:
         """All events; a recording's arrive at the moment at which they were measured."""
         n = len(self._t)
         t = np.array(self._t, np.int64)
         value = np.fromiter(chain.from_iterable(self._value), np.float64, n * self.width).reshape(n, self.width)
-        batch = Readings(t, t.copy(), np.array(self._kind, np.int8), np.array(self._channel, np.int32), value)
+        batch = Events(t, t.copy(), np.array(self._kind, np.int8), np.array(self._channel, np.int32), value)
         self._clear()
         return batch

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimators.errors import SourceError
-from estimators.log import INPUT, READING, TRUTH, Readings
+from estimators.log import INPUT, READING, TRUTH, Events
 from estimators.numerics.jit import jit
 
 from .geodesy import east_north
@@ -193,7 +193,7 @@ class Mapping:
         values: np.ndarray,
         state: np.ndarray,
         skip: np.ndarray,
-    ) -> Readings:
+    ) -> Events:
         """The events of rows of values.
 
         Args:
@@ -211,7 +211,7 @@ class Mapping:
         refused, cut = np.zeros(len(self._channels), np.int64), np.zeros(len(self._channels), np.int64)
         n = _emit(self._tables, plan, skip, values, state, source, kind, channel, value, refused, cut)
         source = source[:n]
-        batch = Readings(t[source], arrival[source], kind[:n].copy(), channel[:n].copy(), value[:n].copy())
+        batch = Events(t[source], arrival[source], kind[:n].copy(), channel[:n].copy(), value[:n].copy())
         if refused.any() or cut.any():
             self._tell(refused, cut)
         for item in self._positions.values():
@@ -232,7 +232,7 @@ class Mapping:
                     f"{channel.name}: a frame of {channel.message} ends before {', '.join(channel.signals)}",
                 )
 
-    def _place(self, batch: Readings, channel: Channel) -> None:
+    def _place(self, batch: Events, channel: Channel) -> None:
         """Latitude and longitude to east and north, in place; the first valid fix is the origin unless one is given."""
         rows = np.flatnonzero((batch.kind == READING) & (batch.channel == channel.index))
         if not rows.size:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from estimators.log import Readings
+from estimators.log import Events
 
 BATCH = 4096
 
@@ -12,7 +12,7 @@ class MemorySource:
 
     live = False
 
-    def __init__(self, readings: Readings, *, batch: int = BATCH) -> None:
+    def __init__(self, readings: Events, *, batch: int = BATCH) -> None:
         self._readings = readings
         self._batch = batch
         self._next = 0
@@ -23,7 +23,7 @@ class MemorySource:
         t = self._readings.t
         return (int(t.min()), int(t.max())) if t.size else None
 
-    def read(self, timeout: float) -> Readings | None:
+    def read(self, timeout: float) -> Events | None:
         """The next events; None at the end."""
         if self._next >= len(self._readings):
             return None

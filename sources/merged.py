@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from estimators.errors import SourceError
-from estimators.log import Readings
+from estimators.log import Events
 
 from .source import Endless, Source, span_of
 
@@ -28,7 +28,7 @@ class Merged:
         if any(source.live for source in sources):
             raise SourceError("merged: a live source cannot be merged with others; use recordings")
         self._sources: list[Source] = list(sources)
-        self._pending: list[Readings | None] = [None] * len(self._sources)
+        self._pending: list[Events | None] = [None] * len(self._sources)
         self._order: list[np.ndarray] = [np.zeros(0, np.int64)] * len(self._sources)
         self._latest = [np.iinfo(np.int64).min] * len(self._sources)
         self._ended = [False] * len(self._sources)
@@ -47,7 +47,7 @@ class Merged:
         """Whether one of them has no end."""
         return any(isinstance(source, Endless) and source.endless for source in self._sources)
 
-    def read(self, timeout: float) -> Readings | None:
+    def read(self, timeout: float) -> Events | None:
         """The next events of all sources, up to the earliest time to which every one of them is known."""
         for k, source in enumerate(self._sources):
             while not self._ended[k] and not self._order[k].size:
@@ -75,7 +75,7 @@ class Merged:
             parts.append(pending.select(slice(0, count)))
             orders.append(self._order[k][:count])
             self._pending[k], self._order[k] = pending.select(slice(count, None)), self._order[k][count:]
-        joined = Readings.concat(parts, 0)
+        joined = Events.concat(parts, 0)
         return joined.select(np.argsort(np.concatenate(orders), kind="stable"))
 
     def now(self) -> int | None:

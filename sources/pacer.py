@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from estimators.log import Readings
+from estimators.log import Events
 
 from .source import Source, span_of
 
@@ -49,7 +49,7 @@ class Pacer:
         self._clock = clock
         self._changed = threading.Condition()
         self._source = open_source()
-        self._pending: Readings | None = None
+        self._pending: Events | None = None
         self._reach = np.zeros(0, np.int64)
         self._ended = False
         self._first: int | None = None
@@ -121,7 +121,7 @@ class Pacer:
             self._seek = t
             self._changed.notify_all()
 
-    def read(self, timeout: float) -> Readings | None:
+    def read(self, timeout: float) -> Events | None:
         """The events that are due; an empty batch if none becomes due within `timeout` seconds; None at the end."""
         with self._changed:
             self._obey_seek()
@@ -157,9 +157,9 @@ class Pacer:
             self.restarts += 1
         self._playhead, self._anchor = t, self._clock()
 
-    def _fill(self, timeout: float) -> Readings | None:
+    def _fill(self, timeout: float) -> Events | None:
         """Have at least one event waiting; else an empty batch if the source has none yet, and None at its end."""
-        batch: Readings | None = None
+        batch: Events | None = None
         if self._pending is None and not self._ended:
             batch = self._source.read(timeout)
             if batch is None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
-    from estimators.log import Readings
+    from estimators.log import Events
 
 Report = Callable[[str, str], None]
 """report(key, text): counted under `key`, `text` shown among the events; called from the source's thread."""
@@ -27,7 +27,7 @@ class Source(Protocol):
 
     live: bool
 
-    def read(self, timeout: float) -> Readings | None:
+    def read(self, timeout: float) -> Events | None:
         """The next events; none after `timeout` seconds without one; None at the end."""
 
     def now(self) -> int | None:

@@ -17,7 +17,7 @@ from config.loader import shipped
 from config.source_schema import SimulatorSection
 from estimators.compiled.orphan import leave_with_parent
 from estimators.errors import ConfigError, SourceError
-from estimators.log import Readings
+from estimators.log import Events
 from estimators.registry import ESTIMATORS, find_estimator, unfit
 
 from ..stderr import complain
@@ -84,16 +84,16 @@ def _compare(arguments: Arguments, name: str) -> None:
         write_scores(twin.path, lines)
 
 
-def _logs(twin: Twin, overrides: Mapping[str, str], arguments: Arguments) -> list[Readings]:
+def _logs(twin: Twin, overrides: Mapping[str, str], arguments: Arguments) -> list[Events]:
     """The twin's log, or several of its simulator, whose seeds count up from the twin's own."""
     if arguments.logs == 1:
-        return [read_log(twin, arguments.duration)[0].readings]
+        return [read_log(twin, arguments.duration)[0].events]
     source = twin.config.source
     if not isinstance(source, SimulatorSection):
         raise ConfigError(f"--logs {arguments.logs}: {twin.name} is not simulated; there is one log of it")
     seeds = range(source.seed, source.seed + arguments.logs)
     twins = (load_twin(arguments.twin, overrides={**overrides, "source.seed": str(seed)}) for seed in seeds)
-    return [read_log(other, arguments.duration)[0].readings for other in twins]
+    return [read_log(other, arguments.duration)[0].events for other in twins]
 
 
 def _plain(row: Row) -> dict[str, Any]:
@@ -124,7 +124,7 @@ def compare(
     twin: str,
     overrides: Mapping[str, str],
     names: Sequence[str],
-    logs: Sequence[Readings],
+    logs: Sequence[Events],
     jobs: int | None = None,
     budget: float = BUDGET,
 ) -> Iterator[Row]:
@@ -163,7 +163,7 @@ def compare(
 def _share(name: str, overrides: dict[str, str], logs: list[tuple[np.ndarray, ...]]) -> None:
     leave_with_parent()
     _shared["twin"] = load_twin(name, overrides=overrides)
-    _shared["logs"] = [Readings(*columns) for columns in logs]
+    _shared["logs"] = [Events(*columns) for columns in logs]
     numba.set_num_threads(1)  # the processors have a filter each, and a step costs what it costs one
 
 

@@ -13,7 +13,7 @@ from estimators.diagnostics.score import Fit, score
 from estimators.errors import NisusError
 from estimators.estimator import Estimator
 from estimators.fold import Fold
-from estimators.log import Log, Readings
+from estimators.log import Events, Log
 from estimators.registry import find_estimator
 from estimators.track import DIVERGED
 
@@ -79,7 +79,7 @@ def draws(entry: Estimator) -> bool:
     return any(option.name in ("particles", "members") for option in entry.options)
 
 
-def fold_row(twin: Twin, estimator: str, logs: Sequence[Readings], budget: float = BUDGET) -> Row:
+def fold_row(twin: Twin, estimator: str, logs: Sequence[Events], budget: float = BUDGET) -> Row:
     """Fold one filter over each of the logs, or, if it draws and there is one log, over that with several seeds.
 
     A filter that takes more than `budget` seconds of one processor folds a shorter span of the log; but the one that
@@ -105,13 +105,13 @@ def fold_row(twin: Twin, estimator: str, logs: Sequence[Readings], budget: float
     return row_of(estimator, outcomes, options, span)
 
 
-def refold(twin: Twin, estimator: str, events: Readings, seed: int = 0) -> Outcome:
+def refold(twin: Twin, estimator: str, events: Events, seed: int = 0) -> Outcome:
     """Fold one filter over all the events."""
     fold, seconds = _timed(twin, estimator, events, seed, np.inf, enough=0.0)
     return outcome_of(fold, events, seconds)
 
 
-def within(events: Readings, span: float | None) -> Readings:
+def within(events: Events, span: float | None) -> Events:
     """The events of the first `span` seconds."""
     if span is None:
         return events
@@ -125,7 +125,7 @@ def tidy(seconds: float) -> float:
 
 
 def _timed(
-    twin: Twin, estimator: str, events: Readings, seed: int, budget: float, enough: float = ENOUGH
+    twin: Twin, estimator: str, events: Events, seed: int, budget: float, enough: float = ENOUGH
 ) -> tuple[Fold, float]:
     """Fold the events, or what the budget (s) allows; a short fold again and again, as other work disturbs it.
 
@@ -155,7 +155,7 @@ def _timed(
     return fold, min(took) / fold.n
 
 
-def outcome_of(fold: Fold, events: Readings, seconds: float) -> Outcome:
+def outcome_of(fold: Fold, events: Events, seconds: float) -> Outcome:
     """What a fold was worth over its first events, which are these."""
     model, track = fold.model, fold.track.select(slice(0, len(events)))
     fold.finish()

@@ -87,9 +87,9 @@ def fitting(twin: Twin) -> Table:
 
 
 def reading_rate(twin: Twin) -> float:
-    """Readings a second of the twin's source, by its first minute."""
+    """Events a second of the twin's source, by its first minute."""
     log, _ = attend(twin.model, lambda: read_log(twin, SAMPLE), "reading the source's first minute")
-    events = log.readings
+    events = log.events
     times = events.t[events.kind == READING]
     return float((times.size - 1) / (times[-1] - times[0]) * 1e9) if times.size > 1 and times[-1] > times[0] else 0.0
 

@@ -86,7 +86,7 @@ def fold_twin(arguments: Arguments) -> int:
     interruptible(fold, work)
     seconds = (time.perf_counter() - begun) / log.n
     pictures = fold.pictures.taken if fold.pictures is not None else []
-    result = score(fold.track, log.readings, twin.model, pictures)
+    result = score(fold.track, log.events, twin.model, pictures)
     if arguments.out is not None:
         _write(arguments.out, twin, log, fold.track, pictures)
     if arguments.json:
@@ -229,4 +229,4 @@ def _write(path: Path, twin: Twin, log: Log, track: Track, pictures: Sequence[Pi
 
         write_recording(path, twin, log, track, pictures)
         return
-    pq.write_table(table_of(twin.model, log.readings, track), path)
+    pq.write_table(table_of(twin.model, log.events, track), path)

@@ -46,7 +46,7 @@ def open_review(path: Path, page: Page | None) -> tuple[Session, Recorded]:
     def open_source(report: Callable[[str, str], None]) -> object:
         from sources.memory import MemorySource
 
-        return MemorySource(recorded.readings)
+        return MemorySource(recorded.events)
 
     session = Session(
         twin,

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from estimators.log import READING, Readings
+from estimators.log import READING, Events
 from estimators.model.state_space import StateSpaceModel
 from estimators.track import FAILED, GATED, MISSING, VERDICT_NAMES, Track
 
@@ -40,7 +40,7 @@ class RowCounts:
         self.again()
 
     def count(self, verdict: np.ndarray, channel: np.ndarray) -> dict[str, int]:
-        """Readings in all and by verdict, given the verdicts and channels of all rows; and what went wrong where."""
+        """Events in all and by verdict, given the verdicts and channels of all rows; and what went wrong where."""
         settled = max(self._settled, len(verdict) - UNSETTLED)
         self._counts += self._of(verdict[self._settled : settled], channel[self._settled : settled])
         self._settled = settled
@@ -96,7 +96,7 @@ class Latency:
         self._ms = np.zeros(LATENCIES)
         self._n = 0
 
-    def note(self, batch: Readings) -> None:
+    def note(self, batch: Events) -> None:
         """The rows of a batch are there."""
         arrivals = batch.arrival[batch.kind == READING]
         if not arrivals.size:

@@ -1,6 +1,6 @@
 """The engine: one thread that owns the log and the fold, and lets everybody else read copies.
 
-Readings, commands and finished refolds come through one inbox and are dealt with in order. Views pull; nothing they
+Events, commands and finished refolds come through one inbox and are dealt with in order. Views pull; nothing they
 do, or fail to do, reaches this thread.
 """
 
@@ -19,8 +19,8 @@ import numpy as np
 from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import EstimatorError, NisusError
 from estimators.fold import Fold
-from estimators.log import TICK, Log, Readings
-from estimators.numerics.peaks import modes_of
+from estimators.log import TICK, Events, Log
+from estimators.numerics.peaks import peaks_of
 from estimators.registry import find_estimator
 from estimators.snapshots import SPARSE_EVERY, Base
 from estimators.track import TRACKING
@@ -180,12 +180,12 @@ class Engine:
             if limit is not None:
                 end = min(end, start + limit)
             rows = slice(start - log.first, max(start, end) - log.first)
-            readings = log.readings.select(rows)
+            readings = log.events.select(rows)
             pull = Pull(
                 self._revision,
                 fresh,
                 start,
-                Readings(*(column.copy() for column in readings)),
+                Events(*(column.copy() for column in readings)),
                 fold.track.select(rows).copy(),
                 pictures=_since(fold, cursor.picture, max(start, end)),
             )
@@ -245,10 +245,10 @@ class Engine:
         with self._reading():
             mean, cov = self._fold.moments()
             points, clock = self._fold.points(), self._fold.clock
-            model, several = self._fold.model, self._fold.estimator.modes is not None
+            model, several = self._fold.model, self._fold.estimator.peaks is not None
         # Clustering takes milliseconds, which the engine's thread must not wait for.
-        modes = modes_of(points, model.circular) if several else []
-        return Belief(clock, mean, cov, points, tuple(modes) if len(modes) > 1 else ())
+        peaks = peaks_of(points, model.circular) if several else []
+        return Belief(clock, mean, cov, points, tuple(peaks) if len(peaks) > 1 else ())
 
     def status(self) -> Status:
         """What a panel shows; computed at most ten times a second."""
@@ -304,9 +304,9 @@ class Engine:
         except queue.Empty:
             self._when_silent()
             return
-        batches: list[Readings] = []
+        batches: list[Events] = []
         while item is not None:
-            if isinstance(item, Readings):
+            if isinstance(item, Events):
                 batches.append(item)
                 if not self._feeder.live:
                     self._feeder.taken()
@@ -320,10 +320,10 @@ class Engine:
                 item = None
         self._accept(batches)
 
-    def _accept(self, batches: list[Readings]) -> None:
+    def _accept(self, batches: list[Events]) -> None:
         if not batches:
             return
-        batch = batches[0] if len(batches) == 1 else Readings.concat(batches, self.model.width)
+        batch = batches[0] if len(batches) == 1 else Events.concat(batches, self.model.width)
         with self._lock, self._stall.watched(self._fold):
             stale = self._take(batch, self._horizon)
             self._idle_ticks.broken(self._log.newest)
@@ -335,7 +335,7 @@ class Engine:
         if self._feeder.live:
             self._latency.note(batch)
 
-    def _take(self, batch: Readings, horizon: int | None = None) -> int:
+    def _take(self, batch: Events, horizon: int | None = None) -> int:
         """Put events where they belong, and fold from there on; how many were stale."""
         first, stale = self._log.extend(batch, horizon)
         before = min(first, self._fold.n)
@@ -369,7 +369,7 @@ class Engine:
             return
         now = self._idle_ticks.asks(self._feeder.source, int(self._log.t[self._log.n - 1]))
         if now is not None:
-            self.insert(Readings.one(now, time.time_ns(), TICK, 0, [], self.model.width))
+            self.insert(Events.one(now, time.time_ns(), TICK, 0, [], self.model.width))
 
     def _say_stalled(self, text: str, level: str) -> None:
         self.notices.say(text, level=level)
@@ -404,7 +404,7 @@ class Engine:
         if wanted:
             self.retune(*wanted)
 
-    def insert(self, event: Readings) -> None:
+    def insert(self, event: Events) -> None:
         """Put in an event of our own."""
         with self._lock, self._stall.watched(self._fold):
             self._take(event)
@@ -450,7 +450,7 @@ class Engine:
                     self._revision,
                     False,
                     log.first,
-                    Readings(*(column[: old.n].copy() for column in log.readings)),
+                    Events(*(column[: old.n].copy() for column in log.events)),
                     old.track,
                 )
                 self._fold, self._row_counts = fold, row_counts

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from estimators.errors import ConfigError
-from estimators.log import RESET, Readings
+from estimators.log import RESET, Events
 from estimators.registry import checked, find_estimator
 
 from . import commands
@@ -68,12 +68,12 @@ def execute(command: commands.Command, engine: Running) -> None:
         play(engine.source, command, engine.span()[0])
 
 
-def _reset_now(engine: Running) -> Readings:
+def _reset_now(engine: Running) -> Events:
     """A reset now: an event of the log, so that refolds and recordings have it where it was."""
     now = engine.span()[1]
     if not now:
         raise ConfigError("nothing to reset: no reading has come yet")
-    return Readings.one(now, time.time_ns(), RESET, 0, [], engine.model.width)
+    return Events.one(now, time.time_ns(), RESET, 0, [], engine.model.width)
 
 
 class Remembered:

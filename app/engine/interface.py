@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from estimators.diagnostics.health import HealthPolicy
-from estimators.log import Readings
+from estimators.log import Events
 from estimators.model.state_space import StateSpaceModel
 from estimators.snapshots import Base
 from estimators.tuning import Tuning
@@ -95,5 +95,5 @@ class Running(Protocol):
     def retune(self, estimator: str, tuning: Tuning) -> None:
         """Fold the history again with another estimator or tuning; on the engine's own thread."""
 
-    def insert(self, event: Readings) -> None:
+    def insert(self, event: Events) -> None:
         """Put in an event of our own; on the engine's own thread."""

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from estimators.diagnostics.field_pictures import Picture
-from estimators.log import Readings
-from estimators.numerics.peaks import Mode
+from estimators.log import Events
+from estimators.numerics.peaks import Peak
 from estimators.track import Track
 from estimators.tuning import Tuning
 
@@ -44,7 +44,7 @@ class Pull:
     revision: int
     fresh: bool
     first: int
-    readings: Readings
+    events: Events
     track: Track
     notices: list[Notice] = field(default_factory=list)
     pictures: list[Picture] = field(default_factory=list)
@@ -58,7 +58,7 @@ class Belief:
     mean: np.ndarray
     cov: np.ndarray
     points: np.ndarray
-    modes: tuple[Mode, ...] = ()
+    peaks: tuple[Peak, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -162,13 +162,13 @@ class RecordingFile:
                     text=[line.text for line in pull.notices],
                 ),
             )
-        count = len(pull.readings)
+        count = len(pull.events)
         if not count:
             return
         index = [rr.TimeColumn(TIMELINE, sequence=np.arange(pull.first, pull.first + count))]
         # As Arrow's arrays: Rerun would turn NumPy's into Python lists, which takes fifty times as long.
         flat: dict[str, pa.Array] = {}
-        for name, column in zip(pull.readings._fields, pull.readings, strict=True):
+        for name, column in zip(pull.events._fields, pull.events, strict=True):
             if column.ndim == 1:
                 flat[name] = pa.array(column)
             else:

@@ -17,7 +17,7 @@ import numpy as np
 from rerun.chunk import RrdReader
 
 from estimators.errors import SourceError
-from estimators.log import Readings
+from estimators.log import Events
 from estimators.snapshots import Base
 
 from .format import FORMAT, PREFIX, READABLE, TIMELINE, base_from_json
@@ -28,7 +28,7 @@ from .rrd import BEGIN, MESSAGE_HEADER, STREAM_HEADER, whole_until
 class Recorded:
     """What a recording holds: twin, the last tuning, the log as it was at the end, lines (t, level, text).
 
-    A fold of `readings` starts at `base` (None: the prior). `first` is the index of their first event in the session,
+    A fold of `events` starts at `base` (None: the prior). `first` is the index of their first event in the session,
     `rows` how many there are, and `closed` whether the recording was finished when it ended.
     """
 
@@ -39,7 +39,7 @@ class Recorded:
     base: Base | None
     tuning: str
     tunings: int
-    readings: Readings
+    events: Events
     notices: list[tuple[int, str, str]]
     first: int
     rows: int
@@ -79,9 +79,7 @@ def read_recording(path: Path) -> Recorded:
     base = base_from_json(content.bases[-1][1] if content.bases else str(header["base"]))
     start = content.bases[-1][0] if content.bases else first
     # What stands before the base belongs to a fold that the session had left behind.
-    readings = Readings(*(_column(name, columns) for name in Readings._fields)).select(
-        slice(max(0, start - first), None)
-    )
+    events = Events(*(_column(name, columns) for name in Events._fields)).select(slice(max(0, start - first), None))
     return Recorded(
         path=path,
         name=str(header["name"]),
@@ -90,10 +88,10 @@ def read_recording(path: Path) -> Recorded:
         base=None if base is None else base._replace(first=start),
         tuning=str(tunings[-1]),
         tunings=len(tunings),
-        readings=readings,
+        events=events,
         notices=notices,
         first=start,
-        rows=len(readings),
+        rows=len(events),
         closed=finished(path),
     )
 

@@ -243,7 +243,7 @@ class _Part:
         while True:
             pull = self._engine.pull(cursor, ROWS)
             yield pull
-            if len(pull.readings) < ROWS and cursor.next == pull.first + len(pull.readings):
+            if len(pull.events) < ROWS and cursor.next == pull.first + len(pull.events):
                 return
 
     def end(self, *, short: bool = False) -> None:
@@ -290,7 +290,7 @@ def write_recording(path: Path, twin: Twin, log: Log, track: Track, pictures: Se
         for start in range(0, log.n, ROWS):
             rows = slice(start, min(log.n, start + ROWS))
             here = [picture for picture in pictures if start < picture.before <= rows.stop]
-            pull = Pull(0, start == 0, start, log.readings.select(rows), track.select(rows), pictures=here)
+            pull = Pull(0, start == 0, start, log.events.select(rows), track.select(rows), pictures=here)
             file.write(pull)
             drawing(pull)
             file.flush()

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import rerun as rr
 
-from estimators.log import Readings
+from estimators.log import Events
 from estimators.track import Track
 
 from ..engine.notices import KEPT
@@ -80,13 +80,13 @@ class RerunFeed:
             return self._read()
         pull = self._engine.pull(self._cursor, ROWS)
         self._notices.extend(pull.notices)
-        if pull.fresh and self._rows is not None and not len(pull.readings):
+        if pull.fresh and self._rows is not None and not len(pull.events):
             # The source has just begun again: the charts stay as they are until there is something to show.
             self._cursor.revision = -1
             return []
         if pull.fresh:
             return self._begin(self._whole(pull))
-        if self._rows is None or not (len(pull.readings) or pull.notices or pull.pictures):
+        if self._rows is None or not (len(pull.events) or pull.notices or pull.pictures):
             return []
         self._rows(pull)
         return self._read()
@@ -100,28 +100,28 @@ class RerunFeed:
     def _whole(self, pull: Pull) -> Pull:
         """All there is of a revision that just began, pulled in pieces."""
         parts = [pull]
-        while len(parts[-1].readings) == ROWS:
+        while len(parts[-1].events) == ROWS:
             more = self._engine.pull(self._cursor, ROWS)
             self._notices.extend(more.notices)
             # Another revision may begin meanwhile, or a late reading rewrite rows: those are the ones that hold.
             parts = [more] if more.fresh else [*parts, more]
         if len(parts) == 1:
             return parts[0]
-        readings: list[Readings] = []
+        events: list[Events] = []
         tracks: list[Track] = []
         end = parts[0].first
         pictures = {picture.before: picture for part in parts for picture in part.pictures}
         for part in parts:
             if part.first < end:
-                readings, tracks = _cut(readings, tracks, part.first - parts[0].first)
-            readings.append(part.readings)
+                events, tracks = _cut(events, tracks, part.first - parts[0].first)
+            events.append(part.events)
             tracks.append(part.track)
-            end = part.first + len(part.readings)
+            end = part.first + len(part.events)
         return replace(
             parts[-1],
             fresh=True,
             first=parts[0].first,
-            readings=Readings.concat(readings, 0),
+            events=Events.concat(events, 0),
             track=Track(*(np.concatenate(column) for column in zip(*tracks, strict=True))),
             pictures=[pictures[index] for index in sorted(pictures)],
         )
@@ -137,16 +137,16 @@ class RerunFeed:
         self._layout = False
         self._frame = 0
         announcement = json.dumps({"recording": f"Recording:{self.application}:{name}", "revision": pull.revision})
-        t = pull.readings.t
+        t = pull.events.t
         cut = int(np.searchsorted(t, t[-1] - int(AHEAD * rows.sink.window * 1e9))) if t.size and pull.revision else 0
         before = self._engine.previous() if pull.revision and t.size else None
         # A recording's timeline must not begin before its rows; they may have been forgotten meanwhile.
-        grey = before.readings.t if before is not None else t[:0]
+        grey = before.events.t if before is not None else t[:0]
         known = int(np.searchsorted(grey, t[0])) if t.size else 0
         grey_cut = max(known, int(np.searchsorted(grey, t[cut]))) if t.size else 0
 
         def draw(part: slice, grey_part: slice, past: bool) -> None:
-            rows.rows(pull.readings.select(part), pull.track.select(part), past=past)
+            rows.rows(pull.events.select(part), pull.track.select(part), past=past)
             if before is not None and grey[grey_part].size:
                 rows.previous(grey[grey_part], before.track.select(grey_part))
             begun = pull.first + cut
@@ -175,10 +175,10 @@ class RerunFeed:
         return [data] if data else []
 
 
-def _cut(readings: list[Readings], tracks: list[Track], rows: int) -> tuple[list[Readings], list[Track]]:
+def _cut(events: list[Events], tracks: list[Track], rows: int) -> tuple[list[Events], list[Track]]:
     """The first `rows` rows of some pieces."""
     kept_readings, kept_tracks = [], []
-    for reading, track in zip(readings, tracks, strict=True):
+    for reading, track in zip(events, tracks, strict=True):
         count = min(rows, len(reading))
         kept_readings.append(reading.select(slice(0, count)))
         kept_tracks.append(track.select(slice(0, count)))

@@ -6,7 +6,7 @@ import numpy as np
 import rerun as rr
 
 from estimators.diagnostics.field_pictures import Picture
-from estimators.log import READING, Readings
+from estimators.log import READING, Events
 from estimators.model.state_space import StateSpaceModel
 from estimators.track import Track
 
@@ -62,11 +62,11 @@ class FieldDrawing:
                 ),
             )
 
-    def readings(self, sink: Sink, readings: Readings, track: Track, width: int) -> None:
+    def readings(self, sink: Sink, events: Events, track: Track, width: int) -> None:
         """Log of each sensor with many rows the size of its innovations, in units of their deviations."""
-        is_reading = readings.kind == READING
+        is_reading = events.kind == READING
         for k, sensor in enumerate(self._model.sensors):
-            mask = is_reading & (readings.channel == k)
+            mask = is_reading & (events.channel == k)
             if not mask.any():
                 continue
             count = len(sensor.rows)
@@ -77,12 +77,12 @@ class FieldDrawing:
             rms = np.sqrt(np.where(known, sizes, 0.0).__pow__(2).sum(axis=1) / number)
             values = np.stack((rms, np.where(known, sizes, 0.0).max(axis=1)), axis=1)
             values[~known.any(axis=1)] = np.nan
-            sink.line(f"/innovation/{sensor.name}", readings.t[mask], values, width, by_first=True)
+            sink.line(f"/innovation/{sensor.name}", events.t[mask], values, width, by_first=True)
 
-    def note(self, readings: Readings, track: Track) -> None:
+    def note(self, events: Events, track: Track) -> None:
         """Remember the newest innovation of each sensor row, for the dots on the pictures."""
         for k in range(len(self._model.sensors)):
-            mine = np.flatnonzero((readings.kind == READING) & (readings.channel == k))
+            mine = np.flatnonzero((events.kind == READING) & (events.channel == k))
             if mine.size:
                 last = mine[-1]
                 of = self._which[:, 0] == k

@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from estimators.log import Readings, truth_of
+from estimators.log import Events, truth_of
 from estimators.model.state_space import StateSpaceModel
 from estimators.track import Track
 
@@ -121,7 +121,7 @@ class PairDrawing:
         self._way = np.zeros((0, 2), np.float32)
         self._way_t = np.zeros(0, np.int64)
 
-    def draw(self, sink: Sink, t: np.ndarray, track: Track, readings: Readings, past: bool) -> None:
+    def draw(self, sink: Sink, t: np.ndarray, track: Track, events: Events, past: bool) -> None:
         """Log the pictures of some rows of the track."""
         step = int(max(sink.window * 1e9, int(t[-1]) - int(t[0])) / PICTURES)
         pick = last_of_stretch(t, step)
@@ -144,7 +144,7 @@ class PairDrawing:
                 self._blank(sink, t[run[:1]], past)
         if not past:
             self._last = int(t[pick[-1]])
-        self._truth(sink, readings, t[pick])
+        self._truth(sink, events, t[pick])
 
     def _blank(self, sink: Sink, t: np.ndarray, past: bool) -> None:
         """Show nothing from a time (1,) on, at which the estimate is not a number."""
@@ -197,9 +197,9 @@ class PairDrawing:
             for i, j, here in zip(start, end, mean, strict=True)
         ]
 
-    def _truth(self, sink: Sink, readings: Readings, wanted: np.ndarray) -> None:
-        (in_a, a), (in_b, b) = (truth_of(readings, int(j)) for j in self._pair)
-        times, of_a, of_b = np.intersect1d(readings.t[in_a], readings.t[in_b], return_indices=True)
+    def _truth(self, sink: Sink, events: Events, wanted: np.ndarray) -> None:
+        (in_a, a), (in_b, b) = (truth_of(events, int(j)) for j in self._pair)
+        times, of_a, of_b = np.intersect1d(events.t[in_a], events.t[in_b], return_indices=True)
         if not times.size:
             return
         near = np.unique(np.clip(np.searchsorted(times, wanted), 0, times.size - 1))

@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 
 from estimators.diagnostics.field_pictures import Picture
-from estimators.log import READING, Readings, truth_of
+from estimators.log import READING, Events, truth_of
 from estimators.track import FAILED, GATED, HEALTH_NAMES, Track
 
 from ..drawing.direct_readings import observed
@@ -91,22 +91,22 @@ class RerunRows:
             self._revisions += 1
             if self._revisions > 1:
                 self._begin(f"/revision_{pull.revision}")
-        t = pull.readings.t
+        t = pull.events.t
         if t.size:
             newest = self._newest
             rewritten = newest is not None and pull.first < self._next
             after = t > newest if rewritten else np.ones(t.size, bool)
-            fresh = self._not_drawn(pull.readings) if rewritten else after
+            fresh = self._not_drawn(pull.events) if rewritten else after
             self._next = pull.first + t.size
-            self.rows(pull.readings, pull.track, lines=after, dots=fresh)
+            self.rows(pull.events, pull.track, lines=after, dots=fresh)
         self.pictures(pull.pictures)
         self.notices(pull.notices)
 
     def begin(self, pull: Any) -> None:
         """Take note of a whole revision whose rows will be logged in pieces, by `rows`."""
         self._revisions += 1
-        self._next = pull.first + len(pull.readings)
-        self._oldest = int(pull.readings.t[0])
+        self._next = pull.first + len(pull.events)
+        self._oldest = int(pull.events.t[0])
         self.sink.started(self._oldest)
 
     def width(self, t: np.ndarray) -> int:
@@ -117,7 +117,7 @@ class RerunRows:
 
     def rows(
         self,
-        readings: Readings,
+        events: Events,
         track: Track,
         *,
         lines: np.ndarray | None = None,
@@ -127,13 +127,13 @@ class RerunRows:
         """Log rows.
 
         Args:
-            readings: The events.
+            events: The events.
             track: Their rows.
             lines: Mask of the rows to draw as lines; None for all.
             dots: Mask of the rows to draw as dots.
             past: These rows came before rows that are drawn already.
         """
-        t = readings.t
+        t = events.t
         self.sink.started(int(t[0]))
         self._oldest = int(t[0]) if self._oldest is None else min(int(t[0]), self._oldest)
         self._newest = int(t[-1]) if self._newest is None else max(int(t[-1]), self._newest)
@@ -147,9 +147,9 @@ class RerunRows:
             self._window_nis(line_t, line_track, width)
             self._health_changes(line_t, line_track, past)
             for ellipse in self._ellipses:
-                ellipse.draw(self.sink, line_t, line_track, readings.select(lines), past)
+                ellipse.draw(self.sink, line_t, line_track, events.select(lines), past)
         if dots.any():
-            drawn = readings.select(dots)
+            drawn = events.select(dots)
             self._readings(drawn, track.select(dots), width)
             self._remember(drawn)
 
@@ -211,21 +211,21 @@ class RerunRows:
             names = [HEALTH_NAMES[health[k]] for k in changes]
             self.sink.columns("/health", t[changes], rr.StateChange.columns(state=names))
 
-    def _readings(self, readings: Readings, track: Track, width: int) -> None:
-        channel, t = readings.channel, readings.t
-        is_reading = readings.kind == READING
+    def _readings(self, events: Events, track: Track, width: int) -> None:
+        channel, t = events.channel, events.t
+        is_reading = events.kind == READING
         for j, state in zip(self.model.shown.tolist(), self.model.shown_states, strict=True):
-            rows, values = truth_of(readings, j)
+            rows, values = truth_of(events, j)
             self.sink.line(f"/truth/{state.name}", t[rows], values[:, None], width)
         for item in self._dots:
             name = self.model.row_names[self.model.row_start[item.sensor] + item.row]
             of_sensor = is_reading & (channel == item.sensor)
             for path, mask in (("reading", track.verdict != GATED), ("refused", track.verdict == GATED)):
                 rows = of_sensor & mask
-                self.sink.line(f"/{path}/{name}", t[rows], readings.value[rows, item.row, None], width)
+                self.sink.line(f"/{path}/{name}", t[rows], events.value[rows, item.row, None], width)
         if self._field is not None:
-            self._field.readings(self.sink, readings, track, width)
-            self._field.note(readings, track)
+            self._field.readings(self.sink, events, track, width)
+            self._field.note(events, track)
         for k, sensor in enumerate(() if self._field is not None else self.model.sensors):
             mask = is_reading & (channel == k)
             if not mask.any():
@@ -237,16 +237,16 @@ class RerunRows:
                 self.sink.line(path, t[mask], np.stack((nu, twice, -twice), axis=1), width, by_first=True, gaps=failed)
         self.sink.line("/nis/reading", t[is_reading], track.nis[is_reading, None], width)
 
-    def _keys(self, readings: Readings) -> np.ndarray:
+    def _keys(self, events: Events) -> np.ndarray:
         # One number an event; that int64 wraps around does not matter.
-        return readings.t * 4096 + readings.channel * 8 + readings.kind
+        return events.t * 4096 + events.channel * 8 + events.kind
 
-    def _remember(self, readings: Readings) -> None:
+    def _remember(self, events: Events) -> None:
         assert self._newest is not None
-        t = np.concatenate((self._drawn_t, readings.t))
+        t = np.concatenate((self._drawn_t, events.t))
         recent = t >= self._newest - REMEMBERED
-        self._drawn = np.concatenate((self._drawn, self._keys(readings)))[recent]
+        self._drawn = np.concatenate((self._drawn, self._keys(events)))[recent]
         self._drawn_t = t[recent]
 
-    def _not_drawn(self, readings: Readings) -> np.ndarray:
-        return ~np.isin(self._keys(readings), self._drawn)
+    def _not_drawn(self, events: Events) -> np.ndarray:
+        return ~np.isin(self._keys(events), self._drawn)

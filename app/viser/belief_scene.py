@@ -9,7 +9,7 @@ import viser
 
 from estimators.log import truth_of
 from estimators.model.state_space import StateSpaceModel
-from estimators.numerics.peaks import Mode
+from estimators.numerics.peaks import Peak
 
 from ..drawing.geometry import circle, disc, ellipsoid, round_step, segments, tick_text
 from .camera import fit_cameras
@@ -19,7 +19,7 @@ TRAIL = 120
 """Rows of the track that are drawn behind the point."""
 
 TICKS = (-2, -1, 0, 1, 2)
-MODES = 6
+PEAKS = 6
 """Peaks of the estimate that are marked at most."""
 
 HALF = 2.5
@@ -89,12 +89,12 @@ class BeliefScene:
         self._mean = api.add_point_cloud(
             "/belief/mean", one + [0.0, 0.0, 0.04 if flat else 0.0], (29, 78, 216), point_size=0.04, **dot
         )
-        self._modes = [
+        self._peaks = [
             (
-                api.add_point_cloud(f"/modes/{k}/mean", one, (190, 24, 93), point_size=0.05, visible=False, **dot),
-                api.add_label(f"/modes/{k}/weight", " ", visible=False, font_screen_scale=0.8, anchor="bottom-left"),
+                api.add_point_cloud(f"/peaks/{k}/mean", one, (190, 24, 93), point_size=0.05, visible=False, **dot),
+                api.add_label(f"/peaks/{k}/weight", " ", visible=False, font_screen_scale=0.8, anchor="bottom-left"),
             )
-            for k in range(MODES)
+            for k in range(PEAKS)
         ]
         if flat:
             vertices, faces = disc()
@@ -141,7 +141,7 @@ class BeliefScene:
         self._belief.visible = known
         if known:
             self._draw_belief(history, belief, axes, mean, cov, lift)
-        self._mark(axes, index, belief.modes if known else (), lift)
+        self._mark(axes, index, belief.peaks if known else (), lift)
         self._cloud(self._truth, axes, self._true_point(history, index), lift)
 
     def _draw_belief(
@@ -175,15 +175,15 @@ class BeliefScene:
             self._points, axes, belief.points[:, index] if len(belief.points) else np.zeros((0, n)), lift, centre
         )
 
-    def _mark(self, axes: list[_Axis], index: list[int], modes: tuple[Mode, ...], lift: np.ndarray) -> None:
+    def _mark(self, axes: list[_Axis], index: list[int], peaks: tuple[Peak, ...], lift: np.ndarray) -> None:
         """Put a dot with its weight at each peak, where there are several."""
-        for k, (dot, label) in enumerate(self._modes):
-            place = self._place(axes, modes[k].mean[None, index])[0] if k < len(modes) else np.full(3, np.nan)
+        for k, (dot, label) in enumerate(self._peaks):
+            place = self._place(axes, peaks[k].mean[None, index])[0] if k < len(peaks) else np.full(3, np.nan)
             shown = bool(np.isfinite(place).all() and (np.abs(place) <= 1.3).all())
             if shown:
                 dot.points = (place + 2 * lift)[None].astype(np.float32)
                 label.position = tuple(place + 2 * lift)
-                label.text = f"{100 * modes[k].weight:.0f} %"
+                label.text = f"{100 * peaks[k].weight:.0f} %"
             dot.visible = label.visible = shown
 
     def _cloud(

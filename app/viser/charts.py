@@ -99,7 +99,7 @@ class Charts:
             self._previous = None
         else:
             self._previous = (
-                pull.readings.t.copy(),
+                pull.events.t.copy(),
                 np.where(estimated_rows(pull.track)[:, None], pull.track.mean, np.nan),
             )
 

@@ -132,9 +132,9 @@ class FieldScene:
                     self._latest[kind.name] = image
                     self._dirty = True
                     break
-        readings, track = pull.readings, pull.track
+        events, track = pull.events, pull.track
         for k in np.unique(self._which[:, 0]):
-            mine = np.flatnonzero((readings.kind == READING) & (readings.channel == k))
+            mine = np.flatnonzero((events.kind == READING) & (events.channel == k))
             if mine.size:
                 of = self._which[:, 0] == k
                 with np.errstate(invalid="ignore", divide="ignore"):

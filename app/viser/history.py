@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from estimators.log import Readings
+from estimators.log import Events
 
 _COLUMNS = ("t", "kind", "channel", "value", "mean", "std", "nis", "nis_mean", "nis_low", "nis_high", "verdict")
 
@@ -37,10 +37,10 @@ class History:
         """The valid rows of one column, as a view."""
         return self._columns[name][: self.n]
 
-    def events(self, rows: slice = slice(None)) -> Readings:
+    def events(self, rows: slice = slice(None)) -> Events:
         """Some of the valid rows as events, as views; each as if it had arrived when it was measured."""
         t, kind, channel, value = (self.column(name)[rows] for name in ("t", "kind", "channel", "value"))
-        return Readings(t, t, kind, channel, value)
+        return Events(t, t, kind, channel, value)
 
     def settled(self, name: str, rows: int) -> np.ndarray:
         """The newest rows of a column, only the last one of each time: what all sensors together made of it."""
@@ -58,18 +58,18 @@ class History:
         Returns:
             The first row that changed; all after it did too.
         """
-        count = len(pull.readings)
+        count = len(pull.events)
         if pull.fresh or not self.n or not self.base <= pull.first <= self.base + self.n:
             self.base, self.n = pull.first, 0
         if not count:
             return self.n
         if pull.first == 0 or self.origin is None:
-            self.origin = int(pull.readings.t[0])
+            self.origin = int(pull.events.t[0])
         start = pull.first - self.base
         if start + count > 2 * self.limit:
             start -= self._drop(start - self.limit)
         for name, column in self._columns.items():
-            batch = getattr(pull.readings if name in ("t", "kind", "channel", "value") else pull.track, name)
+            batch = getattr(pull.events if name in ("t", "kind", "channel", "value") else pull.track, name)
             # Charts have no use for the variances that readings bring, in columns after the values.
             column[start : start + count] = batch[:, : column.shape[1]] if name == "value" else batch
         self.n = start + count

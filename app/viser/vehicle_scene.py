@@ -20,7 +20,7 @@ from .camera import distance_for, fit_cameras
 from .history import History
 
 TRAIL = 600
-MODES = 4
+PEAKS = 4
 POINTS = 1500
 SOFTNESS = 0.3
 """Part of the way to the vehicle that the view moves in one frame."""
@@ -85,12 +85,12 @@ class VehicleScene:
         dot = {"point_shape": "circle", "precision": "float32", "point_shading": "flat", "visible": False}
         one = np.zeros((1, 3), np.float32)
         self._cloud = api.add_point_cloud("/world/cloud", one, (124, 58, 237), point_size=0.15, **dot)
-        self._modes = [
+        self._peaks = [
             (
-                api.add_point_cloud(f"/world/modes/{k}/mean", one, (190, 24, 93), point_size=0.6, **dot),
-                api.add_label(f"/world/modes/{k}/weight", " ", visible=False, anchor="bottom-left"),
+                api.add_point_cloud(f"/world/peaks/{k}/mean", one, (190, 24, 93), point_size=0.6, **dot),
+                api.add_label(f"/world/peaks/{k}/weight", " ", visible=False, anchor="bottom-left"),
             )
-            for k in range(MODES)
+            for k in range(PEAKS)
         ]
         self._vehicle = api.add_frame("/world/vehicle", show_axes=False)
         api.add_box("/world/vehicle/body", (30, 64, 175), (4.4, 1.8, 0.7), position=(0, 0, 0.65), cast_shadow=False)
@@ -126,7 +126,7 @@ class VehicleScene:
         known = bool(np.isfinite(belief.mean[[self.east, self.north]]).all())
         # What was drawn before would else stand for an estimate that is not a number.
         self._vehicle.visible = known
-        self._draw_cloud(belief.points if known else (), belief.modes if known else ())
+        self._draw_cloud(belief.points if known else (), belief.peaks if known else ())
         if known:
             self._draw_vehicle(mean, belief)
         else:
@@ -135,7 +135,7 @@ class VehicleScene:
     def _draw_vehicle(self, mean: np.ndarray, belief: Any) -> None:
         """Move the vehicle with its ellipse, and the world under the camera."""
         # A mean between two peaks is nowhere.
-        peak = belief.modes[0] if len(belief.modes) > 1 else belief
+        peak = belief.peaks[0] if len(belief.peaks) > 1 else belief
         here = peak.mean[[self.east, self.north]]
         middle = here if self.follow or self._home is None else self._home
         if self._anchor is None or np.linalg.norm(middle - self._anchor) > 200.0:
@@ -192,7 +192,7 @@ class VehicleScene:
         if len(points):
             self._readings.points = points
 
-    def _draw_cloud(self, points: Any, modes: Any) -> None:
+    def _draw_cloud(self, points: Any, peaks: Any) -> None:
         """The points that stand for the belief, and a dot with its weight at each peak, where there are several."""
         plane = [self.east, self.north]
         points = points[:, plane] if len(points) else np.zeros((0, 2))
@@ -200,8 +200,8 @@ class VehicleScene:
         self._cloud.visible = bool(len(points))
         if len(points):
             self._cloud.points = np.column_stack((points, np.full(len(points), 0.2))).astype(np.float32)
-        several = modes if len(modes) > 1 else ()
-        for k, (dot, label) in enumerate(self._modes):
+        several = peaks if len(peaks) > 1 else ()
+        for k, (dot, label) in enumerate(self._peaks):
             shown = k < len(several) and bool(np.isfinite(several[k].mean[plane]).all())
             if shown:
                 place = (*several[k].mean[plane], 1.2)

@@ -110,14 +110,14 @@ class ViserView:
             while True:
                 pull = self.engine.pull(self._cursor, self._rows)
                 notices += pull.notices
-                changed |= bool(len(pull.readings)) or pull.fresh
+                changed |= bool(len(pull.events)) or pull.fresh
                 if pull.fresh:
                     self.charts.clear()
                 if isinstance(self.scene, FieldScene):
                     self.scene.take(pull)
                 first = self.history.take(pull)
                 self.charts.update(self.history, max(0, first - self.history.trim()))
-                if len(pull.readings) < self._rows:
+                if len(pull.events) < self._rows:
                     break
             if pull.revision != self._revision:
                 self._revision = pull.revision

@@ -18,7 +18,7 @@ PROBABILITY = 0.95
 
 
 FEW = 10
-"""Readings in a window below which it says nothing of health."""
+"""Events in a window below which it says nothing of health."""
 
 
 FAR = 20

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from ..errors import EstimatorError
-from ..events.batch import TRUTH, Readings
+from ..events.batch import TRUTH, Events
 from ..model.state_space import StateSpaceModel
 from ..numerics.quantiles import chi_square_quantile
 from .health import PROBABILITY
@@ -44,7 +44,7 @@ class Nees(NamedTuple):
         return float(np.mean((self.low <= self.value)[known] & (self.value <= self.high)[known]))
 
 
-def nees(model: StateSpaceModel, events: Readings, mean: np.ndarray, cov: np.ndarray) -> Nees:
+def nees(model: StateSpaceModel, events: Events, mean: np.ndarray, cov: np.ndarray) -> Nees:
     """NEES at the truth events.
 
     Args:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..log import READING, Readings, truth_of
+from ..log import READING, Events, truth_of
 from ..model.state_space import StateSpaceModel
 from ..numerics.quantiles import normal_quantile
 from ..track import GATED, HELD_OUT, MISSING, USED, VERDICT_NAMES, Track
@@ -46,7 +46,7 @@ class Score(NamedTuple):
     field: Fit | None = None
 
 
-def score(track: Track, events: Readings, model: StateSpaceModel, pictures: Sequence[Picture] = ()) -> Score:
+def score(track: Track, events: Events, model: StateSpaceModel, pictures: Sequence[Picture] = ()) -> Score:
     """Sum a track up. Errors are taken at the truth events, whose rows hold the estimate at that time.
 
     Of a large field the fold's `pictures` are summed up too; the track knows a few cells only.
@@ -79,7 +79,7 @@ def _over_field(pictures: Sequence[Picture]) -> Fit | None:
     return Fit(float(np.sqrt(square)), float(np.average([picture.inside for picture in told], weights=cells)))
 
 
-def _against_truth(track: Track, events: Readings, model: StateSpaceModel) -> dict[str, Fit]:
+def _against_truth(track: Track, events: Events, model: StateSpaceModel) -> dict[str, Fit]:
     fits: dict[str, Fit] = {}
     for k, (j, state) in enumerate(zip(model.shown, model.shown_states, strict=True)):
         rows, values = truth_of(events, int(j))
@@ -91,7 +91,7 @@ def _against_truth(track: Track, events: Readings, model: StateSpaceModel) -> di
     return fits
 
 
-def _held_out(track: Track, events: Readings, model: StateSpaceModel) -> dict[str, Fit]:
+def _held_out(track: Track, events: Events, model: StateSpaceModel) -> dict[str, Fit]:
     fits: dict[str, Fit] = {}
     held = track.verdict == HELD_OUT
     for i, sensor in enumerate(model.sensors):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import EventError, nearest
-from .batch import BEFORE, INPUT, READING, TICK, TRUTH, Readings
+from .batch import BEFORE, INPUT, READING, TICK, TRUTH, Events
 
 if TYPE_CHECKING:
     from ..model.state_space import StateSpaceModel
@@ -31,8 +31,8 @@ def nanoseconds(name: str, seconds: Any) -> np.ndarray:
     return np.rint(s * 1e9).astype(np.int64)
 
 
-def readings(model: StateSpaceModel, sensor: str, seconds: Any, values: Any, variance: Any = None) -> Readings:
-    """Readings of one sensor; see `Log.add`."""
+def readings(model: StateSpaceModel, sensor: str, seconds: Any, values: Any, variance: Any = None) -> Events:
+    """Events of one sensor; see `Log.add`."""
     index = _index("sensor", sensor, model.sensor_names, model)
     rows = len(model.sensors[index].rows)
     t = nanoseconds("seconds", seconds)
@@ -57,7 +57,7 @@ def readings(model: StateSpaceModel, sensor: str, seconds: Any, values: Any, var
     return batch
 
 
-def inputs(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Readings:
+def inputs(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Events:
     """Inputs by name; see `Log.add_inputs`."""
     if not named:
         raise EventError(f"add_inputs: no input is given; {nearest('', model.input_names)}")
@@ -68,7 +68,7 @@ def inputs(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Re
     return batch
 
 
-def truth(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Readings:
+def truth(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Events:
     """True states by name, in as few events a time as their places in the state allow; see `Log.add_truth`."""
     if not named:
         raise EventError(f"add_truth: no state is given; {nearest('', model.state_names)}")
@@ -76,7 +76,7 @@ def truth(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Rea
     known = {
         _index("state", name, model.state_names, model): _column(name, values, t.size) for name, values in named.items()
     }
-    blocks: list[Readings] = []
+    blocks: list[Events] = []
     for state in sorted(known):
         if not blocks or state >= int(blocks[-1].channel[0]) + model.width:
             blocks.append(_blank(t, TRUTH, state, model.width))
@@ -84,18 +84,18 @@ def truth(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Rea
         blocks[-1].value[:, state - first] = known[state]
         if not t.size:
             break
-    return Readings.concat(blocks, model.width)
+    return Events.concat(blocks, model.width)
 
 
-def ticks(width: int, seconds: Any) -> Readings:
+def ticks(width: int, seconds: Any) -> Events:
     """Queries; see `Log.add_ticks`."""
     return _blank(nanoseconds("seconds", seconds), TICK, 0, width)
 
 
-def _blank(t: np.ndarray, kind: int, channel: int, width: int) -> Readings:
+def _blank(t: np.ndarray, kind: int, channel: int, width: int) -> Events:
     """Events that know nothing yet; they arrive when they are measured."""
     n = t.size
-    return Readings(t, t.copy(), np.full(n, kind, np.int8), np.full(n, channel, np.int32), np.full((n, width), np.nan))
+    return Events(t, t.copy(), np.full(n, kind, np.int8), np.full(n, channel, np.int32), np.full((n, width), np.nan))
 
 
 def _numbers(name: str, values: Any) -> np.ndarray:

@@ -18,7 +18,7 @@ BEFORE = -(2**62)
 KIND_NAMES = ("reading", "input", "truth", "tick", "reset")
 
 
-class Readings(NamedTuple):
+class Events(NamedTuple):
     """A batch of events in the order of arrival; columns of one length N.
 
     `channel` is the sensor's index for a reading, the first state's for a truth, else 0. `value` (N, width) holds a
@@ -36,13 +36,13 @@ class Readings(NamedTuple):
     value: np.ndarray
 
     @staticmethod
-    def empty(width: int) -> Readings:
+    def empty(width: int) -> Events:
         """A batch without events."""
         none = np.zeros(0, np.int64)
-        return Readings(none, none, np.zeros(0, np.int8), np.zeros(0, np.int32), np.zeros((0, width)))
+        return Events(none, none, np.zeros(0, np.int8), np.zeros(0, np.int32), np.zeros((0, width)))
 
     @staticmethod
-    def one(t: int, arrival: int, kind: int, channel: int, values: object, width: int) -> Readings:
+    def one(t: int, arrival: int, kind: int, channel: int, values: object, width: int) -> Events:
         """A batch of one event; `values` fill the first columns, the rest is NaN.
 
         Raises:
@@ -53,7 +53,7 @@ class Readings(NamedTuple):
         if given.size > width:
             raise EventError(f"values are {given.size}; they must be {width} at most, the width of the log")
         row[0, : given.size] = given
-        return Readings(
+        return Events(
             np.array([_whole("t", t)], np.int64),
             np.array([_whole("arrival", arrival)], np.int64),
             np.array([_whole("kind", kind)], np.int8),
@@ -62,24 +62,24 @@ class Readings(NamedTuple):
         )
 
     @staticmethod
-    def concat(batches: list[Readings], width: int) -> Readings:
+    def concat(batches: list[Events], width: int) -> Events:
         """Batches one after the other, with at least `width` value columns."""
         if not batches:
-            return Readings.empty(width)
+            return Events.empty(width)
         widest = max(width, *(batch.value.shape[1] for batch in batches))
         wide = [batch.widened(widest) for batch in batches]
-        return Readings(*(np.concatenate(columns) for columns in zip(*wide, strict=True)))
+        return Events(*(np.concatenate(columns) for columns in zip(*wide, strict=True)))
 
-    def widened(self, width: int) -> Readings:
+    def widened(self, width: int) -> Events:
         """The same events with at least `width` value columns; those that are added know nothing."""
         missing = width - self.value.shape[1]
         if missing <= 0:
             return self
-        return Readings(*self[:4], np.pad(self.value, ((0, 0), (0, missing)), constant_values=np.nan))
+        return Events(*self[:4], np.pad(self.value, ((0, 0), (0, missing)), constant_values=np.nan))
 
-    def select(self, index: Any) -> Readings:
+    def select(self, index: Any) -> Events:
         """The events that a mask, slice or index array picks."""
-        return Readings(*(column[index] for column in self))
+        return Events(*(column[index] for column in self))
 
     def __len__(self) -> int:
         """Number of events (not of columns)."""
@@ -87,7 +87,7 @@ class Readings(NamedTuple):
 
 
 # What `_replace` builds with; NamedTuple's own counts the columns by `len`, which here is the number of events.
-Readings._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[method-assign, assignment]
+Events._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[method-assign, assignment]
 
 
 def _whole(name: str, value: Any) -> int:
@@ -100,7 +100,7 @@ def _whole(name: str, value: Any) -> int:
         raise EventError(f"{name} is {value!r}; it must be {unit}: {remedy}") from None
 
 
-def truth_of(events: Readings, state: int) -> tuple[np.ndarray, np.ndarray]:
+def truth_of(events: Events, state: int) -> tuple[np.ndarray, np.ndarray]:
     """What the truth events know of one state.
 
     Args:

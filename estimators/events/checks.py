@@ -15,7 +15,7 @@ from numba import types
 from ..errors import LARGEST, EventError
 from ..model.layout import Layout
 from ..numerics.jit import i64, jit_brief
-from .batch import BEFORE, INPUT, KIND_NAMES, READING, TRUTH, Readings
+from .batch import BEFORE, INPUT, KIND_NAMES, READING, TRUTH, Events
 
 FINE, TIME, KIND, CHANNEL, VALUES, STRAY, VARIANCE = range(7)
 """The rules, as `_look` names the one that is broken."""
@@ -93,7 +93,7 @@ def _looking() -> Any:
 _TYPES = {"t": np.int64, "arrival": np.int64, "kind": np.int8, "channel": np.int32}
 
 
-def admitted(batch: Readings, width: int, layout: Layout | None) -> Readings:
+def admitted(batch: Events, width: int, layout: Layout | None) -> Events:
     """The batch, with infinite values as missing ones, if a log may take it.
 
     Args:
@@ -118,7 +118,7 @@ def admitted(batch: Readings, width: int, layout: Layout | None) -> Readings:
     return batch
 
 
-def _plain(batch: Readings) -> Readings:
+def _plain(batch: Events) -> Events:
     """The batch with columns of one length and of the log's types.
 
     Raises:
@@ -137,7 +137,7 @@ def _plain(batch: Readings) -> Readings:
     if value.ndim != 2 or value.shape[0] != n or value.dtype.kind not in "fiu":
         raise EventError(f"value has shape {value.shape} of {value.dtype}; it must be numbers of shape ({n}, width)")
     columns[4] = np.ascontiguousarray(value, float)
-    return Readings(*columns)
+    return Events(*columns)
 
 
 def _integers(name: str, column: np.ndarray, wanted: type) -> np.ndarray:
@@ -151,7 +151,7 @@ def _integers(name: str, column: np.ndarray, wanted: type) -> np.ndarray:
     return column.astype(wanted)
 
 
-def _broken(batch: Readings, at: int, rule: int, width: int, layout: Layout | None) -> str:
+def _broken(batch: Events, at: int, rule: int, width: int, layout: Layout | None) -> str:
     """What is wrong with an event, and what would be right."""
     t, kind, channel = int(batch.t[at]), int(batch.kind[at]), int(batch.channel[at])
     value = batch.value[at]

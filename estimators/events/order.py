@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from .batch import INPUT, READING, RESET, TICK, TRUTH, Readings
+from .batch import INPUT, READING, RESET, TICK, TRUTH, Events
 
 _ORDER = (INPUT, READING, TRUTH, TICK, RESET)
 _RANK = np.array([_ORDER.index(kind) for kind in range(len(_ORDER))], np.int64) << 32
 
 
-def in_order(events: Readings) -> bool:
+def in_order(events: Events) -> bool:
     """Whether each event comes after the one before it, with no two that only their values could order."""
     t = events.t
     if t.size < 2:
@@ -30,7 +30,7 @@ def in_order(events: Readings) -> bool:
     return bool(np.all(later | ((t[1:] == t[:-1]) & (place[1:] > place[:-1]))))
 
 
-def sorted_order(events: Readings) -> np.ndarray:
+def sorted_order(events: Events) -> np.ndarray:
     """The permutation (N,) that puts events in the order of a log."""
     place = _RANK.take(events.kind) + events.channel
     order: np.ndarray = np.lexsort((place, events.t))

@@ -28,7 +28,7 @@ from ..diagnostics.health import HealthPolicy
 from ..errors import ConfigError, EstimatorError
 from ..fold import Fold
 from ..fold import fold as fold_track
-from ..log import Log, Readings
+from ..log import Events, Log
 from ..model.state_space import StateSpaceModel
 from ..registry import checked, find_estimator
 from ..track import Track
@@ -63,7 +63,7 @@ def fold(
     Args:
         estimator: Its name, such as "ukf"; all are in `ESTIMATORS`.
         model: What the log is of.
-        log: Readings, inputs, true states.
+        log: Events, inputs, true states.
         R: Variances of sensor noise, in the rows' units squared: by sensor (one number, or one for each row), or by
             row, "gnss.east".
         Q: Variances that the process noises add in a second, by name.
@@ -216,13 +216,13 @@ def _check_named(log: Log, model: StateSpaceModel) -> None:
             )
 
 
-def _copied(log: Log) -> Readings:
+def _copied(log: Log) -> Events:
     """The log's events now, whatever comes later."""
-    return Readings(*(column.copy() for column in log.readings))
+    return Events(*(column.copy() for column in log.events))
 
 
 def _estimates(
-    estimator: str, model: StateSpaceModel, tuning: Tuning, events: Readings, track: Track, covariance: bool
+    estimator: str, model: StateSpaceModel, tuning: Tuning, events: Events, track: Track, covariance: bool
 ) -> Estimates:
     return Estimates(estimator=estimator, model=model, tuning=tuning, events=events, track=track, covariance=covariance)
 

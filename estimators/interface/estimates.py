@@ -11,7 +11,7 @@ import numpy as np
 from ..diagnostics.nees import Nees, nees
 from ..diagnostics.score import Score, score
 from ..errors import EstimatorError
-from ..events.batch import READING, Readings
+from ..events.batch import READING, Events
 from ..model.state_space import StateSpaceModel
 from ..track import Track
 from ..tuning import Tuning
@@ -25,7 +25,7 @@ class Estimates:
     estimator: str
     model: StateSpaceModel
     tuning: Tuning = field(repr=False)
-    events: Readings = field(repr=False)
+    events: Events = field(repr=False)
     track: Track = field(repr=False)
     covariance: bool = False
 

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from ..events.batch import KIND_NAMES, READING, Readings, truth_of
+from ..events.batch import KIND_NAMES, READING, Events, truth_of
 from ..model.state_space import StateSpaceModel
 from ..track import HEALTH_NAMES, VERDICT_NAMES, Track
 
 
-def table_of(model: StateSpaceModel, events: Readings, track: Track) -> Any:
+def table_of(model: StateSpaceModel, events: Events, track: Track) -> Any:
     """A pyarrow.Table of events and track.
 
     Columns: `t_ns` and `arrival_ns`; `seconds`; `event`, `channel`, and `sensor` (null unless it is a reading);

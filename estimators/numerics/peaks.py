@@ -32,7 +32,7 @@ CANDIDATES = 12
 """Peaks that are told from bumps of the density at most."""
 
 
-class Mode(NamedTuple):
+class Peak(NamedTuple):
     """One peak: its part of the probability, mean (nx,) and covariance (nx, nx)."""
 
     weight: float
@@ -40,7 +40,7 @@ class Mode(NamedTuple):
     cov: np.ndarray
 
 
-def modes_of(points: np.ndarray, circular: np.ndarray) -> list[Mode]:
+def peaks_of(points: np.ndarray, circular: np.ndarray) -> list[Peak]:
     """The peaks of points of equal weight, the heaviest first.
 
     Args:
@@ -54,11 +54,11 @@ def modes_of(points: np.ndarray, circular: np.ndarray) -> list[Mode]:
     few = places[np.arange(min(len(places), SAMPLE)) * len(places) // min(len(places), SAMPLE)]
     label = _peaks(few)
     if label.max() == 0:
-        return [_mode(points, circular, 1.0)]
+        return [_peak(points, circular, 1.0)]
     whole = label[np.argmin(_squares(places, few), axis=1)]
     parts = [points[whole == k] for k in range(label.max() + 1)]
-    found = [_mode(part, circular, len(part) / len(points)) for part in parts if len(part)]
-    return sorted(found, key=lambda mode: -mode.weight)
+    found = [_peak(part, circular, len(part) / len(points)) for part in parts if len(part)]
+    return sorted(found, key=lambda peak: -peak.weight)
 
 
 def _whitened(points: np.ndarray, circular: np.ndarray) -> np.ndarray:
@@ -160,7 +160,7 @@ def _valley(places: np.ndarray, label: np.ndarray, a: int, b: int) -> bool:
     return bool(density[8:-8].min() < DIP * lower)
 
 
-def _mode(points: np.ndarray, circular: np.ndarray, weight: float) -> Mode:
+def _peak(points: np.ndarray, circular: np.ndarray, weight: float) -> Peak:
     """Mean and covariance of one peak's points; angles about their mean direction."""
     mean = points.mean(axis=0)
     for j in np.flatnonzero(circular):
@@ -168,4 +168,4 @@ def _mode(points: np.ndarray, circular: np.ndarray, weight: float) -> Mode:
     deviations = points - mean
     for j in np.flatnonzero(circular):
         deviations[:, j] = (deviations[:, j] + np.pi) % (2.0 * np.pi) - np.pi
-    return Mode(weight, mean, deviations.T @ deviations / len(points))
+    return Peak(weight, mean, deviations.T @ deviations / len(points))

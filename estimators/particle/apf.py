@@ -25,7 +25,7 @@ from ..numerics.jit import jit, matrix
 from ..numerics.random import ONE, key_of, normal
 from ..track import FAILED, MISSING, USED
 from .cloud import DRAW, MEMBERS, OPTIONS, RESAMPLE, RESAMPLED, cloud_of, own_covariance, sized, tune, weigh_equally
-from .describe import describe, modes, moments, points, recoveries
+from .describe import describe, moments, peaks, points, recoveries
 from .innovation import finite_rows
 from .proposals import (
     PROPOSE,
@@ -129,7 +129,7 @@ APF = Estimator(
     work_size=work_size,
     moments=moments,
     points=points,
-    modes=modes,
+    peaks=peaks,
     recoveries=recoveries,
     options=tuple(option for option in OPTIONS if option.name != "fraction"),
     tune=tune,

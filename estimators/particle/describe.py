@@ -8,7 +8,7 @@ from ..compiled.context import options as numbers
 from ..compiled.context import shown_states
 from ..estimator import Options
 from ..numerics.jit import ints, jit
-from ..numerics.peaks import Mode, modes_of
+from ..numerics.peaks import Peak, peaks_of
 from .cloud import EQUAL, MEMBERS, RECOVERIES, block, members, views, weights_of
 from .moments import cloud_moments
 
@@ -35,9 +35,9 @@ def points(options: Options, state: np.ndarray, nx: int) -> np.ndarray:
     return records[np.minimum(picked, n - 1), :nx]
 
 
-def modes(options: Options, state: np.ndarray, nx: int) -> list[Mode]:
+def peaks(options: Options, state: np.ndarray, nx: int) -> list[Peak]:
     """The peaks of the cloud."""
-    return modes_of(points(options, state, nx), views(options, state, nx).circular != 0.0)
+    return peaks_of(points(options, state, nx), views(options, state, nx).circular != 0.0)
 
 
 def recoveries(state: np.ndarray) -> int:

@@ -42,7 +42,7 @@ from .cloud import (
     sized,
     tune,
 )
-from .describe import describe, modes, moments, points, recoveries
+from .describe import describe, moments, peaks, points, recoveries
 from .innovation import finite_rows, predicted
 from .propagate import propagate_block, smooth_block, work_size
 from .recovery import recover, start
@@ -150,7 +150,7 @@ PF = Estimator(
     work_size=work_size,
     moments=moments,
     points=points,
-    modes=modes,
+    peaks=peaks,
     recoveries=recoveries,
     options=OPTIONS,
     blocks=block,
@@ -172,7 +172,7 @@ PF_REG = Estimator(
     work_size=work_size,
     moments=moments,
     points=points,
-    modes=modes,
+    peaks=peaks,
     recoveries=recoveries,
     options=(*OPTIONS, BANDWIDTH, JITTERED),
     blocks=block,

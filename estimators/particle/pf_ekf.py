@@ -20,7 +20,7 @@ from ..numerics.jit import inlined, jit
 from ..numerics.random import ONE, key_of, normal
 from ..track import FAILED, MISSING, USED
 from .cloud import DRAW, MEMBERS, OPTIONS, RESAMPLE, cloud_of, own_covariance, sized, tune
-from .describe import describe, modes, moments, points, recoveries
+from .describe import describe, moments, peaks, points, recoveries
 from .innovation import finite_rows
 from .proposals import (
     PROPOSE,
@@ -140,7 +140,7 @@ PF_EKF = Estimator(
     work_size=work_size,
     moments=moments,
     points=points,
-    modes=modes,
+    peaks=peaks,
     recoveries=recoveries,
     options=OPTIONS,
     tune=tune,

@@ -23,7 +23,7 @@ from ..estimator import Estimator, Option, Options
 from ..gaussian.shared import admit
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import floats, jit, matrix
-from ..numerics.peaks import Mode, modes_of
+from ..numerics.peaks import Peak, peaks_of
 from ..numerics.random import key_of, normal
 from ..track import FAILED, MISSING, USED
 from .cloud import (
@@ -203,9 +203,9 @@ def points(options: Options, state: np.ndarray, nx: int) -> np.ndarray:
     return np.asarray(records[picked, :nx] + np.einsum("kij,kj->ki", vectors, z))
 
 
-def modes(options: Options, state: np.ndarray, nx: int) -> list[Mode]:
+def peaks(options: Options, state: np.ndarray, nx: int) -> list[Peak]:
     """The peaks of the mixture."""
-    return modes_of(points(options, state, nx), views(options, state, nx).circular != 0.0)
+    return peaks_of(points(options, state, nx), views(options, state, nx).circular != 0.0)
 
 
 def applies(model: StateSpaceModel) -> str | None:
@@ -237,7 +237,7 @@ RBPF = Estimator(
     work_size=work_size,
     moments=moments,
     points=points,
-    modes=modes,
+    peaks=peaks,
     recoveries=recoveries,
     options=OPTIONS,
     tune=tune,

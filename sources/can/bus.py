@@ -10,7 +10,7 @@ from typing import Any
 import can
 
 from estimators.errors import SourceError
-from estimators.log import Readings
+from estimators.log import Events
 
 from ..source import Report, ignore
 from .decoder import Decoder
@@ -85,12 +85,12 @@ class CanBus:
         self._bus: Any = self._connect()
         self._heard = Heard(f"CAN bus {self._name}", decoder, clock, report)
 
-    def read(self, timeout: float) -> Readings | None:
+    def read(self, timeout: float) -> Events | None:
         """The events of the frames that are queued; waits up to `timeout` seconds for the first. None once closed."""
         if self._closed.is_set():
             return None
         if self._bus is None and not self._reconnect(timeout):
-            return Readings.empty(self._decoder.width)
+            return Events.empty(self._decoder.width)
         messages: list[Any] = []
         arrivals: list[int] = []
         try:

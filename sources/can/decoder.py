@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from estimators.errors import SourceError
-from estimators.log import READING, Readings
+from estimators.log import READING, Events
 
 from ..clock import second_ns
 from ..mapping import ABSENT, PRESENT, SHORT, Mapping
@@ -184,7 +184,7 @@ class Decoder:
             np.frombuffer(bytearray().join(chunks), np.uint8).reshape(len(chunks), longest),
         )
 
-    def decode(self, frames: Frames) -> Readings:
+    def decode(self, frames: Frames) -> Events:
         """The events of frames, in their order; the same for a live frame and for a whole recording."""
         values = np.empty((frames.plan.size, self._most))
         state = np.empty((frames.plan.size, self._most), np.int8)
@@ -240,7 +240,7 @@ class Decoder:
             )
 
 
-def _valued(batch: Readings, kind: int, index: int) -> bool:
+def _valued(batch: Events, kind: int, index: int) -> bool:
     """Whether a batch has a value for the sensor, input or state `index`."""
     rows = batch.kind == kind
     if kind == READING:

@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 
 from estimators.errors import SourceError
-from estimators.log import Readings
+from estimators.log import Events
 
 from ..reader_process import Apart, patience_for
 from ..source import NEVER, TRUNCATED, Report, ignore
@@ -54,14 +54,14 @@ class CanLog:
         """First and last time, ns; None where the format does not tell without being read."""
         return log_span(self._files)
 
-    def _all(self) -> Generator[Readings, None, None]:
+    def _all(self) -> Generator[Events, None, None]:
         for path in self._files:
             yield from self._one(path)
         for item in self._decoder.expected:
             for text in self._decoder.missing(item, self._seen):
                 self._report(NEVER, f"{self._name}: {text}")
 
-    def _one(self, path: Path) -> Generator[Readings, None, None]:
+    def _one(self, path: Path) -> Generator[Events, None, None]:
         before = self.frames
         apart = Apart(read_frames, path, self._decoder.wanted, self._decoder.longest, patience=patience_for(path))
         fault = ""
@@ -79,7 +79,7 @@ class CanLog:
                         self._report("error frame", f"{path.name}: error frame")
                     fault = item.fault
                 elif not apart.ended:
-                    yield Readings.empty(self._decoder.width)
+                    yield Events.empty(self._decoder.width)
         except SourceError as error:
             if self.frames == before and path == self._files[0]:
                 # What the reader itself raised names the file; what became of the reader does not.
@@ -92,7 +92,7 @@ class CanLog:
             fault = fault or "it holds none"
             self._report(TRUNCATED, f"{path.name}: the file is damaged after {count} frames ({fault})")
 
-    def read(self, timeout: float) -> Readings | None:
+    def read(self, timeout: float) -> Events | None:
         """The events of the next frames; none if there are none within `timeout` seconds; None at the end."""
         self._timeout = timeout
         return next(self._batches, None)

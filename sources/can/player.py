@@ -10,7 +10,7 @@ from typing import Any
 
 import can
 
-from estimators.log import INPUT, READING, TRUTH, Readings
+from estimators.log import INPUT, READING, TRUTH, Events
 
 from ..simulation.simulator import Simulator
 from ..source import Channel, Report, ignore
@@ -107,7 +107,7 @@ class Player:
                     begun -= wait
                 self._say(t, events)
 
-    def _moments(self, batch: Readings) -> list[tuple[int, list[tuple[int, int, Sequence[float]]]]]:
+    def _moments(self, batch: Events) -> list[tuple[int, list[tuple[int, int, Sequence[float]]]]]:
         """The events of a batch by time; every input and every true state is one by itself."""
         moments: list[tuple[int, list[tuple[int, int, Sequence[float]]]]] = []
         columns = (batch.t.tolist(), batch.kind.tolist(), batch.channel.tolist(), batch.value.tolist())

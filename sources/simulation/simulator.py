@@ -9,7 +9,7 @@ import numpy as np
 
 from estimators.compiled.model import compile_model
 from estimators.errors import NisusError, SourceError
-from estimators.log import INPUT, READING, TICK, TRUTH, Readings
+from estimators.log import INPUT, READING, TICK, TRUTH, Events
 from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.jit import plain
 from estimators.numerics.steps import steps_of
@@ -129,7 +129,7 @@ class Simulator:
     def _inputs(self, t: float) -> np.ndarray:
         return np.array([profile.at(t) for profile in self._profiles], float)
 
-    def read(self, timeout: float) -> Readings | None:
+    def read(self, timeout: float) -> Events | None:
         """The events of the next steps; None at the end."""
         rows: list[tuple[int, int, int, np.ndarray]] = []
         if not self._begun:
@@ -153,7 +153,7 @@ class Simulator:
         for i, (_, _, _, given) in enumerate(rows):
             value[i, : given.size] = given
         t = np.array([row[0] for row in rows], np.int64)
-        return Readings(
+        return Events(
             t,
             t.copy(),
             np.array([row[1] for row in rows], np.int8),

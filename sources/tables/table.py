@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from estimators.errors import SourceError, nearest
-from estimators.log import Readings
+from estimators.log import Events
 
 from ..mapping import ABSENT, PRESENT, Mapping
 from ..source import NEVER, TRUNCATED, Channel, Report, ignore
@@ -74,7 +74,7 @@ class Table:
         self._order = Order(time_column, time_unit, None if horizon is None else round(horizon * 1e9), report)
         self._batches = self._all()
 
-    def _all(self) -> Generator[Readings, None, None]:
+    def _all(self) -> Generator[Events, None, None]:
         for path in self._files:
             yield from self._one(path)
         if self._count:
@@ -82,11 +82,11 @@ class Table:
                 if name not in self._valued:
                     self._report(NEVER, self._never(name))
 
-    def _one(self, path: Path) -> Generator[Readings, None, None]:
+    def _one(self, path: Path) -> Generator[Events, None, None]:
         before = self._count
         try:
             for rows in rows_of(path, self._time, self._unit, self._columns, lambda: self._timeout):
-                batch = Readings.empty(self._width) if rows is None else self._events(path, rows)
+                batch = Events.empty(self._width) if rows is None else self._events(path, rows)
                 if rows is None or len(batch):
                     yield batch
         except SourceError as error:
@@ -95,7 +95,7 @@ class Table:
             gist = str(error).removeprefix(f"{path}: ")
             self._report(TRUNCATED, f"{path.name}: damaged after {self._count - before} rows: {gist}")
 
-    def _events(self, path: Path, rows: Rows) -> Readings:
+    def _events(self, path: Path, rows: Rows) -> Events:
         for key, line, text in rows.problems:
             self._report(key, f"{path.name}:{line}: {text}")
         known = rows.known
@@ -119,7 +119,7 @@ class Table:
         files = self._files[0].name + (f" and {len(self._files) - 1} more" if len(self._files) > 1 else "")
         return f"{files}: column {name!r} has no value in {self._count} rows; {fed} gets nothing from it"
 
-    def read(self, timeout: float) -> Readings | None:
+    def read(self, timeout: float) -> Events | None:
         """The events of the next rows; none if there are none within `timeout` seconds; None at the end."""
         self._timeout = timeout
         return next(self._batches, None)

@@ -9,7 +9,7 @@ import numpy as np
 from app.engine.commands import Pause, Record, Restore, SetEstimator, SetOption, SetTuning, Speed, UseSensor
 from config.schema import ViewSection
 from estimators.fold import Fold
-from estimators.log import Log, Readings
+from estimators.log import Events, Log
 from estimators.registry import ESTIMATORS
 from estimators.track import TRACKING
 from estimators.tuning import Tuning
@@ -100,25 +100,25 @@ class FakeEngine:
     def previous(self):
         return self.before
 
-    modes = ()
+    peaks = ()
 
     def belief(self):
         mean, cov = self.fold.moments()
-        return SimpleNamespace(t=self.state.t, mean=mean, cov=cov, points=self.fold.points(), modes=self.modes)
+        return SimpleNamespace(t=self.state.t, mean=mean, cov=cov, points=self.fold.points(), peaks=self.peaks)
 
     def _pull(self, first, fresh):
         rows = slice(first, self.log.n)
         return SimpleNamespace(
-            revision=self.state.revision, fresh=fresh, first=first, readings=self.log.readings.select(rows),
+            revision=self.state.revision, fresh=fresh, first=first, events=self.log.events.select(rows),
             track=self.fold.track.select(rows).copy(), notices=[],
         )  # fmt: skip
 
 
 def events(model, kind, channel, times, values):
-    """Readings of one channel at times in seconds; `values` (n,) or (n, k)."""
+    """Events of one channel at times in seconds; `values` (n,) or (n, k)."""
     times = np.asarray(times, float)
     values = np.asarray(values, float).reshape(times.size, -1)
     padded = np.full((times.size, model.width), np.nan)
     padded[:, : values.shape[1]] = values
     t = np.round(times * 1e9).astype(np.int64)
-    return Readings(t, t, np.full(t.size, kind, np.int8), np.full(t.size, channel, np.int32), padded)
+    return Events(t, t, np.full(t.size, kind, np.int8), np.full(t.size, channel, np.int32), padded)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from estimators.diagnostics.health import HealthPolicy
-from estimators.log import READING, Readings
+from estimators.log import READING, Events
 from estimators.models import MODELS
 from estimators.tuning import Tuning
 
@@ -15,10 +15,10 @@ SECOND = 10**9
 
 
 def readings(times_s, values):
-    """Readings of the winding sensor."""
+    """Events of the winding sensor."""
     t = np.round(np.asarray(times_s, float) * SECOND).astype(np.int64)
     n = t.size
-    return Readings(
+    return Events(
         t, t.copy(), np.full(n, READING, np.int8), np.zeros(n, np.int32), np.asarray(values, float).reshape(n, 1)
     )
 
@@ -56,7 +56,7 @@ class Scripted:
         try:
             item = self.batches.get(timeout=timeout)
         except queue.Empty:
-            return Readings.empty(MODEL.width)
+            return Events.empty(MODEL.width)
         if isinstance(item, Exception):
             raise item
         return item

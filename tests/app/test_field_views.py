@@ -85,10 +85,10 @@ class Running:
         self.put(batches)
 
     def put(self, batches):
-        wanted = len(self.pull().readings) + sum(map(len, batches))
+        wanted = len(self.pull().events) + sum(map(len, batches))
         for batch in batches:
             self.source.put(batch)
-        wait_for(lambda: len(self.pull().readings) == wanted)
+        wait_for(lambda: len(self.pull().events) == wanted)
 
     def end(self):
         self.source.put(None)
@@ -177,7 +177,7 @@ def test_a_swap_and_a_retune_leave_tracks_and_pictures_complete(running, twin, b
     ):
         live.submit(command)
         pull, (tuning, estimator) = live.pull(), live.engine.folded_with()
-        expected = direct(twin, tuning, estimator, pull.readings)
+        expected = direct(twin, tuning, estimator, pull.events)
         np.testing.assert_array_equal(pull.track.mean, expected.track.mean)
         assert_same(pull.pictures, expected.pictures.taken)
         assert len(pull.pictures) > 6
@@ -186,7 +186,7 @@ def test_a_swap_and_a_retune_leave_tracks_and_pictures_complete(running, twin, b
     live.put(batches[-4:])
     live.end()
     pull = live.pull()
-    expected = direct(twin, tuning, estimator, pull.readings)
+    expected = direct(twin, tuning, estimator, pull.events)
     expected.finish()
     assert_same(pull.pictures, expected.pictures.taken)
     assert seconds(pull.pictures[-1]) == 20 and pull.pictures[-1].cells == 96
@@ -203,7 +203,7 @@ def test_a_cursor_gets_each_picture_once(running, batches):
     assert_same([picture for part in got for picture in part], live.pull().pictures)
     # In pieces too.
     pieces, cursor = [], live.engine.cursor()
-    while (pull := live.engine.pull(cursor, 7)).readings.t.size:
+    while (pull := live.engine.pull(cursor, 7)).events.t.size:
         pieces += pull.pictures
     assert_same(pieces, live.pull().pictures)
 
@@ -285,7 +285,7 @@ def test_the_scene_shows_the_picture_that_is_chosen_and_the_sensor_that_is_off(r
         shown = first[:: frame.tall, :: frame.wide].astype(int).sum(axis=2)
         assert shown[i, j] == shown.max()
         # Red are the sensors that are far off in the newest reading: the one with a bias of 40 °C, not all.
-        last = np.flatnonzero(pull.readings.kind == READING)[-1]
+        last = np.flatnonzero(pull.events.kind == READING)[-1]
         far = np.abs(pull.track.innovation[last] / pull.track.innovation_std[last]) >= 3
         biased = [row.name for row in live.engine.model.sensors[0].rows].index("t2_3")
         assert far[biased] and not far.all()

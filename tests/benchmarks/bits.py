@@ -75,7 +75,7 @@ def hashes(names: list[str]) -> dict[str, str]:
                 continue
             begun = time.perf_counter()
             key = f"{twin_name}/{name}"
-            events = whole.readings.select(slice(0, events_of(twin, name)))
+            events = whole.events.select(slice(0, events_of(twin, name)))
             log = Log(twin.model.width, len(events))
             log.extend(events)
             tuning = replace(twin.tuning, options=twin.options_of(name))

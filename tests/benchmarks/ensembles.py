@@ -12,7 +12,7 @@ import numpy as np
 
 from estimators.compiled.model import compile_model
 from estimators.fold import Fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.model.state_space import StateSpaceModel
 from estimators.models.lorenz96 import LORENZ96
 from estimators.models.thermal_field import thermal_field
@@ -40,7 +40,7 @@ def _ours(name: str, options: dict[str, float]) -> Callable[[], None]:
     truth, readings = _truth(CYCLES)
     log = Log(LORENZ96.width, CYCLES)
     t = (np.arange(CYCLES, dtype=np.int64) + 1) * round(STEP * 1e9)
-    log.extend(Readings(t, t, np.full(CYCLES, READING, np.int8), np.zeros(CYCLES, np.int32), readings))
+    log.extend(Events(t, t, np.full(CYCLES, READING, np.int8), np.zeros(CYCLES, np.int32), readings))
     tuning = Tuning.of(LORENZ96).with_options(options).set("Q.x", 0.0)
     growing = Fold(name, LORENZ96, tuning, log, base=Base(truth[0], 0.1 * np.eye(40), 0, np.zeros(0)))
     growing.advance()
@@ -113,7 +113,7 @@ def analysis(model: StateSpaceModel, name: str, options: dict[str, float], repet
     log = Log(model.width, 16)
     y = model.prior_mean[0] + np.random.default_rng(0).standard_normal(model.width)
     for _ in range(repetitions + 1):
-        log.extend(Readings.one(0, 0, READING, 0, y, model.width))
+        log.extend(Events.one(0, 0, READING, 0, y, model.width))
     fold = Fold(name, model, Tuning.of(model).with_options(options), log)
     fold.advance(1)
     gc.collect()
@@ -171,7 +171,7 @@ def thermal_cycles() -> None:
     rng = np.random.default_rng(0)
     for k in range(cycles):
         y = 20.0 + rng.standard_normal(model.width)
-        log.extend(Readings.one((k + 1) * 10**9, 0, READING, 0, y, model.width))
+        log.extend(Events.one((k + 1) * 10**9, 0, READING, 0, y, model.width))
     print("Cycles of 40,000 cells, 40 members, 100 thermocouples; model included")
     for title, name, options in (("ETKF", "etkf", {}), ("EnSRF, 0.5 m", "ensrf", {"radius": 0.5})):
         fold = Fold(name, model, Tuning.of(model).with_options({"members": 40, **options}), log)

@@ -10,7 +10,7 @@ from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter, MerweScaledSigma
 
 from estimators.estimator import call_predict, call_update
 from estimators.fold import Fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.model.state_space import StateSpaceModel
 from estimators.models import MODELS
 from estimators.numerics.jit import borrowed, floats, jit
@@ -27,7 +27,7 @@ REPETITIONS = 15
 
 
 def log_of(model: StateSpaceModel, events: int, *, step: float = 1.0) -> Log:
-    """Readings of the first sensor, `step` seconds apart: noise about what the model expects at its prior."""
+    """Events of the first sensor, `step` seconds apart: noise about what the model expects at its prior."""
     rng = np.random.default_rng(0)
     m = len(model.sensors[0].rows)
     x = np.array([state.mean for state in model.states])
@@ -36,9 +36,7 @@ def log_of(model: StateSpaceModel, events: int, *, step: float = 1.0) -> Log:
     t = np.arange(events, dtype=np.int64) * round(step * SECOND)
     value = expected + 0.3 * rng.standard_normal((events, m))
     log = Log(model.width, events)
-    log.extend(
-        Readings(t, t, np.full(events, READING, np.int8), np.zeros(events, np.int32), np.ascontiguousarray(value))
-    )
+    log.extend(Events(t, t, np.full(events, READING, np.int8), np.zeros(events, np.int32), np.ascontiguousarray(value)))
     return log
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from app.twin.twin import load_twin
 from estimators.fold import Fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.models import MODELS
 from estimators.tuning import Tuning
 
@@ -35,8 +35,8 @@ def growing_history() -> None:
             growing.rewind(0)
             growing.advance()
 
-        def event(t: int) -> Readings:
-            return Readings.one(t, t, READING, 0, 35.0, 1)
+        def event(t: int) -> Events:
+            return Events.one(t, t, READING, 0, 35.0, 1)
 
         def append(log=log, growing=growing) -> None:
             log.extend(event(int(log.t[log.n - 1]) + SECOND))
@@ -61,14 +61,14 @@ def recorded(twin, readings: int) -> Log:
             once.append(batch)
     finally:
         source.close()
-    events = Readings.concat(once, twin.model.width)
+    events = Events.concat(once, twin.model.width)
     events = events.select(np.argsort(events.t, kind="stable"))
     span = int(events.t[-1] - events.t[0]) + SECOND // 10
     copies = -(-readings // int(np.sum(events.kind == READING)))
     log = Log(twin.model.width, copies * len(events))
     for k in range(copies):
-        log.extend(Readings(events.t + k * span, events.arrival + k * span, *events[2:]))
-    enough = int(np.searchsorted(np.cumsum(log.readings.kind == READING), readings)) + 1
+        log.extend(Events(events.t + k * span, events.arrival + k * span, *events[2:]))
+    enough = int(np.searchsorted(np.cumsum(log.events.kind == READING), readings)) + 1
     log.n = min(log.n, enough)
     return log
 

@@ -109,7 +109,7 @@ def main() -> None:
     engine.status()
     time.sleep(0.2)
     cursor = engine.cursor()
-    readings = engine.pull(cursor).readings
+    readings = engine.pull(cursor).events
     engine.release(cursor)
     events = engine.status().counts
     # Every step sends one frame of three readings, and steps are apart by a fixed time: a lost one leaves a gap.
@@ -121,7 +121,7 @@ def main() -> None:
     )
     session.stop()
     recorded = read_recording(folder / "live.rrd")
-    print(f"recorded readings {int(np.sum(recorded.readings.kind == READING))}, health of it: {engine.status().counts}")
+    print(f"recorded readings {int(np.sum(recorded.events.kind == READING))}, health of it: {engine.status().counts}")
     if browser is not None and playwright is not None:
         browser.close()
         playwright.stop()

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 
 from estimators.fold import Fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models.gripper_contact import GRIPPER_CONTACT
 from estimators.tuning import Tuning
@@ -59,7 +59,7 @@ def _ours(name: str, n: int, model: StateSpaceModel = MODEL, middle: float = 0.0
     step = min(1.0, model.max_step)
     for k, value in enumerate(_readings()):
         t = round((k + 1) * step * SECOND)
-        log.extend(Readings.one(t, 0, READING, 0, middle + value, model.width))
+        log.extend(Events.one(t, 0, READING, 0, middle + value, model.width))
     growing = Fold(name, model, Tuning.of(model).with_options({"particles": n}), log)
     growing.advance()
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimators.log import INPUT, READING, Log, Readings
+from estimators.log import INPUT, READING, Events, Log
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 
 SECOND = 1_000_000_000
@@ -143,7 +143,7 @@ def random_correlation(rng: np.random.Generator, m: int) -> np.ndarray:
 
 
 def random_log(rng: np.random.Generator, matrices: Matrices, events: int, *, missing: float = 0.2) -> Log:
-    """Readings of three sensors at rates 3:2:1 and irregular times (some equal), inputs now and then, lost rows."""
+    """Events of three sensors at rates 3:2:1 and irregular times (some equal), inputs now and then, lost rows."""
     width = matrices.model.width
     nu = matrices.u.size
     t, batch = 5 * SECOND, []
@@ -151,14 +151,14 @@ def random_log(rng: np.random.Generator, matrices: Matrices, events: int, *, mis
         t += int(rng.choice([0, 10**7, 10**8, 3 * 10**8]) * rng.uniform(0.5, 1.5))
         if nu and rng.random() < 0.15:
             values = np.where(rng.random(nu) < 0.3, np.nan, rng.normal(0, 1, nu))
-            batch.append(Readings.one(t, t, INPUT, 0, values, width))
+            batch.append(Events.one(t, t, INPUT, 0, values, width))
             continue
         sensor = int(rng.choice(3, p=[0.5, 0.33, 0.17]))
         y = rng.normal(0, 2, ROWS[sensor])
         y[rng.random(y.size) < missing] = np.nan
-        batch.append(Readings.one(t, t, READING, sensor, y, width))
+        batch.append(Events.one(t, t, READING, sensor, y, width))
     log = Log(width)
-    log.extend(Readings.concat(batch, width))
+    log.extend(Events.concat(batch, width))
     return log
 
 
@@ -170,7 +170,7 @@ class JointGaussian:
     """
 
     def __init__(self, matrices: Matrices, log: Log) -> None:
-        events = log.readings
+        events = log.events
         n, K = matrices.mean.size, len(events)
         M = np.eye(n * K)
         c = np.zeros(n * K)

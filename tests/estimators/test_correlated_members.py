@@ -7,7 +7,7 @@ import pytest
 
 from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.model.correlation import covariance_of
 from estimators.models.lorenz96 import LORENZ96
 from estimators.registry import ESTIMATORS, checked
@@ -30,7 +30,7 @@ def log_of(there):
     y = np.full(3, np.nan)
     y[there] = Y[there]
     log = Log(MODEL.width)
-    log.extend(Readings.one(0, 0, READING, 2, y, MODEL.width))
+    log.extend(Events.one(0, 0, READING, 2, y, MODEL.width))
     return log
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
-from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Log, Readings
+from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events, Log
 from estimators.registry import ESTIMATORS
 from estimators.snapshots import RECENT
 from estimators.track import FAILED, GATED, HELD_OUT, MISSING, NONE, USED
@@ -37,20 +37,20 @@ def as_log(readings):
 
 
 def everything(rng, events):
-    """Readings, inputs, lost rows, and among them ticks, truths and a few resets."""
-    readings = random_log(rng, MATRICES, events).readings
+    """Events, inputs, lost rows, and among them ticks, truths and a few resets."""
+    readings = random_log(rng, MATRICES, events).events
     t = readings.t.copy()
     extra = []
     for kind, share in ((TICK, 5), (TRUTH, 5), (RESET, 80)):
         for _ in range(max(1, events // share)):
             at = int(rng.integers(t[0] + SECOND // 10, t[-1]))
-            extra.append(Readings.one(at, at, kind, 0, rng.normal(), MODEL.width))
-    log = as_log(Readings.concat([readings, *extra], MODEL.width))
-    return Readings(*(column.copy() for column in log.readings))
+            extra.append(Events.one(at, at, kind, 0, rng.normal(), MODEL.width))
+    log = as_log(Events.concat([readings, *extra], MODEL.width))
+    return Events(*(column.copy() for column in log.events))
 
 
 def reading(t, sensor, values, width=MODEL.width):
-    return Readings.one(t, t, READING, sensor, values, width)
+    return Events.one(t, t, READING, sensor, values, width)
 
 
 def in_python(name):
@@ -115,7 +115,7 @@ def test_order_of_arrival_does_not_matter(estimator, seed):
 
 
 def test_a_reading_older_than_the_first_event(estimator):
-    events = random_log(np.random.default_rng(4), MATRICES, 50).readings
+    events = random_log(np.random.default_rng(4), MATRICES, 50).events
     log = as_log(events)
     growing = Fold(estimator, MODEL, Tuning.of(MODEL), log)
     growing.advance()
@@ -127,7 +127,7 @@ def test_a_reading_older_than_the_first_event(estimator):
 
 @QUICK
 def test_rewind_far_behind_the_recent_snapshots(estimator):
-    events = random_log(np.random.default_rng(5), MATRICES, 2 * RECENT + 500).readings
+    events = random_log(np.random.default_rng(5), MATRICES, 2 * RECENT + 500).events
     log = as_log(events)
     growing = Fold(estimator, MODEL, Tuning.of(MODEL), log)
     while growing.advance(700):
@@ -246,16 +246,16 @@ def test_follow_over_a_cut(estimator):
 
 def test_queries_never_change_the_estimate(estimator):
     rng = np.random.default_rng(9)
-    events = random_log(rng, MATRICES, 200).readings
+    events = random_log(rng, MATRICES, 200).events
     bare = fold(estimator, MODEL, Tuning.of(MODEL), as_log(events))
     queries = [
-        Readings.one(t, t, kind, 0, 1e6, MODEL.width)
+        Events.one(t, t, kind, 0, 1e6, MODEL.width)
         for kind in (TICK, TRUTH)
         for t in rng.integers(events.t[0] + 1, events.t[-1] + 10 * SECOND, 150)
     ]
-    log = as_log(Readings.concat([events, *queries], MODEL.width))
+    log = as_log(Events.concat([events, *queries], MODEL.width))
     track = fold(estimator, MODEL, Tuning.of(MODEL), log)
-    query = np.isin(log.readings.kind, (TICK, TRUTH))
+    query = np.isin(log.events.kind, (TICK, TRUTH))
     assert query.sum() == 300
     for name in ("mean", "std", "innovation", "innovation_std", "nis", "log_likelihood", "dof", "verdict"):
         np.testing.assert_array_equal(getattr(track.select(~query), name), getattr(bare, name), err_msg=name)
@@ -265,10 +265,10 @@ def test_queries_never_change_the_estimate(estimator):
 
 def test_a_query_says_what_a_missing_reading_says(estimator):
     """Prediction to t is prediction to t, asked in either way."""
-    events = random_log(np.random.default_rng(10), MATRICES, 40).readings
+    events = random_log(np.random.default_rng(10), MATRICES, 40).events
     t = int(events.t[-1]) + SECOND // 3
-    asked = as_log(Readings.concat([events, Readings.one(t, t, TICK, 0, (), MODEL.width)], MODEL.width))
-    missed = as_log(Readings.concat([events, reading(t, 2, np.full(3, np.nan))], MODEL.width))
+    asked = as_log(Events.concat([events, Events.one(t, t, TICK, 0, (), MODEL.width)], MODEL.width))
+    missed = as_log(Events.concat([events, reading(t, 2, np.full(3, np.nan))], MODEL.width))
     a, b = (fold(estimator, MODEL, Tuning.of(MODEL), log) for log in (asked, missed))
     np.testing.assert_array_equal(a.mean[-1], b.mean[-1])
     np.testing.assert_array_equal(a.std[-1], b.std[-1])
@@ -278,15 +278,15 @@ def test_a_query_says_what_a_missing_reading_says(estimator):
 
 def test_reset_is_a_fresh_start(estimator):
     rng = np.random.default_rng(11)
-    events = random_log(rng, MATRICES, 120).readings
+    events = random_log(rng, MATRICES, 120).events
     events = events.select(events.kind == READING)
     t = int(events.t[60]) + 7
-    log = as_log(Readings.concat([events, Readings.one(t, t, RESET, 0, (), MODEL.width)], MODEL.width))
-    at = int(np.flatnonzero(log.readings.kind == RESET)[0])
+    log = as_log(Events.concat([events, Events.one(t, t, RESET, 0, (), MODEL.width)], MODEL.width))
+    at = int(np.flatnonzero(log.events.kind == RESET)[0])
     track = fold(estimator, MODEL, Tuning.of(MODEL), log)
     # A tick anchors the prior of the fresh start at the time of the reset.
     after = as_log(
-        Readings.concat([Readings.one(t, t, TICK, 0, (), MODEL.width), log.readings.select(slice(at + 1, None))], 3)
+        Events.concat([Events.one(t, t, TICK, 0, (), MODEL.width), log.events.select(slice(at + 1, None))], 3)
     )
     fresh = fold(estimator, MODEL, Tuning.of(MODEL), after)
     for name in ("mean", "std", "innovation", "nis", "log_likelihood", "verdict"):
@@ -297,11 +297,11 @@ def test_reset_is_a_fresh_start(estimator):
 def test_reset_keeps_the_inputs(estimator):
     """Inputs are facts about the asset, not beliefs: a reset does not forget them."""
     events = [
-        Readings.one(0, 0, INPUT, 0, [5.0, -3.0], MODEL.width),
-        Readings.one(SECOND, 0, RESET, 0, (), MODEL.width),
-        Readings.one(2 * SECOND, 0, TICK, 0, (), MODEL.width),
+        Events.one(0, 0, INPUT, 0, [5.0, -3.0], MODEL.width),
+        Events.one(SECOND, 0, RESET, 0, (), MODEL.width),
+        Events.one(2 * SECOND, 0, TICK, 0, (), MODEL.width),
     ]
-    track = fold(estimator, MODEL, Tuning.of(MODEL), as_log(Readings.concat(events, MODEL.width)))
+    track = fold(estimator, MODEL, Tuning.of(MODEL), as_log(Events.concat(events, MODEL.width)))
     expected = MATRICES.mean + MATRICES.A @ MATRICES.mean + MATRICES.B @ [5.0, -3.0]
     # One step of a linear map: a few roundings of numbers of order 10.
     np.testing.assert_allclose(track.mean[2], expected, rtol=1e-13, atol=1e-13)
@@ -310,7 +310,7 @@ def test_reset_keeps_the_inputs(estimator):
 def test_dt_of_zero_predicts_nothing(estimator):
     tuning = Tuning.of(MODEL)
     t = 3 * SECOND
-    log = as_log(Readings.concat([reading(t, 0, [1.0]), reading(t, 1, [np.nan] * 2), reading(t, 0, [np.nan])], 3))
+    log = as_log(Events.concat([reading(t, 0, [1.0]), reading(t, 1, [np.nan] * 2), reading(t, 0, [np.nan])], 3))
     track = fold(estimator, MODEL, tuning, log)
     np.testing.assert_array_equal(track.mean[1], track.mean[0])
     np.testing.assert_array_equal(track.std[2], track.std[0])
@@ -344,7 +344,7 @@ def test_a_reading_that_is_not_finite_is_missing(estimator, bad):
     """An infinite row is no number; it must not reach the estimate."""
     t = 3 * SECOND
     track = fold(
-        estimator, MODEL, Tuning.of(MODEL), as_log(Readings.concat([reading(t, 0, [1.0]), reading(2 * t, 0, [bad])], 3))
+        estimator, MODEL, Tuning.of(MODEL), as_log(Events.concat([reading(t, 0, [1.0]), reading(2 * t, 0, [bad])], 3))
     )
     assert track.verdict[1] == MISSING
     assert np.isnan(track.nis[1])
@@ -354,7 +354,7 @@ def test_a_reading_that_is_not_finite_is_missing(estimator, bad):
 
 def test_an_enormous_reading_does_not_raise(estimator):
     """1e300 overflows the NIS: the reading fails or is gated; nothing raises, and the estimate stays a number."""
-    log = as_log(Readings.concat([reading(SECOND, 0, [1.0]), reading(2 * SECOND, 0, [1e300])], 3))
+    log = as_log(Events.concat([reading(SECOND, 0, [1.0]), reading(2 * SECOND, 0, [1e300])], 3))
     assert fold(estimator, MODEL, Tuning.of(MODEL).set("gate", 0.999), log).verdict[1] == GATED
     track = fold(estimator, MODEL, Tuning.of(MODEL), log)
     assert track.nis[1] == np.inf
@@ -365,8 +365,8 @@ def test_an_enormous_reading_does_not_raise(estimator):
 def test_gate_refuses_and_leaves_the_prediction(estimator):
     t = [SECOND, 2 * SECOND, 3 * SECOND]
     tuning = Tuning.of(MODEL).set("gate", 0.99)
-    both = as_log(Readings.concat([reading(t[0], 1, [0.1, 0.2]), reading(t[1], 1, [80.0, -90.0])], 3))
-    missed = as_log(Readings.concat([reading(t[0], 1, [0.1, 0.2]), reading(t[1], 1, [np.nan, np.nan])], 3))
+    both = as_log(Events.concat([reading(t[0], 1, [0.1, 0.2]), reading(t[1], 1, [80.0, -90.0])], 3))
+    missed = as_log(Events.concat([reading(t[0], 1, [0.1, 0.2]), reading(t[1], 1, [np.nan, np.nan])], 3))
     gated, missing = (fold(estimator, MODEL, tuning, log) for log in (both, missed))
     assert gated.verdict[1] == GATED
     np.testing.assert_array_equal(gated.mean[1], missing.mean[1])
@@ -398,10 +398,10 @@ def test_an_unused_sensor_is_held_out_and_a_gated_one_stays_held_out(estimator):
 
 def test_inputs_that_are_nan_stay(estimator):
     events = [
-        Readings.one(0, 0, INPUT, 0, [5.0, np.nan], MODEL.width),
-        Readings.one(SECOND, 0, TICK, 0, (), MODEL.width),
+        Events.one(0, 0, INPUT, 0, [5.0, np.nan], MODEL.width),
+        Events.one(SECOND, 0, TICK, 0, (), MODEL.width),
     ]
-    growing = Fold(estimator, MODEL, Tuning.of(MODEL), as_log(Readings.concat(events, MODEL.width)))
+    growing = Fold(estimator, MODEL, Tuning.of(MODEL), as_log(Events.concat(events, MODEL.width)))
     growing.advance()
     u = np.array([5.0, MATRICES.u[1]])
     np.testing.assert_array_equal(growing.u, u)
@@ -410,7 +410,7 @@ def test_inputs_that_are_nan_stay(estimator):
 
 
 def test_seed_and_version_do_not_change_a_filter_without_randomness(estimator):
-    events = random_log(np.random.default_rng(12), MATRICES, 100).readings
+    events = random_log(np.random.default_rng(12), MATRICES, 100).events
     identical(
         fold(estimator, MODEL, Tuning.of(MODEL), as_log(events)),
         fold(estimator, MODEL, Tuning.of(MODEL), as_log(events)),

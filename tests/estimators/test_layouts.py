@@ -8,7 +8,7 @@ import pytest
 
 from estimators.ensemble import analysis, shared
 from estimators.fold import Fold
-from estimators.log import READING, TICK, Log, Readings
+from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import Field, Noise, Row, Sensor, StateSpaceModel
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
@@ -63,8 +63,8 @@ def readings(model):
             if k == 2:
                 y[:] = 1e200
             t = (k + 1) * SECOND // 10
-            log.extend(Readings.one(t, t, READING, channel, y, model.width))
-        log.extend(Readings.one(t + SECOND // 20, t, TICK, 0, [], model.width))
+            log.extend(Events.one(t, t, READING, channel, y, model.width))
+        log.extend(Events.one(t + SECOND // 20, t, TICK, 0, [], model.width))
     return log
 
 

@@ -6,7 +6,7 @@ The events here are numbered by their values, so that at equal times they keep t
 import numpy as np
 import pytest
 
-from estimators.log import READING, TICK, TRUTH, Log, Readings, truth_of
+from estimators.log import READING, TICK, TRUTH, Events, Log, truth_of
 from estimators.track import Track
 
 SECOND = 1_000_000_000
@@ -18,7 +18,7 @@ def batch(times, first=0, kind=READING, width=2):
     n = t.size
     value = np.full((n, width), np.nan)
     value[:, 0] = first + np.arange(n)
-    return Readings(t, t + 5, np.full(n, kind, np.int8), np.zeros(n, np.int32), value)
+    return Events(t, t + 5, np.full(n, kind, np.int8), np.zeros(n, np.int32), value)
 
 
 def pieces(rng, events):
@@ -48,13 +48,13 @@ def test_order_is_a_stable_sort_whatever_the_pieces(seed):
     expected = events.select(np.array(sorted(range(200), key=lambda i: (events.t[i], i))))
     log = Log(2, capacity=1)
     for piece in pieces(rng, events):
-        before = Readings(*(column.copy() for column in log.readings))
+        before = Events(*(column.copy() for column in log.events))
         start, stale = log.extend(piece)
         assert stale == 0
         assert start <= len(before)
         # Nothing before `start` has changed; so a fold need not look there.
-        same(log.readings.select(slice(0, start)), before.select(slice(0, start)))
-    same(log.readings, expected)
+        same(log.events.select(slice(0, start)), before.select(slice(0, start)))
+    same(log.events, expected)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -75,7 +75,7 @@ def test_stale_is_judged_event_by_event(seed):
         for piece in pieces(rng, events):
             stale += log.extend(piece, horizon)[1]
         assert stale == 200 - sum(keep)
-        same(log.readings, expected)
+        same(log.events, expected)
 
 
 def test_exactly_at_the_horizon_is_kept():
@@ -91,7 +91,7 @@ def test_a_tick_makes_nothing_late():
     log.extend(batch([0]))
     log.extend(batch([100 * SECOND], kind=TICK))
     assert log.extend(batch([SECOND]), horizon=10 * SECOND) == (1, 0)
-    assert list(log.readings.t) == [0, SECOND, 100 * SECOND]
+    assert list(log.events.t) == [0, SECOND, 100 * SECOND]
 
 
 def test_ticks_before_anything_was_said():
@@ -105,14 +105,14 @@ def test_late_events_of_an_equal_time_come_after_those_with_smaller_values():
     log.extend(batch([10, 20, 20, 30]))
     start, _ = log.extend(batch([20, 20], first=100))
     assert start == 3
-    assert list(log.readings.value[:, 0]) == [0, 1, 2, 100, 101, 3]
+    assert list(log.events.value[:, 0]) == [0, 1, 2, 100, 101, 3]
 
 
 def test_appending_says_where():
     log = Log(2)
     assert log.extend(batch([10, 20])) == (0, 0)
     assert log.extend(batch([20], first=2)) == (2, 0)
-    assert log.extend(Readings.empty(2)) == (3, 0)
+    assert log.extend(Events.empty(2)) == (3, 0)
 
 
 def test_drop_front_keeps_absolute_indices():
@@ -120,9 +120,9 @@ def test_drop_front_keeps_absolute_indices():
     log.extend(batch(np.arange(10)))
     log.drop_front(7)
     assert (log.first, log.n) == (7, 3)
-    assert list(log.readings.value[:, 0]) == [7, 8, 9]
+    assert list(log.events.value[:, 0]) == [7, 8, 9]
     log.extend(batch([8], first=50))
-    assert list(log.readings.value[:, 0]) == [7, 8, 50, 9]
+    assert list(log.events.value[:, 0]) == [7, 8, 50, 9]
     log.drop_front(4)
     assert (log.first, log.n) == (11, 0)
 
@@ -134,7 +134,7 @@ def test_a_copy_is_its_own():
     twin = log.copy()
     log.extend(batch([25, 40], first=9))
     assert (twin.n, twin.first, twin.newest) == (2, 1, 30)
-    assert list(twin.readings.t) == [20, 30]
+    assert list(twin.events.t) == [20, 30]
     # It judges staleness as the log would have.
     assert twin.extend(batch([15]), horizon=10) == (2, 1)
 
@@ -143,29 +143,29 @@ def test_growth_keeps_everything():
     log = Log(2, capacity=1)
     for k in range(300):
         log.extend(batch([k], first=k))
-    same(log.readings, batch(np.arange(300)))
+    same(log.events, batch(np.arange(300)))
     assert log.capacity < 1000
 
 
 def test_one_and_concat():
-    one = Readings.one(7, 8, READING, 3, [1.5], 3)
+    one = Events.one(7, 8, READING, 3, [1.5], 3)
     np.testing.assert_array_equal(one.value, [[1.5, np.nan, np.nan]])
     assert (one.t[0], one.arrival[0], one.kind[0], one.channel[0], len(one)) == (7, 8, READING, 3, 1)
-    both = Readings.concat([one, one], 3)
+    both = Events.concat([one, one], 3)
     assert len(both) == 2
-    assert len(Readings.concat([], 3)) == 0
-    assert Readings.concat([], 3).value.shape == (0, 3)
+    assert len(Events.concat([], 3)) == 0
+    assert Events.concat([], 3).value.shape == (0, 3)
 
 
 def test_fewer_columns_are_filled_up_not_repeated():
     """A recording of old holds one true value an event; in a wider log it must not become that of its neighbour."""
-    old = Readings.one(1, 1, TRUTH, 0, 7.0, 1)
+    old = Events.one(1, 1, TRUTH, 0, 7.0, 1)
     log = Log(3)
     log.extend(old)
-    log.extend(Readings.concat([old, Readings.one(2, 2, TRUTH, 1, 8.0, 3)], 3))
+    log.extend(Events.concat([old, Events.one(2, 2, TRUTH, 1, 8.0, 3)], 3))
     expected = [[7.0, np.nan, np.nan], [7.0, np.nan, np.nan], [8.0, np.nan, np.nan]]
-    np.testing.assert_array_equal(log.readings.value, expected)
-    assert old.widened(1) is old and log.readings.widened(2).value.shape == (3, 3)
+    np.testing.assert_array_equal(log.events.value, expected)
+    assert old.widened(1) is old and log.events.widened(2).value.shape == (3, 3)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -173,7 +173,7 @@ def test_truth_of_is_its_definition(seed):
     """Event by event: values from the state `channel` on, some NaN, among readings and ticks that must not count."""
     rng = np.random.default_rng(seed)
     n, width, states = 1000, 4, 11
-    events = Readings(
+    events = Events(
         np.arange(n),
         np.arange(n),
         rng.choice([READING, TRUTH, TICK], n).astype(np.int8),
@@ -190,11 +190,11 @@ def test_truth_of_is_its_definition(seed):
         got = truth_of(events, j)
         assert got[0].tolist() == rows and got[1].tolist() == values
     assert all(len(rows) > 5 for rows, _ in list(known.values())[:states])
-    assert truth_of(Readings.empty(2), 0)[1].size == 0
+    assert truth_of(Events.empty(2), 0)[1].size == 0
 
 
 def test_columns_can_be_replaced_though_len_counts_events():
-    events = Readings.one(1, 2, READING, 0, [1.0], 2)
+    events = Events.one(1, 2, READING, 0, [1.0], 2)
     changed = events._replace(t=np.array([5]))
     assert changed.t.tolist() == [5] and changed.arrival is events.arrival and len(changed) == 1
     track = Track.allocate(7, 2, 1, 1)

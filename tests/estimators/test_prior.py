@@ -5,7 +5,7 @@ import pytest
 
 from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
-from estimators.log import READING, RESET, Log, Readings
+from estimators.log import READING, RESET, Events, Log
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS, unfit
 from estimators.tuning import Tuning
@@ -42,7 +42,7 @@ def posterior(P, y, sensor):
 
 def one_reading(y, sensor):
     log = Log.of(MODEL)
-    log.extend(Readings.one(SECOND, 0, READING, sensor, y, MODEL.width))
+    log.extend(Events.one(SECOND, 0, READING, sensor, y, MODEL.width))
     return log
 
 
@@ -96,7 +96,7 @@ def test_a_state_that_is_certain_stays_so_until_noise_comes():
 def test_a_reset_goes_back_to_it(name):
     P = PRIORS["correlated"]
     log = one_reading([5.0, 5.0], 1)
-    log.extend(Readings.one(2 * SECOND, 0, RESET, 0, (), MODEL.width))
+    log.extend(Events.one(2 * SECOND, 0, RESET, 0, (), MODEL.width))
     growing = Fold(name, MODEL, Tuning.of(MODEL), log, prior=(MEAN, P))
     before = growing.moments()
     growing.advance()

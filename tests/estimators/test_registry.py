@@ -7,7 +7,7 @@ import pytest
 
 from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS, checked, find_estimator, unfit
 from estimators.tuning import Tuning
@@ -38,7 +38,7 @@ def test_sizes_are_enough(name):
     model = ANYBODYS
     log = Log(1)
     for k in range(5):
-        log.extend(Readings.one(k * 10**9, 0, READING, 0, 36.0 + k, 1))
+        log.extend(Events.one(k * 10**9, 0, READING, 0, 36.0 + k, 1))
     fold = Fold(name, model, Tuning.of(model), log)
     work = entry.work_size(fold.options, model.nx, model.width)
     from_end = name in ("kf", "sr-kf", "kf-steady")  # these find their F from the end
@@ -146,7 +146,7 @@ def test_an_unknown_name_is_told_the_near_ones():
 @pytest.mark.parametrize("name", list(ESTIMATORS))
 @pytest.mark.parametrize("model", [m for m in MODELS.values() if m.nx < 100_000], ids=lambda m: m.name)
 def test_every_estimator_runs_every_model_it_applies_to(name, model):
-    """Readings of exactly what the model expects at its prior: the estimate stays finite and near."""
+    """Events of exactly what the model expects at its prior: the estimate stays finite and near."""
     if reason := unfit(ESTIMATORS[name], model):
         assert model.name in reason
         return
@@ -160,7 +160,7 @@ def test_every_estimator_runs_every_model_it_applies_to(name, model):
     for k, sensor in enumerate(model.sensors):
         y = np.empty(len(sensor.rows))
         compiled.h[k](x, u, p, y)
-        log.extend(Readings.one(0, 0, READING, k, y, model.width))
+        log.extend(Events.one(0, 0, READING, k, y, model.width))
     fold = Fold(name, model, Tuning.of(model), log)
     fold.advance()
     mean, cov = fold.moments()
@@ -180,7 +180,7 @@ def test_every_estimator_runs_every_model_it_applies_to(name, model):
 def test_ukf_points_have_the_moments_of_the_state():
     model = WINDING
     log = Log(1)
-    log.extend(Readings.one(0, 0, READING, 0, 36.0, 1))
+    log.extend(Events.one(0, 0, READING, 0, 36.0, 1))
     fold = Fold("ukf", model, Tuning.of(model).with_options({"alpha": 0.7, "kappa": 1.0}), log)
     fold.advance()
     points = fold.points()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from estimators.errors import SourceError
-from estimators.log import Readings
+from estimators.log import Events
 from sources.memory import MemorySource
 from sources.merged import Merged
 from tests.sources.can.can_tools import read_all, same
@@ -13,7 +13,7 @@ from tests.sources.can.can_tools import read_all, same
 def events(times, who):
     n = len(times)
     t = np.array(times, np.int64)
-    return Readings(t, t, np.zeros(n, np.int8), np.full(n, who, np.int32), np.arange(n, dtype=float)[:, None])
+    return Events(t, t, np.zeros(n, np.int8), np.full(n, who, np.int32), np.arange(n, dtype=float)[:, None])
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -21,7 +21,7 @@ def test_merged_is_the_stable_sort_of_all(seed):
     rng = np.random.default_rng(seed)
     # Few distinct times, so that ties fall on the borders of batches too.
     parts = [events(np.sort(rng.integers(0, 30, rng.integers(0, 60))), k) for k in range(4)]
-    whole = Readings.concat(parts, 1)
+    whole = Events.concat(parts, 1)
     expected = whole.select(np.argsort(whole.t, kind="stable"))
     merged = Merged([MemorySource(part, batch=int(rng.integers(1, 9))) for part in parts])
     assert same(read_all(merged), expected)

@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 
-from estimators.log import Readings
+from estimators.log import Events
 from sources.memory import MemorySource
 from sources.pacer import BATCH, Pacer
 from tests.sources.can.can_tools import read_all
@@ -29,7 +29,7 @@ class Clock:
 def events(times):
     n = len(times)
     t = np.array([round(100 * S + x * S) for x in times], np.int64)
-    return Readings(t, t, np.zeros(n, np.int8), np.zeros(n, np.int32), np.arange(n, dtype=float)[:, None])
+    return Events(t, t, np.zeros(n, np.int8), np.zeros(n, np.int32), np.arange(n, dtype=float)[:, None])
 
 
 def player(times=(0, 1, 2, 3, 4, 5), *, batch=2, **more):

@@ -8,7 +8,7 @@ from config.loader import Loaded
 from config.source_schema import CanSection
 from config.yaml_lines import Key
 from estimators.errors import NisusError
-from estimators.log import Readings
+from estimators.log import Events
 from estimators.model.state_space import StateSpaceModel
 
 from ..channels import channels
@@ -88,7 +88,7 @@ class PlayedBus:
         self._player = player
         player.start()
 
-    def read(self, timeout: float) -> Readings | None:
+    def read(self, timeout: float) -> Events | None:
         """The next events of the bus."""
         return self._bus.read(timeout)
 

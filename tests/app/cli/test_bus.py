@@ -12,7 +12,7 @@ from app.cli.main import main
 from app.twin.sources.asset import make_asset
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
-from estimators.log import INPUT, READING, TRUTH, Readings, truth_of
+from estimators.log import INPUT, READING, TRUTH, Events, truth_of
 
 
 class Clock:
@@ -35,13 +35,13 @@ def play_at_once(player: Any, duration: float | None) -> None:
     player.run()
 
 
-def events(*, log: Path) -> Readings:
+def events(*, log: Path) -> Events:
     source = load_twin("motor_can", log_files=[log]).open_source(lambda key, text: None, live=False)
     batches = []
     while (batch := source.read(1.0)) is not None:
         batches.append(batch)
     source.close()
-    return Readings.concat(batches, 5)
+    return Events.concat(batches, 5)
 
 
 @pytest.mark.parametrize("suffix", bus.FORMATS)
@@ -57,7 +57,7 @@ def test_what_is_recorded_is_what_the_asset_said(suffix: str, tmp_path: Path, mo
     batches = []
     while (batch := simulator.read(0.0)) is not None:
         batches.append(batch)
-    said = Readings.concat(batches, 5)
+    said = Events.concat(batches, 5)
     sensors = [
         [batch.value[(batch.kind == READING) & (batch.channel == k), 0] for batch in (got, said)] for k in range(3)
     ]

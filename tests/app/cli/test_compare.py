@@ -156,7 +156,7 @@ def test_compare_says_what_fold_says(capsys):
 
 def test_a_filter_that_draws_folds_with_several_seeds_and_several_logs():
     twin = load_twin("motor_winding")
-    logs = [read_log(load_twin("motor_winding", overrides={"source.seed": seed}), 30)[0].readings for seed in "89"]
+    logs = [read_log(load_twin("motor_winding", overrides={"source.seed": seed}), 30)[0].events for seed in "89"]
     row = fold_row(twin, "etkf", logs[:1])
     alone = [refold(twin, "etkf", logs[0], seed).nis for seed in range(8)]
     assert row.seeds == len(set(alone)) == 8
@@ -182,7 +182,7 @@ def test_logs_of_other_seeds_are_those_of_the_simulator(capsys):
 def test_a_slow_filter_folds_a_stated_span(monkeypatch):
     """A step takes 0.1 ms by a clock of the test's own: a budget of 60 ms is 600 of the log's 12,953 events."""
     twin = load_twin("motor_can")
-    events = read_log(twin, None)[0].readings
+    events = read_log(twin, None)[0].events
     stepped = 0
     advance = Fold.advance
 
@@ -206,7 +206,7 @@ def test_a_slow_filter_folds_a_stated_span(monkeypatch):
 def test_a_span_ends_between_two_times(budget):
     """Wherever the budget ends among events of one time: the log has five at each step, of which three are readings."""
     twin = load_twin("motor_joint", overrides={"source.duration": "60"})
-    events = read_log(twin, None)[0].readings
+    events = read_log(twin, None)[0].events
     row = fold_row(twin, "filterpy-ekf", [events], budget=budget)
     assert row.span is not None and row.span >= 0.5
     assert row.nis.value == refold(twin, "filterpy-ekf", within(events, row.span)).nis
@@ -221,7 +221,7 @@ def test_divergence_is_noted_with_its_time():
     """Told a prior that is 40 times too narrow, the winding's filter is far from the readings from the first on."""
     twin = load_twin("motor_winding", overrides={"prior.temperature.std": "0.001", "Q.temperature": "0", "Q.rate": "0",
                                                  "prior.rate.std": "0.0001", "R.winding": "0.01"})  # fmt: skip
-    events = read_log(twin, None)[0].readings
+    events = read_log(twin, None)[0].events
     row = fold_row(twin, "kf", [events])
     # Health judges from the tenth reading on, which comes after 10 s.
     assert row.diverged == 1 and row.since == pytest.approx(10.0) and row.lost > 0.9

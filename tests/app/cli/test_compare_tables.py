@@ -14,7 +14,7 @@ from app.cli.scores import read_scores
 from app.twin.twin import Twin, load_twin
 from config.loader import shipped
 from estimators.errors import SourceError
-from estimators.log import Readings
+from estimators.log import Events
 from estimators.registry import ESTIMATORS, unfit
 from tests.conftest import absent
 
@@ -32,17 +32,17 @@ SIGMA = 5.0 * math.sqrt(1 + 1 / 8)
 
 
 @lru_cache(maxsize=1)
-def recorded(name: str) -> tuple[Twin, Readings]:
+def recorded(name: str) -> tuple[Twin, Events]:
     twin = load_twin(name)
     try:
-        return twin, read_log(twin, None)[0].readings
+        return twin, read_log(twin, None)[0].events
     except SourceError as error:
         if "is not there" in str(error):
             absent(str(error))
         raise
 
 
-def quick(estimator: str, cells: dict[str, str], events: Readings) -> bool:
+def quick(estimator: str, cells: dict[str, str], events: Events) -> bool:
     entry = ESTIMATORS[estimator]
     seconds = 1e-6 * float(cells[COST]) * len(within(events, read_span(cells)))
     return seconds < SECONDS or not (draws(entry) or entry.interpreted)
@@ -57,7 +57,7 @@ def scores_of(twin: Twin) -> dict[str, dict[str, str]]:
     return {cells["filter"]: cells for cells in read_scores(twin.path)}
 
 
-def mismatches(twin: Twin, events: Readings, rows: dict[str, dict[str, str]]) -> list[str]:
+def mismatches(twin: Twin, events: Events, rows: dict[str, dict[str, str]]) -> list[str]:
     """Figures of the quick filters that are not those of a new fold."""
     wrong = []
     for estimator, cells in rows.items():
@@ -112,7 +112,7 @@ def test_other_logs_are_as_the_head_says(name: str) -> None:
     for seed in (int(said[2]) + 1, int(said[2]) + 2):
         twin = load_twin(name, overrides={"source.seed": str(seed)})
         assert twin.estimator == said[3]
-        outcome = refold(twin, twin.estimator, read_log(twin, None)[0].readings)
+        outcome = refold(twin, twin.estimator, read_log(twin, None)[0].events)
         assert abs(outcome.nis - nis[0]) < SIGMA * nis[1]
         assert abs(100.0 * outcome.coverage - band[0]) < SIGMA * max(band[1], LEAST)
 

@@ -40,7 +40,7 @@ def test_true_states_have_columns_of_their_own(tmp_path: Path) -> None:
         assert np.isnan(column[~truth]).all() and np.sum(~truth) == 3
     # The events as they were read are in the table too.
     log, _ = read_log(load_twin(str(tmp_path / "drive.yaml")), None)
-    np.testing.assert_array_equal(table["value_1"].to_numpy(), log.readings.value[:, 1])
+    np.testing.assert_array_equal(table["value_1"].to_numpy(), log.events.value[:, 1])
 
 
 BOX = """\
@@ -86,7 +86,7 @@ def test_what_a_black_box_failed_with_is_told(tmp_path: Path, capsys: pytest.Cap
     told = json.loads(capsys.readouterr().out)
     assert told["failed"] == 2 and told["failure"].startswith(said)
     twin = load_twin(path)
-    row = fold_row(twin, "filterpy-ukf", [read_log(twin, None)[0].readings])
+    row = fold_row(twin, "filterpy-ukf", [read_log(twin, None)[0].events])
     assert row.failure.startswith(said)
 
 

@@ -58,7 +58,7 @@ def test_the_pair_folds_and_does_what_its_text_promises(tmp_path: Path) -> None:
     while (batch := source.read(0.0)) is not None:
         log.extend(batch)
     track = fold(twin.estimator, twin.model, twin.tuning, log)
-    events = log.readings
+    events = log.events
     late = events.select(events.t > 60_000_000_000)
     (rows, level), (other, delivery) = (truth_of(late, k) for k in (0, 1))
     late_mean = track.mean[-len(late) :]

@@ -60,7 +60,7 @@ def review(tmp_path):
         engine.submit(commands.Record(path))
         t = np.arange(1.0, 301.0)
         source.put(readings(t, 40.0 + 0.05 * t + np.random.default_rng(1).normal(0.0, 1.5, 300)))
-        wait_for(lambda: len(rows(engine).readings) == 300)
+        wait_for(lambda: len(rows(engine).events) == 300)
         carry_out(engine, *TURNED)
         seen = rows(engine).track
         engine.submit(commands.Record(None))

@@ -13,7 +13,7 @@ from app.engine.engine import Engine
 from app.engine.notices import Notices
 from app.twin.twin import load_twin
 from estimators.fold import Fold, fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.track import DIVERGED, FAILED, USED
 from estimators.tuning import Tuning
 from tests.app.scripted import MODEL, SECOND, Scripted, readings, twin, wait_for
@@ -47,7 +47,7 @@ def everything(engine):
 
 
 def rows(engine):
-    return len(everything(engine).readings)
+    return len(everything(engine).events)
 
 
 def assert_same(track, expected):
@@ -93,7 +93,7 @@ def test_cursor_is_taken_back_by_a_late_reading(started):
     again = engine.pull(cursor)
     assert not again.fresh
     assert again.first == 2
-    np.testing.assert_array_equal(again.readings.t, np.array([2.5, 3.0]) * SECOND)
+    np.testing.assert_array_equal(again.events.t, np.array([2.5, 3.0]) * SECOND)
 
 
 def test_readings_beyond_the_horizon_are_counted_and_dropped(started):
@@ -102,7 +102,7 @@ def test_readings_beyond_the_horizon_are_counted_and_dropped(started):
     source.put(readings([10.0, 7.9, 7.5, 8.1], [40, 41, 43, 42]))
     wait_for(lambda: rows(engine) == 2)
     wait_for(lambda: engine.notices.counts().get("stale") == 2)
-    np.testing.assert_array_equal(everything(engine).readings.t, np.array([8.1, 10.0]) * SECOND)
+    np.testing.assert_array_equal(everything(engine).events.t, np.array([8.1, 10.0]) * SECOND)
 
 
 @pytest.mark.parametrize(
@@ -170,7 +170,7 @@ def test_history_is_bounded_and_a_refold_starts_where_it_was_cut(started):
     # The count goes on; the rows are bounded.
     wait_for(lambda: (status := engine.status()).t == round(times[-1] * SECOND) and status.counts["readings"] == n)
     pull = everything(engine)
-    assert 8000 <= len(pull.readings) <= 8000 + 4 * 1024
+    assert 8000 <= len(pull.events) <= 8000 + 4 * 1024
     expected = reference(times, values)
     windowed = ("nis_mean", "nis_low", "nis_high", "health", "age")
     kept = expected.select(slice(pull.first, n))
@@ -259,7 +259,7 @@ def test_silence_predicts_and_health_degrades(started):
     wait_for(lambda: rows(engine) >= 4)
     track = everything(engine).track
     assert np.all(np.diff(track.std[:, 0]) > 0)
-    assert isinstance(everything(engine).readings, Readings)
+    assert isinstance(everything(engine).events, Events)
 
 
 def by_hand(times, values):
@@ -355,7 +355,7 @@ def test_what_went_wrong_is_counted_by_sensor_however_often_it_is_folded():
         channel = np.array([sensor for _, sensor, _ in readings], np.int32)
         value = np.full((t.size, model.width), np.nan)
         value[:, 0] = [y for _, _, y in readings]
-        return Readings(t, t.copy(), np.full(t.size, READING, np.int8), channel, value)
+        return Events(t, t.copy(), np.full(t.size, READING, np.int8), channel, value)
 
     try:
         source.put(batch((0.01, force, np.nan), (0.02, force, np.nan), (0.03, position, np.nan), (0.04, force, 1e9)))
@@ -405,7 +405,7 @@ def test_a_black_box_that_fails_loses_nothing_and_says_so_once(started):
             source.put(readings(times[one : one + 1], values[one : one + 1]))
             wait_for(lambda upto=one + 1: rows(engine) == upto)
     pull = everything(engine)
-    np.testing.assert_array_equal(pull.readings.value[:, 0], values)
+    np.testing.assert_array_equal(pull.events.value[:, 0], values)
     assert list(pull.track.verdict) == [USED] * 5 + [FAILED] * 5 + [USED] * 5
     assert engine.status().counts["failed"] == 5 and engine.status().counts["used"] == 10
     assert np.all(pull.track.health[5:10] == DIVERGED) and np.all(np.isnan(pull.track.mean[5:10]))

@@ -178,14 +178,14 @@ def test_the_other_charts_end_their_lines_and_pictures_and_begin_them_anew(tmp_p
             t = batch.column(batch.schema.names.index("time")).cast(pa.int64()).to_numpy()
             into = cleared if "Clear:is_recursive" in batch.schema.names else drawn
             into.setdefault(chunk.entity_path, set()).update((t // SECOND).tolist())
-    track, t = engine._fold.track, engine._log.readings.t // SECOND
+    track, t = engine._fold.track, engine._log.events.t // SECOND
     first = int(t[lost_rows(track)[0]])
     pair = f"/pair/{pair_name(RAIL, engine.pairs[0])}/up"
     paths = ["/state/east", "/state/height", *(f"{pair}/{name}" for name in ("ellipse", "mean", "way", "numbers"))]
     for path in paths:
         assert cleared[path] == {first}
         assert drawn[path] == {*range(1, first), *range(RESET_AT, END + 1)}
-    # Readings that could not be used have no innovation, and the first had one.
+    # Events that could not be used have no innovation, and the first had one.
     failed = int(t[np.flatnonzero(track.verdict == 5)[0]])
     assert cleared["/innovation/gnss.east"] == {failed}
     assert "/truth/east" not in cleared and "/reading/gnss.east" not in cleared

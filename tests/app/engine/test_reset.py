@@ -14,13 +14,13 @@ from app.twin.twin import load_twin
 from app.viser.status import status_html
 from estimators.errors import EstimatorError
 from estimators.fold import Fold
-from estimators.log import READING, RESET, Log, Readings
+from estimators.log import READING, RESET, Events, Log
 from estimators.registry import ESTIMATORS
 from estimators.track import DIVERGED, GATED, TRACKING, USED
 from tests.app.scripted import MODEL, SECOND, Scripted, readings, twin, wait_for
 
 JUMP = 60
-"""Readings before the asset jumps, by more than the gate lets through."""
+"""Events before the asset jumps, by more than the gate lets through."""
 RESET_AT = 100
 FAMILIES = ["kf", "sr-kf", "ekf", "ukf", "sr-ukf", "pf", "pf-reg", "apf", "enkf", "etkf", "ensrf", "filterpy-enkf"]
 OPTIONS = {"particles": 300.0, "members": 8.0}
@@ -71,7 +71,7 @@ def everything(engine):
 
 
 def rows(engine):
-    return len(everything(engine).readings)
+    return len(everything(engine).events)
 
 
 def fresh(engine):
@@ -111,10 +111,10 @@ def test_what_diverges_says_since_when_and_is_reset(name, start, tmp_path):
     engine.submit(commands.Record(None))
     wait_for(lambda: path in engine.recorder.finished)
     recorded = read_recording(path)
-    assert np.flatnonzero(recorded.readings.kind == RESET).tolist() == [RESET_AT]
+    assert np.flatnonzero(recorded.events.kind == RESET).tolist() == [RESET_AT]
     tuning, estimator = tuning_from_json(recorded.tuning, MODEL)
     log = Log(MODEL.width)
-    log.extend(recorded.readings)
+    log.extend(recorded.events)
     again = Fold(estimator, MODEL, tuning, log, pairs=np.array([[0, 1]]), base=recorded.base)
     again.advance(37)
     again.advance()
@@ -132,7 +132,7 @@ def test_a_reset_stays_where_it_was_when_the_history_is_folded_again(start):
     source.put(readings(t[RESET_AT:], y[RESET_AT:]))
     wait_for(lambda: rows(engine) == RESET_AT + 11 and engine.status().revision == 1)
     pull = everything(engine)
-    assert np.flatnonzero(pull.readings.kind == RESET).tolist() == [RESET_AT]
+    assert np.flatnonzero(pull.events.kind == RESET).tolist() == [RESET_AT]
     # The particles of a reset are drawn from the prior, as they are at the start.
     np.testing.assert_allclose(pull.track.mean[RESET_AT], [35.0, 0.0], atol=4.0 * 5.0 / np.sqrt(2000.0))
 
@@ -175,7 +175,7 @@ def test_options_are_kept_for_each_filter(start):
 def test_a_filter_that_does_not_apply_changes_nothing(start):
     made = load_twin("lorenz63", overrides={"estimator": "ekf"})
     source, engine = start(made)
-    source.put(Readings.one(SECOND, SECOND, READING, 0, [1.0, -1.0, 25.0], made.model.width))
+    source.put(Events.one(SECOND, SECOND, READING, 0, [1.0, -1.0, 25.0], made.model.width))
     wait_for(lambda: rows(engine) == 1)
     before = everything(engine)
     with pytest.raises(EstimatorError, match="kf does not apply: lorenz63 is not linear"):

@@ -23,7 +23,7 @@ from app.viser.view import ViserView
 from config.loader import shipped
 from estimators.events.order import sorted_order
 from estimators.fold import Fold
-from estimators.log import INPUT, READING, TICK, TRUTH, Log, Readings
+from estimators.log import INPUT, READING, TICK, TRUTH, Events, Log
 from estimators.registry import ESTIMATORS, unfit
 from tests.app.scripted import Scripted, wait_for
 
@@ -110,8 +110,8 @@ def asset(model, count, seed=0):
             compiled.h[channel](x, u, p, values)
             values += np.sqrt([row.variance for row in rows]) * rng.standard_normal(len(rows))
         now = round(t * 1e9)
-        batches.append(Readings.one(now, now, kind, channel, values, model.width))
-    events = Readings.concat(batches, model.width)
+        batches.append(Events.one(now, now, kind, channel, values, model.width))
+    events = Events.concat(batches, model.width)
     return events.select(sorted_order(events))
 
 
@@ -147,7 +147,7 @@ class Running:
 
     def settled(self, revision):
         status = self.engine.status()
-        return status.revision == revision and not status.refolding and len(self.rows().readings) == self.given
+        return status.revision == revision and not status.refolding and len(self.rows().events) == self.given
 
     def swap(self, name):
         """Swap as a browser does it, with readings on their way."""
@@ -175,7 +175,7 @@ class Running:
         """Engine, status and the left side of the page show this filter over the whole history."""
         pull, status = self.rows(), self.engine.status()
         assert pull.first == 0
-        for column, given in zip(pull.readings, self.events.select(slice(0, self.given)), strict=True):
+        for column, given in zip(pull.events, self.events.select(slice(0, self.given)), strict=True):
             np.testing.assert_array_equal(column, given)
         for column, a, b in zip(pull.track._fields, pull.track, self.fold(name), strict=True):
             np.testing.assert_array_equal(a, b[: self.given], err_msg=f"{name}: {column}")
@@ -187,7 +187,7 @@ class Running:
         assert panel.estimator.handle.value == ESTIMATORS[name].title
         assert panel.options.shown == name and sorted(panel.options.rows) == sorted(options)
         assert f"revision {status.revision}" in panel.status.content
-        seconds = (pull.readings.t - pull.readings.t[0]) * 1e-9
+        seconds = (pull.events.t - pull.events.t[0]) * 1e-9
         for chart, j in zip(charts._charts, charts._shown, strict=True):
             x, high, low, mean = chart.data[0], chart.data[1], chart.data[2], chart.data[8]
             assert (x[0], x[-1]) == (0.0, pytest.approx(seconds[-1])) and np.isfinite([x, high, low, mean]).all()
@@ -222,7 +222,7 @@ class Running:
                     means += [row[0] for row in batch.column(names.index("Scalars:scalars")).to_pylist()[:]]
         order = np.argsort(times, kind="stable")
         # Of several events at one time, the chart shows the last.
-        t = pull.readings.t
+        t = pull.events.t
         shown = np.append(t[1:] != t[:-1], True)
         assert revision == pull.revision
         assert set(np.asarray(times)[order]) == set(t[shown] - (0 if times[0] >= t[0] else t[0]))

@@ -152,7 +152,7 @@ def test_a_session_on_the_page(browser, served, tmp_path, monkeypatch):
     wait_for(lambda: (engine.status().tuning.get("Q.temperature") > 0.05) and not engine.status().refolding, PATIENCE)
     after = track_of(engine)
     assert after.revision > before.revision
-    rows = len(before.readings)
+    rows = len(before.events)
     assert np.all(after.track.std[10:rows, 0] > before.track.std[10:rows, 0])
     until(page, f"window.nisus.revision >= {after.revision}")
     until(page, "window.nisus.status.estimator === 'ukf'")
@@ -165,7 +165,7 @@ def test_a_session_on_the_page(browser, served, tmp_path, monkeypatch):
     panel.get_by_role("button", name="Stop").click()
     wait_for(lambda: engine.status().recording is None and session.recorder.finished, PATIENCE)
     recorded = read_recording(path)
-    np.testing.assert_array_equal(recorded.readings.value, final.readings.value)
+    np.testing.assert_array_equal(recorded.events.value, final.events.value)
 
     # Nothing was asked of anybody else. What the viewer tries, the page's policy stops before it leaves.
     own = f"http://127.0.0.1:{session.server.port}/"

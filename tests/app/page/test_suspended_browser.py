@@ -23,7 +23,7 @@ FLAGS = (
 ).split()
 PATIENCE = 120.0
 LIVED = 300
-"""Readings, one a second of the twin, that come while the browser is suspended."""
+"""Events, one a second of the twin, that come while the browser is suspended."""
 
 
 @pytest.fixture
@@ -70,6 +70,6 @@ def test_a_suspended_browser_costs_nothing(suspendable, tmp_path):
     finally:
         session.stop()
     recorded = read_recording(path)
-    rows = recorded.readings.t[recorded.readings.kind == READING]
+    rows = recorded.events.t[recorded.events.kind == READING]
     assert rows.size > during
     np.testing.assert_array_equal(np.diff(rows), 1_000_000_000)

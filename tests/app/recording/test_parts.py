@@ -65,7 +65,7 @@ def rows(engine):
 
 def end_of(engine):
     pull = rows(engine)
-    return pull.first + len(pull.readings)
+    return pull.first + len(pull.events)
 
 
 def recorded_to(engine):
@@ -101,7 +101,7 @@ def refold(recorded):
     tuning, estimator = tuning_from_json(recorded.tuning, MODEL)
     log = Log(MODEL.width)
     log.first = recorded.first
-    log.extend(recorded.readings)
+    log.extend(recorded.events)
     fold = Fold(estimator, MODEL, tuning, log, pairs=np.array([[0, 1]]), base=recorded.base)
     fold.advance()
     return fold.track
@@ -112,7 +112,7 @@ def reviewed(recorded):
     tuning, estimator = tuning_from_json(recorded.tuning, MODEL)
     made = twin(estimator=estimator)
     made.tuning = tuning
-    engine = Engine(made, lambda report: MemorySource(recorded.readings), base=recorded.base, horizon=np.inf)
+    engine = Engine(made, lambda report: MemorySource(recorded.events), base=recorded.base, horizon=np.inf)
     engine.start()
     try:
         wait_for(lambda: engine.status().finished)
@@ -138,18 +138,18 @@ def test_edits_add_their_tunings_and_one_drawing_of_the_history(start, tmp_path)
     path = tmp_path / "run.rrd"
     engine.submit(commands.Record(path))
     feed(source, engine, 0, 2000)
-    wait_for(lambda: sum(len(pull.readings) for pull in drawn) == 2000)
+    wait_for(lambda: sum(len(pull.events) for pull in drawn) == 2000)
     for k in range(8):
         edit(engine, "Q.rate", 0.01 + 0.001 * k)
         feed(source, engine, 2000 + 100 * k, 2100 + 100 * k)
     seen = rows(engine)
     stop_recording(engine)
     assert written(path) == 2800
-    assert sum(len(pull.readings) for pull in drawn) == 2 * 2800
+    assert sum(len(pull.events) for pull in drawn) == 2 * 2800
     # Before the end the charts went on; at the end came the last revision's, from the first row on.
     again = [k for k, pull in enumerate(drawn) if pull.fresh]
     assert len(again) == 2 and again[0] == 0
-    assert drawn[again[1]].first == 0 and sum(len(pull.readings) for pull in drawn[again[1] :]) == 2800
+    assert drawn[again[1]].first == 0 and sum(len(pull.events) for pull in drawn[again[1] :]) == 2800
     np.testing.assert_array_equal(np.concatenate([pull.track.mean for pull in drawn[again[1] :]]), seen.track.mean)
     recorded = read_recording(path)
     assert recorded.tunings == 9
@@ -181,7 +181,7 @@ def test_parts_fold_by_themselves_to_the_same_bits(estimator, start, tmp_path):
         begin, end = reached, recorded.first + recorded.rows
         again = refold(recorded).select(slice(begin - recorded.first, None))
         assert_same(again, seen.track.select(slice(begin, end)))
-        np.testing.assert_array_equal(recorded.readings.t, last.readings.t[recorded.first : end])
+        np.testing.assert_array_equal(recorded.events.t, last.events.t[recorded.first : end])
         reached = end
     assert reached == COUNT and seen is last
 
@@ -310,7 +310,7 @@ import numpy as np
 from pathlib import Path
 from app.engine.outputs import Pull
 from app.recording.format import RecordingFile
-from estimators.log import READING, Readings
+from estimators.log import READING, Events
 from estimators.track import Track
 def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
@@ -319,7 +319,7 @@ rows, width = 4, 24
 track = Track.allocate(rows, 2, 1, width)
 for k in range(7000):
     t = np.arange(rows * k, rows * (k + 1))
-    events = Readings(t, t, np.zeros(rows, np.int8), np.zeros(rows, np.int32), np.random.rand(rows, width))
+    events = Events(t, t, np.zeros(rows, np.int8), np.zeros(rows, np.int32), np.random.rand(rows, width))
     file.write(Pull(0, k == 0, rows * k, events, track))
     file.flush()
     if k == 1000:

@@ -21,7 +21,7 @@ from app.viser.history import History
 from estimators.diagnostics.score import score
 from estimators.errors import SourceError
 from estimators.fold import Fold, fold
-from estimators.log import TRUTH, Log, Readings
+from estimators.log import TRUTH, Events, Log
 from estimators.track import Track
 from estimators.tuning import Tuning
 from tests.app.scripted import MODEL, SECOND, Scripted, readings, twin, wait_for
@@ -55,7 +55,7 @@ def refold(recorded):
     """The recorded readings through the fold, as a review does it."""
     tuning, estimator = tuning_from_json(recorded.tuning, MODEL)
     log = Log(MODEL.width)
-    log.extend(recorded.readings)
+    log.extend(recorded.events)
     fold = Fold(estimator, MODEL, tuning, log, pairs=np.array([[0, 1]]), base=recorded.base)
     fold.advance()
     return fold.track
@@ -79,7 +79,7 @@ def test_recording_holds_history_late_readings_and_retunes(running, tmp_path):
     times = np.arange(1, 2001) * 0.01
     values = 40 + rng.normal(size=2000)
     source.put(readings(times[:500], values[:500]))
-    wait_for(lambda: len(rows(engine).readings) == 500)
+    wait_for(lambda: len(rows(engine).events) == 500)
     path = tmp_path / "run.rrd"
     engine.submit(commands.Record(path))
     wait_for(lambda: recorder.path == path)
@@ -90,7 +90,7 @@ def test_recording_holds_history_late_readings_and_retunes(running, tmp_path):
         for k in late:
             if start <= k < start + 100:
                 source.put(readings(times[[k]], values[[k]]))
-    wait_for(lambda: len(rows(engine).readings) == 2000)
+    wait_for(lambda: len(rows(engine).events) == 2000)
     engine.submit(commands.SetTuning("Q.rate", 0.02))
     engine.submit(commands.SetEstimator("ukf"))
     wait_for(lambda: engine.status().estimator == "ukf" and not engine.status().refolding)
@@ -100,8 +100,8 @@ def test_recording_holds_history_late_readings_and_retunes(running, tmp_path):
     wait_for(lambda: recorder.finished == [path])
     recorded = read_recording(path)
     assert recorded.name == "scripted" and recorded.text == "model: motor_winding\n"
-    np.testing.assert_array_equal(recorded.readings.t, np.round(times * SECOND).astype(np.int64))
-    np.testing.assert_array_equal(recorded.readings.value[:, 0], values)
+    np.testing.assert_array_equal(recorded.events.t, np.round(times * SECOND).astype(np.int64))
+    np.testing.assert_array_equal(recorded.events.value[:, 0], values)
     assert_same(refold(recorded), seen.track)
     texts = [line.text for line in engine.notices.since(0)]
     assert [text for _, _, text in recorded.notices] == texts[: len(recorded.notices)]
@@ -114,7 +114,7 @@ def test_recording_holds_history_late_readings_and_retunes(running, tmp_path):
 def test_several_recordings_one_after_the_other(running, tmp_path):
     source, engine, recorder = running
     source.put(readings([1.0, 2.0], [40, 41]))
-    wait_for(lambda: len(rows(engine).readings) == 2)
+    wait_for(lambda: len(rows(engine).events) == 2)
     for name in ("a.rrd", "b.rrd"):
         engine.submit(commands.Record(tmp_path / name))
         wait_for(lambda name=name: recorder.path == tmp_path / name)
@@ -131,7 +131,7 @@ def test_place_that_cannot_be_written_is_one_line_and_the_twin_goes_on(running, 
     wait_for(lambda: any("recording" in line.text and line.level == "error" for line in engine.notices.since(0)))
     assert recorder.path is None
     source.put(readings([1.0], [40]))
-    wait_for(lambda: len(rows(engine).readings) == 1)
+    wait_for(lambda: len(rows(engine).events) == 1)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a recording", b"RRF2" + bytes(200)])
@@ -204,7 +204,7 @@ def test_truncated_recording_keeps_what_is_whole(tmp_path):
     file.tuning(Tuning.of(MODEL), "kf", 0, 0)
     for start in range(0, 1000, 100):
         part = slice(start, start + 100)
-        file.write(Pull(0, start == 0, start, log.readings.select(part), track.select(part)))
+        file.write(Pull(0, start == 0, start, log.events.select(part), track.select(part)))
         file.flush()
     file.close()
     whole = path.read_bytes()
@@ -255,9 +255,9 @@ def test_recordings_with_one_true_value_an_event_read_back(tmp_path):
 
     def truths(channel, values):
         channels = np.full(50, channel, np.int32)
-        return Readings(spoken.t, spoken.t, np.full(50, TRUTH, np.int8), channels, values)
+        return Events(spoken.t, spoken.t, np.full(50, TRUTH, np.int8), channels, values)
 
-    old = Readings.concat([spoken, truths(0, x[:, :1]), truths(1, x[:, 1:])], 1)
+    old = Events.concat([spoken, truths(0, x[:, :1]), truths(1, x[:, 1:])], 1)
     old = old.select(np.argsort(old.t, kind="stable"))
     path = tmp_path / "old.rrd"
     file = RecordingFile(path, name="scripted", text="model: motor_winding\n", twin_path=Path("x.yaml"), base=None)
@@ -265,13 +265,13 @@ def test_recordings_with_one_true_value_an_event_read_back(tmp_path):
     file.write(Pull(0, True, 0, old, Track.allocate(150, 2, 1, 1)))
     file.close()
     recorded = read_recording(path)
-    assert recorded.readings.value.shape == (150, 1) and MODEL.width == 2
+    assert recorded.events.value.shape == (150, 1) and MODEL.width == 2
     log, blocks = Log(MODEL.width), Log(MODEL.width)
-    log.extend(recorded.readings)
+    log.extend(recorded.events)
     blocks.extend(spoken)
     blocks.extend(truths(0, x))
     scores = [
-        score(fold("kf", MODEL, Tuning.of(MODEL), events), events.readings, MODEL).states for events in (log, blocks)
+        score(fold("kf", MODEL, Tuning.of(MODEL), events), events.events, MODEL).states for events in (log, blocks)
     ]
     assert scores[0] == scores[1] and list(scores[0]) == ["temperature", "rate"]
 
@@ -296,13 +296,13 @@ def test_variances_that_readings_bring_are_recorded(running, tmp_path):
     engine.submit(commands.Record(None))
     wait_for(lambda: recorder.finished == [path])
     recorded = read_recording(path)
-    variances = recorded.readings.value[:, MODEL.width :]
+    variances = recorded.events.value[:, MODEL.width :]
     np.testing.assert_array_equal(variances[:, 0], [np.nan, np.nan, 0.25, 0.25, np.nan, np.nan])
     assert_same(recorded.track, seen.track)
     assert_same(refold(recorded), seen.track)
     innovation_std = recorded.track.innovation_std[:, 0]
     assert innovation_std[2] < innovation_std[1] and innovation_std[2] < innovation_std[4]
-    np.testing.assert_array_equal(history.column("value")[:, 0], seen.readings.value[:, 0])
+    np.testing.assert_array_equal(history.column("value")[:, 0], seen.events.value[:, 0])
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_FSIZE stands in for a full disk")

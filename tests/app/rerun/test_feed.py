@@ -19,7 +19,7 @@ from app.rerun.rows import RerunRows
 from app.rerun.sink import CALENDAR
 from app.rerun.style import pair_name
 from app.rerun.thin import last_of_each_time, thin
-from estimators.log import READING, TRUTH, Readings
+from estimators.log import READING, TRUTH, Events
 from tests.app.scripted import Scripted, readings, twin, wait_for
 
 WINDOW = 10.0
@@ -48,7 +48,7 @@ class Fed:
         wait_for(lambda: self.engine.status().counts["readings"] == total)
 
     def events(self):
-        return len(self.track().readings)
+        return len(self.track().events)
 
     def track(self):
         cursor = self.engine.cursor()
@@ -104,25 +104,25 @@ def truths(times_s, values):
     """Blocks of true states from the first one on, or single values of it."""
     values = np.asarray(values, float).reshape(len(times_s), -1)
     batch = readings(times_s, values[:, 0])
-    return Readings(batch.t, batch.arrival, np.full(len(batch), TRUTH, np.int8), batch.channel, values)
+    return Events(batch.t, batch.arrival, np.full(len(batch), TRUTH, np.int8), batch.channel, values)
 
 
 def test_bytes_hold_the_rows_of_the_track(fed):
     t = np.arange(1, 31) * 0.25
     block = np.stack((40 + np.cos(t), np.where(np.arange(30) % 3, np.sin(t), np.nan)), axis=1)
-    batch = Readings.concat([readings(t, 40 + np.sin(t)), truths(t, block)], fed.engine.model.width)
+    batch = Events.concat([readings(t, 40 + np.sin(t)), truths(t, block)], fed.engine.model.width)
     fed.put(batch.select(np.argsort(batch.t, kind="stable")))
     fed.next()
     pull = fed.track()
-    rows = last_of_each_time(pull.readings.t)
+    rows = last_of_each_time(pull.events.t)
     for j, name in enumerate(fed.engine.model.state_names):
         times, values = fed.column(f"/state/{name}")
-        np.testing.assert_array_equal(times, pull.readings.t[rows])
+        np.testing.assert_array_equal(times, pull.events.t[rows])
         mean, std = pull.track.mean[rows, j], pull.track.std[rows, j]
         np.testing.assert_array_equal(values, np.stack((mean, mean + 2 * std, mean - 2 * std), axis=1))
-    reading = pull.readings.kind == READING
+    reading = pull.events.kind == READING
     sensor = fed.engine.model.row_names[0]
-    np.testing.assert_array_equal(fed.column(f"/reading/{sensor}")[1], pull.readings.value[reading, :1])
+    np.testing.assert_array_equal(fed.column(f"/reading/{sensor}")[1], pull.events.value[reading, :1])
     np.testing.assert_array_equal(fed.column("/nis/reading")[1][:, 0], pull.track.nis[reading])
     _, values = fed.column(f"/innovation/{sensor}")
     np.testing.assert_array_equal(values[:, 0], pull.track.innovation[reading, 0])
@@ -204,7 +204,7 @@ def test_the_window_of_a_revision_comes_before_its_past(fed):
     assert len(fed.pieces) == 1
     fed.next()
     times, values = fed.column("/state/temperature")
-    np.testing.assert_array_equal(times, fed.track().readings.t)
+    np.testing.assert_array_equal(times, fed.track().events.t)
     np.testing.assert_array_equal(values[:, 0], fed.track().track.mean[:, 0])
     np.testing.assert_array_equal(fed.column("/previous/state/temperature")[0], times)
     assert fed.next() == []
@@ -267,7 +267,7 @@ def test_a_history_pulled_in_pieces_is_whole(fed, monkeypatch):
     t = np.arange(1, 51) * 0.1
     fed.put(readings(t, 40 + t))
     fed.next()
-    np.testing.assert_array_equal(fed.column("/state/temperature")[0], fed.track().readings.t)
+    np.testing.assert_array_equal(fed.column("/state/temperature")[0], fed.track().events.t)
 
 
 def test_rows_rewritten_between_two_pieces_count_once(fed, monkeypatch):
@@ -287,9 +287,9 @@ def test_rows_rewritten_between_two_pieces_count_once(fed, monkeypatch):
     fed.next()
     monkeypatch.undo()
     expected = fed.track()
-    assert len(expected.readings) == 31
+    assert len(expected.events) == 31
     times, values = fed.column("/state/temperature")
-    np.testing.assert_array_equal(times, expected.readings.t)
+    np.testing.assert_array_equal(times, expected.events.t)
     np.testing.assert_array_equal(values[:, 0], expected.track.mean[:, 0])
 
 
@@ -406,7 +406,7 @@ def test_after_seeking_back_nothing_lies_beyond_the_rows(fed):
 def test_a_revision_without_rows_does_not_empty_the_pane(fed):
     fed.put(readings([1.0, 2.0], [40.0, 41.0]))
     fed.next()
-    seek_back(fed, Readings.empty(fed.engine.model.width))
+    seek_back(fed, Events.empty(fed.engine.model.width))
     assert fed.next() == [] and fed.next() == []
     fed.engine.notices.say("still said")
     assert fed.next() == []

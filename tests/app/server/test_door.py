@@ -347,7 +347,7 @@ def test_the_feed_holds_the_track_and_the_next_revision_replaces_it(page, tmp_pa
         viewer.until(lambda: viewer.column(state)[0].size >= 50)
         times, values = viewer.column(state)
         pull = track(page.engine)
-        np.testing.assert_array_equal(times, pull.readings.t)
+        np.testing.assert_array_equal(times, pull.events.t)
         np.testing.assert_array_equal(values[:, 0], pull.track.mean[:, 0])
         # Two roundings of numbers below 100 lie between the bounds and the standard deviation.
         np.testing.assert_allclose(values[:, 1] - values[:, 2], 4 * pull.track.std[:, 0], rtol=0, atol=1e-13)
@@ -378,7 +378,7 @@ def test_a_viewer_that_stops_reading_costs_nobody_anything(page, tmp_path):
             page.source.put(batch)
             sent += len(batch)
             viewer.until(lambda: (t := viewer.column(state)[0]).size and t[-1] == batch.t[-1])  # noqa: B023
-        assert len(track(page.engine).readings) == sent
+        assert len(track(page.engine).events) == sent
         # The stuck one was given one picture, and asked for no other: there is no queue for it that grows.
         pictures = 0
         while True:

@@ -18,7 +18,7 @@ from app.viser.view import ViserView
 from estimators.compiled.model import compile_model
 from estimators.errors import ConfigError, ModelError, NisusError
 from estimators.fold import fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS, unfit
@@ -56,7 +56,7 @@ def start():
 
 
 def reading(model, second, values):
-    return Readings.one(round(second * SECOND), round(second * SECOND), READING, 0, values, model.width)
+    return Events.one(round(second * SECOND), round(second * SECOND), READING, 0, values, model.width)
 
 
 def rows(engine):
@@ -98,7 +98,7 @@ def test_an_option_that_cannot_be_is_one_line_and_changes_nothing(case, way, sta
         one_line(str(caught.value), expected)
         return
     source.put(reading(engine.model, 1.0, [40.0]))
-    wait_for(lambda: len(rows(engine).readings) == 1)
+    wait_for(lambda: len(rows(engine).events) == 1)
     estimator, options = engine.status().estimator, engine.status().options
     from_the_page(engine, option, value)
     wait_for(lambda: errors(engine))
@@ -109,7 +109,7 @@ def test_an_option_that_cannot_be_is_one_line_and_changes_nothing(case, way, sta
     assert (engine.status().estimator, engine.status().options) == (estimator, options)
     assert rows(engine).revision == 0
     source.put(reading(engine.model, 2.0, [41.0]))
-    wait_for(lambda: len(rows(engine).readings) == 2)
+    wait_for(lambda: len(rows(engine).events) == 2)
     assert rows(engine).track.verdict[1] == USED
 
 
@@ -215,7 +215,7 @@ def test_particles_that_all_weigh_nothing_recover_and_it_is_said(name, start):
     source, engine = start(load_twin("motor_winding", overrides={"estimator": name}))
     for second, value in enumerate([40.0, 1e200, 41.0, 40.5, 39.5], start=1):
         source.put(reading(engine.model, second, [value]))
-    wait_for(lambda: len(rows(engine).readings) == 5)
+    wait_for(lambda: len(rows(engine).events) == 5)
     track = rows(engine).track
     assert track.verdict.tolist() == [USED, FAILED, USED, USED, USED]
     assert np.isfinite(track.mean).all() and abs(track.mean[-1, 0] - 40.0) < 5.0
@@ -231,10 +231,10 @@ def test_an_estimate_that_is_no_number_stays_off_the_page(twin, start):
     source, engine = start(made)
     model = engine.model
     source.put(reading(model, 1.0, model.prior_mean[: len(model.sensors[0].rows)]))
-    wait_for(lambda: len(rows(engine).readings) == 1)
+    wait_for(lambda: len(rows(engine).events) == 1)
     engine._fold._state[:] = np.nan
     source.put(reading(model, 1.1, model.prior_mean[: len(model.sensors[0].rows)]))
-    wait_for(lambda: len(rows(engine).readings) == 2)
+    wait_for(lambda: len(rows(engine).events) == 2)
     view = ViserView(engine, secret="s3cret")
     try:
         view.frame()
@@ -248,7 +248,7 @@ def test_an_estimate_that_is_no_number_stays_off_the_page(twin, start):
             if isinstance(node, viser.SceneNodeHandle):
                 assert np.isfinite([*node.position, *node.wxyz]).all()
         engine.submit(commands.Reset())
-        wait_for(lambda: len(rows(engine).readings) == 3)
+        wait_for(lambda: len(rows(engine).events) == 3)
         assert np.isfinite(rows(engine).track.mean[2]).all()
     finally:
         view.stop()

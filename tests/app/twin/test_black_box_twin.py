@@ -11,7 +11,7 @@ import pytest
 from app.twin.twin import load_twin
 from estimators.errors import ModelError
 from estimators.fold import fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.model.user_file import portable
 from estimators.track import Track
 
@@ -63,7 +63,7 @@ def run(folder: Path, text: str, last: float = 2.0) -> Track:
     log = Log(twin.model.width)
     for seconds in (0.0, 0.5, 1.0, 1.5, last):
         t = round(seconds * 1e9)
-        log.extend(Readings.one(t, t, READING, 0, [1.4 + 0.2 * np.sin(t)], twin.model.width))
+        log.extend(Events.one(t, t, READING, 0, [1.4 + 0.2 * np.sin(t)], twin.model.width))
     return fold(twin.estimator, twin.model, twin.tuning, log)
 
 

@@ -7,12 +7,12 @@ from app.twin.twin import load_twin
 from config.loader import TWINS, shipped
 from estimators.errors import SourceError
 from estimators.fold import fold
-from estimators.log import READING, Log, Readings, truth_of
+from estimators.log import READING, Events, Log, truth_of
 from estimators.track import GATED, USED, Track
 from tests.conftest import absent
 
 
-def folded(name: str) -> tuple[Readings, Track]:
+def folded(name: str) -> tuple[Events, Track]:
     twin = load_twin(name)
     try:
         source = twin.open_source(lambda key, text: None, live=False)
@@ -24,7 +24,7 @@ def folded(name: str) -> tuple[Readings, Track]:
     while (batch := source.read(1.0)) is not None:
         log.extend(batch)
     source.close()
-    return log.readings, fold(twin.estimator, twin.model, twin.tuning, log)
+    return log.events, fold(twin.estimator, twin.model, twin.tuning, log)
 
 
 HUGE = ("thermal_field_large",)

@@ -6,7 +6,7 @@ import pytest
 
 from app.twin.twin import Twin, load_twin
 from estimators.errors import ConfigError, NisusError, SourceError
-from estimators.log import INPUT, READING, TRUTH, Readings
+from estimators.log import INPUT, READING, TRUTH, Events
 from estimators.models import MODELS
 
 DBC = """\
@@ -64,17 +64,17 @@ def twin_of(text: str, **options: object) -> Twin:
     return load_twin("motor.yaml", **options)  # type: ignore[arg-type]
 
 
-def events(twin: Twin, *, live: bool = False) -> Readings:
+def events(twin: Twin, *, live: bool = False) -> Events:
     reports: list[tuple[str, str]] = []
     source = twin.open_source(lambda key, text: reports.append((key, text)), live=live)
     batches = []
     while (batch := source.read(1.0)) is not None:
         batches.append(batch)
     source.close()
-    return Readings.concat(batches, twin.model.width)
+    return Events.concat(batches, twin.model.width)
 
 
-def of(batch: Readings, kind: int) -> Readings:
+def of(batch: Events, kind: int) -> Events:
     return batch.select(batch.kind == kind)
 
 
@@ -308,15 +308,15 @@ source:
 def test_a_virtual_bus_plays_its_own_asset() -> None:
     source = twin_of(BUS.replace("CHANNEL", "test-played")).open_source(lambda key, text: None)
     assert source.live
-    batches: list[Readings] = []
+    batches: list[Events] = []
     try:
         for _ in range(100):  # reads wait for frames; 20 come, and silence for ten seconds is a failure
-            batches.append(source.read(0.1) or Readings.empty(1))
+            batches.append(source.read(0.1) or Events.empty(1))
             if sum(map(len, batches)) >= 20:
                 break
     finally:
         source.close()
-    batch = Readings.concat(batches, 1)
+    batch = Events.concat(batches, 1)
     assert len(batch) == 20 and set(batch.kind.tolist()) == {READING}
     # 60 °C ± the process noise of 0.2 s, some hundredths, in steps of the DBC's 0.01 °C.
     np.testing.assert_allclose(batch.value[:, 0], 60.0, atol=1.0)

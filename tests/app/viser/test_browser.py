@@ -7,7 +7,7 @@ from app.engine.commands import SetEstimator, SetTuning
 from app.engine.engine import Engine
 from app.server.private_viser import HEADER
 from app.viser.view import ViserView
-from estimators.log import READING, TRUTH, Readings
+from estimators.log import READING, TRUTH, Events
 from estimators.models import MODELS
 from estimators.track import TRACKING
 from tests.app.engine.test_reset import JUMP, RESET_AT, asset, stubborn
@@ -41,7 +41,7 @@ def engine():
     t = 1.0 + np.arange(60)
     truth = 40.0 + 0.1 * t
     parts = [events(WINDING, READING, 0, t, truth + rng.normal(0, 2, 60)), events(WINDING, TRUTH, 0, t, truth)]
-    both = Readings.concat(parts, WINDING.width)
+    both = Events.concat(parts, WINDING.width)
     engine.put(both.select(np.argsort(both.t, kind="stable")))
     return engine
 

@@ -174,7 +174,7 @@ def pull(first, t, fresh=False):
         def __len__(self):
             return n
 
-    return SimpleNamespace(first=first, fresh=fresh, readings=Batch(**vars(readings)), track=track)
+    return SimpleNamespace(first=first, fresh=fresh, events=Batch(**vars(readings)), track=track)
 
 
 def test_history_overwrites_rewritten_rows():

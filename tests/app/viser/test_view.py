@@ -21,9 +21,9 @@ from app.viser.rows import PATIENCE
 from app.viser.vehicle_scene import VehicleScene
 from app.viser.view import ViserView
 from config.schema import SceneSection, ViewSection
-from estimators.log import READING, TRUTH, Readings
+from estimators.log import READING, TRUTH, Events
 from estimators.models import MODELS
-from estimators.numerics.peaks import Mode
+from estimators.numerics.peaks import Peak
 from tests.app.fake_engine import FakeEngine, events
 
 WINDING = MODELS["motor_winding"]
@@ -43,7 +43,7 @@ def history(n=60, seed=0):
     t = 1.0 + np.arange(n)
     truth = 40.0 + 0.1 * t
     parts = [events(WINDING, READING, 0, t, truth + rng.normal(0, 2, n)), events(WINDING, TRUTH, 0, t, truth)]
-    both = Readings.concat(parts, WINDING.width)
+    both = Events.concat(parts, WINDING.width)
     return both.select(np.argsort(both.t, kind="stable"))
 
 
@@ -287,7 +287,7 @@ def test_chart_holds_band_mean_readings_truth_and_previous(view, engine):
     engine.submit(SetTuning("Q.temperature", 10.0))
     view.frame()
     x, high, low, reading, _, _, previous, truth, mean, _, _ = view.charts._charts[0].data
-    track, readings = engine.fold.track, engine.log.readings
+    track, readings = engine.fold.track, engine.log.events
     used = readings.kind == READING
     # One bucket of the 60 s window holds the reading and the truth of one second: x doubles, values stay.
     np.testing.assert_allclose(np.unique(x), np.unique(readings.t - readings.t[0]) * 1e-9)
@@ -346,16 +346,16 @@ def test_blocks_of_true_states_are_drawn(engine):
 def test_peaks_are_marked_with_their_weights_while_there_are_several(view, engine):
     belief = engine.belief()
     std = np.sqrt(np.diag(belief.cov))
-    engine.modes = tuple(
-        Mode(weight, belief.mean + side * std, belief.cov) for weight, side in ((0.75, 0.5), (0.25, -0.5))
+    engine.peaks = tuple(
+        Peak(weight, belief.mean + side * std, belief.cov) for weight, side in ((0.75, 0.5), (0.25, -0.5))
     )
     view.scene.draw(view.history, engine.belief())
     (first, heavy), (second, light), (third, _) = view.scene._modes[:3]
     assert first.visible and second.visible and not third.visible
     assert (heavy.text, light.text) == ("75 %", "25 %")
-    place = [axis.place(engine.modes[1].mean[axis.state]) for axis in view.scene.axes]
+    place = [axis.place(engine.peaks[1].mean[axis.state]) for axis in view.scene.axes]
     np.testing.assert_allclose(second.points[0, : len(place)], place[:3], atol=0.05)
-    engine.modes = ()
+    engine.peaks = ()
     view.scene.draw(view.history, engine.belief())
     assert not (first.visible or second.visible)
 
@@ -373,9 +373,9 @@ def test_vehicle_scene_stands_at_the_heaviest_peak_among_its_walls():
         walls = (((-5.0, -1.0), (5.0, -1.0), (5.0, 1.0)),)
         section = SceneSection(kind="vehicle", position=("east", "north"), heading="heading", walls=walls)
         scene = VehicleScene(server, MODELS["agv_corridor"], section)
-        peaks = (Mode(0.7, np.array([4.0, 0.5, 0.0]), 0.01 * np.eye(3)), Mode(0.3, -np.ones(3), 0.01 * np.eye(3)))
+        peaks = (Peak(0.7, np.array([4.0, 0.5, 0.0]), 0.01 * np.eye(3)), Peak(0.3, -np.ones(3), 0.01 * np.eye(3)))
         cloud = np.array([[4.0, 0.5, 0.0], [-1.0, -1.0, -1.0], [np.nan, 0.0, 0.0]])
-        belief = SimpleNamespace(mean=np.array([2.5, 0.0, -0.3]), cov=np.eye(3), points=cloud, modes=peaks)
+        belief = SimpleNamespace(mean=np.array([2.5, 0.0, -0.3]), cov=np.eye(3), points=cloud, peaks=peaks)
         rows = History(3, 4, 16)
         rows.n = 1
         scene.draw(rows, belief)
@@ -407,7 +407,7 @@ def test_the_first_view_holds_all_walls_and_stays_until_it_is_to_follow():
         rows = History(3, 4, 16)
         rows.n = 1
         cov = 0.01 * np.eye(3)
-        belief = SimpleNamespace(mean=np.array([135.0, 1.0, 0.0]), cov=cov, points=np.zeros((0, 3)), modes=())
+        belief = SimpleNamespace(mean=np.array([135.0, 1.0, 0.0]), cov=cov, points=np.zeros((0, 3)), peaks=())
         scene.draw(rows, belief)
         np.testing.assert_allclose(scene.world.position, [-110.0, -21.0, 0.0])
         scene.follow = True

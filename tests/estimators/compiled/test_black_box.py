@@ -12,7 +12,7 @@ import pytest
 from estimators.compiled.model import compile_model
 from estimators.errors import EstimatorError, ModelError
 from estimators.fold import Fold, fold
-from estimators.log import INPUT, READING, RESET, TICK, Log, Readings
+from estimators.log import INPUT, READING, RESET, TICK, Events, Log
 from estimators.registry import ESTIMATORS, find_estimator, unfit
 from estimators.track import DIVERGED, FAILED, NONE
 from estimators.tuning import Tuning
@@ -34,7 +34,7 @@ def some_log(events=80):
         values = {READING: rng.normal(0, 0.5, 2 - sensor), INPUT: rng.normal(0, 0.3, 1)}.get(kind, ())
         if kind == READING and rng.random() < 0.15:
             values[0] = np.nan
-        log.extend(Readings.one(t, t, kind, sensor, values, ONE.width))
+        log.extend(Events.one(t, t, kind, sensor, values, ONE.width))
     return log
 
 
@@ -283,7 +283,7 @@ def test_a_reading_that_f_does_not_reach_is_as_if_it_had_not_come(name):
     growing = folded(name, Switch(), log, dict.fromkeys(alone + tick, "f"))
     kept = np.setdiff1d(np.arange(log.n), alone + tick)
     shorter = Log(ONE.width)
-    shorter.extend(log.readings.select(kept))
+    shorter.extend(log.events.select(kept))
     expected, track = fold(name, BOX, few(name), shorter), growing.track
     assert np.all(track.verdict[alone] == FAILED) and np.all(track.verdict[tick] == NONE)
     assert np.all(np.isnan(track.mean[alone + tick])) and np.all(np.isnan(track.std[alone + tick]))
@@ -308,7 +308,7 @@ def test_an_f_that_fails_half_way_keeps_the_steps_that_were_made():
     def log_of(*events):
         log = Log(ONE.width)
         for seconds, kind, values in ((0.0, READING, [0.2, 0.1]), *events):
-            log.extend(Readings.one(round(seconds * SECOND), 0, kind, 0, values, ONE.width))
+            log.extend(Events.one(round(seconds * SECOND), 0, kind, 0, values, ONE.width))
         return log
 
     model = replace(BOX, f=second_fails)

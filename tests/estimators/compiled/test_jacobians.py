@@ -6,7 +6,7 @@ import pytest
 from estimators.compiled.jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step_f, complex_step_h, scratch_size
 from estimators.compiled.model import compile_model
 from estimators.fold import Fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.numerics.jit import jit
@@ -106,7 +106,7 @@ def track(model):
     log = Log(2)
     rng = np.random.default_rng(0)
     for k in range(40):
-        log.extend(Readings.one(k * 20_000_000, 0, READING, 0, rng.normal((0.18, -0.66), 0.1), 2))
+        log.extend(Events.one(k * 20_000_000, 0, READING, 0, rng.normal((0.18, -0.66), 0.1), 2))
     folded = Fold("ekf", model, Tuning.of(model), log)
     folded.advance()
     return folded.track

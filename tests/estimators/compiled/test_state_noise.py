@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from estimators.fold import fold
-from estimators.log import TICK, Log, Readings
+from estimators.log import TICK, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
 
@@ -35,7 +35,7 @@ def test_noise_is_that_of_the_state_before_the_step(estimator):
     )
     log = Log(1)
     for t in (0, 1_000_000_000):
-        log.extend(Readings.one(t, 0, TICK, 0, [], 1))
+        log.extend(Events.one(t, 0, TICK, 0, [], 1))
     track = fold(estimator, model, Tuning.of(model), log)
     np.testing.assert_allclose(track.mean[1, 0], 6.0, rtol=1e-14)
     np.testing.assert_allclose(track.std[1, 0] ** 2, 1.9, rtol=1e-13)

@@ -8,7 +8,7 @@ import pytest
 
 from estimators.diagnostics.failure_cause import failures
 from estimators.fold import Fold
-from estimators.log import INPUT, READING, TICK, Log, Readings
+from estimators.log import INPUT, READING, TICK, Events, Log
 from estimators.model.joint import Unknown, joint
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.track import FAILED
@@ -57,8 +57,8 @@ def driven(model, name="ekf"):
     for k in range(9):
         t = k * SECOND // 2
         if k == 4:
-            log.extend(Readings.one(t, 0, INPUT, 0, [1.0], model.width))
-        log.extend(Readings.one(t, 0, READING, 0, [max(0.0, 0.5 * (k - 4))], model.width))
+            log.extend(Events.one(t, 0, INPUT, 0, [1.0], model.width))
+        log.extend(Events.one(t, 0, READING, 0, [max(0.0, 0.5 * (k - 4))], model.width))
     growing = Fold(name, model, Tuning.of(model), log)
     growing.advance()
     return growing
@@ -130,7 +130,7 @@ def test_the_inputs_that_held_are_taken():
     model = walk(f=root_step, states=(State("s", "m", 0.0, 1e-6),), noises=(Noise("s", "m²/s", 0.0),))
     log = Log(model.width)
     for t, kind, value in ((0, READING, 0.0), (1, INPUT, 1.0), (2, TICK, np.nan), (4, READING, 3.0), (5, READING, 4.0)):
-        log.extend(Readings.one(t * SECOND, 0, kind, 0, [value], 1))
+        log.extend(Events.one(t * SECOND, 0, kind, 0, [value], 1))
     growing = Fold("ekf", model, Tuning.of(model), log)
     growing.advance()
     rows = failures(growing.track)
@@ -151,7 +151,7 @@ def test_the_path_is_walked_in_the_models_own_steps():
     model = walk(f=root_step, states=(State("s", "m", 0.0, 1e-6),), noises=(Noise("s", "m²/s", 0.0),), max_step=1.0)
     log = Log(model.width)
     for t, kind, value in ((0, READING, 0.0), (0, INPUT, 1.0), (4, READING, 4.0)):
-        log.extend(Readings.one(t * SECOND, 0, kind, 0, [value], 1))
+        log.extend(Events.one(t * SECOND, 0, kind, 0, [value], 1))
     growing = Fold("ekf", model, Tuning.of(model), log)
     growing.advance()
     assert list(failures(growing.track)) == [2]
@@ -170,7 +170,7 @@ def test_a_block_that_returns_no_number_is_named_too():
     model = replace(BOX, f=f, sensors=(replace(BOX.sensors[0], h=both), BOX.sensors[1]))
     log = Log(model.width)
     for t, kind, values in ((0.0, READING, [0.2, 0.1]), (0.1, INPUT, [2.0]), (0.2, READING, [0.2, 0.1])):
-        log.extend(Readings.one(round(t * SECOND), 0, kind, 0, values, model.width))
+        log.extend(Events.one(round(t * SECOND), 0, kind, 0, values, model.width))
     growing = Fold("enkf", model, Tuning.of(model), log)
     growing.advance()
     assert list(failures(growing.track)) == [2]
@@ -185,7 +185,7 @@ def test_a_reading_that_the_model_cannot_expect_has_failed_and_is_not_gated(esti
     tuning = Tuning.of(model) if gate is None else Tuning.of(model).set("gate", gate)
     log = Log(model.width)
     for t, kind, value in ((1, READING, 0.0), (2, INPUT, 50.0), (3, READING, 0.0)):
-        log.extend(Readings.one(t * SECOND, t * SECOND, kind, 0, value, model.width))
+        log.extend(Events.one(t * SECOND, t * SECOND, kind, 0, value, model.width))
     growing = Fold(estimator, model, tuning, log)
     growing.advance()
     assert growing.track.verdict[2] == FAILED

@@ -7,7 +7,7 @@ from estimators.diagnostics import field_pictures as module
 from estimators.diagnostics.field_pictures import Picture, plane, plane_shape
 from estimators.diagnostics.score import score
 from estimators.fold import Fold
-from estimators.log import READING, TRUTH, Log, Readings
+from estimators.log import READING, TRUTH, Events, Log
 from estimators.model.field import Field
 from estimators.models.thermal_field import thermal_field
 from estimators.tuning import Tuning
@@ -24,7 +24,7 @@ def events():
     batches = []
     while (batch := source.read(0.0)) is not None:
         batches.append(batch)
-    return Readings.concat(batches, MODEL.width)
+    return Events.concat(batches, MODEL.width)
 
 
 def growing(log, picture=2.0):
@@ -146,7 +146,7 @@ def test_pictures_keep_within_their_memory_and_their_numbers_stay(monkeypatch):
     pictures = module.Pictures(field, 1.0)
     log = Log(8)
     for second in range(100):
-        log.extend(Readings.one(second * 10**9, 0, READING, 0, [np.nan], 8))
+        log.extend(Events.one(second * 10**9, 0, READING, 0, [np.nan], 8))
         if second:
             assert pictures.check(log, second)
             pictures.take(log, second, np.full(8, second), np.ones(8))

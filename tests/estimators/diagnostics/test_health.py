@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from estimators.diagnostics.health import FAR, FEW, HealthPolicy, assess, chi_square_bounds, nis_bounds
 from estimators.diagnostics.score import score
 from estimators.fold import Fold, fold
-from estimators.log import READING, RESET, TICK, TRUTH, Log, Readings
+from estimators.log import READING, RESET, TICK, TRUTH, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS
@@ -27,13 +27,13 @@ def simulated(seed, bias=0.0):
     """A run of the motor drawn from its own model; the truth starts from the prior, as the filter believes."""
     rng = np.random.default_rng(seed)
     x = np.array([35.0, 0.0]) + rng.normal(0, 1, 2) * [5.0, 1.0]
-    batch = [Readings.one(0, 0, TICK, 0, (), 1)]
+    batch = [Events.one(0, 0, TICK, 0, (), 1)]
     for k in range(1, STEPS + 1):
         x = F @ x + rng.normal(0, np.sqrt(np.diag(Q)))
-        batch.append(Readings.one(k * SECOND, 0, READING, 0, x[0] + bias + rng.normal(0, 2.0), 1))
-        batch += [Readings.one(k * SECOND, 0, TRUTH, j, x[j], 1) for j in range(2)]
+        batch.append(Events.one(k * SECOND, 0, READING, 0, x[0] + bias + rng.normal(0, 2.0), 1))
+        batch += [Events.one(k * SECOND, 0, TRUTH, j, x[j], 1) for j in range(2)]
     log = Log(1)
-    log.extend(Readings.concat(batch, 1))
+    log.extend(Events.concat(batch, 1))
     return log
 
 
@@ -46,7 +46,7 @@ def averages(estimator, tuning, bias=0.0):
         folded.advance()
         nis += folded.track.nis[folded.track.verdict == USED].sum()
         mean, cov = folded.moments()
-        error = mean - log.readings.value[-2:, 0]
+        error = mean - log.events.value[-2:, 0]
         nees += error @ np.linalg.solve(cov, error)
     return nis, nees
 
@@ -98,7 +98,7 @@ def test_bounds_are_the_published_quantiles():
 def test_score_is_the_definitions():
     log = simulated(3)
     track = fold("kf", MOTOR, Tuning.of(MOTOR).set("gate", 0.9), log)
-    events = log.readings
+    events = log.events
     result = score(track, events, MOTOR)
     used = track.verdict == USED
     assert result.gated == np.sum(track.verdict == GATED) > 0
@@ -116,9 +116,9 @@ def test_score_is_the_definitions():
 
 def test_errors_of_angles_are_the_short_way():
     log = Log(1)
-    log.extend(Readings.one(0, 0, TRUTH, 0, 3.1, 1))
+    log.extend(Events.one(0, 0, TRUTH, 0, 3.1, 1))
     track = fold("kf", COMPASS, Tuning.of(COMPASS), log)
-    short = score(track, log.readings, COMPASS).states["heading"].rmse
+    short = score(track, log.events, COMPASS).states["heading"].rmse
     np.testing.assert_allclose(short, 2 * np.pi - 6.2, rtol=1e-12)
 
 
@@ -142,14 +142,14 @@ def test_true_states_come_in_blocks():
     low[0], low[5], low[31] = 0.3, 1.5, 3.1  # errors -0.3, -1, 0
     high[0], high[1], high[7] = nan, -2.8, 4.3  # state 33: 3.3 + 2.8 = 6.1 is -0.1832 the short way; state 39: -0.4
     batch = [
-        Readings.one(0, 0, TRUTH, 0, low, 32),
-        Readings.one(0, 0, TRUTH, 32, high, 32),
-        Readings.one(SECOND, 0, TRUTH, 5, 0.5 - 2.0, 32),  # error 2, outside the band as the -1 before it
-        Readings.one(SECOND, 0, TRUTH, 0, nan, 32),
+        Events.one(0, 0, TRUTH, 0, low, 32),
+        Events.one(0, 0, TRUTH, 32, high, 32),
+        Events.one(SECOND, 0, TRUTH, 5, 0.5 - 2.0, 32),  # error 2, outside the band as the -1 before it
+        Events.one(SECOND, 0, TRUTH, 0, nan, 32),
     ]
     log = Log(many.width)
-    log.extend(Readings.concat(batch, many.width))
-    fits = score(fold("kf", many, Tuning.of(many), log), log.readings, many).states
+    log.extend(Events.concat(batch, many.width))
+    fits = score(fold("kf", many, Tuning.of(many), log), log.events, many).states
     expected = {
         "s0": (0.3, 1.0),
         "s5": (np.sqrt((1.0 + 4.0) / 2), 0.0),
@@ -191,10 +191,10 @@ COMPASS = StateSpaceModel(
 
 
 def history(values, kind=READING, step=1.0):
-    """Readings `step` seconds apart, one a value."""
+    """Events `step` seconds apart, one a value."""
     log = Log(1)
     for k, value in enumerate(values):
-        log.extend(Readings.one(round(k * step * SECOND), 0, kind, 0, value, 1))
+        log.extend(Events.one(round(k * step * SECOND), 0, kind, 0, value, 1))
     return log
 
 
@@ -214,8 +214,8 @@ def test_silence_degrades_then_goes_stale_and_a_reading_heals():
     log = history(GOOD[:20])
     last = 19
     for seconds in (5, 5.001, 29.999, 30.001):
-        log.extend(Readings.one(round((last + seconds) * SECOND), 0, TICK, 0, (), 1))
-    log.extend(Readings.one(60 * SECOND, 0, READING, 0, -3.1, 1))
+        log.extend(Events.one(round((last + seconds) * SECOND), 0, TICK, 0, (), 1))
+    log.extend(Events.one(60 * SECOND, 0, READING, 0, -3.1, 1))
     track = fold("kf", COMPASS, Tuning.of(COMPASS), log)
     assert list(track.health[20:]) == [TRACKING, DEGRADED, DEGRADED, STALE, TRACKING]
     np.testing.assert_allclose(track.age[20:], [5, 5.001, 29.999, 30.001, 0], atol=1e-12)

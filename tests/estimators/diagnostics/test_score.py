@@ -6,7 +6,7 @@ from scipy.stats import chi2
 
 from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.score import score
-from estimators.log import READING, Readings
+from estimators.log import READING, Events
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import GATED, HELD_OUT, MISSING, USED, Track
 
@@ -59,7 +59,7 @@ def result():
         track.nis[i], track.log_likelihood[i] = nis, log_likelihood
     t = np.arange(n, dtype=np.int64) * 10**9
     sensors = np.array([row[0] for row in ROWS], np.int32)
-    return score(track, Readings(t, t, np.full(n, READING, np.int8), sensors, np.zeros((n, 2))), MODEL)
+    return score(track, Events(t, t, np.full(n, READING, np.int8), sensors, np.zeros((n, 2))), MODEL)
 
 
 def test_the_used_readings_are_summed_and_the_others_counted(result):
@@ -86,7 +86,7 @@ def test_pictures_of_a_field_weigh_as_many_cells_as_they_knew():
     def picture(cells, rmse, inside):
         return Picture(0, 0, cells, rmse, inside, 1.0, None, None, None)
 
-    empty = Readings.one(0, 0, READING, 0, 0.0, 2)
+    empty = Events.one(0, 0, READING, 0, 0.0, 2)
     pictures = [picture(300, 1.0, 0.9), picture(0, NAN, NAN), picture(100, 3.0, 0.5)]
     fit = score(Track.allocate(1, 1, 0, 2), empty, MODEL, pictures).field
     # Squares over all 400 cells: (300 · 1 + 100 · 9) / 400 = 3; inside: 270 + 50 of 400.

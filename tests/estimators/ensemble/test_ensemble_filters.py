@@ -10,7 +10,7 @@ from estimators.ensemble import analysis, localisation, shared
 from estimators.ensemble.localisation import gaspari_cohn
 from estimators.errors import EstimatorError
 from estimators.fold import Fold
-from estimators.log import READING, TICK, Log, Readings
+from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import Field, Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models.lorenz96 import LORENZ96
 from estimators.models.motor_winding import MOTOR_WINDING
@@ -28,7 +28,7 @@ MATRICES = random_linear(np.random.default_rng(3), 4, 1)
 def log_of(width, *events):
     log = Log(width)
     for event in events:
-        log.extend(Readings.one(*event, width))
+        log.extend(Events.one(*event, width))
     return log
 
 
@@ -384,7 +384,7 @@ def test_bits_are_the_same_on_any_number_of_threads(name, monkeypatch):
     rng = np.random.default_rng(2)
     log = Log(40)
     for k in range(6):
-        log.extend(Readings.one(k * 50_000_000, 0, READING, 0, rng.normal(2, 4, 40), 40))
+        log.extend(Events.one(k * 50_000_000, 0, READING, 0, rng.normal(2, 4, 40), 40))
     options = {"members": 11, "inflation": 1.02, "additive": 0.01} | ({} if name == "etkf" else {"radius": 8.0})
     states = []
     for crews in (1, 2, 5):
@@ -441,9 +441,9 @@ def lorenz_run(cycles, seed=1):
     truth = states[-cycles:]
     t = (np.arange(cycles) + 1) * 50_000_000
     log = Log(40, cycles + 1)
-    log.extend(Readings.one(0, 0, TICK, 0, [], 40))
+    log.extend(Events.one(0, 0, TICK, 0, [], 40))
     value = truth + rng.standard_normal(truth.shape)
-    log.extend(Readings(t, t, np.full(cycles, READING, np.int8), np.zeros(cycles, np.int32), value))
+    log.extend(Events(t, t, np.full(cycles, READING, np.int8), np.zeros(cycles, np.int32), value))
     return states[-cycles - 1], truth, log
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from estimators.errors import EstimatorError, EventError
 from estimators.fold import Fold, fold
-from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Log, Readings
+from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events, Log
 from estimators.model.state_space import Input, Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.snapshots import Base
@@ -40,11 +40,11 @@ TWO = StateSpaceModel(
     ),
     f=still,
 )
-FINE = Readings.one(SECOND, SECOND, READING, 1, [0.5, 0.25], TWO.width)
+FINE = Events.one(SECOND, SECOND, READING, 1, [0.5, 0.25], TWO.width)
 
 
 def event(kind, channel, values, width=TWO.width, t=SECOND):
-    return Readings.one(t, t, kind, channel, values, width)
+    return Events.one(t, t, kind, channel, values, width)
 
 
 WRONG = {
@@ -83,7 +83,7 @@ def test_what_does_not_fit_is_refused_and_the_log_stays(name):
     with pytest.raises(EventError, match=text):
         log.extend(batch)
     assert log.n == 1 and not log.has_variances
-    np.testing.assert_array_equal(log.readings.value, FINE.value)
+    np.testing.assert_array_equal(log.events.value, FINE.value)
 
 
 @pytest.mark.parametrize("name", [name for name, (batch, _) in WRONG.items() if batch.value.shape[1] <= TWO.width])
@@ -105,7 +105,7 @@ def test_a_log_of_no_model_is_checked_where_it_meets_one(name, grown):
 
 def test_the_first_wrong_event_is_named_and_none_is_taken():
     log = Log.of(TWO)
-    batch = Readings.concat([FINE, event(READING, 1, 3.0), event(READING, 9, 1.0, t=5 * SECOND), FINE], TWO.width)
+    batch = Events.concat([FINE, event(READING, 1, 3.0), event(READING, 9, 1.0, t=5 * SECOND), FINE], TWO.width)
     with pytest.raises(EventError, match="event 3 of 4 .reading at 5 s.: channel is 9"):
         log.extend(batch)
     assert log.n == 0
@@ -122,21 +122,21 @@ def test_what_fits_passes():
         event(TICK, 0, [5.0, 6.0]),
         event(RESET, 0, ()),
     ]
-    log.extend(Readings.concat(fits, TWO.width))
+    log.extend(Events.concat(fits, TWO.width))
     assert log.n == len(fits)
-    assert log.readings.kind.tolist() == [INPUT, READING, READING, TRUTH, TRUTH, TICK, RESET]
+    assert log.events.kind.tolist() == [INPUT, READING, READING, TRUTH, TRUTH, TICK, RESET]
 
 
 def test_integers_of_other_types_are_taken():
     columns = FINE._replace(
         kind=FINE.kind.astype(np.int64), channel=FINE.channel.astype(np.uint8), value=FINE.value.T.T
     )
-    frozen = Readings(*(column.copy() for column in columns))
+    frozen = Events(*(column.copy() for column in columns))
     for column in frozen:
         column.flags.writeable = False
     log = Log.of(TWO)
     log.extend(frozen)
-    np.testing.assert_array_equal(log.readings.channel, [1])
+    np.testing.assert_array_equal(log.events.channel, [1])
 
 
 def test_infinite_values_are_missing():
@@ -144,7 +144,7 @@ def test_infinite_values_are_missing():
     log, other = Log.of(TWO), Log.of(TWO)
     log.extend(event(READING, 1, [np.inf, 2.0]))
     other.extend(event(READING, 1, [np.nan, 2.0]))
-    np.testing.assert_array_equal(log.readings.value, other.readings.value)
+    np.testing.assert_array_equal(log.events.value, other.events.value)
 
 
 @pytest.mark.parametrize("argument", ["t", "arrival", "kind", "channel"])
@@ -152,18 +152,18 @@ def test_one_takes_integers_only(argument):
     """1.5 s given as a float became 0 ns, and the reading stood at the wrong time without a word."""
     given = {"t": 1, "arrival": 1, "kind": READING, "channel": 0, argument: 1.5}
     with pytest.raises(EventError, match=f"{argument} is 1.5; it must be"):
-        Readings.one(**given, values=1.0, width=2)
+        Events.one(**given, values=1.0, width=2)
     given[argument] = np.int32(1)
-    assert len(Readings.one(**given, values=1.0, width=2)) == 1
+    assert len(Events.one(**given, values=1.0, width=2)) == 1
     with pytest.raises(EventError, match="values are 3; they must be 2 at most"):
-        Readings.one(0, 0, READING, 0, [1.0, 2.0, 3.0], 2)
+        Events.one(0, 0, READING, 0, [1.0, 2.0, 3.0], 2)
 
 
 def test_a_log_narrower_than_the_model_is_refused():
     """Its readings would go on into the next event's numbers."""
     model = MODELS["lorenz63"]
     log = Log(1)
-    log.extend(Readings.one(0, 0, READING, 0, 1.0, 1))
+    log.extend(Events.one(0, 0, READING, 0, 1.0, 1))
     with pytest.raises(EstimatorError, match="the log has 1 value column.s.; an event of lorenz63 needs 3"):
         Fold("ekf", model, Tuning.of(model), log)
 

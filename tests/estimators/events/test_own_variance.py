@@ -1,4 +1,4 @@
-"""Readings that bring their own variance: as if they were of a sensor that is tuned to it, in every filter."""
+"""Events that bring their own variance: as if they were of a sensor that is tuned to it, in every filter."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import pytest
 from estimators import registry
 from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.model.state_space import Row, Sensor
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS, unfit
@@ -44,12 +44,12 @@ def logs(rng, events=60):
         y[rng.random(2) < 0.2] = np.nan
         kind = rng.integers(0, 3)
         if kind == 0:
-            both = Readings.one(t, t, READING, 0, y, MODEL.width)
+            both = Events.one(t, t, READING, 0, y, MODEL.width)
             own.append(both)
             fine.append(both)
             continue
-        own.append(Readings.one(t, t, READING, 0, [*y, *[np.nan] * (MODEL.width - 2), *FINE], MODEL.width + 2))
-        fine.append(Readings.one(t, t, READING, 1, y, MODEL.width))
+        own.append(Events.one(t, t, READING, 0, [*y, *[np.nan] * (MODEL.width - 2), *FINE], MODEL.width + 2))
+        fine.append(Events.one(t, t, READING, 1, y, MODEL.width))
     made = []
     for batch in (own, fine):
         log = Log.of(MODEL)
@@ -73,7 +73,7 @@ def test_the_same_bits_as_a_sensor_tuned_to_it(name, monkeypatch):
     identical(track, expected)
     # And it matters: with the coarse variances alone the estimate is another.
     plain = Log.of(MODEL)
-    plain.extend(own.readings._replace(value=own.readings.value[:, : MODEL.width]))
+    plain.extend(own.events._replace(value=own.events.value[:, : MODEL.width]))
     assert not np.allclose(fold(name, MODEL, tuning, plain).mean, expected.mean, rtol=1e-3)
 
 
@@ -111,11 +111,11 @@ def test_memory_only_where_it_is_used():
     assert log.value.shape == (100, MODEL.width)
     log.add("coarse", 1.5, np.zeros((1, 2)), variance=2.0)
     assert log.value.shape[1] == MODEL.width + MODEL.ny and log.n == 3
-    own = log.readings.value[:, MODEL.width : MODEL.width + 2]
+    own = log.events.value[:, MODEL.width : MODEL.width + 2]
     np.testing.assert_array_equal(own, [[np.nan, np.nan], [2.0, 2.0], [np.nan, np.nan]])
     twin = log.copy()
     log.drop_front(1)
-    np.testing.assert_array_equal(twin.readings.select(slice(1, None)).value, log.readings.value)
+    np.testing.assert_array_equal(twin.events.select(slice(1, None)).value, log.events.value)
 
 
 def test_filters_that_hold_on_to_one_r_say_so():

@@ -5,7 +5,7 @@ import pytest
 
 from estimators.errors import ConfigError, EstimatorError
 from estimators.fold import Fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.registry import ESTIMATORS, find_estimator
 from estimators.track import FAILED, USED
@@ -18,10 +18,10 @@ SINGULAR = [name for name, entry in ESTIMATORS.items() if entry.singular]
 
 def apart(log):
     """The same events, each 10 ms after the one before at least: two exact readings at one time have no S."""
-    events = log.readings
+    events = log.events
     t, *columns = events.select(slice(0, None))
     other = Log(log.width)
-    other.extend(Readings(t + 10**7 * np.arange(len(events)), *columns))
+    other.extend(Events(t + 10**7 * np.arange(len(events)), *columns))
     return other
 
 
@@ -40,7 +40,7 @@ def test_what_is_certain_equals_the_joint_gaussian(estimator, nx, seed, correlat
             # As in test_joint_gaussian.py; an exact row leaves variances of q dt, a hundredth of the others.
             scale = max(1e-3, float(np.max(np.abs(expected))))
             np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * scale)
-    readings = log.readings.kind == READING
+    readings = log.events.kind == READING
     assert np.all(fold.track.verdict[joint.events] == USED) and readings.sum() > 20
     likelihood = fold.track.log_likelihood[fold.track.verdict == USED].sum()
     assert likelihood == pytest.approx(joint.log_likelihood(used), rel=1e-9)
@@ -70,7 +70,7 @@ def model(*, std=1.0, variance=0.0):
 def test_an_exact_reading_is_believed_and_a_second_one_at_that_time_fails(estimator):
     log = Log(1)
     log.extend(
-        Readings.concat([Readings.one(t * SECOND, 0, READING, 0, [y], 1) for t, y in ((0, 2.0), (0, 3.0), (2, 4.0))], 1)
+        Events.concat([Events.one(t * SECOND, 0, READING, 0, [y], 1) for t, y in ((0, 2.0), (0, 3.0), (2, 4.0))], 1)
     )
     fold = Fold(estimator, model(), Tuning.of(model()), log)
     fold.advance()

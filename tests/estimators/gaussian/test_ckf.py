@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from estimators.fold import Fold
-from estimators.log import INPUT, READING, TICK, Log, Readings
+from estimators.log import INPUT, READING, TICK, Events, Log
 from estimators.tuning import Tuning
 from tests.estimators.interpreted.test_filterpy import P0, PENDULUM, X0, Q, R, hx
 
@@ -26,10 +26,10 @@ def moved(x, u):
 @pytest.mark.parametrize(("sensor", "y"), [(0, [1.2]), (1, [-1.0, 2.9]), (1, [np.nan, 2.0])])
 def test_a_step_and_a_reading_are_the_published_sums(sensor, y):
     log = Log(2)
-    log.extend(Readings.one(0, 0, INPUT, 0, [0.7], 2))
+    log.extend(Events.one(0, 0, INPUT, 0, [0.7], 2))
     asked = log.copy()
-    asked.extend(Readings.one(round(DT * 1e9), 0, TICK, 0, [], 2))
-    log.extend(Readings.one(round(DT * 1e9), 0, READING, sensor, y, 2))
+    asked.extend(Events.one(round(DT * 1e9), 0, TICK, 0, [], 2))
+    log.extend(Events.one(round(DT * 1e9), 0, READING, sensor, y, 2))
     before, fold = (Fold("ckf", PENDULUM, Tuning.of(PENDULUM), one) for one in (asked, log))
     before.advance()
     fold.advance()

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from estimators.fold import Fold, fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import FAILED
 from estimators.tuning import Tuning
@@ -40,7 +40,7 @@ def test_on_a_linear_model_the_count_does_not_matter(iterations):
 def test_many_iterations_find_the_mode_and_count_the_reading_once(sensor, y):
     """The minimum of ½ |x - x̂|²_P⁻¹ + ½ |y - h(x)|²_R⁻¹ by scipy, and P = (P⁻¹ + Hᵀ R⁻¹ H)⁻¹ there."""
     readings = Log(2)
-    readings.extend(Readings.one(0, 0, READING, sensor, y, 2))
+    readings.extend(Events.one(0, 0, READING, sensor, y, 2))
     folded = Fold("iekf", PENDULUM, Tuning.of(PENDULUM).with_options({"iterations": 20}), readings)
     folded.advance()
     finite = np.isfinite(y)
@@ -77,7 +77,7 @@ def test_an_iteration_that_leaves_the_model_fails_visibly():
         f=still,
     )
     readings = Log(1)
-    readings.extend(Readings.one(0, 0, READING, 0, -3.0, 1))
+    readings.extend(Events.one(0, 0, READING, 0, -3.0, 1))
     track = fold("iekf", model, Tuning.of(model), readings)
     assert track.verdict[0] == FAILED
     assert (track.mean[0, 0], track.std[0, 0]) == (1.0, 10.0)

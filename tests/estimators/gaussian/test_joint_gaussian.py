@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from estimators.fold import Fold
-from estimators.log import READING, Readings
+from estimators.log import READING, Events
 from estimators.registry import ESTIMATORS
 from estimators.track import HELD_OUT, MISSING, USED
 from estimators.tuning import Tuning
@@ -63,7 +63,7 @@ def test_innovations_nis_and_likelihood(estimator, nx, nu, seed):
     matrices, log, joint = case(nx, nu, seed)
     used = np.ones(3, bool)
     track = folded(estimator, matrices, log).track
-    events = log.readings
+    events = log.events
     readings = np.flatnonzero(events.kind == READING)
     assert np.all((track.verdict == MISSING)[events.kind == READING] == ~np.isin(readings, joint.owner))
     for k in joint.events[::3]:
@@ -84,7 +84,7 @@ def test_held_out_sensor_is_predicted_and_scored_but_not_used(estimator, held_ou
     matrices, log, joint = case(4, 1, 5)
     tuning = Tuning.of(matrices.model).set(f"use.{held_out}", False)
     fold = folded(estimator, matrices, log, tuning)
-    events, track = log.readings, fold.track
+    events, track = log.events, fold.track
     expected_mean, expected_cov = joint.filtered(log.n - 1, tuning.used)
     close(fold.moments()[0], expected_mean, "mean")
     close(fold.moments()[1], expected_cov, "covariance")
@@ -105,9 +105,9 @@ def test_held_out_sensor_is_predicted_and_scored_but_not_used(estimator, held_ou
 def test_order_of_equal_times_does_not_matter(estimator):
     """Sequential updates at one time commute for a linear model: one joint update, whatever the order."""
     matrices, log, _ = case(3, 0, 9)
-    events = log.readings
+    events = log.events
     _, *columns = events.select(np.flatnonzero(events.kind == READING)[:8])
-    together = Readings(np.full(8, 10**9), *columns)
+    together = Events(np.full(8, 10**9), *columns)
     moments = []
     for order in (np.arange(8), np.arange(8)[::-1], np.array([3, 1, 4, 0, 5, 2, 7, 6])):
         again = type(log)(log.width)

@@ -6,7 +6,7 @@ import pytest
 from estimators.errors import EstimatorError
 from estimators.fold import Fold
 from estimators.gaussian.kf_steady import AFTER
-from estimators.log import READING, TICK, Log, Readings
+from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import Input, Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS
@@ -25,7 +25,7 @@ def readings(values, times=None):
     log = Log(1)
     for k, value in enumerate(values):
         t = k if times is None else times[k]
-        log.extend(Readings.one(round(t * SECOND), 0, READING, 0, value, 1))
+        log.extend(Events.one(round(t * SECOND), 0, READING, 0, value, 1))
     return log
 
 
@@ -89,7 +89,7 @@ def test_lost_readings_let_the_covariance_grow_and_it_settles_again():
 def test_readings_a_little_late_are_steady_and_ticks_grow():
     log = readings(np.full(500, 36.0), [k + 0.004 * (-1) ** k for k in range(500)])
     at = 499 * SECOND
-    log.extend(Readings.one(at + 3 * SECOND, 0, TICK, 0, [], 1))
+    log.extend(Events.one(at + 3 * SECOND, 0, TICK, 0, [], 1))
     track = folded("kf-steady", log).track
     np.testing.assert_array_equal(track.std[450], track.std[499])
     assert np.all(track.std[500] > track.std[499])
@@ -125,7 +125,7 @@ def test_two_rows_an_input_split_steps_and_a_row_that_is_missing():
     values = rng.normal(0, 1, (300, 2))
     values[150, 1] = values[170, 0] = np.nan
     for k, value in enumerate(values):
-        log.extend(Readings.one(k * SECOND // 4, 0, READING, 0, value, 2))
+        log.extend(Events.one(k * SECOND // 4, 0, READING, 0, value, 2))
     steady = folded("kf-steady", log, Tuning.of(TWO_ROWS).with_options({"period": 0.25}), TWO_ROWS)
     kalman = folded("kf", log, model=TWO_ROWS)
     assert np.all(steady.track.verdict == USED)
@@ -215,7 +215,7 @@ def test_the_steady_gain_of_correlated_rows():
     y = np.random.default_rng(5).normal(0, 1.0, (1500, 2)) + [36.0, 0.0]
     log = Log(declared.width)
     log.extend(
-        Readings.concat([Readings.one(k * SECOND, 0, READING, 0, row, 2) for k, row in enumerate(y)], declared.width)
+        Events.concat([Events.one(k * SECOND, 0, READING, 0, row, 2) for k, row in enumerate(y)], declared.width)
     )
     steady, kalman = (folded(name, log, model=declared) for name in ("kf-steady", "kf"))
     for a, b in zip(steady.moments(), kalman.moments(), strict=True):

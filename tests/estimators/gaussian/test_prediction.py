@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from estimators.fold import LONGEST, Fold, fold
-from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Log, Readings
+from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS
@@ -64,7 +64,7 @@ def log_of(*events):
     """(seconds, kind, value) as a log."""
     log = Log(1)
     for t, kind, value in events:
-        log.extend(Readings.one(round(t * SECOND), 0, kind, 0, value, 1))
+        log.extend(Events.one(round(t * SECOND), 0, kind, 0, value, 1))
     return log
 
 
@@ -169,7 +169,7 @@ def test_purity_where_jacobians_are_differences(estimator):
     growing = Fold(estimator, guarded_model, tuning, log)
     growing.advance()
     t, kind, value = events[late]
-    changed, _ = log.extend(Readings.one(round(t * SECOND), 0, kind, 0, value, 1))
+    changed, _ = log.extend(Events.one(round(t * SECOND), 0, kind, 0, value, 1))
     growing.rewind(changed)
     growing.advance()
     np.testing.assert_array_equal(growing.track.mean, whole.mean)
@@ -178,7 +178,7 @@ def test_purity_where_jacobians_are_differences(estimator):
 
 @pytest.mark.parametrize("estimator", NAMES)
 def test_a_reset_recovers_from_an_estimate_that_was_lost(estimator):
-    """Readings of 1e300 are believed, as Q is 1e300; after a reset nothing of that may remain."""
+    """Events of 1e300 are believed, as Q is 1e300; after a reset nothing of that may remain."""
     events = [(0, TICK, 0.0), (0.5, READING, 1e300), (0.7, READING, -1e300), (0.9, READING, 1e300)]
     after = [(1, RESET, 0.0), (1.2, READING, 0.3), (1.4, READING, 0.4)]
     lost = run(estimator, model(drift, states=2, q=1e300), *events, *after).track
@@ -190,11 +190,11 @@ def test_a_reset_recovers_from_an_estimate_that_was_lost(estimator):
 def test_after_a_clock_jump_the_estimate_is_the_prior():
     model = MODELS["motor_drive"]
     log = Log(model.width)
-    log.extend(Readings.one(0, 0, READING, 0, 90.0, model.width))
+    log.extend(Events.one(0, 0, READING, 0, 90.0, model.width))
     just, beyond = int(model.max_step * LONGEST * 1e9), int(model.max_step * LONGEST * 1e9) + 10**9
-    log.extend(Readings.one(just, 0, TICK, 0, [], model.width))
-    log.extend(Readings.one(beyond, 0, TICK, 0, [], model.width))
-    log.extend(Readings.one(1_700_000_000 * 10**9, 0, INPUT, 0, [0, 0, 0, 40, 25], model.width))
+    log.extend(Events.one(just, 0, TICK, 0, [], model.width))
+    log.extend(Events.one(beyond, 0, TICK, 0, [], model.width))
+    log.extend(Events.one(1_700_000_000 * 10**9, 0, INPUT, 0, [0, 0, 0, 40, 25], model.width))
     track = fold("ekf", model, Tuning.of(model), log)
     prior = np.array([state.mean for state in model.states])
     assert np.all(np.abs(track.mean[1] - prior) > 1e-3)  # still predicted, towards its surroundings
@@ -205,9 +205,9 @@ def test_after_a_clock_jump_the_estimate_is_the_prior():
 def test_several_truths_at_one_time_are_one_query():
     model = MODELS["motor_drive"]
     log = Log(model.width)
-    log.extend(Readings.one(0, 0, READING, 0, 90.0, model.width))
+    log.extend(Events.one(0, 0, READING, 0, 90.0, model.width))
     for kind, t in ((TRUTH, 5), (TRUTH, 5), (TICK, 5), (TRUTH, 9), (INPUT, 12), (TRUTH, 12), (TRUTH, 12)):
-        log.extend(Readings.one(t * 10**8, 0, kind, 0, 50.0, model.width))
+        log.extend(Events.one(t * 10**8, 0, kind, 0, 50.0, model.width))
     whole = fold("ekf", model, Tuning.of(model), log)
     alone = Fold("ekf", model, Tuning.of(model), log)
     while alone.advance(1):

@@ -8,7 +8,7 @@ from scipy.optimize import brentq, minimize
 
 from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.registry import ESTIMATORS
 from estimators.track import GATED, USED
@@ -66,8 +66,8 @@ PLANE = StateSpaceModel(
 def log_of(values, *, step=1.0):
     width = np.size(values[0])
     log = Log(width)
-    batch = [Readings.one(round(k * step * SECOND), 0, READING, 0, value, width) for k, value in enumerate(values)]
-    log.extend(Readings.concat(batch, width))
+    batch = [Events.one(round(k * step * SECOND), 0, READING, 0, value, width) for k, value in enumerate(values)]
+    log.extend(Events.concat(batch, width))
     return log
 
 
@@ -278,9 +278,9 @@ def test_each_row_has_its_own_variance():
         sensor = k % 3
         noise = np.sqrt(matrices.R[sensor] * (np.array([1.0, 9.0, 1.0]) if sensor == 2 else 1.0))
         y = matrices.H[sensor] @ x + noise * rng.standard_normal(ROWS[sensor])
-        batch.append(Readings.one(t, t, READING, sensor, y, 3))
+        batch.append(Events.one(t, t, READING, sensor, y, 3))
     log = Log(3)
-    log.extend(Readings.concat(batch, 3))
+    log.extend(Events.concat(batch, 3))
     tuning = Tuning.of(matrices.model).with_options({"adapt": 1, "memory": 500, "bound": 30})
     fold = Fold("ekf", matrices.model, tuning, log)
     fold.advance()
@@ -318,7 +318,7 @@ def test_a_reset_forgets(estimator):
     from estimators.log import RESET
 
     log = log_of([0.0, 3.0, -4.0])
-    log.extend(Readings.one(5 * SECOND, 0, RESET, 0, [], 1))
+    log.extend(Events.one(5 * SECOND, 0, RESET, 0, [], 1))
     fold = Fold(estimator, model(q=0.01), Tuning.of(model(q=0.01)).with_options(options), log)
     fold.advance()
     np.testing.assert_array_equal(fold._state[-2:], [R, R])

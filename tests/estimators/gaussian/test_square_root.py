@@ -10,7 +10,7 @@ import pytest
 
 from estimators.errors import EstimatorError
 from estimators.fold import Fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.track import FAILED, USED
 from estimators.tuning import Tuning
@@ -103,15 +103,15 @@ def test_a_negative_weight_that_outweighs_the_others_fails_visibly(estimator):
     values = {"alpha": 1.0, "beta": 0.0, "kappa": -0.9}
     model = one(keep, squared, 1e-9)
     readings = Log(1)
-    readings.extend(Readings.one(0, 0, READING, 0, 0.3, 1))
+    readings.extend(Events.one(0, 0, READING, 0, 0.3, 1))
     fold = Fold(estimator, model, Tuning.of(model).with_options(values), readings)
     fold.advance()
     assert fold.track.verdict[0] == FAILED
     np.testing.assert_array_equal(fold.track.mean[0], 0.0)
     model = one(square, squared, 1e-9)
     readings = Log(1)
-    readings.extend(Readings.one(0, 0, READING, 0, np.nan, 1))
-    readings.extend(Readings.one(SECOND, 0, READING, 0, 0.3, 1))
+    readings.extend(Events.one(0, 0, READING, 0, np.nan, 1))
+    readings.extend(Events.one(SECOND, 0, READING, 0, 0.3, 1))
     fold = Fold(estimator, model, Tuning.of(model).with_options(values), readings)
     fold.advance()
     assert fold.track.verdict[1] == FAILED
@@ -136,7 +136,7 @@ COMPASS = StateSpaceModel(
 def test_an_angle_is_corrected_across_the_seam(estimator):
     """3.1 ± 0.2 and the reading -3.1 ± 0.1, which is 3.183: 4/5 of the way, beyond π."""
     readings = Log(1)
-    readings.extend(Readings.one(0, 0, READING, 0, -3.1, 1))
+    readings.extend(Events.one(0, 0, READING, 0, -3.1, 1))
     fold = Fold(estimator, COMPASS, Tuning.of(COMPASS), readings)
     fold.advance()
     gap = 2 * np.pi - 6.2
@@ -192,14 +192,14 @@ def exact():
 
 def at_once():
     together = Log(2)
-    together.extend(Readings.one(0, 0, READING, 0, Y, 2))
+    together.extend(Events.one(0, 0, READING, 0, Y, 2))
     return together
 
 
 def one_by_one():
     apart = Log(2)
-    apart.extend(Readings.one(0, 0, READING, 1, Y[:1], 2))
-    apart.extend(Readings.one(0, 0, READING, 2, Y[1:], 2))
+    apart.extend(Events.one(0, 0, READING, 1, Y[:1], 2))
+    apart.extend(Events.one(0, 0, READING, 2, Y[1:], 2))
     return apart
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from estimators.compiled.jacobians import scratch_size
 from estimators.fold import Fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.numerics.jit import inlined, jit
 from estimators.numerics.simd_ir import padded
@@ -71,8 +71,8 @@ def readings(model, rng):
         sensor = k % len(model.sensors)
         y = rng.normal(2.0, 1.0, len(model.sensors[sensor].rows))
         y[rng.random(y.size) < 0.3 * (k % 3)] = np.nan
-        batch.append(Readings.one(k * SECOND, k * SECOND, READING, sensor, y, model.width))
-    log.extend(Readings.concat(batch, model.width))
+        batch.append(Events.one(k * SECOND, k * SECOND, READING, sensor, y, model.width))
+    log.extend(Events.concat(batch, model.width))
     return log
 
 

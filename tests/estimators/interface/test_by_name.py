@@ -12,7 +12,7 @@ from estimators import MODELS, Log, fold, fold_many, mean_nees
 from estimators.errors import EventError, NisusError
 from estimators.fold import Fold
 from estimators.fold import fold as fold_track
-from estimators.log import INPUT, READING, TICK, TRUTH, Readings
+from estimators.log import INPUT, READING, TICK, TRUTH, Events
 from estimators.track import HELD_OUT, USED
 from estimators.tuning import Tuning
 from tests.estimators.test_fold import identical
@@ -33,7 +33,7 @@ def motor_log(**given):
 def test_it_is_the_fold_of_events_and_a_tuning():
     log = Log(MOTOR.width)
     for second, celsius in enumerate(CELSIUS, start=1):
-        log.extend(Readings.one(second * SECOND, second * SECOND, READING, 0, celsius, MOTOR.width))
+        log.extend(Events.one(second * SECOND, second * SECOND, READING, 0, celsius, MOTOR.width))
     tuning = Tuning.of(MOTOR).set("R.winding", 9.0).set("gate", 0.99).with_options({"alpha": 0.5})
     expected = fold_track("ukf", MOTOR, tuning, log)
     got = fold("ukf", MOTOR, motor_log(), R={"winding": 9.0}, gate=0.99, alpha=0.5)
@@ -46,7 +46,7 @@ def test_any_order_and_any_pieces_give_the_same_log():
     whole, pieces = motor_log(), Log.of(MOTOR)
     for k in (3, 0, 4, 2, 1):
         pieces.add("winding", k + 1.0, CELSIUS[k])
-    for a, b in zip(whole.readings, pieces.readings, strict=True):
+    for a, b in zip(whole.events, pieces.events, strict=True):
         np.testing.assert_array_equal(a, b)
 
 
@@ -69,7 +69,7 @@ def test_inputs_and_truth_by_name():
     u, x = DRIVE.input_names, DRIVE.state_names
     log.add_inputs([1.0, 2.0], **{u[0]: [3.0, np.nan], u[-1]: 7.0})
     log.add_truth([2.0, 3.0], **{x[0]: 5.0, x[-1]: [6.0, np.nan]})
-    events = log.readings
+    events = log.events
     assert events.kind.tolist() == [INPUT, INPUT, TRUTH, TRUTH]
     np.testing.assert_array_equal(events.value[:2, 0], [3.0, np.nan])
     np.testing.assert_array_equal(events.value[:2, DRIVE.nu - 1], 7.0)
@@ -82,8 +82,8 @@ def test_truth_of_far_apart_states_of_a_field_is_told_in_blocks():
     log = Log.of(model)
     names = model.state_names
     log.add_truth(1.0, **{names[39]: 9.0, names[0]: 1.0, names[31]: 3.0})
-    assert log.readings.channel.tolist() == ([0] if model.width >= 40 else [0, 39])
-    np.testing.assert_array_equal(np.sort(log.readings.value[np.isfinite(log.readings.value)]), [1.0, 3.0, 9.0])
+    assert log.events.channel.tolist() == ([0] if model.width >= 40 else [0, 39])
+    np.testing.assert_array_equal(np.sort(log.events.value[np.isfinite(log.events.value)]), [1.0, 3.0, 9.0])
 
 
 WRONG = {
@@ -301,4 +301,4 @@ def test_ticks_are_asked_by_seconds():
     log = Log.of(MOTOR, start=0.0)
     log.add_ticks(np.arange(3.0))
     track = fold("kf", MOTOR, log)
-    assert log.readings.kind.tolist() == [TICK] * 3 and np.all(np.diff(track.std[:, 0]) > 0)
+    assert log.events.kind.tolist() == [TICK] * 3 and np.all(np.diff(track.std[:, 0]) > 0)

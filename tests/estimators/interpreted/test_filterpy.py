@@ -19,7 +19,7 @@ import pytest
 from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from estimators.fold import Fold
-from estimators.log import READING, TICK, Log, Readings
+from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, random_linear
@@ -101,7 +101,7 @@ def log():
     """200 readings of a simulated pendulum: irregular times, some equal, some rows and some readings missing."""
     rng = np.random.default_rng(11)
     x, t = np.array([0.9, 0.1, 1.2]), 17_000_003
-    batch = [Readings.one(0, 0, TICK, 0, (), 2)]
+    batch = [Events.one(0, 0, TICK, 0, (), 2)]
     for _ in range(200):
         step = int(rng.choice([0, 1, 2, 3], p=[0.2, 0.5, 0.2, 0.1])) * 17_000_003
         t += step
@@ -109,15 +109,15 @@ def log():
         sensor = int(rng.random() < 0.4)
         y = hx(sensor, x) + rng.normal(0, np.sqrt(R[sensor]))
         y[rng.random(y.size) < 0.15] = np.nan
-        batch.append(Readings.one(t, t, READING, sensor, y, 2))
+        batch.append(Events.one(t, t, READING, sensor, y, 2))
     log = Log(2)
-    log.extend(Readings.concat(batch, 2))
+    log.extend(Events.concat(batch, 2))
     return log
 
 
 def steps(log):
     """Per reading: dt since the event before, sensor, finite rows, their values and variances."""
-    events = log.readings
+    events = log.events
     for k in range(1, len(events)):
         sensor = int(events.channel[k])
         y = events.value[k, : R[sensor].size]
@@ -195,18 +195,18 @@ def test_ukf(log, values):
 def test_kf():
     rng = np.random.default_rng(3)
     matrices = random_linear(rng, 3, 2)
-    batch = [Readings.one(0, 0, TICK, 0, (), 3)]
+    batch = [Events.one(0, 0, TICK, 0, (), 3)]
     t = 0
     for _ in range(150):
         t += int(rng.integers(1, 5)) * 10**8
         sensor = int(rng.integers(3))
-        batch.append(Readings.one(t, t, READING, sensor, rng.normal(0, 2, ROWS[sensor]), 3))
+        batch.append(Events.one(t, t, READING, sensor, rng.normal(0, 2, ROWS[sensor]), 3))
     log = Log(3)
-    log.extend(Readings.concat(batch, 3))
+    log.extend(Events.concat(batch, 3))
     track = folded("kf", matrices.model, log)
     kf = KalmanFilter(dim_x=3, dim_z=3, dim_u=2)
     kf.x, kf.P = matrices.mean.copy(), np.diag(matrices.std**2)
-    events = log.readings
+    events = log.events
     for k in range(1, len(events)):
         dt = (int(events.t[k]) - int(events.t[k - 1])) / SECOND
         kf.predict(u=matrices.u, B=dt * matrices.B, F=np.eye(3) + dt * matrices.A, Q=matrices.q * dt * matrices.W)

@@ -7,7 +7,7 @@ import pytest
 from filterpy.kalman import EnsembleKalmanFilter
 
 from estimators.fold import Fold, fold
-from estimators.log import READING, TICK, Log, Readings
+from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import FAILED, GATED, HELD_OUT, MISSING, USED
 from estimators.tuning import Tuning
@@ -74,7 +74,7 @@ def test_angles_turn_past_pi(name):
         y[0] = (y[0] + np.pi) % (2 * np.pi) - np.pi
         if rng.random() < 0.2:
             y[int(rng.integers(2))] = np.nan
-        events.extend(Readings.one(k * SECOND // 10, 0, READING, 0, y, 2))
+        events.extend(Events.one(k * SECOND // 10, 0, READING, 0, y, 2))
     ours, theirs = (fold(n, COMPASS, Tuning.of(COMPASS), events, pairs=PAIRS[:1]) for n in (name, f"filterpy-{name}"))
     close(theirs, ours)
     assert np.sum(np.abs(np.diff(theirs.mean[:, 0])) > np.pi) >= 1  # it did pass
@@ -92,11 +92,7 @@ def one_reading(members):
         "filterpy-enkf",
         MODEL,
         tuning,
-        as_log(
-            Readings.concat(
-                [Readings.one(0, 0, TICK, 0, (), 3), Readings.one(SECOND, 0, READING, 1, [0.4, -0.7], 3)], 3
-            )
-        ),
+        as_log(Events.concat([Events.one(0, 0, TICK, 0, (), 3), Events.one(SECOND, 0, READING, 1, [0.4, -0.7], 3)], 3)),
     )
     fold_.advance()
     return fold_
@@ -151,8 +147,8 @@ def test_enkf_p_is_not_its_members_covariance():
 
 def test_a_covariance_without_a_factor_fails_and_is_no_exception():
     events = Log(2)
-    events.extend(Readings.one(0, 0, TICK, 0, (), 2))
-    events.extend(Readings.one(SECOND, 0, READING, 0, [0.5], 2))
+    events.extend(Events.one(0, 0, TICK, 0, (), 2))
+    events.extend(Events.one(SECOND, 0, READING, 0, [0.5], 2))
     fold_ = Fold("filterpy-ukf", PENDULUM, Tuning.of(PENDULUM), events)
     fold_.advance(1)
     fold_._state[3:] = -np.eye(3).ravel()

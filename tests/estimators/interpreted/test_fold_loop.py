@@ -7,7 +7,7 @@ import pytest
 
 from estimators import registry
 from estimators.fold import LONGEST, Fold, fold
-from estimators.log import TICK, Log, Readings
+from estimators.log import TICK, Events, Log
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear
 from tests.estimators.test_fold import MODEL, as_log, everything, identical, in_python
@@ -31,9 +31,9 @@ def test_long_gaps_are_split_and_end_at_the_prior_as_in_the_kernel(name, monkeyp
     monkeypatch.setitem(registry.ESTIMATORS, f"{name}-python", in_python(name))
     model = replace(MODEL, max_step=0.125)
     times = np.cumsum([1, 0.3, 0.1251, 7.77, 0.125 * LONGEST + 1, 0.5]) * SECOND
-    readings = [Readings.one(int(t), int(t), 0, 1, [0.3, -0.2], 3) for t in times]
-    tick = Readings.one(int(times[3]) + 1, 0, TICK, 0, (), 3)
-    log = as_log(Readings.concat([*readings, tick], 3))
+    readings = [Events.one(int(t), int(t), 0, 1, [0.3, -0.2], 3) for t in times]
+    tick = Events.one(int(times[3]) + 1, 0, TICK, 0, (), 3)
+    log = as_log(Events.concat([*readings, tick], 3))
     compiled, python = (fold(n, model, Tuning.of(model), log) for n in (name, f"{name}-python"))
     identical(python, compiled)
     # Behind the gap the reading meets the prior again.

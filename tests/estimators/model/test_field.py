@@ -7,7 +7,7 @@ from estimators.compiled.model import compile_model
 from estimators.diagnostics.score import score
 from estimators.errors import EstimatorError, ModelError
 from estimators.fold import Fold
-from estimators.log import READING, TRUTH, Log, Readings
+from estimators.log import READING, TRUTH, Events, Log
 from estimators.model.state_space import LARGE, Field, Noise, Row, Sensor, StateSpaceModel
 from estimators.models.thermal_field import thermal_field
 from estimators.numerics.smoothed_noise import smooth
@@ -83,7 +83,7 @@ def test_a_field_is_folded_and_scored_by_its_shown_cells():
     log = Log(model.width)
     while (batch := source.read(0.0)) is not None:
         log.extend(batch)
-    events = log.readings
+    events = log.events
     told = np.unique(events.channel[events.kind == TRUTH])
     assert told.tolist() == model.shown.tolist()
     tuning = Tuning.of(model).with_options({"members": 30, "radius": 0.3})
@@ -108,7 +108,7 @@ def test_forecast_noise_has_the_models_shape():
     model = thermal_field(4, 5, 1)
     log = Log(model.width)
     for k in (0, 1):
-        log.extend(Readings.one(k * 10**9, 0, READING, 0, [np.nan], model.width))
+        log.extend(Events.one(k * 10**9, 0, READING, 0, [np.nan], model.width))
     tuning = Tuning.of(model).set("p.diffusivity", 0.0).set("p.relaxation", 1e6).set("p.heating", 0.0)
     fold = Fold("etkf", model, tuning.set("Q.temperature", 3.0).with_options({"members": 10_000}), log)
     fold.advance()

@@ -15,7 +15,7 @@ from estimators.compiled.model import compile_model
 from estimators.diagnostics.score import score
 from estimators.errors import ModelError
 from estimators.fold import fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.model.joint import Unknown, joint
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
@@ -75,7 +75,7 @@ def readings(n: int = 80) -> Log:
     x, log = 0.5, Log(1)
     for k in range(1, n + 1):
         x += 0.45 - 0.1 * x + rng.normal(0.0, 0.1)
-        log.extend(Readings.one(k * SECOND, 0, READING, 0, x + 0.25 + rng.normal(0.0, 0.2), 1))
+        log.extend(Events.one(k * SECOND, 0, READING, 0, x + 0.25 + rng.normal(0.0, 0.2), 1))
     return log
 
 
@@ -161,7 +161,7 @@ def test_a_silted_jacket_is_found(estimator: str) -> None:
     twin = load_twin("motor_joint")
     log, _ = read_log(twin, None)
     track = fold(estimator, twin.model, twin.tuning, log)
-    result = score(track, log.readings, twin.model)
+    result = score(track, log.events, twin.model)
     late = slice(len(track.mean) // 2, None)
     np.testing.assert_allclose(track.mean[late, 4], 0.04, atol=4 * track.std[late, 4].max())
     assert track.std[-1, 4] < 5e-4 and track.mean[0, 4] == pytest.approx(0.03)
@@ -175,7 +175,7 @@ def test_on_the_bench_the_magnet_is_found_without_the_jackets_resistance(data: C
     twin = load_twin("motor_bench_joint")
     log, _ = read_log(twin, None)
     track = fold("ekf", twin.model, twin.tuning, log)
-    result = score(track, log.readings, twin.model)
+    result = score(track, log.events, twin.model)
     assert track.mean[0, 4] == pytest.approx(0.048)
     assert 0.026 < track.mean[-1, 4] < 0.033  # fitted with all temperatures: 0.032
     assert result.states["magnet"].rmse < 1.1

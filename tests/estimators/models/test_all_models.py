@@ -14,7 +14,7 @@ from estimators.compiled.model import compile_model
 from estimators.diagnostics.score import score
 from estimators.errors import ModelError
 from estimators.fold import fold
-from estimators.log import INPUT, READING, Log, Readings, truth_of
+from estimators.log import INPUT, READING, Events, Log, truth_of
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.models.motor_drive import COPPER, MOTOR_DRIVE
@@ -240,7 +240,7 @@ def test_car_noise_does_not_depend_on_how_time_is_cut() -> None:
 @dataclass(frozen=True)
 class Run:
     model: StateSpaceModel
-    events: Readings
+    events: Events
     track: Track
 
     def of(self, sensor: str) -> np.ndarray:
@@ -272,7 +272,7 @@ def replayed(name: str) -> tuple[object, Log]:
 
 def run(name: str, estimator: str) -> Run:
     twin, log = replayed(name)
-    return Run(twin.model, log.readings, fold(estimator, twin.model, twin.tuning, log))
+    return Run(twin.model, log.events, fold(estimator, twin.model, twin.tuning, log))
 
 
 def in_bounds(run: Run) -> bool:

@@ -9,7 +9,7 @@ import pytest
 
 from estimators.diagnostics.score import score
 from estimators.fold import Fold
-from estimators.log import READING, TICK, TRUTH, Log, Readings
+from estimators.log import READING, TICK, TRUTH, Events, Log
 from estimators.models import MODELS
 from estimators.track import MISSING, USED
 from estimators.tuning import Tuning
@@ -50,13 +50,13 @@ def example():
 
 def as_log(rows):
     """A tick at 0, where the prior holds; then per step the reading (NaN where lost) and the true states."""
-    batch = [Readings.one(0, 0, TICK, 0, (), 1)]
+    batch = [Events.one(0, 0, TICK, 0, (), 1)]
     for k, (truth, y, lost, *_) in enumerate(rows):
         t = (k + 1) * SECOND
-        batch.append(Readings.one(t, t, READING, 0, np.nan if lost else y, 2))
-        batch.append(Readings.one(t, t, TRUTH, 0, truth, 2))
+        batch.append(Events.one(t, t, READING, 0, np.nan if lost else y, 2))
+        batch.append(Events.one(t, t, TRUTH, 0, truth, 2))
     log = Log(2)
-    log.extend(Readings.concat(batch, 2))
+    log.extend(Events.concat(batch, 2))
     return log
 
 
@@ -74,7 +74,7 @@ def folded(request, rows):
 
 
 def test_every_row(folded, rows):
-    track, kinds = folded.track, folded.log.readings.kind
+    track, kinds = folded.track, folded.log.events.kind
     at = np.flatnonzero(kinds == READING)
     P = np.array([row[4] for row in rows])
     # Some thousand roundings, each 1e-16 of its size; the filter forgets the older ones.
@@ -86,7 +86,7 @@ def test_every_row(folded, rows):
 
 
 def test_published_numbers(folded, rows):
-    result = score(folded.track, folded.log.readings, folded.model)
+    result = score(folded.track, folded.log.events, folded.model)
     assert round(result.states["temperature"].rmse, 4) == 1.0432
     assert round(result.nis, 4) == 0.8227
     mean, cov = folded.moments()
@@ -104,7 +104,7 @@ def test_published_numbers_are_the_examples_own(rows):
 
 
 def test_lost_samples_are_missing_and_covariance_grows(folded, rows):
-    at = np.flatnonzero(folded.log.readings.kind == READING)
+    at = np.flatnonzero(folded.log.events.kind == READING)
     verdict = folded.track.verdict[at]
     lost = np.array([row[2] for row in rows])
     assert np.all(verdict[lost] == MISSING)
@@ -126,8 +126,8 @@ def test_the_simulator_draws_the_same(rows):
     batches = []
     while (batch := source.read(0.0)) is not None:
         batches.append(batch)
-    events = Readings.concat(batches, model.width)
-    expected = as_log(rows).readings
+    events = Events.concat(batches, model.width)
+    expected = as_log(rows).events
     np.testing.assert_array_equal(events.kind, expected.kind)
     np.testing.assert_array_equal(events.t, expected.t)
     # The simulator factorises Q once where the example draws from it anew: the last bit may differ.

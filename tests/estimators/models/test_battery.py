@@ -156,7 +156,7 @@ def recorded(name: str) -> tuple[Twin, Log]:
 def scored(name: str, estimator: str) -> Score:
     twin, log = recorded(name)
     track = fold(estimator, twin.model, twin.tuning, log)
-    return score(track, log.readings, twin.model)
+    return score(track, log.events, twin.model)
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ def drive():
 
 def unasked(log: Log) -> Log:
     """The log without its truths: queries, which change nothing and cost a copy and a prediction of all particles."""
-    events = log.readings
+    events = log.events
     other = Log(log.width, log.n)
     other.extend(events.select(events.kind != TRUTH))
     return other
@@ -104,10 +104,10 @@ def unasked(log: Log) -> Log:
 
 def places(fold: Fold, seconds: float) -> dict[int, float]:
     """Weight of the peaks by the side of the building, east 1 and west -1, after so many seconds."""
-    events = fold.log.readings
+    events = fold.log.events
     fold.advance(int(np.searchsorted(events.t - events.t[0], seconds * 1e9, side="right")) - fold.n)
     found = {1: 0.0, -1: 0.0}
-    for mode in fold.modes():
+    for mode in fold.peaks():
         found[int(np.sign(mode.mean[0]))] += mode.weight
     return found
 
@@ -125,8 +125,8 @@ def test_particles_keep_both_peaks_until_the_door_and_then_settle(drive, estimat
     for seconds in (4, 8, 15):
         assert min(places(fold, seconds).values()) > 0.1
     places(fold, 40)
-    (mode,) = fold.modes()
-    truth = np.array([truth_of(log.readings, k)[1][-1] for k in range(3)])
+    (mode,) = fold.peaks()
+    truth = np.array([truth_of(log.events, k)[1][-1] for k in range(3)])
     # The posterior's own spread: 4 standard deviations.
     miss = np.abs((mode.mean - truth + np.pi) % (2 * np.pi) - np.pi)
     assert (miss < 4 * np.sqrt(np.diag(mode.cov))).all(), f"{mode.mean} and {truth}"
@@ -144,9 +144,9 @@ def test_the_door_tells_over_seeds_of_simulator_and_filter(seed) -> None:
         east = np.mean(fold.points()[:, 0] > 0)
         assert 0.02 < east < 0.98
     places(fold, 40)
-    (mode,) = fold.modes()
-    rows, east = truth_of(log.readings, 0)
-    at = np.searchsorted(log.readings.t[rows] - log.readings.t[0], 40e9)
+    (mode,) = fold.peaks()
+    rows, east = truth_of(log.events, 0)
+    at = np.searchsorted(log.events.t[rows] - log.events.t[0], 40e9)
     assert abs(mode.mean[0] - east[at]) < 1.0  # the other place is 29 m away
 
 
@@ -162,7 +162,7 @@ def test_a_gaussian_filter_leaves_the_building_and_its_nis_tells(drive, estimato
     twin, log = drive
     fold = Fold(estimator, twin.model, Tuning.of(twin.model), log)
     fold.advance()
-    events = log.readings
+    events = log.events
     miss = [abs(fold.track.mean[-1, k] - truth_of(events, k)[1][-1]) for k in (0, 1)]
     assert max(miss) > 5.0
     assert np.nanmean(fold.track.nis) > 100.0
@@ -173,8 +173,8 @@ def test_told_roughly_where_it_heads_the_ekf_chooses_that_peak_and_is_sure() -> 
     twin, log = narrow(**{"prior.heading.mean": "0.0", "prior.heading.std": "0.3"})
     fold = Fold("ekf", twin.model, Tuning.of(twin.model), log)
     fold.advance()
-    rows, east = truth_of(log.readings, 0)
-    at = np.searchsorted(log.readings.t[rows], 15e9)
+    rows, east = truth_of(log.events, 0)
+    at = np.searchsorted(log.events.t[rows], 15e9)
     for k in (at, -1):
         assert fold.track.std[rows[k], 0] < 0.5
         assert abs(fold.track.mean[rows[k], 0] - east[k]) > 10 * fold.track.std[rows[k], 0]

@@ -24,7 +24,7 @@ def contact(name, seed, particles=300, duration=15.0):
     tuning = twin.tuning.with_options({"particles": particles} if name in ("rbpf", "pf") else {})
     run = Fold(name, twin.model, tuning, log)
     run.advance()
-    rows, truth = truth_of(log.readings, CONTACT)
+    rows, truth = truth_of(log.events, CONTACT)
     return run.track.mean[rows, CONTACT], truth, run
 
 
@@ -71,7 +71,7 @@ def test_simulated_jumps_follow_the_chances():
     """How often each step's chances came true: the sum of (jump - chance) over its standard deviation is N(0, 1)."""
     twin = load_twin("gripper_contact", overrides={"source.seed": "9"})
     log, _ = read_log(twin, None)
-    states = np.array([truth_of(log.readings, j)[1] for j in range(5)]).T
+    states = np.array([truth_of(log.events, j)[1] for j in range(5)]).T
     assert set(np.unique(states[:, CONTACT])) == {0.0, 1.0}
     miss, variance = 0.0, 0.0
     for before, after in zip(states[:-1], states[1:], strict=True):
@@ -109,7 +109,7 @@ def test_rbpf_needs_fewer_particles_than_pf():
 
 def test_the_estimate_is_consistent():
     run = contact("rbpf", SEEDS[0])[2]
-    rows, surface = truth_of(run.log.readings, SURFACE)
+    rows, surface = truth_of(run.log.events, SURFACE)
     miss = (run.track.mean[rows, SURFACE] - surface) / run.track.std[rows, SURFACE]
     # After the first touch; neighbours are the same estimate, a handful of independent ones remain.
     assert np.sqrt(np.mean(miss[rows.size // 3 :] ** 2)) < 2.0

@@ -65,10 +65,8 @@ def test_a_simulated_rover_is_tracked_within_what_the_filter_says(estimator: str
     while (batch := source.read(1.0)) is not None:
         log.extend(batch)
     track = fold(estimator, model, Tuning.of(model), log)
-    rows, _ = truth_of(log.readings, 0)
-    squares = sum(
-        ((track.mean[rows, k] - truth_of(log.readings, k)[1]) / track.std[rows, k])[200:] ** 2 for k in (0, 1)
-    )
+    rows, _ = truth_of(log.events, 0)
+    squares = sum(((track.mean[rows, k] - truth_of(log.events, k)[1]) / track.std[rows, k])[200:] ** 2 for k in (0, 1))
     assert np.mean(squares) == pytest.approx(2.0, abs=1.5)
     assert track.mean[-1, 4] == pytest.approx(1.04, abs=4 * track.std[-1, 4])
 
@@ -86,7 +84,7 @@ def replayed(name: str, estimator: str, *, ranges: bool = True) -> tuple[Track, 
     for sensor in twin.model.sensor_names if not ranges else ():
         tuning = tuning.set(f"use.{sensor}", False)
     track = fold(estimator, twin.model, tuning, log)
-    result = score(track, log.readings, twin.model)
+    result = score(track, log.events, twin.model)
     return track, float(np.hypot(result.states["east"].rmse, result.states["north"].rmse)), result.states, result.nis
 
 

@@ -10,7 +10,7 @@ import pytest
 from estimators.compiled.model import compile_model
 from estimators.errors import ModelError
 from estimators.fold import fold
-from estimators.log import READING, Log, Readings
+from estimators.log import READING, Events, Log
 from estimators.model.joint import Unknown, joint
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.numerics.helpers import with_helpers
@@ -54,7 +54,7 @@ def tank(f=f, h=h):
 def log():
     given = Log(2)
     for k, value in enumerate((40.0, 38.0, 35.0, 31.0)):
-        given.extend(Readings.one(k * 10**9, 0, READING, 0, value, 2))
+        given.extend(Events.one(k * 10**9, 0, READING, 0, value, 2))
     return given
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimators.numerics.peaks import modes_of
+from estimators.numerics.peaks import peaks_of
 
 N = 2000
 
@@ -18,7 +18,7 @@ def test_a_gaussian_cloud_has_one_peak(nx):
     for _ in range(5):
         A = rng.standard_normal((nx, nx))
         x = rng.standard_normal((N, nx)) @ A.T * 100 + 7
-        (mode,) = modes_of(x, flat(nx))
+        (mode,) = peaks_of(x, flat(nx))
         assert mode.weight == 1.0
         assert np.allclose(mode.mean, x.mean(axis=0)) and np.allclose(mode.cov, np.cov(x.T, bias=True))
 
@@ -30,7 +30,7 @@ def test_two_peaks_are_told_apart_with_their_weights(nx, part):
     here = rng.random(N) < part
     x = rng.standard_normal((N, nx))
     x[:, 0] += np.where(here, 5.0, -5.0)
-    first, second = modes_of(x, flat(nx))
+    first, second = peaks_of(x, flat(nx))
     # Ten standard deviations apart, so that every point is assigned right but for accidents.
     assert abs(first.weight - max(here.mean(), 1 - here.mean())) < 0.005
     assert abs(first.weight + second.weight - 1.0) < 1e-12
@@ -53,7 +53,7 @@ def test_a_light_peak_far_away_is_kept(part, seed):
     along, across, turn = rng.standard_normal((3, N)) * np.array([[2.0], [0.16], [0.2]])
     heading = np.where(east, np.pi, 0.0) + turn
     x = np.column_stack((np.where(east, 17.0, -17.0) + along, across, (heading + np.pi) % (2 * np.pi) - np.pi))
-    west, other = modes_of(x, np.array([False, False, True]))
+    west, other = peaks_of(x, np.array([False, False, True]))
     for mode, here in ((west, ~east), (other, east)):
         assert abs(mode.weight - here.mean()) < 2 / N  # at 8 deviations from the middle not a point strays
         assert np.allclose(mode.mean[:2], x[here, :2].mean(axis=0), atol=5 * 2.0 / np.sqrt(here.sum()) / 10)
@@ -67,7 +67,7 @@ def test_a_few_points_far_away_are_found_among_the_bumps_of_the_many():
         here = rng.random(N) < 0.04
         x = rng.standard_normal((N, 3))
         x[:, 0] += np.where(here, 5.0, -5.0)
-        found += len(modes_of(x, flat(3))) == 2
+        found += len(peaks_of(x, flat(3))) == 2
     assert found >= 9  # their density is so thin that a sample may miss it: 11 of these
 
 
@@ -76,7 +76,7 @@ def test_copies_of_a_particle_beside_a_cloud_are_a_peak():
     x = rng.standard_normal((N, 2)) + [10.0, 0.0]
     here = rng.random(N) < 0.4
     x[here] = [-5.0, 0.0]
-    cloud, copies = modes_of(x, flat(2))
+    cloud, copies = peaks_of(x, flat(2))
     assert copies.weight == here.mean() and np.array_equal(copies.mean, [-5.0, 0.0]) and np.all(copies.cov == 0)
     assert np.allclose(cloud.mean, x[~here].mean(axis=0)) and np.allclose(cloud.cov, np.cov(x[~here].T, bias=True))
 
@@ -87,30 +87,30 @@ def test_a_few_particles_copied_often_are_one_cloud():
     for seed in range(10):
         rng = np.random.default_rng(seed)
         places = rng.standard_normal((80, 3))
-        right += len(modes_of(places[rng.integers(0, 80, N)], flat(3))) == 1
+        right += len(peaks_of(places[rng.integers(0, 80, N)], flat(3))) == 1
     assert right >= 8  # a density of 80 points dips by chance at times; one of 2000 in half of the seeds
 
 
 def test_angles_do_not_tear_a_peak():
     rng = np.random.default_rng(0)
     x = (np.pi + 0.3 * rng.standard_normal((N, 1)) + np.pi) % (2 * np.pi) - np.pi
-    (mode,) = modes_of(x, np.ones(1, bool))
+    (mode,) = peaks_of(x, np.ones(1, bool))
     assert abs(abs(mode.mean[0]) - np.pi) < 5 * 0.3 / np.sqrt(N)
     assert abs(np.sqrt(mode.cov[0, 0]) - 0.3) < 5 * 0.3 / np.sqrt(2 * N)
 
 
 def test_flat_heavy_tailed_and_degenerate_clouds():
     rng = np.random.default_rng(0)
-    assert len(modes_of(rng.uniform(-1, 1, (N, 2)), flat(2))) == 1
-    assert len(modes_of(rng.standard_t(3, (N, 2)), flat(2))) == 1
-    (point,) = modes_of(np.ones((N, 2)), flat(2))
+    assert len(peaks_of(rng.uniform(-1, 1, (N, 2)), flat(2))) == 1
+    assert len(peaks_of(rng.standard_t(3, (N, 2)), flat(2))) == 1
+    (point,) = peaks_of(np.ones((N, 2)), flat(2))
     assert np.array_equal(point.mean, [1.0, 1.0]) and np.all(point.cov == 0)
-    assert modes_of(np.full((10, 2), np.nan), flat(2)) == []
-    assert len(modes_of(np.zeros((1, 3)), flat(3))) == 1
+    assert peaks_of(np.full((10, 2), np.nan), flat(2)) == []
+    assert len(peaks_of(np.zeros((1, 3)), flat(3))) == 1
 
 
 def test_copies_of_one_point_are_one_peak_whatever_their_size():
     """The mean of equal numbers differs from them by rounding, which is no spread to divide by."""
     for scale in (1e-250, 0.1, 123.456, 1e9, 1e100):
-        (mode,) = modes_of(np.tile(scale * np.array([1.0, 0.3, -0.7]), (40, 1)), np.array([False, False, True]))
+        (mode,) = peaks_of(np.tile(scale * np.array([1.0, 0.3, -0.7]), (40, 1)), np.array([False, False, True]))
         assert mode.weight == 1.0 and np.allclose(mode.mean[:2], scale * np.array([1.0, 0.3]), rtol=1e-12, atol=0)

@@ -8,7 +8,7 @@ import pytest
 
 from estimators import registry
 from estimators.fold import fold
-from estimators.log import TICK, Readings
+from estimators.log import TICK, Events
 from estimators.numerics.steps import SLACK, steps_of
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear
@@ -54,8 +54,8 @@ def test_the_fold_crosses_a_gap_in_as_many_steps(name, monkeypatch):
     monkeypatch.setitem(registry.ESTIMATORS, "ekf-python", in_python("ekf"))
     matrices = random_linear(np.random.default_rng(1), 3, 2)
     model = replace(matrices.model, max_step=0.1)
-    ticks = [Readings.one(t, 0, TICK, 0, (), model.width) for t in (0, 3 * SECOND // 10)]
-    track = fold(name, model, Tuning.of(model), as_log(Readings.concat(ticks, model.width)))
+    ticks = [Events.one(t, 0, TICK, 0, (), model.width) for t in (0, 3 * SECOND // 10)]
+    track = fold(name, model, Tuning.of(model), as_log(Events.concat(ticks, model.width)))
     x = matrices.mean
     for _ in range(3):
         x = x + 0.1 * (matrices.A @ x + matrices.B @ matrices.u)

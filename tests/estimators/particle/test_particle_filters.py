@@ -9,7 +9,7 @@ import pytest
 
 from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
-from estimators.log import READING, TICK, Log, Readings
+from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.particle.cloud import RECOVERIES, block, members
 from estimators.track import FAILED, GATED, HELD_OUT, MISSING, USED
@@ -30,7 +30,7 @@ def problem():
     joint = JointGaussian(matrices, log)
     cov = joint.H @ joint.cov @ joint.H.T + joint.R
     y = iter(rng.multivariate_normal(joint.H @ joint.mean + joint.offset, cov))
-    events = log.readings
+    events = log.events
     for k in range(log.n):
         if events.kind[k] == READING:
             for row in np.flatnonzero(np.isfinite(events.value[k])):
@@ -79,7 +79,7 @@ def within_half(y, x, u, p, r):
 def log_of(*events):
     log = Log(1)
     for t, kind, value in events:
-        log.extend(Readings.one(int(t * SECOND), 0, kind, 0, value, 1))
+        log.extend(Events.one(int(t * SECOND), 0, kind, 0, value, 1))
     return log
 
 
@@ -214,7 +214,7 @@ def test_two_peaks_stay_alive_and_are_reported(name):
     log = log_of(*((k, READING, 4.0 + 0.5 * rng.standard_normal()) for k in range(20)))
     run = Fold(name, model, Tuning.of(model).with_options({"particles": 20_000}), log)
     run.advance()
-    first, second = run.modes()
+    first, second = run.peaks()
     assert abs(abs(first.mean[0]) - 2.0) < 0.15 and abs(first.mean[0] + second.mean[0]) < 0.1
     # Half each, but for what 20 resamplings of a cloud of 20,000 let the share wander.
     assert abs(first.weight - 0.5) < 5 * np.sqrt(20 * 0.25 / 20_000) + 0.02
@@ -427,7 +427,7 @@ def test_resampling_often_keeps_what_the_strata_gain(scheme, most):
         swing(x, None, None, 0.01, out)
         x = out + [0.0, 0.01 * rng.standard_normal()]
         value = np.sin(x[0]) + 0.1 * rng.standard_normal()
-        log.extend(Readings.one(k * SECOND // 100, 0, READING, 0, value, model.width))
+        log.extend(Events.one(k * SECOND // 100, 0, READING, 0, value, model.width))
     tuning = Tuning.of(model).with_options({"particles": 2000, "fraction": 1.0, "resampling": scheme})
     means = np.array([fold("pf", model, replace(tuning, seed=seed), log).mean[:, 0] for seed in range(40)])
     assert np.sqrt(np.mean(means.var(axis=0, ddof=1))) < most

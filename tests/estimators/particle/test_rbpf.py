@@ -9,7 +9,7 @@ import pytest
 
 from estimators.errors import EstimatorError, ModelError
 from estimators.fold import Fold, fold
-from estimators.log import READING, TICK, Log, Readings
+from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import Jump, Noise, Row, Sensor, State, StateSpaceModel
 from estimators.particle.cloud import RECOVERIES
 from estimators.track import FAILED, USED
@@ -54,10 +54,10 @@ READINGS = (0.4, 1.6, 3.1, 4.4, 3.9, 4.2)
 
 def log_of(*values, width=3, every=1.0):
     log = Log(width)
-    log.extend(Readings.one(0, 0, TICK, 0, np.zeros(width), width))
+    log.extend(Events.one(0, 0, TICK, 0, np.zeros(width), width))
     for k, value in enumerate(values):
         t = int((k + 1) * every * SECOND)
-        log.extend(Readings.one(t, t, READING, 0, np.atleast_1d(value), width))
+        log.extend(Events.one(t, t, READING, 0, np.atleast_1d(value), width))
     return log
 
 
@@ -277,8 +277,8 @@ def test_a_cloud_without_weight_recovers_visibly():
     model = jump_model(f=far, inputs=(Input("blow", "1"),), jump=Jump("m", ("a", "b"), chances))
     log = log_of(0.1, 0.2)
     for t, on in ((3, 1.0), (4, 0.0)):
-        log.extend(Readings.one(t * SECOND, t * SECOND, INPUT, 0, np.array([on]), 3))
-    log.extend(Readings.one(5 * SECOND, 5 * SECOND, READING, 0, np.array([0.3]), 3))
+        log.extend(Events.one(t * SECOND, t * SECOND, INPUT, 0, np.array([on]), 3))
+    log.extend(Events.one(5 * SECOND, 5 * SECOND, READING, 0, np.array([0.3]), 3))
     run = Fold("rbpf", model, Tuning.of(model).with_options({"particles": 100}), log)
     run.advance()
     assert run._state[RECOVERIES] == 1
@@ -289,7 +289,7 @@ def test_peaks_are_reported_with_their_weights():
     model, log = jump_model(), log_of(3.0)
     run = Fold("rbpf", model, Tuning.of(model).with_options({"particles": 4000}), log)
     run.advance()
-    first, second = run.modes()
+    first, second = run.peaks()
     p = run.track.mean[-1, 2]
     assert abs(first.weight - max(p, 1 - p)) < 0.05 and abs(first.weight + second.weight - 1) < 1e-9
     assert abs(first.mean[2] - second.mean[2]) > 0.9

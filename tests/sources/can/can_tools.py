@@ -6,7 +6,7 @@ from typing import Any
 
 import can
 
-from estimators.log import READING, Readings
+from estimators.log import READING, Events
 from sources.source import Channel
 
 DBC = """VERSION ""
@@ -71,14 +71,14 @@ def frame(identifier: int, data: bytes, *, t: float = 1.0, bus: Any = None, exte
     return can.Message(timestamp=t, arbitration_id=identifier, is_extended_id=extended, data=data, channel=bus)
 
 
-def read_all(source: Any) -> Readings:
+def read_all(source: Any) -> Events:
     batches = []
     while (batch := source.read(0.0)) is not None:
         batches.append(batch)
-    return Readings.concat(batches, batches[0].value.shape[1])
+    return Events.concat(batches, batches[0].value.shape[1])
 
 
-def same(a: Readings, b: Readings) -> bool:
+def same(a: Events, b: Events) -> bool:
     return all(
         x.shape == y.shape and x.dtype == y.dtype and bool(((x == y) | ((x != x) & (y != y))).all())
         for x, y in zip(a, b, strict=True)

@@ -7,7 +7,7 @@ import can
 import pytest
 
 from estimators.errors import SourceError
-from estimators.log import Readings
+from estimators.log import Events
 from sources.can.bus import WAITS, CanBus, open_bus
 from sources.can.decoder import Decoder
 from tests.sources.can.can_tools import DBC, Reports, dbc, frame, sensor
@@ -54,7 +54,7 @@ def listen(bus, count):
     while sum(map(len, batches)) < count:
         assert time.monotonic() < deadline
         batches.append(bus.read(0.1))
-    return Readings.concat(batches, 1)
+    return Events.concat(batches, 1)
 
 
 def test_frames_of_a_virtual_bus_arrive_decoded_in_order(decoder):

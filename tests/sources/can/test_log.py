@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from estimators.errors import SourceError
-from estimators.log import READING, Readings
+from estimators.log import READING, Events
 from sources.can.decoder import Decoder
 from sources.can.log import CanLog
 from sources.clock import to_ns
@@ -86,7 +86,7 @@ def test_files_follow_one_another_and_chunks_do_not_matter(tmp_path, messages):
     got = read_all(CanLog(parts, decoder))
     np.testing.assert_array_equal(got.value, decoder.decode(decoder.gather(messages, None)).value)
     one_by_one = [decoder.decode(decoder.gather([message], None)) for message in messages]
-    assert same(Readings.concat(one_by_one, 3), decoder.decode(decoder.gather(messages, None)))
+    assert same(Events.concat(one_by_one, 3), decoder.decode(decoder.gather(messages, None)))
 
 
 def test_a_cut_file_gives_what_is_there_and_says_so(tmp_path, messages):
