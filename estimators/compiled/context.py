@@ -143,12 +143,6 @@ def transition(context, x, u, dt, out):
 
 
 @jit
-def transition_rows(context, X, stride, n, u, dt, out):
-    """f of n states that begin at the address X, `stride` numbers apart, into rows of `out` (n or more, nx or more)."""
-    call_f_rows(context.f, X, stride, n, u.ctypes.data, context.p, dt, out.ctypes.data, out.shape[1])
-
-
-@jit
 def transition_points(context, X, u, dt, out):
     """Rows of `out` (N, nx or more) = f of the rows of X (N, nx or more)."""
     rows, stride = X.shape
@@ -160,13 +154,6 @@ def expect(context, sensor, x, u, out):
     """out = h(x, u, p) of one sensor."""
     h = ints(context.h, context.n_sensors)[sensor]
     call_h_rows(h, x.ctypes.data, 0, 1, u.ctypes.data, context.p, out.ctypes.data, 0)
-
-
-@jit
-def expect_rows(context, sensor, X, stride, n, u, out):
-    """h of one sensor at n states that begin at the address X, `stride` numbers apart, into rows of `out`."""
-    h = ints(context.h, context.n_sensors)[sensor]
-    call_h_rows(h, X, stride, n, u.ctypes.data, context.p, out.ctypes.data, out.shape[1])
 
 
 @jit
