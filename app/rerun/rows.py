@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import rerun as rr
 
@@ -14,6 +12,8 @@ from estimators.track import FAILED, GATED, HEALTH_NAMES, Track
 from ..drawing.direct_readings import observed
 from ..engine.counts import estimated_rows
 from ..engine.interface import Running
+from ..engine.notices import Notice
+from ..engine.outputs import Pull
 from .field import FieldDrawing
 from .layout import blueprint, styles
 from .pairs import PairDrawing
@@ -56,7 +56,7 @@ class RerunRows:
         self._dots = observed(self.model)
         self._tells_field = bool(self.model.grid is not None and engine.twin.tells_field)
         self._revisions = 0
-        self._lines: list[Any] = []
+        self._lines: list[Notice] = []
         self._begin("")
 
     def _begin(self, root: str) -> None:
@@ -85,7 +85,7 @@ class RerunRows:
             for k, pair in enumerate(self.pairs)
         ]
 
-    def __call__(self, pull: Any) -> None:
+    def __call__(self, pull: Pull) -> None:
         """Log one pull."""
         if pull.fresh:
             self._revisions += 1
@@ -102,7 +102,7 @@ class RerunRows:
         self.pictures(pull.pictures)
         self.notices(pull.notices)
 
-    def begin(self, pull: Any) -> None:
+    def begin(self, pull: Pull) -> None:
         """Take note of a whole revision whose rows will be logged in pieces, by `rows`."""
         self._revisions += 1
         self._next = pull.first + len(pull.events)
@@ -168,7 +168,7 @@ class RerunRows:
             self.sink.line(f"/previous/state/{name}", t[rows], mean[:, None], width, gaps=True)
         self.sink.line("/previous/nis", t[rows], track.nis_mean[rows, None], width, gaps=True)
 
-    def notices(self, notices: list[Any]) -> None:
+    def notices(self, notices: list[Notice]) -> None:
         """Log lines for people, once the rows have come to their time: a viewer that follows goes to the last of all.
 
         They are under one path in all revisions, so that the table of a recording has them all.

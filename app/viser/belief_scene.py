@@ -12,6 +12,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.peaks import Peak
 
 from ..drawing.geometry import circle, disc, ellipsoid, round_step, segments, tick_text
+from ..engine.outputs import Belief
 from .camera import fit_cameras
 from .history import History
 
@@ -130,7 +131,7 @@ class BeliefScene:
                 # A whole new axis: the drawing thread sees either the old one or the new.
                 self.axes[k] = _Axis(self.model.state_names.index(choice.value))
 
-    def draw(self, history: History, belief: Any) -> None:
+    def draw(self, history: History, belief: Belief) -> None:
         """Send where everything is now."""
         axes = list(self.axes)
         index = [axis.state for axis in axes]
@@ -145,7 +146,7 @@ class BeliefScene:
         self._cloud(self._truth, axes, self._true_point(history, index), lift)
 
     def _draw_belief(
-        self, history: History, belief: Any, axes: list[_Axis], mean: np.ndarray, cov: np.ndarray, lift: np.ndarray
+        self, history: History, belief: Belief, axes: list[_Axis], mean: np.ndarray, cov: np.ndarray, lift: np.ndarray
     ) -> None:
         index = [axis.state for axis in axes]
         for k, axis in enumerate(axes):

@@ -13,6 +13,7 @@ from estimators.track import GATED
 
 from ..drawing.direct_readings import observed
 from ..engine.counts import estimated_rows
+from ..engine.outputs import Pull
 from .decimate import Buckets, bridge, extended, runs
 from .history import History
 from .series import BLUE, DOTS, GREEN, GREY, HEIGHT, RED, axes, frame, nis_series, no_data, send, state_series
@@ -93,7 +94,7 @@ class Charts:
         chart, state = self._charts[-1], self.model.shown_states[self._shown[-1]]
         chart.title = _title(self.model.label(state.name), state.unit)
 
-    def set_previous(self, pull: Any) -> None:
+    def set_previous(self, pull: Pull | None) -> None:
         """The track of the previous revision, drawn as a thin grey line."""
         if pull is None:
             self._previous = None

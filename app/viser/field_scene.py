@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from typing import Any
 
 import numpy as np
 import viser
@@ -15,6 +14,7 @@ from estimators.model.state_space import StateSpaceModel
 
 from ..drawing.geometry import segments
 from ..drawing.heatmap import ESTIMATE, RIM, Frame, Scale, image_of, kinds, palette, positioned, sensor_colors
+from ..engine.outputs import Pull
 from .camera import fit_cameras
 
 EVERY = 0.5
@@ -116,7 +116,7 @@ class FieldScene:
             "orange: below 3σ; red: above; grey: silent. Green: the cells that are charted.</div>"
         )
 
-    def take(self, pull: Any) -> None:
+    def take(self, pull: Pull) -> None:
         """Take note of what a pull brings."""
         if pull.fresh:
             self.numbers.clear()

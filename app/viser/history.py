@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from estimators.log import Events
+
+from ..engine.outputs import Pull
 
 _COLUMNS = ("t", "kind", "channel", "value", "mean", "std", "nis", "nis_mean", "nis_low", "nis_high", "verdict")
 
@@ -52,7 +52,7 @@ class History:
         """Forget all rows; the origin of time stays."""
         self.base, self.n = 0, 0
 
-    def take(self, pull: Any) -> int:
+    def take(self, pull: Pull) -> int:
         """Write a pull of at most `limit` rows into the arrays.
 
         Returns:

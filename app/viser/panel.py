@@ -16,6 +16,7 @@ from estimators.registry import ESTIMATORS, unfit
 
 from ..engine.commands import Command, Pause, Record, Reset, Seek, SetEstimator, SetTuning, Speed, Step, UseSensor
 from ..engine.interface import Running
+from ..engine.notices import Notice
 from ..engine.outputs import Status
 from .coalescer import Coalescer
 from .options import OptionRows
@@ -131,7 +132,7 @@ class Panel:
         """Show one line about an edit that cannot be used, or nothing."""
         self._show(self._note, "note", note_html(text))
 
-    def note(self, notices: list[Any]) -> None:
+    def note(self, notices: list[Notice]) -> None:
         """Take events from the engine."""
         if notices:
             self._events.extend(notices)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import html
-from typing import Any
 
 from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
 
+from ..engine.notices import Notice
 from ..engine.outputs import Status
 from .time_units import SECONDS, Unit
 
@@ -52,7 +52,7 @@ def status_html(status: Status, origin: int | None, unit: Unit = SECONDS) -> str
     )
 
 
-def events_html(notices: list[Any], origin: int | None, unit: Unit = SECONDS) -> str:
+def events_html(notices: list[Notice], origin: int | None, unit: Unit = SECONDS) -> str:
     """The last events, newest first."""
     style = "padding:0.2em 0.9em 0.6em;font-size:0.8em;line-height:1.5;overflow-wrap:anywhere"
     if not notices:

@@ -16,6 +16,7 @@ from estimators.model.state_space import StateSpaceModel
 
 from ..drawing.direct_readings import observed
 from ..drawing.geometry import about_z, circle, disc, ellipsoid, segments
+from ..engine.outputs import Belief
 from .camera import distance_for, fit_cameras
 from .history import History
 
@@ -115,7 +116,7 @@ class VehicleScene:
         def _(event: viser.GuiEvent) -> None:
             self.follow = follow.value
 
-    def draw(self, history: History, belief: Any) -> None:
+    def draw(self, history: History, belief: Belief) -> None:
         """Send where everything is now."""
         if not history.n:
             return
@@ -132,7 +133,7 @@ class VehicleScene:
         else:
             self._draw_ellipse(np.zeros(2), np.full((2, 2), np.nan))
 
-    def _draw_vehicle(self, mean: np.ndarray, belief: Any) -> None:
+    def _draw_vehicle(self, mean: np.ndarray, belief: Belief) -> None:
         """Move the vehicle with its ellipse, and the world under the camera."""
         # A mean between two peaks is nowhere.
         peak = belief.peaks[0] if len(belief.peaks) > 1 else belief
