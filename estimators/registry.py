@@ -73,10 +73,6 @@ def checked(entry: Estimator, model: StateSpaceModel, options: Mapping[str, floa
     return values
 
 
-CORRELATED = ("Gaussian", "reference")
-"""Families that take the correlation of a sensor's rows into account."""
-
-
 def unfit(entry: Estimator, model: StateSpaceModel) -> str | None:
     """Why an estimator does not fit a model, or None: its own reason, or the size of what it carries."""
     if model.black_box and entry.blocks is None and not entry.interpreted:
@@ -84,11 +80,6 @@ def unfit(entry: Estimator, model: StateSpaceModel) -> str | None:
         return (
             f"{model.name} is a black box, whose f and h run on blocks of states and are not compiled; {entry.name} "
             f"needs compiled ones; use {able}"
-        )
-    if model.correlated and entry.family not in CORRELATED:
-        return (
-            f"the rows of {model.name}'s sensor {model.correlated} are correlated, and {entry.name} takes the noise of "
-            f"each row as independent; use {', '.join(e.name for e in GAUSSIAN)}"
         )
     if model.certain and not entry.singular:
         return (

@@ -77,14 +77,15 @@ class View:
 
     @contextmanager
     def brought(self, sensor: int, own: np.ndarray) -> Iterator[None]:
-        """While it lasts, r is what a reading brought where it brought any, own (ny or more,); NaN leaves the tuned."""
-        r = self._r[sensor]
-        tuned, own = r.copy(), own[: r.size]
+        """While it lasts, R has the variances that a reading brought, own (ny or more,); NaN leaves the tuned one."""
+        tuned = self._R[sensor]
+        r, own = self._r[sensor].copy(), own[: len(tuned)]
         np.copyto(r[: own.size], own, where=np.isfinite(own))
+        self._R[sensor] = covariance_of(self.compiled.model.sensors[sensor].correlation, r)
         try:
             yield
         finally:
-            r[:] = tuned
+            self._R[sensor] = tuned
 
     def circular_rows(self, sensor: int) -> np.ndarray:
         """For each row of a sensor, whether it is an angle."""

@@ -50,6 +50,11 @@ def joint(model: StateSpaceModel, unknowns: Mapping[str, Unknown]) -> StateSpace
             raise ModelError(f"model {model.name} has no parameter {name!r} to estimate; it has {', '.join(names)}")
         if name in model.state_names:
             raise ModelError(f"model {model.name} has a state {name!r}; a parameter of that name cannot become one")
+        if not unknowns[name].std > 0.0:
+            raise ModelError(
+                f"model {model.name}: the prior of {name} has std {unknowns[name].std:g}; an estimated one must be "
+                "uncertain: give a positive std"
+            )
     moved = [item for item in model.parameters if item.name in unknowns]
     kept = [item for item in model.parameters if item.name not in unknowns]
     # Where each of the model's parameters comes from: θ[k], or -1 - k for p[k] of those that stay.

@@ -56,7 +56,8 @@ def test_a_recording_without_rows_is_named_and_so_is_one_that_feeds_nothing(
     (line,) = said(capsys, "fold", str(drive / "drive.yaml"))
     assert "drive.yaml:2: source: " in line and line.endswith("drive.csv: it has a header and no rows; record it again")
     (drive / "mute.csv").write_text("t,y,temperature,rate\n0,,,\n1,,,\n")
-    (line,) = said(capsys, "fold", str(drive / "drive.yaml"), "--log", str(drive / "mute.csv"))
+    *never, line = said(capsys, "fold", str(drive / "drive.yaml"), "--log", str(drive / "mute.csv"))
+    assert never and all("has no value in 2 rows" in item for item in never), never
     assert line == (
         f"nisus: --log {drive / 'mute.csv'}: the source said nothing that a sensor needs; check the channel maps"
     )
@@ -68,5 +69,6 @@ def test_times_that_run_backwards_are_said_once(
 ) -> None:
     rows = "".join(f"{60 - k},40,,\n" for k in range(60))
     (drive / "drive.csv").write_text("t,y,temperature,rate\n" + rows)
-    (line,) = said(capsys, arguments[0], str(drive / "drive.yaml"), *arguments[1:])
+    line, *others = said(capsys, arguments[0], str(drive / "drive.yaml"), *arguments[1:])
+    assert all("has no value in 60 rows" in other for other in others) and len(others) == 2
     assert line.startswith("nisus: drive.csv:5: t is 3 s before that of drive.csv:2, more than time.horizon (2 s), ")

@@ -19,6 +19,7 @@ from app.engine.commands import SetEstimator
 from app.engine.engine import Engine
 from app.rerun.feed import RerunFeed
 from app.rerun.field import FieldDrawing
+from app.rerun.sink import Sink
 from app.rerun.style import pair_name
 from app.server.api import status_json
 from app.viser.decimate import extended, runs
@@ -283,8 +284,7 @@ def test_a_field_that_is_not_a_number_is_grey_and_has_no_scale():
     assert scale.ticks() == [] and np.all(scale.indices(lost) == NOTHING)
     stream = rr.RecordingStream("field")
     data = stream.binary_stream()
-    rows = SimpleNamespace(root="", stream=stream, times=lambda t: rr.TimeColumn("time", duration=t * 1e-9))
-    FieldDrawing(model, truth=False)._draw(rows, SECOND, ESTIMATE.name, lost)
+    FieldDrawing(model, truth=False)._draw(Sink(stream, window=60.0), SECOND, ESTIMATE.name, lost)
     assert b"/field/estimate/image" in data.read()
 
 

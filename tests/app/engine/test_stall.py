@@ -76,6 +76,8 @@ class Child:
             [sys.executable, "-m", "app.cli.main", *map(str, words)],
             cwd=ROOT,
             stderr=subprocess.PIPE,
+            # A shell that starts the tests in the background has its children ignore Ctrl-C.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
             stdout=subprocess.DEVNULL,
             text=True,
         )

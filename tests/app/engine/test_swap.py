@@ -188,12 +188,14 @@ class Running:
         assert panel.options.shown == name and sorted(panel.options.rows) == sorted(options)
         assert f"revision {status.revision}" in panel.status.content
         seconds = (pull.events.t - pull.events.t[0]) * 1e-9
+        # Of several events at one time, the chart shows the last.
+        last = np.append(pull.events.t[1:] != pull.events.t[:-1], True)
         for chart, j in zip(charts._charts, charts._shown, strict=True):
             x, high, low, mean = chart.data[0], chart.data[1], chart.data[2], chart.data[8]
             assert (x[0], x[-1]) == (0.0, pytest.approx(seconds[-1])) and np.isfinite([x, high, low, mean]).all()
             # A chart keeps the extremes of each stretch of time, so those of the whole are the track's.
             # A probability has no band.
-            expected, band = pull.track.mean[:, j], 2.0 * pull.track.std[:, j] * (j != self.twin.model.mode)
+            expected, band = pull.track.mean[last, j], 2.0 * pull.track.std[last, j] * (j != self.twin.model.mode)
             assert (mean.min(), mean.max()) == (expected.min(), expected.max())
             assert (low.min(), high.max()) == ((expected - band).min(), (expected + band).max())
         assert "engine error" not in status.counts, [line.text for line in self.engine.notices.since(0)]

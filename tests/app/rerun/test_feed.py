@@ -371,7 +371,9 @@ def seek_back(fed, batch):
         fed.source.restarts = 1
         return batch
 
-    fed.source.restarts = 0
+    fed.source.restarts, fed.source.speed, fed.source.paused = 0, 1.0, False
+    for name in ("pause", "resume", "set_speed", "step", "seek"):
+        setattr(fed.source, name, None)
     fed.source.read = begun_again
     wait_for(lambda: fed.engine.status().revision > revision and fed.events() == len(batch))
 

@@ -46,5 +46,5 @@ def test_a_port_that_was_checked_is_free_again(taken):
     check_port(free)
     check_port(0)
     for wrong in (-1, 70000):
-        with pytest.raises(ConfigError, match=f"port {wrong}: is no port; choose another with --port"):
+        with pytest.raises(ConfigError, match=f"port {wrong}: is not a port; choose another with --port"):
             check_port(wrong)

@@ -89,7 +89,7 @@ def test_truth_of_far_apart_states_of_a_field_is_told_in_blocks():
 WRONG = {
     "a sensor": (lambda log: log.add("windng", 1.0, 2.0), "no sensor 'windng'; did you mean winding"),
     "an input": (lambda log: log.add_inputs(1.0, speed=2.0), "motor_winding has no input 'speed'; there are none"),
-    "no input": (lambda log: log.add_inputs(1.0), "no input is given; motor_winding has none"),
+    "no input": (lambda log: log.add_inputs(1.0), "no input is given; there are none"),
     "a state": (lambda log: log.add_truth(1.0, temperatur=2.0), "no state 'temperatur'; did you mean temperature"),
     "values": (
         lambda log: log.add("winding", [1.0, 2.0], [1.0]),

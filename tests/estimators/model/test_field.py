@@ -25,7 +25,7 @@ def test_cells_have_names_places_and_a_prior():
     np.testing.assert_array_equal(field.positions(), [state.position for state in field])
     assert field.periods == (np.inf, 2.0)
     for name in ("t[3,0]", "t[0]", "u[0,0]", "t"):
-        with pytest.raises(ValueError, match="no cell of t"):
+        with pytest.raises(ValueError, match="not a cell of t"):
             field.index_of(name)
     with pytest.raises(ModelError, match="means has 2 entries; give 12"):
         Field("t", "K", (3, 4), means=(1.0, 2.0))
