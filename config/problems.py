@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from estimators.errors import ConfigError, nearest
 
+from .source_schema import PartSection, SourceSection
 from .yaml_lines import Key, Places, dotted
 
 MOST = 5
@@ -91,9 +92,8 @@ def _locate(loc: tuple[str | int, ...], data: Any) -> tuple[Key, Any]:
 
 
 def _choices(problem: ErrorDetails) -> str:
-    kinds = (
-        ("simulator", "can", "can_log", "table", "merged") if problem["loc"] == ("source",) else ("can_log", "table")
-    )
+    sections = get_args(SourceSection if problem["loc"] == ("source",) else PartSection)[0]
+    kinds = [get_args(section.model_fields["type"].annotation)[0] for section in get_args(sections)]
     return f"it must be one of {', '.join(kinds)}"
 
 

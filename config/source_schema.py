@@ -363,14 +363,16 @@ class TableSection(RecordingSection):
     with a cell for each of its own; cells that a sensor reads are left out."""
 
 
+PartSection = Annotated[CanLogSection | TableSection, Field(discriminator="type")]
+"""What may be merged."""
+
+
 class MergedSection(Section):
     """Several recordings of one drive, merged in order of time."""
 
     type: Literal["merged"]
     """merged"""
-    parts: Annotated[
-        tuple[Annotated[CanLogSection | TableSection, Field(discriminator="type")], ...], Field(min_length=1)
-    ]
+    parts: Annotated[tuple[PartSection, ...], Field(min_length=1)]
     """The recordings: sections of type can_log or table, whose clocks agree."""
 
 

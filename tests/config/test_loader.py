@@ -1,8 +1,10 @@
 from pathlib import Path
+from typing import Annotated
 
 import pytest
 
 from config.loader import find, load, load_text, shipped
+from config.source_schema import CanSection, SimulatorSection
 from estimators.errors import ConfigError
 
 MOTOR = """\
@@ -71,11 +73,6 @@ def test_values_are_read_and_defaults_filled_in() -> None:
         ("duration: 120", "duration: no", "motor.yaml:11: source.duration is 'no'; it must be a number"),
         ("duration: 120", "duration: true", "motor.yaml:11: source.duration is true; it must be a number"),
         ("duration: 120", "duration: 1:30", "motor.yaml:11: source.duration is '1:30'; it must be a number"),
-        (
-            "  type: simulator\n",
-            "",
-            "motor.yaml:9: source.type is missing; it must be one of simulator, can, can_log, table, merged",
-        ),
         ("simulator", "simulater", "motor.yaml:10: source.type is 'simulater'; did you mean simulator?"),
         ("model: motor_winding\n", "", "motor.yaml:1: model is missing; add it"),
         ("motor_winding", "5", "motor.yaml:1: model is 5; it must be text; put it in quotes if it looks like a number"),
@@ -91,6 +88,14 @@ def test_values_are_read_and_defaults_filled_in() -> None:
 def test_a_value_that_breaks_a_rule_is_one_line(old: str, new: str, expected: str) -> None:
     assert old in MOTOR
     assert message(MOTOR.replace(old, new, 1)) == expected
+
+
+def test_a_missing_type_is_told_those_of_the_schema(monkeypatch: pytest.MonkeyPatch) -> None:
+    untyped = MOTOR.replace("  type: simulator\n", "")
+    known = "motor.yaml:9: source.type is missing; it must be one of simulator, can"
+    assert message(untyped).startswith(f"{known}, can_log, table")
+    monkeypatch.setattr("config.problems.SourceSection", Annotated[SimulatorSection | CanSection, "two of them"])
+    assert message(untyped) == known
 
 
 @pytest.mark.parametrize(

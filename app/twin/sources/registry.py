@@ -1,4 +1,4 @@
-"""The types of sources: one line each. Its schema is in config/source_schema.py, the rest in its own file."""
+"""The types of sources, by name. Their schema is in config/source_schema.py; what opens one is here or in its file."""
 
 from __future__ import annotations
 

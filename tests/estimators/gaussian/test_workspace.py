@@ -1,4 +1,4 @@
-"""Every Gaussian filter works within the scratch that it asks for, and asks for no more than it did."""
+"""Every Gaussian filter works within the scratch that it asks for, and the older ones ask for no more than they did."""
 
 from typing import Any, NamedTuple
 
@@ -104,8 +104,8 @@ def test_nothing_is_written_beyond_the_scratch(name, n, m):
             np.testing.assert_array_equal(fold.track.mean, plain.track.mean)
 
 
-def old_sizes(name, n, m):
-    """What the filters asked for when each layout was written twice."""
+def old_sizes(n, m):
+    """What each of these filters asked for when each layout was written twice."""
     shared = 2 * m + 2 * m * m + n * m + m * padded(n) + m * m + 4 * m
     ekf = max(n + 3 * n * n, shared + 2 * n * m + n * n) + scratch_size(n, m)
     rows = 2 * n + 1
@@ -128,14 +128,14 @@ def old_sizes(name, n, m):
         "sr-kf": sr_ekf + kept,
         "sr-ekf": sr_ekf,
         "sr-ukf": sr_ukf,
-    }[name]
+    }
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", old_sizes(1, 1))
 def test_the_scratch_is_no_larger_than_it_was(name):
     for n in (1, 2, 3, 7, 8, 9, 24, 100):
         for m in (1, 2, 5, 8, 9, 40):
-            assert ESTIMATORS[name].work_size({}, n, m) <= old_sizes(name, n, m), (n, m)
+            assert ESTIMATORS[name].work_size({}, n, m) <= old_sizes(n, m)[name], (n, m)
 
 
 class Views(NamedTuple):
