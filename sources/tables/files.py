@@ -217,7 +217,7 @@ def _numbers(
                 blank[k] = True
             elif cell.strip().lower() not in ("na", "n/a", "null", "none"):
                 point = decimal_comma(cell)
-                why = "which is no number" if point is None else f"with a decimal comma; write {point}"
+                why = "which is not a number" if point is None else f"with a decimal comma; write {point}"
                 problem(UNREADABLE, lines[k], f"{name} is {quoted(cell.strip())}, {why}; the value is missing")
 
 
