@@ -246,6 +246,19 @@ def test_late_readings_are_drawn_once_and_lines_do_not_go_back(fed):
     assert (fed.column("/state/temperature")[0] * 1e-9).tolist() == [1.0, 2.0, 3.0, 4.0]
 
 
+def test_a_reset_at_the_time_of_the_last_reading_is_seen_in_the_picture(fed):
+    """As after the end of a source: no event follows that would bring the next picture."""
+    fed.put(readings(np.arange(1.0, 21.0), np.full(20, 40.0)))
+    fed.next()
+    fed.engine.submit(commands.Reset())
+    wait_for(lambda: fed.events() == 21)
+    fed.next()
+    model, pair = fed.engine.model, np.array([0, 1])
+    _, values = fed.column(f"/pair/{pair_name(model, pair)}/up/mean", "Points2D:positions")
+    prior = [state.mean for state in model.states] / axis_scales(model, pair)
+    np.testing.assert_allclose(np.concatenate(values[-1]), prior, rtol=1e-6)
+
+
 def test_dates_are_dates_and_seconds_are_durations(fed):
     batch = readings(np.array([1.0, 2.0]) + CALENDAR * 1e-9, [40.0, 41.0])
     fed.put(batch)
