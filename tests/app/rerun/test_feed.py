@@ -210,13 +210,16 @@ def test_the_window_of_a_revision_comes_before_its_past(fed):
     assert fed.next() == []
 
 
-def test_events_outlive_the_recording(fed):
+def test_events_outlive_the_recording_and_say_of_which_revision_they_are(fed):
     fed.put(readings([1.0, 2.0], [40.0, 41.0]))
     fed.engine.notices.say("something happened")
     fed.next()
     fed.submit(commands.SetTuning("Q.temperature", 5.0))
     fed.next()
-    assert "something happened" in fed.column("/events", "TextLog:text")[1].ravel().tolist()
+    fed.engine.notices.say("something else happened")
+    fed.next()
+    texts = fed.column("/events", "TextLog:text")[1].ravel().tolist()
+    assert "revision 0: something happened" in texts and "something else happened" in texts
 
 
 def test_the_layout_comes_once(fed):
