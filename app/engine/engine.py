@@ -397,6 +397,7 @@ class Engine:
             self.estimator, self.tuning = self._fold.estimator.name, self._fold.tuning
             self._clear(self._first_base)
             self._revision += 1
+            self.notices.revision = self._revision
             self._finished = False
             self._requests.forget()
             self.notices.begin_again()
@@ -455,6 +456,7 @@ class Engine:
                 )
                 self._fold, self._row_counts = fold, row_counts
                 self._revision += 1
+                self.notices.revision = self._revision
                 self._alerts.again()
                 self._alerts.look(fold, fold.n)
         if stale:

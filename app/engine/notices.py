@@ -16,13 +16,14 @@ KEPT = 1000
 
 @dataclass(frozen=True)
 class Notice:
-    """One line for people: when (ns, the twin's time), how bad, what, and in which pass over the source."""
+    """One line for people: when (ns, the twin's time), how bad, what, in which pass over the source and revision."""
 
     number: int
     t: int
     level: str
     text: str
     passage: int = 0
+    revision: int = 0
 
 
 class Notices:
@@ -38,6 +39,8 @@ class Notices:
         self._next = 0
         self.passage = 0
         """How often the source has begun again; what was said before that is of another life of the twin."""
+        self.revision = 0
+        """Of the estimate that is shown, as the engine counts them."""
         self._last: dict[str, tuple[float, int]] = {}
 
     def report(self, key: str, text: str, level: str = "warn", *, counted: bool = True, times: int = 1) -> None:
@@ -74,7 +77,9 @@ class Notices:
                 self._add(level, text, t)
 
     def _add(self, level: str, text: str, t: int | None = None) -> None:
-        self._lines.append(Notice(self._next, self._now() if t is None else t, level, text, self.passage))
+        self._lines.append(
+            Notice(self._next, self._now() if t is None else t, level, text, self.passage, self.revision)
+        )
         self._next += 1
 
     def since(self, number: int) -> list[Notice]:

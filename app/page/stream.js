@@ -61,7 +61,7 @@ export class Stream {
     if (this.socket !== socket) return;
     if (typeof data === "string") {
       const message = JSON.parse(data);
-      if (message.recording) await this.viewer.announce(message.recording);
+      if (message.recording) this.viewer.announce(message.recording);
       // What the user just asked for is worth a picture at once.
       const revision = message.status?.revision ?? this.revision;
       if (revision !== this.revision && this.resting) this.ask(socket);

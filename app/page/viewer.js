@@ -24,6 +24,12 @@ async function fetched(url) {
   return answer;
 }
 
+// By default a browser drops what WebGL has drawn as soon as it is on the screen, and then nobody can copy it.
+function keepPicture(canvas) {
+  const getContext = canvas.getContext.bind(canvas);
+  canvas.getContext = (kind, options) => getContext(kind, { ...options, preserveDrawingBuffer: true });
+}
+
 export class Viewer {
   // cover: a canvas over the viewer's, hidden; see `hold`.
   static async open(canvas, cover, base, theme) {
@@ -42,6 +48,7 @@ export class Viewer {
       notebook: false,
       panel_state_overrides: { top: "Hidden", blueprint: "Hidden", selection: "Hidden" },
     });
+    keepPicture(canvas);
     await viewer.handle.start(canvas);
     viewer.handle.open_channel(CHANNEL, "Nisus");
     return viewer;
@@ -65,8 +72,8 @@ export class Viewer {
   }
 
   // Another recording follows: note where the user is, to come back to it.
-  async announce(id) {
-    if (this.id !== null) await this.hold();
+  announce(id) {
+    if (this.id !== null) this.hold();
     const { active, recordings } = this.state();
     const shown = recordings.find((recording) => recording.id === active);
     // Once only: a revision that is overtaken by the next has no place of its own yet.
@@ -76,10 +83,8 @@ export class Viewer {
     this.announced = true;
   }
 
-  // The viewer shows another recording before it has its rows and colours: until then, what was shown last covers it,
-  // or, where the browser no longer has that, a blank page.
-  async hold() {
-    await frame();
+  // The viewer shows another recording before it has its rows and colours: until then, what was shown last covers it.
+  hold() {
     this.cover.width = this.canvas.width;
     this.cover.height = this.canvas.height;
     this.cover.getContext("2d").drawImage(this.canvas, 0, 0);

@@ -158,7 +158,7 @@ class RerunFeed:
         # The engine gives a line once; the viewer forgets it with the recording that it closes. Times of what was said
         # before the source began again are yet to come.
         here = self._engine.notices.passage
-        rows.notices([line for line in self._notices if line.passage == here])
+        rows.notices([_labelled(line, pull.revision) for line in self._notices if line.passage == here])
         if cut:
             self._later = lambda: draw(slice(0, cut), slice(known, grey_cut), past=True)
         return [announcement, *self._read()]
@@ -173,6 +173,11 @@ class RerunFeed:
         )
         data = self._bytes.read()
         return [data] if data else []
+
+
+def _labelled(line: Notice, revision: int) -> Notice:
+    """A line for the table of a revision: one of another revision says so, as its rows are no longer to be seen."""
+    return line if line.revision == revision else replace(line, text=f"revision {line.revision}: {line.text}")
 
 
 def _cut(events: list[Events], tracks: list[Track], rows: int) -> tuple[list[Events], list[Track]]:

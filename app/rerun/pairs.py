@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from estimators.log import Events, truth_of
+from estimators.log import RESET, Events, truth_of
 from estimators.model.state_space import StateSpaceModel
 from estimators.track import Track
 
@@ -128,7 +128,8 @@ class PairDrawing:
         if past or self._last is None:
             self._last = None
         else:
-            pick = pick[t[pick] >= self._last + step // 2]
+            # After a reset nothing else may come.
+            pick = pick[(t[pick] >= self._last + step // 2) | (events.kind[pick] == RESET)]
         if not pick.size:
             return
         columns = (

@@ -98,14 +98,16 @@ class Buckets:
     def points(self, since: int) -> tuple[np.ndarray, np.ndarray]:
         """What to draw of the buckets that end at or after `since`: times (k,) and values (k, columns).
 
-        A bucket of several times gives two points, its extremes in the order in which they lead on to the next.
+        A bucket of several times gives two points, its extremes in the order in which they lead on to the next; one of
+        a single time gives the second of them only, which its last row tends to.
         """
         start = int(np.searchsorted(self.last, since))
         first, last = self.first[start:], self.last[start:]
         low, high, rising = self.low[start:], self.high[start:], self.rising[start:]
         wide = last > first
         times = np.stack((first, last), axis=1)
-        values = np.stack((np.where(rising, low, high), np.where(rising, high, low)), axis=1)
+        upwards = rising == wide[:, None]
+        values = np.stack((np.where(upwards, low, high), np.where(rising, high, low)), axis=1)
         # One extreme, as of a single reading among many rows: one point, not two side by side.
         same = low == high
         values[:, 1][same & ~rising] = np.nan

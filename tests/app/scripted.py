@@ -9,9 +9,9 @@ from estimators.diagnostics.health import HealthPolicy
 from estimators.log import READING, Events
 from estimators.models import MODELS
 from estimators.tuning import Tuning
+from tests.support import SECOND
 
 MODEL = MODELS["motor_winding"]
-SECOND = 10**9
 
 
 def readings(times_s, values):
@@ -77,3 +77,21 @@ def wait_for(condition, seconds=60.0):
         if time.monotonic() > end:
             raise AssertionError("waited in vain")
         time.sleep(0.002)
+
+
+def pull_all(engine):
+    """All rows of a running twin, as a consumer that has just come gets them."""
+    cursor = engine.cursor()
+    pull = engine.pull(cursor)
+    engine.release(cursor)
+    return pull
+
+
+def row_count(engine):
+    return len(pull_all(engine).events)
+
+
+def fresh_status(engine):
+    """A status that is not the kept one."""
+    engine._status = None
+    return engine.status()

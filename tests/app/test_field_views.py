@@ -128,7 +128,7 @@ def direct(twin, tuning, estimator, readings):
     return fold
 
 
-def assert_same(ours, theirs):
+def assert_same_pictures(ours, theirs):
     assert [picture.before for picture in ours] == [picture.before for picture in theirs]
     for a, b in zip(ours, theirs, strict=True):
         for x, y in zip(a, b, strict=True):
@@ -179,7 +179,7 @@ def test_a_swap_and_a_retune_leave_tracks_and_pictures_complete(running, twin, b
         pull, (tuning, estimator) = live.pull(), live.engine.folded_with()
         expected = direct(twin, tuning, estimator, pull.events)
         np.testing.assert_array_equal(pull.track.mean, expected.track.mean)
-        assert_same(pull.pictures, expected.pictures.taken)
+        assert_same_pictures(pull.pictures, expected.pictures.taken)
         assert len(pull.pictures) > 6
     assert (tuning.r == 0.5).all() and tuning.options["radius"] == 0.03
     # And it goes on.
@@ -188,7 +188,7 @@ def test_a_swap_and_a_retune_leave_tracks_and_pictures_complete(running, twin, b
     pull = live.pull()
     expected = direct(twin, tuning, estimator, pull.events)
     expected.finish()
-    assert_same(pull.pictures, expected.pictures.taken)
+    assert_same_pictures(pull.pictures, expected.pictures.taken)
     assert seconds(pull.pictures[-1]) == 20 and pull.pictures[-1].cells == 96
 
 
@@ -200,12 +200,12 @@ def test_a_cursor_gets_each_picture_once(running, batches):
     for k in range(9, len(batches)):
         live.put(batches[k : k + 1])
         got.append(live.engine.pull(cursor).pictures)
-    assert_same([picture for part in got for picture in part], live.pull().pictures)
+    assert_same_pictures([picture for part in got for picture in part], live.pull().pictures)
     # In pieces too.
     pieces, cursor = [], live.engine.cursor()
     while (pull := live.engine.pull(cursor, 7)).events.t.size:
         pieces += pull.pictures
-    assert_same(pieces, live.pull().pictures)
+    assert_same_pictures(pieces, live.pull().pictures)
 
 
 def test_a_recording_reviews_to_the_same_pictures(running, twin, batches, tmp_path):
@@ -226,7 +226,7 @@ def test_a_recording_reviews_to_the_same_pictures(running, twin, batches, tmp_pa
     finally:
         session.stop()
     np.testing.assert_array_equal(again.track.mean, seen.track.mean)
-    assert_same(again.pictures, seen.pictures)
+    assert_same_pictures(again.pictures, seen.pictures)
 
     # What Rerun draws of them: every picture, with the colours of its values.
     drawn = entities(path, tmp_path)

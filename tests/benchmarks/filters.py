@@ -17,16 +17,16 @@ from estimators.numerics.jit import borrowed, floats, jit
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
 
+from ..support import SECOND
 from . import ring
 from .timing import compare, judged, medians
 
-SECOND = 1_000_000_000
 STEPS = 4096
 THEIR_STEPS = 200
 REPETITIONS = 15
 
 
-def log_of(model: StateSpaceModel, events: int, *, step: float = 1.0) -> Log:
+def noisy_log(model: StateSpaceModel, events: int, *, step: float = 1.0) -> Log:
     """Events of the first sensor, `step` seconds apart: noise about what the model expects at its prior."""
     rng = np.random.default_rng(0)
     m = len(model.sensors[0].rows)
@@ -103,7 +103,7 @@ def theirs_ukf(n: int, m: int, x: np.ndarray, P: np.ndarray, Q: np.ndarray, R: n
 def beside_filterpy() -> None:
     """Each filter beside FilterPy's, in one run."""
     motor, ring24 = MODELS["motor_winding"], ring.ring(24, 8)
-    small, large = log_of(motor, STEPS), log_of(ring24, STEPS // 16, step=0.1)
+    small, large = noisy_log(motor, STEPS), noisy_log(ring24, STEPS // 16, step=0.1)
     x24 = np.array([state.mean for state in ring24.states])
 
     def f2(x, dt):
@@ -157,7 +157,7 @@ def beside_filterpy() -> None:
 
 def alone(estimator: str, model: StateSpaceModel) -> Callable[[], None]:
     """Predictions and updates as the fold calls them, but nothing else: no estimate, health or log is written."""
-    log = log_of(model, STEPS, step=0.1)
+    log = noisy_log(model, STEPS, step=0.1)
     fold = Fold(estimator, model, Tuning.of(model), log)
     fold.advance()
     places = (fold._u, fold._state, fold._work, fold._score, log.value, *np.empty((2, model.width)))
@@ -181,7 +181,10 @@ def _steps(predict, update, context, n, u, state, work, score, value, innovation
 
 def step_alone() -> None:
     """A step of the unscented filter as the issue of speed is usually put: prediction and update alone."""
-    calls = [alone("ukf", ring.ring(4, 2)), folding("ukf", ring.ring(4, 2), log_of(ring.ring(4, 2), STEPS, step=0.1))]
+    calls = [
+        alone("ukf", ring.ring(4, 2)),
+        folding("ukf", ring.ring(4, 2), noisy_log(ring.ring(4, 2), STEPS, step=0.1)),
+    ]
     step, whole = (value / STEPS * 1e6 for value in medians(calls, REPETITIONS))
     print(f"UKF n=4 m=2: predict and update {step:.2f} µs   <= 1   {judged(step, 1.0, at_least=False)}")
     print(f"             with estimate, NIS bounds, health and history {whole:.2f} µs")
@@ -220,7 +223,7 @@ def beside_stone_soup() -> None:
         ("kf", KalmanPredictor(moving), KalmanUpdater(reading)),
         ("ukf", UnscentedKalmanPredictor(moving), UnscentedKalmanUpdater(reading)),
     ):
-        ours = folding(name, motor, log_of(motor, STEPS))
+        ours = folding(name, motor, noisy_log(motor, STEPS))
         pair = compare(ours, theirs(predictor, updater), steps=(STEPS, THEIR_STEPS), repetitions=7)
         print(f"  {name:4s} {pair.ours * 1e6:7.3f} µs, theirs {pair.theirs * 1e6:7.0f} µs, ratio {pair.ratio:6.0f}")
 
@@ -236,7 +239,7 @@ def growing_n() -> None:
         calls = []
         for name in ("kf", "ekf", "ukf"):
             model = ring.ring(n, m, linear=name == "kf")
-            calls.append(folding(name, model, log_of(model, steps, step=0.1)))
+            calls.append(folding(name, model, noisy_log(model, steps, step=0.1)))
         each = [value / steps for value in medians(calls, 7)]
         print(f"  {n:4d} {m:3d}" + "".join(f"{s * 1e6:11.2f} [{s * 1e9 / n**3:6.2f}]" for s in each))
 
@@ -247,7 +250,9 @@ def growing_m() -> None:
     print("A step against m (ring of 24 states): µs; expected: a part that does not depend on m, and one as n² m")
     for name in ("kf", "ekf", "ukf"):
         models = [ring.ring(24, m, linear=name == "kf") for m in sizes]
-        each = [value / 256 * 1e6 for value in medians([folding(name, a, log_of(a, 256, step=0.1)) for a in models], 7)]
+        each = [
+            value / 256 * 1e6 for value in medians([folding(name, a, noisy_log(a, 256, step=0.1)) for a in models], 7)
+        ]
         print(f"  {name:4s} " + "   ".join(f"m = {m}: {value:6.2f}" for m, value in zip(sizes, each, strict=True)))
 
 
@@ -270,7 +275,7 @@ def gaussian_family() -> None:
         calls = []
         for name, options in variants:
             model = ring.ring(n, m, linear=name in ("kf", "kf-steady", "sr-kf"))
-            calls.append(folding(name, model, log_of(model, steps, step=0.1), options))
+            calls.append(folding(name, model, noisy_log(model, steps, step=0.1), options))
         columns.append([value / steps for value in medians(calls, 7)])
     for row, (name, options) in enumerate(variants):
         label = " ".join([name, *(f"{key}={value:g}" for key, value in options.items())])

@@ -10,7 +10,8 @@ from estimators.log import READING, Events, Log
 from estimators.models import MODELS
 from estimators.tuning import Tuning
 
-from .filters import SECOND, log_of
+from ..support import SECOND
+from .filters import noisy_log
 from .timing import both, judged, medians
 
 REFOLD_READINGS = 100_000
@@ -25,7 +26,7 @@ def growing_history() -> None:
     print("History (KF n=2 m=1): µs an event of the whole fold, of one event appended, of one reading 100 events late")
     print(f"  {'events':>9s} {'fold':>9s} {'append':>9s} {'late':>9s}")
     for size in (1_000, 10_000, 100_000, 1_000_000):
-        log = log_of(model, size)
+        log = noisy_log(model, size)
         # Room for what is appended, so that the one growth of the arrays is not in the measure.
         log._reserve(4096)
         growing = Fold("kf", model, tuning, log)

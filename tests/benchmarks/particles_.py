@@ -19,10 +19,10 @@ from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceMo
 from estimators.models.gripper_contact import GRIPPER_CONTACT
 from estimators.tuning import Tuning
 
+from ..support import SECOND
 from .timing import judged
 
 STEPS = 20
-SECOND = 1_000_000_000
 
 
 def _f(x, u, p, dt, out):  # noqa: ANN001, ANN202

@@ -11,8 +11,8 @@ import numpy as np
 
 from estimators.log import INPUT, READING, Events, Log
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from tests.support import SECOND
 
-SECOND = 1_000_000_000
 ROWS = (1, 2, 3)
 """Rows of the three sensors."""
 

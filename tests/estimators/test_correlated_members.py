@@ -7,12 +7,13 @@ import pytest
 
 from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
-from estimators.log import READING, Events, Log
+from estimators.log import READING, Log
 from estimators.model.correlation import covariance_of
 from estimators.models.lorenz96 import LORENZ96
 from estimators.registry import ESTIMATORS, checked
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear
+from tests.support import log_of
 
 C = ((1.0, 0.8, -0.5), (0.8, 1.0, -0.2), (-0.5, -0.2, 1.0))
 MATRICES = random_linear(np.random.default_rng(3), 4, 1)
@@ -26,12 +27,11 @@ H, OFFSET, R = MATRICES.H[2], MATRICES.D[2] @ MATRICES.u, covariance_of(C, MATRI
 THERE = [[0, 1, 2], [0, 2], [1, 2], [2]]
 
 
-def log_of(there):
+def rows_there(there):
+    """A log of one reading, of which these rows came."""
     y = np.full(3, np.nan)
     y[there] = Y[there]
-    log = Log(MODEL.width)
-    log.extend(Events.one(0, 0, READING, 2, y, MODEL.width))
-    return log
+    return log_of(MODEL.width, (0, READING, y, 2))
 
 
 def update(mean, P, there):
@@ -50,7 +50,7 @@ def update(mean, P, there):
 @pytest.mark.parametrize("name", ["enkf", "etkf", "ensrf", "letkf"])
 def test_ensembles_take_the_whole_r(name, members, there):
     """Kalman's update of the sample moments: an identity, but for the covariance of enkf, which is right on average."""
-    run = Fold(name, MODEL, Tuning.of(MODEL).with_options({"members": members}), log_of(there))
+    run = Fold(name, MODEL, Tuning.of(MODEL).with_options({"members": members}), rows_there(there))
     before = run.points()
     run.advance()
     after = run.points()
@@ -68,7 +68,7 @@ def test_perturbations_are_correlated():
 
     For Gaussian perturbations a sample covariance from N = 2000 members is off by P √(2 / N), 3 %; five of these.
     """
-    run = Fold("enkf", MODEL, Tuning.of(MODEL).with_options({"members": 2000}), log_of([0, 1, 2]))
+    run = Fold("enkf", MODEL, Tuning.of(MODEL).with_options({"members": 2000}), rows_there([0, 1, 2]))
     before = run.points()
     run.advance()
     _, P, *_ = update(before.mean(0), np.cov(before.T), [0, 1, 2])
@@ -79,7 +79,7 @@ def test_perturbations_are_correlated():
 
 @pytest.mark.parametrize("there", THERE)
 def test_rbpf_with_nothing_to_sample_is_the_kalman_filter(there):
-    track = fold("rbpf", MODEL, Tuning.of(MODEL).with_options({"particles": 2}), log_of(there))
+    track = fold("rbpf", MODEL, Tuning.of(MODEL).with_options({"particles": 2}), rows_there(there))
     mean, P, nis, log_likelihood, std = update(MATRICES.mean, np.diag(MATRICES.std**2), there)
     np.testing.assert_allclose(track.mean[0], mean, rtol=0, atol=1e-9)
     np.testing.assert_allclose(track.std[0], np.sqrt(np.diag(P)), rtol=1e-9)
@@ -96,7 +96,7 @@ def test_particles_are_weighed_by_the_whole_r(name, there):
     The likelihood is unbiased, so its mean over the clouds is right to its standard error too.
     """
     tuning = Tuning.of(MODEL).with_options({"particles": 4000})
-    runs = [fold(name, MODEL, replace(tuning, seed=seed), log_of(there)) for seed in range(40)]
+    runs = [fold(name, MODEL, replace(tuning, seed=seed), rows_there(there)) for seed in range(40)]
     mean, P, nis, log_likelihood, std = update(MATRICES.mean, np.diag(MATRICES.std**2), there)
     means = np.array([run.mean[0] for run in runs])
     error = means.std(axis=0, ddof=1) / np.sqrt(len(runs))

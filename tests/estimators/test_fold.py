@@ -13,8 +13,8 @@ from estimators.snapshots import RECENT
 from estimators.track import FAILED, GATED, HELD_OUT, MISSING, NONE, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, random_linear, random_log
+from tests.support import SECOND, as_log, assert_same
 
-SECOND = 1_000_000_000
 MATRICES = random_linear(np.random.default_rng(1), 3, 2)
 MODEL = MATRICES.model
 PYTHON = ["filterpy-kf", "ekf-python"]
@@ -22,18 +22,6 @@ PYTHON = ["filterpy-kf", "ekf-python"]
 
 GAUSSIAN = [name for name, entry in ESTIMATORS.items() if entry.family == "Gaussian" and entry.applies(MODEL) is None]
 NAMES = GAUSSIAN + PYTHON
-
-
-def identical(a, b):
-    """The same bits in every column; NaN equals NaN."""
-    for name, left, right in zip(a._fields, a, b, strict=True):
-        np.testing.assert_array_equal(left, right, err_msg=name)
-
-
-def as_log(readings):
-    log = Log(MODEL.width)
-    log.extend(readings)
-    return log
 
 
 def everything(rng, events):
@@ -88,7 +76,7 @@ def test_pieces_do_not_matter(estimator, seed):
         at += size
         growing.advance(int(rng.integers(1, 40)) if rng.random() < 0.5 else None)
     growing.advance()
-    identical(growing.track, whole)
+    assert_same(growing.track, whole)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -111,7 +99,7 @@ def test_order_of_arrival_does_not_matter(estimator, seed):
         growing.rewind(changed)
         growing.advance()
     assert late > 30
-    identical(growing.track, whole)
+    assert_same(growing.track, whole)
 
 
 def test_a_reading_older_than_the_first_event(estimator):
@@ -122,7 +110,7 @@ def test_a_reading_older_than_the_first_event(estimator):
     changed, _ = log.extend(reading(int(events.t[0]) - SECOND, 1, [0.3, -0.4]))
     growing.rewind(changed)
     growing.advance()
-    identical(growing.track, fold(estimator, MODEL, Tuning.of(MODEL), log.copy()))
+    assert_same(growing.track, fold(estimator, MODEL, Tuning.of(MODEL), log.copy()))
 
 
 @QUICK
@@ -136,7 +124,7 @@ def test_rewind_far_behind_the_recent_snapshots(estimator):
         growing.rewind(index)
         assert growing.n <= index
         growing.advance()
-    identical(growing.track, fold(estimator, MODEL, Tuning.of(MODEL), log.copy()))
+    assert_same(growing.track, fold(estimator, MODEL, Tuning.of(MODEL), log.copy()))
 
 
 @pytest.mark.parametrize("late", [False, True])
@@ -154,7 +142,7 @@ def test_follow_a_log_that_grew_meanwhile(estimator, late):
     beside.advance()
     beside.follow(log, changed)
     beside.advance()
-    identical(beside.track, fold(estimator, MODEL, tuning, log.copy()))
+    assert_same(beside.track, fold(estimator, MODEL, tuning, log.copy()))
 
 
 @QUICK
@@ -179,7 +167,7 @@ def test_drop_front_and_base_at(estimator):
         # What does not look back over the cut: everything but the windowed columns of the fresh one.
         for name in ("mean", "std", "cross", "innovation", "innovation_std", "nis", "log_likelihood", "dof", "verdict"):
             np.testing.assert_array_equal(getattr(one.track, name), getattr(whole, name)[at:], err_msg=name)
-    identical(growing.track, whole.select(slice(at, None)))
+    assert_same(growing.track, whole.select(slice(at, None)))
     with pytest.raises(EstimatorError, match="no snapshot"):
         growing.drop_front(1)
 
@@ -239,7 +227,7 @@ def test_follow_over_a_cut(estimator):
     log.extend(events.select(slice(4000, None)))
     beside.follow(log, None)
     beside.advance()
-    identical(beside.track, fold(estimator, MODEL, tuning, as_log(events)).select(slice(at, None)))
+    assert_same(beside.track, fold(estimator, MODEL, tuning, as_log(events)).select(slice(at, None)))
     with pytest.raises(EstimatorError, match="another"):
         beside.follow(as_log(events), None)
 
@@ -411,7 +399,7 @@ def test_inputs_that_are_nan_stay(estimator):
 
 def test_seed_and_version_do_not_change_a_filter_without_randomness(estimator):
     events = random_log(np.random.default_rng(12), MATRICES, 100).events
-    identical(
+    assert_same(
         fold(estimator, MODEL, Tuning.of(MODEL), as_log(events)),
         fold(estimator, MODEL, Tuning.of(MODEL), as_log(events)),
     )

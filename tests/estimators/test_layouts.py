@@ -12,7 +12,8 @@ from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import Field, Noise, Row, Sensor, StateSpaceModel
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
-from tests.estimators.linear_models import SECOND, random_linear
+from tests.estimators.linear_models import random_linear
+from tests.support import SECOND
 
 GUARD = 16_384
 """Numbers before and after that no filter may touch: more than a block of particles takes."""

@@ -8,8 +8,7 @@ import pytest
 
 from estimators.log import READING, TICK, TRUTH, Events, Log, truth_of
 from estimators.track import Track
-
-SECOND = 1_000_000_000
+from tests.support import SECOND
 
 
 def batch(times, first=0, kind=READING, width=2):

@@ -10,8 +10,8 @@ from estimators.models import MODELS
 from estimators.registry import ESTIMATORS, unfit
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear
+from tests.support import SECOND
 
-SECOND = 1_000_000_000
 MATRICES = random_linear(np.random.default_rng(6), 3, 2)
 MODEL = MATRICES.model
 MEAN = np.array([1.0, -2.0, 0.5])

@@ -19,8 +19,9 @@ from sources.can.log import CanLog
 from sources.source import Channel
 from sources.tables.table import Table
 from tests.sources import readers_that_fail
-from tests.sources.can.can_tools import Reports, dbc, read_all, sensor
+from tests.sources.can.can_tools import Reports, dbc, sensor
 from tests.sources.can.test_log import decoder_of, messages, write  # noqa: F401  a fixture
+from tests.support import read_all
 
 
 def flipped(content, seed, *, most=200):

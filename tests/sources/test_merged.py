@@ -7,7 +7,8 @@ from estimators.errors import SourceError
 from estimators.log import Events
 from sources.memory import MemorySource
 from sources.merged import Merged
-from tests.sources.can.can_tools import read_all, same
+from tests.sources.can.can_tools import same
+from tests.support import read_all
 
 
 def events(times, who):

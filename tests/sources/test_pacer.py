@@ -8,27 +8,25 @@ import pytest
 from estimators.log import Events
 from sources.memory import MemorySource
 from sources.pacer import BATCH, Pacer
-from tests.sources.can.can_tools import read_all
-
-S = 10**9
+from tests.support import SECOND, read_all
 
 
 class Clock:
     """Nanoseconds that pass when a test says so."""
 
     def __init__(self):
-        self.now = 7 * S
+        self.now = 7 * SECOND
 
     def __call__(self):
         return self.now
 
     def advance(self, seconds):
-        self.now += round(seconds * S)
+        self.now += round(seconds * SECOND)
 
 
 def events(times):
     n = len(times)
-    t = np.array([round(100 * S + x * S) for x in times], np.int64)
+    t = np.array([round(100 * SECOND + x * SECOND) for x in times], np.int64)
     return Events(t, t, np.zeros(n, np.int8), np.zeros(n, np.int32), np.arange(n, dtype=float)[:, None])
 
 
@@ -53,7 +51,7 @@ def test_events_come_when_playback_reaches_them():
     clock.advance(0.999)
     assert due(pacer) == []
     clock.advance(0.001)
-    assert due(pacer) == [1] and pacer.now() == 101 * S
+    assert due(pacer) == [1] and pacer.now() == 101 * SECOND
     clock.advance(2.5)
     assert due(pacer) == [2, 3]
     clock.advance(10)
@@ -65,7 +63,7 @@ def test_speed(speed, seconds):
     pacer, clock = player(speed=speed)
     due(pacer)
     clock.advance(seconds)
-    assert due(pacer) == [1, 2] and pacer.now() == 102 * S
+    assert due(pacer) == [1, 2] and pacer.now() == 102 * SECOND
 
 
 def test_a_change_of_speed_holds_from_then_on():
@@ -73,9 +71,9 @@ def test_a_change_of_speed_holds_from_then_on():
     due(pacer)
     clock.advance(1.5)
     pacer.set_speed(3.0)
-    assert pacer.now() == round(101.5 * S)
+    assert pacer.now() == round(101.5 * SECOND)
     clock.advance(0.5)
-    assert due(pacer) == [1, 2, 3] and pacer.now() == 103 * S
+    assert due(pacer) == [1, 2, 3] and pacer.now() == 103 * SECOND
 
 
 def test_as_fast_as_possible_is_everything_in_breaths():
@@ -93,7 +91,7 @@ def test_a_playhead_beyond_all_times_releases_everything(speed, seconds):
     clock.advance(seconds)
     assert due(pacer) == [1, 2, 3, 4, 5]
     pacer.pause()
-    pacer.seek(100 * S)
+    pacer.seek(100 * SECOND)
     assert due(pacer) == [0]
 
 
@@ -103,7 +101,7 @@ def test_pause_and_resume():
     clock.advance(0.5)
     pacer.pause()
     clock.advance(100)
-    assert pacer.paused and due(pacer) == [] and pacer.now() == round(100.5 * S)
+    assert pacer.paused and due(pacer) == [] and pacer.now() == round(100.5 * SECOND)
     pacer.resume()
     assert due(pacer) == []
     clock.advance(0.5)
@@ -116,9 +114,9 @@ def test_a_step_releases_the_next_timestamp_whole():
     pacer.pause()
     pacer.step()
     assert due(pacer) == [1, 2, 3, 4], "also where a timestamp spreads over the source's batches"
-    assert due(pacer) == [] and pacer.now() == 101 * S
+    assert due(pacer) == [] and pacer.now() == 101 * SECOND
     pacer.step()
-    assert due(pacer) == [5] and pacer.now() == 102 * S
+    assert due(pacer) == [5] and pacer.now() == 102 * SECOND
     pacer.resume()
     clock.advance(1.0)
     assert due(pacer) == [6]
@@ -130,8 +128,8 @@ def test_a_seek_ahead_releases_what_lies_between_at_once(paused):
     due(pacer)
     if paused:
         pacer.pause()
-    pacer.seek(103 * S)
-    assert due(pacer) == [1, 2, 3] and pacer.now() == 103 * S and pacer.restarts == 0
+    pacer.seek(103 * SECOND)
+    assert due(pacer) == [1, 2, 3] and pacer.now() == 103 * SECOND and pacer.restarts == 0
     clock.advance(1.0)
     assert due(pacer) == ([] if paused else [4])
 
@@ -142,8 +140,8 @@ def test_a_seek_back_begins_again(ended):
     due(pacer)
     clock.advance(50 if ended else 4)
     assert due(pacer) == ([1, 2, 3, 4, 5] if ended else [1, 2, 3, 4])
-    pacer.seek(102 * S)
-    assert due(pacer) == [0, 1, 2] and pacer.restarts == 1 and pacer.now() == 102 * S
+    pacer.seek(102 * SECOND)
+    assert due(pacer) == [0, 1, 2] and pacer.restarts == 1 and pacer.now() == 102 * SECOND
     clock.advance(1.0)
     assert due(pacer) == [3]
 
@@ -176,7 +174,7 @@ def test_whatever_is_pressed_each_event_comes_once_and_in_order(seed):
         elif press == 3:
             pacer.set_speed(float(rng.choice([0.1, 1.0, 20.0, np.inf])))
         elif press == 4:
-            pacer.seek(100 * S + round(rng.uniform(0, 10) * S))
+            pacer.seek(100 * SECOND + round(rng.uniform(0, 10) * SECOND))
         else:
             clock.advance(rng.uniform(0, 0.5))
         batch = pacer.read(0.0)
@@ -195,7 +193,7 @@ def test_a_reader_that_waits_is_woken_by_a_seek():
     got = []
     thread = threading.Thread(target=lambda: got.append(pacer.read(60.0)))
     thread.start()
-    pacer.seek(3700 * S)
+    pacer.seek(3700 * SECOND)
     thread.join(20.0)
     assert not thread.is_alive()
     numbers = [int(v) for batch in got for v in batch.value[:, 0]] + due(pacer)

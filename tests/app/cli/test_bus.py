@@ -13,6 +13,7 @@ from app.twin.sources.asset import make_asset
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from estimators.log import INPUT, READING, TRUTH, Events, truth_of
+from tests.support import read_all
 
 
 class Clock:
@@ -37,11 +38,9 @@ def play_at_once(player: Any, duration: float | None) -> None:
 
 def events(*, log: Path) -> Events:
     source = load_twin("motor_can", log_files=[log]).open_source(lambda key, text: None, live=False)
-    batches = []
-    while (batch := source.read(1.0)) is not None:
-        batches.append(batch)
+    events = read_all(source)
     source.close()
-    return Events.concat(batches, 5)
+    return events
 
 
 @pytest.mark.parametrize("suffix", bus.FORMATS)
@@ -54,10 +53,7 @@ def test_what_is_recorded_is_what_the_asset_said(suffix: str, tmp_path: Path, mo
     twin = load_twin("motor_can", overrides={"source.asset.duration": "12"})
     section: Any = twin.config.source
     simulator = make_asset(twin.loaded, twin.model, section.asset, ("source", "asset"))
-    batches = []
-    while (batch := simulator.read(0.0)) is not None:
-        batches.append(batch)
-    said = Events.concat(batches, 5)
+    said = read_all(simulator)
     sensors = [
         [batch.value[(batch.kind == READING) & (batch.channel == k), 0] for batch in (got, said)] for k in range(3)
     ]

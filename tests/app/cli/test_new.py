@@ -8,8 +8,9 @@ from app.cli.new import write_twin
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from estimators.fold import fold
-from estimators.log import READING, Log, truth_of
+from estimators.log import READING, truth_of
 from estimators.track import USED
+from tests.support import as_log, read_all
 
 
 def test_the_pair_that_new_writes_loads_as_it_stands(tmp_path: Path) -> None:
@@ -53,10 +54,8 @@ def test_a_folder_that_is_absent_is_refused(tmp_path: Path) -> None:
 
 def test_the_pair_folds_and_does_what_its_text_promises(tmp_path: Path) -> None:
     twin = load_twin(write_twin("pump", tmp_path)[0])
-    log = Log(twin.model.width)
     source = twin.open_source(lambda key, text: None, live=False)
-    while (batch := source.read(0.0)) is not None:
-        log.extend(batch)
+    log = as_log(read_all(source))
     track = fold(twin.estimator, twin.model, twin.tuning, log)
     events = log.events
     late = events.select(events.t > 60_000_000_000)

@@ -16,7 +16,8 @@ from app.viser.restore import began_html
 from app.viser.view import ViserView
 from estimators.errors import ConfigError
 from estimators.tuning import Tuning
-from tests.app.scripted import Scripted, readings, wait_for
+from tests.app.scripted import Scripted, pull_all, readings, wait_for
+from tests.support import assert_same
 
 BROWSER = SimpleNamespace(client_id=0)
 TURNED = (
@@ -27,24 +28,12 @@ TURNED = (
 )
 
 
-def rows(engine):
-    cursor = engine.cursor()
-    pull = engine.pull(cursor)
-    engine.release(cursor)
-    return pull
-
-
 def carry_out(engine, *wanted):
     """Each command, and the refold after it."""
     for command in wanted:
         revision = engine.status().revision
         engine.submit(command)
         wait_for(lambda revision=revision: engine.status().revision > revision and not engine.status().refolding)
-
-
-def assert_same(track, expected):
-    for name, a, b in zip(track._fields, track, expected, strict=True):
-        np.testing.assert_array_equal(a, b, err_msg=name)
 
 
 @pytest.fixture
@@ -60,9 +49,9 @@ def review(tmp_path):
         engine.submit(commands.Record(path))
         t = np.arange(1.0, 301.0)
         source.put(readings(t, 40.0 + 0.05 * t + np.random.default_rng(1).normal(0.0, 1.5, 300)))
-        wait_for(lambda: len(rows(engine).events) == 300)
+        wait_for(lambda: len(pull_all(engine).events) == 300)
         carry_out(engine, *TURNED)
-        seen = rows(engine).track
+        seen = pull_all(engine).track
         engine.submit(commands.Record(None))
         wait_for(lambda: path in recorder.finished)
     finally:
@@ -77,7 +66,7 @@ def review(tmp_path):
 
 def test_a_review_goes_back_to_what_was_recorded(review):
     engine, seen = review
-    assert_same(rows(engine).track, seen)
+    assert_same(pull_all(engine).track, seen)
     said = status_json(engine)
     assert (said["began_as"], said["turned"]) == ("recorded", {})
     assert (said["estimator"], said["options"]["alpha"]) == ("ukf", 0.5)
@@ -97,11 +86,11 @@ def test_a_review_goes_back_to_what_was_recorded(review):
     assert status_json(engine)["turned"] == {
         "estimator": "ukf", "R.winding": 2.25, "use.winding": True, "gate": 0.99,
     }  # fmt: skip
-    assert not np.array_equal(rows(engine).track.mean, seen.mean)
+    assert not np.array_equal(pull_all(engine).track.mean, seen.mean)
 
     carry_out(engine, command_from_json({"command": "Restore"}, engine))
     assert status_json(engine)["turned"] == {}
-    assert_same(rows(engine).track, seen)
+    assert_same(pull_all(engine).track, seen)
 
 
 def test_the_panel_says_what_was_recorded_and_has_the_way_back(review):
@@ -123,7 +112,7 @@ def test_the_panel_says_what_was_recorded_and_has_the_way_back(review):
         assert not began.button.visible
         assert view.panel.estimator.handle.value == "Unscented Kalman filter"
         assert view.panel.gate.handle.value == "99 %"
-        assert_same(rows(engine).track, seen)
+        assert_same(pull_all(engine).track, seen)
     finally:
         view.stop()
 

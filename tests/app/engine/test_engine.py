@@ -16,7 +16,8 @@ from estimators.fold import Fold, fold
 from estimators.log import READING, Events, Log
 from estimators.track import DIVERGED, FAILED, USED
 from estimators.tuning import Tuning
-from tests.app.scripted import MODEL, SECOND, Scripted, readings, twin, wait_for
+from tests.app.scripted import MODEL, Scripted, pull_all, readings, row_count, twin, wait_for
+from tests.support import SECOND, assert_same
 
 
 @pytest.fixture
@@ -37,22 +38,6 @@ def started():
 def series(n, seed=1):
     rng = np.random.default_rng(seed)
     return np.arange(1, n + 1) * 0.01, 40 + np.cumsum(rng.normal(size=n)) * 0.1 + rng.normal(size=n)
-
-
-def everything(engine):
-    cursor = engine.cursor()
-    pull = engine.pull(cursor)
-    engine.release(cursor)
-    return pull
-
-
-def rows(engine):
-    return len(everything(engine).events)
-
-
-def assert_same(track, expected):
-    for name, a, b in zip(track._fields, track, expected, strict=True):
-        np.testing.assert_array_equal(a, b, err_msg=name)
 
 
 def reference(times, values, estimator="kf", tuning=None):
@@ -77,8 +62,8 @@ def test_live_in_pieces_out_of_order_equals_one_fold(started):
         piece = order[at : at + size]
         source.put(readings(times[piece], values[piece]))
         at += size
-    wait_for(lambda: rows(engine) == 3000)
-    assert_same(everything(engine).track, reference(times, values))
+    wait_for(lambda: row_count(engine) == 3000)
+    assert_same(pull_all(engine).track, reference(times, values))
 
 
 def test_cursor_is_taken_back_by_a_late_reading(started):
@@ -86,10 +71,10 @@ def test_cursor_is_taken_back_by_a_late_reading(started):
     engine = started(source)
     cursor = engine.cursor()
     source.put(readings([1.0, 2.0, 3.0], [40, 41, 42]))
-    wait_for(lambda: rows(engine) == 3)
+    wait_for(lambda: row_count(engine) == 3)
     assert engine.pull(cursor).first == 0
     source.put(readings([2.5], [41.5]))
-    wait_for(lambda: rows(engine) == 4)
+    wait_for(lambda: row_count(engine) == 4)
     again = engine.pull(cursor)
     assert not again.fresh
     assert again.first == 2
@@ -100,9 +85,9 @@ def test_readings_beyond_the_horizon_are_counted_and_dropped(started):
     source = Scripted()
     engine = started(source)
     source.put(readings([10.0, 7.9, 7.5, 8.1], [40, 41, 43, 42]))
-    wait_for(lambda: rows(engine) == 2)
+    wait_for(lambda: row_count(engine) == 2)
     wait_for(lambda: engine.notices.counts().get("stale") == 2)
-    np.testing.assert_array_equal(everything(engine).events.t, np.array([8.1, 10.0]) * SECOND)
+    np.testing.assert_array_equal(pull_all(engine).events.t, np.array([8.1, 10.0]) * SECOND)
 
 
 @pytest.mark.parametrize(
@@ -118,12 +103,12 @@ def test_refold_replaces_the_whole_history(started, command, estimator, tuned):
     source = Scripted()
     engine = started(source)
     source.put(readings(times, values))
-    wait_for(lambda: rows(engine) == 2000)
-    before = everything(engine)
+    wait_for(lambda: row_count(engine) == 2000)
+    before = pull_all(engine)
     cursor = engine.cursor()
     engine.pull(cursor)
     engine.submit(command)
-    wait_for(lambda: everything(engine).revision == 1)
+    wait_for(lambda: pull_all(engine).revision == 1)
     pull = engine.pull(cursor)
     assert pull.fresh and pull.first == 0
     assert_same(pull.track, reference(times, values, estimator, tuned(Tuning.of(MODEL))))
@@ -136,7 +121,7 @@ def test_readings_that_come_during_a_refold_are_not_lost(started):
     source = Scripted()
     engine = started(source)
     source.put(readings(times[:50_000], values[:50_000]))
-    wait_for(lambda: rows(engine) == 50_000)
+    wait_for(lambda: row_count(engine) == 50_000)
     engine.submit(commands.SetTuning("Q.rate", 0.01))
     late = [50_850, 50_900]
     for start in range(50_000, 60_000, 250):
@@ -144,8 +129,8 @@ def test_readings_that_come_during_a_refold_are_not_lost(started):
         source.put(readings(times[piece], values[piece]))
         if start == 50_750:
             source.put(readings(times[late], values[late]))
-    wait_for(lambda: rows(engine) == 60_000 and not engine.status().refolding)
-    assert_same(everything(engine).track, reference(times, values, "kf", Tuning.of(MODEL).set("Q.rate", 0.01)))
+    wait_for(lambda: row_count(engine) == 60_000 and not engine.status().refolding)
+    assert_same(pull_all(engine).track, reference(times, values, "kf", Tuning.of(MODEL).set("Q.rate", 0.01)))
 
 
 def test_of_many_slider_values_the_last_one_holds(started):
@@ -153,11 +138,11 @@ def test_of_many_slider_values_the_last_one_holds(started):
     source = Scripted()
     engine = started(source)
     source.put(readings(times, values))
-    wait_for(lambda: rows(engine) == 5000)
+    wait_for(lambda: row_count(engine) == 5000)
     for value in np.geomspace(1e-4, 1e-1, 50):
         engine.submit(commands.SetTuning("Q.rate", float(value)))
     wait_for(lambda: not engine.status().refolding and engine.status().tuning.get("Q.rate") == pytest.approx(0.1))
-    assert_same(everything(engine).track, reference(times, values, "kf", Tuning.of(MODEL).set("Q.rate", 0.1)))
+    assert_same(pull_all(engine).track, reference(times, values, "kf", Tuning.of(MODEL).set("Q.rate", 0.1)))
 
 
 def test_history_is_bounded_and_a_refold_starts_where_it_was_cut(started):
@@ -169,7 +154,7 @@ def test_history_is_bounded_and_a_refold_starts_where_it_was_cut(started):
         source.put(readings(times[start : start + 500], values[start : start + 500]))
     # The count goes on; the rows are bounded.
     wait_for(lambda: (status := engine.status()).t == round(times[-1] * SECOND) and status.counts["readings"] == n)
-    pull = everything(engine)
+    pull = pull_all(engine)
     assert 8000 <= len(pull.events) <= 8000 + 4 * 1024
     expected = reference(times, values)
     windowed = ("nis_mean", "nis_low", "nis_high", "health", "age")
@@ -179,8 +164,8 @@ def test_history_is_bounded_and_a_refold_starts_where_it_was_cut(started):
             np.testing.assert_array_equal(a, b, err_msg=name)
     # A Kalman filter's mean and covariance are all of its state: refolding from the cut changes nothing.
     engine.submit(commands.SetTuning("Q.rate", Tuning.of(MODEL).get("Q.rate")))
-    wait_for(lambda: everything(engine).revision == 1)
-    again = everything(engine)
+    wait_for(lambda: pull_all(engine).revision == 1)
+    again = pull_all(engine)
     np.testing.assert_array_equal(again.track.mean, kept.mean)
 
 
@@ -188,7 +173,7 @@ def test_bad_commands_are_one_line_and_change_nothing(started):
     source = Scripted()
     engine = started(source)
     source.put(readings([1.0], [40]))
-    wait_for(lambda: rows(engine) == 1)
+    wait_for(lambda: row_count(engine) == 1)
     for command in (
         commands.SetTuning("R.winding", -1.0),
         commands.SetTuning("Q.nothing", 1.0),
@@ -198,7 +183,7 @@ def test_bad_commands_are_one_line_and_change_nothing(started):
     ):
         engine.submit(command)
     engine.submit(commands.SetTuning("R.winding", 9.0))
-    wait_for(lambda: everything(engine).revision == 1)
+    wait_for(lambda: pull_all(engine).revision == 1)
     assert engine.status().tuning.get("R.winding") == 9.0
     errors = [line.text for line in engine.notices.since(0) if line.level == "error"]
     assert errors and all("\n" not in text for text in errors)
@@ -208,20 +193,20 @@ def test_reset_goes_back_to_the_prior(started):
     source = Scripted()
     engine = started(source)
     source.put(readings([1.0, 2.0], [50, 51]))
-    wait_for(lambda: rows(engine) == 2)
+    wait_for(lambda: row_count(engine) == 2)
     engine.submit(commands.Reset())
-    wait_for(lambda: rows(engine) == 3)
-    np.testing.assert_array_equal(everything(engine).track.mean[-1], [35.0, 0.0])
-    np.testing.assert_allclose(everything(engine).track.std[-1], [5.0, 1.0], rtol=1e-15)
+    wait_for(lambda: row_count(engine) == 3)
+    np.testing.assert_array_equal(pull_all(engine).track.mean[-1], [35.0, 0.0])
+    np.testing.assert_allclose(pull_all(engine).track.std[-1], [5.0, 1.0], rtol=1e-15)
 
 
 def test_nan_is_missing_and_the_twin_goes_on(started):
     source = Scripted()
     engine = started(source)
     source.put(readings([1.0, 2.0, 3.0], [40, np.nan, 41]))
-    wait_for(lambda: rows(engine) == 3)
+    wait_for(lambda: row_count(engine) == 3)
     assert engine.status().counts["missing"] == 1
-    assert np.isfinite(everything(engine).track.mean).all()
+    assert np.isfinite(pull_all(engine).track.mean).all()
     assert any("no value" in line.text for line in engine.notices.since(0))
 
 
@@ -234,7 +219,7 @@ def test_a_live_source_that_fails_is_reopened():
         sources[0].put(readings([1.0], [40]))
         sources[0].put(OSError("bus off"))
         sources[1].put(readings([2.0], [41]))
-        wait_for(lambda: rows(engine) == 2)
+        wait_for(lambda: row_count(engine) == 2)
         texts = [line.text for line in engine.notices.since(0)]
         assert any("bus off" in text for text in texts)
         assert engine.notices.counts()["source reopened"] == 1
@@ -249,17 +234,17 @@ def test_end_of_source_is_said_and_the_page_stays(started):
     source.put(None)
     wait_for(lambda: engine.status().finished)
     engine.submit(commands.SetEstimator("ekf"))
-    wait_for(lambda: everything(engine).revision == 1)
+    wait_for(lambda: pull_all(engine).revision == 1)
 
 
 def test_silence_predicts_and_health_degrades(started):
     source = Scripted(live=True)
     engine = started(source, tick=0.02)
     source.put(readings([1.0], [40]))
-    wait_for(lambda: rows(engine) >= 4)
-    track = everything(engine).track
+    wait_for(lambda: row_count(engine) >= 4)
+    track = pull_all(engine).track
     assert np.all(np.diff(track.std[:, 0]) > 0)
-    assert isinstance(everything(engine).events, Events)
+    assert isinstance(pull_all(engine).events, Events)
 
 
 def by_hand(times, values):
@@ -283,10 +268,10 @@ def test_a_late_reading_between_two_requests_reaches_the_first_ones_answer():
     engine._accept([readings(times[[60]], values[[60]])])
     engine.retune("kf", engine.tuning.set("Q.rate", 0.2))
     engine._adopt(first)
-    assert_same(everything(engine).track, reference(times, values, "kf", Tuning.of(MODEL).set("Q.rate", 0.1)))
+    assert_same(pull_all(engine).track, reference(times, values, "kf", Tuning.of(MODEL).set("Q.rate", 0.1)))
     assert engine.status().refolding
     engine._adopt(refolded(engine))
-    assert_same(everything(engine).track, reference(times, values, "kf", Tuning.of(MODEL).set("Q.rate", 0.2)))
+    assert_same(pull_all(engine).track, reference(times, values, "kf", Tuning.of(MODEL).set("Q.rate", 0.2)))
 
 
 def test_a_source_that_begins_again_during_a_refold_gets_no_rows_of_the_old_log():
@@ -298,10 +283,10 @@ def test_a_source_that_begins_again_during_a_refold_gets_no_rows_of_the_old_log(
     engine._accept([readings(times[200:], values[200:])])
     engine._adopt(old)
     engine._status = None
-    assert_same(everything(engine).track, reference(times[200:], values[200:]))
+    assert_same(pull_all(engine).track, reference(times[200:], values[200:]))
     assert engine.status().estimator == "ukf" and engine.status().refolding, "what was asked for is asked for again"
     engine._adopt(refolded(engine))
-    assert_same(everything(engine).track, reference(times[200:], values[200:], "ukf"))
+    assert_same(pull_all(engine).track, reference(times[200:], values[200:], "ukf"))
 
 
 def test_a_refold_that_fails_after_a_late_reading_leaves_what_runs():
@@ -332,11 +317,11 @@ def test_the_same_filter_keeps_its_members_when_a_cut_history_is_folded_again(st
         for start in range(0, 7000, 500):
             source.put(readings(times[start : start + 500], values[start : start + 500]))
         wait_for(lambda: engine.status().counts["readings"] == 7000)
-        seen = everything(engine)
+        seen = pull_all(engine)
         assert seen.first > 0
         engine.submit(commands.SetTuning("Q.rate", Tuning.of(MODEL).get("Q.rate")))
-        wait_for(lambda: everything(engine).revision == 1)
-        np.testing.assert_array_equal(everything(engine).track.mean, seen.track.mean)
+        wait_for(lambda: pull_all(engine).revision == 1)
+        np.testing.assert_array_equal(pull_all(engine).track.mean, seen.track.mean)
     finally:
         engine.stop()
 
@@ -360,9 +345,9 @@ def test_what_went_wrong_is_counted_by_sensor_however_often_it_is_folded():
     try:
         source.put(batch((0.01, force, np.nan), (0.02, force, np.nan), (0.03, position, np.nan), (0.04, force, 1e9)))
         source.put(batch((0.05, force, np.nan), (0.06, position, 0.0)))
-        wait_for(lambda: rows(engine) == 6)
+        wait_for(lambda: row_count(engine) == 6)
         source.put(batch((0.015, position, np.nan)))
-        wait_for(lambda: rows(engine) == 7)
+        wait_for(lambda: row_count(engine) == 7)
         engine.submit(commands.SetTuning("R.position", 1e-6))
         wait_for(lambda: engine.status().revision > 0 and not engine.status().refolding)
         wait_for(lambda: engine.status().counts["readings"] == 7)
@@ -403,8 +388,8 @@ def test_a_black_box_that_fails_loses_nothing_and_says_so_once(started):
         solver.away = away
         for one in range(rest.start, rest.stop):
             source.put(readings(times[one : one + 1], values[one : one + 1]))
-            wait_for(lambda upto=one + 1: rows(engine) == upto)
-    pull = everything(engine)
+            wait_for(lambda upto=one + 1: row_count(engine) == upto)
+    pull = pull_all(engine)
     np.testing.assert_array_equal(pull.events.value[:, 0], values)
     assert list(pull.track.verdict) == [USED] * 5 + [FAILED] * 5 + [USED] * 5
     assert engine.status().counts["failed"] == 5 and engine.status().counts["used"] == 10
@@ -429,11 +414,11 @@ def test_a_refold_over_a_black_box_that_fails_says_so_too(started):
     engine = started(source, model=solver.model(), estimator="filterpy-ukf")
     times, values = series(5)
     source.put(readings(times, values))
-    wait_for(lambda: rows(engine) == 5)
+    wait_for(lambda: row_count(engine) == 5)
     solver.away = True
     engine.submit(commands.SetTuning("Q.rate", 0.5))
-    wait_for(lambda: everything(engine).revision == 1)
-    pull = everything(engine)
+    wait_for(lambda: pull_all(engine).revision == 1)
+    pull = pull_all(engine)
     # The first needs no f: the clock starts with it.
     assert list(pull.track.verdict) == [USED] + [FAILED] * 4
     assert sum("the solver is away" in line.text for line in engine.notices.since(0)) == 1
@@ -472,7 +457,7 @@ def test_a_noise_that_is_none_where_the_asset_gets_is_named_once_a_fold(started,
     engine = started(source, model=replace(MODEL, Q=cooling, linear=False), estimator=estimator)
     times = np.arange(1.0, 61.0)
     source.put(readings(times, 40.0 + times))
-    wait_for(lambda: rows(engine) == 60)
+    wait_for(lambda: row_count(engine) == 60)
 
     def said():
         return [line for line in engine.notices.since(0) if "positive semidefinite" in line.text]
@@ -487,14 +472,14 @@ def test_a_noise_that_is_none_where_the_asset_gets_is_named_once_a_fold(started,
     # When it happened: the asset is at 50 °C after 10 s.
     assert 5 * SECOND < line.t < 60 * SECOND
     source.put(readings([61.0, 62.0], [101.0, 102.0]))
-    wait_for(lambda: rows(engine) == 62)
+    wait_for(lambda: row_count(engine) == 62)
     assert len(said()) == 1
     engine.submit(commands.SetTuning("R.winding", 5.0))
-    wait_for(lambda: everything(engine).revision == 1)
+    wait_for(lambda: pull_all(engine).revision == 1)
     assert len(said()) == 2
     # A fold without trouble has nothing to say.
     engine.submit(commands.SetTuning("Q.temperature", 0.0))
-    wait_for(lambda: everything(engine).revision == 2)
+    wait_for(lambda: pull_all(engine).revision == 2)
     assert len(said()) == 2
 
 

@@ -35,7 +35,8 @@ from estimators.models import MODELS
 from estimators.track import DIVERGED
 from estimators.tuning import Tuning
 from tests.app.fake_engine import FakeEngine, events
-from tests.app.scripted import SECOND, Scripted, readings, twin
+from tests.app.scripted import Scripted, fresh_status, readings, twin
+from tests.support import SECOND
 
 RESET_AT, END = 20, 24
 
@@ -100,11 +101,6 @@ def by_hand(estimator, *batches):
 def swap(engine, estimator):
     engine.retune(estimator, engine.tuning.with_options({}))
     engine._adopt(engine._refolder._fold(*engine._refolder._pending))
-
-
-def fresh(engine):
-    engine._status = None
-    return engine.status()
 
 
 def lost_rows(track):
@@ -194,10 +190,10 @@ def test_the_other_charts_end_their_lines_and_pictures_and_begin_them_anew(tmp_p
 
 def test_it_is_said_since_when_and_what_mends_it():
     engine = by_hand("ekf", fixes(1, 3))
-    assert fresh(engine).lost is None and status_json(engine)["lost"] is None
+    assert fresh_status(engine).lost is None and status_json(engine)["lost"] is None
     engine._accept([fixes(4, RESET_AT - 1)])
     first = int(engine._log.t[lost_rows(engine._fold.track)[0]])
-    status = fresh(engine)
+    status = fresh_status(engine)
     assert status.health == DIVERGED and status.lost == status_json(engine)["lost"] == first
     text = status_html(status, SECOND)
     assert f"not a number since {first / SECOND - 1:.1f} s" in text and "<b>Reset</b>" in text and "filter" in text
@@ -205,37 +201,40 @@ def test_it_is_said_since_when_and_what_mends_it():
     (line,) = [line for line in engine.notices.since(0) if "not a number" in line.text]
     assert (line.t, line.level) == (first, "error") and "Reset" in line.text and "filter" in line.text
     engine._accept([reset()])
-    assert fresh(engine).lost is None and "not a number" not in status_html(fresh(engine), SECOND)
+    assert fresh_status(engine).lost is None and "not a number" not in status_html(fresh_status(engine), SECOND)
     # Lost again, and a late reading folds all of it anew: it is said of the second time, not of the first.
     engine._accept([events(RAIL, READING, 0, [21.0, 22.0, 23.0], [[11.0, 0.0]] * 3)])
-    again = fresh(engine).lost
+    again = fresh_status(engine).lost
     assert again == 22 * SECOND
     engine._accept([events(RAIL, READING, 0, [22.5], [[11.0, 0.0]])])
-    assert fresh(engine).lost == again
+    assert fresh_status(engine).lost == again
     engine._accept([events(RAIL, READING, 0, [21.5], [[11.0, 0.0]])])
-    assert fresh(engine).lost == 21.5 * SECOND
+    assert fresh_status(engine).lost == 21.5 * SECOND
 
 
 def test_it_is_said_of_the_filter_that_is_shown():
     engine = by_hand("pf", fixes(1, RESET_AT - 1))
-    assert fresh(engine).lost is None
+    assert fresh_status(engine).lost is None
     swap(engine, "ekf")
-    assert fresh(engine).lost == int(engine._log.t[lost_rows(engine._fold.track)[0]])
+    assert fresh_status(engine).lost == int(engine._log.t[lost_rows(engine._fold.track)[0]])
     swap(engine, "pf")
-    assert fresh(engine).lost is None
+    assert fresh_status(engine).lost is None
 
 
 def test_counts_are_those_of_the_revision_that_is_shown():
     engine = by_hand("pf", fixes(1, RESET_AT - 1))
-    assert fresh(engine).counts["recovered"] == engine._fold.recoveries() > 0
-    assert f"{engine._fold.recoveries()}</span>" in status_html(fresh(engine), SECOND).partition("recovered</span>")[2]
+    assert fresh_status(engine).counts["recovered"] == engine._fold.recoveries() > 0
+    assert (
+        f"{engine._fold.recoveries()}</span>"
+        in status_html(fresh_status(engine), SECOND).partition("recovered</span>")[2]
+    )
     swap(engine, "ekf")
-    counts = fresh(engine).counts
-    assert "recovered" not in counts and "recovered" not in status_html(fresh(engine), SECOND)
+    counts = fresh_status(engine).counts
+    assert "recovered" not in counts and "recovered" not in status_html(fresh_status(engine), SECOND)
     assert counts["failed"] == np.count_nonzero(engine._fold.track.verdict == 5) > 0
     swap(engine, "pf")
-    assert fresh(engine).counts["recovered"] == engine._fold.recoveries()
-    assert fresh(engine).counts["failed"] == np.count_nonzero(engine._fold.track.verdict == 5)
+    assert fresh_status(engine).counts["recovered"] == engine._fold.recoveries()
+    assert fresh_status(engine).counts["failed"] == np.count_nonzero(engine._fold.track.verdict == 5)
 
 
 def test_counts_of_forgotten_rows_are_those_of_the_filter_that_folded_them(monkeypatch):
@@ -249,9 +248,9 @@ def test_counts_of_forgotten_rows_are_those_of_the_filter_that_folded_them(monke
     for at in range(0, t.size, 50):
         engine._accept([readings(t[at : at + 50], np.where(t[at : at + 50] % 10 == 5, 1e4, 40.0))])
     assert engine._log.first > 0
-    assert fresh(engine).counts["readings"] == 1000 and fresh(engine).counts["gated"] == 100
+    assert fresh_status(engine).counts["readings"] == 1000 and fresh_status(engine).counts["gated"] == 100
     swap(engine, "ukf")
-    counts = fresh(engine).counts
+    counts = fresh_status(engine).counts
     assert counts["readings"] == engine._fold.n < 1000
     assert counts["gated"] == np.count_nonzero(engine._fold.track.verdict == 2) > 0
 

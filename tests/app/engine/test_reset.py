@@ -17,7 +17,8 @@ from estimators.fold import Fold
 from estimators.log import READING, RESET, Events, Log
 from estimators.registry import ESTIMATORS
 from estimators.track import DIVERGED, GATED, TRACKING, USED
-from tests.app.scripted import MODEL, SECOND, Scripted, readings, twin, wait_for
+from tests.app.scripted import MODEL, Scripted, fresh_status, pull_all, readings, row_count, twin, wait_for
+from tests.support import SECOND
 
 JUMP = 60
 """Events before the asset jumps, by more than the gate lets through."""
@@ -63,23 +64,6 @@ def start():
         engine.recorder.stop()
 
 
-def everything(engine):
-    cursor = engine.cursor()
-    pull = engine.pull(cursor)
-    engine.release(cursor)
-    return pull
-
-
-def rows(engine):
-    return len(everything(engine).events)
-
-
-def fresh(engine):
-    """A status that is not the kept one."""
-    engine._status = None
-    return engine.status()
-
-
 @pytest.mark.parametrize("name", FAMILIES)
 def test_what_diverges_says_since_when_and_is_reset(name, start, tmp_path):
     source, engine = start(stubborn(name))
@@ -88,8 +72,8 @@ def test_what_diverges_says_since_when_and_is_reset(name, start, tmp_path):
     wait_for(lambda: engine.recorder.path == path)
     t, y = asset(RESET_AT + 20)
     source.put(readings(t[:RESET_AT], y[:RESET_AT]))
-    wait_for(lambda: rows(engine) == RESET_AT)
-    track, status = everything(engine).track, fresh(engine)
+    wait_for(lambda: row_count(engine) == RESET_AT)
+    track, status = pull_all(engine).track, fresh_status(engine)
     assert np.all(track.verdict[JUMP + 1 : RESET_AT] == GATED)
     # More than half of the 50 readings of the window are refused from the 26th on that are.
     first = int(np.searchsorted(np.cumsum(track.verdict == GATED), 26))
@@ -99,10 +83,10 @@ def test_what_diverges_says_since_when_and_is_reset(name, start, tmp_path):
     (line,) = [line for line in engine.notices.since(0) if "diverged" in line.text]
     assert line.level == "warn" and "Reset" in line.text
     engine.submit(command_from_json({"command": "Reset"}, engine))
-    wait_for(lambda: rows(engine) == RESET_AT + 1)
+    wait_for(lambda: row_count(engine) == RESET_AT + 1)
     source.put(readings(t[RESET_AT:], y[RESET_AT:]))
-    wait_for(lambda: rows(engine) == RESET_AT + 21)
-    track, status = everything(engine).track, fresh(engine)
+    wait_for(lambda: row_count(engine) == RESET_AT + 21)
+    track, status = pull_all(engine).track, fresh_status(engine)
     assert np.all(track.verdict[RESET_AT + 1 :] == USED) and np.all(track.health[RESET_AT:] == TRACKING)
     assert status.since == RESET_AT * SECOND and "diverged" not in status_html(status, SECOND)
     assert status_json(engine)["since"] == RESET_AT * SECOND
@@ -126,12 +110,12 @@ def test_a_reset_stays_where_it_was_when_the_history_is_folded_again(start):
     source, engine = start(stubborn("kf"))
     t, y = asset(RESET_AT + 10)
     source.put(readings(t[:RESET_AT], y[:RESET_AT]))
-    wait_for(lambda: rows(engine) == RESET_AT)
+    wait_for(lambda: row_count(engine) == RESET_AT)
     engine.submit(commands.Reset())
     engine.submit(commands.SetEstimator("pf"))
     source.put(readings(t[RESET_AT:], y[RESET_AT:]))
-    wait_for(lambda: rows(engine) == RESET_AT + 11 and engine.status().revision == 1)
-    pull = everything(engine)
+    wait_for(lambda: row_count(engine) == RESET_AT + 11 and engine.status().revision == 1)
+    pull = pull_all(engine)
     assert np.flatnonzero(pull.events.kind == RESET).tolist() == [RESET_AT]
     # The particles of a reset are drawn from the prior, as they are at the start.
     np.testing.assert_allclose(pull.track.mean[RESET_AT], [35.0, 0.0], atol=4.0 * 5.0 / np.sqrt(2000.0))
@@ -141,7 +125,7 @@ def test_nothing_to_reset_is_one_line(start):
     _, engine = start(twin())
     engine.submit(commands.Reset())
     wait_for(lambda: any("nothing to reset" in line.text for line in engine.notices.since(0)))
-    assert rows(engine) == 0
+    assert row_count(engine) == 0
 
 
 def test_last_run_is_the_first_of_the_equal_ones():
@@ -157,13 +141,13 @@ def test_options_are_kept_for_each_filter(start):
     made.options_of = lambda name: {"alpha": 0.5} if name == "ukf" else {}
     source, engine = start(made)
     source.put(readings([1.0, 2.0], [40, 41]))
-    wait_for(lambda: rows(engine) == 2)
+    wait_for(lambda: row_count(engine) == 2)
 
     def done(command):
         revision = engine.status().revision
         engine.submit(command)
         wait_for(lambda: engine.status().revision > revision and not engine.status().refolding)
-        return fresh(engine).options
+        return fresh_status(engine).options
 
     assert done(commands.SetEstimator("ukf"))["alpha"] == 0.5
     assert done(commands.SetOption("beta", 1.0))["beta"] == 1.0
@@ -176,14 +160,14 @@ def test_a_filter_that_does_not_apply_changes_nothing(start):
     made = load_twin("lorenz63", overrides={"estimator": "ekf"})
     source, engine = start(made)
     source.put(Events.one(SECOND, SECOND, READING, 0, [1.0, -1.0, 25.0], made.model.width))
-    wait_for(lambda: rows(engine) == 1)
-    before = everything(engine)
+    wait_for(lambda: row_count(engine) == 1)
+    before = pull_all(engine)
     with pytest.raises(EstimatorError, match="kf does not apply: lorenz63 is not linear"):
         command_from_json({"command": "SetEstimator", "name": "kf"}, engine)
     engine.submit(commands.SetEstimator("kf"))
     wait_for(lambda: engine.notices.counts().get("engine error") == 1)
     (line,) = [line.text for line in engine.notices.since(0) if line.level == "error"]
     assert line.startswith("estimator kf does not apply: lorenz63 is not linear") and "\n" not in line
-    status, after = fresh(engine), everything(engine)
+    status, after = fresh_status(engine), pull_all(engine)
     assert (status.estimator, status.revision, status.refolding) == ("ekf", 0, False)
     np.testing.assert_array_equal(after.track.mean, before.track.mean)

@@ -10,7 +10,7 @@ from app.cli.run import live_source
 from app.recording.reader import read_recording
 from app.session import Page, Session
 from app.twin.twin import load_twin
-from tests.app.scripted import wait_for
+from tests.app.scripted import pull_all, wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -98,13 +98,6 @@ def drag_right(page, thumb, reached):
     pytest.fail("the engine never had the slider's value")
 
 
-def track_of(engine):
-    cursor = engine.cursor()
-    pull = engine.pull(cursor)
-    engine.release(cursor)
-    return pull
-
-
 def test_a_session_on_the_page(browser, served, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     twin = load_twin("motor_winding")
@@ -147,10 +140,10 @@ def test_a_session_on_the_page(browser, served, tmp_path, monkeypatch):
     assert page.evaluate("window.nisus.revision") == 1
 
     # Drag Q: larger process noise must make a wider band on every row of the history.
-    before = track_of(engine)
+    before = pull_all(engine)
     drag_right(page, panel.get_by_role("slider").first, lambda: engine.status().tuning.get("Q.temperature") > 0.05)
     wait_for(lambda: (engine.status().tuning.get("Q.temperature") > 0.05) and not engine.status().refolding, PATIENCE)
-    after = track_of(engine)
+    after = pull_all(engine)
     assert after.revision > before.revision
     rows = len(before.events)
     assert np.all(after.track.std[10:rows, 0] > before.track.std[10:rows, 0])
@@ -160,7 +153,7 @@ def test_a_session_on_the_page(browser, served, tmp_path, monkeypatch):
 
     # Stop the recording once the source has ended, so that it holds everything.
     wait_for(lambda: engine.status().finished, PATIENCE)
-    final = track_of(engine)
+    final = pull_all(engine)
     panel.get_by_role("tab", name="Play").click()
     panel.get_by_role("button", name="Stop").click()
     wait_for(lambda: engine.status().recording is None and session.recorder.finished, PATIENCE)
@@ -177,7 +170,7 @@ def test_a_session_on_the_page(browser, served, tmp_path, monkeypatch):
     review, _ = open_review(path, Page(0, open_browser=False))
     served(review)
     wait_for(lambda: review.engine.status().finished, PATIENCE)
-    np.testing.assert_array_equal(track_of(review.engine).track.mean, final.track.mean)
+    np.testing.assert_array_equal(pull_all(review.engine).track.mean, final.track.mean)
     page = open_page(browser, review, asked)
     wait_for(lambda: drawn(page, "#rerun")["estimate"] > 200, PATIENCE)
     assert page.locator("#estimator").inner_text() == "UKF"

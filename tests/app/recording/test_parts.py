@@ -25,8 +25,9 @@ from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import Log
 from sources.memory import MemorySource
-from tests.app.scripted import MODEL, Scripted, readings, twin, wait_for
+from tests.app.scripted import MODEL, Scripted, pull_all, readings, twin, wait_for
 from tests.conftest import ROOT
+from tests.support import assert_same
 
 COUNT = 6000
 TIMES = np.arange(1, COUNT + 1) * 0.01
@@ -56,15 +57,8 @@ def start(monkeypatch):
         engine.recorder.stop()
 
 
-def rows(engine):
-    cursor = engine.cursor()
-    pull = engine.pull(cursor)
-    engine.release(cursor)
-    return pull
-
-
 def end_of(engine):
-    pull = rows(engine)
+    pull = pull_all(engine)
     return pull.first + len(pull.events)
 
 
@@ -116,14 +110,9 @@ def reviewed(recorded):
     engine.start()
     try:
         wait_for(lambda: engine.status().finished)
-        return rows(engine).track
+        return pull_all(engine).track
     finally:
         engine.stop()
-
-
-def assert_same(track, expected):
-    for name, a, b in zip(track._fields, track, expected, strict=True):
-        np.testing.assert_array_equal(a, b, err_msg=name)
 
 
 def written(path, entity="/nisus/events"):
@@ -142,7 +131,7 @@ def test_edits_add_their_tunings_and_one_drawing_of_the_history(start, tmp_path)
     for k in range(8):
         edit(engine, "Q.rate", 0.01 + 0.001 * k)
         feed(source, engine, 2000 + 100 * k, 2100 + 100 * k)
-    seen = rows(engine)
+    seen = pull_all(engine)
     stop_recording(engine)
     assert written(path) == 2800
     assert sum(len(pull.events) for pull in drawn) == 2 * 2800
@@ -164,10 +153,10 @@ def test_parts_fold_by_themselves_to_the_same_bits(estimator, start, tmp_path):
     engine.submit(commands.Record(path))
     wait_for(lambda: engine.recorder.path == path)
     feed(source, engine, 0, 5400, late=range(150, 5400, 200))
-    first = rows(engine)
+    first = pull_all(engine)
     edit(engine, "Q.rate", 0.013)
     feed(source, engine, 5400, COUNT)
-    last = rows(engine)
+    last = pull_all(engine)
     stop_recording(engine)
     assert not engine.recorder.failure
     parts = engine.recorder.finished
@@ -192,12 +181,12 @@ def test_a_session_that_forgot_its_oldest_events_reviews_to_the_same_bits(estima
     source, engine, _ = start(estimator, history=2048)
     path = tmp_path / "run.rrd"
     feed(source, engine, 0, 5400, step=100)
-    assert rows(engine).first > 0
+    assert pull_all(engine).first > 0
     engine.submit(commands.Record(path))
     wait_for(lambda: engine.recorder.path == path)
     feed(source, engine, 5400, 5600)
     stop_recording(engine)
-    seen = rows(engine)
+    seen = pull_all(engine)
     recorded = read_recording(path)
     assert recorded.first == seen.first
     # Health and age at the start look back at rows that are forgotten.
@@ -212,11 +201,11 @@ def test_an_edit_after_events_were_forgotten_reviews_to_the_same_bits(estimator,
     path = tmp_path / "run.rrd"
     engine.submit(commands.Record(path))
     feed(source, engine, 0, 5600, step=100)
-    assert rows(engine).first > 0
+    assert pull_all(engine).first > 0
     edit(engine, "Q.rate", 0.013)
     feed(source, engine, 5600, 5700)
     stop_recording(engine)
-    seen, recorded = rows(engine), read_recording(path)
+    seen, recorded = pull_all(engine), read_recording(path)
     assert_same(refold(recorded), seen.track)
 
 
@@ -266,7 +255,7 @@ def test_a_disk_that_fills_is_warned_of_and_the_recording_closed_in_time(start, 
     assert len(texts) == 2 and texts[1] == engine.recorder.failure
     recorded = read_recording(path)
     assert recorded.closed and recorded.rows == 1400
-    assert_same(refold(recorded), rows(engine).track)
+    assert_same(refold(recorded), pull_all(engine).track)
     feed(source, engine, 1400, 1500)  # the twin goes on
 
 

@@ -24,8 +24,9 @@ from estimators.fold import Fold, fold
 from estimators.log import TRUTH, Events, Log
 from estimators.track import Track
 from estimators.tuning import Tuning
-from tests.app.scripted import MODEL, SECOND, Scripted, readings, twin, wait_for
+from tests.app.scripted import MODEL, Scripted, pull_all, readings, twin, wait_for
 from tests.conftest import ROOT
+from tests.support import SECOND, assert_same
 
 
 def drawn(stream):
@@ -42,13 +43,6 @@ def running():
     yield source, engine, recorder
     engine.stop()
     recorder.stop()
-
-
-def rows(engine):
-    cursor = engine.cursor()
-    pull = engine.pull(cursor)
-    engine.release(cursor)
-    return pull
 
 
 def refold(recorded):
@@ -68,18 +62,13 @@ def steady(count):
     return fold("kf", MODEL, Tuning.of(MODEL), log, pairs=np.array([[0, 1]]))
 
 
-def assert_same(track, expected):
-    for name, a, b in zip(track._fields, track, expected, strict=True):
-        np.testing.assert_array_equal(a, b, err_msg=name)
-
-
 def test_recording_holds_history_late_readings_and_retunes(running, tmp_path):
     source, engine, recorder = running
     rng = np.random.default_rng(3)
     times = np.arange(1, 2001) * 0.01
     values = 40 + rng.normal(size=2000)
     source.put(readings(times[:500], values[:500]))
-    wait_for(lambda: len(rows(engine).events) == 500)
+    wait_for(lambda: len(pull_all(engine).events) == 500)
     path = tmp_path / "run.rrd"
     engine.submit(commands.Record(path))
     wait_for(lambda: recorder.path == path)
@@ -90,12 +79,12 @@ def test_recording_holds_history_late_readings_and_retunes(running, tmp_path):
         for k in late:
             if start <= k < start + 100:
                 source.put(readings(times[[k]], values[[k]]))
-    wait_for(lambda: len(rows(engine).events) == 2000)
+    wait_for(lambda: len(pull_all(engine).events) == 2000)
     engine.submit(commands.SetTuning("Q.rate", 0.02))
     engine.submit(commands.SetEstimator("ukf"))
     wait_for(lambda: engine.status().estimator == "ukf" and not engine.status().refolding)
-    wait_for(lambda: rows(engine).revision >= 1 and rows(engine).track.mean.shape[0] == 2000)
-    seen = rows(engine)
+    wait_for(lambda: pull_all(engine).revision >= 1 and pull_all(engine).track.mean.shape[0] == 2000)
+    seen = pull_all(engine)
     engine.submit(commands.Record(None))
     wait_for(lambda: recorder.finished == [path])
     recorded = read_recording(path)
@@ -114,7 +103,7 @@ def test_recording_holds_history_late_readings_and_retunes(running, tmp_path):
 def test_several_recordings_one_after_the_other(running, tmp_path):
     source, engine, recorder = running
     source.put(readings([1.0, 2.0], [40, 41]))
-    wait_for(lambda: len(rows(engine).events) == 2)
+    wait_for(lambda: len(pull_all(engine).events) == 2)
     for name in ("a.rrd", "b.rrd"):
         engine.submit(commands.Record(tmp_path / name))
         wait_for(lambda name=name: recorder.path == tmp_path / name)
@@ -131,7 +120,7 @@ def test_place_that_cannot_be_written_is_one_line_and_the_twin_goes_on(running, 
     wait_for(lambda: any("recording" in line.text and line.level == "error" for line in engine.notices.since(0)))
     assert recorder.path is None
     source.put(readings([1.0], [40]))
-    wait_for(lambda: len(rows(engine).events) == 1)
+    wait_for(lambda: len(pull_all(engine).events) == 1)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a recording", b"RRF2" + bytes(200)])
@@ -292,7 +281,7 @@ def test_variances_that_readings_bring_are_recorded(running, tmp_path):
         # In the file before the next come: it has parts without variances, and parts with.
         wait_for(lambda n=2 * first: recorder._open is not None and recorder._open.file.rows == n)
         history.take(engine.pull(cursor))
-    seen = rows(engine)
+    seen = pull_all(engine)
     engine.submit(commands.Record(None))
     wait_for(lambda: recorder.finished == [path])
     recorded = read_recording(path)

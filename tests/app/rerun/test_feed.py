@@ -210,13 +210,16 @@ def test_the_window_of_a_revision_comes_before_its_past(fed):
     assert fed.next() == []
 
 
-def test_events_outlive_the_recording(fed):
+def test_events_outlive_the_recording_and_say_of_which_revision_they_are(fed):
     fed.put(readings([1.0, 2.0], [40.0, 41.0]))
     fed.engine.notices.say("something happened")
     fed.next()
     fed.submit(commands.SetTuning("Q.temperature", 5.0))
     fed.next()
-    assert "something happened" in fed.column("/events", "TextLog:text")[1].ravel().tolist()
+    fed.engine.notices.say("something else happened")
+    fed.next()
+    texts = fed.column("/events", "TextLog:text")[1].ravel().tolist()
+    assert "revision 0: something happened" in texts and "something else happened" in texts
 
 
 def test_the_layout_comes_once(fed):
@@ -244,6 +247,19 @@ def test_late_readings_are_drawn_once_and_lines_do_not_go_back(fed):
     assert (times * 1e-9).tolist() == [1.0, 2.0, 2.5, 3.0, 4.0]
     assert values[:, 0].tolist() == [40.0, 41.0, 41.5, 42.0, 43.0]
     assert (fed.column("/state/temperature")[0] * 1e-9).tolist() == [1.0, 2.0, 3.0, 4.0]
+
+
+def test_a_reset_at_the_time_of_the_last_reading_is_seen_in_the_picture(fed):
+    """As after the end of a source: no event follows that would bring the next picture."""
+    fed.put(readings(np.arange(1.0, 21.0), np.full(20, 40.0)))
+    fed.next()
+    fed.engine.submit(commands.Reset())
+    wait_for(lambda: fed.events() == 21)
+    fed.next()
+    model, pair = fed.engine.model, np.array([0, 1])
+    _, values = fed.column(f"/pair/{pair_name(model, pair)}/up/mean", "Points2D:positions")
+    prior = [state.mean for state in model.states] / axis_scales(model, pair)
+    np.testing.assert_allclose(np.concatenate(values[-1]), prior, rtol=1e-6)
 
 
 def test_dates_are_dates_and_seconds_are_durations(fed):

@@ -1,4 +1,7 @@
-"""Between two revisions a real browser covers the viewer, which has neither rows nor colours of the next one yet."""
+"""Between two revisions a real browser shows the viewer's last picture, until the next one has rows and colours."""
+
+import base64
+import io
 
 import numpy as np
 import pytest
@@ -15,9 +18,30 @@ pytestmark = pytest.mark.browser
 NOTE = """() => {
     window.covered = [];
     const cover = document.getElementById("before");
-    const note = () => window.covered.push([!cover.hidden, window.nisus.viewer.announced, cover.width]);
+    const note = () => {
+        window.covered.push([!cover.hidden, window.nisus.viewer.announced]);
+        if (!cover.hidden) window.picture = cover.toDataURL();
+    };
     new MutationObserver(note).observe(cover, { attributes: true, attributeFilter: ["hidden"] });
 }"""
+
+
+def colours(png):
+    from PIL import Image
+
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
+
+
+def at_rest(page):
+    """What a person sees of the viewer, once two looks at it are alike."""
+    box, looks = page.locator("#rerun").bounding_box(), []
+
+    def alike():
+        looks.append(page.screenshot(clip=box, timeout=PATIENCE * 1000))
+        return len(looks) > 1 and looks[-1] == looks[-2]
+
+    wait_for(alike, PATIENCE)
+    return colours(looks[-1])
 
 
 def test_the_viewer_is_covered_until_it_has_drawn_the_next(browser):  # noqa: F811
@@ -33,12 +57,16 @@ def test_the_viewer_is_covered_until_it_has_drawn_the_next(browser):  # noqa: F8
         page.goto(server.url, timeout=PATIENCE * 1000)
         until(page, "window.nisus?.drawn > 0")
         page.evaluate(NOTE)
+        before = at_rest(page)
         engine.submit(commands.SetTuning("Q.temperature", 0.5))
         wait_for(lambda: engine.status().revision == 1, PATIENCE)
         until(page, "window.nisus.revision === 1 && !window.nisus.viewer.announced && window.covered.length > 1")
         covered = page.evaluate("window.covered")
         assert [shown for shown, *_ in covered] == [True, False]
-        assert not covered[-1][1] and covered[0][2] > 0
+        assert not covered[-1][1]
+        held = colours(base64.b64decode(page.evaluate("window.picture").partition(",")[2]))
+        assert held.shape == before.shape and before.std() > 5
+        assert np.mean(np.abs(held - before).max(axis=-1) > 32) < 0.01
     finally:
         page.context.close()
         engine.stop()

@@ -13,7 +13,7 @@ from app.engine import commands
 from app.engine.engine import Engine
 from app.server.server import PageServer
 from estimators.errors import ConfigError
-from tests.app.scripted import Scripted, readings, wait_for
+from tests.app.scripted import Scripted, pull_all, readings, wait_for
 from tests.app.served import PATIENCE, SECRET, Client, FakeViser, shown_twin
 
 STREAM = "/rerun/stream"
@@ -330,13 +330,6 @@ class Viewer:
         return t[order], np.concatenate([part[1] for part in parts])[order]
 
 
-def track(engine):
-    cursor = engine.cursor()
-    pull = engine.pull(cursor)
-    engine.release(cursor)
-    return pull
-
-
 def test_the_feed_holds_the_track_and_the_next_revision_replaces_it(page, tmp_path):
     t = np.arange(1, 51) * 0.5
     page.source.put(readings(t, 40 + t))
@@ -346,7 +339,7 @@ def test_the_feed_holds_the_track_and_the_next_revision_replaces_it(page, tmp_pa
         viewer = Viewer(connection, tmp_path)
         viewer.until(lambda: viewer.column(state)[0].size >= 50)
         times, values = viewer.column(state)
-        pull = track(page.engine)
+        pull = pull_all(page.engine)
         np.testing.assert_array_equal(times, pull.events.t)
         np.testing.assert_array_equal(values[:, 0], pull.track.mean[:, 0])
         # Two roundings of numbers below 100 lie between the bounds and the standard deviation.
@@ -360,7 +353,7 @@ def test_the_feed_holds_the_track_and_the_next_revision_replaces_it(page, tmp_pa
         page.engine.submit(commands.SetTuning("Q.rate", 3.0))
         viewer.until(lambda: len(viewer.recordings) == 2 and viewer.column(state)[0].size >= 100)
         assert viewer.names[0] != viewer.names[1]
-        np.testing.assert_array_equal(viewer.column(state)[1][:, 0], track(page.engine).track.mean[:, 0])
+        np.testing.assert_array_equal(viewer.column(state)[1][:, 0], pull_all(page.engine).track.mean[:, 0])
         viewer.until(lambda: viewer.column(f"/previous{state}")[0].size >= 100)
         grey, old = viewer.column(f"/previous{state}")[1], viewer.column(state, which=0)[1]
         np.testing.assert_array_equal(grey[:, 0], old[:, 0])
@@ -378,7 +371,7 @@ def test_a_viewer_that_stops_reading_costs_nobody_anything(page, tmp_path):
             page.source.put(batch)
             sent += len(batch)
             viewer.until(lambda: (t := viewer.column(state)[0]).size and t[-1] == batch.t[-1])  # noqa: B023
-        assert len(track(page.engine).events) == sent
+        assert len(pull_all(page.engine).events) == sent
         # The stuck one was given one picture, and asked for no other: there is no queue for it that grows.
         pictures = 0
         while True:

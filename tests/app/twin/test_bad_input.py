@@ -25,8 +25,9 @@ from estimators.models import MODELS
 from estimators.registry import ESTIMATORS, unfit
 from estimators.track import DIVERGED, FAILED, GATED, USED
 from estimators.tuning import Tuning
-from tests.app.scripted import SECOND, Scripted, wait_for
+from tests.app.scripted import Scripted, pull_all, wait_for
 from tests.conftest import ROOT
+from tests.support import SECOND
 
 BAD = {
     "no particles": ("pf", "particles", 0.0, "particles is 0; it must lie between 2 and"),
@@ -58,13 +59,6 @@ def start():
 
 def reading(model, second, values):
     return Events.one(round(second * SECOND), round(second * SECOND), READING, 0, values, model.width)
-
-
-def rows(engine):
-    cursor = engine.cursor()
-    pull = engine.pull(cursor)
-    engine.release(cursor)
-    return pull
 
 
 def errors(engine):
@@ -99,7 +93,7 @@ def test_an_option_that_cannot_be_is_one_line_and_changes_nothing(case, way, sta
         one_line(str(caught.value), expected)
         return
     source.put(reading(engine.model, 1.0, [40.0]))
-    wait_for(lambda: len(rows(engine).events) == 1)
+    wait_for(lambda: len(pull_all(engine).events) == 1)
     estimator, options = engine.status().estimator, engine.status().options
     from_the_page(engine, option, value)
     wait_for(lambda: errors(engine))
@@ -108,10 +102,10 @@ def test_an_option_that_cannot_be_is_one_line_and_changes_nothing(case, way, sta
     wait_for(lambda: not engine.status().refolding)
     engine._status = None
     assert (engine.status().estimator, engine.status().options) == (estimator, options)
-    assert rows(engine).revision == 0
+    assert pull_all(engine).revision == 0
     source.put(reading(engine.model, 2.0, [41.0]))
-    wait_for(lambda: len(rows(engine).events) == 2)
-    assert rows(engine).track.verdict[1] == USED
+    wait_for(lambda: len(pull_all(engine).events) == 2)
+    assert pull_all(engine).track.verdict[1] == USED
 
 
 def with_option(way, name, option, value):
@@ -216,8 +210,8 @@ def test_particles_that_all_weigh_nothing_recover_and_it_is_said(name, start):
     source, engine = start(load_twin("motor_winding", overrides={"estimator": name}))
     for second, value in enumerate([40.0, 1e200, 41.0, 40.5, 39.5], start=1):
         source.put(reading(engine.model, second, [value]))
-    wait_for(lambda: len(rows(engine).events) == 5)
-    track = rows(engine).track
+    wait_for(lambda: len(pull_all(engine).events) == 5)
+    track = pull_all(engine).track
     assert track.verdict.tolist() == [USED, FAILED, USED, USED, USED]
     assert np.isfinite(track.mean).all() and abs(track.mean[-1, 0] - 40.0) < 5.0
     wait_for(lambda: engine.status().counts.get("recovered") == 1)
@@ -232,10 +226,10 @@ def test_an_estimate_that_is_no_number_stays_off_the_page(twin, start):
     source, engine = start(made)
     model = engine.model
     source.put(reading(model, 1.0, model.prior_mean[: len(model.sensors[0].rows)]))
-    wait_for(lambda: len(rows(engine).events) == 1)
+    wait_for(lambda: len(pull_all(engine).events) == 1)
     engine._fold._state[:] = np.nan
     source.put(reading(model, 1.1, model.prior_mean[: len(model.sensors[0].rows)]))
-    wait_for(lambda: len(rows(engine).events) == 2)
+    wait_for(lambda: len(pull_all(engine).events) == 2)
     view = ViserView(engine, secret="s3cret")
     try:
         view.frame()
@@ -249,8 +243,8 @@ def test_an_estimate_that_is_no_number_stays_off_the_page(twin, start):
             if isinstance(node, viser.SceneNodeHandle):
                 assert np.isfinite([*node.position, *node.wxyz]).all()
         engine.submit(commands.Reset())
-        wait_for(lambda: len(rows(engine).events) == 3)
-        assert np.isfinite(rows(engine).track.mean[2]).all()
+        wait_for(lambda: len(pull_all(engine).events) == 3)
+        assert np.isfinite(pull_all(engine).track.mean[2]).all()
     finally:
         view.stop()
 

@@ -7,9 +7,10 @@ from app.twin.twin import load_twin
 from config.loader import TWINS, shipped
 from estimators.errors import SourceError
 from estimators.fold import fold
-from estimators.log import READING, Events, Log, truth_of
+from estimators.log import READING, Events, truth_of
 from estimators.track import GATED, USED, Track
 from tests.conftest import absent
+from tests.support import as_log, read_all
 
 
 def folded(name: str) -> tuple[Events, Track]:
@@ -20,9 +21,7 @@ def folded(name: str) -> tuple[Events, Track]:
         if "is not there" in str(error):
             absent(str(error))
         raise
-    log = Log(twin.model.width)
-    while (batch := source.read(1.0)) is not None:
-        log.extend(batch)
+    log = as_log(read_all(source))
     source.close()
     return log.events, fold(twin.estimator, twin.model, twin.tuning, log)
 
@@ -35,9 +34,7 @@ def test_a_million_cells_fold() -> None:
     for name in HUGE:
         twin = load_twin(name, overrides={"source.duration": "2"})
         source = twin.open_source(lambda key, text: None)
-        log = Log(twin.model.width)
-        while (batch := source.read(1.0)) is not None:
-            log.extend(batch)
+        log = as_log(read_all(source))
         tuning = twin.tuning.with_options({"members": 3, "radius": 0.5})
         track = fold(twin.estimator, twin.model, tuning, log)
         assert np.sum(track.verdict == USED) == 2

@@ -8,6 +8,7 @@ from app.twin.twin import Twin, load_twin
 from estimators.errors import ConfigError, NisusError, SourceError
 from estimators.log import INPUT, READING, TRUTH, Events
 from estimators.models import MODELS
+from tests.support import read_all
 
 DBC = """\
 VERSION ""
@@ -67,11 +68,9 @@ def twin_of(text: str, **options: object) -> Twin:
 def events(twin: Twin, *, live: bool = False) -> Events:
     reports: list[tuple[str, str]] = []
     source = twin.open_source(lambda key, text: reports.append((key, text)), live=live)
-    batches = []
-    while (batch := source.read(1.0)) is not None:
-        batches.append(batch)
+    events = read_all(source)
     source.close()
-    return Events.concat(batches, twin.model.width)
+    return events
 
 
 def of(batch: Events, kind: int) -> Events:

@@ -21,7 +21,7 @@ from app.viser.rows import PATIENCE
 from app.viser.vehicle_scene import VehicleScene
 from app.viser.view import ViserView
 from config.schema import SceneSection, ViewSection
-from estimators.log import READING, TRUTH, Events
+from estimators.log import READING, RESET, TRUTH, Events
 from estimators.models import MODELS
 from estimators.numerics.peaks import Peak
 from tests.app.fake_engine import FakeEngine, events
@@ -297,6 +297,19 @@ def test_chart_holds_band_mean_readings_truth_and_previous(view, engine):
     np.testing.assert_allclose(np.sort(reading[np.isfinite(reading)]), np.sort(readings.value[used, 0]))
     np.testing.assert_allclose(np.unique(truth), np.unique(readings.value[~used, 0]))
     np.testing.assert_allclose(np.unique(previous.round(9)), np.unique(before[:, 0].round(9)))
+
+
+@pytest.mark.parametrize("window", ["10 s", "all"])
+def test_a_reset_at_the_time_of_the_last_reading_ends_the_line(window, view, engine):
+    """As after the end of a source: the line and its band end at the prior, not where they were before."""
+    view._wanted_window = window
+    view.frame()
+    engine.put(events(WINDING, RESET, 0, [engine.state.t * 1e-9], np.zeros((1, 0))))
+    view.frame()
+    for j, state in enumerate(WINDING.states):
+        _, high, low, *_, mean, _, _ = view.charts._charts[j].data
+        ends = mean[-1], high[-1], low[-1]
+        assert ends == pytest.approx((state.mean, state.mean + 2 * state.std, state.mean - 2 * state.std))
 
 
 def test_chart_shows_the_window_only(view, engine):

@@ -17,9 +17,8 @@ from estimators.registry import ESTIMATORS, find_estimator, unfit
 from estimators.track import DIVERGED, FAILED, NONE
 from estimators.tuning import Tuning
 from tests.estimators.ensemble.blocks import BOX, ONE, both_block, f_block
-from tests.estimators.test_fold import identical
+from tests.support import assert_same, log_of
 
-SECOND = 1_000_000_000
 COMPILED = [name for name, entry in ESTIMATORS.items() if entry.blocks is not None]
 
 
@@ -52,14 +51,14 @@ def test_compiled_filters_give_the_bits_of_the_compiled_model(name):
     options = {"members": 30.0} if ESTIMATORS[name].family == "ensemble" else {"particles": 300.0}
     log = some_log()
     one, box = (fold(name, m, Tuning.of(m).with_options(options), log) for m in (ONE, BOX))
-    identical(box, one)
+    assert_same(box, one)
     assert np.all(np.isfinite(box.mean))
 
 
 @pytest.mark.parametrize("name", ["filterpy-ukf", "filterpy-enkf"])
 def test_filterpy_without_derivatives_gives_the_bits_of_the_compiled_model(name):
     log = some_log()
-    identical(*(fold(name, m, Tuning.of(m), log) for m in (BOX, ONE)))
+    assert_same(*(fold(name, m, Tuning.of(m), log) for m in (BOX, ONE)))
 
 
 def test_filterpy_ekf_differentiates_the_block():
@@ -78,7 +77,7 @@ def test_executors_split_the_block_and_change_nothing(executor):
     log = some_log(12)
     split = replace(BOX, executor=executor)
     tuning = Tuning.of(BOX).with_options({"members": 31.0})
-    identical(fold("enkf", split, tuning, log), fold("enkf", BOX, tuning, log))
+    assert_same(fold("enkf", split, tuning, log), fold("enkf", BOX, tuning, log))
 
 
 def test_an_executor_gets_pieces():
@@ -267,7 +266,7 @@ def test_a_reading_whose_h_fails_is_as_one_without_a_value(name):
     # Once it answers again, a refold knows nothing of it.
     growing.rewind(0)
     growing.advance()
-    identical(growing.track, fold(name, BOX, few(name), some_log(40)))
+    assert_same(growing.track, fold(name, BOX, few(name), some_log(40)))
 
 
 @pytest.mark.parametrize("name", ANY)
@@ -305,18 +304,15 @@ def test_an_f_that_fails_half_way_keeps_the_steps_that_were_made():
             raise OSError("the licence server is away")
         return f_block(X, u, p, dt)
 
-    def log_of(*events):
-        log = Log(ONE.width)
-        for seconds, kind, values in ((0.0, READING, [0.2, 0.1]), *events):
-            log.extend(Events.one(round(seconds * SECOND), 0, kind, 0, values, ONE.width))
-        return log
-
+    first = (0.0, READING, [0.2, 0.1])
     model = replace(BOX, f=second_fails)
-    growing = Fold("filterpy-ukf", model, Tuning.of(BOX), log_of((0.4, INPUT, [2.0]), (0.5, READING, [0.3, 0.2])))
+    growing = Fold(
+        "filterpy-ukf", model, Tuning.of(BOX), log_of(ONE.width, first, (0.4, INPUT, [2.0]), (0.5, READING, [0.3, 0.2]))
+    )
     calls.clear()
     growing.advance()
     assert growing.failures == 1 and np.isnan(growing.track.mean[1, 0])
-    steps = log_of((0.4 / 3, INPUT, [2.0]), (0.5, READING, [0.3, 0.2]))
+    steps = log_of(ONE.width, first, (0.4 / 3, INPUT, [2.0]), (0.5, READING, [0.3, 0.2]))
     expected = fold("filterpy-ukf", BOX, Tuning.of(BOX), steps)
     np.testing.assert_allclose(growing.track.mean[2], expected.mean[2], rtol=1e-8)
     np.testing.assert_allclose(growing.track.std[2], expected.std[2], rtol=1e-8)

@@ -11,7 +11,7 @@ from estimators.model.correlation import correlation_of, covariance_of
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
 from sources.simulation.simulator import Simulator
-from tests.sources.can.can_tools import read_all
+from tests.support import read_all
 
 C = ((1.0, 0.6, -0.3), (0.6, 1.0, 0.2), (-0.3, 0.2, 1.0))
 

@@ -14,8 +14,7 @@ from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, S
 from estimators.track import FAILED
 from estimators.tuning import Tuning
 from tests.estimators.ensemble.blocks import BOX, both_block, f_block
-
-SECOND = 1_000_000_000
+from tests.support import SECOND
 
 
 def drift(x, u, p, dt, out):

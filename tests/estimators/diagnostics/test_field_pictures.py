@@ -12,6 +12,7 @@ from estimators.model.field import Field
 from estimators.models.thermal_field import thermal_field
 from estimators.tuning import Tuning
 from sources.simulation.simulator import Simulator
+from tests.support import read_all
 
 MODEL = thermal_field(12, 9, 2)
 SECONDS = 24
@@ -21,10 +22,7 @@ EVERY = 4
 @pytest.fixture(scope="module")
 def events():
     source = Simulator(MODEL, seed=3, step=1.0, duration=SECONDS, truth_every=EVERY)
-    batches = []
-    while (batch := source.read(0.0)) is not None:
-        batches.append(batch)
-    return Events.concat(batches, MODEL.width)
+    return read_all(source)
 
 
 def growing(log, picture=2.0):
@@ -43,7 +41,7 @@ def folded(events, cuts=(), picture=2.0):
     return fold
 
 
-def assert_same(ours, theirs):
+def assert_same_pictures(ours, theirs):
     assert len(ours) == len(theirs)
     for a, b in zip(ours, theirs, strict=True):
         for name, x, y in zip(Picture._fields, a, b, strict=True):
@@ -55,8 +53,8 @@ def test_pictures_do_not_depend_on_how_the_log_came(events):
     # Every second second ends a period, and every fourth the truth was told: 3, 4, 5, 7, 8, ... (0 is a tick's).
     times = sorted({*range(1, SECONDS, 2), *range(EVERY, SECONDS, EVERY)})
     assert [picture.t // 10**9 for picture in whole] == times
-    assert_same(folded(events, range(1, len(events))).pictures.taken, whole)
-    assert_same(folded(events, [7, 40, 41, 100]).pictures.taken, whole)
+    assert_same_pictures(folded(events, range(1, len(events))).pictures.taken, whole)
+    assert_same_pictures(folded(events, [7, 40, 41, 100]).pictures.taken, whole)
 
 
 def test_a_late_reading_takes_the_pictures_behind_it_again(events):
@@ -72,7 +70,7 @@ def test_a_late_reading_takes_the_pictures_behind_it_again(events):
     fold.advance()
     fresh = growing(log)
     fresh.advance()
-    assert_same(fold.pictures.taken, fresh.pictures.taken)
+    assert_same_pictures(fold.pictures.taken, fresh.pictures.taken)
     changed = [bool((a.mean != b.mean).any()) for a, b in zip(before, fresh.pictures.taken, strict=True)]
     assert changed == [picture.t >= 9 * 10**9 for picture in before]
 
@@ -121,7 +119,7 @@ def test_what_is_forgotten_in_front_takes_its_pictures_along(events):
         count = 60
     expected = [picture for picture in fold.pictures.taken if picture.before >= count]
     fold.drop_front(count)
-    assert_same(fold.pictures.taken, expected)
+    assert_same_pictures(fold.pictures.taken, expected)
 
 
 def test_a_large_field_is_averaged_over_squares_the_last_ones_smaller():

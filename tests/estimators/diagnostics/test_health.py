@@ -15,8 +15,8 @@ from estimators.models import MODELS
 from estimators.registry import ESTIMATORS
 from estimators.track import DEGRADED, DIVERGED, FAILED, GATED, HELD_OUT, MISSING, NONE, STALE, TRACKING, USED, Track
 from estimators.tuning import Tuning
+from tests.support import SECOND
 
-SECOND = 1_000_000_000
 MOTOR = MODELS["motor_winding"]
 F = np.array([[1.0, 1.0], [0.0, 1.0]])
 Q = np.diag([0.01, 0.001])

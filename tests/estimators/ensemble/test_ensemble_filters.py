@@ -18,18 +18,12 @@ from estimators.numerics.random import key_of, normal
 from estimators.snapshots import Base
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, JointGaussian, random_linear, random_log
+from tests.support import log_of
 
 NAMES = ["enkf", "etkf", "ensrf", "letkf"]
 EXACT = ["etkf", "ensrf", "letkf"]
 LOCAL = ["enkf", "ensrf", "letkf"]
 MATRICES = random_linear(np.random.default_rng(3), 4, 1)
-
-
-def log_of(width, *events):
-    log = Log(width)
-    for event in events:
-        log.extend(Events.one(*event, width))
-    return log
 
 
 def members_of(fold):
@@ -40,7 +34,7 @@ def members_of(fold):
 def analysed(name, model, options, sensor, y, seed=0):
     """Members before and after one reading at the time of the prior, and the fold."""
     tuning = replace(Tuning.of(model).with_options(options), seed=seed)
-    fold = Fold(name, model, tuning, log_of(model.width, (0, 0, READING, sensor, y)))
+    fold = Fold(name, model, tuning, log_of(model.width, (0, READING, y, sensor)))
     before = members_of(fold)
     fold.advance()
     return before, members_of(fold), fold
@@ -195,7 +189,7 @@ def test_missing_rows_gate_and_held_out(name):
     assert fold.track.dof[0] == 2
     assert np.isnan(fold.track.innovation[0, 1])
     for tuning in (Tuning.of(model).set("gate", 0.5), Tuning.of(model).set("use.third", False)):
-        far = log_of(model.width, (0, 0, READING, 2, [1e3, 1e3, 1e3]))
+        far = log_of(model.width, (0, READING, [1e3, 1e3, 1e3], 2))
         refused = Fold(name, model, tuning.with_options({"members": 30}), far)
         refused.advance()
         np.testing.assert_array_equal(members_of(refused), before)

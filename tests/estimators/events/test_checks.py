@@ -10,8 +10,7 @@ from estimators.model.state_space import Input, Noise, Row, Sensor, State, State
 from estimators.models import MODELS
 from estimators.snapshots import Base
 from estimators.tuning import Tuning
-
-SECOND = 1_000_000_000
+from tests.support import SECOND
 
 
 def still(x, u, p, dt, out):

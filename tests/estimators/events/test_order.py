@@ -8,9 +8,8 @@ from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events, Log
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, random_linear
-from tests.estimators.test_fold import identical
+from tests.support import SECOND, assert_same
 
-SECOND = 1_000_000_000
 MODEL = random_linear(np.random.default_rng(1), 3, 2).model
 WIDTH = MODEL.width
 RANK = {INPUT: 0, READING: 1, TRUTH: 2, TICK: 3, RESET: 4}
@@ -90,7 +89,7 @@ def test_any_order_of_arrival_gives_the_same_bits(name):
             growing.rewind(changed)
             growing.advance()
         assert rewound > 0 or len(log.t) == 1
-        identical(growing.track, expected)
+        assert_same(growing.track, expected)
 
 
 def test_inputs_hold_for_the_readings_of_their_time_and_a_reset_comes_last():

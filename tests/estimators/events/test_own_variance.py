@@ -14,9 +14,9 @@ from estimators.models import MODELS
 from estimators.registry import ESTIMATORS, unfit
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear
-from tests.estimators.test_fold import identical, in_python
+from tests.estimators.test_fold import in_python
+from tests.support import SECOND, assert_same
 
-SECOND = 1_000_000_000
 PLAIN = random_linear(np.random.default_rng(5), 3, 2).model
 COARSE, FINE = (4.0, 9.0), (0.25, 0.04)
 
@@ -70,7 +70,7 @@ def test_the_same_bits_as_a_sensor_tuned_to_it(name, monkeypatch):
     assert own.has_variances and not fine.has_variances
     tuning = Tuning.of(MODEL).with_options(options(name))
     track, expected = (fold(name, MODEL, tuning, log) for log in (own, fine))
-    identical(track, expected)
+    assert_same(track, expected)
     # And it matters: with the coarse variances alone the estimate is another.
     plain = Log.of(MODEL)
     plain.extend(own.events._replace(value=own.events.value[:, : MODEL.width]))
@@ -87,7 +87,7 @@ def test_the_tuned_variances_are_back_afterwards(name):
     growing = Fold(name, MODEL, tuning, own)
     while growing.advance(1):
         pass
-    identical(growing.track, whole)
+    assert_same(growing.track, whole)
     np.testing.assert_array_equal(tuning.r, before)
     np.testing.assert_array_equal(growing._held["r"], before)
 

@@ -11,8 +11,8 @@ from estimators.registry import ESTIMATORS, find_estimator
 from estimators.track import FAILED, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import JointGaussian, random_linear, random_log
+from tests.support import SECOND
 
-SECOND = 1_000_000_000
 SINGULAR = [name for name, entry in ESTIMATORS.items() if entry.singular]
 
 

@@ -14,8 +14,8 @@ from estimators.track import USED
 from estimators.tuning import Tuning
 from tests.estimators.interpreted.test_filterpy import PENDULUM
 from tests.estimators.linear_models import random_linear
+from tests.support import SECOND
 
-SECOND = 1_000_000_000
 MOTOR = MODELS["motor_winding"]
 F, H, R = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 0.0]]), 4.0
 Q = np.diag([0.01, 0.001])

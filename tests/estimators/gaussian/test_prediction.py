@@ -10,8 +10,8 @@ from estimators.models import MODELS
 from estimators.registry import ESTIMATORS
 from estimators.track import MISSING, USED
 from estimators.tuning import Tuning
+from tests.support import SECOND, log_of
 
-SECOND = 1_000_000_000
 # The gain of the first readings of kf-steady is another.
 NAMES = [name for name, entry in ESTIMATORS.items() if entry.family == "Gaussian" and name != "kf-steady"]
 
@@ -60,16 +60,8 @@ def model(f, h=itself, *, states=1, std=0.5, mean=0.0, q=0.02, r=0.0025, circula
     )
 
 
-def log_of(*events):
-    """(seconds, kind, value) as a log."""
-    log = Log(1)
-    for t, kind, value in events:
-        log.extend(Events.one(round(t * SECOND), 0, kind, 0, value, 1))
-    return log
-
-
 def run(estimator, model, *events):
-    folded = Fold(estimator, model, Tuning.of(model), log_of(*events))
+    folded = Fold(estimator, model, Tuning.of(model), log_of(1, *events))
     folded.advance()
     return folded
 
@@ -163,9 +155,9 @@ def test_purity_where_jacobians_are_differences(estimator):
     times = np.cumsum(rng.choice([0.1, 0.1, 0.1, 0.35], 400))
     events = [(t, READING, 50 * 0.965**t + rng.normal(0, 0.05)) for t in times]
     tuning = Tuning.of(guarded_model)
-    whole = fold(estimator, guarded_model, tuning, log_of(*events))
+    whole = fold(estimator, guarded_model, tuning, log_of(1, *events))
     late = 300
-    log = log_of(*events[:late], *events[late + 1 :])
+    log = log_of(1, *events[:late], *events[late + 1 :])
     growing = Fold(estimator, guarded_model, tuning, log)
     growing.advance()
     t, kind, value = events[late]

@@ -14,8 +14,8 @@ from estimators.registry import ESTIMATORS
 from estimators.track import GATED, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, random_linear, random_log
+from tests.support import SECOND, log_of
 
-SECOND = 1_000_000_000
 NAMES = [name for name, entry in ESTIMATORS.items() if entry.family == "Gaussian" and name != "kf-steady"]
 P, R = 4.0, 0.25
 
@@ -63,17 +63,14 @@ PLANE = StateSpaceModel(
 )
 
 
-def log_of(values, *, step=1.0):
-    width = np.size(values[0])
-    log = Log(width)
-    batch = [Events.one(round(k * step * SECOND), 0, READING, 0, value, width) for k, value in enumerate(values)]
-    log.extend(Events.concat(batch, width))
-    return log
+def readings_of(values, *, step=1.0):
+    """A log of one reading after the other, `step` seconds apart."""
+    return log_of(np.size(values[0]), *((k * step, READING, value) for k, value in enumerate(values)))
 
 
 def folded(estimator, model, values, options, *, step=1.0, gate=None):
     tuning = Tuning.of(model).with_options(options).set("gate", gate)
-    fold = Fold(estimator, model, tuning, log_of(values, step=step))
+    fold = Fold(estimator, model, tuning, readings_of(values, step=step))
     fold.advance()
     return fold
 
@@ -262,7 +259,7 @@ def test_only_readings_that_were_used_adapt(estimator):
     fold_without = folded(estimator, model(q=0.01), [0.1, np.nan, 0.2, np.nan, 0.3], options, gate=0.99)
     np.testing.assert_array_equal(fold._state, fold_without._state)
     tuning = Tuning.of(model()).with_options(options).set("use.y", False)
-    held_out = Fold(estimator, model(), tuning, log_of([0.5, 9.0]))
+    held_out = Fold(estimator, model(), tuning, readings_of([0.5, 9.0]))
     held_out.advance()
     np.testing.assert_array_equal(held_out._state[-2:], [R, R])
 
@@ -317,7 +314,7 @@ def test_a_reset_forgets(estimator):
     assert fold._state[-1] != R
     from estimators.log import RESET
 
-    log = log_of([0.0, 3.0, -4.0])
+    log = readings_of([0.0, 3.0, -4.0])
     log.extend(Events.one(5 * SECOND, 0, RESET, 0, [], 1))
     fold = Fold(estimator, model(q=0.01), Tuning.of(model(q=0.01)).with_options(options), log)
     fold.advance()

@@ -15,8 +15,8 @@ from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, S
 from estimators.track import FAILED, USED
 from estimators.tuning import Tuning
 from tests.estimators.interpreted.test_filterpy import PENDULUM, log  # noqa: F401  the fixture
+from tests.support import SECOND
 
-SECOND = 1_000_000_000
 FILTERPY = ["filterpy-kf", "filterpy-ekf", "filterpy-ukf"]
 EVERYTHING = [
     {},

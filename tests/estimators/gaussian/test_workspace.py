@@ -14,8 +14,8 @@ from estimators.numerics.simd_ir import padded
 from estimators.numerics.workspace import layout, size_of, start_of, take_matrix, take_vector
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
+from tests.support import SECOND
 
-SECOND = 1_000_000_000
 NAMES = [name for name, entry in ESTIMATORS.items() if entry.family == "Gaussian"]
 SIZES = [(1, 4), (2, 1), (5, 9), (9, 3), (17, 5)]
 OPTIONS = [{}, {"joseph": 0}, {"robust": 1}, {"robust": 2, "adapt": 1}, {"adapt": 2, "inflation": 1.1}]

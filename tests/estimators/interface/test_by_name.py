@@ -15,9 +15,8 @@ from estimators.fold import fold as fold_track
 from estimators.log import INPUT, READING, TICK, TRUTH, Events
 from estimators.track import HELD_OUT, USED
 from estimators.tuning import Tuning
-from tests.estimators.test_fold import identical
+from tests.support import SECOND, assert_same
 
-SECOND = 1_000_000_000
 MOTOR = MODELS["motor_winding"]
 DRIVE = MODELS["motor_drive"]
 ROAD = MODELS["road_car"]
@@ -37,7 +36,7 @@ def test_it_is_the_fold_of_events_and_a_tuning():
     tuning = Tuning.of(MOTOR).set("R.winding", 9.0).set("gate", 0.99).with_options({"alpha": 0.5})
     expected = fold_track("ukf", MOTOR, tuning, log)
     got = fold("ukf", MOTOR, motor_log(), R={"winding": 9.0}, gate=0.99, alpha=0.5)
-    identical(got.track, expected)
+    assert_same(got.track, expected)
     np.testing.assert_array_equal(got.seconds, [1.0, 2.0, 3.0, 4.0, 5.0])
     assert got.log_likelihood == pytest.approx(np.nansum(expected.log_likelihood))
 
@@ -153,7 +152,7 @@ def test_words_for_choices():
     by_word = fold("pf", MOTOR, log, seed=3, resampling="stratified", particles=100)
     by_number = fold("pf", MOTOR, log, seed=3, resampling=by_word.tuning.options["resampling"], particles=100)
     assert isinstance(by_word.tuning.options["resampling"], float)
-    identical(by_word.track, by_number.track)
+    assert_same(by_word.track, by_number.track)
     other = fold("pf", MOTOR, log, seed=4, resampling="stratified", particles=100)
     assert not np.array_equal(other.mean, by_word.mean)
 
@@ -263,7 +262,7 @@ def test_many_seeds_are_the_folds_one_by_one(executor):
     many = fold_many("pf", MOTOR, log, seeds=range(5), executor=pool, particles=50)
     for seed, track in enumerate(many):
         assert track.tuning.seed == seed
-        identical(track.track, fold("pf", MOTOR, log, seed=seed, particles=50).track)
+        assert_same(track.track, fold("pf", MOTOR, log, seed=seed, particles=50).track)
     if executor == "own":
         assert pool.submit(int, 3).result() == 3
         pool.shutdown()
@@ -275,7 +274,7 @@ def test_several_logs_and_processes():
     assert [track.tuning.seed for track in many] == [1, 2, 1, 2]
     expected = [fold("enkf", MOTOR, log, seed=seed, members=10) for log in logs for seed in (1, 2)]
     for a, b in zip(many, expected, strict=True):
-        identical(a.track, b.track)
+        assert_same(a.track, b.track)
 
 
 def test_the_import_loads_no_numerics():

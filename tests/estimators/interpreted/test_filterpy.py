@@ -23,8 +23,8 @@ from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, random_linear
+from tests.support import SECOND
 
-SECOND = 1_000_000_000
 Q = np.array([0.02, 0.05, 0.01])
 R = (np.array([0.04]), np.array([0.09, 0.25]))
 P0 = np.array([0.5, 0.8, 0.3])

@@ -12,9 +12,9 @@ from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceMo
 from estimators.track import FAILED, GATED, HELD_OUT, MISSING, USED
 from estimators.tuning import Tuning
 from tests.estimators.interpreted.test_filterpy import PENDULUM, log  # noqa: F401  log is a fixture
-from tests.estimators.test_fold import MODEL, as_log, everything, identical
+from tests.estimators.test_fold import MODEL, everything
+from tests.support import SECOND, as_log, assert_same
 
-SECOND = 1_000_000_000
 PAIRS = np.array([[0, 1], [0, 2], [1, 2]])
 
 
@@ -130,7 +130,7 @@ def test_enkf_draws_by_seed_and_leaves_the_global_generator_alone():
         pieces.advance()
     pieces.rewind(60)
     pieces.advance()
-    identical(pieces.track, one)
+    assert_same(pieces.track, one)
     other = fold("filterpy-enkf", MODEL, replace(tuning, seed=1), as_log(events))
     assert np.mean(other.mean != one.mean) > 0.9  # all but the resets, which give the prior's draw
 

@@ -10,9 +10,8 @@ from estimators.fold import LONGEST, Fold, fold
 from estimators.log import TICK, Events, Log
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear
-from tests.estimators.test_fold import MODEL, as_log, everything, identical, in_python
-
-SECOND = 1_000_000_000
+from tests.estimators.test_fold import MODEL, everything, in_python
+from tests.support import SECOND, as_log, assert_same
 
 
 @pytest.mark.parametrize("name", ["kf", "ekf", "ukf", "sr-ekf", "enkf", "pf"])
@@ -22,7 +21,7 @@ def test_the_python_loop_gives_the_bits_of_the_kernel(name, monkeypatch):
     tuning = Tuning.of(MODEL).set("gate", 0.97).set("use.second", False)
     pairs = np.array([[0, 1], [2, 1]])
     compiled, python = (fold(n, MODEL, tuning, as_log(events), pairs=pairs) for n in (name, f"{name}-python"))
-    identical(python, compiled)
+    assert_same(python, compiled)
     assert len(np.unique(compiled.verdict)) == 5  # none, used, gated, held out, missing: all were compared
 
 
@@ -35,7 +34,7 @@ def test_long_gaps_are_split_and_end_at_the_prior_as_in_the_kernel(name, monkeyp
     tick = Events.one(int(times[3]) + 1, 0, TICK, 0, (), 3)
     log = as_log(Events.concat([*readings, tick], 3))
     compiled, python = (fold(n, model, Tuning.of(model), log) for n in (name, f"{name}-python"))
-    identical(python, compiled)
+    assert_same(python, compiled)
     # Behind the gap the reading meets the prior again.
     np.testing.assert_array_equal(compiled.innovation_std[5], compiled.innovation_std[0])
 

@@ -13,6 +13,7 @@ from estimators.models.thermal_field import thermal_field
 from estimators.numerics.smoothed_noise import smooth
 from estimators.tuning import Tuning
 from sources.simulation.simulator import Simulator
+from tests.support import as_log, read_all
 
 
 def test_cells_have_names_places_and_a_prior():
@@ -80,9 +81,7 @@ def test_a_field_is_folded_and_scored_by_its_shown_cells():
     model = thermal_field(40, 40, 4)
     assert model.nx > LARGE
     source = Simulator(model, seed=1, step=1.0, duration=20)
-    log = Log(model.width)
-    while (batch := source.read(0.0)) is not None:
-        log.extend(batch)
+    log = as_log(read_all(source))
     events = log.events
     told = np.unique(events.channel[events.kind == TRUTH])
     assert told.tolist() == model.shown.tolist()

@@ -20,8 +20,7 @@ from estimators.model.joint import Unknown, joint
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.tuning import Tuning
-
-SECOND = 1_000_000_000
+from tests.support import SECOND
 
 
 def fall(x, u, p, dt, out):

@@ -20,6 +20,7 @@ from estimators.models import MODELS
 from estimators.models.motor_drive import COPPER, MOTOR_DRIVE
 from estimators.models.road_car import ROAD_CAR
 from estimators.track import HELD_OUT, Track
+from tests.support import as_log, read_all
 
 P = {item.name: k for k, item in enumerate(MOTOR_DRIVE.parameters)}
 
@@ -263,9 +264,7 @@ class Run:
 def replayed(name: str) -> tuple[object, Log]:
     twin = load_twin(name)
     source = twin.open_source(lambda key, text: None, live=False)
-    log = Log(twin.model.width)
-    while (batch := source.read(1.0)) is not None:
-        log.extend(batch)
+    log = as_log(read_all(source))
     source.close()
     return twin, log
 

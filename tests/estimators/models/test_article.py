@@ -14,8 +14,7 @@ from estimators.models import MODELS
 from estimators.track import MISSING, USED
 from estimators.tuning import Tuning
 from sources.simulation.simulator import SensorPlan, Simulator
-
-SECOND = 1_000_000_000
+from tests.support import SECOND, read_all
 
 
 def example():
@@ -48,7 +47,7 @@ def example():
     return rows
 
 
-def as_log(rows):
+def example_log(rows):
     """A tick at 0, where the prior holds; then per step the reading (NaN where lost) and the true states."""
     batch = [Events.one(0, 0, TICK, 0, (), 1)]
     for k, (truth, y, lost, *_) in enumerate(rows):
@@ -68,7 +67,7 @@ def rows():
 @pytest.fixture(scope="module", params=["kf", "ekf", "ukf"])
 def folded(request, rows):
     model = MODELS["motor_winding"]
-    folded = Fold(request.param, model, Tuning.of(model), as_log(rows), pairs=np.array([[0, 1]]))
+    folded = Fold(request.param, model, Tuning.of(model), example_log(rows), pairs=np.array([[0, 1]]))
     folded.advance()
     return folded
 
@@ -123,11 +122,8 @@ def test_the_simulator_draws_the_same(rows):
         initial={"temperature": 40.0, "rate": 0.2},
         sensors={"winding": SensorPlan(drop_every=15)},
     )
-    batches = []
-    while (batch := source.read(0.0)) is not None:
-        batches.append(batch)
-    events = Events.concat(batches, model.width)
-    expected = as_log(rows).events
+    events = read_all(source)
+    expected = example_log(rows).events
     np.testing.assert_array_equal(events.kind, expected.kind)
     np.testing.assert_array_equal(events.t, expected.t)
     # The simulator factorises Q once where the example draws from it anew: the last bit may differ.

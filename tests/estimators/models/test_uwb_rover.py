@@ -11,13 +11,14 @@ from estimators.compiled.model import compile_model
 from estimators.diagnostics.score import score
 from estimators.errors import SourceError
 from estimators.fold import fold
-from estimators.log import Log, truth_of
+from estimators.log import truth_of
 from estimators.models.uwb_rover import UWB_ROVER, uwb_rover
 from estimators.track import Track
 from estimators.tuning import Tuning
 from sources.simulation.profile import Constant, Sine
 from sources.simulation.simulator import Simulator
 from tests.conftest import absent
+from tests.support import as_log, read_all
 
 
 def parameters(**changed: float) -> np.ndarray:
@@ -61,9 +62,7 @@ def test_a_simulated_rover_is_tracked_within_what_the_filter_says(estimator: str
         initial={"east": 0.5, "north": -0.5, "range_scale": 1.04},
         inputs={"speed": Constant(0.8), "yaw_rate": Sine(0.0, 0.4, 20.0)},
     )
-    log = Log(model.width)
-    while (batch := source.read(1.0)) is not None:
-        log.extend(batch)
+    log = as_log(read_all(source))
     track = fold(estimator, model, Tuning.of(model), log)
     rows, _ = truth_of(log.events, 0)
     squares = sum(((track.mean[rows, k] - truth_of(log.events, k)[1]) / track.std[rows, k])[200:] ** 2 for k in (0, 1))

@@ -12,9 +12,8 @@ from estimators.log import TICK, Events
 from estimators.numerics.steps import SLACK, steps_of
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear
-from tests.estimators.test_fold import as_log, in_python
-
-SECOND = 1_000_000_000
+from tests.estimators.test_fold import in_python
+from tests.support import SECOND, as_log
 
 
 @pytest.mark.parametrize("exponent", range(-9, 10))

@@ -14,7 +14,8 @@ from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceMo
 from estimators.particle.cloud import RECOVERIES, block, members
 from estimators.track import FAILED, GATED, HELD_OUT, MISSING, USED
 from estimators.tuning import Tuning
-from tests.estimators.linear_models import SECOND, JointGaussian, random_linear, random_log
+from tests.estimators.linear_models import JointGaussian, random_linear, random_log
+from tests.support import SECOND, log_of
 
 NAMES = ("pf", "pf-reg", "pf-ekf", "apf")
 EXACT = ("pf", "pf-ekf", "apf")
@@ -74,13 +75,6 @@ def relative(x, u, p, q, dt, out):
 
 def within_half(y, x, u, p, r):
     return 0.0 if abs(y[0] - x[0]) < 0.5 else -np.inf
-
-
-def log_of(*events):
-    log = Log(1)
-    for t, kind, value in events:
-        log.extend(Events.one(int(t * SECOND), 0, kind, 0, value, 1))
-    return log
 
 
 @pytest.mark.parametrize("name", EXACT)
@@ -165,7 +159,7 @@ def test_any_pieces_and_any_threads_give_the_same_bits(name, n):
 def test_substeps_draw_noise_of_their_own(name, max_step):
     """Ten steps of the same draws would make ten times the variance of independent ones."""
     model = scalar(max_step=max_step)
-    track = fold(name, model, Tuning.of(model).with_options({"particles": 1e5}), log_of((0, TICK, 0), (1, TICK, 0)))
+    track = fold(name, model, Tuning.of(model).with_options({"particles": 1e5}), log_of(1, (0, TICK, 0), (1, TICK, 0)))
     # A variance of 10⁵ draws is right to 5·√(2/10⁵) = 2.3 %.
     assert abs(track.std[1, 0] ** 2 / (0.25 + 0.3) - 1) < 0.023
     assert abs(track.mean[1, 0] - 2.0) < 5 * np.sqrt(0.55 / 1e5)
@@ -174,7 +168,7 @@ def test_substeps_draw_noise_of_their_own(name, max_step):
 @pytest.mark.parametrize("name", NAMES)
 def test_noise_that_depends_on_the_state_is_each_particles_own(name):
     model = scalar(Q=relative)
-    track = fold(name, model, Tuning.of(model).with_options({"particles": 1e5}), log_of((0, TICK, 0), (1, TICK, 0)))
+    track = fold(name, model, Tuning.of(model).with_options({"particles": 1e5}), log_of(1, (0, TICK, 0), (1, TICK, 0)))
     # E x² = 4 + 0.25; the draws' kurtosis is below 4.
     assert abs(track.std[1, 0] ** 2 / (0.25 + 0.3 * 4.25) - 1) < 5 * np.sqrt(3 / 1e5)
 
@@ -183,17 +177,17 @@ def test_noise_that_depends_on_the_state_is_each_particles_own(name):
 def test_queries_change_no_draw(name):
     model = scalar()
     tuning = Tuning.of(model).with_options({"particles": 200})
-    plain = fold(name, model, tuning, log_of((0, READING, 2.1), (1, READING, 2.4), (2, READING, 2.2)))
+    plain = fold(name, model, tuning, log_of(1, (0, READING, 2.1), (1, READING, 2.4), (2, READING, 2.2)))
     asked = fold(
         name, model, tuning,
-        log_of((0, READING, 2.1), (0.5, TICK, 0), (0.9, TICK, 0), (1, READING, 2.4), (2, READING, 2.2)),
+        log_of(1, (0, READING, 2.1), (0.5, TICK, 0), (0.9, TICK, 0), (1, READING, 2.4), (2, READING, 2.2)),
     )  # fmt: skip
     assert np.array_equal(plain.mean, asked.mean[[0, 3, 4]])
 
 
 def test_the_kernel_widens_the_cloud_by_its_bandwidth():
     model = scalar(noises=(Noise("s", "m²/s", 0.0),))
-    log = log_of((0, READING, 2.3), (1, TICK, 0))
+    log = log_of(1, (0, READING, 2.3), (1, TICK, 0))
     tuning = Tuning.of(model).with_options({"particles": 1e5, "fraction": 1.0, "bandwidth": 2.0})
     run = Fold("pf-reg", model, tuning, log)
     run.advance()
@@ -211,7 +205,7 @@ def test_two_peaks_stay_alive_and_are_reported(name):
         states=(State("s", "m", 0.0, 2.0),), noises=(Noise("s", "m²/s", 1e-3),),
         sensors=(Sensor("y", (Row("y", "m²", 0.3),), h=square),),
     )  # fmt: skip
-    log = log_of(*((k, READING, 4.0 + 0.5 * rng.standard_normal()) for k in range(20)))
+    log = log_of(1, *((k, READING, 4.0 + 0.5 * rng.standard_normal()) for k in range(20)))
     run = Fold(name, model, Tuning.of(model).with_options({"particles": 20_000}), log)
     run.advance()
     first, second = run.peaks()
@@ -224,7 +218,7 @@ def test_two_peaks_stay_alive_and_are_reported(name):
 @pytest.mark.parametrize("name", ["pf", "pf-reg", "apf"])
 def test_a_sensor_may_have_a_likelihood_of_its_own(name):
     model = scalar(sensors=(Sensor("y", (Row("y", "m", 0.04),), h=itself, log_likelihood=within_half),))
-    track = fold(name, model, Tuning.of(model).with_options({"particles": 1e5}), log_of((0, READING, 2.2)))
+    track = fold(name, model, Tuning.of(model).with_options({"particles": 1e5}), log_of(1, (0, READING, 2.2)))
     from scipy.stats import norm, truncnorm
 
     a, b = (1.7 - 2.0) / 0.5, (2.7 - 2.0) / 0.5
@@ -239,7 +233,7 @@ def test_a_sensor_may_have_a_likelihood_of_its_own(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_cloud_that_explains_nothing_fails_visibly_and_recovers(name):
     model = scalar(sensors=(Sensor("y", (Row("y", "m", 0.04),), h=itself, log_likelihood=within_half),))
-    log = log_of(*((0.01 * k, READING, 30.0) for k in range(40)))
+    log = log_of(1, *((0.01 * k, READING, 30.0) for k in range(40)))
     run = Fold(name, model, Tuning.of(model).with_options({"particles": 2000}), log)
     run.advance()
     verdict = run.track.verdict
@@ -258,8 +252,10 @@ def test_a_reading_without_a_value_changes_nothing(name):
     """Nor how often the filter drew: what comes after it has its bits as before. It is the last of its time."""
     model = scalar()
     tuning = Tuning.of(model).with_options({"particles": 200})
-    plain = fold(name, model, tuning, log_of((0, READING, 2.1), (1, READING, 2.4), (2, READING, 2.2)))
-    gaps = log_of((0, READING, 2.1), (1, READING, np.nan), (1, READING, 2.4), (2, READING, 2.2), (2, READING, np.nan))
+    plain = fold(name, model, tuning, log_of(1, (0, READING, 2.1), (1, READING, 2.4), (2, READING, 2.2)))
+    gaps = log_of(
+        1, (0, READING, 2.1), (1, READING, np.nan), (1, READING, 2.4), (2, READING, 2.2), (2, READING, np.nan)
+    )
     missed = fold(name, model, tuning, gaps)
     assert list(missed.verdict) == [USED, USED, MISSING, USED, MISSING]
     assert np.array_equal(plain.mean[[0, 1, 1, 2, 2]], missed.mean)
@@ -272,8 +268,8 @@ def test_a_reading_that_is_not_used_moves_no_particle(name, key, value, verdict)
     """The estimate is what a question at that time is answered with where no reading comes."""
     model = scalar()
     tuning = Tuning.of(model).with_options({"particles": 200}).set(key, value)
-    asked = fold(name, model, tuning, log_of((0, READING, 2.1), (1, TICK, 0)))
-    track = fold(name, model, tuning, log_of((0, READING, 2.1), (1, READING, 9.0)))
+    asked = fold(name, model, tuning, log_of(1, (0, READING, 2.1), (1, TICK, 0)))
+    track = fold(name, model, tuning, log_of(1, (0, READING, 2.1), (1, READING, 9.0)))
     assert track.verdict[1] == verdict
     # Moments may be added up in another order.
     np.testing.assert_allclose(track.mean[1], asked.mean[1], rtol=1e-12)
@@ -286,7 +282,7 @@ def test_every_child_of_the_auxiliary_filter_is_a_copy_of_its_parent():
     model = scalar(sensors=(quiet,), noises=(Noise("s", "m²/s", 0.0),))
     for seed in range(5):
         tuning = replace(Tuning.of(model).with_options({"particles": 2}), seed=seed)
-        run = Fold("apf", model, tuning, log_of((0, READING, 2.5)))
+        run = Fold("apf", model, tuning, log_of(1, (0, READING, 2.5)))
         assert run.moments()[1][0, 0] > 0.0
         run.advance()
         assert run.track.verdict[0] == USED
@@ -302,7 +298,7 @@ def test_the_likelihood_of_a_bent_sensor_is_that_of_quadrature(name):
     its standard error, under 1.5 %.
     """
     model = scalar(sensors=(Sensor("y", (Row("y", "m²", 0.3),), h=square),))
-    log = log_of((0, TICK, 0), (1, READING, 0.0))
+    log = log_of(1, (0, TICK, 0), (1, READING, 0.0))
     tuning = Tuning.of(model).with_options({"particles": 5000})
     runs = [fold(name, model, replace(tuning, seed=seed), log) for seed in range(100)]
     x = np.linspace(-4.0, 8.0, 120_001)
@@ -321,7 +317,7 @@ def test_the_likelihood_of_a_bent_sensor_is_that_of_quadrature(name):
 def test_particles_where_the_sensor_says_no_number_are_out(name):
     """y = √x, of which a sixth of the prior has none: the posterior is that of the others, by quadrature."""
     model = scalar(states=(State("s", "m", 0.5, 0.5),), sensors=(Sensor("y", (Row("y", "m", 0.04),), h=root),))
-    run = Fold(name, model, Tuning.of(model).with_options({"particles": 20_000}), log_of((0, READING, 0.9)))
+    run = Fold(name, model, Tuning.of(model).with_options({"particles": 20_000}), log_of(1, (0, READING, 0.9)))
     run.advance()
     x = np.linspace(0.0, 4.0, 40_001)
     density = np.exp(-0.5 * ((x - 0.5) / 0.5) ** 2 - 0.5 * ((0.9 - np.sqrt(x)) / 0.2) ** 2)
@@ -338,7 +334,7 @@ def test_copies_of_one_particle_widen_too():
     """No spread is left to double, nor process noise to bring it back; it takes the seed 23 doublings to reach 0.5."""
     sharp = Sensor("y", (Row("y", "m", 0.04),), h=itself, log_likelihood=within_half)
     model = scalar(sensors=(sharp,), noises=(Noise("s", "m²/s", 0.0),))
-    log = log_of(*((0.01 * k, READING, 2.0 if k == 0 else 4.0) for k in range(60)))
+    log = log_of(1, *((0.01 * k, READING, 2.0 if k == 0 else 4.0) for k in range(60)))
     run = Fold("pf", model, Tuning.of(model).with_options({"particles": 20}), log)
     run.advance(1)
     block(run.options, run._state, 1)[:] = 2.0
@@ -356,7 +352,7 @@ def test_no_particles_are_refused():
 
 def test_snapshots_of_large_states_keep_to_their_memory(monkeypatch):
     model = scalar()
-    log = log_of(*((0.01 * k, READING, 2.0) for k in range(3000)))
+    log = log_of(1, *((0.01 * k, READING, 2.0) for k in range(3000)))
     tuning = Tuning.of(model).with_options({"particles": 500})
     plain = Fold("pf", model, tuning, log)
     plain.advance()
@@ -373,7 +369,9 @@ def test_snapshots_of_large_states_keep_to_their_memory(monkeypatch):
 
 def test_points_are_drawn_by_weight():
     model = scalar()
-    run = Fold("pf", model, Tuning.of(model).with_options({"particles": 1e5, "fraction": 0}), log_of((0, READING, 2.6)))
+    run = Fold(
+        "pf", model, Tuning.of(model).with_options({"particles": 1e5, "fraction": 0}), log_of(1, (0, READING, 2.6))
+    )
     run.advance()
     points, (mean, cov) = run.points(), run.moments()
     assert points.shape == (2000, 1) and members(run.options) == 100_000
@@ -389,7 +387,7 @@ def test_siblings_stand_side_by_side(name, scheme):
     tuning = Tuning.of(model).with_options({"particles": 3000, "resampling": scheme, "fraction": 1.0})
     if name == "apf":
         tuning = tuning.with_options({"particles": 3000, "resampling": scheme})
-    run = Fold(name, model, tuning, log_of((0, TICK, 0), (1, READING, 2.3)))
+    run = Fold(name, model, tuning, log_of(1, (0, TICK, 0), (1, READING, 2.3)))
     run.advance(1)
     before = block(run.options, run._state, 1)[:, 0].copy()
     run.advance()
@@ -441,7 +439,7 @@ def test_the_kernel_may_move_duplicates_only():
         ("pf", {}), ("pf-reg", {"jitter": 1}), ("pf-reg", {"jitter": 0}), ("pf-reg", {"jitter": 1, "bandwidth": 0.0}),
     ):  # fmt: skip
         tuning = Tuning.of(model).with_options({"particles": 3000, "fraction": 1.0, **options})
-        run = Fold(name, model, tuning, log_of((0, READING, 2.3)))
+        run = Fold(name, model, tuning, log_of(1, (0, READING, 2.3)))
         run.advance()
         clouds[name, *options.values()] = block(run.options, run._state, 1)[:, 0].copy()
     drawn, moved, all_moved = clouds["pf",], clouds["pf-reg", 1], clouds["pf-reg", 0]

@@ -9,12 +9,13 @@ import pytest
 
 from estimators.errors import EstimatorError, ModelError
 from estimators.fold import Fold, fold
-from estimators.log import READING, TICK, Events, Log
+from estimators.log import READING, TICK, Events
 from estimators.model.state_space import Jump, Noise, Row, Sensor, State, StateSpaceModel
 from estimators.particle.cloud import RECOVERIES
 from estimators.track import FAILED, USED
 from estimators.tuning import Tuning
-from tests.estimators.linear_models import SECOND, random_linear, random_log
+from tests.estimators.linear_models import random_linear, random_log
+from tests.support import SECOND, log_of
 
 # A jump-Markov linear system: a walk that drifts in mode 1, seen by a sensor that is biased there.
 STAY = ((0.9, 0.1), (0.2, 0.8))
@@ -52,13 +53,9 @@ def jump_model(**changes):
 READINGS = (0.4, 1.6, 3.1, 4.4, 3.9, 4.2)
 
 
-def log_of(*values, width=3, every=1.0):
-    log = Log(width)
-    log.extend(Events.one(0, 0, TICK, 0, np.zeros(width), width))
-    for k, value in enumerate(values):
-        t = int((k + 1) * every * SECOND)
-        log.extend(Events.one(t, t, READING, 0, np.atleast_1d(value), width))
-    return log
+def after_prior(*values, width=3, every=1.0):
+    """A log of a tick at 0, where the prior holds, and then a reading `every` so many seconds."""
+    return log_of(width, (0, TICK, ()), *(((k + 1) * every, READING, value) for k, value in enumerate(values)))
 
 
 def exact_mixture():
@@ -116,7 +113,7 @@ def test_with_nothing_to_sample_it_is_the_kalman_filter(nx):
 
 def test_a_jump_markov_system_gives_the_mixture_over_all_mode_sequences():
     answers, total = exact_mixture()
-    model, log = jump_model(), log_of(*READINGS)
+    model, log = jump_model(), after_prior(*READINGS)
     few = runs(model, 400, 60, log)
     for k, (mean, cov) in enumerate(answers, start=1):
         means = np.array([run.mean[k] for run in few])
@@ -139,7 +136,9 @@ def test_a_jump_markov_system_gives_the_mixture_over_all_mode_sequences():
 
 def test_the_innovation_is_that_of_the_mixture():
     """Of the first reading, by hand: two modes, each with a Gaussian."""
-    run = fold("rbpf", jump_model(), Tuning.of(jump_model()).with_options({"particles": 100_000}), log_of(READINGS[0]))
+    run = fold(
+        "rbpf", jump_model(), Tuning.of(jump_model()).with_options({"particles": 100_000}), after_prior(READINGS[0])
+    )
     share = 0.7 * 0.1 + 0.3 * 0.8
     F = [np.array([[d, 1.0], [0.0, 1.0]]) for d in DAMP]
     P = [F[m] @ np.diag([1.0, 0.16]) @ F[m].T + np.diag([Q, 0.02]) for m in (0, 1)]
@@ -176,7 +175,7 @@ def test_what_the_sampled_state_did_tells_of_the_linear_one():
         noises=(Noise("a", "m²/s", 0.05), Noise("b", "m²/s", 0.1)),
         sensors=(Sensor("y", (Row("y", "m", 0.2),), h=both),), conditionally_linear=("b",),
     )  # fmt: skip
-    log = log_of(0.9, 1.2, 0.4, 1.5, 2.2, 2.6, width=2)
+    log = after_prior(0.9, 1.2, 0.4, 1.5, 2.2, 2.6, width=2)
     reference = runs(model, 300_000, 2, log, "pf")
     few = runs(model, 1000, 40, log)
     for k in range(1, 7):
@@ -193,7 +192,7 @@ def test_what_the_sampled_state_did_tells_of_the_linear_one():
 
 @pytest.mark.parametrize("n", [300, 5000])
 def test_any_pieces_and_any_threads_give_the_same_bits(n):
-    model, log = jump_model(), log_of(*READINGS, *READINGS)
+    model, log = jump_model(), after_prior(*READINGS, *READINGS)
     tuning = Tuning.of(model).with_options({"particles": n})
     whole = fold("rbpf", model, tuning, log)
     threads = numba.get_num_threads()
@@ -217,7 +216,7 @@ def test_any_pieces_and_any_threads_give_the_same_bits(n):
 def test_other_particle_filters_sample_the_mode(name):
     """Every particle is in one mode, and the mode's probability is the exact one, but for pf-reg's kernel."""
     answers, _ = exact_mixture()
-    model, log = jump_model(), log_of(*READINGS)
+    model, log = jump_model(), after_prior(*READINGS)
     run = Fold(name, model, Tuning.of(model).with_options({"particles": 20_000}), log)
     run.advance()
     assert set(np.unique(run.points()[:, 2])) == {0.0, 1.0}
@@ -230,7 +229,7 @@ def test_other_particle_filters_sample_the_mode(name):
 def test_filters_of_moments_see_the_mode_as_a_number_with_a_jumps_moments(name):
     # So narrow that no sigma point leaves the range, where the chances would be those of its ends.
     model = jump_model(states=(State("s", "m", 0.0, 1.0), State("v", "m/s", 0.5, 0.4), State("m", "", 0.3, 0.15)))
-    track = fold(name, model, Tuning.of(model), log_of(np.nan))
+    track = fold(name, model, Tuning.of(model), after_prior(np.nan))
     p = 0.7 * 0.1 + 0.3 * 0.8
     # The mean of the chances; the jump's variance p(1-p), and the prior's, whose mode counts 0.8 - 0.1.
     assert abs(track.mean[1, 2] - p) < 1e-9
@@ -246,7 +245,7 @@ def nan_slopes(x, u, p, out):
 def test_readings_beyond_the_numbers_fail_alone():
     model = jump_model()
     tuning = replace(Tuning.of(model).with_options({"particles": 200}), gate=None)
-    log = log_of(*READINGS[:3], 1e300, *READINGS[3:])
+    log = after_prior(*READINGS[:3], 1e300, *READINGS[3:])
     run = Fold("rbpf", model, tuning, log)
     run.advance()
     assert run.track.verdict[4] == FAILED and np.all(run.track.verdict[[1, 2, 3, 5, 6, 7]] == USED)
@@ -257,7 +256,7 @@ def test_readings_beyond_the_numbers_fail_alone():
 
 def test_slopes_that_are_no_numbers_leave_their_particles_out():
     model = jump_model(sensors=(Sensor("y", (Row("y", "m", 0.3),), h=biased, H=nan_slopes),))
-    run = Fold("rbpf", model, Tuning.of(model).with_options({"particles": 200}), log_of(*READINGS))
+    run = Fold("rbpf", model, Tuning.of(model).with_options({"particles": 200}), after_prior(*READINGS))
     run.advance()
     assert np.all(run.track.verdict[1:] == USED) and np.all(np.isfinite(run.track.mean))
     assert np.all(run.track.mean[1:, 2] < 1e-12)
@@ -275,7 +274,7 @@ def test_a_cloud_without_weight_recovers_visibly():
     from estimators.model.state_space import Input
 
     model = jump_model(f=far, inputs=(Input("blow", "1"),), jump=Jump("m", ("a", "b"), chances))
-    log = log_of(0.1, 0.2)
+    log = after_prior(0.1, 0.2)
     for t, on in ((3, 1.0), (4, 0.0)):
         log.extend(Events.one(t * SECOND, t * SECOND, INPUT, 0, np.array([on]), 3))
     log.extend(Events.one(5 * SECOND, 5 * SECOND, READING, 0, np.array([0.3]), 3))
@@ -286,7 +285,7 @@ def test_a_cloud_without_weight_recovers_visibly():
 
 
 def test_peaks_are_reported_with_their_weights():
-    model, log = jump_model(), log_of(3.0)
+    model, log = jump_model(), after_prior(3.0)
     run = Fold("rbpf", model, Tuning.of(model).with_options({"particles": 4000}), log)
     run.advance()
     first, second = run.peaks()
@@ -337,10 +336,10 @@ def leaning(x, u, p, dt, out):
 )
 def test_a_model_that_is_not_what_it_says_is_refused(changes, said):
     with pytest.raises(ModelError, match=said):
-        Fold("rbpf", jump_model(**changes), Tuning.of(jump_model(**changes)), log_of(0.0))
+        Fold("rbpf", jump_model(**changes), Tuning.of(jump_model(**changes)), after_prior(0.0))
 
 
 def test_models_that_declare_nothing_are_refused():
     model = jump_model(jump=None, conditionally_linear=())
     with pytest.raises(EstimatorError, match="rbpf needs states that are linear once the others are known"):
-        fold("rbpf", model, Tuning.of(model), log_of(0.0))
+        fold("rbpf", model, Tuning.of(model), after_prior(0.0))

@@ -71,13 +71,6 @@ def frame(identifier: int, data: bytes, *, t: float = 1.0, bus: Any = None, exte
     return can.Message(timestamp=t, arbitration_id=identifier, is_extended_id=extended, data=data, channel=bus)
 
 
-def read_all(source: Any) -> Events:
-    batches = []
-    while (batch := source.read(0.0)) is not None:
-        batches.append(batch)
-    return Events.concat(batches, batches[0].value.shape[1])
-
-
 def same(a: Events, b: Events) -> bool:
     return all(
         x.shape == y.shape and x.dtype == y.dtype and bool(((x == y) | ((x != x) & (y != y))).all())

@@ -15,7 +15,8 @@ from sources.can.decoder import Decoder
 from sources.can.log import CanLog
 from sources.clock import to_ns
 from sources.source import Channel, Condition
-from tests.sources.can.can_tools import Reports, dbc, frame, read_all, same, sensor
+from tests.sources.can.can_tools import Reports, dbc, frame, same, sensor
+from tests.support import read_all
 
 FORMATS = [".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc"]
 START = 1_700_000_000

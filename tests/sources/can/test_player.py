@@ -16,7 +16,8 @@ from sources.can.player import Player
 from sources.simulation.profile import Steps
 from sources.simulation.simulator import SensorPlan, Simulator
 from sources.source import Channel
-from tests.sources.can.can_tools import Reports, dbc, read_all
+from tests.sources.can.can_tools import Reports, dbc
+from tests.support import read_all
 
 ASSET = """VERSION ""
 NS_ :

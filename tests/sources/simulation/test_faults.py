@@ -9,7 +9,8 @@ from estimators.log import READING
 from estimators.models import MODELS
 from sources.simulation.faults import Fault
 from sources.simulation.simulator import SensorPlan, Simulator
-from tests.sources.can.can_tools import read_all, same
+from tests.sources.can.can_tools import same
+from tests.support import read_all
 
 PACK = MODELS["motor_drive"]
 SENSOR = PACK.sensors[0].name

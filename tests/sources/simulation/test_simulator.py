@@ -10,7 +10,8 @@ from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, S
 from estimators.models import MODELS
 from sources.simulation.profile import Constant, Sine, Steps, Sum
 from sources.simulation.simulator import SensorPlan, Simulator
-from tests.sources.can.can_tools import read_all, same
+from tests.sources.can.can_tools import same
+from tests.support import read_all
 
 WINDING = MODELS["motor_winding"]
 

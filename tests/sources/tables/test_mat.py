@@ -9,7 +9,8 @@ from estimators.log import INPUT, READING, TRUTH
 from sources.source import Channel
 from sources.tables.mat import read_mat
 from sources.tables.table import Table
-from tests.sources.can.can_tools import read_all, same
+from tests.sources.can.can_tools import same
+from tests.support import read_all
 
 
 def channels(prefix=""):

@@ -10,7 +10,7 @@ from sources.source import Channel
 from sources.tables import npz
 from sources.tables.rows import read_rows
 from sources.tables.table import Table
-from tests.sources.can.can_tools import read_all
+from tests.support import read_all
 
 T0 = np.datetime64("2019-03-01T00:00", "ns")
 RNG = np.random.default_rng(0)

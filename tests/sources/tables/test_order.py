@@ -7,9 +7,9 @@ from estimators.log import READING, Log
 from sources.source import Channel
 from sources.tables.order import BACKWARDS, MANY, STANDING, Order
 from sources.tables.table import Table
-from tests.sources.can.can_tools import Reports, read_all
+from tests.sources.can.can_tools import Reports
+from tests.support import SECOND, read_all
 
-SECOND = 10**9
 X = (Channel(READING, 0, "x", ("x",)),)
 
 

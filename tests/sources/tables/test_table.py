@@ -10,7 +10,8 @@ from estimators.log import INPUT, READING, TRUTH
 from sources.source import Channel, Condition
 from sources.tables.table import Table
 from sources.tables.time_column import column_ns
-from tests.sources.can.can_tools import Reports, read_all, same
+from tests.sources.can.can_tools import Reports, same
+from tests.support import read_all
 
 CHANNELS = (
     Channel(READING, 0, "temp", ("temp",), units=("degC",), model_units=("K",)),

@@ -1,0 +1,41 @@
+"""What the tests of several rooms share: a second, logs from a few rows, all that a source gives, the same bits."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from estimators.log import Events, Log
+
+SECOND = 1_000_000_000
+"""Nanoseconds."""
+
+
+def as_log(events: Events) -> Log:
+    """A log of these events."""
+    log = Log(events.value.shape[1])
+    log.extend(events)
+    return log
+
+
+def log_of(width: int, *rows: tuple[float, int, Any] | tuple[float, int, Any, int]) -> Log:
+    """A log of rows (seconds, kind, value) or (seconds, kind, value, channel); without a channel it is the first."""
+    batch = []
+    for seconds, kind, value, channel in ((*row, 0)[:4] for row in rows):
+        t = round(seconds * SECOND)
+        batch.append(Events.one(t, t, kind, channel, value, width))
+    return as_log(Events.concat(batch, width))
+
+
+def read_all(source: Any) -> Events:
+    """Everything that a source gives until its end."""
+    batches = []
+    while (batch := source.read(0.0)) is not None:
+        batches.append(batch)
+    return Events.concat(batches, batches[0].value.shape[1])
+
+
+def assert_same(a: Iterable[Any], b: Iterable[Any]) -> None:
+    """The same bits in every column of two tracks or logs; NaN equals NaN."""
+    for name, left, right in zip(a._fields, a, b, strict=True):  # type: ignore[attr-defined]
+        np.testing.assert_array_equal(left, right, err_msg=name)
