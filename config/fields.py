@@ -13,6 +13,7 @@ Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST, l
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=LARGEST)]
 NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=LARGEST)]
 Count = Annotated[int, Field(strict=True, ge=1)]
+Option = Number | Annotated[str, Field(min_length=1)]
 Flag = Annotated[bool, Field(strict=True)]
 Text = Annotated[str, Field(min_length=1)]
 Item = TypeVar("Item")
@@ -29,8 +30,8 @@ Texts = Annotated[
 Numbers = Annotated[
     tuple[Number, ...], Field(min_length=1), BeforeValidator(as_list, json_schema_input_type=float | list[float])
 ]
-Positives = Annotated[
-    tuple[Positive, ...], Field(min_length=1), BeforeValidator(as_list, json_schema_input_type=float | list[float])
+NotNegatives = Annotated[
+    tuple[NotNegative, ...], Field(min_length=1), BeforeValidator(as_list, json_schema_input_type=float | list[float])
 ]
 
 
@@ -87,9 +88,10 @@ class LevelSection(Section):
 class SpreadSection(Section):
     """The noise of one sensor."""
 
-    variance: Positives | None = None
-    """Variance of the noise, in the square of the sensor's unit; a list gives one a row. Default: the model's."""
-    std: Positives | None = None
+    variance: NotNegatives | None = None
+    """Variance of the noise, in the square of the sensor's unit; a list gives one a row. 0 is a sensor without noise,
+    which kf, ekf, iekf and the square-root filters take. Default: the model's."""
+    std: NotNegatives | None = None
     """Its square root: standard deviation, in the sensor's unit; a list gives one a row. Default: the model's."""
 
     @model_validator(mode="after")

@@ -10,7 +10,18 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from .fields import Count, Flag, LevelSection, NotNegative, Number, Positive, Section, SpreadSection, Text
+from .fields import (
+    Count,
+    Flag,
+    LevelSection,
+    NotNegative,
+    Number,
+    Option,
+    Positive,
+    Section,
+    SpreadSection,
+    Text,
+)
 from .source_schema import SourceSection
 
 
@@ -19,8 +30,9 @@ class PriorSection(Section):
 
     mean: Number | None = None
     """Expected value, in the state's unit. Default: the model's."""
-    std: Positive | None = None
-    """Standard deviation of that belief, in the state's unit. Default: the model's."""
+    std: NotNegative | None = None
+    """Standard deviation of that belief, in the state's unit. 0 is a state that is known for certain, which kf, ekf,
+    iekf and the square-root filters take; not of a field. Default: the model's."""
 
 
 class UnknownSection(Section):
@@ -35,6 +47,10 @@ class UnknownSection(Section):
 class SensorSection(SpreadSection):
     """The noise of one sensor as the estimator assumes it, and whether the estimate uses it."""
 
+    correlation: tuple[tuple[Number, ...], ...] | None = None
+    """Correlation of the noise of its rows, for example [[1, 0.5], [0.5, 1]], with R_ij = correlation_ij √(R_ii R_jj):
+    it stays while the variances are tuned. Particle and ensemble filters take independent rows, [[1, 0], [0, 1]].
+    Default: the model's."""
     use: Flag = True
     """false holds the sensor out: the estimate ignores it, and its prediction of it is scored. Default: true."""
 
@@ -44,8 +60,9 @@ class EstimatorSection(Section):
 
     name: Text
     """Name in the catalogue: kf, ekf, ukf, ..."""
-    options: dict[str, Number] = {}
-    """The filter's own options by name, for example {alpha: 0.5} of the UKF. Default: the catalogue's."""
+    options: dict[str, Option] = {}
+    """The filter's own options by name, for example {alpha: 0.5} of the UKF; a choice by its word, {resampling:
+    stratified}, or its number. Default: the catalogue's."""
 
 
 class TimeSection(Section):
@@ -137,7 +154,7 @@ class TwinSection(Section):
         EstimatorSection, BeforeValidator(_estimator, json_schema_input_type=str | EstimatorSection)
     ] = EstimatorSection(name="ekf")
     """The filter that runs first: a name, or {name, options}. Default: ekf."""
-    filters: dict[str, dict[str, Number]] = {}
+    filters: dict[str, dict[str, Option]] = {}
     """Options of other filters, by name, for when one is chosen on the page or compared, for example
     {letkf: {radius: 4}}. Default: the catalogue's."""
     gate: Annotated[float, Field(strict=True, gt=0, lt=1)] | None = None

@@ -41,6 +41,36 @@ def _range(value: Any) -> Any:
 Range = Annotated[RangeSection, BeforeValidator(_range, json_schema_input_type=float | bool | RangeSection)]
 
 
+class AccuracySection(Section):
+    """What the source itself says of the noise of each reading, as a GNSS receiver does. Give one of the two.
+
+    It takes the place of the tuned R for that one reading. Where it is missing, or not positive, R holds.
+    """
+
+    std: Texts | None = None
+    """Name of the signal of the same message, or of the column, that holds the standard deviation; a list names one for
+    each row of the sensor."""
+    variance: Texts | None = None
+    """The same of the variance."""
+    units: Texts | None = None
+    """Unit of each, converted to the row's, or to its square for a variance (cm, m^2, ...). Default: the DBC's, else
+    the model's."""
+    scale: Annotated[
+        tuple[Positive, ...], Field(min_length=1), BeforeValidator(as_list, json_schema_input_type=float | list[float])
+    ] = (1.0,)
+    """Factor applied after the unit is converted: 0.5 where two standard deviations are told. Default: 1."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The signals or columns, one for all rows or one a row."""
+        return self.std or self.variance or ()
+
+    @model_validator(mode="after")
+    def _one(self) -> AccuracySection:
+        one_of(self, "std", "variance", required=True)
+        return self
+
+
 class ChannelSection(Section):
     """How the values of one sensor, input or state are taken from the source: value·scale + offset, in model units."""
 
@@ -61,6 +91,8 @@ class ChannelSection(Section):
     Default: null, no conversion."""
     origin: tuple[Number, Number] | None = None
     """Latitude and longitude of the local origin, degrees. Default: the first valid fix."""
+    accuracy: AccuracySection | None = None
+    """Of a sensor: the noise that comes with each reading, {std: SIGNAL}. Default: null, the tuned R."""
 
     def names(self) -> tuple[str, ...]:
         """The signals or columns, one a row."""
@@ -76,6 +108,14 @@ class ChannelSection(Section):
                     "length",
                     "has {have} entries; give one, or one for each of the {count} values",
                     {"have": len(values), "count": count, "key": key},
+                )
+        own = self.accuracy
+        for word, entries in (("names", own.names), ("units has", own.units), ("scale has", own.scale)) if own else ():
+            if entries is not None and len(entries) not in (1, count):
+                raise PydanticCustomError(
+                    "length",
+                    "{word} {have}; give one, or one for each of the {count} values",
+                    {"word": word, "have": len(entries), "count": count, "key": "accuracy"},
                 )
         if self.convert == "east_north" and count != 2:
             raise PydanticCustomError(

@@ -7,20 +7,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimators.errors import SourceError
+from estimators.errors import LARGEST, SourceError
 from estimators.log import INPUT, READING, TRUTH, Events
 from estimators.numerics.jit import jit
 
 from .geodesy import east_north
-from .source import Channel, Report
-from .units import conversion
+from .source import Accuracy, Channel, Report
+from .units import conversion, spread_factor
 
 PRESENT, ABSENT, SHORT = range(3)
 """A value is there; the frame does not carry the signal (multiplexing); the frame ends before it."""
 
 
 class _Tables(NamedTuple):
-    """Channels of all groups (messages, or one table), one a row; see `Mapping`."""
+    """Channels of all groups (messages, or one table), one a row; see `Mapping`.
+
+    `own_slot` is where a row's own spread is, -1 where it has none.
+    """
 
     group: np.ndarray
     kind: np.ndarray
@@ -31,6 +34,9 @@ class _Tables(NamedTuple):
     shift: np.ndarray
     scale: np.ndarray
     offset: np.ndarray
+    own_slot: np.ndarray
+    own_factor: np.ndarray
+    own_squared: np.ndarray
     where: np.ndarray
     where_slot: np.ndarray
     selects: np.ndarray
@@ -39,13 +45,25 @@ class _Tables(NamedTuple):
 
 
 @jit
-def _emit(tables, plan, skip, values, state, source, kind, channel, value, refused, cut):
+def _own_variance(tables, r, values, state, i):
+    """The variance that frame i tells of row r's noise; NaN if what it tells is none."""
+    slot = tables.own_slot[r]
+    own = tables.own_factor[r] * values[i, slot]
+    if state[i, slot] != PRESENT or not own > 0.0:
+        return np.nan
+    if tables.own_squared[r] == 0:
+        own *= own
+    return own if 0.0 < own <= LARGEST else np.nan
+
+
+@jit
+def _emit(tables, plan, skip, values, state, width, source, kind, channel, value, refused, cut, unsaid):
     """Write the events of each frame: its inputs as one event, then readings, then true states in blocks.
 
-    Returns how many. A block begins with a state that is known, and takes what follows as far as it reaches.
+    Returns how many. A block begins with a state that is known, and takes what follows as far as it reaches. Columns of
+    `value` from `width` on take the variances that readings bring.
     """
     n = 0
-    width = value.shape[1]
     for i in range(plan.size):
         g = plan[i]
         if g < 0 or skip[i] != 0:
@@ -81,7 +99,7 @@ def _emit(tables, plan, skip, values, state, source, kind, channel, value, refus
                 source[n] = i
                 kind[n] = tables.kind[c]
                 channel[n] = 0 if tables.kind[c] == INPUT else tables.target[c]
-                for column in range(width):
+                for column in range(value.shape[1]):
                     value[n, column] = np.nan
                 n += 1
                 if tables.kind[c] == INPUT:
@@ -89,6 +107,7 @@ def _emit(tables, plan, skip, values, state, source, kind, channel, value, refus
                 elif tables.kind[c] == TRUTH:
                     truth_event = event
             if good:
+                vague = False
                 for r in range(tables.row[c], tables.row[c + 1]):
                     converted = tables.factor[r] * values[i, tables.slot[r]] + tables.shift[r]
                     column = r - tables.row[c]
@@ -98,6 +117,12 @@ def _emit(tables, plan, skip, values, state, source, kind, channel, value, refus
                         column = tables.target[c] - channel[event]
                     final = tables.scale[r] * converted + tables.offset[r]
                     value[event, column] = final if np.isfinite(final) else np.nan
+                    if tables.own_slot[r] >= 0 and np.isfinite(final):
+                        own = _own_variance(tables, r, values, state, i)
+                        value[event, width + column] = own
+                        vague = vague or np.isnan(own)
+                if vague:
+                    unsaid[c] += 1
                 if tables.kind[c] == TRUTH and np.isnan(value[event, 0]):
                     n -= 1
                     truth_event = -1
@@ -111,7 +136,7 @@ class Mapping:
         groups: For each message (or the one table): its channels, the names of its values in their order, and the
             unit that each value has where the channel declares none.
         width: Value columns of an event.
-        report: Told of readings that a condition refused or that a short frame cut.
+        report: Told of readings that a condition refused, that a short frame cut, or whose accuracy is not told.
 
     Raises:
         SourceError: If a unit does not convert to the model's.
@@ -130,6 +155,7 @@ class Mapping:
         self._channels: list[Channel] = []
         group, kind, index, row, where = [0], [], [], [0], [0]
         slot, factors, scale, offset, where_slot, selects, low, high = ([] for _ in range(8))
+        own_slot, own_factor, own_squared = [], [], []
         for channels, names, units in groups:
             positions = {name: k for k, name in enumerate(names)}
             # True states in their order, for the blocks.
@@ -144,6 +170,11 @@ class Mapping:
                     # Of a position, scale and offset hold for metres, not for degrees.
                     scale.append(1.0 if channel.convert else channel.scale[k])
                     offset.append(0.0 if channel.convert else channel.offset[k])
+                    own = channel.accuracy
+                    at = positions[own.signals[k]] if own is not None else -1
+                    own_slot.append(at)
+                    own_factor.append(0.0 if own is None else self._own_factor(channel, own, k, units[at]))
+                    own_squared.append(own is not None and own.squared)
                 row.append(len(slot))
                 for condition in (*channel.where, *channel.only):
                     where_slot.append(positions[condition.signal])
@@ -163,12 +194,16 @@ class Mapping:
             shift=np.array([shift for _, shift in factors], real),
             scale=np.array(scale, real),
             offset=np.array(offset, real),
+            own_slot=np.array(own_slot, whole),
+            own_factor=np.array(own_factor, real),
+            own_squared=np.array(own_squared, whole),
             where=np.array(where, whole),
             where_slot=np.array(where_slot, whole),
             selects=np.array(selects, whole),
             low=np.array(low, real),
             high=np.array(high, real),
         )
+        self._columns = width + max((len(c.signals) for c in self._channels if c.accuracy is not None), default=0)
         self._most = int(np.diff(self._tables.group).max(initial=0))
         # By sensor: a message that comes under two ids has its channels twice here.
         self._positions = {c.index: c for c in self._channels if c.convert == "east_north"}
@@ -184,6 +219,11 @@ class Mapping:
         if channel.convert is not None:
             raise SourceError(f"{channel.name}: convert is {channel.convert!r}; only east_north is known")
         return conversion(unit, wanted, f"{channel.name}: {name}")
+
+    @staticmethod
+    def _own_factor(channel: Channel, own: Accuracy, k: int, unit: str | None) -> float:
+        where = f"{channel.name}: {own.signals[k]}"
+        return own.scale[k] * spread_factor(own.units[k] or unit, channel.model_units[k], where, squared=own.squared)
 
     def events(
         self,
@@ -207,18 +247,20 @@ class Mapping:
         room = plan.size * self._most
         source = np.empty(room, np.int64)
         kind, channel = np.empty(room, np.int8), np.empty(room, np.int32)
-        value = np.empty((room, self._width))
-        refused, cut = np.zeros(len(self._channels), np.int64), np.zeros(len(self._channels), np.int64)
-        n = _emit(self._tables, plan, skip, values, state, source, kind, channel, value, refused, cut)
+        value = np.empty((room, self._columns))
+        counts = refused, cut, unsaid = np.zeros((3, len(self._channels)), np.int64)
+        n = _emit(
+            self._tables, plan, skip, values, state, self._width, source, kind, channel, value, refused, cut, unsaid
+        )
         source = source[:n]
         batch = Events(t[source], arrival[source], kind[:n].copy(), channel[:n].copy(), value[:n].copy())
-        if refused.any() or cut.any():
-            self._tell(refused, cut)
+        if counts.any():
+            self._tell(refused, cut, unsaid)
         for item in self._positions.values():
             self._place(batch, item)
         return batch
 
-    def _tell(self, refused: np.ndarray, cut: np.ndarray) -> None:
+    def _tell(self, refused: np.ndarray, cut: np.ndarray, unsaid: np.ndarray) -> None:
         for c in np.flatnonzero(refused):
             channel = self._channels[c]
             rule = " and ".join(f"{w.signal} in {w.low:g} to {w.high:g}" for w in channel.where)
@@ -230,6 +272,17 @@ class Mapping:
                 self._report(
                     f"short frame {channel.name}",
                     f"{channel.name}: a frame of {channel.message} ends before {', '.join(channel.signals)}",
+                )
+
+        for c in np.flatnonzero(unsaid):
+            channel = self._channels[c]
+            assert channel.accuracy is not None
+            names = ", ".join(dict.fromkeys(channel.accuracy.signals))
+            what = "variance" if channel.accuracy.squared else "standard deviation"
+            for _ in range(unsaid[c]):
+                self._report(
+                    f"accuracy {channel.name}",
+                    f"{channel.name}: {names} tells no {what} of a reading, which must be positive; the tuned R holds",
                 )
 
     def _place(self, batch: Events, channel: Channel) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
@@ -95,6 +95,25 @@ class Condition:
 
 
 @dataclass(frozen=True)
+class Accuracy:
+    """Where the variances of a sensor's readings come from, if these tell them: a signal for each row.
+
+    A signal holds a standard deviation, or a variance if `squared`, in its unit; it is converted to the row's unit (or
+    the square of that) and multiplied by `scale`. One entry stands for all rows.
+    """
+
+    signals: tuple[str, ...]
+    squared: bool = False
+    units: tuple[str | None, ...] = (None,)
+    scale: tuple[float, ...] = (1.0,)
+
+    def spread(self, rows: int) -> Accuracy:
+        """With one entry for each of the rows."""
+        each = {name: getattr(self, name) for name in ("signals", "units", "scale")}
+        return replace(self, **{name: item * rows for name, item in each.items() if len(item) == 1})
+
+
+@dataclass(frozen=True)
 class Channel:
     """Where the values of one sensor, input or true state come from.
 
@@ -103,7 +122,7 @@ class Channel:
     scale * value + offset. `units` None means the DBC's own unit, or the model's where that is empty too.
     Where a condition of `where` fails the value is missing; where one of `only` fails, nothing was said of the channel.
     With convert "east_north" the two signals are latitude and longitude in degrees and become metres east and north of
-    `origin`, which is the first valid fix unless given.
+    `origin`, which is the first valid fix unless given. `accuracy` is that of a sensor's readings, where they tell it.
     """
 
     kind: int
@@ -119,6 +138,7 @@ class Channel:
     only: tuple[Condition, ...] = ()
     convert: str | None = None
     origin: tuple[float, float] | None = None
+    accuracy: Accuracy | None = None
 
     def __post_init__(self) -> None:
         """Spread the defaults over the rows."""
@@ -128,11 +148,14 @@ class Channel:
             if len(value) != count:
                 raise ValueError(f"channel {self.name}: {field} has {len(value)} entries for {count} signals")
             object.__setattr__(self, field, value)
+        if self.accuracy is not None:
+            object.__setattr__(self, "accuracy", self.accuracy.spread(count))
 
     @property
     def needed(self) -> tuple[str, ...]:
-        """The signals and those of the conditions, each once."""
-        return tuple(dict.fromkeys((*self.signals, *(item.signal for item in (*self.where, *self.only)))))
+        """The signals, those of the conditions and of the accuracy, each once."""
+        own = self.accuracy.signals if self.accuracy is not None else ()
+        return tuple(dict.fromkeys((*self.signals, *(item.signal for item in (*self.where, *self.only)), *own)))
 
 
 def ignore(key: str, text: str) -> None:

@@ -114,3 +114,16 @@ def conversion(given: str | None, wanted: str, where: str) -> tuple[float, float
     except LookupError:
         raise SourceError(f"{where}: unit {given!r} is unknown, and the model's is {wanted!r}; {remedy}") from None
     raise SourceError(f"{where}: {given!r} does not convert to the model's {wanted!r}; {remedy}")
+
+
+def spread_factor(given: str | None, wanted: str, where: str, *, squared: bool) -> float:
+    """What turns a standard deviation, or a variance if `squared`, in `given` into one of a value in `wanted`.
+
+    A spread knows no zero point: one of 2 °C is 2 K.
+
+    Raises:
+        SourceError: As `conversion`.
+    """
+    if squared and wanted.strip():
+        wanted = f"({_normal(wanted)})**2"
+    return conversion(given, wanted, where)[0]

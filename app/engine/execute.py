@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from estimators.errors import ConfigError
+from estimators.estimator import Estimator
+from estimators.fold_checks import check_variances
 from estimators.log import RESET, Events
 from estimators.registry import checked, find_estimator
 
@@ -36,17 +38,24 @@ def retuned(command: Refolding, engine: Running) -> tuple[str, Tuning]:
     if isinstance(command, commands.SetEstimator):
         entry = find_estimator(command.name, engine.model)
         options = engine.options_of(entry.name)
-        checked(entry, engine.model, options)
+        _check(entry, engine, options)
         return entry.name, tuning.with_options(options)
     if isinstance(command, commands.SetOption):
         entry = find_estimator(estimator, engine.model)
         number = entry.complete({command.name: command.value})[command.name]
         options = {**tuning.options, command.name: number}
-        checked(entry, engine.model, options)
+        _check(entry, engine, options)
         return estimator, tuning.with_options(options)
     if isinstance(command, commands.UseSensor):
         return estimator, tuning.set(f"use.{command.name}", command.used)
     return estimator, tuning.set(command.key, command.value)
+
+
+def _check(entry: Estimator, engine: Running, options: Mapping[str, float]) -> None:
+    """Refuse what a fold would refuse, also of readings that are still to come."""
+    values = checked(entry, engine.model, options)
+    if engine.twin.plan.brings_variances:
+        check_variances(entry, values)
 
 
 def execute(command: commands.Command, engine: Running) -> None:

@@ -62,9 +62,12 @@ def _cells(loaded: Loaded, key: Key, item: ChannelSection, field: Field, read: s
 def _channel(
     loaded: Loaded, key: Key, item: ChannelSection, kind: int, index: int, name: str, rows: list[tuple[str, str]]
 ) -> Channel:
-    from sources.source import Channel
+    from sources.source import Accuracy, Channel
 
     names = item.names()
+    own = item.accuracy
+    if own is not None and kind != READING:
+        raise loaded.error((*key, "accuracy"), "is for sensors; leave it out")
     word = "signals" if isinstance(item, SignalSection) else "columns"
     if len(names) != len(rows):
         row_names = ", ".join(row for row, _ in rows)
@@ -83,6 +86,7 @@ def _channel(
         only=_conditions(item.only),
         convert=item.convert,
         origin=item.origin,
+        accuracy=None if own is None else Accuracy(own.names, own.std is None, own.units or (None,), own.scale),
     )
 
 

@@ -10,9 +10,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
+
 from config.loader import Loaded, shown_path
 from config.yaml_lines import Key
 from estimators.errors import ModelError, NisusError, nearest
+from estimators.model.correlation import Correlation, flaw
 from estimators.model.joint import Unknown, joint
 from estimators.model.state_space import Field, State, StateSpaceModel
 from estimators.model.user_file import run_file
@@ -132,6 +135,11 @@ def _states(model: StateSpaceModel, loaded: Loaded) -> Sequence[State]:
         prior = given.get(states.name)
         if prior is None:
             return states
+        if prior.std == 0.0:
+            raise loaded.error(
+                ("prior", states.name, "std"),
+                "is 0; that of a field must be positive, or its members would be alike",
+            )
         means = states.means if prior.mean is None else ()
         return replace(
             states, mean=states.mean if prior.mean is None else prior.mean, means=means, std=prior.std or states.std
@@ -140,18 +148,30 @@ def _states(model: StateSpaceModel, loaded: Loaded) -> Sequence[State]:
     for state in states:
         prior = given.get(state.name)
         mean, std = (prior.mean, prior.std) if prior else (None, None)
-        found.append(replace(state, mean=state.mean if mean is None else mean, std=std or state.std))
+        found.append(replace(state, mean=state.mean if mean is None else mean, std=state.std if std is None else std))
     return tuple(found)
 
 
 def _sensor(sensor: Any, loaded: Loaded) -> Any:
     section = loaded.config.sensors.get(sensor.name)
-    if section is None or section.variances is None:
+    if section is None:
+        return sensor
+    if section.correlation is not None:
+        sensor = replace(sensor, correlation=_correlation(sensor, section.correlation, loaded))
+    if section.variances is None:
         return sensor
     key = ("sensors", sensor.name, "std" if section.std is not None else "variance")
     variances = one_each(loaded, key, section.variances, [row.name for row in sensor.rows])
     rows = tuple(replace(row, variance=variance) for row, variance in zip(sensor.rows, variances, strict=True))
     return replace(sensor, rows=rows)
+
+
+def _correlation(sensor: Any, given: Correlation, loaded: Loaded) -> Correlation | None:
+    """The correlation of a sensor's rows; None of rows that are independent, which every filter takes."""
+    wrong = flaw(given, len(sensor.rows))
+    if wrong:
+        raise loaded.error(("sensors", sensor.name, "correlation"), wrong)
+    return None if np.array_equal(given, np.eye(len(given))) else given
 
 
 def one_each(loaded: Loaded, key: Key, values: tuple, rows: list[str]) -> tuple:

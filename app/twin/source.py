@@ -32,6 +32,8 @@ class Plan:
     loaded: Loaded
     model: StateSpaceModel
     log_files: tuple[Path, ...] | None
+    brings_variances: bool = False
+    """Whether some sensor's readings tell their own noise."""
 
     def open(self, report: Report, *, live: bool = True) -> Source:
         """Open the source; `live` False takes a recording in place of a bus.
@@ -61,7 +63,6 @@ def plan_source(loaded: Loaded, model: StateSpaceModel, log_files: Sequence[Path
     """
     section = loaded.config.source
     kind = SOURCES[section.type]
-    plan = Plan(loaded, model, tuple(log_files) if log_files is not None else None)
     if log_files is not None and not kind.takes_log:
         others = [name for name, other in SOURCES.items() if other.takes_log]
         raise SourceError(
@@ -74,4 +75,5 @@ def plan_source(loaded: Loaded, model: StateSpaceModel, log_files: Sequence[Path
         names = ", ".join(model.sensor_names)
         raise loaded.error(KEY, f"feeds no sensor; name at least one of {names} under sensors")
     kind.check(loaded, model, section, KEY)
-    return plan
+    own = any(item.accuracy is not None for item in found)
+    return Plan(loaded, model, tuple(log_files) if log_files is not None else None, own)

@@ -17,6 +17,7 @@ from config.source_schema import AssetSection
 from config.yaml_lines import parse
 from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import ConfigError, EstimatorError
+from estimators.fold_checks import check_variances
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_entry, find_estimator
 from estimators.tuning import Tuning
@@ -94,9 +95,8 @@ class Twin:
         return any(grid.name in getattr(part, "truth", {}) for part in getattr(source, "parts", (source,)))
 
     def options_of(self, estimator: str) -> Mapping[str, float]:
-        """The options that the YAML gives for an estimator."""
-        first = self.config.estimator
-        return {**self.config.filters.get(estimator, {}), **(first.options if estimator == first.name else {})}
+        """The options that the YAML gives for an estimator; of a choice its number."""
+        return _options(self.config, estimator)
 
     def open_source(self, report: Report, *, live: bool = True) -> Source:
         """Open the source.
@@ -163,16 +163,19 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
         _check_options(loaded, ("filters", name), name, given, model)
     first = config.estimator
     with _placed(loaded, ("estimator",)):
-        find_estimator(first.name, model)
+        entry = find_estimator(first.name, model)
     _check_options(loaded, ("estimator", "options"), first.name, first.options, model)
-    options = {**config.filters.get(first.name, {}), **first.options}
-    tuning = Tuning.of(model).with_options(options).set("gate", config.gate)
+    tuning = Tuning.of(model).with_options(_options(config, first.name)).set("gate", config.gate)
     for name, section in config.sensors.items():
         if not section.use:
             tuning = tuning.set(f"use.{name}", False)
     for key, value in overrides.items():
         if key not in _of_yaml(overrides):
             tuning = _set(tuning, key, value)
+    plan = plan_source(loaded, model, [Path(file) for file in log_files] if log_files else None)
+    if plan.brings_variances:
+        with _placed(loaded, ("estimator",)):
+            check_variances(entry, entry.complete(tuning.options))
     return Twin(
         loaded=loaded,
         model=model,
@@ -180,12 +183,20 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
         estimator=first.name,
         pairs=_pairs(loaded, model),
         overrides=overrides,
-        plan=plan_source(loaded, model, [Path(file) for file in log_files] if log_files else None),
+        plan=plan,
     )
 
 
+def _options(config: TwinSection, estimator: str) -> dict[str, float]:
+    """The options given for an estimator, with words of choices as their numbers."""
+    first = config.estimator
+    given = {**config.filters.get(estimator, {}), **(first.options if estimator == first.name else {})}
+    values = find_entry(estimator).complete(given)
+    return {name: values[name] for name in given}
+
+
 def _check_options(
-    loaded: Loaded, key: tuple[str, ...], name: str, given: Mapping[str, float], model: StateSpaceModel
+    loaded: Loaded, key: tuple[str, ...], name: str, given: Mapping[str, float | str], model: StateSpaceModel
 ) -> None:
     """Refuse options, given under `key`, that the estimator of that name cannot run with; each has its own line."""
     with _placed(loaded, key):

@@ -240,7 +240,8 @@ def probe_likelihoods(model: StateSpaceModel) -> None:
     u = np.array([item.default for item in model.inputs], float)
     p = np.array([item.value for item in model.parameters], float)
     for sensor in model.sensors:
-        if sensor.log_likelihood is None:
+        # A row without noise has none: only particle filters would use it, and they refuse such a model.
+        if sensor.log_likelihood is None or any(row.variance == 0.0 for row in sensor.rows):
             continue
         y = np.zeros(len(sensor.rows))
         r = np.array([row.variance for row in sensor.rows], float)

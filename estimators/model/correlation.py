@@ -49,10 +49,11 @@ def flaw(correlation: Correlation, ny: int) -> str | None:
         )
     c = np.array(correlation)
     if not np.all(np.isfinite(c)) or np.any(np.diag(c) != 1.0):
-        return "must be finite, with ones on its diagonal; of a covariance R take correlation_of(R)"
+        return "must be finite, with ones on its diagonal; of a covariance R give R_ij / √(R_ii R_jj)"
     if not np.array_equal(c, c.T):
         return "is not symmetric; fill both triangles alike"
     least = np.linalg.eigvalsh(c)[0]
     if not least > _LEAST:
-        return f"is not positive definite (smallest eigenvalue {least:.2g}); leave out rows that repeat others"
+        remedy = "leave out rows that repeat others" if least > -_LEAST else "lessen the correlations"
+        return f"is not positive definite (smallest eigenvalue {least:.2g}); {remedy}"
     return None

@@ -198,7 +198,7 @@ class Decoder:
             self._tell(frames, bad)
         batch = self._mapping.events(frames.plan, frames.t, frames.arrival, values, state, bad)
         if self._silent and len(batch):
-            self._silent = {item for item in self._silent if not _valued(batch, *item)}
+            self._silent = {item for item in self._silent if not _valued(batch, self.width, *item)}
         return batch
 
     def _by_cantools(self, frames: Frames, i: int, values: np.ndarray, state: np.ndarray, bad: np.ndarray) -> None:
@@ -240,12 +240,12 @@ class Decoder:
             )
 
 
-def _valued(batch: Events, kind: int, index: int) -> bool:
-    """Whether a batch has a value for the sensor, input or state `index`."""
+def _valued(batch: Events, width: int, kind: int, index: int) -> bool:
+    """Whether a batch has a value for the sensor, input or state `index` in its first `width` columns."""
     rows = batch.kind == kind
     if kind == READING:
         rows = rows & (batch.channel == index)
-        return bool(np.isfinite(batch.value[rows]).any())
+        return bool(np.isfinite(batch.value[rows, :width]).any())
     column = index - batch.channel[rows]
-    inside = np.flatnonzero((column >= 0) & (column < batch.value.shape[1]))
+    inside = np.flatnonzero((column >= 0) & (column < width))
     return bool(np.isfinite(batch.value[rows][inside, column[inside]]).any())

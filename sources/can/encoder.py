@@ -82,6 +82,10 @@ class Encoder:
                 )
             if channel.only:
                 raise SourceError(f"{channel.name}: only picks frames; it cannot be encoded, so leave it out")
+            if channel.accuracy is not None:
+                raise SourceError(
+                    f"{channel.name}: accuracy comes from the asset; it cannot be encoded, so leave it out"
+                )
             messages, _, path = find_messages(found, channel)
             message = messages[0]
             if any(signal.multiplexer_ids for signal in message.signals):

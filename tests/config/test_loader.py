@@ -51,10 +51,10 @@ def test_values_are_read_and_defaults_filled_in() -> None:
     ("old", "new", "expected"),
     [
         ("    std: 2", "    sdt: 2", "motor.yaml:6: sensors.winding.sdt is not known; did you mean std?"),
-        ("    std: 2", "    std: -0.1", "motor.yaml:6: sensors.winding.std is -0.1; it must be positive"),
+        ("    std: 2", "    std: -0.1", "motor.yaml:6: sensors.winding.std is -0.1; it must be zero or positive"),
         ("    std: 2", "    std: 1e200", "motor.yaml:6: sensors.winding.std is 1e+200; it must be 1e+50 at most"),
-        ("    std: 2", "    variance: 0", "motor.yaml:6: sensors.winding.variance is 0; it must be positive"),
-        ("    std: 2", "    std: [1, -1]", "motor.yaml:6: sensors.winding.std[1] is -1; it must be positive"),
+        ("    std: 2", "    variance: -1", "motor.yaml:6: sensors.winding.variance is -1; it must be zero or positive"),
+        ("    std: 2", "    std: [1, -1]", "motor.yaml:6: sensors.winding.std[1] is -1; it must be zero or positive"),
         ("    std: 2", "    std: .nan", "motor.yaml:6: sensors.winding.std is nan; it must be a finite number"),
         ("    std: 2", "    std: []", "motor.yaml:6: sensors.winding.std is []; it needs 1 or more entries"),
         (
@@ -80,8 +80,8 @@ def test_values_are_read_and_defaults_filled_in() -> None:
         ("[5, 2]", "[5]", "motor.yaml:13: source.inputs.torque[1].steps[1] is [5]; it needs 2 or more entries"),
         (
             "estimator: kf",
-            "estimator: {name: kf, options: {a: b}}",
-            "motor.yaml:7: estimator.options.a is 'b'; it must be a number",
+            "estimator: {name: kf, options: {a: [b]}}",
+            "motor.yaml:7: estimator.options.a is ['b']; it must be a number",
         ),
     ],
 )
@@ -148,7 +148,7 @@ def test_what_is_not_a_twin_at_all_is_one_line(text: str, expected: str) -> None
             "motor.yaml:14: name is 'my motor'; use letters, digits, _ and -, and begin with a letter or digit",
         ),
         ("history: 2.5", "motor.yaml:14: history is 2.5; it must be a whole number"),
-        ("prior: {a: {std: 0}}", "motor.yaml:14: prior.a.std is 0; it must be positive"),
+        ("prior: {a: {std: -1}}", "motor.yaml:14: prior.a.std is -1; it must be zero or positive"),
     ],
 )
 def test_settings_that_contradict_each_other_are_one_line(more: str, expected: str) -> None:
@@ -166,7 +166,7 @@ def test_a_profile_that_cannot_repeat_is_one_line(repeat: str) -> None:
 def test_one_mistake_is_one_line_though_it_breaks_several_rules() -> None:
     text = MOTOR.replace("    std: 2", "    std: [-1]").replace("[1, {steps: [[0, 1], [5, 2]]}]", "{a: 1}")
     assert message(text).splitlines() == [
-        "motor.yaml:6: sensors.winding.std[0] is -1; it must be positive",
+        "motor.yaml:6: sensors.winding.std[0] is -1; it must be zero or positive",
         "motor.yaml:13: source.inputs.torque.a is not known; choose from constant, steps, repeat, sine",
     ]
     text = "model: a\nsource: {type: can, interface: virtual, channel: [1], dbc: a.dbc}\n"
@@ -183,7 +183,7 @@ def test_nested_aliases_cannot_ask_for_billions_of_values() -> None:
 def test_several_problems_are_a_line_each_and_no_more_than_five() -> None:
     text = MOTOR.replace("    std: 2", "    std: -2").replace("gate: 0.9973", "gate: 2")
     assert message(text).splitlines() == [
-        "motor.yaml:6: sensors.winding.std is -2; it must be positive",
+        "motor.yaml:6: sensors.winding.std is -2; it must be zero or positive",
         "motor.yaml:8: gate is 2; it must be below 1",
     ]
     noise = "".join(f"  n{k}: {{variance: -1}}\n" for k in range(8))

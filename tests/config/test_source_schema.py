@@ -128,3 +128,12 @@ source:
 def test_a_mistake_in_a_source_is_one_line(old: str, new: str, expected: str) -> None:
     assert old in CAR
     assert message(CAR.replace(old, new, 1)) == expected
+
+
+def test_a_receiver_that_knows_its_accuracy_can_be_written() -> None:
+    own = "convert: east_north\n          accuracy: {std: PositionAccuracy, units: cm, scale: 0.5}"
+    source = load_text(CAR.replace("convert: east_north", own), Path("car.yaml")).config.source
+    assert isinstance(source, MergedSection)
+    accuracy = source.parts[0].sensors["gnss"].accuracy
+    assert accuracy is not None and accuracy.std == ("PositionAccuracy",) and accuracy.variance is None
+    assert accuracy.units == ("cm",) and accuracy.scale == (0.5,)

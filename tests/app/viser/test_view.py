@@ -5,6 +5,7 @@ import base64
 import http.client
 import os
 import socket
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -470,5 +471,32 @@ def test_vehicle_scene_keeps_the_vehicle_in_the_middle():
         assert view.scene._course == pytest.approx(0.0, abs=0.05)
         cov = engine.belief().cov[:2, :2]
         np.testing.assert_allclose(view.scene._ellipse.scale[:2], 2 * np.sqrt(np.linalg.eigvalsh(cov)), rtol=1e-6)
+    finally:
+        view.stop()
+
+
+def test_a_variance_of_zero_is_typed_not_dragged(clock, monkeypatch):
+    """Powers of ten from zero lead nowhere: its row has no slider, and takes what is typed; zero again too."""
+    row = replace(WINDING.sensors[0].rows[0], variance=0.0)
+    exact = replace(
+        WINDING,
+        states=(replace(WINDING.states[0], std=0.0), WINDING.states[1]),
+        sensors=(replace(WINDING.sensors[0], rows=(row,)),),
+    )
+    engine = FakeEngine(exact, "kf")
+    engine.put(history())
+    view = ViserView(engine, secret="s3cret")
+    try:
+        monkeypatch.setattr(view.coalescer, "_clock", clock)
+        view.frame()
+        shown = view.panel.rows["R.winding"]
+        assert shown.slider is None and shown.field.value == "0"
+        for text, value in (("0.25", 0.25), ("0", 0.0)):
+            edit(shown.field, text)
+            clock.now += 2 * TYPING_PAUSE
+            view.coalescer.flush()
+            assert engine.commands[-1] == SetTuning("R.winding", value)
+        view.frame()
+        assert shown.field.value == "0" and engine.state.tuning.get("R.winding") == 0.0
     finally:
         view.stop()

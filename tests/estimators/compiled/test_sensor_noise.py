@@ -93,7 +93,7 @@ def test_a_sensor_holds_any_matrix_so_that_models_compare():
     [
         (np.eye(2), "has 2 rows of 2, 2; it must be 3 × 3"),
         ([[1.0]], "has 1 rows of 1; it must be 3 × 3"),
-        (2.0 * np.eye(3), "must be finite, with ones on its diagonal; of a covariance R take correlation_of"),
+        (2.0 * np.eye(3), "must be finite, with ones on its diagonal; of a covariance R give R_ij"),
         (np.full((3, 3), np.nan), "must be finite"),
         (np.eye(3) + 0.1 * np.eye(3, k=1), "is not symmetric; fill both triangles alike"),
         (np.ones((3, 3)), "is not positive definite"),

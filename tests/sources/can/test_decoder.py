@@ -8,7 +8,7 @@ import pytest
 from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TRUTH
 from sources.can.decoder import Decoder
-from sources.source import Channel, Condition
+from sources.source import Accuracy, Channel, Condition
 from tests.sources.can.can_tools import Reports, dbc, frame, sensor
 
 
@@ -246,3 +246,66 @@ def test_a_recording_decodes_as_cantools_does(data):
         found = database.decode_message(message.arbitration_id, message.data, decode_choices=False)
         theirs = [float(found[name]) for name in signals[names[k]]]
         assert row[: len(theirs)].tolist() == theirs
+
+
+def test_a_frame_brings_the_noise_of_its_reading(tmp_path):
+    """Squared, in columns of their own; one that is not positive or cut off leaves the tuned R, and is counted."""
+    reports = Reports()
+    accuracy = Accuracy(("Torque",), units=("cm",), scale=(0.5,))
+    fix = Channel(
+        READING, 0, "engine", ("Temp", "Rpm"), "ENGINE", units=("m", "m"), model_units=("m", "m"), accuracy=accuracy
+    )
+    decoder = Decoder([(dbc(tmp_path), None)], [fix, sensor(1, "FIX", "Lat")], width=3, report=reports)
+    database = cantools.database.load_file(dbc(tmp_path), strict=False)
+    data = [
+        database.encode_message("ENGINE", {"Temp": 20.0, "Rpm": 800.0, "Torque": torque, "Ok": 1})
+        for torque in (300.0, 0.0, -5.0)
+    ]
+    frames = [frame(256, item) for item in (*data, data[0][:4])] + [frame(258, bytes(8))]
+    batch = decoder.decode(decoder.gather(frames, None))
+    nan = np.nan
+    np.testing.assert_allclose(
+        batch.value,
+        [
+            [20.0, 800.0, nan, (0.01 * 300.0 * 0.5) ** 2, (0.01 * 300.0 * 0.5) ** 2],
+            *[[20.0, 800.0, nan, nan, nan]] * 3,
+            [0.0, nan, nan, nan, nan],
+        ],
+        rtol=1e-14,
+    )
+    assert reports.counts == {"accuracy engine": 3}
+    assert reports.texts["accuracy engine"].startswith("engine: Torque tells no standard deviation of a reading")
+
+
+def test_an_accuracy_is_no_value_of_its_sensor(tmp_path):
+    """A fix at 200° of latitude is missing, however accurate."""
+    accuracy = Accuracy(("Torque",), units=("m",))
+    place = Channel(
+        READING, 0, "gnss", ("Temp", "Rpm"), "ENGINE", units=("deg", "deg"), model_units=("m", "m"),
+        convert="east_north", accuracy=accuracy,
+    )  # fmt: skip
+    decoder = Decoder([(dbc(tmp_path), None)], [place], width=2)
+    database = cantools.database.load_file(dbc(tmp_path), strict=False)
+    for latitude, missing in ((200.0, True), (50.0, False)):
+        data = database.encode_message("ENGINE", {"Temp": latitude, "Rpm": 10.0, "Torque": 3.0, "Ok": 1})
+        batch = decoder.decode(decoder.gather([frame(256, data)], None))
+        assert np.isnan(batch.value[0, :2]).all() == missing == bool(decoder.expected)
+    np.testing.assert_array_equal(batch.value, [[0.0, 0.0, 9.0, 9.0]])
+
+
+@pytest.mark.parametrize(("unit", "square"), [("m^2", 1.0), ("cm^2", 1e-4), ("m²", 1.0)])
+def test_variances_convert_by_the_square(tmp_path, unit, square):
+    accuracy = Accuracy(("Torque",), squared=True, units=(unit,), scale=(2.0,))
+    fix = Channel(READING, 0, "engine", ("Temp",), "ENGINE", units=("m",), model_units=("m",), accuracy=accuracy)
+    decoder = Decoder([(dbc(tmp_path), None)], [fix], width=1)
+    database = cantools.database.load_file(dbc(tmp_path), strict=False)
+    data = database.encode_message("ENGINE", {"Temp": 20.0, "Rpm": 0.0, "Torque": 3.0, "Ok": 1})
+    batch = decoder.decode(decoder.gather([frame(256, data)], None))
+    np.testing.assert_allclose(batch.value, [[20.0, 6.0 * square]], rtol=1e-12)
+
+
+def test_an_accuracy_of_another_dimension_is_refused(tmp_path):
+    accuracy = Accuracy(("Torque",), squared=True, units=("m",))
+    fix = Channel(READING, 0, "engine", ("Temp",), "ENGINE", units=("m",), model_units=("m",), accuracy=accuracy)
+    with pytest.raises(SourceError, match=r"engine: Torque: 'm' does not convert to the model's '\(m\)\*\*2'"):
+        Decoder([(dbc(tmp_path), None)], [fix], width=1)

@@ -1,0 +1,280 @@
+"""Noise as a twin's YAML can say it: correlated rows, none at all, and that which comes with each reading."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.cli.arguments import Fold as Arguments
+from app.cli.fold import fold_twin, read_log
+from app.engine.commands import SetEstimator, SetOption
+from app.engine.execute import retuned
+from app.recording.format import tuning_from_json
+from app.recording.reader import read_recording
+from app.twin.twin import Twin, load_twin, restore_twin
+from estimators.errors import ConfigError, EstimatorError
+from estimators.fold import fold
+from estimators.log import READING, TRUTH, Log
+from estimators.models import MODELS
+
+ROVER = """\
+model: pair.py:Pair
+sensors:
+  fix: {std: [1, 2]}
+prior:
+  x: {mean: 1, std: 2}
+estimator: kf
+source:
+  type: simulator
+  duration: 400
+"""
+
+PAIR = """\
+from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
+
+
+def f(x, u, p, dt, out):
+    out[:] = x
+
+
+def h(x, u, p, out):
+    out[:] = x
+
+
+def Pair():
+    return StateSpaceModel(
+        name="pair", title="Pair", states=(State("x", "m"), State("y", "m")), f=f, linear=True,
+        noises=(Noise("x", "m²/s", 0.1), Noise("y", "m²/s", 0.1)),
+        sensors=(Sensor("fix", (Row("east", "m", 1.0), Row("north", "m", 4.0)), h=h),),
+    )
+"""
+
+TABLE = """\
+model: motor_winding
+estimator: kf
+sensors:
+  winding: {std: 2}
+source:
+  type: table
+  files: run.csv
+  time: {column: t}
+  sensors:
+    winding: {columns: w, accuracy: {std: a}}
+"""
+
+
+@pytest.fixture(autouse=True)
+def _inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Messages show paths as they look from the working directory."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("NISUS_DATA", raising=False)
+    Path("pair.py").write_text(PAIR)
+
+
+def twin_of(text: str, **options: object) -> Twin:
+    Path("twin.yaml").write_text(text)
+    return load_twin("twin.yaml", **options)  # type: ignore[arg-type]
+
+
+def message(text: str, **options: object) -> str:
+    with pytest.raises(ConfigError) as caught:
+        twin_of(text, **options)
+    return str(caught.value)
+
+
+def correlated(matrix: str) -> str:
+    return ROVER.replace("[1, 2]}", f"[1, 2], correlation: {matrix}}}")
+
+
+def test_correlated_rows_make_a_full_r() -> None:
+    """The first posterior of a prior N(m, P) at R = [[1, 1], [1, 4]], by the equations of the Kalman filter."""
+    twin = twin_of(correlated("[[1, 0.5], [0.5, 1]]"))
+    log = Log.of(twin.model, start=0.0)
+    log.add("fix", [0.0], [[3.0, -1.0]])
+    track = fold("kf", twin.model, twin.tuning, log)
+    m, P, R = np.array([1.0, 0.0]), np.diag([4.0, 1.0]), np.array([[1.0, 1.0], [1.0, 4.0]])
+    K = P @ np.linalg.inv(P + R)
+    np.testing.assert_allclose(track.mean[-1], m + K @ (np.array([3.0, -1.0]) - m), rtol=1e-12)
+    np.testing.assert_allclose(track.std[-1], np.sqrt(np.diag(P - K @ P)), rtol=1e-12)
+
+
+def test_the_simulated_sensor_is_correlated_too() -> None:
+    """What is said less what is true, of 400 readings: the correlation within 5 standard errors, (1 - c²) / √n."""
+    log, _ = read_log(twin_of(correlated("[[1, -0.9], [-0.9, 1]]")), None)
+    events = log.events
+    said, true = (events.value[events.kind == kind] for kind in (READING, TRUTH))
+    c = np.corrcoef((said - true).T)[0, 1]
+    assert len(said) == 400 and abs(c + 0.9) < 5 * (1 - 0.9**2) / np.sqrt(400)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "expected"),
+    [
+        ("[[1, 0.5]]", "has 1 rows of 2; it must be 2 × 2"),
+        ("[[1, 0.5], [1]]", "has 2 rows of 2, 1; it must be 2 × 2"),
+        ("[[1]]", "has 1 rows of 1; it must be 2 × 2"),
+        ("[[1, 0.5], [0.4, 1]]", "is not symmetric; fill both triangles alike"),
+        ("[[2, 0.5], [0.5, 1]]", "must be finite, with ones on its diagonal; of a covariance R give R_ij / √(R_ii R_jj)"),  # noqa: E501
+        ("[[1, 1.5], [1.5, 1]]", "is not positive definite (smallest eigenvalue -0.5); lessen the correlations"),  # noqa: E501
+        ("[[1, 1], [1, 1]]", "is not positive definite (smallest eigenvalue 0); leave out rows that repeat others"),
+    ],
+)  # fmt: skip
+def test_a_correlation_that_is_none_is_one_line(matrix: str, expected: str) -> None:
+    assert message(correlated(matrix)) == f"twin.yaml:3: sensors.fix.correlation {expected}"
+
+
+def test_a_correlation_must_be_rows_of_numbers() -> None:
+    assert (
+        message(correlated("[1, 0.5]")) == "twin.yaml:3: sensors.fix.correlation[0] is 1; it must be a list\n"
+        "twin.yaml:3: sensors.fix.correlation[1] is 0.5; it must be a list"
+    )
+
+
+def test_a_filter_that_takes_rows_as_independent_says_so() -> None:
+    text = correlated("[[1, 0.5], [0.5, 1]]").replace("estimator: kf", "estimator: pf")
+    assert message(text).startswith("twin.yaml:6: estimator pf does not apply: the rows of pair's sensor fix are")
+
+
+def test_the_identity_correlates_nothing() -> None:
+    assert twin_of(correlated("[[1, 0], [0, 1]]").replace("estimator: kf", "estimator: pf")).model.correlated is None
+
+
+def test_a_sensor_without_noise_and_a_state_that_is_certain() -> None:
+    """x is known to be 1 at first and stays so, as it is not driven; y is what the sensor reads, exactly."""
+    text = ROVER.replace("[1, 2]", "[1, 0]").replace("std: 2}", "std: 0}") + "noise:\n  x: {std: 0}\n"
+    twin = twin_of(text)
+    log = Log.of(twin.model, start=0.0)
+    log.add("fix", [0.0, 1.0], [[3.0, -1.0], [5.0, 2.5]])
+    track = fold("kf", twin.model, twin.tuning, log)
+    np.testing.assert_allclose(track.mean, [[1.0, -1.0], [1.0, 2.5]], atol=1e-12)
+    np.testing.assert_allclose(track.std, 0.0, atol=1e-9)
+    assert twin.tuning.set("R.fix.north", 4.0).set("R.fix.north", 0.0).get("R.fix.north") == 0.0
+
+
+@pytest.mark.parametrize(("old", "new", "what"), [
+    ("[1, 2]", "[1, 0]", "fix.north reads without noise"),
+    ("std: 2}", "std: 0}", "x is certain at first"),
+])  # fmt: skip
+def test_a_filter_that_cannot_bear_certainty_says_what_can(old: str, new: str, what: str) -> None:
+    text = ROVER.replace(old, new).replace("estimator: kf", "estimator: ukf")
+    assert message(text) == (
+        f"twin.yaml:6: estimator ukf does not apply: in pair {what}, and ukf takes no singular covariance; give it a "
+        "small variance, or use kf, ekf, iekf, sr-kf, sr-ekf, sr-ukf"
+    )
+
+
+def test_a_simulated_sensor_may_be_exact() -> None:
+    """The asset's own noise is 0, the estimator's is not."""
+    twin = twin_of(ROVER + "  sensors: {fix: {std: 0}}\n")
+    log, _ = read_log(twin, None)
+    said, true = (log.events.value[log.events.kind == kind] for kind in (READING, TRUTH))
+    np.testing.assert_array_equal(said, true)
+    assert twin.tuning.get("R.fix.east") == 1.0
+
+
+def test_a_field_must_be_uncertain() -> None:
+    name = MODELS["field_era5"].states.name
+    text = (
+        f"model: field_era5\nestimator: enkf\nprior:\n  {name}: {{std: 0}}\nsource: {{type: simulator, duration: 1}}\n"
+    )
+    assert message(text) == (
+        f"twin.yaml:4: prior.{name}.std is 0; that of a field must be positive, or its members would be alike"
+    )
+
+
+def test_a_log_likelihood_is_not_asked_about_readings_without_noise() -> None:
+    """Only particle filters use it, and they refuse such a sensor; √0 in its denominator is nobody's fault."""
+    likely = "def likely(y, x, u, p, r):\n    return -0.5 * (y[0] - x[0]) ** 2 / r[0]\n\n\n"
+    pair = PAIR.replace("def Pair", likely + "def Pair").replace("h=h)", "h=h, log_likelihood=likely)")
+    Path("pair.py").write_text(pair)
+    twin = twin_of(ROVER.replace("[1, 2]", "[0, 2]"))
+    log = Log.of(twin.model, start=0.0)
+    log.add("fix", [0.0], [[3.0, -1.0]])
+    assert fold("kf", twin.model, twin.tuning, log).mean[-1, 0] == pytest.approx(3.0)
+
+
+def test_a_reading_brings_its_own_noise_from_a_table() -> None:
+    """As if a script had added each with its variance; what is no deviation leaves the tuned R, and is counted."""
+    accuracy = ["0.5", "", "3", "0", "-1", "1"]
+    t, w = np.arange(1.0, 7.0), [21.0, 22.0, 20.0, 25.0, 24.0, 23.0]
+    rows = "\n".join(f"{a:g},{b:g},{c}" for a, b, c in zip(t, w, accuracy, strict=True))
+    Path("run.csv").write_text(f"t,w,a\n{rows}\n")
+    twin = twin_of(TABLE)
+    log, counts = read_log(twin, None)
+    assert counts["accuracy winding"] == 3
+    oracle = Log.of(twin.model)
+    oracle.add("winding", t, w, variance=[0.25, np.nan, 9.0, np.nan, np.nan, 1.0])
+    ours, theirs = (fold("kf", twin.model, twin.tuning, each) for each in (log, oracle))
+    rows = log.events.kind == READING
+    np.testing.assert_array_equal(ours.mean[rows], theirs.mean)
+    np.testing.assert_array_equal(ours.std[rows], theirs.std)
+
+
+@pytest.mark.parametrize(("old", "new", "expected"), [
+    ("{std: a}", "{std: a, variance: a}", "twin.yaml:10: source.sensors.winding.accuracy gives both std and variance; keep one"),  # noqa: E501
+    ("{std: a}", "{scale: 2}", "twin.yaml:10: source.sensors.winding.accuracy gives neither std nor variance; add it"),
+    ("{std: a}", "{std: [a, a]}", "twin.yaml:10: source.sensors.winding.accuracy names 2; give one, or one for each of the 1 values"),  # noqa: E501
+    ("estimator: kf", "estimator: {name: kf, options: {adapt: R}}", "twin.yaml:2: estimator kf: readings bring their own variance, but adapt learns one R of each sensor; set adapt to off or Q"),  # noqa: E501
+    ("  sensors:\n    winding: ", "  sensors: {winding: {columns: w}}\n  truth:\n    temperature: ", "twin.yaml:11: source.truth.temperature.accuracy is for sensors; leave it out"),  # noqa: E501
+])  # fmt: skip
+def test_an_accuracy_that_cannot_be_used_is_one_line(old: str, new: str, expected: str) -> None:
+    assert old in TABLE
+    assert message(TABLE.replace(old, new)) == expected
+
+
+def test_what_readings_bring_is_recorded_and_folded_again() -> None:
+    """A recording has the variances; the fold of them is the one that was recorded, and not that of the tuned R."""
+    Path("run.csv").write_text("t,w,a\n1,40,0.5\n2,42,\n3,41,3\n")
+    Path("twin.yaml").write_text(TABLE)
+    assert fold_twin(Arguments("twin.yaml", out=Path("run.rrd"))) == 0
+    recorded = read_recording(Path("run.rrd"))
+    twin = restore_twin(recorded.text, recorded.twin_path)
+    np.testing.assert_array_equal(recorded.events.value[:, twin.model.width], [0.25, np.nan, 9.0])
+    log = Log.of(twin.model)
+    log.extend(recorded.events)
+    tuning, estimator = tuning_from_json(recorded.tuning, twin.model)
+    again, direct = (
+        fold(estimator, twin.model, tuning, log),
+        fold("kf", twin.model, twin.tuning, read_log(twin, None)[0]),
+    )
+    np.testing.assert_array_equal(again.std, direct.std)
+    # P⁺ = P r / (P + r) at once, of the first reading; its prior has the variance 25.
+    assert again.std[0, 0] == pytest.approx(np.sqrt(25 * 0.25 / 25.25), rel=1e-12)
+
+
+def test_a_filter_of_one_r_is_refused_before_readings_bring_theirs() -> None:
+    """On the page too, where the first of them may be yet to come; then the twin would stand still."""
+    twin = twin_of(TABLE)
+    engine: Any = SimpleNamespace(
+        twin=twin, model=twin.model, estimator="kf", tuning=twin.tuning, options_of=twin.options_of
+    )
+    for command, reason in (
+        (SetEstimator("kf-steady"), "its gain is for one R; use kf"),
+        (SetOption("adapt", 1.0), "adapt learns one R of each sensor; set adapt to off or Q"),
+    ):
+        with pytest.raises(EstimatorError, match=f"readings bring their own variance, but {reason}"):
+            retuned(command, engine)
+    assert retuned(SetOption("adapt", 2.0), engine)[1].options["adapt"] == 2.0
+
+
+@pytest.mark.parametrize("word", ["stratified", "2"])
+def test_options_that_are_choices_may_be_words(word: str) -> None:
+    from estimators import ESTIMATORS
+
+    option = next(item for item in ESTIMATORS["pf"].options if item.name == "resampling")
+    code = float(option.choices.index(word)) if word in option.choices else float(word)
+    text = ROVER.replace("estimator: kf", f"estimator: {{name: pf, options: {{resampling: {word}}}}}")
+    twin = twin_of(text + "filters: {kf: {adapt: R, joseph: off}}\n")
+    assert twin.tuning.options == {"resampling": code} == twin.options_of("pf")
+    assert twin.options_of("kf") == {"adapt": 1.0, "joseph": 0.0}
+    over = twin_of(ROVER, overrides={"estimator": "pf", "estimator.options.resampling": word})
+    assert over.tuning.options == {"resampling": code}
+
+
+def test_a_word_that_is_no_choice_is_one_line() -> None:
+    text = ROVER.replace("estimator: kf", "estimator: {name: kf, options: {adapt: sometimes}}")
+    assert message(text) == "twin.yaml:6: estimator kf: adapt is 'sometimes'; it must be one of off, R, Q"
+    text = ROVER.replace("estimator: kf", "estimator: {name: kf, options: {inflation: R}}")
+    assert message(text) == "twin.yaml:6: estimator kf: inflation is 'R'; it must be a number"
