@@ -78,14 +78,14 @@ class View:
     @contextmanager
     def brought(self, sensor: int, own: np.ndarray) -> Iterator[None]:
         """While it lasts, R has the variances that a reading brought, own (ny or more,); NaN leaves the tuned one."""
-        tuned = self._R[sensor]
-        r, own = self._r[sensor].copy(), own[: len(tuned)]
+        r, tuned = self._r[sensor], (self._r[sensor].copy(), self._R[sensor])
+        own = own[: len(tuned[1])]
         np.copyto(r[: own.size], own, where=np.isfinite(own))
         self._R[sensor] = covariance_of(self.compiled.model.sensors[sensor].correlation, r)
         try:
             yield
         finally:
-            self._R[sensor] = tuned
+            r[:], self._R[sensor] = tuned
 
     def circular_rows(self, sensor: int) -> np.ndarray:
         """For each row of a sensor, whether it is an angle."""

@@ -69,6 +69,27 @@ class Scripted:
         pass
 
 
+class Replayed(Scripted):
+    """As a replay, whose time can be held and sought; a test says when it began again, by `restarts`."""
+
+    speed, paused, restarts, span = 1.0, False, 0, None
+
+    def pause(self):
+        pass
+
+    def resume(self):
+        pass
+
+    def step(self):
+        pass
+
+    def set_speed(self, speed):
+        pass
+
+    def seek(self, t):
+        pass
+
+
 def wait_for(condition, seconds=60.0):
     """Poll until a condition holds; what another thread does has no event to wait on."""
     import time

@@ -20,7 +20,7 @@ from app.rerun.sink import CALENDAR
 from app.rerun.style import pair_name
 from app.rerun.thin import last_of_each_time, thin
 from estimators.log import READING, TRUTH, Events
-from tests.app.scripted import Scripted, readings, twin, wait_for
+from tests.app.scripted import Replayed, readings, twin, wait_for
 
 WINDOW = 10.0
 
@@ -29,7 +29,7 @@ class Fed:
     """An engine on readings that the test gives, and a feed of it."""
 
     def __init__(self, tmp_path):
-        self.source = Scripted()
+        self.source = Replayed()
         made = twin()
         made.config.view = SimpleNamespace(window=WINDOW)
         self.engine = Engine(made, lambda report: self.source)
@@ -387,9 +387,6 @@ def seek_back(fed, batch):
         fed.source.restarts = 1
         return batch
 
-    fed.source.restarts, fed.source.speed, fed.source.paused = 0, 1.0, False
-    for name in ("pause", "resume", "set_speed", "step", "seek"):
-        setattr(fed.source, name, None)
     fed.source.read = begun_again
     wait_for(lambda: fed.engine.status().revision > revision and fed.events() == len(batch))
 

@@ -193,7 +193,7 @@ def seekable(page, tmp_path, monkeypatch):  # noqa: F811
         monkeypatch.setattr(page.source, name, lambda value: None, raising=False)
     for name in ("pause", "resume", "step"):
         monkeypatch.setattr(page.source, name, lambda: None, raising=False)
-    for name, value in (("speed", 1.0), ("paused", False), ("restarts", 0)):
+    for name, value in (("speed", 1.0), ("paused", False), ("restarts", 0), ("span", None)):
         monkeypatch.setattr(page.source, name, value, raising=False)
     page.engine.recorder = type("Deaf", (), {"record": lambda self, path: None, "path": None, "finished": []})()
     page.source.put(readings([1.0, 2.0], [40.0, 41.0]))

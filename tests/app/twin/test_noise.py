@@ -132,9 +132,9 @@ def test_a_correlation_must_be_rows_of_numbers() -> None:
     )
 
 
-def test_a_filter_that_takes_rows_as_independent_says_so() -> None:
-    text = correlated("[[1, 0.5], [0.5, 1]]").replace("estimator: kf", "estimator: pf")
-    assert message(text).startswith("twin.yaml:6: estimator pf does not apply: the rows of pair's sensor fix are")
+def test_localisation_needs_rows_that_have_places_of_their_own() -> None:
+    text = correlated("[[1, 0.5], [0.5, 1]]").replace("estimator: kf", "estimator: {name: enkf, options: {radius: 1}}")
+    assert message(text).startswith("twin.yaml:6: estimator enkf: radius is 1, but the rows of pair's sensor fix are")
 
 
 def test_the_identity_correlates_nothing() -> None:
