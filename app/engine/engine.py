@@ -422,14 +422,20 @@ class Engine:
 
     def _adopt(self, done: Refolded) -> None:
         """Swap a finished refold in, after it has caught up with what came meanwhile."""
-        wanted, changed_from = self._requests.answer(done.ticket)
-        if not wanted:
-            return
+        # Answered under the lock, so that nobody sees the old fold, and that none is waited for.
+        with self._lock:
+            wanted, changed_from = self._requests.answer(done.ticket)
+            if wanted and not self._swap(done, changed_from):
+                # The log was cut meanwhile: ask again.
+                self.retune(self.estimator, self.tuning)
+
+    def _swap(self, done: Refolded, changed_from: int | None) -> bool:
+        """Go on with a refold, or say why not; False if it no longer fits the log."""
         if done.fold is None:
             self._refuse(done.ticket, done.error)
-            return
+            return True
         fold = done.fold
-        with self._lock, self._stall.watched(fold):
+        with self._stall.watched(fold):
             old, log = self._fold, self._log
             # What the new revision says of the readings counts, also of those that it loses here; not what others said.
             lost = max(0, log.first - fold.log.first)
@@ -438,29 +444,20 @@ class Engine:
             try:
                 fold.follow(log, changed_from)
             except EstimatorError:
-                # The log was cut meanwhile: the answer no longer fits, ask again.
-                stale = True
-            else:
-                stale = False
-                try:
-                    fold.advance()
-                except NisusError as error:
-                    self._refuse(done.ticket, str(error))
-                    return
-                self._previous = Pull(
-                    self._revision,
-                    False,
-                    log.first,
-                    Events(*(column[: old.n].copy() for column in log.events)),
-                    old.track,
-                )
-                self._fold, self._row_counts = fold, row_counts
-                self._revision += 1
-                self.notices.revision = self._revision
-                self._alerts.again()
-                self._alerts.look(fold, fold.n)
-        if stale:
-            self.retune(self.estimator, self.tuning)
+                return False
+            try:
+                fold.advance()
+            except NisusError as error:
+                self._refuse(done.ticket, str(error))
+                return True
+            events = Events(*(column[: old.n].copy() for column in log.events))
+            self._previous = Pull(self._revision, False, log.first, events, old.track)
+            self._fold, self._row_counts = fold, row_counts
+            self._revision += 1
+            self.notices.revision = self._revision
+            self._alerts.again()
+            self._alerts.look(fold, fold.n)
+        return True
 
     def _refuse(self, ticket: int, reason: str) -> None:
         """A refold failed: what runs goes on, and is what the panel shows."""

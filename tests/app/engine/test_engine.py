@@ -304,6 +304,39 @@ def test_a_refold_that_fails_after_a_late_reading_leaves_what_runs():
     assert text.startswith("not folded again: ") and "position" in text and "\n" not in text
 
 
+class Told:
+    """A lock that asks, whenever it is taken, whether another thread could have seen what is not so."""
+
+    def __init__(self, lock, honest):
+        self.lock, self.honest, self.seen = lock, honest, []
+
+    def acquire(self, timeout=-1):
+        self.seen.append(self.honest())
+        return self.lock.acquire(timeout=timeout)
+
+    def release(self):
+        self.lock.release()
+        self.seen.append(self.honest())
+
+    __enter__ = acquire
+
+    def __exit__(self, *_):
+        self.release()
+
+
+@pytest.mark.parametrize(("estimator", "options", "ends"), [("ukf", {}, "ukf"), ("enkf", {"radius": 5.0}, "kf")])
+def test_nobody_sees_the_old_rows_and_that_no_refold_is_waited_for(estimator, options, ends):
+    """Also of one that fails, after which the estimator is the old one again."""
+    engine = by_hand(*series(100))
+    lock = Told(engine._lock, lambda: engine._requests.waiting or engine.estimator == engine._fold.estimator.name)
+    engine.retune(estimator, engine.tuning.with_options(options))
+    done = refolded(engine)
+    engine._lock = lock
+    engine._adopt(done)
+    assert engine._fold.estimator.name == engine.estimator == ends and not engine._requests.waiting
+    assert lock.seen == [True, True]
+
+
 @pytest.mark.parametrize("name", ["pf", "enkf"])
 def test_the_same_filter_keeps_its_members_when_a_cut_history_is_folded_again(started, name):
     times, values = series(7000)
