@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -94,9 +95,9 @@ class ChannelSection(Section):
     accuracy: AccuracySection | None = None
     """Of a sensor: the noise that comes with each reading, {std: SIGNAL}. Default: null, the tuned R."""
 
+    @abstractmethod
     def names(self) -> tuple[str, ...]:
         """The signals or columns, one a row."""
-        raise NotImplementedError
 
     @model_validator(mode="after")
     def _lengths(self) -> ChannelSection:
