@@ -36,8 +36,8 @@ class Episode(NamedTuple):
     """Something that was wrong.
 
     `start` and `end` in seconds of the log; `end` None while it lasts. `subject`: a sensor, one of its rows, a state,
-    an input, or "twin". `cause`: a key of ALARMS.md. `size` in `unit` with its 95 % interval, `low` to `high` (NaN where
-    there is none). `text`: one sentence with the remedy.
+    an input, or "twin". `cause`: a key of ALARMS.md. `size` in `unit` with its 95 % interval, `low` to `high` (NaN
+    where there is none). `text`: one sentence with the remedy.
     """
 
     start: float
