@@ -160,7 +160,7 @@ def outcome_of(fold: Fold, events: Events, seconds: float) -> Outcome:
     model, track = fold.model, fold.track.select(slice(0, len(events)))
     fold.finish()
     pictures = () if fold.pictures is None else [one for one in fold.pictures.taken if one.before <= len(events)]
-    result = score(track, events, model, pictures)
+    result = score(track, events, model, pictures, gate=fold.tuning.gate)
     fits, units = result.states, {state.name: state.unit for state in model.shown_states}
     if result.field is not None and model.grid is not None:
         fits, units = {model.grid.name: result.field}, {model.grid.name: model.grid.unit}

@@ -86,7 +86,7 @@ def fold_twin(arguments: Arguments) -> int:
     interruptible(fold, work)
     seconds = (time.perf_counter() - begun) / log.n
     pictures = fold.pictures.taken if fold.pictures is not None else []
-    result = score(fold.track, log.events, twin.model, pictures)
+    result = score(fold.track, log.events, twin.model, pictures, gate=twin.tuning.gate)
     if arguments.out is not None:
         _write(arguments.out, twin, log, fold.track, pictures)
     if arguments.json:
