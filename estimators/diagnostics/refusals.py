@@ -14,9 +14,9 @@ that knows as much. And a consistent filter loses next to nothing: 1 - P of its 
 N(ŷ, S) would say. A density fitted to what was refused (as wide as the filter is wrong) would give neither, and a
 uniform one needs a range that sensors do not have.
 
-|S| is replaced by the product of its diagonal, which the track keeps for every filter. That is never less (Hadamard), so
-p integrates to one at most, and to one exactly for a reading of one row. A particle filter's gate is by its moments, so
-what its mixture has inside is P but for a part of 1 - P, and its score can gain no more than that a reading.
+|S| is replaced by the product of its diagonal, which the track keeps for every filter. That is never less (Hadamard),
+so p integrates to one at most, and to one exactly for a reading of one row. A particle filter's gate is by its moments,
+so its mixture may have more inside than P, by 1 - P at most: more than that a reading its score cannot gain.
 
 Sources: Gneiting & Raftery (2007), doi:10.1198/016214506000001437, for proper scores; Kotz & Nadarajah, Multivariate t
 Distributions and Their Applications (2004), 1.1 and 1.10, for t and its NIS / m, which is F(m, 1).
