@@ -103,8 +103,9 @@ class Fold:
         self._spare = np.empty_like(self._state)
         self._work = _scratch(self.estimator.work_size(self.options, model.nx, model.width) + 1)
         self._score = np.empty(WHITENED + model.ny)
-        marginal = self.estimator.family in ("particle", "ensemble")
-        self._watch = watch_of(model, tuning.r, tuning.gate, marginal, baseline, expected)
+        # Predictions that are not Gaussian: each row is whitened by itself (see Track).
+        self.marginal = self.estimator.family in ("particle", "ensemble")
+        self._watch = watch_of(model, tuning.r, tuning.gate, self.marginal, baseline, expected)
         self._evidence = fresh(model)
         self._clock = np.array([UNSET])
         self._u = np.array([item.default for item in model.inputs], float)

@@ -60,6 +60,7 @@ def calibrations(
     track: Track,
     *,
     gate: float | None = None,
+    marginal: bool = False,
     limits: Limits = LIMITS,
 ) -> list[Calibration]:
     """Calibration of every sensor row with readings, those that were used or refused and those held out apart.
@@ -72,6 +73,7 @@ def calibrations(
         events: What was folded, or a window of it.
         track: What was concluded of these events.
         gate: That of the tuning; None where nothing is refused.
+        marginal: Whether the filter's predictions are not Gaussian, and `Track.whitened` holds each row by itself.
         limits: What matters.
     """
     found = []
@@ -80,11 +82,11 @@ def calibrations(
     for i, (sensor, start) in enumerate(zip(model.sensors, model.row_start, strict=True)):
         own = (events.kind == READING) & (events.channel == i)
         for k in range(len(sensor.rows)):
-            e = standardised(track, k)
+            e = standardised(track, k, marginal)
             there = own & np.isfinite(e)
             rows = np.flatnonzero(there & judged)
             if rows.size:
-                edge = np.inf if limit is None else np.sqrt(limit[track.dof[rows] - 1])
+                edge = np.full(rows.size, np.inf) if limit is None else np.sqrt(limit[track.dof[rows] - 1])
                 refused = (track.verdict[rows] == GATED).astype(bool)
                 found.append(_of_row(model.row_names[start + k], events.t[rows], e[rows], edge, refused, limits))
             rows = np.flatnonzero(there & (track.verdict == HELD_OUT))
@@ -132,18 +134,24 @@ def truth_calibration(
     return found
 
 
-def standardised(track: Track, row: int) -> np.ndarray:
-    """e of one row of each event's sensor, (N,): innovation over its standard deviation; NaN where there is none."""
+def standardised(track: Track, row: int, marginal: bool) -> np.ndarray:
+    """e of one row of each event's sensor, (N,), as it would be drawn from N(0, 1); NaN where there is none.
+
+    The innovation over its standard deviation, or, with `marginal`, what the predictive distribution makes of it.
+    """
     with np.errstate(all="ignore"):
         e: np.ndarray = track.innovation[:, row] / track.innovation_std[:, row]
-    return e
+    own = track.whitened[:, row]
+    return np.where(np.isfinite(own), own, e) if marginal else e
 
 
-def _of_row(name: str, t: np.ndarray, e: np.ndarray, edge: np.ndarray, refused: np.ndarray, limits: Limits):
+def _of_row(
+    name: str, t: np.ndarray, e: np.ndarray, edge: np.ndarray, refused: np.ndarray, limits: Limits
+) -> Calibration:
     coverage, _ = _coverage(e, limits)
     clipped = np.clip(e, -edge, edge)
     # E min(z², g²) of a normal z: that of z² inside, and g² outside.
-    edge = np.minimum(np.broadcast_to(edge, e.shape), 40.0)
+    edge = np.minimum(edge, 40.0)
     tail = 2.0 * ndtr(-edge)
     left = 1.0 - tail - 2.0 * edge * np.exp(-0.5 * edge**2) / np.sqrt(2.0 * np.pi) + edge**2 * tail
     ratio = scale_interval(clipped**2 / left)

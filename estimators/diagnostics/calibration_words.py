@@ -60,12 +60,18 @@ def reading_words(
 
 def held_out_words(name: str, verdicts: Sequence[Verdict]) -> tuple[str, ...]:
     """What matters of a sensor row that is held out: the widest band that holds too many or too few."""
-    return tuple(f"{name}: the {100 * band:.0f} % band holds {_share(share)} of it" for band, share in verdicts[:1])
+    return tuple(
+        f"{name}: {_share(share)} of its readings in the {100 * band:.0f} % band of the prediction{_wide(band, share)}"
+        for band, share in verdicts[:1]
+    )
 
 
 def truth_words(name: str, verdicts: Sequence[Verdict], bias: Interval, limits: Limits) -> tuple[str, ...]:
     """What matters of a state whose truth is told."""
-    said = [f"{name}: truth in its {100 * band:.0f} % band {_share(share)} of the time" for band, share in verdicts[:1]]
+    said = [
+        f"{name}: truth in its {100 * band:.0f} % band {_share(share)} of the time{_wide(band, share)}"
+        for band, share in verdicts[:1]
+    ]
     if bias.beyond(-limits.bias, limits.bias):
         side = "above" if bias.value > 0.0 else "below"
         said.append(f"{name}: truth {side} the estimate (bias {_figures(bias, '+.2f')} σ)")
@@ -74,17 +80,21 @@ def truth_words(name: str, verdicts: Sequence[Verdict], bias: Interval, limits: 
 
 def _off(scale: float) -> str:
     """How far bands are off that would have to be `scale` times as wide."""
-    factor = max(scale, 1.0 / scale) if scale > 0.0 else float("inf")
-    side = "too narrow" if scale > 1.0 else "too wide"
-    if factor - 1.0 < FRACTIONS[-1][0]:
-        return f"{next(word for limit, word in FRACTIONS if factor - 1.0 < limit)} {side}"
-    return f"{side} by a factor of {factor:.2g}"
+    if not scale > 0.0:
+        return "far too wide: the readings never differ from the prediction"
+    factor, side = (scale, "too narrow") if scale > 1.0 else (1.0 / scale, "too wide")
+    fraction = next((word for limit, word in FRACTIONS if factor - 1.0 < limit), None)
+    return f"{fraction} {side}" if fraction else f"{side} by a factor of {factor:.2g}"
 
 
 def _figures(figure: Interval, form: str) -> str:
     """Value, low to high."""
     value, low, high = (format(number, form) for number in figure)
     return f"{value}, {low} to {high}"
+
+
+def _wide(band: float, share: Interval) -> str:
+    return ", too wide" if share.value > band else ""
 
 
 def _share(share: Interval) -> str:
