@@ -13,6 +13,7 @@ from app.cli.arguments import Fold
 from app.cli.compare_fold import fold_row
 from app.cli.fold import fold_twin, read_log
 from app.twin.twin import load_twin
+from estimators.track import HEALTH_NAMES
 
 DRIVE = """\
 model: motor_winding
@@ -162,7 +163,7 @@ def test_the_json_says_what_a_script_needs(tmp_path: Path, capsys: pytest.Captur
     assert told["stale"] == 1 and told["readings"] == 401 and told["gated"] == 1
     assert told["conditioned"] == told["missing"] == np.sum(~good) > 20
     assert told["used"] == np.sum(good) == np.sum(table.verdict == "used")
-    assert set(told["health"]) == {"tracking", "degraded", "diverged", "stale"}
+    assert tuple(told["health"]) == HEALTH_NAMES
     for name, share in told["health"].items():
         assert share == np.mean(table.health == name)
     assert told["health"]["tracking"] > 0.5 and sum(told["health"].values()) == pytest.approx(1.0)
@@ -175,7 +176,7 @@ def test_the_json_says_what_a_script_needs(tmp_path: Path, capsys: pytest.Captur
     winding, temperature, rate = told["calibration"]
     assert (winding["subject"], winding["role"], winding["n"]) == ("winding", "used", told["used"] + 1)
     # Clipped at the gate, 3.89 deviations, the outlier adds 15.1 to the squares; one in 10,000 would be clipped anyway.
-    e = (table["winding_innovation"] / table["winding_innovation_std"])[used]
+    e = (table.innovation_0 / table.innovation_std_0)[used]
     assert winding["ratio"]["value"] == pytest.approx((np.sum(e**2) + 15.137) / (e.size + 1), rel=1e-3)
     assert winding["refused"]["value"] == told["refused"] and winding["words"] == []
     assert (temperature["role"], rate["subject"], temperature["n"]) == ("truth", "rate", len(truth))
