@@ -203,7 +203,7 @@ def _calibration_lines(found: Sequence[Calibration], model: StateSpaceModel) -> 
         inside = 100 * float(np.mean([entry.coverage[-1].value for entry in entries]))
         bad = [entry for entry in entries if entry.words]
         lines.append(
-            f"{group}, {len(entries)} {'known' if role == 'truth' else role}: in the 95 % band {inside:.3g} %; "
+            f"{group}, {len(entries)} {'of them' if role == 'truth' else 'rows ' + role}: in the 95 % band {inside:.3g} %; "
             + (f"beyond the limits {len(bad)}, as {bad[0].words[0]}" if bad else "none beyond the limits")
         )
     return lines

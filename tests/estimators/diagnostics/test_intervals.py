@@ -62,6 +62,15 @@ def test_the_interval_is_as_wide_as_the_correlation_asks():
     assert widths["white"] == pytest.approx((2 * t.ppf(0.975, COSINES)) ** 2 / STEPS, rel=0.08)
 
 
+@pytest.mark.parametrize("kind", ["white", "correlated", "alternating"])
+def test_a_correlation_is_as_uncertain_as_bartlett_says(kind):
+    """Its variance is (1 - ρ²) / n for a first-order autoregression."""
+    found = [correlation_interval(series(kind, seed)[0]) for seed in range(RUNS)]
+    half = t.ppf(0.975, COSINES)
+    variance = np.mean([((one.high - one.low) / (2 * half)) ** 2 for one in found])
+    assert variance == pytest.approx((1 - series(kind, 0)[1] ** 2) / STEPS, rel=0.1)
+
+
 def test_the_projections_are_on_cosines():
     x = np.random.default_rng(3).standard_normal(50) + 7.0
     steps = np.arange(50) + 0.5
@@ -87,6 +96,8 @@ def test_what_never_changes_is_worth_as_little_as_the_values_it_is_told_of():
     white = np.random.default_rng(1).standard_normal(STEPS)
     always = np.ones(STEPS, bool)
     assert share_interval(always, slow).low < 0.8 < 0.99 < share_interval(always, white).low
+    # So is one whose sign alternates about it.
+    assert share_interval(always, slow * np.tile([1.0, -1.0], STEPS // 2)).low < 0.8
 
 
 def test_few_values_have_no_interval():
