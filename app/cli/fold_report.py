@@ -176,11 +176,11 @@ def as_text(
     ]
     width = max(len(name) for name, _ in rows)
     lines = [f"{name:<{width}}  {value}" for name, value in rows]
-    said = _calibration_lines(found, twin.model)
+    said = calibration_lines(found, twin.model)
     return lines + (["calibration, 95 % intervals:", *(f"  {line}" for line in said)] if said else [])
 
 
-def _calibration_lines(found: Sequence[Calibration], model: StateSpaceModel) -> list[str]:
+def calibration_lines(found: Sequence[Calibration], model: StateSpaceModel) -> list[str]:
     """A line for what each row or state has to say; the many rows of one sensor, or many states, are one."""
     many = {
         model.row_names[start + k]: sensor.name
@@ -202,10 +202,9 @@ def _calibration_lines(found: Sequence[Calibration], model: StateSpaceModel) -> 
     for (group, role), entries in groups.items():
         inside = 100 * float(np.mean([entry.coverage[-1].value for entry in entries]))
         bad = [entry for entry in entries if entry.words]
-        lines.append(
-            f"{group}, {len(entries)} {'of them' if role == 'truth' else 'rows ' + role}: in the 95 % band {inside:.3g} %; "
-            + (f"beyond the limits {len(bad)}, as {bad[0].words[0]}" if bad else "none beyond the limits")
-        )
+        counted = f"{len(entries)} {'of them' if role == 'truth' else f'rows {role}'}"
+        beyond = f"beyond the limits {len(bad)}, as {bad[0].words[0]}" if bad else "none beyond the limits"
+        lines.append(f"{group}, {counted}: in the 95 % band {inside:.3g} %; {beyond}")
     return lines
 
 
