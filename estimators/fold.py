@@ -98,6 +98,7 @@ class Fold:
         self._code: Code = driven(self.estimator) if model.black_box else self.estimator.code()
         most = model.width * max(1, self.policy.window)
         self._bounds: Bounds = chi_square_bounds(most)
+        self.marginal = self.estimator.family in ("particle", "ensemble")
         self._seen = self._see(baseline, expected)
         self._context: Any = self._seen
         numbers = self.estimator.state_size(self.options, model.nx) + self.estimator.memory(self.options, model)
@@ -147,7 +148,7 @@ class Fold:
             "options": np.ascontiguousarray(self.estimator.tune(self.options, model, tuning), float),
             "pairs": self.pairs,
             "prepared": self.estimator.prepare(model, self.options),
-            **watched(model, tuning.gate, self.estimator.family in ("particle", "ensemble"), baseline, expected),
+            **watched(model, tuning.gate, self.marginal, baseline, expected),
         }
         values: dict[str, Any] = {**self._compiled.static, **held}
         if self._own_prior is not None:

@@ -184,9 +184,10 @@ def watched(
     if model.mode >= 0:
         column[model.mode] = -1
     ranges = np.full((len(shown) + model.nu, 2), [-np.inf, np.inf])
-    for k, item in enumerate([*model.shown_states, *model.inputs]):
-        if item.fitted is not None:
-            ranges[k] = item.fitted
+    fitted = [item.fitted for item in model.shown_states] + [item.fitted for item in model.inputs]
+    for k, given in enumerate(fitted):
+        if given is not None:
+            ranges[k] = given
     chance = min(max(1e-6, 1.0 - gate), 0.5 * REFUSED_SHARE) if gate is not None else 0.5 * REFUSED_SHARE
     counts = np.array([len(sensor.rows) for sensor in model.sensors], np.int64)
     several = int(np.sum(counts > 1))
