@@ -16,7 +16,7 @@ import numpy as np
 
 from .compiled.context import context_of
 from .compiled.model import compile_model
-from .diagnostics.evidence import fresh, watched
+from .diagnostics.evidence import fresh, no_baseline, watched
 from .diagnostics.failure_cause import Estimate, around, cause, failures, questions
 from .diagnostics.field_pictures import Pictures
 from .diagnostics.health import Bounds, HealthPolicy, chi_square_bounds
@@ -99,7 +99,8 @@ class Fold:
         most = model.width * max(1, self.policy.window)
         self._bounds: Bounds = chi_square_bounds(most)
         self.marginal = self.estimator.family in ("particle", "ensemble")
-        self._seen = self._see(baseline, expected)
+        self.baseline = no_baseline(model) if baseline is None else baseline
+        self._seen = self._see(expected)
         self._context: Any = self._seen
         numbers = self.estimator.state_size(self.options, model.nx) + self.estimator.memory(self.options, model)
         self._state = np.empty(numbers)
@@ -132,7 +133,7 @@ class Fold:
         self._remember()
         self._rows = Track.allocate(log.capacity, len(model.shown), len(self.pairs), model.ny, model.width)
 
-    def _see(self, baseline: np.ndarray | None, expected: np.ndarray | None) -> np.void:
+    def _see(self, expected: np.ndarray | None) -> np.void:
         """The context of this model and tuning; the arrays that it points to are kept in `self._held`."""
         model, tuning = self.model, self.tuning
         gate = np.full(model.width + 1, np.inf)
@@ -148,7 +149,7 @@ class Fold:
             "options": np.ascontiguousarray(self.estimator.tune(self.options, model, tuning), float),
             "pairs": self.pairs,
             "prepared": self.estimator.prepare(model, self.options),
-            **watched(model, tuning.gate, self.marginal, baseline, expected),
+            **watched(model, tuning.gate, self.marginal, self.baseline, expected),
         }
         values: dict[str, Any] = {**self._compiled.static, **held}
         if self._own_prior is not None:

@@ -52,7 +52,8 @@ class Episode(NamedTuple):
 class Folded(Protocol):
     """What episodes are read from: a Fold, or whatever has its log and track.
 
-    `marginal`: whether `Track.whitened` holds each row by itself, as for predictions that are not Gaussian.
+    `marginal`: whether `Track.whitened` holds each row by itself, as for predictions that are not Gaussian. `baseline`:
+    what was normal, see evidence.py.
     """
 
     @property
@@ -67,6 +68,8 @@ class Folded(Protocol):
     def n(self) -> int: ...  # noqa: D102
     @property
     def marginal(self) -> bool: ...  # noqa: D102
+    @property
+    def baseline(self) -> np.ndarray: ...  # noqa: D102
 
 
 def episodes(fold: Folded) -> list[Episode]:
@@ -103,6 +106,13 @@ def standardised(fold: Folded, rows: np.ndarray, k: int) -> np.ndarray:
     return np.where((verdict == USED) | (verdict == GATED), e, np.nan)
 
 
+def unusual(fold: Folded, s: int, k: int, e: np.ndarray) -> np.ndarray:
+    """Finite e (n,) of row k of sensor s as it would be drawn from N(0, 1) if it were as it was when accepted."""
+    bias, scale, phi = fold.baseline[fold.model.row_start[s] + k, :3]
+    e = (e - bias) / scale
+    return np.append(e[:1], (e[1:] - phi * e[:-1]) / np.sqrt(1.0 - phi**2)) if phi else e
+
+
 def _of_sensors(fold: Folded) -> Iterator[Episode]:
     log, track, model = fold.log, fold.track, fold.model
     kind, channel = log.kind[: fold.n], log.channel[: fold.n]
@@ -117,7 +127,7 @@ def _of_sensor(fold: Folded, s: int, rows: np.ndarray, masks: np.ndarray, begin:
     """The episode of the readings `begin` to `end` of a sensor, whose events are `rows`."""
     log, track, model = fold.log, fold.track, fold.model
     said = np.bitwise_or.reduce(masks[begin:end])
-    k, begun, ranked = _most_telling(fold, rows, np.flatnonzero(said), begin, end)
+    k, begun, ranked = _most_telling(fold, s, rows, np.flatnonzero(said), begin, end)
     effect = ranked[0]
     cause, size, low, high = effect.cause, effect.size, effect.low, effect.high
     values, verdict = log.value[rows], track.verdict[rows]
@@ -158,7 +168,7 @@ def _of_sensor(fold: Folded, s: int, rows: np.ndarray, masks: np.ndarray, begin:
 
 
 def _most_telling(
-    fold: Folded, rows: np.ndarray, said: np.ndarray, begin: int, end: int
+    fold: Folded, s: int, rows: np.ndarray, said: np.ndarray, begin: int, end: int
 ) -> tuple[int, int, list[Effect]]:
     """The row that shows most of what is wrong, the reading since when, and what it shows, the likeliest first."""
     first = max(0, begin - LOOKED_AT)
@@ -168,7 +178,7 @@ def _most_telling(
         known = np.flatnonzero(np.isfinite(e))
         if known.size < 2:
             continue
-        e = e[known]
+        e = unusual(fold, s, int(k), e[known])
         alarm = min(int(np.searchsorted(known, begin - first)), e.size - 1)
         guess = effects(e[max(0, alarm - JOINED) :][:LOOKED_AT])[0]
         begun = onset(e[: alarm + 1], guess.cause)
