@@ -1,0 +1,153 @@
+"""Responses: how innovations and states move with each nudge, by folding the same log again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import nullcontext
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeVar
+
+import numba
+import numpy as np
+
+from ...fold import Fold
+from ...log import READING, Log
+from ...model.state_space import StateSpaceModel
+from ...registry import find_entry, find_estimator, unfit
+from ...snapshots import Base
+from ...track import MISSING, NONE, USED, Track
+from ...tuning import Tuning
+from .nudges import Given, Nudge, nudged
+
+SMOOTH = ("ekf", "ukf", "kf")
+"""Filters that stand in for one that draws at random, the first that applies."""
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+class Response(NamedTuple):
+    """What one unit of a nudge does: N events, `innovation` and `whitened` NaN where there is none.
+
+    innovation (N, ny) is dν, whitened (N, ny) S^-1/2 dν, states (N, shown) dx, of the states that a track keeps.
+    `nonlinearity` is the share by which they change when the step is halved: far below 1 where the difference is a
+    derivative.
+    """
+
+    nudge: Nudge
+    innovation: np.ndarray
+    whitened: np.ndarray
+    states: np.ndarray
+    nonlinearity: float
+
+
+class Start(NamedTuple):
+    """The fold that is nudged: its estimator, what it is given, its track, and the log's index of its first event."""
+
+    estimator: str
+    given: Given
+    track: Track
+    first: int
+    note: str
+
+
+def stand_in(estimator: str, model: StateSpaceModel) -> tuple[str, str]:
+    """The filter to nudge in place of one that draws at random, and a note that says so, or nothing.
+
+    With one seed the draws are the same, but a nudge changes which particles survive, so that differences are noise.
+
+    Raises:
+        EstimatorError: If the estimator does not exist or does not apply to the model.
+    """
+    if find_estimator(estimator, model).family not in ("particle", "ensemble"):
+        return estimator, ""
+    for name in SMOOTH:
+        if unfit(find_entry(name), model) is None:
+            return name, f"{estimator} draws at random; nudged in its place: {name}"
+    return estimator, f"{estimator} draws at random, and no filter without chance applies: differences hold its noise"
+
+
+def start(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, base: Base | None, most: int) -> Start:
+    """Fold once, and prepare to fold the last `most` events again and again from what stood before them.
+
+    What was refused stays refused under every nudge, however near to the gate it was: it is taken out of the log, and
+    the gate is opened.
+    """
+    name, note = stand_in(estimator, model)
+    if name != estimator:
+        tuning = tuning.with_options({})
+    fold = Fold(name, model, tuning, log, base=base)
+    fold.advance()
+    at, base = fold.base_at(max(0, log.n - most))
+    still = log.copy()
+    refused = (still.kind == READING) & ~np.isin(fold.track.verdict, (USED, NONE, MISSING))
+    # Of a sensor that is held out nothing is used anyhow, and its prediction is of interest.
+    refused &= tuning.used[np.where(still.kind == READING, still.channel, 0)]
+    still.value[refused, : still.width] = np.nan
+    if at:
+        still.drop_front(at)
+    given = Given(replace(tuning, gate=None), still, base)
+    return Start(name, given, refold(name, given), at, note)
+
+
+def refold(estimator: str, given: Given) -> Track:
+    """The track of what is given."""
+    fold = Fold(estimator, given.tuning.model, given.tuning, given.log, base=given.base)
+    fold.advance()
+    return fold.track
+
+
+def respond(begun: Start, nudge: Nudge) -> Response:
+    """Differences over a step and over half of it; central where the range allows."""
+    whole = _difference(begun, nudge, nudge.step)
+    half = _difference(begun, nudge, 0.5 * nudge.step)
+    changes = [_change(a, b) for a, b in zip(whole, half, strict=True)]
+    innovation, states = half
+    return Response(nudge, innovation, innovation / begun.track.innovation_std, states, max(changes))
+
+
+def _difference(begun: Start, nudge: Nudge, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """dν (N, ny) and dx (N, shown) per unit."""
+    low, high = max(-step, nudge.low), min(step, nudge.high)
+    below, above = (
+        begun.track if size == 0.0 else refold(begun.estimator, nudged(begun.given, nudge, size))
+        for size in (low, high)
+    )
+    innovation, states = moved(begun, below, above)
+    return innovation / (high - low), states / (high - low)
+
+
+def moved(begun: Start, old: Track, new: Track) -> tuple[np.ndarray, np.ndarray]:
+    """ν (N, ny) and x (N, shown) of one track less those of another, angles by the shorter way."""
+    model = begun.given.tuning.model
+    log = begun.given.log
+    innovation, states = new.innovation - old.innovation, new.mean - old.mean
+    for s, sensor in enumerate(model.sensors):
+        for k, row in enumerate(sensor.rows):
+            if row.circular:
+                own = (log.kind[: log.n] == READING) & (log.channel[: log.n] == s)
+                innovation[own, k] = _shorter(innovation[own, k])
+    for j, state in enumerate(model.shown_states):
+        if state.circular:
+            states[:, j] = _shorter(states[:, j])
+    return innovation, states
+
+
+def _shorter(angle: np.ndarray) -> np.ndarray:
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def _change(a: np.ndarray, b: np.ndarray) -> float:
+    """Relative difference of two arrays, in the sense of least squares; 0 where nothing moves."""
+    known = np.isfinite(a) & np.isfinite(b)
+    size = float(np.linalg.norm(b[known]))
+    return float(np.linalg.norm(a[known] - b[known])) / size if size > 0.0 else 0.0
+
+
+def each(work: Callable[[T], R], items: Iterable[T], executor: Executor | str | None) -> list[R]:
+    """Do the same with each item: "threads" side by side (a fold gives up the interpreter), None one by one."""
+    own = ThreadPoolExecutor(int(numba.config.NUMBA_NUM_THREADS)) if executor == "threads" else nullcontext(executor)
+    with own as pool:
+        run: Any = map if pool is None else pool.map
+        return list(run(work, items))

@@ -1,0 +1,208 @@
+"""What could be wrong without anyone noticing: every sensor, input and parameter off by a little, and what moves.
+
+From folds of the same log alone, no new mathematics: the smallest visible fault of each, the bound of the error of each
+state under a fault that is not seen, and what the log can tell of several unknowns at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from typing import NamedTuple
+
+import numpy as np
+
+from ...log import READING, Log
+from ...model.state_space import StateSpaceModel
+from ...registry import find_estimator
+from ...snapshots import Base
+from ...track import USED
+from ...tuning import Tuning
+from .information import Uncertainty, information, noncentrality, smallest_visible, threshold, uncertainty
+from .integrity import Integrity, integrity
+from .nudges import KINDS, Nudge, nudges_of
+from .responses import Response, each, respond, start
+
+MOST_STATES = 64
+"""States beyond which a model is too large to be folded again for each of its nudges."""
+
+MOST_EVENTS = 20_000
+"""Events that are folded again; of a longer log the last."""
+
+MOST_NUMBERS = 32_000_000
+"""Numbers that the responses may take together; a model with many nudges is looked at over fewer events."""
+
+DAY = 86400.0
+
+TESTS = 17
+"""Sequential tests of one sensor row: scale up and down, shift, correlation, spikes."""
+
+
+class Sensitivity(NamedTuple):
+    """What nudges of a fold do, and what follows; k nudges, N events, the last of the log.
+
+    estimator is the filter that was nudged. `reason` is empty, or says why nothing was done: then all arrays are
+    empty; `note` says what to know of the result. t (N,) are the events' times, ns; `first` the index in the log of the
+    first. std (N, shown): σ of the states without nudge.
+
+    fisher (k, k), deviation (k,) and correlation (k, k): see `Uncertainty`, for all nudges unknown together; `among`
+    gives them for some.
+
+    h is the threshold of the tests, noncentrality the λ that passes it with the probability asked for.
+    smallest_visible (k,): the size of the smallest fault of each nudge that the best test would find, present in
+    all N events; infinite if never. unseen (k,): the largest fault that can pass, that size or the end of the nudge's
+    range.
+
+    integrity_bias, integrity (shown,): at the end, the largest error of each state by one unseen fault, and the same
+    plus 1.96 σ; integrity_cause (shown,): index of the nudge that causes it, -1 for none. `over_time` has the same for
+    every event.
+    """
+
+    estimator: str
+    reason: str
+    note: str
+    first: int
+    t: np.ndarray
+    std: np.ndarray
+    responses: tuple[Response, ...]
+    fisher: np.ndarray
+    deviation: np.ndarray
+    correlation: np.ndarray
+    h: float
+    noncentrality: float
+    smallest_visible: np.ndarray
+    unseen: np.ndarray
+    integrity_bias: np.ndarray
+    integrity: np.ndarray
+    integrity_cause: np.ndarray
+    over_time: Integrity
+
+    @property
+    def nudges(self) -> tuple[Nudge, ...]:
+        """The nudges, in the order of the arrays."""
+        return tuple(response.nudge for response in self.responses)
+
+    def index(self, kind: str, name: str) -> int:
+        """Where a nudge stands in the arrays.
+
+        Raises:
+            KeyError: If there is no such nudge.
+        """
+        for k, nudge in enumerate(self.nudges):
+            if (nudge.kind, nudge.name) == (kind, name):
+                return k
+        raise KeyError(f"no nudge of {kind} {name!r}; there are {', '.join(n.name for n in self.nudges)}")
+
+    def among(self, indices: Sequence[int]) -> Uncertainty:
+        """What the log tells of some nudges, if these are unknown and all others are known."""
+        some = list(indices)
+        return uncertainty(self.fisher[np.ix_(some, some)], [self.nudges[k] for k in some])
+
+
+def sensitivity(
+    estimator: str,
+    model: StateSpaceModel,
+    tuning: Tuning,
+    log: Log,
+    *,
+    base: Base | None = None,
+    kinds: Sequence[str] = KINDS,
+    most: int = MOST_EVENTS,
+    false_alarm: float = DAY,
+    tests: int = TESTS,
+    detection: float = 0.95,
+    executor: Executor | str | None = "threads",
+) -> Sensitivity:
+    """Nudge every sensor row, input and parameter, fold the log again, and look at what moved.
+
+    A fault is a constant that is there from the first of the events looked at to the last. In a nonlinear model it is
+    as large as the derivative says: see `Response.nonlinearity`.
+
+    Args:
+        estimator: Of the twin; particles and ensembles are replaced by a filter without chance, see `note`.
+        model: Of at most 64 states.
+        tuning: As the twin's.
+        log: The events; it must not grow meanwhile (give a copy). Refused readings stay refused.
+        base: Where the log starts, if older events were dropped; see `Fold.base_at`.
+        kinds: Which nudges, of "sensor", "input", "parameter".
+        most: Events to look at, from the end; fewer where the responses would take more than 256 MB.
+        false_alarm: Mean time between false alarms, s.
+        tests: How many tests each sensor row has.
+        detection: Probability with which the smallest visible fault is seen.
+        executor: "threads", an Executor, or None to fold one after the other. The results are the same bits.
+
+    Raises:
+        EstimatorError: As `Fold`.
+        ModelError: As `Fold`.
+    """
+    find_estimator(estimator, model)
+    if model.grid is not None or model.nx > MOST_STATES:
+        what = f"{model.name} has {model.nx:,} states; sensitivities are computed up to {MOST_STATES}"
+        return _nothing(estimator, what, len(model.shown))
+    if not np.any(log.kind[: log.n] == READING):
+        return _nothing(estimator, "the log has no reading, so nothing can be seen", len(model.shown))
+    nudges = nudges_of(model, tuning, log, kinds)
+    if not nudges:
+        return _nothing(estimator, f"{model.name} has nothing to nudge of {', '.join(kinds)}", len(model.shown))
+    width = 2 * model.ny + len(model.shown)
+    most = min(most, MOST_NUMBERS // (len(nudges) * width))
+    begun = start(estimator, model, tuning, log, base, max(1, most))
+    responses = each(lambda nudge: respond(begun, nudge), nudges, executor)
+    track, still = begun.track, begun.given.log
+    used = track.verdict == USED
+    fisher = information([response.whitened[used] for response in responses])
+    told = uncertainty(fisher, nudges)
+    t = still.t[: still.n].copy()
+    rows = np.isfinite(track.innovation[used]).any(axis=1).sum()
+    span = max(1e-9, float(t[-1] - t[0]) * 1e-9)
+    h = threshold(false_alarm * float(rows) / span, tests * len(model.row_names))
+    least = noncentrality(h, detection)
+    visible = smallest_visible(fisher, least)
+    unseen = np.minimum(visible, [nudge.largest for nudge in nudges])
+    bounds = integrity(responses, unseen, track.std)
+    return Sensitivity(
+        estimator=begun.estimator,
+        reason="",
+        note=begun.note,
+        first=begun.first,
+        t=t,
+        std=track.std.copy(),
+        responses=tuple(responses),
+        fisher=fisher,
+        deviation=told.deviation,
+        correlation=told.correlation,
+        h=h,
+        noncentrality=least,
+        smallest_visible=visible,
+        unseen=unseen,
+        integrity_bias=bounds.bias[-1],
+        integrity=bounds.bound[-1],
+        integrity_cause=bounds.cause[-1],
+        over_time=bounds,
+    )
+
+
+def _nothing(estimator: str, reason: str, shown: int) -> Sensitivity:
+    none, rows, square = np.zeros(0), np.zeros((0, shown)), np.zeros((0, 0))
+    unknown = np.full(shown, np.nan)
+    cause = np.full(shown, -1)
+    return Sensitivity(
+        estimator=estimator,
+        reason=reason,
+        note="",
+        first=0,
+        t=np.zeros(0, np.int64),
+        std=rows,
+        responses=(),
+        fisher=square,
+        deviation=none,
+        correlation=square,
+        h=np.nan,
+        noncentrality=np.nan,
+        smallest_visible=none,
+        unseen=none,
+        integrity_bias=unknown,
+        integrity=unknown,
+        integrity_cause=cause,
+        over_time=Integrity(rows, rows, np.zeros((0, shown), int)),
+    )
