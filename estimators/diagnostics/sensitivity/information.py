@@ -28,6 +28,10 @@ PRESENT = 1e-3
 """Share of a nudge in a direction, below which it has no part in it."""
 
 
+PART = 0.1
+"""Of the largest part of a direction, below which another is not named."""
+
+
 class Direction(NamedTuple):
     """A combination of nudges, and how well the log tells it.
 
@@ -95,16 +99,17 @@ def directions(fisher: np.ndarray, nudges: Sequence[Nudge]) -> tuple[Direction, 
 
 def in_words(weights: np.ndarray, nudges: Sequence[Nudge], most: int = 4) -> str:
     """A combination of nudges: its largest parts, parameters in percent of their values, the others in units."""
-    order = np.argsort(-np.abs(weights), kind="stable")[:most]
-    largest = abs(weights[order[0]])
+    order = np.argsort(-np.abs(weights), kind="stable")
+    order = order[np.abs(weights[order]) >= PART * np.abs(weights[order[0]])]
     parts = []
-    for j in order:
-        if abs(weights[j]) < 0.1 * largest:
-            continue
-        nudge, part = nudges[j], weights[j] / largest
-        size = f"{100 * part:+.0f} %" if nudge.kind == "parameter" else f"{part * nudge.scale:+.3g} {nudge.unit}"
-        parts.append(f"{nudge.name} {size}" if nudge.kind == "parameter" else f"{nudge.kind} {nudge.name} {size}")
-    return " with ".join([parts[0], ", ".join(parts[1:])]) if len(parts) > 1 else parts[0]
+    for j in order[:most]:
+        nudge, part = nudges[j], float(weights[j] / np.abs(weights[order[0]]))
+        if nudge.kind == "parameter":
+            parts.append(f"{nudge.name} {100 * part:+.0f} %")
+        else:
+            parts.append(f"{nudge.kind} {nudge.name} {part * nudge.scale:+.3g} {nudge.unit}")
+    more = f" and {len(order) - most} more" if len(order) > most else ""
+    return (f"{parts[0]} with {', '.join(parts[1:])}" if len(parts) > 1 else parts[0]) + more
 
 
 def threshold(readings: float, tests: int) -> float:

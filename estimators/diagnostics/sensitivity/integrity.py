@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ...numerics.quantiles import normal_quantile
-from .responses import Response
 
 PROBABILITY = 0.95
 """That an error stays below the bound, under the fault that is worst for it."""
@@ -26,14 +25,11 @@ class Integrity(NamedTuple):
     cause: np.ndarray
 
 
-def integrity(responses: Sequence[Response], sizes: np.ndarray, std: np.ndarray) -> Integrity:
-    """Bounds from responses, the size (k,) of the largest unseen fault of each, and σ (N, shown)."""
+def integrity(errors: Sequence[np.ndarray], std: np.ndarray) -> Integrity:
+    """Bounds from the error (N, shown) by the largest unseen fault of each nudge, and σ (N, shown)."""
     bias = np.zeros(std.shape)
     cause = np.full(std.shape, -1)
-    for k, (response, size) in enumerate(zip(responses, sizes, strict=True)):
-        moved = np.abs(response.states)
-        # What does not move is not wrong, however large the fault.
-        wrong = np.multiply(moved, size, out=np.zeros(std.shape), where=moved > 0.0)
-        worse = wrong > bias
-        bias[worse], cause[worse] = wrong[worse], k
+    for k, error in enumerate(errors):
+        worse = error > bias
+        bias[worse], cause[worse] = error[worse], k
     return Integrity(bias, bias + normal_quantile(0.5 + PROBABILITY / 2.0) * std, cause)

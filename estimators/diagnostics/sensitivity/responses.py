@@ -23,6 +23,8 @@ from .nudges import Given, Nudge, nudged
 SMOOTH = ("ekf", "ukf", "kf")
 """Filters that stand in for one that draws at random, the first that applies."""
 
+THREADS = int(numba.config.NUMBA_NUM_THREADS)
+
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -31,15 +33,12 @@ class Response(NamedTuple):
     """What one unit of a nudge does: N events, `innovation` and `whitened` NaN where there is none.
 
     innovation (N, ny) is dν, whitened (N, ny) S^-1/2 dν, states (N, shown) dx, of the states that a track keeps.
-    `nonlinearity` is the share by which they change when the step is halved: far below 1 where the difference is a
-    derivative.
     """
 
     nudge: Nudge
     innovation: np.ndarray
     whitened: np.ndarray
     states: np.ndarray
-    nonlinearity: float
 
 
 class Start(NamedTuple):
@@ -99,29 +98,29 @@ def refold(estimator: str, given: Given) -> Track:
 
 
 def respond(begun: Start, nudge: Nudge) -> Response:
-    """Differences over a step and over half of it; central where the range allows."""
-    whole = _difference(begun, nudge, nudge.step)
-    half = _difference(begun, nudge, 0.5 * nudge.step)
-    changes = [_change(a, b) for a, b in zip(whole, half, strict=True)]
-    innovation, states = half
-    return Response(nudge, innovation, innovation / begun.track.innovation_std, states, max(changes))
-
-
-def _difference(begun: Start, nudge: Nudge, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """dν (N, ny) and dx (N, shown) per unit."""
-    low, high = max(-step, nudge.low), min(step, nudge.high)
+    """The derivative, as a difference over a step; central where the range allows."""
+    low, high = max(-nudge.step, nudge.low), min(nudge.step, nudge.high)
     below, above = (
         begun.track if size == 0.0 else refold(begun.estimator, nudged(begun.given, nudge, size))
         for size in (low, high)
     )
-    innovation, states = moved(begun, below, above)
-    return innovation / (high - low), states / (high - low)
+    innovation, states = (change / (high - low) for change in moved(begun, above, below))
+    return Response(nudge, innovation, whiten(begun, innovation), states)
 
 
-def moved(begun: Start, old: Track, new: Track) -> tuple[np.ndarray, np.ndarray]:
-    """ν (N, ny) and x (N, shown) of one track less those of another, angles by the shorter way."""
+def whiten(begun: Start, innovation: np.ndarray) -> np.ndarray:
+    """S^-1/2 dν (N, ny), with the S of the fold without nudge."""
+    return innovation / begun.track.innovation_std
+
+
+def moved(begun: Start, new: Track, old: Track | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """ν (N, ny) and x (N, shown) of a track less those of another, or of the fold without nudge.
+
+    Angles go by the shorter way.
+    """
     model = begun.given.tuning.model
     log = begun.given.log
+    old = old or begun.track
     innovation, states = new.innovation - old.innovation, new.mean - old.mean
     for s, sensor in enumerate(model.sensors):
         for k, row in enumerate(sensor.rows):
@@ -138,16 +137,8 @@ def _shorter(angle: np.ndarray) -> np.ndarray:
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
-def _change(a: np.ndarray, b: np.ndarray) -> float:
-    """Relative difference of two arrays, in the sense of least squares; 0 where nothing moves."""
-    known = np.isfinite(a) & np.isfinite(b)
-    size = float(np.linalg.norm(b[known]))
-    return float(np.linalg.norm(a[known] - b[known])) / size if size > 0.0 else 0.0
-
-
 def each(work: Callable[[T], R], items: Iterable[T], executor: Executor | str | None) -> list[R]:
     """Do the same with each item: "threads" side by side (a fold gives up the interpreter), None one by one."""
-    own = ThreadPoolExecutor(int(numba.config.NUMBA_NUM_THREADS)) if executor == "threads" else nullcontext(executor)
+    own: Any = ThreadPoolExecutor(THREADS) if executor == "threads" else nullcontext(executor)
     with own as pool:
-        run: Any = map if pool is None else pool.map
-        return list(run(work, items))
+        return list(map(work, items) if pool is None else pool.map(work, items))

@@ -12,19 +12,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...log import READING, Log
+from ...log import Log
 from ...model.state_space import StateSpaceModel
 from ...registry import find_estimator
 from ...snapshots import Base
 from ...track import USED
 from ...tuning import Tuning
+from .faults import fault
 from .information import Uncertainty, information, noncentrality, smallest_visible, threshold, uncertainty
 from .integrity import Integrity, integrity
 from .nudges import KINDS, Nudge, nudges_of
 from .responses import Response, each, respond, start
-
-MOST_STATES = 64
-"""States beyond which a model is too large to be folded again for each of its nudges."""
+from .size import reason_against
 
 MOST_EVENTS = 20_000
 """Events that are folded again; of a longer log the last."""
@@ -50,8 +49,8 @@ class Sensitivity(NamedTuple):
 
     h is the threshold of the tests, noncentrality the λ that passes it with the probability asked for.
     smallest_visible (k,): the size of the smallest fault of each nudge that the best test would find, present in
-    all N events; infinite if never. unseen (k,): the largest fault that can pass, that size or the end of the nudge's
-    range.
+    all N events; infinite if none in its range. unseen (k, 2): from where to where faults can pass, both signs, within
+    the range. nonlinearity (k,): how much another size is visible than the derivative says, as a share.
 
     integrity_bias, integrity (shown,): at the end, the largest error of each state by one unseen fault, and the same
     plus 1.96 σ; integrity_cause (shown,): index of the nudge that causes it, -1 for none. `over_time` has the same for
@@ -72,6 +71,7 @@ class Sensitivity(NamedTuple):
     noncentrality: float
     smallest_visible: np.ndarray
     unseen: np.ndarray
+    nonlinearity: np.ndarray
     integrity_bias: np.ndarray
     integrity: np.ndarray
     integrity_cause: np.ndarray
@@ -82,7 +82,7 @@ class Sensitivity(NamedTuple):
         """The nudges, in the order of the arrays."""
         return tuple(response.nudge for response in self.responses)
 
-    def index(self, kind: str, name: str) -> int:
+    def place(self, kind: str, name: str) -> int:
         """Where a nudge stands in the arrays.
 
         Raises:
@@ -115,8 +115,8 @@ def sensitivity(
 ) -> Sensitivity:
     """Nudge every sensor row, input and parameter, fold the log again, and look at what moved.
 
-    A fault is a constant that is there from the first of the events looked at to the last. In a nonlinear model it is
-    as large as the derivative says: see `Response.nonlinearity`.
+    A fault is a constant that is there from the first of the events looked at to the last. What it does is folded at
+    its own size, so the model need not be linear; `fisher` is of derivatives.
 
     Args:
         estimator: Of the twin; particles and ensembles are replaced by a filter without chance, see `note`.
@@ -136,11 +136,9 @@ def sensitivity(
         ModelError: As `Fold`.
     """
     find_estimator(estimator, model)
-    if model.grid is not None or model.nx > MOST_STATES:
-        what = f"{model.name} has {model.nx:,} states; sensitivities are computed up to {MOST_STATES}"
-        return _nothing(estimator, what, len(model.shown))
-    if not np.any(log.kind[: log.n] == READING):
-        return _nothing(estimator, "the log has no reading, so nothing can be seen", len(model.shown))
+    reason = reason_against(model, log)
+    if reason:
+        return _nothing(estimator, reason, len(model.shown))
     nudges = nudges_of(model, tuning, log, kinds)
     if not nudges:
         return _nothing(estimator, f"{model.name} has nothing to nudge of {', '.join(kinds)}", len(model.shown))
@@ -157,9 +155,9 @@ def sensitivity(
     span = max(1e-9, float(t[-1] - t[0]) * 1e-9)
     h = threshold(false_alarm * float(rows) / span, tests * len(model.row_names))
     least = noncentrality(h, detection)
-    visible = smallest_visible(fisher, least)
-    unseen = np.minimum(visible, [nudge.largest for nudge in nudges])
-    bounds = integrity(responses, unseen, track.std)
+    sizes = smallest_visible(fisher, least)
+    faults = each(lambda k: fault(begun, responses[k], float(sizes[k]), least), range(len(nudges)), executor)
+    bounds = integrity([item.error for item in faults], track.std)
     return Sensitivity(
         estimator=begun.estimator,
         reason="",
@@ -173,8 +171,9 @@ def sensitivity(
         correlation=told.correlation,
         h=h,
         noncentrality=least,
-        smallest_visible=visible,
-        unseen=unseen,
+        smallest_visible=np.array([item.visible for item in faults]),
+        unseen=np.array([(item.low, item.high) for item in faults]),
+        nonlinearity=np.array([item.nonlinearity for item in faults]),
         integrity_bias=bounds.bias[-1],
         integrity=bounds.bound[-1],
         integrity_cause=bounds.cause[-1],
@@ -200,7 +199,8 @@ def _nothing(estimator: str, reason: str, shown: int) -> Sensitivity:
         h=np.nan,
         noncentrality=np.nan,
         smallest_visible=none,
-        unseen=none,
+        unseen=np.zeros((0, 2)),
+        nonlinearity=none,
         integrity_bias=unknown,
         integrity=unknown,
         integrity_cause=cause,
