@@ -28,7 +28,7 @@ PRESENT = 1e-3
 """Share of a nudge in a direction, below which it has no part in it."""
 
 
-PART = 0.1
+PART = 0.05
 """Of the largest part of a direction, below which another is not named."""
 
 
@@ -76,7 +76,7 @@ def uncertainty(fisher: np.ndarray, nudges: Sequence[Nudge]) -> Uncertainty:
     shares = vectors**2
     spread = shares[:, told] @ (1.0 / values[told])
     lost = ~seen | (shares[:, ~told].sum(axis=1) > PRESENT**2)
-    deviation = np.where(lost, np.inf, np.sqrt(spread) * np.where(seen, alone, np.inf))
+    deviation = np.where(lost, np.inf, np.sqrt(spread) * unit)
     # Of what the log cannot tell, the null space says which goes with which; the rest is nothing beside it.
     weight = np.where(told, 1.0 / np.maximum(values, LEAST), 1.0 / LEAST)
     cov = (vectors * weight) @ vectors.T
@@ -101,13 +101,8 @@ def in_words(weights: np.ndarray, nudges: Sequence[Nudge], most: int = 4) -> str
     """A combination of nudges: its largest parts, parameters in percent of their values, the others in units."""
     order = np.argsort(-np.abs(weights), kind="stable")
     order = order[np.abs(weights[order]) >= PART * np.abs(weights[order[0]])]
-    parts = []
-    for j in order[:most]:
-        nudge, part = nudges[j], float(weights[j] / np.abs(weights[order[0]]))
-        if nudge.kind == "parameter":
-            parts.append(f"{nudge.name} {100 * part:+.0f} %")
-        else:
-            parts.append(f"{nudge.kind} {nudge.name} {part * nudge.scale:+.3g} {nudge.unit}")
+    largest = np.abs(weights[order[0]])
+    parts = [nudges[j].in_words(float(weights[j] / largest) * nudges[j].scale) for j in order[:most]]
     more = f" and {len(order) - most} more" if len(order) > most else ""
     return (f"{parts[0]} with {', '.join(parts[1:])}" if len(parts) > 1 else parts[0]) + more
 

@@ -25,7 +25,8 @@ class Nudge(NamedTuple):
 
     `step` is what is added and taken off for the differences, `low` and `high` the range in which a fault of this kind
     (a change from the present value) makes sense, `scale` the size by which nudges are compared: the deviation of the
-    sensor's noise, the spread of the input in the log, the parameter's value. All in `unit`.
+    sensor's noise, the spread of the input in the log, the parameter's value, or its range where that is 0. `value` is
+    a parameter's own. All in `unit`.
     """
 
     kind: str
@@ -35,6 +36,14 @@ class Nudge(NamedTuple):
     low: float
     high: float
     scale: float
+    value: float = np.nan
+
+    def in_words(self, size: float) -> str:
+        """A fault of a size: of a parameter in percent of its value, if it has one; else in units."""
+        if self.kind == PARAMETER and self.value:
+            return f"{self.name} {100.0 * size / abs(self.value):+.3g} %"
+        kind = "" if self.kind == PARAMETER else f"{self.kind} "
+        return f"{kind}{self.name} {size:+.3g} {self.unit}"
 
     @property
     def largest(self) -> float:
@@ -69,7 +78,7 @@ def nudges_of(model: StateSpaceModel, tuning: Tuning, log: Log, kinds: Sequence[
         low, high = parameter.low - value, parameter.high - value
         scale = abs(value) or (high - low if np.isfinite(high - low) else 1.0)
         if low < high:
-            found.append(Nudge(PARAMETER, parameter.name, parameter.unit, STEP * scale, low, high, scale))
+            found.append(Nudge(PARAMETER, parameter.name, parameter.unit, STEP * scale, low, high, scale, value))
     return [nudge for nudge in found if nudge.kind in kinds]
 
 

@@ -139,12 +139,11 @@ def sensitivity(
     reason = reason_against(model, log)
     if reason:
         return _nothing(estimator, reason, len(model.shown))
-    nudges = nudges_of(model, tuning, log, kinds)
+    most = min(most, MOST_NUMBERS // (_count(model) * (2 * model.ny + 2 * len(model.shown))))
+    begun = start(estimator, model, tuning, log, base, max(1, most))
+    nudges = nudges_of(model, tuning, begun.given.log, kinds)
     if not nudges:
         return _nothing(estimator, f"{model.name} has nothing to nudge of {', '.join(kinds)}", len(model.shown))
-    width = 2 * model.ny + len(model.shown)
-    most = min(most, MOST_NUMBERS // (len(nudges) * width))
-    begun = start(estimator, model, tuning, log, base, max(1, most))
     responses = each(lambda nudge: respond(begun, nudge), nudges, executor)
     track, still = begun.track, begun.given.log
     used = track.verdict == USED
@@ -179,6 +178,11 @@ def sensitivity(
         integrity_cause=bounds.cause[-1],
         over_time=bounds,
     )
+
+
+def _count(model: StateSpaceModel) -> int:
+    """Most nudges that a model has."""
+    return len(model.row_names) + model.nu + len(model.parameters)
 
 
 def _nothing(estimator: str, reason: str, shown: int) -> Sensitivity:
