@@ -28,7 +28,7 @@ from ...track import USED
 from ...tuning import Tuning
 from .information import information
 from .nudges import STEP, Given
-from .responses import Start, each, moved, refold, stand_in, whiten
+from .responses import Start, each, moved, refold, stand_in
 from .size import reason_against
 
 TOLD = 1.0
@@ -153,8 +153,7 @@ def _response(begun: Start, j: int, std: float) -> np.ndarray:
         mean = base.mean.copy()
         mean[j] += size * std
         tracks.append(refold(begun.estimator, begun.given._replace(base=base._replace(mean=mean))))
-    innovation, _ = moved(begun, tracks[1], tracks[0])
-    return whiten(begun, innovation) / (2.0 * STEP)
+    return moved(begun, tracks[1], tracks[0]).whitened / (2.0 * STEP)
 
 
 def _in_words(weights: np.ndarray, model: StateSpaceModel, left: float) -> str:

@@ -1,4 +1,4 @@
-"""What the innovations tell of each nudge: Fisher information, and the smallest fault that tests can see.
+"""What the innovations tell of each nudge: Fisher information.
 
 With innovations ν ~ N(0, S), white, and dν_i what one unit of nudge i does to them, the information of the log is
 
@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...numerics.quantiles import normal_quantile
 from .nudges import Nudge
 
 LEAST = 1e-10
@@ -105,35 +104,6 @@ def in_words(weights: np.ndarray, nudges: Sequence[Nudge], most: int = 4) -> str
     parts = [nudges[j].in_words(float(weights[j] / largest) * nudges[j].scale) for j in order[:most]]
     more = f" and {len(order) - most} more" if len(order) > most else ""
     return (f"{parts[0]} with {', '.join(parts[1:])}" if len(parts) > 1 else parts[0]) + more
-
-
-def threshold(readings: float, tests: int) -> float:
-    """What a log likelihood ratio must reach, so that `tests` of them raise one false alarm in so many readings.
-
-    h = log(readings · tests)
-
-    A cumulative sum of log likelihood ratios has a mean time of e^h at least between false alarms, whatever came
-    before. Source: Lorden (1971), doi:10.1214/aoms/1177693055.
-    """
-    return float(np.log(max(np.e, readings * tests)))
-
-
-def noncentrality(h: float, detection: float) -> float:
-    """λ of the smallest fault that the best test finds with a given probability.
-
-    Under a fault of size θ the innovations are shifted by θ dν, and their log likelihood ratio against none is
-    N(λ/2, λ), λ = θ² Σ dνᵀ S⁻¹ dν. It passes h with probability Φ((λ/2 - h) / √λ), so √λ = z + √(z² + 2h), z the
-    quantile. The best test knows what the fault looks like; any other needs more.
-
-    Source: Basseville & Nikiforov (1993), Detection of Abrupt Changes, 4.2 and 7.2.
-    """
-    z = normal_quantile(detection)
-    return float((z + np.sqrt(z * z + 2.0 * h)) ** 2)
-
-
-def smallest_visible(fisher: np.ndarray, least: float) -> np.ndarray:
-    """θ (k,) with θ² F_ii = λ: the size from which on the fault of each nudge, alone, is seen; infinite if never."""
-    return np.sqrt(least) * _reciprocal(np.sqrt(np.diag(fisher)))
 
 
 def _reciprocal(values: np.ndarray) -> np.ndarray:

@@ -104,33 +104,38 @@ def respond(begun: Start, nudge: Nudge) -> Response:
         begun.track if size == 0.0 else refold(begun.estimator, nudged(begun.given, nudge, size))
         for size in (low, high)
     )
-    innovation, states = (change / (high - low) for change in moved(begun, above, below))
-    return Response(nudge, innovation, whiten(begun, innovation), states)
+    return Response(nudge, *(change / (high - low) for change in moved(begun, above, below)))
 
 
-def whiten(begun: Start, innovation: np.ndarray) -> np.ndarray:
-    """S^-1/2 dν (N, ny), with the S of the fold without nudge."""
-    return innovation / begun.track.innovation_std
+class Moved(NamedTuple):
+    """What is other in one track than in another; see `Response`."""
+
+    innovation: np.ndarray
+    whitened: np.ndarray
+    states: np.ndarray
 
 
-def moved(begun: Start, new: Track, old: Track | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """ν (N, ny) and x (N, shown) of a track less those of another, or of the fold without nudge.
-
-    Angles go by the shorter way.
-    """
+def moved(begun: Start, new: Track, old: Track | None = None) -> Moved:
+    """A track less another, or less that of the fold without nudge; angles go by the shorter way."""
     model = begun.given.tuning.model
     log = begun.given.log
     old = old or begun.track
     innovation, states = new.innovation - old.innovation, new.mean - old.mean
+    reading, channel = log.kind[: log.n] == READING, log.channel[: log.n]
+    whitened = new.whitened - old.whitened
     for s, sensor in enumerate(model.sensors):
+        own = reading & (channel == s)
         for k, row in enumerate(sensor.rows):
             if row.circular:
-                own = (log.kind[: log.n] == READING) & (log.channel[: log.n] == s)
                 innovation[own, k] = _shorter(innovation[own, k])
+        # By the S of the fold without nudge, where its square root is known: where S moves, too, the whitened rows hold
+        # what that does to the innovations there are. It is less than what a change of S tells in truth.
+        if len(sensor.rows) == 1 or not np.isfinite(whitened[own]).any():
+            whitened[own] = innovation[own] / begun.track.innovation_std[own]
     for j, state in enumerate(model.shown_states):
         if state.circular:
             states[:, j] = _shorter(states[:, j])
-    return innovation, states
+    return Moved(innovation, whitened, states)
 
 
 def _shorter(angle: np.ndarray) -> np.ndarray:

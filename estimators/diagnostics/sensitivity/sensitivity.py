@@ -12,18 +12,21 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...errors import EstimatorError
 from ...log import Log
 from ...model.state_space import StateSpaceModel
 from ...registry import find_estimator
 from ...snapshots import Base
 from ...track import USED
 from ...tuning import Tuning
+from ..health import HealthPolicy
 from .faults import fault
-from .information import Uncertainty, information, noncentrality, smallest_visible, threshold, uncertainty
+from .information import Uncertainty, information, uncertainty
 from .integrity import Integrity, integrity
 from .nudges import KINDS, Nudge, nudges_of
 from .responses import Response, each, respond, start
 from .size import reason_against
+from .visibility import tests_of
 
 MOST_EVENTS = 20_000
 """Events that are folded again; of a longer log the last."""
@@ -31,10 +34,8 @@ MOST_EVENTS = 20_000
 MOST_NUMBERS = 32_000_000
 """Numbers that the responses may take together; a model with many nudges is looked at over fewer events."""
 
-DAY = 86400.0
-
-TESTS = 17
-"""Sequential tests of one sensor row: scale up and down, shift, correlation, spikes."""
+BANK, BEST = WITNESSES = ("bank", "best")
+"""By whom a fault is seen: the bank of tests that watches the twin, or the best test that there could be."""
 
 
 class Sensitivity(NamedTuple):
@@ -47,9 +48,9 @@ class Sensitivity(NamedTuple):
     fisher (k, k), deviation (k,) and correlation (k, k): see `Uncertainty`, for all nudges unknown together; `among`
     gives them for some.
 
-    h is the threshold of the tests, noncentrality the λ that passes it with the probability asked for.
-    smallest_visible (k,): the size of the smallest fault of each nudge that the best test would find, present in
-    all N events; infinite if none in its range. unseen (k, 2): from where to where faults can pass, both signs, within
+    h (rows,) are the thresholds of the tests by sensor row, noncentrality the λ that passes them with the probability
+    asked for. smallest_visible (k,): the size of the smallest fault of each nudge that is seen, if it is there in all N
+    events; infinite if none in its range is. unseen (k, 2): from where to where faults can pass, both signs, within
     the range. nonlinearity (k,): how much another size is visible than the derivative says, as a share.
 
     integrity_bias, integrity (shown,): at the end, the largest error of each state by one unseen fault, and the same
@@ -67,7 +68,7 @@ class Sensitivity(NamedTuple):
     fisher: np.ndarray
     deviation: np.ndarray
     correlation: np.ndarray
-    h: float
+    h: np.ndarray
     noncentrality: float
     smallest_visible: np.ndarray
     unseen: np.ndarray
@@ -108,9 +109,10 @@ def sensitivity(
     base: Base | None = None,
     kinds: Sequence[str] = KINDS,
     most: int = MOST_EVENTS,
-    false_alarm: float = DAY,
-    tests: int = TESTS,
+    seen_by: str = BANK,
+    false_alarm: float = HealthPolicy().false_alarm_every,
     detection: float = 0.95,
+    baseline: np.ndarray | None = None,
     executor: Executor | str | None = "threads",
 ) -> Sensitivity:
     """Nudge every sensor row, input and parameter, fold the log again, and look at what moved.
@@ -126,16 +128,20 @@ def sensitivity(
         base: Where the log starts, if older events were dropped; see `Fold.base_at`.
         kinds: Which nudges, of "sensor", "input", "parameter".
         most: Events to look at, from the end; fewer where the responses would take more than 256 MB.
-        false_alarm: Mean time between false alarms, s.
-        tests: How many tests each sensor row has.
+        seen_by: "bank" for the tests that watch the twin, "best" for a test that would know what each fault looks like:
+            what it does not see, nobody can.
+        false_alarm: Mean time between false alarms of all tests together, s.
         detection: Probability with which the smallest visible fault is seen.
+        baseline: What was normal when the tuning was accepted, as `Fold`; without it, white innovations.
         executor: "threads", an Executor, or None to fold one after the other. The results are the same bits.
 
     Raises:
-        EstimatorError: As `Fold`.
+        EstimatorError: As `Fold`; if nobody is called `seen_by`.
         ModelError: As `Fold`.
     """
     find_estimator(estimator, model)
+    if seen_by not in WITNESSES:
+        raise EstimatorError(f"seen_by is {seen_by!r}; it must be one of {', '.join(WITNESSES)}")
     reason = reason_against(model, log)
     if reason:
         return _nothing(estimator, reason, len(model.shown))
@@ -150,12 +156,10 @@ def sensitivity(
     fisher = information([response.whitened[used] for response in responses])
     told = uncertainty(fisher, nudges)
     t = still.t[: still.n].copy()
-    rows = np.isfinite(track.innovation[used]).any(axis=1).sum()
-    span = max(1e-9, float(t[-1] - t[0]) * 1e-9)
-    h = threshold(false_alarm * float(rows) / span, tests * len(model.row_names))
-    least = noncentrality(h, detection)
-    sizes = smallest_visible(fisher, least)
-    faults = each(lambda k: fault(begun, responses[k], float(sizes[k]), least), range(len(nudges)), executor)
+    tests = tests_of(
+        model, tuning, still, track, every=false_alarm, detection=detection, bank=seen_by == BANK, baseline=baseline
+    )
+    faults = each(lambda response: fault(begun, response, tests), responses, executor)
     bounds = integrity([item.error for item in faults], track.std)
     return Sensitivity(
         estimator=begun.estimator,
@@ -168,8 +172,8 @@ def sensitivity(
         fisher=fisher,
         deviation=told.deviation,
         correlation=told.correlation,
-        h=h,
-        noncentrality=least,
+        h=tests.h,
+        noncentrality=tests.noncentrality,
         smallest_visible=np.array([item.visible for item in faults]),
         unseen=np.array([(item.low, item.high) for item in faults]),
         nonlinearity=np.array([item.nonlinearity for item in faults]),
@@ -200,7 +204,7 @@ def _nothing(estimator: str, reason: str, shown: int) -> Sensitivity:
         fisher=square,
         deviation=none,
         correlation=square,
-        h=np.nan,
+        h=none,
         noncentrality=np.nan,
         smallest_visible=none,
         unseen=np.zeros((0, 2)),
