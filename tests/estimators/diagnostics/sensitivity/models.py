@@ -35,6 +35,25 @@ WALK = StateSpaceModel(
 )
 
 
+def still(x, u, p, dt, out):
+    out[0] = x[0]
+
+
+def twice(x, u, p, out):
+    out[0] = x[0]
+    out[1] = x[0]
+
+
+TWICE = StateSpaceModel(
+    name="twice",
+    title="A random walk read by two rows of one sensor",
+    states=(State("x", "m", mean=0.0, std=1.0),),
+    noises=(Noise("x", "m²/s", Q),),
+    sensors=(Sensor("level", (Row("coarse", "m", R), Row("fine", "m", 0.5 * R)), h=twice),),
+    f=still,
+)
+
+
 def coupled(x, u, p, dt, out):
     out[0] = x[0] + dt * (p[0] * (x[1] - x[0]) + u[0])
     out[1] = x[1] + dt * (p[1] * (x[0] - x[1]) - p[2] * (x[1] - u[1]))
