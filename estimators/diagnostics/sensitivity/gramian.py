@@ -29,13 +29,16 @@ from ...tuning import Tuning
 from .information import information
 from .nudges import STEP, Given
 from .responses import Start, each, moved, refold, stand_in
-from .size import reason_against
+from .size import most_events, reason_against
 
 TOLD = 1.0
 """Information, in units of the prior's, from which on the readings tell more of a direction than the prior did."""
 
-SURE = 1e-12
-"""Least share of the prior's variance that is told from zero."""
+SURE = 1e-9
+"""Least share of the prior's variance that differences tell from zero; no eigenvalue is larger than its reciprocal."""
+
+BEYOND = 1.05
+"""Eigenvalue of G from which on the filter does not follow nudges in proportion: of a linear model none is above 1."""
 
 
 class View(NamedTuple):
@@ -44,7 +47,8 @@ class View(NamedTuple):
     begin, end: ns. gramian (nx, nx) is J, in the prior's deviations, and eigenvalues (nx,) its own, rising. `rank`
     counts those of which the readings tell more than the prior did; `conditioning` is the ratio of the largest to the
     smallest. deviation (nx,): share of each state's prior deviation that is left. weakest (nx,): the direction of the
-    smallest eigenvalue, in the prior's deviations; `text` has it in words.
+    smallest eigenvalue, in the prior's deviations; `text` has it in words. `beyond`: nudges were not followed in
+    proportion, so this says little.
     """
 
     begin: int
@@ -56,6 +60,7 @@ class View(NamedTuple):
     deviation: np.ndarray
     weakest: np.ndarray
     text: str
+    beyond: bool
 
 
 class Gramian(NamedTuple):
@@ -76,6 +81,7 @@ def gramian(
     *,
     base: Base | None = None,
     windows: int = 8,
+    most: int | None = None,
     executor: Executor | str | None = "threads",
 ) -> Gramian:
     """Nudge the prior mean of each state, and see what the readings of a log tell of it.
@@ -87,6 +93,7 @@ def gramian(
         log: The events; it must not grow meanwhile (give a copy).
         base: Where the log starts, if older events were dropped.
         windows: Parts of equal time. Each begins at the estimate of that time with the covariance of the prior.
+        most: Events to look at, from the end; None for what takes seconds.
         executor: As `sensitivity`.
 
     Raises:
@@ -101,16 +108,19 @@ def gramian(
         tuning = tuning.with_options({})
     fold = Fold(name, model, tuning, log, base=base)
     t = log.t[: log.n]
-    cuts = np.searchsorted(t, np.linspace(t[0], t[-1], windows + 1)[1:-1])
-    begins = [0, *(int(k) for k in cuts)]
+    begin = max(0, log.n - (most or most_events(model, 2 * model.nx)))
+    cuts = np.searchsorted(t, np.linspace(t[begin], t[-1], windows + 1)[1:-1])
+    begins = [begin, *(int(k) for k in cuts)]
     bases = []
-    for begin in begins:
-        fold.advance(begin - fold.n)
+    for k in begins:
+        fold.advance(k - fold.n)
         mean, _ = fold.moments()
         bases.append(Base(mean, np.diag(model.prior_std**2), fold.clock, fold.u))
     spans = list(zip(begins, [*begins[1:], log.n], bases, strict=True))
-    parts = [(0, log.n, bases[0]), *(span for span in spans if span[1] > span[0])]
+    parts = [(begin, log.n, bases[0]), *(span for span in spans if span[1] > span[0])]
     views = each(lambda part: _view(name, model, tuning, log, *part), parts, executor)
+    if any(view.beyond for view in views):
+        note = "; ".join(filter(None, [note, f"{name} does not follow nudges in proportion: the Gramian says little"]))
     return Gramian(name, "", note, views[0], tuple(views[1:]))
 
 
@@ -143,6 +153,7 @@ def _view(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, begi
         deviation=np.sqrt((vectors**2) @ left),
         weakest=weak,
         text=_in_words(weak, model, float(left[order[0]]) if order else 0.0),
+        beyond=bool(np.any(values > BEYOND)),
     )
 
 

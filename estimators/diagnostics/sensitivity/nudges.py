@@ -60,15 +60,17 @@ class Given(NamedTuple):
 
 
 def nudges_of(model: StateSpaceModel, tuning: Tuning, log: Log, kinds: Sequence[str] = KINDS) -> list[Nudge]:
-    """Every nudge of a model: rows of the sensors in use, inputs, parameters that have room in their range."""
+    """Every nudge of a model: rows of sensors that speak and are used, inputs, parameters with room in their range."""
     found = []
     units = [row.unit for sensor in model.sensors for row in sensor.rows]
-    in_use = np.repeat(tuning.used, [len(sensor.rows) for sensor in model.sensors])
+    kind, channel = log.kind[: log.n], log.channel[: log.n]
+    speak = tuning.used & np.isin(np.arange(len(model.sensors)), channel[kind == READING])
+    in_use = np.repeat(speak, [len(sensor.rows) for sensor in model.sensors])
     for name, unit, variance, used in zip(model.row_names, units, tuning.r, in_use, strict=True):
         if used:
             scale = float(np.sqrt(variance)) or 1.0
             found.append(Nudge(SENSOR, name, unit, STEP * scale, -np.inf, np.inf, scale))
-    given = log.value[: log.n][log.kind[: log.n] == INPUT]
+    given = log.value[: log.n][kind == INPUT]
     for k, item in enumerate(model.inputs):
         values = given[np.isfinite(given[:, k]), k]
         values = values if values.size else np.array([item.default])

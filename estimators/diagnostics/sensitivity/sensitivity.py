@@ -25,14 +25,11 @@ from .information import Uncertainty, information, uncertainty
 from .integrity import Integrity, integrity
 from .nudges import KINDS, Nudge, nudges_of
 from .responses import Response, each, respond, start
-from .size import reason_against
+from .size import most_events, reason_against
 from .visibility import tests_of
 
-MOST_EVENTS = 20_000
-"""Events that are folded again; of a longer log the last."""
-
-MOST_NUMBERS = 32_000_000
-"""Numbers that the responses may take together; a model with many nudges is looked at over fewer events."""
+CURVED = 0.5
+"""Nonlinearity from which on a derivative says little; where half the nudges are beyond it, the result says so."""
 
 BANK, BEST = WITNESSES = ("bank", "best")
 """By whom a fault is seen: the bank of tests that watches the twin, or the best test that there could be."""
@@ -108,7 +105,7 @@ def sensitivity(
     *,
     base: Base | None = None,
     kinds: Sequence[str] = KINDS,
-    most: int = MOST_EVENTS,
+    most: int | None = None,
     seen_by: str = BANK,
     false_alarm: float = HealthPolicy().false_alarm_every,
     detection: float = 0.95,
@@ -127,7 +124,7 @@ def sensitivity(
         log: The events; it must not grow meanwhile (give a copy). Refused readings stay refused.
         base: Where the log starts, if older events were dropped; see `Fold.base_at`.
         kinds: Which nudges, of "sensor", "input", "parameter".
-        most: Events to look at, from the end; fewer where the responses would take more than 256 MB.
+        most: Events to look at, from the end; None for what takes seconds and 256 MB at most.
         seen_by: "bank" for the tests that watch the twin, "best" for a test that would know what each fault looks like:
             what it does not see, nobody can.
         false_alarm: Mean time between false alarms of all tests together, s.
@@ -145,8 +142,8 @@ def sensitivity(
     reason = reason_against(model, log)
     if reason:
         return _nothing(estimator, reason, len(model.shown))
-    most = min(most, MOST_NUMBERS // (_count(model) * (2 * model.ny + 2 * len(model.shown))))
-    begun = start(estimator, model, tuning, log, base, max(1, most))
+    count = len(model.row_names) + model.nu + len(model.parameters)
+    begun = start(estimator, model, tuning, log, base, most or most_events(model, count))
     nudges = nudges_of(model, tuning, begun.given.log, kinds)
     if not nudges:
         return _nothing(estimator, f"{model.name} has nothing to nudge of {', '.join(kinds)}", len(model.shown))
@@ -161,10 +158,13 @@ def sensitivity(
     )
     faults = each(lambda response: fault(begun, response, tests), responses, executor)
     bounds = integrity([item.error for item in faults], track.std)
+    notes = [begun.note]
+    if np.median([item.nonlinearity for item in faults]) > CURVED:
+        notes.append(f"{begun.estimator} does not follow nudges in proportion: Fisher information says little here")
     return Sensitivity(
         estimator=begun.estimator,
         reason="",
-        note=begun.note,
+        note="; ".join(filter(None, notes)),
         first=begun.first,
         t=t,
         std=track.std.copy(),
@@ -182,11 +182,6 @@ def sensitivity(
         integrity_cause=bounds.cause[-1],
         over_time=bounds,
     )
-
-
-def _count(model: StateSpaceModel) -> int:
-    """Most nudges that a model has."""
-    return len(model.row_names) + model.nu + len(model.parameters)
 
 
 def _nothing(estimator: str, reason: str, shown: int) -> Sensitivity:
