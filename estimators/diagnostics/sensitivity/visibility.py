@@ -38,7 +38,7 @@ WIDEST = 2.0**12
 """Multiple of what the best test sees, beyond which the bank sees nothing."""
 
 
-class Tests(NamedTuple):
+class Witness(NamedTuple):
     """What watches the innovations of a fold.
 
     h (rows,) are thresholds by sensor row, z the quantile of the probability of detection; `used` (N,) marks the used
@@ -105,7 +105,7 @@ def tests_of(
     detection: float,
     bank: bool,
     baseline: np.ndarray | None = None,
-) -> Tests:
+) -> Witness:
     """The tests of a fold: thresholds as the bank's, log(readings between false alarms · tests) of each sensor."""
     watch = watch_of(model, tuning.r, tuning.gate, False, baseline)
     t, kind, channel = log.t[: log.n], log.kind[: log.n], log.channel[: log.n]
@@ -119,7 +119,7 @@ def tests_of(
             h.append(threshold(every / max(period, 1e-3), watch.tests))
             places.append(mine)
             columns.append(k)
-    return Tests(np.array(h), normal_quantile(detection), used, tuple(places), tuple(columns), watch.baseline, bank)
+    return Witness(np.array(h), normal_quantile(detection), used, tuple(places), tuple(columns), watch.baseline, bank)
 
 
 def threshold(readings: float, tests: int) -> float:
