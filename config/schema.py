@@ -55,6 +55,19 @@ class SensorSection(SpreadSection):
     """false holds the sensor out: the estimate ignores it, and its prediction of it is scored. Default: true."""
 
 
+class NormalSection(Section):
+    """What was normal of one sensor row when this tuning was accepted; `nisus commission` writes it."""
+
+    bias: Number = 0.0
+    """Mean of its standardised innovations. Default: 0."""
+    scale: Positive = 1.0
+    """Their standard deviation. Default: 1."""
+    correlation: Annotated[float, Field(strict=True, gt=-1, lt=1)] = 0.0
+    """Their lag-1 correlation. Default: 0, white."""
+    reached: dict[str, NotNegative] = {}
+    """How high the tests of each cause rose on the accepted data, nats: {narrow: 12.5}. Default: 0."""
+
+
 class EstimatorSection(Section):
     """The filter that runs first; the page swaps it."""
 
@@ -160,6 +173,9 @@ class TwinSection(Section):
     gate: Annotated[float, Field(strict=True, gt=0, lt=1)] | None = None
     """Probability with which a good reading passes the gate, for example 0.9973; readings outside are not used.
     Default: null, no gate."""
+    commissioned: dict[str, NormalSection] = {}
+    """What was normal when this tuning was accepted, by sensor row: alarms are about what has changed since. Default:
+    innovations that are white and as large as the filter says."""
     time: TimeSection = TimeSection()
     """How the twin treats lateness and silence."""
     history: Count = 200_000

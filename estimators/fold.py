@@ -55,7 +55,6 @@ class Fold:
         base: Base | None = None,
         picture: float | None = None,
         prior: tuple[np.ndarray, np.ndarray] | None = None,
-        baseline: np.ndarray | None = None,
         expected: np.ndarray | None = None,
     ) -> None:
         """Prepare; nothing is folded yet.
@@ -73,8 +72,6 @@ class Fold:
             picture: Seconds of the log between two pictures of a large field; None for those that score it only.
             prior: Mean (nx,) and covariance (nx, nx), positive semidefinite, in place of the model's; beyond `LARGE`
                 states the variances (1, nx). It holds at the log's start, and a reset goes back to it.
-            baseline: What was normal of the innovations when the tuning was accepted, see diagnostics/evidence.py; None
-                for white ones.
             expected: Sensors that must speak, (sensors,) of bool; None for those that have spoken.
 
         Raises:
@@ -99,7 +96,7 @@ class Fold:
         most = model.width * max(1, self.policy.window)
         self._bounds: Bounds = chi_square_bounds(most)
         self.marginal = self.estimator.family in ("particle", "ensemble")
-        self.baseline = no_baseline(model) if baseline is None else baseline
+        self.baseline = no_baseline(model) if tuning.baseline is None else tuning.baseline
         self._seen = self._see(expected)
         self._context: Any = self._seen
         numbers = self.estimator.state_size(self.options, model.nx) + self.estimator.memory(self.options, model)
@@ -177,6 +174,11 @@ class Fold:
     def track(self) -> Track:
         """Views of the rows folded so far."""
         return self._rows.select(slice(0, self.n))
+
+    @property
+    def evidence(self) -> np.ndarray:
+        """The state of the bank of tests now; see diagnostics/evidence.py."""
+        return self._evidence.copy()
 
     @property
     def clock(self) -> int:

@@ -95,6 +95,27 @@ class Compare:
 
 
 @dataclass(frozen=True)
+class Commission:
+    """Fold data on which everything was in order, and write what is normal there: alarms are then about changes.
+
+    Prints the lines of the twin's YAML, or puts them there.
+    """
+
+    twin: Twin
+    """Name of a twin that ships, or path of a YAML file."""
+    estimator: str | None = None
+    """Estimator to use instead of the twin's own."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable, as for `run`."""
+    log: tuple[Path, ...] = ()
+    """Recordings to read instead of the twin's own."""
+    duration: float | None = None
+    """Take only this many seconds of the source."""
+    write: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Put the section `commissioned` into the twin's YAML, in place of the one that is there."""
+
+
+@dataclass(frozen=True)
 class Filters:
     """List the estimators: what they assume, their options, what they cost and when they fail."""
 
@@ -186,7 +207,7 @@ class New:
     """Its unit: s, ms, us, ns, min or h."""
 
 
-Command = Run | Fold | Compare | Filters | Review | Bus | Twins | Schema | Log | New
+Command = Run | Fold | Compare | Commission | Filters | Review | Bus | Twins | Schema | Log | New
 COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in get_args(Command)}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_entry, find_estimator
 from estimators.tuning import Tuning
 
+from .commissioned import baseline
 from .model import check_named, configure, find_model
 from .source import Plan, plan_source
 
@@ -166,6 +167,7 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
         entry = find_estimator(first.name, model)
     _check_options(loaded, ("estimator", "options"), first.name, first.options, model)
     tuning = Tuning.of(model).with_options(_options(config, first.name)).set("gate", config.gate)
+    tuning = replace(tuning, baseline=baseline(loaded, model))
     for name, section in config.sensors.items():
         if not section.use:
             tuning = tuning.set(f"use.{name}", False)
