@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from estimators.log import MARK
 from estimators.model.state_space import StateSpaceModel
 
 from .effect import Effect, Moment
 from .fault import Fault
-from .item import MARK, Item
+from .item import Item
 from .kinds import find_kind, numbers
 from .routes import Elsewhere, Silence, Swap
 from .target import Target

@@ -8,8 +8,6 @@ import numpy as np
 
 from estimators.log import Events
 
-MARK = 5
-
 
 class Item:
     """An event. `at` is when it was truly measured, ns, whatever the clocks say in `t`; `value` is never written to."""

@@ -145,6 +145,12 @@ class Faults:
             return tuple(found)
 
     @property
+    def lost(self) -> int:
+        """Events that faults swallowed, since the source began."""
+        with self._lock:
+            return sum(active.lost for _, active in self._active)
+
+    @property
     def can_change(self) -> bool:
         """Whether the source is an asset whose true parameters can be changed."""
         return self._asset is not None

@@ -7,10 +7,9 @@ import pytest
 
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError, SourceError
-from estimators.log import READING
+from estimators.log import MARK, READING
 from estimators.models import MODELS
 from sources.faults.fault import Fault
-from sources.faults.item import MARK
 from sources.faults.layer import Faults
 from sources.faults.source import FaultySource
 from sources.simulation.simulator import SensorPlan, Simulator
