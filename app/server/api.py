@@ -147,7 +147,7 @@ def _converted(command: str, name: str, value: Any, hint: Any) -> Any:
             return None
         if kind in (bool, str) and isinstance(value, kind):
             return value
-        if kind is int and isinstance(value, int) and not isinstance(value, bool):
+        if kind is int and isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**53:
             return value
         if kind is float and not isinstance(value, bool) and (isinstance(value, (int, float)) or value == "inf"):
             try:

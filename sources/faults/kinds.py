@@ -11,6 +11,9 @@ from estimators.model.state_space import StateSpaceModel
 
 from .fault import Fault
 
+LONGEST = 1e6
+"""Seconds by which an event may be late, eleven days."""
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -22,9 +25,9 @@ class Parameter:
     name: str
     unit: str
     help: str
-    default: float | None = None
-    holds: Callable[[float], bool] = isfinite
-    rule: str = "must be a finite number"
+    default: float | None
+    holds: Callable[[float], bool]
+    rule: str
 
 
 @dataclass(frozen=True)
@@ -44,11 +47,19 @@ class Kind:
 
 
 def _size(unit: str, text: str) -> Parameter:
-    return Parameter("size", unit, text)
+    return Parameter("size", unit, text, None, lambda x: abs(x) <= LARGEST, f"must lie within {LARGEST:g}")
 
 
-def _positive(unit: str, text: str, name: str = "size") -> Parameter:
-    return Parameter(name, unit, text, None, lambda x: 0.0 < x <= LARGEST, "must be positive")
+def _positive(unit: str, text: str) -> Parameter:
+    return Parameter("size", unit, text, None, lambda x: 0.0 < x <= LARGEST, "must be positive")
+
+
+def _seconds(name: str, text: str, default: float | None = None) -> Parameter:
+    def holds(x: float) -> bool:
+        return (0.0 < x if default is None else 0.0 <= x) and x <= LONGEST
+
+    low = "positive" if default is None else "zero or positive"
+    return Parameter(name, "s", text, default, holds, f"must be {low}, and {LONGEST:g} s at most")
 
 
 def _rate(text: str, default: float | None = 1.0) -> Parameter:
@@ -69,20 +80,20 @@ _LIST = (
     Kind("noise", 6, "a draw of that standard deviation is added to each reading", VALUE,
          (_positive("row", "standard deviation of the added noise"),), rows=True),
     Kind("quantisation", 7, "what is said is rounded to multiples of size", VALUE,
-         (_positive("row", "the step"),), rows=True),
+         (Parameter("size", "row", "the step", None, lambda x: 1e-9 <= x <= LARGEST, "must be 1e-9 or more"),),
+         rows=True),
     Kind("dropout", 8, "with probability rate a reading arrives empty", ANY, (_rate("probability, a reading"),)),
     Kind("silence", 9, "nothing arrives; an input stays as it was told last", ANY),
-    Kind("delay", 10, "what is said arrives later by size", ANY, (_positive("s", "the delay"),)),
+    Kind("delay", 10, "what is said arrives later by size", ANY, (_seconds("size", "the delay"),)),
     Kind("jitter", 11, "what is said arrives later by a draw of an exponential distribution", ANY,
-         (_positive("s", "mean of the delays"),)),
+         (_seconds("size", "mean of the delays"),)),
     Kind("bursts", 12, "what is said is kept back, and arrives together every so many seconds", ANY,
-         (_positive("s", "seconds between two arrivals", "every"),)),
+         (_seconds("every", "seconds between two arrivals"),)),
     Kind("reorder", 13, "with probability rate a reading arrives after the next one of its kind", ANY,
          (_rate("probability, a reading"),)),
     Kind("duplicate", 14, "with probability rate a reading is said again", ANY,
          (_rate("probability, a reading"),
-          Parameter("every", "s", "seconds between the repetitions, by their stamps and arrivals; 0 repeats the stamp",
-                    0.0, lambda x: 0.0 <= x <= LARGEST, "must be zero or positive"),
+          _seconds("every", "seconds between repetitions, by stamp and arrival; 0 repeats the stamp", 0.0),
           Parameter("count", "1", "repetitions of a reading", 1.0,
                     lambda x: 1.0 <= x <= 1000.0 and x == round(x), "must be a whole number from 1 to 1000"))),
     Kind("clock_jump", 15, "the clock that stamps what is said is ahead by size", ANY,
