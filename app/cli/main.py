@@ -1,4 +1,4 @@
-"""The command line: `nisus run`, `fold`, `compare`, `filters`, `review`, `bus`, `twins`, `schema`, `log`, `new`."""
+"""The command line: `nisus run`, `fold`, `compare`, `stress`, `filters`, `review`, `bus`, `twins` and so on."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import tyro
 from estimators.errors import NisusError
 
 from ..stderr import complain
-from .arguments import COMMANDS, Bus, Command, Compare, Filters, Fold, Log, Review, Run, Schema, Twins
+from .arguments import COMMANDS, Bus, Command, Compare, Filters, Fold, Log, Review, Run, Schema, Stress, Twins
 
 
 def carry_out(command: Command) -> int:
@@ -31,6 +31,10 @@ def carry_out(command: Command) -> int:
         from .compare import compare_twin
 
         return compare_twin(command)
+    if isinstance(command, Stress):
+        from .stress import stress_twin
+
+        return stress_twin(command)
     if isinstance(command, Filters):
         from .filters import show_filters
 
