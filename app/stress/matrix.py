@@ -86,7 +86,9 @@ def _of_sensors(model: StateSpaceModel, tuning: Tuning) -> Iterator[Mistake]:
             scaled = _fault("scale", sensor=name, row=row, size=1.1)
             yield Mistake(f"{label} x1.1", MODEL, own, fault=scaled)
         yield Mistake(f"{name} stuck", frozenset({"stuck"}), own, fault=_fault("stuck", sensor=name))
-        yield Mistake(f"{name} silent", frozenset({"silent"}), own, fault=_fault("silence", sensor=name))
+        lost = _fault("silence", sensor=name)
+        if len(model.sensors) > 1:
+            yield Mistake(f"{name} silent", frozenset({"silent"}), own, fault=lost)
     if len(model.sensors) > 1:
         yield Mistake("all stuck", frozenset({"stuck"}), fault=_fault("stuck"))
     yield Mistake("all silent", frozenset({"silent", "stale"}), fault=_silent(model))

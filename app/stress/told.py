@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimators.diagnostics.episodes import Episode
-from estimators.log import READING, TRUTH
+from estimators.log import READING
 from estimators.track import TRACKING, WAITING
 
 if TYPE_CHECKING:
@@ -37,8 +37,6 @@ def said_at(fold: Fold, episode: Episode) -> float:
         heard = flagged
     elif sensors:
         heard = alarmed & (kind == READING) & (channel == sensors[0])
-    elif episode.cause == "missed":
-        heard = alarmed & (kind == TRUTH)
     else:
         heard = (health != TRACKING) & (health != WAITING)
     rows = np.flatnonzero(heard & since)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
 
 from config.source_schema import AssetSection, CanSection
 from estimators.diagnostics.episodes import episodes
 from estimators.diagnostics.score import Score, score
 from estimators.errors import SourceError
 from estimators.fold import Fold
-from estimators.log import MARK, Events, Log
+from estimators.log import MARK, TICK, TRUTH, Events, Log
 from estimators.tuning import Tuning
 from sources.faults.layer import Faults
 from sources.faults.source import with_faults
@@ -55,6 +58,24 @@ class Trial:
     coverage: dict[str, float]
     recovery: float | None
     stale: int
+
+
+class Folded(NamedTuple):
+    """A fold of a log without its true states, the same events with them, and how many came too late for it."""
+
+    fold: Fold
+    truth: Events
+    stale: int
+
+
+def without_truth(events: Events) -> Events:
+    """Events of a log, with a question in place of each true state, so that every row stays where it is."""
+    told = events.kind == TRUTH
+    return events._replace(
+        kind=np.where(told, TICK, events.kind).astype(np.int8),
+        channel=np.where(told, 0, events.channel).astype(np.int32),
+        value=np.where(told[:, None], np.nan, events.value),
+    )
 
 
 def asset_of(twin: Twin, seed: int) -> Simulator | None:
@@ -111,7 +132,8 @@ class Bench:
         seed: Of the asset, the faults and the filter.
         duration: Seconds of the log.
 
-    A fault of the source lasts from a third to two thirds of the log; an error of the belief from its start on.
+    A fault of the source lasts from a third to two thirds of the log; an error of the belief from its start on. What the
+    twin says, it says without having been told the truth; that is for the scores alone.
     """
 
     def __init__(self, twin: Twin, seed: int, duration: float) -> None:
@@ -119,7 +141,7 @@ class Bench:
         self.events = plain_log(twin, seed, duration)
         self.origin = float(self.events.t[0]) * 1e-9
         self.length = float(self.events.t.max() - self.events.t[0]) * 1e-9
-        self._calm: dict[str, Fold] = {}
+        self._calm: dict[str, Folded] = {}
 
     def window(self, mistake: Mistake) -> tuple[float, float]:
         """When a mistake lasts, seconds after the log's first event."""
@@ -134,17 +156,17 @@ class Bench:
         start, end = self.window(mistake)
         events = self._damaged(mistake, start, end)
         tuning = self._tuning(estimator, mistake)
-        gated, stale = self._fold(estimator, tuning.set("gate", self.twin.tuning.gate or GATE), events)
-        bare, _ = self._fold(estimator, tuning.set("gate", None), events)
-        shipped = gated if self.twin.tuning.gate is not None else bare
-        calm = self._undisturbed(estimator)
+        gated = self._fold(estimator, tuning.set("gate", self.twin.tuning.gate or GATE), events)
+        bare = self._fold(estimator, tuning.set("gate", None), events)
+        ships = gated if self.twin.tuning.gate is not None else bare
+        shipped = ships.fold
         begun, ended = self.origin + start, self.origin + end
         told = sorted(((said_at(shipped, item), item) for item in episodes(shipped)), key=lambda pair: pair[0])
         after = [(at, item) for at, item in told if at >= begun and at < ended]
         fits = [at for at, item in after if mistake.right_cause(item) and mistake.right_subject(item)]
         first = after[0][1] if after else None
-        results = {name: self._score(fold, begun, ended) for name, fold in (("gated", gated), ("bare", bare))}
-        quiet = self._score(calm, begun, ended)
+        scores = {name: self._score(item, begun, ended) for name, item in (("gated", gated), ("bare", bare))}
+        calm = self._score(self._undisturbed(estimator), begun, ended)
         return Trial(
             mistake=mistake.name,
             estimator=estimator,
@@ -158,16 +180,13 @@ class Bench:
             subject_right=first is not None and mistake.right_subject(first),
             early=sum(at < begun for at, _ in told),
             green=green_share(shipped, begun, ended),
-            error={name: fit.rmse for name, fit in results["gated"].states.items()},
-            bare={name: fit.rmse for name, fit in results["bare"].states.items()},
-            calm={name: fit.rmse for name, fit in quiet.states.items()},
-            coverage={
-                name: fit.coverage
-                for name, fit in results["gated" if shipped is gated else "bare"].states.items()
-            },
+            error={name: fit.rmse for name, fit in scores["gated"].states.items()},
+            bare={name: fit.rmse for name, fit in scores["bare"].states.items()},
+            calm={name: fit.rmse for name, fit in calm.states.items()},
+            coverage={name: fit.coverage for name, fit in scores["gated" if ships is gated else "bare"].states.items()},
             recovery=None if mistake.fault is None else recovery(shipped, ended),
-            stale=stale,
-        )  # fmt: skip
+            stale=ships.stale,
+        )
 
     def _damaged(self, mistake: Mistake, start: float, end: float) -> Events:
         """The log as it becomes; a change of the asset needs a run of its own."""
@@ -190,28 +209,29 @@ class Bench:
             tuning = tuning.set(key, factor * float(tuning.get(key) or 0.0))
         return tuning
 
-    def _fold(self, estimator: str, tuning: Tuning, events: Events) -> tuple[Fold, int]:
+    def _fold(self, estimator: str, tuning: Tuning, events: Events) -> Folded:
         twin = self.twin
         log = Log.of(twin.model, capacity=max(1, len(events)))
         _, stale = log.extend(events, round(twin.config.time.horizon * 1e9))
-        fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=twin.policy)
+        truth = log.events.select(slice(None))
+        untold = Log.of(twin.model, capacity=max(1, len(truth)))
+        untold.extend(without_truth(truth))
+        fold = Fold(estimator, twin.model, tuning, untold, pairs=twin.pairs, policy=twin.policy)
         fold.advance()
         fold.finish()
-        return fold, stale
+        return Folded(fold, truth, stale)
 
-    def _undisturbed(self, estimator: str) -> Fold:
+    def _undisturbed(self, estimator: str) -> Folded:
         if estimator not in self._calm:
             tuning = replace(self.twin.tuning.with_options(self.twin.options_of(estimator)), seed=self.seed)
-            self._calm[estimator] = self._fold(estimator, tuning, self.events)[0]
+            self._calm[estimator] = self._fold(estimator, tuning, self.events)
         return self._calm[estimator]
 
-    def _score(self, fold: Fold, start: float, end: float) -> Score:
-        t = fold.log.t[: fold.n]
+    def _score(self, folded: Folded, start: float, end: float) -> Score:
+        t = folded.truth.t
         rows = (t >= round(start * 1e9)) & (t <= round(end * 1e9))
         return score(
-            fold.track.select(slice(0, fold.n)).select(rows),
-            fold.log.events.select(slice(0, fold.n)).select(rows),
-            fold.model,
+            folded.fold.track.select(slice(0, t.size)).select(rows), folded.truth.select(rows), self.twin.model
         )
 
 
