@@ -20,8 +20,8 @@ def green(fold: Fold) -> np.ndarray:
     return health
 
 
-def said_at(fold: Fold, episode: Episode) -> float:
-    """Seconds of the log at which an episode was first heard of; its start is when it began, found in hindsight."""
+def said_at(fold: Fold, episode: Episode) -> int:
+    """When an episode was first heard of, ns of the log; its start is when it began, found in hindsight."""
     log, track, model = fold.log, fold.track, fold.model
     kind, channel = log.kind[: fold.n], log.channel[: fold.n]
     since = log.t[: fold.n] >= round(episode.start * 1e9)
@@ -40,28 +40,28 @@ def said_at(fold: Fold, episode: Episode) -> float:
     else:
         heard = (health != TRACKING) & (health != WAITING)
     rows = np.flatnonzero(heard & since)
-    return float(log.t[rows[0]]) * 1e-9 if rows.size else episode.start
+    return int(log.t[rows[0]]) if rows.size else round(episode.start * 1e9)
 
 
-def first_word(fold: Fold, start: float) -> float | None:
-    """Seconds from `start` to the first row that is not green after one that was; None if all stay green."""
+def first_word(fold: Fold, start: int) -> float | None:
+    """Seconds from `start` (ns) to the first row that is not green, once a reading has come; None if all stay green."""
     t, ok = fold.log.t[: fold.n], green(fold)
     waiting = fold.track.health[: fold.n] == WAITING
-    rows = np.flatnonzero(~ok & ~waiting & (t >= round(start * 1e9)))
-    return float(t[rows[0]] - round(start * 1e9)) * 1e-9 if rows.size else None
+    rows = np.flatnonzero(~ok & ~waiting & (t >= start))
+    return int(t[rows[0]] - start) / 1e9 if rows.size else None
 
 
-def green_share(fold: Fold, start: float, end: float) -> float:
-    """Share of green rows in [start, end), seconds of the log."""
+def green_share(fold: Fold, start: int, end: int) -> float:
+    """Share of green rows in [start, end), ns of the log."""
     t = fold.log.t[: fold.n]
-    during = (t >= round(start * 1e9)) & (t < round(end * 1e9))
+    during = (t >= start) & (t < end)
     return float(green(fold)[during].mean()) if during.any() else np.nan
 
 
-def recovery(fold: Fold, end: float) -> float | None:
-    """Seconds from `end` until the twin is green for good; None if it is not at the end of the log."""
+def recovery(fold: Fold, end: int) -> float | None:
+    """Seconds from `end` (ns) until the twin is green for good; None if it is not at the end of the log."""
     t, ok = fold.log.t[: fold.n], green(fold)
-    after = np.flatnonzero(t >= round(end * 1e9))
+    after = np.flatnonzero(t >= end)
     if not after.size:
         return None
     wrong = after[~ok[after]]
@@ -69,4 +69,4 @@ def recovery(fold: Fold, end: float) -> float | None:
         return 0.0
     if wrong[-1] == fold.n - 1:
         return None
-    return float(t[wrong[-1] + 1] - round(end * 1e9)) * 1e-9
+    return int(t[wrong[-1] + 1] - end) / 1e9

@@ -79,7 +79,7 @@ def without_truth(events: Events) -> Events:
 
 
 def asset_of(twin: Twin, seed: int) -> Simulator | None:
-    """The twin's simulated asset, its seed counted up by `seed`; None if it has none."""
+    """The twin's simulated asset, without an end and its seed counted up by `seed`; None if it has none."""
     section = twin.config.source
     found: AssetSection | None = section if isinstance(section, AssetSection) else None
     key: tuple[str, ...] = ("source",)
@@ -87,7 +87,8 @@ def asset_of(twin: Twin, seed: int) -> Simulator | None:
         found, key = section.asset, ("source", "asset")
     if found is None:
         return None
-    return make_asset(twin.loaded, twin.model, found.model_copy(update={"seed": found.seed + seed}), key)
+    changed = {"seed": found.seed + seed, "duration": None}
+    return make_asset(twin.loaded, twin.model, found.model_copy(update=changed), key)
 
 
 def plain_log(twin: Twin, seed: int, duration: float) -> Events:
@@ -132,20 +133,21 @@ class Bench:
         seed: Of the asset, the faults and the filter.
         duration: Seconds of the log.
 
-    A fault of the source lasts from a third to two thirds of the log; an error of the belief from its start on. What the
-    twin says, it says without having been told the truth; that is for the scores alone.
+    A fault of the source lasts from a third to two thirds of the log; an error of the belief from its start on. What
+    the twin says, it says without having been told the truth; that is for the scores alone.
     """
 
     def __init__(self, twin: Twin, seed: int, duration: float) -> None:
         self.twin, self.seed, self.duration = twin, seed, duration
         self.events = plain_log(twin, seed, duration)
-        self.origin = float(self.events.t[0]) * 1e-9
+        self.origin = int(self.events.t[0])
         self.length = float(self.events.t.max() - self.events.t[0]) * 1e-9
         self._calm: dict[str, Folded] = {}
 
     def window(self, mistake: Mistake) -> tuple[float, float]:
         """When a mistake lasts, seconds after the log's first event."""
-        return (0.0, self.length) if mistake.fault is None else (self.length / 3.0, 2.0 * self.length / 3.0)
+        third = round(self.length / 3.0, 3)
+        return (0.0, self.length) if mistake.fault is None else (third, 2.0 * third)
 
     def run(self, mistake: Mistake, estimator: str) -> Trial:
         """Make a mistake with a filter.
@@ -160,9 +162,10 @@ class Bench:
         bare = self._fold(estimator, tuning.set("gate", None), events)
         ships = gated if self.twin.tuning.gate is not None else bare
         shipped = ships.fold
-        begun, ended = self.origin + start, self.origin + end
+        begun, ended = self.origin + round(start * 1e9), self.origin + round(end * 1e9)
         told = sorted(((said_at(shipped, item), item) for item in episodes(shipped)), key=lambda pair: pair[0])
-        after = [(at, item) for at, item in told if at >= begun and at < ended]
+        since = [(at, item) for at, item in told if at >= begun]
+        after = [(at, item) for at, item in since if at < ended]
         fits = [at for at, item in after if mistake.right_cause(item) and mistake.right_subject(item)]
         first = after[0][1] if after else None
         scores = {name: self._score(item, begun, ended) for name, item in (("gated", gated), ("bare", bare))}
@@ -173,12 +176,12 @@ class Bench:
             seed=self.seed,
             start=start,
             end=end,
-            delay=fits[0] - begun if fits else None,
+            delay=(fits[0] - begun) / 1e9 if fits else None,
             word=first_word(shipped, begun),
             named=f"{first.subject} {first.cause}" if first is not None else None,
             cause_right=first is not None and mistake.right_cause(first),
             subject_right=first is not None and mistake.right_subject(first),
-            early=sum(at < begun for at, _ in told),
+            early=len(told) - len(since),
             green=green_share(shipped, begun, ended),
             error={name: fit.rmse for name, fit in scores["gated"].states.items()},
             bare={name: fit.rmse for name, fit in scores["bare"].states.items()},
@@ -227,9 +230,9 @@ class Bench:
             self._calm[estimator] = self._fold(estimator, tuning, self.events)
         return self._calm[estimator]
 
-    def _score(self, folded: Folded, start: float, end: float) -> Score:
+    def _score(self, folded: Folded, start: int, end: int) -> Score:
         t = folded.truth.t
-        rows = (t >= round(start * 1e9)) & (t <= round(end * 1e9))
+        rows = (t >= start) & (t <= end)
         return score(
             folded.fold.track.select(slice(0, t.size)).select(rows), folded.truth.select(rows), self.twin.model
         )
