@@ -53,6 +53,7 @@ class Active:
         self.start, self.end = start, end
         self.begun = self.ended = False
         self.touched = 0
+        self.since: int | None = None
         self._target = Target(fault, model)
         self._code = find_kind(fault.kind).code
         self._scheduled = scheduled
@@ -76,7 +77,7 @@ class Active:
                 out.append(item)
                 continue
             if not self.begun and item.at >= self.start:
-                self.begun = True
+                self.begun, self.since = True, item.at
                 out += [self._stamp(item, self._code), *self._effect.turn(item, self._moment(item, True))]
             if self.begun and not self.ended and item.at >= self.end:
                 self.ended = True

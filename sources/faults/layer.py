@@ -138,9 +138,7 @@ class Faults:
                 active = running.get(entry.number)
                 if self._over(entry):
                     continue
-                begun = active is not None and active.begun
-                since = active.start if active is not None and begun else None
-                touched, lost = (active.touched, active.lost) if active is not None else (0, 0)
+                since, touched, lost = (active.since, active.touched, active.lost) if active else (None, 0, 0)
                 found.append(FaultStatus(entry.number, entry.fault, since, touched, lost))
             return tuple(found)
 
