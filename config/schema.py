@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from .fault_schema import FaultSection
 from .fields import (
     Count,
     Flag,
@@ -182,5 +183,8 @@ class TwinSection(Section):
     """Events that are kept, and folded again when the tuning changes; the oldest are forgotten."""
     source: SourceSection
     """Where the readings come from; its `type` is simulator, can, can_log, table or merged."""
+    faults: tuple[FaultSection, ...] = ()
+    """Faults that are put into what the source says: a list of {kind, sensor, input, start, end, size, rate, ...}. They
+    act in their order, after those of a simulator. Default: none."""
     view: ViewSection = ViewSection()
     """What the page draws."""

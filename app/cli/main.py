@@ -14,7 +14,21 @@ import tyro
 from estimators.errors import NisusError
 
 from ..stderr import complain
-from .arguments import COMMANDS, Bus, Command, Commission, Compare, Filters, Fold, Log, Review, Run, Schema, Twins
+from .arguments import (
+    COMMANDS,
+    Bus,
+    Command,
+    Commission,
+    Compare,
+    Filters,
+    Fold,
+    Log,
+    Review,
+    Run,
+    Schema,
+    Stress,
+    Twins,
+)
 
 
 def carry_out(command: Command) -> int:
@@ -35,6 +49,10 @@ def carry_out(command: Command) -> int:
         from .commission import commission_twin
 
         return commission_twin(command)
+    if isinstance(command, Stress):
+        from .stress import stress_twin
+
+        return stress_twin(command)
     if isinstance(command, Filters):
         from .filters import show_filters
 

@@ -30,6 +30,7 @@ from . import commands
 from .alerts import Alerts
 from .counts import Latency, RowCounts, last_run
 from .execute import Remembered, execute
+from .faults import Faulty
 from .feeder import Feeder, Finished, Restarted
 from .idle_ticks import IdleTicks
 from .interface import Records
@@ -255,6 +256,9 @@ class Engine:
         kept = self._status
         if kept is not None and time.monotonic() - kept[0] < STATUS_AGE:
             return kept[1]
+        source = self._feeder.source
+        layer = source.faults if isinstance(source, Faulty) else None
+        lost = layer.lost if layer is not None else 0
         with self._reading():
             log, fold = self._log, self._fold
             track = fold.track
@@ -273,6 +277,7 @@ class Engine:
                     **self.notices.counts(),
                     **self._row_counts.count(track.verdict, log.channel),
                     **({"recovered": fold.recoveries()} if fold.recoveries() else {}),
+                    **({"silenced": lost} if lost else {}),
                 },
                 nis=float(track.nis_mean[last]) if last >= 0 else np.nan,
                 nis_low=float(track.nis_low[last]) if last >= 0 else np.nan,
@@ -282,6 +287,7 @@ class Engine:
                 recording=self.recorder.path if self.recorder is not None else None,
                 latency_ms=self._latency.percentile(99.0),
                 latency_p50_ms=self._latency.percentile(50.0),
+                faults=layer.status() if layer is not None else (),
             )
         self._status = (time.monotonic(), status)
         return status

@@ -13,6 +13,7 @@ from estimators.log import RESET, Events
 from estimators.registry import checked, find_estimator
 
 from . import commands
+from .faults import carry_out
 from .interface import Running
 from .playback import PLAYBACK, play
 
@@ -73,6 +74,8 @@ def execute(command: commands.Command, engine: Running) -> None:
         if engine.recorder is None:
             raise ConfigError("this session cannot record")
         engine.recorder.record(command.path)
+    elif isinstance(command, commands.InjectFault | commands.ClearFault):
+        engine.notices.say(carry_out(command, engine.source, engine.model))
     elif isinstance(command, PLAYBACK):
         play(engine.source, command, engine.span()[0])
 

@@ -12,6 +12,7 @@ from estimators.log import Events
 from estimators.numerics.peaks import Peak
 from estimators.track import Track
 from estimators.tuning import Tuning
+from sources.faults.layer import FaultStatus
 
 from .notices import Notice
 
@@ -68,6 +69,7 @@ class Status:
     `t` is the time of the last event (ns), `since` the time when the present health began, `lost` the time from which
     the estimate has not been a number (None if it is one). `counts` are those of the rows of this revision, and of
     other things that happened to the twin. `latency_ms` is the 99th percentile from a reading's arrival to its row.
+    `faults` are those that were put into the source, and hold or will.
     """
 
     estimator: str
@@ -91,3 +93,4 @@ class Status:
     recording: Path | None
     latency_ms: float | None
     latency_p50_ms: float | None
+    faults: tuple[FaultStatus, ...] = ()

@@ -28,6 +28,7 @@ from .source import Plan, plan_source
 
 if TYPE_CHECKING:
     from sources.can.player import Player
+    from sources.faults.layer import Faults
     from sources.source import Report, Source
 
 
@@ -99,17 +100,25 @@ class Twin:
         """The options that the YAML gives for an estimator; of a choice its number."""
         return _options(self.config, estimator)
 
-    def open_source(self, report: Report, *, live: bool = True) -> Source:
-        """Open the source.
+    def faults(self) -> Faults:
+        """A new layer of faults for `open_source`, with those of the YAML; more can be injected while it runs."""
+        return self.plan.faults()
+
+    def open_source(
+        self, report: Report, *, live: bool = True, speed: float | None = None, faults: Faults | None = None
+    ) -> Source:
+        """Open the source, behind its faults.
 
         Args:
             report: Called as report(key, text) with what is worth counting; from the source's thread.
             live: False asks for events that end: a recording in place of a bus.
+            speed: Times real time, for what is not live; None gives it as fast as it is asked.
+            faults: A layer of `faults`, for a source that is opened again; None makes one.
 
         Raises:
             SourceError: If it cannot be opened, with the remedy.
         """
-        return self.plan.open(report, live=live)
+        return self.plan.open(report, live=live, speed=speed, faults=faults)
 
     def player(self, report: Report, *, interface: str | None = None, channel: str | int | None = None) -> Player:
         """The asset of a twin on a CAN bus, ready to play there, or on another `interface` and `channel`.

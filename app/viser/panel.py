@@ -19,6 +19,7 @@ from ..engine.interface import Running
 from ..engine.notices import Notice
 from ..engine.outputs import Status
 from .coalescer import Coalescer
+from .faults import FaultRows
 from .options import OptionRows
 from .restore import BeganRows
 from .rows import ChoiceRow, Held, NumberRow
@@ -55,6 +56,7 @@ class Panel:
             gui.add_html('<div style="font-size:0.8em;padding:0 0.9em 0.6em">Off: held out. Predicted and scored, '
                          "never used.</div>")  # fmt: skip
             self.sensors = {name: self._sensor(gui, name, status) for name in engine.model.sensor_names}
+            self.faults = FaultRows(gui, engine.model, engine.submit, self.complain)
         with tabs.add_tab("Play"):
             self._build_play(gui, status)
             self.scene_folder = gui.add_folder("Scene")
@@ -148,6 +150,7 @@ class Panel:
         self.gate.sync(self._gate_text(status.tuning.gate))
         for name, box in self.sensors.items():
             box.sync(bool(status.tuning.get(f"use.{name}")))
+        self.faults.sync(status)
         self._sync_play(status)
         recording = status.recording
         label = "Record" if recording is None else "Stop recording"
