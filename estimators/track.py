@@ -15,6 +15,12 @@ as S was not positive definite beyond rounding or the NIS no finite number; refu
 
 VERDICT_NAMES = ("none", "used", "gated", "held out", "missing", "failed", "screened")
 
+REASONS = ("range", "rate", "stuck", "saturated", "duplicate")
+"""Why a row of a reading is refused at the edge: beyond what can be; changing faster; repeating itself; where its
+converter clips; a reading that came before. Bits of `Track.screened`, in this order."""
+
+RANGE, RATE, REPEATED, SATURATED, DUPLICATE = (1 << k for k in range(len(REASONS)))
+
 WAITING, TRACKING, SUSPECT, DEGRADED, DIVERGED, STALE = range(6)
 """Health: no reading has come; consistent; consistent no more; a sensor is lost or readings are late; the estimate is
 lost; nothing arrives."""
@@ -36,6 +42,7 @@ class Track(NamedTuple):
     whitened (N, ny): the innovation as it would be drawn from N(0, I), by row of the reading; of a prediction that is
     not Gaussian each row by itself, Φ⁻¹(F(y)). alarms (N, width): bits of the causes that are in alarm after this
     event, by row of the reading or state of the truth; flags: bits of what else is wrong (diagnostics/evidence.py).
+    screened (N, ny): bits of `REASONS` for which a row of the reading was refused at the edge.
     """
 
     mean: Any
@@ -56,6 +63,7 @@ class Track(NamedTuple):
     whitened: Any
     alarms: Any
     flags: Any
+    screened: Any
 
     @staticmethod
     def allocate(rows: int, nx: int, pairs: int, ny: int, width: int | None = None) -> Track:
@@ -66,7 +74,8 @@ class Track(NamedTuple):
         windowed = [np.full(rows, np.nan) for _ in range(4)]
         health = [np.zeros(rows, np.int8) for _ in range(2)]
         evidence = [np.full((rows, ny), np.nan), np.zeros((rows, width or ny), np.int32), np.zeros(rows, np.int64)]
-        columns: list[Any] = [*matrix, *vectors, *codes, *windowed, *health, *evidence]
+        screened = np.zeros((rows, ny), np.int8)
+        columns: list[Any] = [*matrix, *vectors, *codes, *windowed, *health, *evidence, screened]
         return Track(*columns)
 
     def select(self, index: object) -> Track:
@@ -85,5 +94,5 @@ class Track(NamedTuple):
 # As in log.py: `len` counts rows, not columns.
 Track._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[method-assign, assignment]
 
-_A2 = types.Array(types.int32, 2, "C")
-track_type = types.NamedTuple((F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, F1, B1, B1, F2, _A2, I1), Track)
+_A2, _B2 = types.Array(types.int32, 2, "C"), types.Array(types.int8, 2, "C")
+track_type = types.NamedTuple((F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, F1, B1, B1, F2, _A2, I1, _B2), Track)

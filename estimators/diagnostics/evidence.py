@@ -32,6 +32,7 @@ from ..numerics.linalg import wrap
 from ..track import (
     DEGRADED,
     DIVERGED,
+    DUPLICATE,
     FAILED,
     GATED,
     SCREENED,
@@ -202,8 +203,8 @@ def watch_of(
     if model.mode >= 0:
         column[model.mode] = -1
     ranges = np.full((len(shown) + model.nu, 2), [-np.inf, np.inf])
-    for k, item in enumerate([*model.shown_states, *model.inputs]):
-        fitted = getattr(item, "fitted", None)
+    fits = [state.fitted for state in model.shown_states] + [item.fitted for item in model.inputs]
+    for k, fitted in enumerate(fits):
         if fitted is not None:
             ranges[k] = fitted
     chance = min(max(1e-6, 1.0 - gate), 0.5 * REFUSED_SHARE) if gate is not None else 0.5 * REFUSED_SHARE
@@ -392,6 +393,15 @@ def _forget(state, sensors, rows, states):
     state[_SUSPECTS] = state[_GONE] = state[_MISSED] = 0.0
 
 
+@inlined
+def _is_copy(i, rows, track):
+    """Whether a reading came before: the copies that a gateway makes say nothing for or against anyone."""
+    for k in range(rows):
+        if track.screened[i, k] & DUPLICATE != 0:
+            return True
+    return False
+
+
 @jit
 def _hear(i, now, y, s, watch, policy, state, track):
     """Put a reading of sensor s to all tests."""
@@ -418,11 +428,12 @@ def _hear(i, now, y, s, watch, policy, state, track):
         if width + k < y.size and np.isfinite(y[width + k]):
             r = y[width + k]
         mask = before & ~STUCK | _repeat(each, y[k], r, h, base, before)
-        if judged or verdict == FAILED:
-            ratio = watch.chances[1] if verdict == USED else watch.chances[0]
+        screened = track.screened[i, k] != 0
+        if judged or verdict == FAILED or screened:
+            ratio = watch.chances[1] if verdict == USED and not screened else watch.chances[0]
             said = _add(each, AT_REFUSALS, ratio, h, base[3 + AT_REFUSALS])
             mask = mask & ~REFUSED | _alarm(said, REFUSED, before)
-        if judged:
+        if judged and not screened:
             e = track.innovation[i, k] / track.innovation_std[i, k]
             if watch.marginal != 0 and np.isfinite(track.whitened[i, k]):
                 e = track.whitened[i, k]
@@ -491,7 +502,8 @@ def watch_rows(first, last, t, kind, channel, value, watch, policy, state, track
         if kind[i] == READING:
             if track.verdict[i] != SCREENED:
                 state[_HEARD] = 1.0
-            _hear(i, now, value[i], channel[i], watch, policy, state, track)
+            if not _is_copy(i, watch.row_count[channel[i]], track):
+                _hear(i, now, value[i], channel[i], watch, policy, state, track)
         elif kind[i] == TRUTH:
             _tell(
                 i,
