@@ -72,7 +72,9 @@ class StuckSection(Section):
 
     @model_validator(mode="after")
     def _one(self) -> StuckSection:
-        one_of(self, "readings", "seconds", required=self.quantum is None)
+        one_of(self, "readings", "seconds", required=False)
+        if self.readings is None and self.seconds is None and self.quantum is None:
+            raise PydanticCustomError("neither", "gives neither {keys}", {"keys": "readings, seconds nor quantum"})
         return self
 
 
