@@ -60,7 +60,7 @@ def test_limits_reach_the_sensor(tmp_path, limits, expected) -> None:
 
 
 def test_a_range_of_validity_takes_the_place_of_the_models(tmp_path) -> None:
-    model = load_twin(write(tmp_path, "use: true", "valid: {winding: {min: 0, max: 150}}")).model
+    model = load_twin(write(tmp_path, "use: true", "valid: {temperature: {min: 0, max: 150}}")).model
     assert [state.fitted for state in model.states if state.name == "temperature"] == [(0.0, 150.0)]
 
 
