@@ -23,6 +23,7 @@ from .fields import (
     SpreadSection,
     Text,
 )
+from .limits_schema import DuplicatesSection, Positives, Ranges, StuckSection, Validity
 from .source_schema import SourceSection
 
 
@@ -46,12 +47,26 @@ class UnknownSection(Section):
 
 
 class SensorSection(SpreadSection):
-    """The noise of one sensor as the estimator assumes it, and whether the estimate uses it."""
+    """The noise of one sensor as the estimator assumes it, what it can say, and whether the estimate uses it."""
 
     correlation: tuple[tuple[Number, ...], ...] | None = None
     """Correlation of the noise of its rows, for example [[1, 0.5], [0.5, 1]], with R_ij = correlation_ij √(R_ii R_jj):
     it stays while the variances are tuned. Particle and ensemble filters take independent rows, [[1, 0], [0, 1]].
     Default: the model's."""
+    range: Ranges | None = None
+    """Least and greatest value that can be, in the sensor's unit, for example [-40, 180], null for none; a list of
+    pairs gives one a row. What lies outside is kept in the log and not used. Default: every value can be."""
+    saturation: Ranges | None = None
+    """The values at which its converter clips: a reading at one of them or beyond is not used. As `range`. Default:
+    none."""
+    rate: Positives | None = None
+    """Greatest change in a second, in the sensor's unit, against the last reading that kept all limits; noise may add
+    8 standard deviations. A list gives one a row. Default: any change can be."""
+    stuck: StuckSection | None = None
+    """When readings that repeat themselves are not used any more. Default: never."""
+    duplicates: DuplicatesSection | None = None
+    """When a reading of the same values is the same reading, which counts once. Default: when it is of the same
+    time."""
     use: Flag = True
     """false holds the sensor out: the estimate ignores it, and its prediction of it is scored. Default: true."""
 
@@ -164,6 +179,9 @@ class TwinSection(Section):
     """Process noise Q by name: how much the model is distrusted. Default: the model's."""
     sensors: dict[str, SensorSection] = {}
     """Sensor noise R by sensor: how much each is distrusted. Default: the model's."""
+    valid: dict[str, Validity] = {}
+    """Range over which the model was fitted or checked, by state or input, in its unit, for example
+    {temperature: {min: 20, max: 38}}. Outside it the twin is suspect. Default: the model's."""
     estimator: Annotated[
         EstimatorSection, BeforeValidator(_estimator, json_schema_input_type=str | EstimatorSection)
     ] = EstimatorSection(name="ekf")

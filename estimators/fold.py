@@ -35,6 +35,7 @@ from .model.state_space import StateSpaceModel
 from .numerics.peaks import Peak
 from .numerics.quantiles import chi_square_quantile
 from .registry import find_estimator
+from .screen import fresh_screen, screen_of
 from .snapshots import Base, Snapshot, Snapshots
 from .track import WHITENED, Track
 from .tuning import Tuning
@@ -105,6 +106,7 @@ class Fold:
         self._work = _scratch(self.estimator.work_size(self.options, model.nx, model.width) + 1)
         self._score = np.empty(WHITENED + model.ny)
         self._evidence = fresh(model)
+        self._screen, self._edge = screen_of(model), fresh_screen(model)
         self._clock = np.array([UNSET])
         self._u = np.array([item.default for item in model.inputs], float)
         mean, cov = self._held["prior_mean"], self._held["prior_cov"]
@@ -113,7 +115,7 @@ class Fold:
         if base is not None:
             check_base(base, model)
             mean, cov, self._clock[0], self._u[:] = base.mean, base.cov, base.clock, base.u
-        self._run, judge, begin = compiled()
+        self._run, judge, begin, self._screen_rows = compiled()
         if model.black_box or self.estimator.interpreted:
             self._context = View(self._compiled, self._context, tuning, self.options, self.pairs, self._held)
             self._run = partial(fold_loop.run_and_judge, judge, self._seen)
@@ -124,6 +126,8 @@ class Fold:
             self._state[:] = left
             if base is not None and base.evidence is not None and base.evidence.size == self._evidence.size:
                 self._evidence[:] = base.evidence
+        if base is not None and base.edge is not None and base.edge.size == self._edge.size:
+            self._edge[:] = base.edge
         self._snapshots = Snapshots(self._state.nbytes)
         self.pictures = Pictures(model.grid, picture) if model.grid is not None else None
         self._asked = -1
@@ -307,6 +311,7 @@ class Fold:
             if self.pictures is not None:
                 stop = self.pictures.next(log, self.n, stop)
             try:
+                self._screen_events(self.n, stop)
                 self._run_events(self.n, stop)
             except BaseException:
                 # Python was stopped between two events: back to where the state is known.
@@ -317,6 +322,11 @@ class Fold:
             if stop == boundary:
                 self._remember()
         return end - begun
+
+    def _screen_events(self, start: int, stop: int) -> None:
+        """Which rows of the readings the filter shall not see."""
+        log, screened = self.log, self._rows.screened
+        self._screen_rows(start, stop, log.t, log.kind, log.channel, log.value, self._screen, self._edge, screened)
 
     def _run_events(self, start: int, stop: int) -> None:
         log = self.log
@@ -365,7 +375,8 @@ class Fold:
         self.pictures.take(self.log, self.n, mean, cov[0] if cov.shape[0] == 1 else np.diag(cov))
 
     def _remember(self) -> None:
-        snapshot = Snapshot(int(self._clock[0]), self._u.copy(), self._state.copy(), self._evidence.copy())
+        gathered = self._evidence.copy(), self._edge.copy()
+        snapshot = Snapshot(int(self._clock[0]), self._u.copy(), self._state.copy(), *gathered)
         self._snapshots.keep(self.log.first + self.n, self.log.first, snapshot)
 
     def rewind(self, index: int) -> None:
@@ -376,7 +387,7 @@ class Fold:
     def _restore(self, index: int) -> None:
         at = self._snapshots.last(self.log.first + index)
         self._snapshots.forget_after(at)
-        self._clock[0], self._u[:], self._state[:], self._evidence[:] = self._snapshots[at]
+        self._clock[0], self._u[:], self._state[:], self._evidence[:], self._edge[:] = self._snapshots[at]
         self.n = at - self.log.first
         self._asked = -1
         if self.pictures is not None:
@@ -385,9 +396,10 @@ class Fold:
     def base_at(self, index: int) -> tuple[int, Base]:
         """The last snapshot at or before the event `index`: its index, and the base of a fold that starts there."""
         at = self._snapshots.last(self.log.first + index)
-        clock, u, state, evidence = self._snapshots[at]
+        clock, u, state, evidence, edge = self._snapshots[at]
         mean, cov = self.estimator.moments(self.options, state, self.model.nx)
-        base = Base(mean, cov, clock, u.copy(), self.estimator.name, state.copy(), at, evidence.copy())
+        name, gathered = self.estimator.name, (evidence.copy(), edge.copy())
+        base = Base(mean, cov, clock, u.copy(), name, state.copy(), at, *gathered)
         return at - self.log.first, base
 
     def follow(self, log: Log, changed_from: int | None) -> None:

@@ -24,7 +24,7 @@ class Base(NamedTuple):
     mean (nx,) and cov (nx, nx), or the variances (1, nx) of a large state, stand for it in any filter. `state` is all
     that the filter `estimator` had (modes, members, particles, what an adaptation learned), for that filter alone.
     `first` is the absolute index of the first event that is folded from here. `evidence` is what had been gathered
-    against the filter, for the same filter.
+    against the filter, for the same filter; `edge` what the screen remembers of the sensors, for any.
     """
 
     mean: np.ndarray
@@ -35,15 +35,17 @@ class Base(NamedTuple):
     state: np.ndarray | None = None
     first: int = 0
     evidence: np.ndarray | None = None
+    edge: np.ndarray | None = None
 
 
 class Snapshot(NamedTuple):
-    """Clock (ns), inputs (nu,), state of a filter and evidence against it, before an event."""
+    """Clock (ns), inputs (nu,), state of a filter, evidence against it and state of the screen, before an event."""
 
     clock: int
     u: np.ndarray
     state: np.ndarray
     evidence: np.ndarray
+    edge: np.ndarray
 
 
 class Snapshots:

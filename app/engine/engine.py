@@ -275,7 +275,7 @@ class Engine:
                 lost=self._alerts.lost,
                 counts={
                     **self.notices.counts(),
-                    **self._row_counts.count(track.verdict, log.channel),
+                    **self._row_counts.count(track, log.channel),
                     **({"recovered": fold.recoveries()} if fold.recoveries() else {}),
                     **({"silenced": lost} if lost else {}),
                 },
@@ -366,7 +366,7 @@ class Engine:
         count = (self._log.n - self._history) // SPARSE_EVERY * SPARSE_EVERY
         count, self._base = self._fold.base_at(count)
         if count:
-            self._row_counts.forget(self._fold.track.verdict[:count], self._log.channel[:count])
+            self._row_counts.forget(self._fold.track.select(slice(0, count)), self._log.channel[:count])
             self._fold.drop_front(count)
             self._log.drop_front(count)
 
@@ -446,7 +446,7 @@ class Engine:
             # What the new revision says of the readings counts, also of those that it loses here; not what others said.
             lost = max(0, log.first - fold.log.first)
             row_counts = RowCounts(self.model)
-            row_counts.forget(fold.track.verdict[:lost], fold.log.channel[:lost])
+            row_counts.forget(fold.track.select(slice(0, lost)), fold.log.channel[:lost])
             try:
                 fold.follow(log, changed_from)
             except EstimatorError:

@@ -35,7 +35,7 @@ def status_html(status: Status, origin: int | None, unit: Unit = SECONDS) -> str
     latency = status.latency_ms
     counts = dict(status.counts)
     known = [(name, counts.pop(name, 0)) for name in COUNTED]
-    known += [(name, counts[name]) for name in ("held out", "failed", "recovered") if counts.get(name)]
+    known += [(name, counts[name]) for name in ("held out", "screened", "failed", "recovered") if counts.get(name)]
     cells = "".join(
         f'<span style="margin-right:0.9em;white-space:nowrap"><span style="opacity:0.65">{html.escape(name)}</span> '
         f"{count:,}</span>"

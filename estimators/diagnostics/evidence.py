@@ -32,6 +32,7 @@ from ..numerics.linalg import wrap
 from ..track import (
     DEGRADED,
     DIVERGED,
+    DUPLICATE,
     FAILED,
     GATED,
     SCREENED,
@@ -443,6 +444,15 @@ def _forget(state, sensors, rows, states):
     state[_SUSPECTS] = state[_GONE] = state[_MISSED] = 0.0
 
 
+@inlined
+def _is_copy(i, track):
+    """Whether a reading came before: the copies that a gateway makes say nothing for or against anyone."""
+    for k in range(track.screened.shape[1]):
+        if track.screened[i, k] & DUPLICATE != 0:
+            return True
+    return False
+
+
 @jit
 def _hear(i, now, y, s, context, policy, state, track):
     """Put a reading y of sensor s, and the variances that it may have brought, to all tests."""
@@ -475,11 +485,12 @@ def _hear(i, now, y, s, context, policy, state, track):
         if width + k < y.size and np.isfinite(y[width + k]):
             r = y[width + k]
         mask = before & ~STUCK | _repeat(each, y[k], r, h, base, before)
-        if judged or verdict == FAILED:
-            ratio = chances[1] if verdict == USED else chances[0]
+        screened = track.screened[i, k] != 0
+        if judged or verdict == FAILED or screened:
+            ratio = chances[1] if verdict == USED and not screened else chances[0]
             said = _add(each, AT_REFUSALS, ratio, h, base[3 + AT_REFUSALS])
             mask = mask & ~REFUSED | _alarm(said, REFUSED, before)
-        if judged:
+        if judged and not screened:
             e = track.innovation[i, k] / track.innovation_std[i, k]
             if context.marginal != 0 and np.isfinite(track.whitened[i, k]):
                 e = track.whitened[i, k]
@@ -554,8 +565,9 @@ def watch_rows(first, last, t, kind, channel, value, context, policy, state, tra
         if kind[i] == READING:
             if track.verdict[i] != SCREENED:
                 state[_HEARD] = 1.0
-            y = floats(value[i:].ctypes.data, value.shape[1])
-            _hear(i, now, y, channel[i], context, policy, state, track)
+            if not _is_copy(i, track):
+                y = floats(value[i:].ctypes.data, value.shape[1])
+                _hear(i, now, y, channel[i], context, policy, state, track)
         elif kind[i] == TRUTH:
             truth = floats(value[i:].ctypes.data, min(width, context.nx - channel[i]))
             _tell(i, channel[i], truth, context, state, track)
