@@ -156,7 +156,7 @@ class Log:
         self.extend(batch)
         return self.n
 
-    def extend(self, batch: Events, horizon: int | None = None) -> tuple[int, int]:
+    def extend(self, batch: Events, horizon: int | None = None, settled: np.ndarray | None = None) -> tuple[int, int]:
         """Put a batch where it belongs in time.
 
         Args:
@@ -164,6 +164,7 @@ class Log:
             horizon: Nanoseconds; an event older than the newest before it by more than this is dropped as stale.
                 Judged event by event, so the outcome does not depend on how arrivals were cut into batches. One
                 before `floor` is stale with any horizon.
+            settled: Mask (N,) of the events to which no horizon applies: they came in time and were held on the way.
 
         Returns:
             The lowest index whose event changed (the old `n` if all were appended) and the number dropped.
@@ -181,7 +182,12 @@ class Log:
         self.newest = int(newest[-1])
         stale = 0
         if horizon is not None or batch.t.min() < self.floor:
-            fresh = batch.t >= (self.floor if horizon is None else np.maximum(newest - horizon, self.floor))
+            oldest = np.full(len(batch), self.floor)
+            if horizon is not None:
+                oldest = np.maximum(newest - horizon, oldest)
+            if settled is not None:
+                oldest[settled] = self.floor
+            fresh = batch.t >= oldest
             stale = int(fresh.size - fresh.sum())
             if stale:
                 batch = batch.select(fresh)

@@ -24,12 +24,15 @@ from estimators.tuning import TOGETHER
 from sources.source import Endless
 
 from ..engine.stall import interruptible
+from ..intake import WRONG_TIME, Intake
 from ..twin.twin import Twin, load_twin
 from .arguments import settings
 from .prepare import prepare
 from .remarks import remarking
 
 if TYPE_CHECKING:
+    from estimators.events.clocks import Passed
+
     from .arguments import Fold as Arguments
 
 
@@ -44,19 +47,25 @@ def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
     def count(key: str, text: str) -> None:
         counts[key] += 1
 
-    source = twin.open_source(remarking(count), live=False)
+    def put(passed: Passed) -> None:
+        counts["stale"] += log.extend(passed.events, horizon, passed.settled)[1]
+
+    remark = remarking(count)
+    source = twin.open_source(remark, live=False)
     if duration is None and isinstance(source, Endless) and source.endless:
         source.close()
         raise SourceError(f"{twin.name}: its source has no end; give --duration SECONDS")
     log = Log.of(twin.model)
     horizon = round(twin.config.time.horizon * 1e9)
+    intake = Intake(twin.model, horizon, remark)
     try:
         while (batch := source.read(1.0)) is not None:
-            _, stale = log.extend(batch, horizon)
-            counts["stale"] += stale
+            put(intake.take(batch))
             if duration is not None and log.n and log.t[log.n - 1] - log.t[0] > duration * 1e9:
                 log.n = int(np.searchsorted(log.t[: log.n], log.t[0] + round(duration * 1e9), side="right"))
                 break
+        else:
+            put(intake.finish())
     finally:
         source.close()
     if not log.n:
@@ -105,7 +114,8 @@ def _as_dict(twin: Twin, result: Score, seconds: float, counts: Counter[str], fo
     """What a script needs of a fold.
 
     `rmse` and `coverage` (the share of errors inside their 95 % band) are by state and `held_out` by sensor row, in
-    their units; `stale` counts the readings that came too late to be among the `readings`, `conditioned` those that a
+    their units; `stale` counts the readings that came too late to be among the `readings`, `wrong_time` the events
+    that were refused for a time that cannot be true, `conditioned` those that a
     condition of the source's map refused; `health` is the share of the track's rows in each state of health.
     """
 
@@ -132,6 +142,7 @@ def _as_dict(twin: Twin, result: Score, seconds: float, counts: Counter[str], fo
         "log_likelihood": number(result.log_likelihood),
         "used": int(np.sum(fold.track.verdict == USED)),
         "stale": counts["stale"],
+        "wrong_time": counts[WRONG_TIME],
         "conditioned": sum(count for key, count in counts.items() if key.startswith("condition ")),
         "gated": result.gated,
         "missing": result.missing,

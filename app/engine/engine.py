@@ -25,6 +25,7 @@ from estimators.registry import find_estimator
 from estimators.snapshots import SPARSE_EVERY, Base
 from estimators.track import TRACKING
 
+from ..intake import Intake
 from ..stderr import complain
 from . import commands
 from .alerts import Alerts
@@ -41,6 +42,7 @@ from .stall import Stall
 
 if TYPE_CHECKING:
     from estimators.diagnostics.field_pictures import Picture
+    from estimators.events.clocks import Passed
     from estimators.tuning import Tuning
     from sources.source import Source
 
@@ -115,6 +117,7 @@ class Engine:
         self._base = base
         self._fold = self._make_fold(self.estimator, self.tuning, self._log, base)
         self._row_counts = RowCounts(self.model)
+        self._intake = Intake(self.model, self._horizon, self.notices.report)
 
     def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
         period = self.twin.picture if self.model.grid is not None else None
@@ -324,20 +327,23 @@ class Engine:
         if not batches:
             return
         batch = batches[0] if len(batches) == 1 else Events.concat(batches, self.model.width)
+        self._put(self._intake.take(batch))
+        if self._feeder.live:
+            self._latency.note(batch)
+
+    def _put(self, passed: Passed) -> None:
         with self._lock, self._stall.watched(self._fold):
-            stale = self._take(batch, self._horizon)
+            stale = self._take(passed.events, self._horizon, passed.settled)
             self._idle_ticks.broken(self._log.newest)
             if self._log.n > self._history + 3 * SPARSE_EVERY:
                 self._forget()
         if stale:
             text = f"{stale} reading(s) later than the horizon, or older than the history, dropped"
             self.notices.report("stale", text, times=stale)
-        if self._feeder.live:
-            self._latency.note(batch)
 
-    def _take(self, batch: Events, horizon: int | None = None) -> int:
+    def _take(self, batch: Events, horizon: int | None = None, settled: np.ndarray | None = None) -> int:
         """Put events where they belong, and fold from there on; how many were stale."""
-        first, stale = self._log.extend(batch, horizon)
+        first, stale = self._log.extend(batch, horizon, settled)
         before = min(first, self._fold.n)
         if first < self._fold.n:
             self._go_back(first)
@@ -382,6 +388,7 @@ class Engine:
         elif isinstance(item, Restarted):
             self._restart()
         elif isinstance(item, Finished):
+            self._put(self._intake.finish())
             with self._lock, self._stall.watched(self._fold):
                 self._fold.finish()
             self._finished = True
