@@ -15,6 +15,7 @@ import numpy as np
 
 from .compiled.context import context_of
 from .compiled.model import compile_model
+from .diagnostics.evidence import fresh, watch_of
 from .diagnostics.failure_cause import Estimate, around, cause, failures, questions
 from .diagnostics.field_pictures import Pictures
 from .diagnostics.health import Bounds, HealthPolicy, chi_square_bounds
@@ -34,7 +35,7 @@ from .numerics.peaks import Peak
 from .numerics.quantiles import chi_square_quantile
 from .registry import find_estimator
 from .snapshots import Base, Snapshot, Snapshots
-from .track import Track
+from .track import WHITENED, Track
 from .tuning import Tuning
 
 
@@ -53,6 +54,8 @@ class Fold:
         base: Base | None = None,
         picture: float | None = None,
         prior: tuple[np.ndarray, np.ndarray] | None = None,
+        baseline: np.ndarray | None = None,
+        expected: np.ndarray | None = None,
     ) -> None:
         """Prepare; nothing is folded yet.
 
@@ -69,6 +72,9 @@ class Fold:
             picture: Seconds of the log between two pictures of a large field; None for those that score it only.
             prior: Mean (nx,) and covariance (nx, nx), positive semidefinite, in place of the model's; beyond `LARGE`
                 states the variances (1, nx). It holds at the log's start, and a reset goes back to it.
+            baseline: What was normal of the innovations when the tuning was accepted, see diagnostics/evidence.py; None
+                for white ones.
+            expected: Sensors that must speak, (sensors,) of bool; None for those that have spoken.
 
         Raises:
             EstimatorError: If the estimator does not exist, does not apply, an option is out of range, or log, tuning,
@@ -96,7 +102,10 @@ class Fold:
         self._state = np.empty(numbers)
         self._spare = np.empty_like(self._state)
         self._work = _scratch(self.estimator.work_size(self.options, model.nx, model.width) + 1)
-        self._score = np.empty(3)
+        self._score = np.empty(WHITENED + model.ny)
+        marginal = self.estimator.family in ("particle", "ensemble")
+        self._watch = watch_of(model, tuning.r, tuning.gate, marginal, baseline, expected)
+        self._evidence = fresh(model)
         self._clock = np.array([UNSET])
         self._u = np.array([item.default for item in model.inputs], float)
         mean, cov = self._held["prior_mean"], self._held["prior_cov"]
@@ -105,7 +114,7 @@ class Fold:
         if base is not None:
             check_base(base, model)
             mean, cov, self._clock[0], self._u[:] = base.mean, base.cov, base.clock, base.u
-        self._run, self._assess, begin = compiled()
+        self._run, self._assess, self._watch_rows, begin = compiled()
         if model.black_box or self.estimator.interpreted:
             self._context = View(self._compiled, self._context, tuning, self.options, self.pairs, self._held)
             self._run = fold_loop.run
@@ -114,11 +123,13 @@ class Fold:
         left = base.state if base is not None and base.estimator == estimator else None
         if left is not None and left.size == self._state.size:
             self._state[:] = left
+            if base is not None and base.evidence is not None and base.evidence.size == self._evidence.size:
+                self._evidence[:] = base.evidence
         self._snapshots = Snapshots(self._state.nbytes)
         self.pictures = Pictures(model.grid, picture) if model.grid is not None else None
         self._asked = -1
         self._remember()
-        self._rows = Track.allocate(log.capacity, len(model.shown), len(self.pairs), model.ny)
+        self._rows = Track.allocate(log.capacity, len(model.shown), len(self.pairs), model.ny, model.width)
 
     def _see(self) -> np.void:
         """The context of this model and tuning; the arrays that it points to are kept in `self._held`."""
@@ -276,7 +287,8 @@ class Fold:
         end = self.log.n if limit is None else min(self.log.n, self.n + limit)
         begun = self.n
         if self.log.capacity > len(self._rows):
-            grown = Track.allocate(self.log.capacity, len(self.model.shown), len(self.pairs), self.model.ny)
+            model = self.model
+            grown = Track.allocate(self.log.capacity, len(model.shown), len(self.pairs), model.ny, model.width)
             for new, old in zip(grown, self._rows, strict=True):
                 new[: self.n] = old[: self.n]
             self._rows = grown
@@ -295,12 +307,28 @@ class Fold:
                 self._held["r"][:] = self.tuning.r
                 self._restore(self.n)
                 raise
+            self._judge(self.n, stop)
             self.n = stop
             if stop == boundary:
                 self._remember()
-        if end > begun:
-            self._assess(begun, end, log.t, log.kind, self._rows, self.policy, self._bounds)
         return end - begun
+
+    def _judge(self, start: int, stop: int) -> None:
+        """What the rows from `start` on say of the estimate."""
+        log = self.log
+        self._assess(start, stop, log.t, log.kind, self._rows, self.policy, self._bounds)
+        self._watch_rows(
+            start,
+            stop,
+            log.t,
+            log.kind,
+            log.channel,
+            log.value,
+            self._watch,
+            self.policy,
+            self._evidence,
+            self._rows,
+        )
 
     def _run_events(self, start: int, stop: int) -> None:
         log = self.log
@@ -344,7 +372,7 @@ class Fold:
         self.pictures.take(self.log, self.n, mean, cov[0] if cov.shape[0] == 1 else np.diag(cov))
 
     def _remember(self) -> None:
-        snapshot = Snapshot(int(self._clock[0]), self._u.copy(), self._state.copy())
+        snapshot = Snapshot(int(self._clock[0]), self._u.copy(), self._state.copy(), self._evidence.copy())
         self._snapshots.keep(self.log.first + self.n, self.log.first, snapshot)
 
     def rewind(self, index: int) -> None:
@@ -355,8 +383,7 @@ class Fold:
     def _restore(self, index: int) -> None:
         at = self._snapshots.last(self.log.first + index)
         self._snapshots.forget_after(at)
-        clock, u, state = self._snapshots[at]
-        self._clock[0], self._u[:], self._state[:] = clock, u, state
+        self._clock[0], self._u[:], self._state[:], self._evidence[:] = self._snapshots[at]
         self.n = at - self.log.first
         self._asked = -1
         if self.pictures is not None:
@@ -365,9 +392,10 @@ class Fold:
     def base_at(self, index: int) -> tuple[int, Base]:
         """The last snapshot at or before the event `index`: its index, and the base of a fold that starts there."""
         at = self._snapshots.last(self.log.first + index)
-        clock, u, state = self._snapshots[at]
+        clock, u, state, evidence = self._snapshots[at]
         mean, cov = self.estimator.moments(self.options, state, self.model.nx)
-        return at - self.log.first, Base(mean, cov, clock, u.copy(), self.estimator.name, state.copy(), at)
+        base = Base(mean, cov, clock, u.copy(), self.estimator.name, state.copy(), at, evidence.copy())
+        return at - self.log.first, base
 
     def follow(self, log: Log, changed_from: int | None) -> None:
         """Go on with the log of which the present one is an earlier copy.

@@ -9,13 +9,14 @@ import numpy as np
 from numba import types
 
 from .compiled.context import context_type, prior, sensor_rows
+from .diagnostics.evidence import watch_rows, watch_signature
 from .diagnostics.health import assess, assess_signature
 from .estimator import call_describe, call_predict, call_start, call_update, code_type
 from .interpreted.fold_loop import LONGEST, UNSET
-from .log import INPUT, READING, RESET, TICK, TRUTH
-from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, jit
+from .log import INPUT, MARK, READING, RESET, TICK, TRUTH
+from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, inlined, jit
 from .numerics.steps import steps_of
-from .track import MISSING, NONE, track_type
+from .track import MISSING, NONE, WHITENED, track_type
 
 
 @jit
@@ -36,6 +37,12 @@ def advance_to(code, context, u, clock, t, index, state, work):
         call_predict(code.predict, context, u, dt / steps, index, state, work)
 
 
+@inlined
+def asks(kind):
+    """Whether an event only asks for the estimate: true states, ticks and marks."""
+    return kind == TRUTH or kind == TICK or kind == MARK
+
+
 @jit
 def exchange(r, own, kept):
     """r (ny,) ← what a reading brought of its own, where it brought any; `kept` (ny,) gets what stood there."""
@@ -49,9 +56,9 @@ def exchange(r, own, kept):
 def run(code, context, first, start, end, t, kind, channel, value, width, clock, u, state, spare, work, score, track):
     """Fold events `start` to `end`: clock (1,), u (nu,) and state move on in place, one track row is filled an event.
 
-    A tick or a truth is a query: it is answered from a copy of the state, so it never changes the estimate. Variances
-    that a reading brings (columns of `value` from `width` on) take the place of the tuned R while it is folded, so
-    every filter honours them.
+    A tick, a truth or a mark is a query: it is answered from a copy of the state, so it never changes the estimate.
+    Variances that a reading brings (columns of `value` from `width` on) take the place of the tuned R while it is
+    folded, so every filter honours them.
     """
     nu = u.size
     variances = value.shape[1] > width
@@ -67,12 +74,14 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
     cross = borrowed_rows(track.cross)
     innovation = borrowed_rows(track.innovation)
     innovation_std = borrowed_rows(track.innovation_std)
+    whitened = borrowed_rows(track.whitened)
     for i in range(start, end):
         what = kind[i]
         index = first + i
         for j in range(innovation.shape[1]):
             innovation[i, j] = np.nan
             innovation_std[i, j] = np.nan
+            score[WHITENED + j] = np.nan
         score[0] = np.nan
         score[1] = 0.0
         score[2] = np.nan
@@ -115,7 +124,7 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
             if clock[0] == UNSET:
                 clock[0] = t[i]
             # Several true states at one time are one query: `spare` still holds its answer.
-            if i == start or kind[i - 1] < TRUTH or kind[i - 1] > TICK or t[i] != t[i - 1]:
+            if i == start or not asks(kind[i - 1]) or t[i] != t[i - 1]:
                 for j in range(state.size):
                     spare[j] = state[j]
                 advance_to(code, context, u, clock[0], t[i], index, spare, work)
@@ -124,6 +133,8 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
         track.dof[i] = int(score[1])
         track.log_likelihood[i] = score[2]
         track.verdict[i] = verdict
+        for j in range(whitened.shape[1]):
+            whitened[i, j] = score[WHITENED + j]
 
 
 @jit
@@ -142,6 +153,8 @@ run_signature = types.void(
 @lru_cache(maxsize=1)
 def compiled() -> tuple[Any, ...]:
     """The entry points, compiled for their one signature (or loaded from the cache)."""
-    for function, signature in ((run, run_signature), (assess, assess_signature), (begin, begin_signature)):
+    functions = (run, assess, watch_rows, begin)
+    signatures = (run_signature, assess_signature, watch_signature, begin_signature)
+    for function, signature in zip(functions, signatures, strict=True):
         function.compile(signature.args)
-    return run, assess, begin
+    return functions

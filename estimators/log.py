@@ -8,14 +8,29 @@ import numpy as np
 
 from .errors import EventError
 from .events import arrays
-from .events.batch import BEFORE, INPUT, KIND_NAMES, READING, RESET, TICK, TRUTH, Events, truth_of
+from .events.batch import (
+    BEFORE,
+    INPUT,
+    KIND_NAMES,
+    MAINTENANCE,
+    MARK,
+    READING,
+    RESET,
+    TICK,
+    TRUTH,
+    Events,
+    truth_of,
+)
 from .events.checks import Layout, admitted
 from .events.order import in_order, sorted_order
 
 if TYPE_CHECKING:
     from .model.state_space import StateSpaceModel
 
-__all__ = ["BEFORE", "INPUT", "KIND_NAMES", "READING", "RESET", "TICK", "TRUTH", "Log", "Events", "truth_of"]
+__all__ = [
+    "BEFORE", "INPUT", "KIND_NAMES", "MAINTENANCE", "MARK", "READING", "RESET", "TICK", "TRUTH", "Log", "Events",
+    "truth_of",
+]  # fmt: skip
 
 
 class Log:
@@ -176,8 +191,8 @@ class Log:
         batch = admitted(batch, self.width, self.layout).widened(self.width)
         if not len(batch):
             return self.n, 0
-        # A tick says nothing of the asset, so nothing is late because of it.
-        said = np.where(batch.kind == TICK, self.newest, batch.t)
+        # A tick or a mark says nothing of the asset, so nothing is late because of it.
+        said = np.where((batch.kind == TICK) | (batch.kind == MARK), self.newest, batch.t)
         newest = np.maximum(np.maximum.accumulate(said), self.newest)
         self.newest = int(newest[-1])
         stale = 0

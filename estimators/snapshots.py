@@ -23,7 +23,8 @@ class Base(NamedTuple):
 
     mean (nx,) and cov (nx, nx), or the variances (1, nx) of a large state, stand for it in any filter. `state` is all
     that the filter `estimator` had (modes, members, particles, what an adaptation learned), for that filter alone.
-    `first` is the absolute index of the first event that is folded from here.
+    `first` is the absolute index of the first event that is folded from here. `evidence` is what had been gathered
+    against the filter, for the same filter.
     """
 
     mean: np.ndarray
@@ -33,14 +34,16 @@ class Base(NamedTuple):
     estimator: str = ""
     state: np.ndarray | None = None
     first: int = 0
+    evidence: np.ndarray | None = None
 
 
 class Snapshot(NamedTuple):
-    """Clock (ns), inputs (nu,) and state of a filter before an event."""
+    """Clock (ns), inputs (nu,), state of a filter and evidence against it, before an event."""
 
     clock: int
     u: np.ndarray
     state: np.ndarray
+    evidence: np.ndarray
 
 
 class Snapshots:

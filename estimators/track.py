@@ -7,18 +7,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from .numerics.jit import B1, F1, F2
+from .numerics.jit import B1, F1, F2, I1
 
-NONE, USED, GATED, HELD_OUT, MISSING, FAILED = range(6)
+NONE, USED, GATED, HELD_OUT, MISSING, FAILED, SCREENED = range(7)
 """Verdict on an event: not a reading; used; refused by the gate; held out and scored; no finite row; not usable,
-as S was not positive definite beyond rounding or the NIS no finite number."""
+as S was not positive definite beyond rounding or the NIS no finite number; refused at the edge, before the filter."""
 
-VERDICT_NAMES = ("none", "used", "gated", "held out", "missing", "failed")
+VERDICT_NAMES = ("none", "used", "gated", "held out", "missing", "failed", "screened")
 
-TRACKING, DEGRADED, DIVERGED, STALE = range(4)
-"""Health: the NIS is in its bounds; it is not, or readings are late; the estimate is lost; nothing arrives."""
+WAITING, TRACKING, SUSPECT, DEGRADED, DIVERGED, STALE = range(6)
+"""Health: no reading has come; consistent; consistent no more; a sensor is lost or readings are late; the estimate is
+lost; nothing arrives."""
 
-HEALTH_NAMES = ("tracking", "degraded", "diverged", "stale")
+WHITENED = 3
+"""Where in what a filter scores (NIS, degrees of freedom, log-likelihood) the whitened rows of the reading begin."""
+
+HEALTH_NAMES = ("waiting", "tracking", "suspect", "degraded", "diverged", "stale")
 
 
 class Track(NamedTuple):
@@ -28,7 +32,10 @@ class Track(NamedTuple):
     each configured pair of states. innovation, innovation_std (N, ny): reading minus prediction and the square
     root of S's diagonal; NaN where there is none. nis: νᵀ S⁻¹ ν, `dof` its degrees of freedom. nis_mean with
     nis_low and nis_high: mean NIS over the last readings, and its 95 % bounds. age: seconds since the last reading that
-    was used, gated or failed, or since a reset. consistency: the health that the window alone would give.
+    was used, gated or failed, or since a reset. consistency: DIVERGED where the window alone says so, else TRACKING.
+    whitened (N, ny): the innovation as it would be drawn from N(0, I), by row of the reading; of a prediction that is
+    not Gaussian each row by itself, Φ⁻¹(F(y)). alarms (N, width): bits of the causes that are in alarm after this
+    event, by row of the reading or state of the truth; flags: bits of what else is wrong (diagnostics/evidence.py).
     """
 
     mean: Any
@@ -46,16 +53,20 @@ class Track(NamedTuple):
     nis_high: Any
     consistency: Any
     health: Any
+    whitened: Any
+    alarms: Any
+    flags: Any
 
     @staticmethod
-    def allocate(rows: int, nx: int, pairs: int, ny: int) -> Track:
+    def allocate(rows: int, nx: int, pairs: int, ny: int, width: int | None = None) -> Track:
         """Columns for `rows` events, filled with NaN (so that their memory is paid for at once)."""
         matrix = [np.full((rows, k), np.nan) for k in (nx, nx, pairs, ny, ny)]
         vectors = [np.full(rows, np.nan) for _ in range(2)]
         codes = [np.zeros(rows, np.int8) for _ in range(2)]
         windowed = [np.full(rows, np.nan) for _ in range(4)]
         health = [np.zeros(rows, np.int8) for _ in range(2)]
-        columns: list[Any] = [*matrix, *vectors, *codes, *windowed, *health]
+        evidence = [np.full((rows, ny), np.nan), np.zeros((rows, width or ny), np.int32), np.zeros(rows, np.int64)]
+        columns: list[Any] = [*matrix, *vectors, *codes, *windowed, *health, *evidence]
         return Track(*columns)
 
     def select(self, index: object) -> Track:
@@ -74,4 +85,5 @@ class Track(NamedTuple):
 # As in log.py: `len` counts rows, not columns.
 Track._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[method-assign, assignment]
 
-track_type = types.NamedTuple((F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, F1, B1, B1), Track)
+_A2 = types.Array(types.int32, 2, "C")
+track_type = types.NamedTuple((F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, F1, B1, B1, F2, _A2, I1), Track)

@@ -20,7 +20,7 @@ TIMELINE = "time"
 GAP = 0.05
 """Between the picture of a field and its scale, and the width of the scale, of the picture's width."""
 
-HEALTH_COLORS = (0x16A34AFF, 0xF59E0BFF, 0xDC2626FF, 0x9CA3AFFF)
+HEALTH_COLORS = (0x60A5FAFF, 0x16A34AFF, 0xFACC15FF, 0xF59E0BFF, 0xDC2626FF, 0x9CA3AFFF)
 
 
 def with_unit(name: str, unit: str) -> str:

@@ -1,4 +1,4 @@
-"""Can the estimate be trusted: NIS against its chi-square bounds, and health."""
+"""When an estimate may be trusted, and its NIS over a window against the chi-square bounds."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..log import RESET
 from ..numerics.jit import B1, F1, I1, f64, i64, inlined, jit
 from ..numerics.quantiles import chi_square_quantile
 from ..numerics.simd import total as sum_of
-from ..track import DEGRADED, DIVERGED, FAILED, GATED, STALE, TRACKING, USED, track_type
+from ..track import DIVERGED, FAILED, GATED, TRACKING, USED, track_type
 
 PROBABILITY = 0.95
 """Of the bounds that charts and reports show."""
@@ -29,9 +29,11 @@ class HealthPolicy(NamedTuple):
     """When a twin may be trusted.
 
     `window` readings are averaged. Without a reading for `degraded_after` seconds the twin is degraded, after
-    `stale_after` stale. It is degraded when the windowed NIS exceeds what chance exceeds once in a thousand windows,
-    and diverged when it is `diverged_nis` times what it should be, when the gate refuses more than `diverged_gated` of
-    the window (or they fail), or when a number is not finite. A reset begins a new window.
+    `stale_after` stale. It is diverged when the windowed NIS is `diverged_nis` times what it should be, when the gate
+    refuses more than `diverged_gated` of the window (or they fail), or when a number is not finite. A reset begins a
+    new window. It is suspect, or degraded where a sensor is lost, when a test of evidence.py is in alarm: by chance
+    once in `false_alarm_every` seconds. A sensor is silent after `silent_periods` of its mean periods, and twice its
+    longest silence so far.
     """
 
     window: int = 50
@@ -39,18 +41,19 @@ class HealthPolicy(NamedTuple):
     stale_after: float = 30.0
     diverged_nis: float = 10.0
     diverged_gated: float = 0.5
+    false_alarm_every: float = 86400.0
+    silent_periods: float = 6.0
 
 
 class Bounds(NamedTuple):
-    """Chi-square quantiles by degrees of freedom: the 95 % bounds, and the bound for `degraded`."""
+    """Chi-square quantiles by degrees of freedom: the 95 % bounds."""
 
     low: Any
     high: Any
-    alarm: Any
 
 
 bounds_type = types.NamedUniTuple(F1, len(Bounds._fields), Bounds)
-policy_type = types.NamedTuple((i64, f64, f64, f64, f64), HealthPolicy)
+policy_type = types.NamedTuple((i64, f64, f64, f64, f64, f64, f64), HealthPolicy)
 
 
 def chi_square_bounds(most: int) -> Bounds:
@@ -58,7 +61,7 @@ def chi_square_bounds(most: int) -> Bounds:
     dof = np.arange(most + 1)
     dof[0] = 1  # of no use, but chi-square has no quantile for 0
     tail = (1.0 - PROBABILITY) / 2.0
-    return Bounds(chi_square_quantile(tail, dof), chi_square_quantile(1.0 - tail, dof), chi_square_quantile(0.999, dof))
+    return Bounds(chi_square_quantile(tail, dof), chi_square_quantile(1.0 - tail, dof))
 
 
 def nis_bounds(dof: int, readings: int) -> tuple[float, float]:
@@ -100,13 +103,11 @@ def _judge(i, total, dof, used, refused, track, policy, bounds):
     track.consistency[i] = TRACKING
     if judged >= FEW and (refused > policy.diverged_gated * judged or total > policy.diverged_nis * dof):
         track.consistency[i] = DIVERGED
-    elif used >= FEW and total > bounds.alarm[dof]:
-        track.consistency[i] = DEGRADED
 
 
 @jit
 def assess(first, last, t, kind, track, policy, bounds):
-    """Fill age, windowed NIS, its bounds and health of rows `first` to `last` of a track.
+    """Fill age, windowed NIS, its bounds and consistency of rows `first` to `last` of a track.
 
     A row looks only at rows before it, so the outcome does not depend on how a fold was cut into pieces. The window
     changes with a reading that is used, gated or failed; the other rows have that of the row before. A reset empties
@@ -165,17 +166,6 @@ def assess(first, last, t, kind, track, policy, bounds):
             track.nis_low[i] = track.nis_low[i - 1]
             track.nis_high[i] = track.nis_high[i - 1]
             track.consistency[i] = track.consistency[i - 1]
-        finite = True
-        for j in range(track.mean.shape[1]):
-            finite &= np.isfinite(track.mean[i, j]) & np.isfinite(track.std[i, j])
-        health = track.consistency[i]
-        if not finite:
-            health = DIVERGED
-        elif track.age[i] > policy.stale_after:
-            health = STALE
-        elif track.age[i] > policy.degraded_after and health == TRACKING:
-            health = DEGRADED
-        track.health[i] = health
 
 
 assess_signature = types.void(i64, i64, I1, B1, track_type, policy_type, bounds_type)

@@ -9,21 +9,24 @@ import numpy as np
 
 from ..errors import EventError
 
-READING, INPUT, TRUTH, TICK, RESET = range(5)
-"""Kinds of event: a sensor's reading; inputs; a true state (scored, never used); a query; back to the prior."""
+READING, INPUT, TRUTH, TICK, RESET, MARK, MAINTENANCE = range(7)
+"""Kinds of event: a sensor's reading; inputs; a true state (scored, never used); a query; back to the prior; a fault
+that begins or ends in what the source is made to say; the covariance of a state back to the prior's."""
 
 BEFORE = -(2**62)
 """Earlier than any event, and far enough from the end of int64 that a horizon can be taken off."""
 
-KIND_NAMES = ("reading", "input", "truth", "tick", "reset")
+KIND_NAMES = ("reading", "input", "truth", "tick", "reset", "mark", "maintenance")
 
 
 class Events(NamedTuple):
     """A batch of events in the order of arrival; columns of one length N.
 
-    `channel` is the sensor's index for a reading, the first state's for a truth, else 0. `value` (N, width) holds a
+    `channel` is the sensor's index for a reading, the first state's for a truth, the state's for a maintenance, that of
+    a sensor, input (after the sensors) or the whole twin (after both) for a mark, else 0. `value` (N, width) holds a
     reading's rows, all inputs, or the true values of the states channel, channel + 1, ...; NaN is a row that is
-    missing, an input that stays, or a state whose truth is not known.
+    missing, an input that stays, or a state whose truth is not known. A mark's first value is the code of its fault,
+    negative where it ends.
 
     Columns of `value` beyond the width of the log hold variances: column width + k is that of the noise of row k of
     this one reading, in the row's unit squared; NaN leaves the tuned one.

@@ -15,7 +15,7 @@ from numba import types
 from ..errors import LARGEST, EventError
 from ..model.layout import Layout
 from ..numerics.jit import i64, jit_brief
-from .batch import BEFORE, INPUT, KIND_NAMES, READING, TRUTH, Events
+from .batch import BEFORE, INPUT, KIND_NAMES, MAINTENANCE, MARK, READING, TRUTH, Events
 
 FINE, TIME, KIND, CHANNEL, VALUES, STRAY, VARIANCE = range(7)
 """The rules, as `_look` names the one that is broken."""
@@ -62,6 +62,12 @@ def _look(t, kind, channel, value, width, rows, nu, nx):
                 if channel[i] >= nx:
                     return i, CHANNEL, infinite
                 places = nx - channel[i]
+            elif kind[i] == MAINTENANCE:
+                if channel[i] >= nx:
+                    return i, CHANNEL, infinite
+            elif kind[i] == MARK:
+                if channel[i] > rows.size + nu:
+                    return i, CHANNEL, infinite
             else:
                 if channel[i] > 0:
                     return i, CHANNEL, infinite
@@ -172,8 +178,10 @@ def _broken(batch: Events, at: int, rule: int, width: int, layout: Layout | None
             names = ", ".join(f"{k} {name}" for k, name in enumerate(layout.sensors[:8]))
             more = ", ..." if len(layout.sensors) > 8 else ""
             return f"channel is {channel}; {layout.name} has {len(layout.rows)} sensor(s): {names}{more}"
+        if kind == MARK:
+            return f"channel is {channel}; it must be {len(layout.rows) + layout.nu} (the whole twin) at most"
         states = f"{layout.name} has {layout.nx} states, counted from 0"
-        return f"channel is {channel}; {states if kind == TRUTH else 'for this kind it must be 0'}"
+        return f"channel is {channel}; {states if kind in (TRUTH, MAINTENANCE) else 'for this kind it must be 0'}"
     if rule == STRAY:
         last = _count(value) - 1 - width
         return f"it gives a variance to row {last}; {layout.sensors[channel]} has {layout.rows[channel]} row(s)"

@@ -21,7 +21,7 @@ from ..numerics.linalg import EPSILON, cholesky, mirror, solve_transposed, solve
 from ..numerics.padded_rows import subtract_squares
 from ..numerics.simd_ir import padded
 from ..numerics.workspace import layout, start_of, take_matrix, take_vector
-from ..track import FAILED, MISSING, USED
+from ..track import FAILED, MISSING, USED, WHITENED
 from .robust import forget, is_robust, reweigh
 
 
@@ -246,6 +246,7 @@ def judge(context, sensor, m, nu, U, score):
     for i in range(m):
         nis += nu[i] * nu[i]
         log_det += 2.0 * np.log(U[i, i])
+        score[WHITENED + i] = nu[i]
     return verdict_of(context, sensor, m, nis, log_det, score)
 
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError
-from ..log import INPUT, READING, RESET, TICK, TRUTH
+from ..log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from ..numerics.steps import steps_of
-from ..track import FAILED, MISSING, NONE, Track
+from ..track import FAILED, MISSING, NONE, WHITENED, Track
 
 UNSET = int(np.iinfo(np.int64).min)
 """The clock before the first event, which sets it: the prior holds at that time."""
@@ -77,7 +77,8 @@ def run(
             what, now, index = int(kind[i]), int(t[i]), first + i
             track.innovation[i] = np.nan
             track.innovation_std[i] = np.nan
-            score[:] = np.nan, 0.0, np.nan
+            score[:] = np.nan
+            score[1] = 0.0
             verdict = NONE
             told = state
             known = True
@@ -106,7 +107,7 @@ def run(
                 if clock[0] == UNSET:
                     clock[0] = now
                 # Several queries at one time are one: `spare` still holds its answer.
-                if i == start or not TRUTH <= kind[i - 1] <= TICK or now != t[i - 1]:
+                if i == start or kind[i - 1] not in (TRUTH, TICK, MARK) or now != t[i - 1]:
                     spare[:] = state
                     try:
                         _advance_to(code, context, u, clock.copy(), now, index, spare, work)
@@ -121,3 +122,4 @@ def run(
             track.dof[i] = int(score[1])
             track.log_likelihood[i] = score[2]
             track.verdict[i] = verdict
+            track.whitened[i] = score[WHITENED:]

@@ -1,0 +1,546 @@
+"""Evidence against the filter: a bank of sequential tests on the standardised innovations of every sensor row.
+
+Under the model the standardised innovations e of a row are N(0, 1) and white. Each way of being wrong is another
+density of e given the one before, and the cumulated log-likelihood ratio tests it:
+
+    W ← min(max(W, 0) + log Λ, cap);  alarm when W ≥ h,  over when W < h/2
+
+With h = log(readings between false alarms × tests) the mean time between false alarms of the whole bank is at least
+what was asked for, whatever is wrong and however long it lasts. The test that speaks names the cause.
+
+Where a tuning was accepted although its innovations are not white (recordings of real assets never leave white ones),
+a `baseline` says what was normal then, and e is standardised by that first: bias, scale and correlation are taken out,
+and each test's threshold is raised by the highest W that the accepted data reached.
+
+Sources: Page (1954), doi:10.1093/biomet/41.1-2.100; Lorden (1971), doi:10.1214/aoms/1177693055, for the bound on false
+alarms; Basseville & Nikiforov (1993), Detection of Abrupt Changes, chapter 2; Shin, Ramdas & Rinaldo (2024),
+doi:10.51387/23-NEJSDS51.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import types
+
+from ..log import INPUT, READING, RESET, TRUTH
+from ..model.state_space import StateSpaceModel
+from ..numerics.jit import B1, F1, F2, I1, i64, inlined, jit
+from ..numerics.linalg import wrap
+from ..track import (
+    DEGRADED,
+    DIVERGED,
+    FAILED,
+    GATED,
+    SCREENED,
+    STALE,
+    SUSPECT,
+    TRACKING,
+    USED,
+    WAITING,
+    track_type,
+)
+from .health import policy_type
+
+CAUSES = (
+    "narrow", "wide", "high", "low", "correlated", "alternating", "spiky", "refused", "stuck", "disagreeing",
+    "agreeing", "missed",
+)  # fmt: skip
+"""What a test says of a row: its bands are too narrow or too wide; it reads high or low; its innovations are
+correlated, or change sign; spikes; the gate refuses it; it repeats itself; the rows of one sensor contradict each
+other, or are closer than their noise; the truth that was told is outside the band. Bits of `Track.alarms`, in this
+order."""
+
+NARROW, WIDE, HIGH, LOW, CORRELATED, ALTERNATING, SPIKY, REFUSED, STUCK, DISAGREEING, AGREEING, MISSED = (
+    1 << k for k in range(len(CAUSES))
+)
+
+LOST = REFUSED | STUCK
+"""Causes for which a sensor tells nothing more."""
+
+OUTSIDE, TRUTH_MISSED = 1 << 60, 1 << 61
+"""Bits of `Track.flags` beside those of the sensors that are silent: outside the range in which the model was fitted;
+the truth that was told is missed."""
+
+SENSORS = 58
+"""Sensors that have a bit of their own in `Track.flags`; the others share the last."""
+
+SCALES = (1.5, 2.5, 6.0, 0.6, 0.3, 0.05)
+"""Variances of e that are tested."""
+
+SHIFTS = (0.2, 0.5, 1.5, -0.2, -0.5, -1.5)
+"""Means of e that are tested, in standard deviations."""
+
+CORRELATIONS = (0.25, 0.6, -0.25, -0.6)
+"""Lag-1 correlations of e that are tested, at unit variance."""
+
+SPIKE_SHARE, SPIKE = 0.03, 5.0
+"""Spikes: this share of e has so many standard deviations."""
+
+REFUSED_SHARE = 0.3
+"""Share of refused readings that is tested against what the gate refuses by chance."""
+
+FURTHEST = 6.0
+"""|e| beyond which it counts as this: what is further off says no more."""
+
+REPEATING = 0.999
+"""Probability that a sensor which is stuck repeats its last value."""
+
+UNKNOWN_QUANTUM = 0.5
+"""Probability of a repeated value that is granted to a sensor which has never changed: its quantum is not known yet."""
+
+SPARE = 8.0
+"""By which W may pass its threshold, so that it falls again when the cause has gone."""
+
+MISSES, MISSES_NO_MORE = 4.5, 3.0
+"""Root mean square of (estimate - truth) / σ, over about `TOLD` tellings, from which a truth is missed, and no more."""
+
+TOLD = 10
+
+_QUADRATIC = len(SCALES) + len(SHIFTS) + len(CORRELATIONS)
+TESTS = _QUADRATIC + 3
+"""Tests of a row: the quadratic ones, spikes, refusals, repetition."""
+
+AT_SPIKES, AT_REFUSALS, AT_REPETITION = range(_QUADRATIC, TESTS)
+
+JOINT = len(SCALES)
+"""Tests of all rows of a sensor together, by its NIS: that of their scale."""
+
+
+def _ratios() -> np.ndarray:
+    """Coefficients (tests, 5): log Λ = a e² + b e e₋ + c e₋² + d e + f, where e₋ is the one before."""
+    rows = [(0.5 - 0.5 / v, 0.0, 0.0, 0.0, -0.5 * math.log(v)) for v in SCALES]
+    rows += [(0.0, 0.0, 0.0, m, -0.5 * m * m) for m in SHIFTS]
+    for phi in CORRELATIONS:
+        rest = 1.0 - phi * phi
+        rows.append((0.5 - 0.5 / rest, phi / rest, -0.5 * phi * phi / rest, 0.0, -0.5 * math.log(rest)))
+    return np.array(rows)
+
+
+_RATIOS = _ratios()
+_BITS = np.array(
+    [*[NARROW] * 3, *[WIDE] * 3, *[HIGH] * 3, *[LOW] * 3, *[CORRELATED] * 2, *[ALTERNATING] * 2, SPIKY, REFUSED, STUCK]
+)
+
+# A row's part of the state: its tests' W, then these.
+_MASK, _RAW, _BEFORE, _VALUE, _QUANTUM = range(TESTS, TESTS + 5)
+ROW = TESTS + 5
+"""Numbers in the state for each row."""
+
+# A sensor's part: W of the joint tests, then these.
+_COUNT, _FIRST, _LAST, _LONGEST, _THRESHOLD, _DUE, _SILENT, _ALL = range(JOINT, JOINT + 8)
+SENSOR = JOINT + 8
+"""Numbers in the state for each sensor."""
+
+# The twin's part.
+_SUSPECTS, _GONE, _NEXT_DUE, _BEGUN, _HEARD, _MISSED = range(6)
+TWIN = 6
+
+# A shown state's part: the mean square of its standardised errors, how often it was told, whether it is missed. After
+# them the inputs that hold.
+STATE = 3
+
+
+class Watch(NamedTuple):
+    """What the bank knows of model and tuning.
+
+    row_start, row_count (sensors,) int64; variances r (rows,); baseline (rows, 3 + TESTS): bias, scale, correlation of
+    what was normal, and the highest W of each test; ranges (shown + inputs, 2) in which the model was fitted; column
+    (nx,) of a state in the track, or -1; circular (nx,) int64; expected (sensors,) int64: 1 where the source feeds it;
+    chances (2,): log Λ of a refused and of an accepted reading; fitted: 1 if there is any range; marginal: 1 if
+    `Track.whitened` holds each row by itself, 0 if the rows of a reading together; tests: how many there are in all.
+    """
+
+    row_start: Any
+    row_count: Any
+    variances: Any
+    baseline: Any
+    ranges: Any
+    column: Any
+    circular: Any
+    expected: Any
+    chances: Any
+    fitted: int
+    marginal: int
+    tests: int
+
+
+I4 = types.int32[::1]
+watch_type = types.NamedTuple((I1, I1, F1, F2, F2, I1, I1, I1, F1, i64, i64, i64), Watch)
+
+
+def no_baseline(model: StateSpaceModel) -> np.ndarray:
+    """That of white innovations, (rows, 3 + TESTS)."""
+    baseline = np.zeros((len(model.row_names), 3 + TESTS))
+    baseline[:, 1] = 1.0
+    return baseline
+
+
+def watch_of(
+    model: StateSpaceModel,
+    variances: np.ndarray,
+    gate: float | None,
+    marginal: bool,
+    baseline: np.ndarray | None = None,
+    expected: np.ndarray | None = None,
+) -> Watch:
+    """What the bank needs to know.
+
+    Args:
+        model: The model.
+        variances: r of the tuning, (rows,).
+        gate: Probability that a good reading passes, or None.
+        marginal: Whether the filter's predictions are not Gaussian, and `Track.whitened` holds each row by itself.
+        baseline: See `Watch`; None for white innovations.
+        expected: Sensors that must speak, (sensors,); None for those that have spoken.
+    """
+    shown = model.shown
+    column = np.full(model.nx, -1, np.int64)
+    column[shown] = np.arange(len(shown))
+    if model.mode >= 0:
+        column[model.mode] = -1
+    ranges = np.full((len(shown) + model.nu, 2), [-np.inf, np.inf])
+    for k, item in enumerate([*model.shown_states, *model.inputs]):
+        fitted = getattr(item, "fitted", None)
+        if fitted is not None:
+            ranges[k] = fitted
+    chance = min(max(1e-6, 1.0 - gate), 0.5 * REFUSED_SHARE) if gate is not None else 0.5 * REFUSED_SHARE
+    counts = np.array([len(sensor.rows) for sensor in model.sensors], np.int64)
+    several = int(np.sum(counts > 1))
+    return Watch(
+        row_start=np.array(model.row_start[: len(counts)], np.int64),
+        row_count=counts,
+        variances=np.ascontiguousarray(variances, float),
+        baseline=np.ascontiguousarray(no_baseline(model) if baseline is None else baseline, float),
+        ranges=ranges,
+        column=column,
+        circular=np.asarray(model.circular, np.int64),
+        expected=np.zeros(len(counts), np.int64) if expected is None else np.asarray(expected, np.int64),
+        chances=np.log([REFUSED_SHARE / chance, (1.0 - REFUSED_SHARE) / (1.0 - chance)]),
+        fitted=int(np.any(np.isfinite(ranges))),
+        marginal=int(marginal),
+        tests=int(counts.sum()) * TESTS + several * JOINT,
+    )
+
+
+def fresh(model: StateSpaceModel) -> np.ndarray:
+    """The bank's state before the first event."""
+    rows, sensors = len(model.row_names), len(model.sensors)
+    state = np.zeros(TWIN + sensors * SENSOR + rows * ROW + len(model.shown) * STATE + model.nu)
+    state[_NEXT_DUE], state[_BEGUN] = np.inf, np.nan
+    for s in range(sensors):
+        state[TWIN + s * SENSOR + _DUE] = np.inf
+    for k in range(rows):
+        own = state[TWIN + sensors * SENSOR + k * ROW :]
+        own[_RAW] = own[_BEFORE] = own[_VALUE] = np.nan
+    state[state.size - model.nu :] = [item.default for item in model.inputs]
+    return state
+
+
+def causes_now(model: StateSpaceModel, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the bank says at present.
+
+    Returns:
+        Bits of causes by sensor row (rows,), those of each sensor as a whole (sensors,), and whether each sensor is
+        silent (sensors,).
+    """
+    rows, sensors = len(model.row_names), len(model.sensors)
+    own = state[TWIN : TWIN + sensors * SENSOR].reshape(sensors, SENSOR)
+    each = state[TWIN + sensors * SENSOR :][: rows * ROW].reshape(rows, ROW)
+    return each[:, _MASK].astype(int), own[:, _ALL].astype(int), own[:, _SILENT] > 0.0
+
+
+@inlined
+def _add(W, k, ratio, h, peak):
+    """Put log Λ of one more reading to test k; 2 where it is in alarm, 1 where an alarm may last, else 0.
+
+    One reading alone never speaks: what an outlier is worth is half a threshold at most.
+    """
+    threshold = h + peak
+    W[k] = min(max(W[k], 0.0) + min(ratio, 0.5 * h), threshold + SPARE)
+    if W[k] >= threshold:
+        return 2
+    return 1 if W[k] >= 0.5 * threshold else 0
+
+
+@inlined
+def _alarm(said, bit, before):
+    """The bit, if a test that said so is in alarm: since now, or still."""
+    return bit if said == 2 or said == 1 and before & bit != 0 else 0
+
+
+@jit
+def _weigh(own, e, h, base, before):
+    """Put one standardised innovation to the tests of its row; the causes that are in alarm."""
+    raw = min(max((e - base[0]) / base[1], -FURTHEST), FURTHEST)
+    phi = base[2]
+    white = raw
+    if phi != 0.0 and np.isfinite(own[_RAW]):
+        white = (raw - phi * own[_RAW]) / math.sqrt(1.0 - phi * phi)
+    own[_RAW] = raw
+    last = own[_BEFORE]
+    first = not np.isfinite(last)
+    if first:
+        last = 0.0
+    own[_BEFORE] = white
+    square, product, old = white * white, white * last, last * last
+    mask = 0
+    # Of the first there is nothing that it could be correlated with.
+    for k in range(_QUADRATIC - len(CORRELATIONS) if first else _QUADRATIC):
+        c = _RATIOS[k]
+        ratio = c[0] * square + c[1] * product + c[2] * old + c[3] * white + c[4]
+        mask |= _alarm(_add(own, k, ratio, h, base[3 + k]), _BITS[k], before)
+    more = SPIKE_SHARE / SPIKE * math.exp(0.5 * square * (1.0 - 1.0 / (SPIKE * SPIKE)))
+    ratio = math.log(1.0 - SPIKE_SHARE + more)
+    return mask | _alarm(_add(own, AT_SPIKES, ratio, h, base[3 + AT_SPIKES]), SPIKY, before)
+
+
+@jit
+def _repeat(own, y, r, h, base, before):
+    """Put a value to the test of repetition.
+
+    Two readings of standard deviation σ, rounded to a quantum q, are equal with a probability of erf(q / 2σ) at most,
+    whatever was measured; q is the smallest step that the sensor has ever made.
+    """
+    last = own[_VALUE]
+    own[_VALUE] = y
+    if not np.isfinite(last):
+        return 0
+    if y == last:
+        chance = UNKNOWN_QUANTUM
+        if own[_QUANTUM] > 0.0 and r > 0.0:
+            chance = min(max(math.erf(0.5 * own[_QUANTUM] / math.sqrt(r)), 0.01), REPEATING)
+        ratio = math.log(REPEATING / chance)
+    else:
+        step = abs(y - last)
+        if own[_QUANTUM] == 0.0 or step < own[_QUANTUM]:
+            own[_QUANTUM] = step
+        ratio = math.log((1.0 - REPEATING) / (1.0 - UNKNOWN_QUANTUM)) - h
+    return _alarm(_add(own, AT_REPETITION, ratio, h, base[3 + AT_REPETITION]), STUCK, before)
+
+
+@jit
+def _weigh_together(own, nis, dof, h, before):
+    """Put the NIS of a sensor with several rows to the tests of their common scale: χ² with dof under the model."""
+    mask = 0
+    for k in range(JOINT):
+        c = _RATIOS[k]
+        bit = DISAGREEING if k < 3 else AGREEING
+        ratio = c[0] * min(nis, dof * FURTHEST * FURTHEST) + dof * c[4]
+        mask |= _alarm(_add(own, k, ratio, h, 0.0), bit, before)
+    return mask
+
+
+@jit
+def _time(own, now, every, tests, policy):
+    """Note that a sensor has spoken: its period, its threshold, and when it will be silent."""
+    count = own[_COUNT]
+    if count == 0.0:
+        own[_FIRST] = now
+    else:
+        own[_LONGEST] = max(own[_LONGEST], now - own[_LAST])
+    own[_LAST] = now
+    own[_COUNT] = count + 1.0
+    n = int(own[_COUNT])
+    period = (now - own[_FIRST]) / count if count > 0.0 else 0.0
+    if n <= 16 or n & (n - 1) == 0:
+        # The rate of a sensor is known better and better; the threshold follows it in ever wider steps.
+        own[_THRESHOLD] = max(math.log(every / max(period, 1e-3) * tests), math.log(8.0 * tests))
+    own[_DUE] = now + max(policy.silent_periods * period, 2.0 * own[_LONGEST]) if n > 2 else np.inf
+    own[_SILENT] = 0.0
+
+
+@jit
+def _listen(state, sensors, now):
+    """Which sensors are silent; from when on the next will be."""
+    due = np.inf
+    for s in range(sensors):
+        own = state[TWIN + s * SENSOR :]
+        if now > own[_DUE]:
+            own[_SILENT] = 1.0
+        elif own[_DUE] < due:
+            due = own[_DUE]
+    state[_NEXT_DUE] = due
+
+
+@jit
+def _miss(own, z, before):
+    """Whether the truth of a state is missed, after another error of z standard deviations."""
+    own[1] = min(own[1] + 1.0, TOLD)
+    own[0] += (min(z * z, 1e4) - own[0]) / own[1]
+    if own[1] == TOLD and own[0] > MISSES * MISSES:
+        return MISSED
+    return MISSED if before and own[0] > MISSES_NO_MORE * MISSES_NO_MORE else 0
+
+
+@jit
+def _forget(state, sensors, rows, states):
+    """A reset: what the readings said of the estimate before, they do not say of the new one."""
+    for s in range(sensors):
+        own = state[TWIN + s * SENSOR :]
+        own[_ALL] = 0.0
+        own[:JOINT] = 0.0
+    for k in range(rows):
+        own = state[TWIN + sensors * SENSOR + k * ROW :]
+        own[:TESTS] = 0.0
+        own[_MASK] = 0.0
+        own[_RAW] = own[_BEFORE] = np.nan
+    begin = TWIN + sensors * SENSOR + rows * ROW
+    state[begin : begin + states * STATE] = 0.0
+    state[_SUSPECTS] = state[_GONE] = state[_MISSED] = 0.0
+
+
+@jit
+def _hear(i, now, y, s, watch, policy, state, track):
+    """Put a reading of sensor s to all tests."""
+    width = track.alarms.shape[1]
+    sensors = watch.row_count.size
+    own = state[TWIN + s * SENSOR :]
+    _time(own, now, policy.false_alarm_every, watch.tests, policy)
+    state[_NEXT_DUE] = min(state[_NEXT_DUE], own[_DUE])
+    h = own[_THRESHOLD]
+    verdict = track.verdict[i]
+    judged = verdict == USED or verdict == GATED
+    together = 0
+    if judged and watch.marginal == 0 and watch.row_count[s] > 1:
+        together = _weigh_together(own, track.nis[i], track.dof[i], h, int(own[_ALL]))
+        own[_ALL] = together
+    for k in range(watch.row_count[s]):
+        if not np.isfinite(y[k]):
+            continue
+        row = watch.row_start[s] + k
+        each = state[TWIN + sensors * SENSOR + row * ROW :]
+        before = int(each[_MASK])
+        base = watch.baseline[row]
+        r = watch.variances[row]
+        if width + k < y.size and np.isfinite(y[width + k]):
+            r = y[width + k]
+        mask = before & ~STUCK | _repeat(each, y[k], r, h, base, before)
+        if judged or verdict == FAILED:
+            ratio = watch.chances[1] if verdict == USED else watch.chances[0]
+            said = _add(each, AT_REFUSALS, ratio, h, base[3 + AT_REFUSALS])
+            mask = mask & ~REFUSED | _alarm(said, REFUSED, before)
+        if judged:
+            e = track.innovation[i, k] / track.innovation_std[i, k]
+            if watch.marginal != 0 and np.isfinite(track.whitened[i, k]):
+                e = track.whitened[i, k]
+            if np.isfinite(e):
+                mask = mask & LOST | _weigh(each, e, h, base, before)
+        if k == 0:
+            mask = mask & ~(DISAGREEING | AGREEING) | int(own[_ALL])
+        each[_MASK] = mask
+        track.alarms[i, k] = mask
+        state[_SUSPECTS] += (mask != 0) - (before != 0)
+        state[_GONE] += (mask & LOST != 0) - (before & LOST != 0)
+
+
+@jit
+def _tell(i, first, truth, watch, state, track):
+    """Compare the estimate with the truth of some states, from `first` on."""
+    begin = TWIN + watch.row_count.size * SENSOR + watch.variances.size * ROW
+    for k in range(truth.size):
+        if not np.isfinite(truth[k]):
+            continue
+        column = watch.column[first + k]
+        if column < 0 or not track.std[i, column] > 0.0:
+            continue
+        error = track.mean[i, column] - truth[k]
+        if watch.circular[first + k] != 0:
+            error = wrap(error)
+        own = state[begin + column * STATE :]
+        before = own[2] != 0.0
+        missed = _miss(own, error / track.std[i, column], before)
+        own[2] = missed
+        track.alarms[i, k] = missed
+        state[_MISSED] += (missed != 0) - before
+
+
+@jit
+def _range(i, u, watch, track):
+    """Whether a state, or an input that holds, is outside the range in which the model was fitted."""
+    states = track.mean.shape[1]
+    for k in range(watch.ranges.shape[0]):
+        value = track.mean[i, k] if k < states else u[k - states]
+        if value < watch.ranges[k, 0] or value > watch.ranges[k, 1]:
+            return True
+    return False
+
+
+@jit
+def watch_rows(first, last, t, kind, channel, value, watch, policy, state, track):
+    """Fill alarms, flags and health of rows `first` to `last` of a track, whose other columns are there.
+
+    `state` moves on with them, as a filter's state does with the events, so the outcome does not depend on how a fold
+    was cut into pieces.
+    """
+    sensors, rows = watch.row_count.size, watch.variances.size
+    nu = watch.ranges.shape[0] - track.mean.shape[1]
+    u = state[state.size - nu :]
+    for i in range(first, last):
+        now = t[i] * 1e-9
+        if not np.isfinite(state[_BEGUN]):
+            state[_BEGUN] = now
+            for s in range(sensors):
+                if watch.expected[s] != 0:
+                    state[TWIN + s * SENSOR + _DUE] = now + policy.stale_after
+            state[_NEXT_DUE] = now + policy.stale_after
+        for k in range(track.alarms.shape[1]):
+            track.alarms[i, k] = 0
+        if kind[i] == READING:
+            if track.verdict[i] != SCREENED:
+                state[_HEARD] = 1.0
+            _hear(i, now, value[i], channel[i], watch, policy, state, track)
+        elif kind[i] == TRUTH:
+            _tell(
+                i,
+                channel[i],
+                value[i, : min(track.alarms.shape[1], watch.column.size - channel[i])],
+                watch,
+                state,
+                track,
+            )
+        elif kind[i] == INPUT:
+            for k in range(nu):
+                if np.isfinite(value[i, k]):
+                    u[k] = value[i, k]
+        elif kind[i] == RESET:
+            _forget(state, sensors, rows, track.mean.shape[1])
+        if now > state[_NEXT_DUE]:
+            _listen(state, sensors, now)
+        flags = 0
+        for s in range(sensors):
+            if state[TWIN + s * SENSOR + _SILENT] != 0.0:
+                flags |= 1 << min(s, SENSORS - 1)
+        silent = flags
+        if watch.fitted != 0 and _range(i, u, watch, track):
+            flags |= OUTSIDE
+        if state[_MISSED] > 0.0:
+            flags |= TRUTH_MISSED
+        track.flags[i] = flags
+        track.health[i] = _health(i, now, silent, flags, state, policy, track)
+
+
+@jit
+def _health(i, now, silent, flags, state, policy, track):
+    """The state of the twin after an event."""
+    finite = True
+    for j in range(track.mean.shape[1]):
+        finite &= np.isfinite(track.mean[i, j]) & np.isfinite(track.std[i, j])
+    if not finite:
+        return DIVERGED
+    if state[_HEARD] == 0.0:
+        return STALE if now - state[_BEGUN] > policy.stale_after else WAITING
+    if track.age[i] > policy.stale_after:
+        return STALE
+    if track.consistency[i] == DIVERGED:
+        return DIVERGED
+    if track.age[i] > policy.degraded_after or silent != 0 or state[_GONE] > 0.0:
+        return DEGRADED
+    if state[_SUSPECTS] > 0.0 or flags != 0:
+        return SUSPECT
+    return TRACKING
+
+
+watch_signature = types.void(i64, i64, I1, B1, I4, F2, watch_type, policy_type, F1, track_type)
