@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 
 from estimators.events.clocks import ClockGuard, Moved, Passed, Refused
+from estimators.events.maintenance import maintained
 from estimators.log import INPUT, READING, Events
 from estimators.model.state_space import StateSpaceModel
 from sources.source import Report
@@ -15,14 +19,42 @@ WRONG_TIME = "wrong time"
 CLOCK_MOVED = "clock moved"
 """Key of a source's clock that was set."""
 
+MAINTENANCE = "maintenance"
+"""Key of a maintenance that the YAML tells of."""
+
+
+class Planned(NamedTuple):
+    """A maintenance that the YAML tells of: its time (ns), what was changed, and the indices of the states."""
+
+    at: int
+    what: str
+    states: tuple[int, ...]
+
+
+def maintenance_text(what: str, states: Sequence[int], model: StateSpaceModel) -> str:
+    """What is said of a maintenance."""
+    names = [model.state_names[k] for k in states]
+    shown = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
+    return f"maintenance: {what}; {shown} as uncertain as at the start, and a new version of the model begins"
+
 
 class Intake:
     """Judges the time of what a source says, and tells what was refused or set right."""
 
-    def __init__(self, model: StateSpaceModel, horizon: int | None, report: Report) -> None:
-        """`horizon`: the log's, ns; None is a recording's log, which was judged when it was recorded."""
+    def __init__(
+        self, model: StateSpaceModel, horizon: int | None, report: Report, planned: Sequence[Planned] = ()
+    ) -> None:
+        """What comes from a source of this model.
+
+        Args:
+            model: The model.
+            horizon: The log's, ns; None is a recording's log, which was judged when it was recorded.
+            report: Told of what is refused or set right, and of maintenance.
+            planned: Maintenance that the YAML tells of; a recording's log has it already.
+        """
         self._model, self._report = model, report
         self._guard = None if horizon is None else ClockGuard(len(model.sensors), horizon)
+        self._planned = [] if horizon is None else sorted(planned, key=lambda item: item.at)
 
     @property
     def held(self) -> int:
@@ -46,7 +78,17 @@ class Intake:
             self._report(WRONG_TIME, self._refusal(refused))
         for moved in passed.moved:
             self._report(CLOCK_MOVED, self._move(moved))
+        while self._planned and len(passed.events) and self._planned[0].at <= passed.events.t.max():
+            passed = self._maintain(passed, self._planned.pop(0))
         return passed
+
+    def _maintain(self, passed: Passed, item: Planned) -> Passed:
+        """With a maintenance whose time has come."""
+        model = self._model
+        events = maintained(item.at, item.at, item.states, model.width)
+        self._report(MAINTENANCE, maintenance_text(item.what, item.states, model))
+        settled = np.concatenate((passed.settled, np.ones(len(events), np.bool_)))
+        return passed._replace(events=Events.concat([passed.events, events], model.width), settled=settled)
 
     def _named(self, kind: int, channel: int) -> str:
         if kind == READING:

@@ -88,6 +88,17 @@ class TimeSection(Section):
         return self
 
 
+class MaintenanceSection(Section):
+    """Something of the asset that was changed."""
+
+    at: Number
+    """When, in seconds of the source's time."""
+    what: Text
+    """What was changed, for people."""
+    states: Annotated[tuple[Text, ...], Field(min_length=1)]
+    """The states that it concerns: they are as uncertain as at the start again, and keep their mean."""
+
+
 class SceneSection(Section):
     """The three-dimensional scene."""
 
@@ -162,6 +173,8 @@ class TwinSection(Section):
     Default: null, no gate."""
     time: TimeSection = TimeSection()
     """How the twin treats lateness and silence."""
+    maintenance: tuple[MaintenanceSection, ...] = ()
+    """When something of the asset was changed: each begins a new version of the model. Default: never."""
     history: Count = 200_000
     """Events that are kept, and folded again when the tuning changes; the oldest are forgotten."""
     source: SourceSection

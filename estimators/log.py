@@ -22,6 +22,7 @@ from .events.batch import (
     truth_of,
 )
 from .events.checks import Layout, admitted
+from .events.maintenance import version_after
 from .events.order import in_order, sorted_order
 
 if TYPE_CHECKING:
@@ -39,7 +40,8 @@ class Log:
     Timestamps are int64 nanoseconds. `first` counts the events that were dropped from the front, so `first + i` names
     an event for ever. Columns are full-length arrays of which the first `n` rows are valid. `changes` counts what was
     put in. `start` is the time at which the prior holds, `BEFORE` for that of the first event; an event before `floor`
-    is stale: what it would change has been forgotten.
+    is stale: what it would change has been forgotten. `version` is the model's at the first event: it counts up with
+    each maintenance that was dropped.
     """
 
     def __init__(self, width: int, capacity: int = 1024) -> None:
@@ -49,6 +51,7 @@ class Log:
         self.n = 0
         self.first = 0
         self.changes = 0
+        self.version = 1
         self.newest = BEFORE
         self.start = self.floor = BEFORE
         self._allocate(capacity, width)
@@ -252,6 +255,7 @@ class Log:
         """Forget the oldest `count` events; what comes later of the time before their end is stale."""
         if count:
             self.floor = max(self.floor, int(self.t[count - 1]))
+            self.version = version_after(self, count)
         for column in self._columns():
             column[: self.n - count] = column[count : self.n].copy()
         self.n -= count

@@ -24,7 +24,7 @@ class Base(NamedTuple):
     mean (nx,) and cov (nx, nx), or the variances (1, nx) of a large state, stand for it in any filter. `state` is all
     that the filter `estimator` had (modes, members, particles, what an adaptation learned), for that filter alone.
     `first` is the absolute index of the first event that is folded from here. `evidence` is what had been gathered
-    against the filter, for the same filter.
+    against the filter, for the same filter. `version` is the model's there (events/maintenance.py).
     """
 
     mean: np.ndarray
@@ -35,6 +35,7 @@ class Base(NamedTuple):
     state: np.ndarray | None = None
     first: int = 0
     evidence: np.ndarray | None = None
+    version: int = 1
 
 
 class Snapshot(NamedTuple):

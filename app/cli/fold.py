@@ -57,7 +57,7 @@ def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
         raise SourceError(f"{twin.name}: its source has no end; give --duration SECONDS")
     log = Log.of(twin.model)
     horizon = round(twin.config.time.horizon * 1e9)
-    intake = Intake(twin.model, horizon, remark)
+    intake = Intake(twin.model, horizon, remark, twin.maintenance)
     try:
         while (batch := source.read(1.0)) is not None:
             put(intake.take(batch))
@@ -240,4 +240,5 @@ def _write(path: Path, twin: Twin, log: Log, track: Track, pictures: Sequence[Pi
 
         write_recording(path, twin, log, track, pictures)
         return
-    pq.write_table(table_of(twin.model, log.events, track), path)
+    table = table_of(twin.model, log.events, track, tuning_version=twin.tuning.version, model_version=log.version)
+    pq.write_table(table, path)

@@ -18,12 +18,12 @@ import numpy as np
 
 from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import EstimatorError, NisusError
+from estimators.events.maintenance import model_version_at
 from estimators.fold import Fold
 from estimators.log import TICK, Events, Log
 from estimators.numerics.peaks import peaks_of
 from estimators.registry import find_estimator
 from estimators.snapshots import SPARSE_EVERY, Base
-from estimators.track import TRACKING
 
 from ..intake import Intake
 from ..stderr import complain
@@ -32,12 +32,14 @@ from .alerts import Alerts
 from .counts import Latency, RowCounts, last_run
 from .execute import Remembered, execute
 from .feeder import Feeder, Finished, Restarted
+from .host_clock import HostClock
 from .idle_ticks import IdleTicks
 from .interface import Records
 from .notices import Notices
 from .outputs import Belief, Cursor, Pull, Status
 from .playback import playback_status
 from .refolder import Refolded, Refolder, Requests
+from .silence import Silence
 from .stall import Stall
 
 if TYPE_CHECKING:
@@ -102,7 +104,9 @@ class Engine:
         self._finished = False
         self._idle_ticks = IdleTicks(section.tick)
         self._latency = Latency()
+        self._clock = HostClock(self.notices, section.horizon)
         self._alerts = Alerts(self.notices)
+        self._silence = Silence(self.notices, section.stale_after)
         self._stall = Stall(self._say_stalled)
         self._status: tuple[float, Status] | None = None
         self.recorder: Records | None = None
@@ -112,12 +116,12 @@ class Engine:
         """An empty log and the fold that follows it."""
         self._log = Log.of(self.model, capacity=self._history + 4 * SPARSE_EVERY)
         if base is not None:
-            self._log.first, self._log.floor = base.first, base.clock
+            self._log.first, self._log.floor, self._log.version = base.first, base.clock, base.version
         self._logs += 1
         self._base = base
         self._fold = self._make_fold(self.estimator, self.tuning, self._log, base)
         self._row_counts = RowCounts(self.model)
-        self._intake = Intake(self.model, self._horizon, self.notices.report)
+        self._intake = Intake(self.model, self._horizon, self.notices.report, self.twin.maintenance)
 
     def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
         period = self.twin.picture if self.model.grid is not None else None
@@ -269,11 +273,14 @@ class Engine:
                 revision=self._revision,
                 refolding=self._requests.waiting,
                 t=int(log.t[last]) if last >= 0 else None,
-                health=int(track.health[last]) if last >= 0 else TRACKING,
+                health=int(track.health[last]) if last >= 0 else self._silence.health,
                 since=int(log.t[last_run(track.health)]) if last >= 0 else None,
                 lost=self._alerts.lost,
+                model_version=model_version_at(log, int(log.t[last])) if last >= 0 else log.version,
+                clock=self._clock.estimate,
                 counts={
                     **self.notices.counts(),
+                    **({"held": self._intake.held} if self._intake.held else {}),
                     **self._row_counts.count(track.verdict, log.channel),
                     **({"recovered": fold.recoveries()} if fold.recoveries() else {}),
                 },
@@ -327,14 +334,18 @@ class Engine:
         if not batches:
             return
         batch = batches[0] if len(batches) == 1 else Events.concat(batches, self.model.width)
-        self._put(self._intake.take(batch))
+        passed = self._intake.take(batch)
+        self._put(passed)
         if self._feeder.live:
             self._latency.note(batch)
+            self._clock.note(passed.events)
 
     def _put(self, passed: Passed) -> None:
         with self._lock, self._stall.watched(self._fold):
             stale = self._take(passed.events, self._horizon, passed.settled)
             self._idle_ticks.broken(self._log.newest)
+            if self._log.n:
+                self._silence.broken()
             if self._log.n > self._history + 3 * SPARSE_EVERY:
                 self._forget()
         if stale:
@@ -371,7 +382,10 @@ class Engine:
             self._log.drop_front(count)
 
     def _when_silent(self) -> None:
-        if self._finished or not self._log.n:
+        if self._finished:
+            return
+        if not self._log.n:
+            self._silence.look(live=self._feeder.live)
             return
         now = self._idle_ticks.asks(self._feeder.source, int(self._log.t[self._log.n - 1]))
         if now is not None:

@@ -69,7 +69,7 @@ def base_to_json(base: Base | None) -> str:
     if base is None:
         return "null"
     moments = {"mean": base.mean.tolist(), "cov": base.cov.tolist(), "clock": base.clock, "u": base.u.tolist()}
-    moments["first"] = base.first
+    moments |= {"first": base.first, "version": base.version}
     if base.state is None:
         return json.dumps(moments)
     state = base64.b64encode(np.ascontiguousarray(base.state, "<f8").tobytes()).decode()
@@ -90,6 +90,7 @@ def base_from_json(text: str) -> Base | None:
         values.get("estimator", ""),
         None if state is None else np.frombuffer(base64.b64decode(state), "<f8").astype(float),
         int(values.get("first", 0)),
+        version=int(values.get("version", 1)),
     )
 
 

@@ -22,6 +22,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_entry, find_estimator
 from estimators.tuning import Tuning
 
+from ..intake import Planned
 from .model import check_named, configure, find_model
 from .source import Plan, plan_source
 
@@ -77,6 +78,15 @@ class Twin:
         """Seconds between two pictures of a large field; None if there is none."""
         view = self.config.view
         return (view.picture or view.window / 60.0) if self.model.grid is not None else None
+
+    @property
+    def maintenance(self) -> tuple[Planned, ...]:
+        """What of the asset was changed, as the YAML says."""
+        names = self.model.state_names
+        return tuple(
+            Planned(round(item.at * 1e9), item.what, tuple(sorted(names.index(name) for name in item.states)))
+            for item in self.config.maintenance
+        )
 
     @property
     def policy(self) -> HealthPolicy:
@@ -172,6 +182,10 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
     for key, value in overrides.items():
         if key not in _of_yaml(overrides):
             tuning = _set(tuning, key, value)
+    for k, item in enumerate(config.maintenance):
+        check_named(loaded, ("maintenance", k, "states"), item.states, model)
+        if len(set(item.states)) != len(item.states):
+            raise loaded.error(("maintenance", k, "states"), "names a state twice; name each once")
     plan = plan_source(loaded, model, [Path(file) for file in log_files] if log_files else None)
     if plan.brings_variances:
         with _placed(loaded, ("estimator",)):

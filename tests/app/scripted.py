@@ -36,6 +36,7 @@ def twin(history=200_000, horizon=2.0, tick=1000.0, model=MODEL, estimator="kf")
         tuning=Tuning.of(model),
         estimator=estimator,
         recorded=False,
+        maintenance=(),
         pairs=np.array([[0, 1]]),
         plan=SimpleNamespace(brings_variances=False),
         config=config,
