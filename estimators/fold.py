@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .compiled.context import context_of
-from .compiled.model import compile_model
+from .compiled.model import CompiledModel, compile_model
 from .diagnostics.evidence import fresh, watch_of
 from .diagnostics.failure_cause import Estimate, around, cause, failures, questions
 from .diagnostics.field_pictures import Pictures
@@ -175,6 +175,11 @@ class Fold:
     def track(self) -> Track:
         """Views of the rows folded so far."""
         return self._rows.select(slice(0, self.n))
+
+    @property
+    def compiled(self) -> CompiledModel:
+        """The model's functions as the filter sees them."""
+        return self._compiled
 
     @property
     def clock(self) -> int:

@@ -59,6 +59,11 @@ class Snapshots:
         self._sparse = max(SPARSE_EVERY, self._every)
         self._kept: dict[int, Snapshot] = {}
 
+    @property
+    def every(self) -> int:
+        """Events between two recent ones: how far a late reading takes a fold back at least, at worst."""
+        return self._every
+
     def __contains__(self, at: int) -> bool:
         """Whether there is one before the event at an absolute index."""
         return at in self._kept

@@ -18,6 +18,7 @@ from estimators.diagnostics.score import Score, score
 from estimators.errors import ConfigError, SourceError
 from estimators.fold import Fold
 from estimators.interface.table import table_of
+from estimators.late import inflated
 from estimators.log import Log
 from estimators.track import FAILED, HEALTH_NAMES, USED, Track
 from estimators.tuning import TOGETHER
@@ -48,7 +49,15 @@ def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
         counts[key] += 1
 
     def put(passed: Passed) -> None:
-        counts["stale"] += log.extend(passed.events, horizon, passed.settled)[1]
+        events = passed.events
+        if beside is not None:
+            events, late = inflated(events, beside, log.newest, horizon)
+            counts["inflated"] += late
+        first, stale = log.extend(events, horizon, passed.settled)
+        counts["stale"] += stale
+        if beside is not None:
+            beside.rewind(first)
+            beside.advance()
 
     remark = remarking(count)
     source = twin.open_source(remark, live=False)
@@ -57,6 +66,8 @@ def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
         raise SourceError(f"{twin.name}: its source has no end; give --duration SECONDS")
     log = Log.of(twin.model)
     horizon = round(twin.config.time.horizon * 1e9)
+    # What a late reading is inflated by is asked of the estimate when it comes.
+    beside = Fold(twin.estimator, twin.model, twin.tuning, log) if twin.late.inflate else None
     intake = Intake(twin.model, horizon, remark, twin.maintenance)
     try:
         while (batch := source.read(1.0)) is not None:
@@ -115,8 +126,9 @@ def _as_dict(twin: Twin, result: Score, seconds: float, counts: Counter[str], fo
 
     `rmse` and `coverage` (the share of errors inside their 95 % band) are by state and `held_out` by sensor row, in
     their units; `stale` counts the readings that came too late to be among the `readings`, `wrong_time` the events
-    that were refused for a time that cannot be true, `conditioned` those that a
-    condition of the source's map refused; `health` is the share of the track's rows in each state of health.
+    that were refused for a time that cannot be true, `conditioned` those that a condition of the source's map refused;
+    `degraded_after` says how long a silence is a dropout, and why so long; `health` is the share of the track's rows
+    in each state of health.
     """
 
     def number(value: float) -> float | None:
@@ -144,6 +156,9 @@ def _as_dict(twin: Twin, result: Score, seconds: float, counts: Counter[str], fo
         "stale": counts["stale"],
         "wrong_time": counts[WRONG_TIME],
         "conditioned": sum(count for key, count in counts.items() if key.startswith("condition ")),
+        "inflated": counts["inflated"],
+        "late": twin.late._asdict(),
+        "degraded_after": twin.degraded._asdict(),
         "gated": result.gated,
         "missing": result.missing,
         "failed": int(np.sum(fold.track.verdict == FAILED)),
@@ -226,6 +241,8 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], fold
     )
     rows += [
         ("final variances", variances),
+        ("late readings", f"{'used when they come, R inflated' if twin.late.inflate else 'exact'}: {twin.late.reason}"),
+        ("degraded after", f"{twin.degraded.seconds:g} s without a reading: {twin.degraded.reason}"),
         ("health at the end", HEALTH_NAMES[int(track.health[-1])]),
         ("time per event", f"{1e6 * seconds:.2f} µs"),
     ]

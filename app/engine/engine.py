@@ -20,6 +20,7 @@ from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import EstimatorError, NisusError
 from estimators.events.maintenance import model_version_at
 from estimators.fold import Fold
+from estimators.late import inflated
 from estimators.log import TICK, Events, Log
 from estimators.numerics.peaks import peaks_of
 from estimators.registry import find_estimator
@@ -121,6 +122,7 @@ class Engine:
         self._base = base
         self._fold = self._make_fold(self.estimator, self.tuning, self._log, base)
         self._row_counts = RowCounts(self.model)
+        self._late = 0
         self._intake = Intake(self.model, self._horizon, self.notices.report, self.twin.maintenance)
 
     def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
@@ -280,6 +282,7 @@ class Engine:
                 clock=self._clock.estimate,
                 counts={
                     **self.notices.counts(),
+                    **({"inflated": self._late} if self._late else {}),
                     **({"held": self._intake.held} if self._intake.held else {}),
                     **self._row_counts.count(track.verdict, log.channel),
                     **({"recovered": fold.recoveries()} if fold.recoveries() else {}),
@@ -342,7 +345,11 @@ class Engine:
 
     def _put(self, passed: Passed) -> None:
         with self._lock, self._stall.watched(self._fold):
-            stale = self._take(passed.events, self._horizon, passed.settled)
+            events = passed.events
+            if self._horizon is not None and self.twin.late.inflate:
+                events, late = inflated(events, self._fold, self._log.newest, self._horizon)
+                self._late += late
+            stale = self._take(events, self._horizon, passed.settled)
             self._idle_ticks.broken(self._log.newest)
             if self._log.n:
                 self._silence.broken()

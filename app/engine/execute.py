@@ -57,7 +57,7 @@ def retuned(command: Refolding, engine: Running) -> tuple[str, Tuning]:
 def _check(entry: Estimator, engine: Running, options: Mapping[str, float]) -> None:
     """Refuse what a fold would refuse, also of readings that are still to come."""
     values = checked(entry, engine.model, options)
-    if engine.twin.plan.brings_variances:
+    if engine.twin.plan.brings_variances or engine.twin.late.inflate:
         check_variances(entry, values)
 
 

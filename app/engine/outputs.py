@@ -68,8 +68,9 @@ class Status:
 
     `t` is the time of the last event (ns), `since` the time when the present health began, `lost` the time from which
     the estimate has not been a number (None if it is one). `model_version` counts up with each maintenance. `clock` is
-    that of a live source against this machine's, None while it is not known. `counts` are those of the rows of this revision, and of
-    other things that happened to the twin. `latency_ms` is the 99th percentile from a reading's arrival to its row.
+    that of a live source against this machine's, None while it is not known. `counts` are those of the rows of this
+    revision, and of other things that happened to the twin. `latency_ms` is the 99th percentile from a reading's
+    arrival to its row.
     """
 
     estimator: str

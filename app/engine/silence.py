@@ -28,9 +28,7 @@ class Silence:
         """Nothing has come yet. A recording may be held; of a bus that is silent so long people are told, once."""
         if live and not self._told and self._clock() - self._since > self._after:
             self._told = True
-            text = (
-                f"stale: nothing has come since the twin started {self._after:g} s ago; check the source and its wiring"
-            )
+            text = f"stale: nothing has come since the twin started, {self._after:g} s ago; check the source"
             self._notices.say(text, level="warn")
 
     def broken(self) -> None:

@@ -64,6 +64,8 @@ def status_json(engine: Running) -> dict[str, Any]:
         "nis": _plain(status.nis),
         "nis_low": _plain(status.nis_low),
         "nis_high": _plain(status.nis_high),
+        "late": {"inflate": engine.twin.late.inflate, "reason": engine.twin.late.reason},
+        "degraded_after": {"seconds": engine.twin.degraded.seconds, "reason": engine.twin.degraded.reason},
         "model_version": status.model_version,
         "clock": None
         if status.clock is None

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,8 @@ from estimators.registry import checked, find_entry, find_estimator
 from estimators.tuning import Tuning
 
 from ..intake import Planned
+from .dropout import DegradedAfter, degraded_after
+from .late import Late, late_policy
 from .model import check_named, configure, find_model
 from .source import Plan, plan_source
 
@@ -92,7 +95,17 @@ class Twin:
     def policy(self) -> HealthPolicy:
         """When the estimate may be trusted."""
         section = self.config.time
-        return HealthPolicy(degraded_after=section.degraded_after, stale_after=section.stale_after)
+        return HealthPolicy(degraded_after=self.degraded.seconds, stale_after=section.stale_after)
+
+    @cached_property
+    def late(self) -> Late:
+        """What becomes of late readings, and why."""
+        return late_policy(self.config, self.model, find_estimator(self.estimator, self.model), self.tuning)
+
+    @cached_property
+    def degraded(self) -> DegradedAfter:
+        """After how long without a reading the twin is degraded, and why then."""
+        return degraded_after(self.config, self.model)
 
     @property
     def tells_field(self) -> bool:
@@ -189,6 +202,9 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
     plan = plan_source(loaded, model, [Path(file) for file in log_files] if log_files else None)
     if plan.brings_variances:
         with _placed(loaded, ("estimator",)):
+            check_variances(entry, entry.complete(tuning.options))
+    if config.time.late == "inflate":
+        with _placed(loaded, ("time", "late")):
             check_variances(entry, entry.complete(tuning.options))
     return Twin(
         loaded=loaded,
