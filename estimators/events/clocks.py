@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from ..numerics.jit import I1, I2, i64, jit_brief
+from ..numerics.jit import B1, I1, I2, i64, inlined, jit_brief
 from .batch import INPUT, READING, TRUTH, Events
 
 SECOND = 10**9
@@ -58,7 +58,7 @@ FITS, AHEAD, BACK = range(3)
 SEEN, LAST, FIRST, STEPS, TOTAL, OFFSET, ARRIVED, LIVE, HOLDING, GAP_FROM, GAP_TO = range(11)
 
 
-@jit_brief
+@inlined
 def _reach(state, row, horizon, live):
     """How far ahead of the newest the next time of a channel may be, ns; -1 while its period is not known."""
     last = state.shape[0] - 1
@@ -70,7 +70,7 @@ def _reach(state, row, horizon, live):
     return max(horizon, periods * (state[row, TOTAL] // state[row, STEPS]))
 
 
-@jit_brief
+@inlined
 def _judge(state, row, t, arrival, live, horizon):
     """Whether a time fits its channel's clock, or is far ahead or back."""
     everything = state.shape[0] - 1
@@ -89,7 +89,7 @@ def _judge(state, row, t, arrival, live, horizon):
     return AHEAD
 
 
-@jit_brief
+@inlined
 def _note(state, row, t, arrival, live, horizon):
     """A time is let in: what its channel, and all together, are expected to say next."""
     everything = state.shape[0] - 1
@@ -113,15 +113,25 @@ def _note(state, row, t, arrival, live, horizon):
             state[k, LIVE] = 1
 
 
+@inlined
+def _row(kind, channel, sensors):
+    """The row of the state for an event; -1 for those that always pass, and that the log refuses."""
+    if kind == READING and 0 <= channel < sensors:
+        return channel
+    return sensors if kind == INPUT else sensors + 1 if kind == TRUTH else -1
+
+
 @jit_brief
-def _scan(state, rows, t, arrival, live, start, horizon):
+def _scan(state, t, raw, arrival, kind, channel, start, horizon):
     """Let in what fits, from `start` to the first event that does not, or whose channel holds some: its index."""
+    sensors = state.shape[0] - 3
     for i in range(start, t.size):
-        row = rows[i]
+        row = _row(kind[i], channel[i], sensors)
         if row >= 0:
-            if state[row, HOLDING] or _judge(state, row, t[i], arrival[i], live[i], horizon) != FITS:
+            live = raw[i] != arrival[i]
+            if state[row, HOLDING] or _judge(state, row, t[i], arrival[i], live, horizon) != FITS:
                 return i
-            _note(state, row, t[i], arrival[i], live[i], horizon)
+            _note(state, row, t[i], arrival[i], live, horizon)
     return t.size
 
 
@@ -132,7 +142,7 @@ def _compiled() -> tuple[Any, Any, Any, Any]:
     _reach.compile((I2, i64, i64, types.boolean))
     _judge.compile(one)
     _note.compile(one)
-    _scan.compile((I2, I1, I1, I1, types.boolean[::1], i64, i64))
+    _scan.compile((I2, I1, I1, I1, B1, types.int32[::1], i64, i64))
     return _reach, _judge, _note, _scan
 
 
@@ -200,13 +210,16 @@ class ClockGuard:
         """The next events, in the order of arrival: those that may go to the log now."""
         if not len(batch):
             return Passed(batch, np.zeros(0, np.bool_), [], [])
-        work = self._work(batch)
-        begin = at = work.begin
         if not self._runs and not self._shift.any():
-            at = self._pass(work, at)
-            if at == len(work.t):
+            batch = _plain(batch)
+            at = self._scan(self._state, batch.t, batch.t, *batch[1:4], 0, self._horizon)
+            if at == len(batch):
                 return Passed(batch, np.zeros(len(batch), np.bool_), [], [])
-            work.emit(range(begin, at))
+            work = self._work(batch)
+            work.emit(range(at))
+        else:
+            work = self._work(batch)
+            at = work.begin
         while at < len(work.t):
             stop = self._pass(work, at)
             work.emit(range(at, stop))
@@ -232,6 +245,7 @@ class ClockGuard:
         return self._leave(work)
 
     def _work(self, batch: Events) -> _Work:
+        batch = _plain(batch)
         rows = self._rows_of(batch)
         moved = batch._replace(t=batch.t + np.where(rows >= 0, self._shift[rows], 0))
         events = Events.concat([self._held, moved], batch.value.shape[1]) if self._runs else moved
@@ -239,7 +253,7 @@ class ClockGuard:
         return _Work(events, rows, np.concatenate((self._raw, batch.t)), len(self._held))
 
     def _rows_of(self, batch: Events) -> np.ndarray:
-        """The row of the state for each event; -1 for those that always pass, and that the log refuses."""
+        """The row of the state for each event, as `_row` has it."""
         rows = np.full(len(batch), -1, np.int64)
         readings = (batch.kind == READING) & (batch.channel >= 0) & (batch.channel < self._sensors)
         rows[readings] = batch.channel[readings]
@@ -248,7 +262,8 @@ class ClockGuard:
         return rows
 
     def _pass(self, work: _Work, start: int) -> int:
-        return int(self._scan(self._state, work.rows, work.t, work.arrival, work.live, start, self._horizon))
+        columns = work.t, work.raw, work.arrival, work.kind, work.channel
+        return int(self._scan(self._state, *columns, start, self._horizon))
 
     def _verdict(self, work: _Work, i: int) -> int:
         return int(self._judge(self._state, work.rows[i], work.t[i], work.arrival[i], work.live[i], self._horizon))
@@ -365,16 +380,23 @@ class ClockGuard:
         return Passed(work.select(work.order), np.array(work.settled, np.bool_), work.refused, work.moved)
 
 
+def _plain(batch: Events) -> Events:
+    """The batch, its columns as the compiled functions read them; as it is, where it is so."""
+    types_ = (np.int64, np.int64, np.int8, np.int32)
+    columns = [np.ascontiguousarray(column, kind) for column, kind in zip(batch[:4], types_, strict=True)]
+    if all(a is b for a, b in zip(columns, batch, strict=False)):
+        return batch
+    return Events(*columns, batch.value)
+
+
 class _Work:
     """Events that were held and a batch, one after the other, and what becomes of them."""
 
     def __init__(self, events: Events, rows: np.ndarray, raw: np.ndarray, begin: int) -> None:
         """The rows of the state (n,), the times as stamped, and how many of the events were held."""
-        self.t = np.ascontiguousarray(events.t, np.int64)
-        self._events = events._replace(t=self.t)
-        self.arrival = np.ascontiguousarray(events.arrival, np.int64)
-        self.kind, self.channel = events.kind, events.channel
-        self.rows, self.raw, self.begin = rows, np.ascontiguousarray(raw, np.int64), begin
+        self._events = events
+        self.t, self.arrival, self.kind, self.channel = events[:4]
+        self.rows, self.raw, self.begin = rows, raw, begin
         self.live = self.raw != self.arrival
         self.order: list[int] = []
         self.settled: list[bool] = []
