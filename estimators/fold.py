@@ -22,7 +22,7 @@ from .diagnostics.health import Bounds, HealthPolicy, chi_square_bounds
 from .errors import EstimatorError, ModelError
 from .estimator import Code, Estimator
 from .events.checks import admitted
-from .events.maintenance import version_after, without
+from .events.maintenance import versions_dropped, without
 from .fold_checks import check_base, check_pairs, check_prior, check_tuning, check_variances
 from .fold_kernel import compiled
 from .interpreted import fold_loop
@@ -423,7 +423,7 @@ class Fold:
         at = self._snapshots.last(self.log.first + index)
         clock, u, state, evidence = self._snapshots[at]
         mean, cov = self.estimator.moments(self.options, state, self.model.nx)
-        version = version_after(self.log, at - self.log.first)
+        version = self.log.version + versions_dropped(self.log.events, at - self.log.first)
         base = Base(mean, cov, clock, u.copy(), self.estimator.name, state.copy(), at, evidence.copy(), version)
         return at - self.log.first, base
 

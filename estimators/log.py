@@ -22,7 +22,7 @@ from .events.batch import (
     truth_of,
 )
 from .events.checks import Layout, admitted
-from .events.maintenance import version_after
+from .events.maintenance import versions_dropped
 from .events.order import in_order, sorted_order
 
 if TYPE_CHECKING:
@@ -255,7 +255,7 @@ class Log:
         """Forget the oldest `count` events; what comes later of the time before their end is stale."""
         if count:
             self.floor = max(self.floor, int(self.t[count - 1]))
-            self.version = version_after(self, count)
+            self.version += versions_dropped(self.events, count)
         for column in self._columns():
             column[: self.n - count] = column[count : self.n].copy()
         self.n -= count

@@ -18,13 +18,13 @@ import numpy as np
 
 from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import EstimatorError, NisusError
-from estimators.events.maintenance import model_version_at
 from estimators.fold import Fold
 from estimators.late import inflated
 from estimators.log import TICK, Events, Log
 from estimators.numerics.peaks import peaks_of
 from estimators.registry import find_estimator
 from estimators.snapshots import SPARSE_EVERY, Base
+from estimators.versions import model_version_at
 
 from ..intake import Intake
 from ..stderr import complain

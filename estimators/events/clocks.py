@@ -19,16 +19,16 @@ events do not tell their source.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import types
 
 from ..numerics.jit import B1, I1, I2, i64, inlined, jit_brief
 from .batch import INPUT, READING, TRUTH, Events
+from .clock_work import Moved, Passed, Refused, Work, plain_events
 
 SECOND = 10**9
 
@@ -146,33 +146,6 @@ def _compiled() -> tuple[Any, Any, Any, Any]:
     return _reach, _judge, _note, _scan
 
 
-class Refused(NamedTuple):
-    """A lone event whose time was far ahead: its kind, channel, time (ns) and where its clock was expected (ns)."""
-
-    kind: int
-    channel: int
-    t: int
-    expected: int
-
-
-class Moved(NamedTuple):
-    """A clock that was set: kind and channel of its first event, its time as stamped, and by how much it moved (ns)."""
-
-    kind: int
-    channel: int
-    t: int
-    by: int
-
-
-class Passed(NamedTuple):
-    """What may go to the log, in order. `settled` (N,) were held: they came in time, so no horizon applies to them."""
-
-    events: Events
-    settled: np.ndarray
-    refused: list[Refused]
-    moved: list[Moved]
-
-
 @dataclass
 class _Run:
     """Events of one channel that agree on another time, held until it is told whether that is true."""
@@ -211,7 +184,7 @@ class ClockGuard:
         if not len(batch):
             return Passed(batch, np.zeros(0, np.bool_), [], [])
         if not self._runs and not self._shift.any():
-            batch = _plain(batch)
+            batch = plain_events(batch)
             at = self._scan(self._state, batch.t, batch.t, *batch[1:4], 0, self._horizon)
             if at == len(batch):
                 return Passed(batch, np.zeros(len(batch), np.bool_), [], [])
@@ -244,13 +217,13 @@ class ClockGuard:
                     self._dissolve(work, row)
         return self._leave(work)
 
-    def _work(self, batch: Events) -> _Work:
-        batch = _plain(batch)
+    def _work(self, batch: Events) -> Work:
+        batch = plain_events(batch)
         rows = self._rows_of(batch)
         moved = batch._replace(t=batch.t + np.where(rows >= 0, self._shift[rows], 0))
         events = Events.concat([self._held, moved], batch.value.shape[1]) if self._runs else moved
         rows = np.concatenate((self._rows_of(self._held), rows))
-        return _Work(events, rows, np.concatenate((self._raw, batch.t)), len(self._held))
+        return Work(events, rows, np.concatenate((self._raw, batch.t)), len(self._held))
 
     def _rows_of(self, batch: Events) -> np.ndarray:
         """The row of the state for each event, as `_row` has it."""
@@ -261,17 +234,17 @@ class ClockGuard:
         rows[batch.kind == TRUTH] = self._sensors + 1
         return rows
 
-    def _pass(self, work: _Work, start: int) -> int:
+    def _pass(self, work: Work, start: int) -> int:
         columns = work.t, work.raw, work.arrival, work.kind, work.channel
         return int(self._scan(self._state, *columns, start, self._horizon))
 
-    def _verdict(self, work: _Work, i: int) -> int:
+    def _verdict(self, work: Work, i: int) -> int:
         return int(self._judge(self._state, work.rows[i], work.t[i], work.arrival[i], work.live[i], self._horizon))
 
-    def _let_in(self, work: _Work, i: int) -> None:
+    def _let_in(self, work: Work, i: int) -> None:
         self._note(self._state, work.rows[i], work.t[i], work.arrival[i], work.live[i], self._horizon)
 
-    def _suspect(self, work: _Work, i: int) -> None:
+    def _suspect(self, work: Work, i: int) -> None:
         """Deal with an event that does not fit, or whose channel holds some."""
         row = int(work.rows[i])
         run = self._runs.get(row)
@@ -298,10 +271,10 @@ class ClockGuard:
         if len(run.at) >= ENOUGH and max(run.t) - min(run.t) >= self._settled:
             self._anchor(work, row)
 
-    def _is_live(self, work: _Work, i: int) -> bool:
+    def _is_live(self, work: Work, i: int) -> bool:
         return bool(work.live[i] or self._state[work.rows[i], LIVE])
 
-    def _agrees(self, work: _Work, run: _Run, i: int) -> bool:
+    def _agrees(self, work: Work, run: _Run, i: int) -> bool:
         """Whether an event says the same of its clock as those that are held."""
         t = int(work.t[i])
         if self._is_live(work, i):
@@ -311,7 +284,7 @@ class ClockGuard:
         reach = int(self._reach(self._state, work.rows[i], self._horizon, False))
         return run.verdict == AHEAD or reach < 0 or t <= run.t[-1] + reach
 
-    def _can_be_set_back(self, work: _Work, i: int) -> bool:
+    def _can_be_set_back(self, work: Work, i: int) -> bool:
         """Whether a time that went back may be a clock's, and not a block of late readings, or files in a wrong order.
 
         With known arrivals it always may. Without, a channel cannot have measured twice at one time: what fills its
@@ -323,7 +296,7 @@ class ClockGuard:
         in_gap = state[GAP_TO] > state[GAP_FROM] and state[GAP_FROM] - horizon <= t <= state[GAP_TO] + horizon
         return bool(t >= state[FIRST] - horizon and not in_gap)
 
-    def _anchor(self, work: _Work, row: int) -> None:
+    def _anchor(self, work: Work, row: int) -> None:
         """What is held was true: let it in, with the clock set right if it was one that moved."""
         run, state = self._runs[row], self._state[row]
         first = run.at[0]
@@ -351,13 +324,13 @@ class ClockGuard:
             if held.verdict == AHEAD and self._verdict(work, held.at[0]) == FITS:
                 self._release(work, other)
 
-    def _release(self, work: _Work, row: int) -> None:
+    def _release(self, work: Work, row: int) -> None:
         run = self._end(row)
         for i in run.at:
             self._let_in(work, i)
         work.emit(run.at, settled=True)
 
-    def _dissolve(self, work: _Work, row: int) -> None:
+    def _dissolve(self, work: Work, row: int) -> None:
         """What is held was not true: refused if it is ahead; what is back goes to the log, which counts it as stale."""
         run = self._end(row)
         if run.verdict == BACK:
@@ -370,7 +343,7 @@ class ClockGuard:
         self._state[row, HOLDING] = 0
         return self._runs.pop(row)
 
-    def _leave(self, work: _Work) -> Passed:
+    def _leave(self, work: Work) -> Passed:
         """What passes; what is still held is kept for the next batch."""
         kept = sorted(i for run in self._runs.values() for i in run.at)
         place = {i: k for k, i in enumerate(kept)}
@@ -378,42 +351,3 @@ class ClockGuard:
             run.at = [place[i] for i in run.at]
         self._held, self._raw = work.select(kept), work.raw[kept]
         return Passed(work.select(work.order), np.array(work.settled, np.bool_), work.refused, work.moved)
-
-
-def _plain(batch: Events) -> Events:
-    """The batch, its columns as the compiled functions read them; as it is, where it is so."""
-    types_ = (np.int64, np.int64, np.int8, np.int32)
-    columns = [np.ascontiguousarray(column, kind) for column, kind in zip(batch[:4], types_, strict=True)]
-    if all(a is b for a, b in zip(columns, batch, strict=False)):
-        return batch
-    return Events(*columns, batch.value)
-
-
-class _Work:
-    """Events that were held and a batch, one after the other, and what becomes of them."""
-
-    def __init__(self, events: Events, rows: np.ndarray, raw: np.ndarray, begin: int) -> None:
-        """The rows of the state (n,), the times as stamped, and how many of the events were held."""
-        self._events = events
-        self.t, self.arrival, self.kind, self.channel = events[:4]
-        self.rows, self.raw, self.begin = rows, raw, begin
-        self.live = self.raw != self.arrival
-        self.order: list[int] = []
-        self.settled: list[bool] = []
-        self.refused: list[Refused] = []
-        self.moved: list[Moved] = []
-
-    def emit(self, at: Sequence[int], *, settled: bool = False) -> None:
-        """These pass, in this order."""
-        self.order.extend(at)
-        self.settled.extend([settled] * len(at))
-
-    def shift(self, row: int, held: list[int], step: int) -> None:
-        """The clock of a row was set: correct what is held, and what is still to come."""
-        later = np.flatnonzero(self.rows == row)
-        self.t[held] += step
-        self.t[later[later > held[-1]]] += step
-
-    def select(self, at: list[int]) -> Events:
-        """The events at these places."""
-        return self._events.select(np.array(at, np.int64))

@@ -7,14 +7,10 @@ from the prior's variance, uncorrelated with the others, as what was known of th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .batch import MAINTENANCE, Events
-
-if TYPE_CHECKING:
-    from ..log import Log
 
 
 def maintained(t: int, arrival: int, states: Sequence[int], width: int) -> Events:
@@ -39,31 +35,13 @@ def model_versions(events: Events, before: int = 1) -> np.ndarray:
     return version
 
 
-def version_after(log: Log, count: int) -> int:
-    """The version of the model where the log begins once its oldest `count` events are dropped.
+def versions_dropped(events: Events, count: int) -> int:
+    """How many versions of the model end with the oldest `count` events, when these are dropped.
 
     A maintenance whose events are dropped in part is told by those that stay.
     """
-    events = log.events
     times = [events.t[part][events.kind[part] == MAINTENANCE] for part in (slice(0, count), slice(count, None))]
-    return log.version + int(np.setdiff1d(times[0], times[1][:1]).size)
-
-
-def maintenance_times(log: Log) -> np.ndarray:
-    """Times (ns) of the maintenances that the log has kept, ascending."""
-    return np.unique(log.t[: log.n][log.kind[: log.n] == MAINTENANCE])
-
-
-def model_version_at(log: Log, t: int) -> int:
-    """The version of the model at time t, ns."""
-    return log.version + int(np.searchsorted(maintenance_times(log), t, side="right"))
-
-
-def last_maintenance(log: Log, t: int) -> int | None:
-    """Time (ns) of the last maintenance at or before t that the log has kept; None if there is none."""
-    times = maintenance_times(log)
-    k = int(np.searchsorted(times, t, side="right"))
-    return int(times[k - 1]) if k else None
+    return int(np.setdiff1d(times[0], times[1][:1]).size)
 
 
 def without(cov: np.ndarray, prior: np.ndarray, state: int) -> np.ndarray:

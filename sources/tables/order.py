@@ -52,8 +52,8 @@ class Order:
             self._tell(
                 BACKWARDS,
                 f"{file}:{line[k]}: {self._column} is {(newest[k] - t[k]) * 1e-9:.6g} s before that of {at}, more than "
-                f"time.horizon ({self._horizon * 1e-9:g} s), and such rows are dropped as stale, unless that was a lone "
-                f"wrong time or a clock that was set; sort the rows by {self._column}, or raise time.horizon",
+                f"time.horizon ({self._horizon * 1e-9:g} s), and such rows are dropped as stale, unless that was a "
+                f"lone wrong time or a clock that was set; sort the rows by {self._column}, or raise time.horizon",
             )
         if newest[-1] > self._newest:
             self._newest, self._newest_at = int(newest[-1]), f"{file}:{line[int(np.argmax(t))]}"
