@@ -99,22 +99,42 @@ class TimeSection(Section):
 
     horizon: NotNegative = 2.0
     """Seconds: a reading later than this is counted as stale and dropped. Size it by the worst credible latency."""
-    degraded_after: Positive = 3.0
-    """Seconds without a used reading after which the twin says that it is degraded."""
+    degraded_after: Positive | None = None
+    """Seconds without a used reading after which the twin says that it is degraded. Default: the slowest time constant
+    of the model at the prior, but at least 3 s and three periods of the slowest simulated sensor, and at most
+    stale_after; `nisus fold` prints where it comes from."""
     stale_after: Positive = 15.0
     """Seconds without a used reading after which the twin says that it is stale. Above degraded_after."""
+    late: Literal["exact", "inflate", "auto"] = "auto"
+    """What becomes of a reading that comes late, within the horizon. exact: it is put where it was measured and the
+    filter goes back; nothing is lost. inflate: it is used when it comes, with a variance larger by what the model says
+    that the reading has moved since; cheap, not exact, and not for filters with a fixed R. auto: exact, unless going
+    back once may take longer than late_allowed, by an arithmetic that `nisus fold` prints. Default: auto."""
+    late_allowed: Positive = 0.25
+    """Seconds that going back for one late reading may take, for late: auto. Default: 0.25."""
     tick: Positive = 0.5
     """Seconds of silence after which the estimate is predicted and shown without a reading."""
 
     @model_validator(mode="after")
     def _order(self) -> TimeSection:
-        if self.stale_after < self.degraded_after:
+        if self.degraded_after is not None and self.stale_after < self.degraded_after:
             raise PydanticCustomError(
                 "order",
                 "is {value} s; it must not be below degraded_after ({other} s)",
                 {"value": self.stale_after, "other": self.degraded_after, "key": "stale_after"},
             )
         return self
+
+
+class MaintenanceSection(Section):
+    """Something of the asset that was changed."""
+
+    at: Number
+    """When, in seconds of the source's time."""
+    what: Text
+    """What was changed, for people."""
+    states: Annotated[tuple[Text, ...], Field(min_length=1)]
+    """The states that it concerns: they are as uncertain as at the start again, and keep their mean."""
 
 
 class SceneSection(Section):
@@ -197,6 +217,8 @@ class TwinSection(Section):
     innovations that are white and as large as the filter says."""
     time: TimeSection = TimeSection()
     """How the twin treats lateness and silence."""
+    maintenance: tuple[MaintenanceSection, ...] = ()
+    """When something of the asset was changed: each begins a new version of the model. Default: never."""
     history: Count = 200_000
     """Events that are kept, and folded again when the tuning changes; the oldest are forgotten."""
     source: SourceSection

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from .compiled.context import context_of
-from .compiled.model import compile_model
+from .compiled.model import CompiledModel, compile_model
 from .diagnostics.evidence import fresh, no_baseline, watched
 from .diagnostics.failure_cause import Estimate, around, cause, failures, questions
 from .diagnostics.field_pictures import Pictures
@@ -23,13 +23,14 @@ from .diagnostics.health import Bounds, HealthPolicy, chi_square_bounds
 from .errors import EstimatorError, ModelError
 from .estimator import Code, Estimator
 from .events.checks import admitted
+from .events.maintenance import versions_dropped, without
 from .fold_checks import check_base, check_pairs, check_prior, check_tuning, check_variances
 from .fold_kernel import compiled
 from .interpreted import fold_loop
 from .interpreted.black_box_filters import driven
 from .interpreted.fold_loop import LONGEST, UNSET
 from .interpreted.view import View
-from .log import BEFORE, INPUT, READING, TICK, TRUTH, Log
+from .log import BEFORE, INPUT, MAINTENANCE, READING, TICK, TRUTH, Log
 from .model.mode_as_number import indicator
 from .model.state_space import StateSpaceModel
 from .numerics.peaks import Peak
@@ -120,6 +121,7 @@ class Fold:
             self._context = View(self._compiled, self._context, tuning, self.options, self.pairs, self._held)
             self._run = partial(fold_loop.run_and_judge, judge, self._seen)
             begin = fold_loop.begin
+        self._begin = begin
         begin(self._code, self._context, np.ascontiguousarray(mean), np.ascontiguousarray(cov), self._state)
         left = base.state if base is not None and base.estimator == estimator else None
         if left is not None and left.size == self._state.size:
@@ -183,6 +185,11 @@ class Fold:
     def evidence(self) -> np.ndarray:
         """The state of the bank of tests now; see diagnostics/evidence.py."""
         return self._evidence.copy()
+
+    @property
+    def compiled(self) -> CompiledModel:
+        """The model's functions as the filter sees them."""
+        return self._compiled
 
     @property
     def clock(self) -> int:
@@ -310,9 +317,13 @@ class Fold:
             stop = min(end, boundary)
             if self.pictures is not None:
                 stop = self.pictures.next(log, self.n, stop)
+            stop = self._maintenance(stop)
             try:
                 self._screen_events(self.n, stop)
-                self._run_events(self.n, stop)
+                if log.kind[self.n] == MAINTENANCE:
+                    self._maintain(self.n)
+                else:
+                    self._run_events(self.n, stop)
             except BaseException:
                 # Python was stopped between two events: back to where the state is known.
                 self._held["r"][:] = self.tuning.r
@@ -353,6 +364,24 @@ class Fold:
             self._evidence,
         )
         self._asked = stop - 1
+
+    def _maintenance(self, stop: int) -> int:
+        """Where to stop, at `stop` at the latest, so that an event of maintenance is dealt with by itself."""
+        found = np.flatnonzero(self.log.kind[self.n : stop] == MAINTENANCE)
+        return stop if not found.size else self.n + max(1, int(found[0]))
+
+    def _maintain(self, i: int) -> None:
+        """Predict to the event; there its state is as unknown as in the prior, and its mean stays.
+
+        The filter begins again from these moments: of particles, members and modes it keeps no more than them.
+        """
+        self._run_events(i, i + 1)
+        mean, cov = self.estimator.moments(self.options, self._spare, self.model.nx)
+        cov = without(cov, self._held["prior_cov"], int(self.log.channel[i]))
+        if np.all(np.isfinite(mean)) and np.all(np.isfinite(cov)):
+            self._begin(self._code, self._context, np.ascontiguousarray(mean), np.ascontiguousarray(cov), self._state)
+            self._clock[0] = self.log.t[i]
+            self._run_events(i, i + 1)
 
     def finish(self) -> None:
         """The log has ended: take the picture for which another event would have been waited."""
@@ -398,8 +427,9 @@ class Fold:
         at = self._snapshots.last(self.log.first + index)
         clock, u, state, evidence, edge = self._snapshots[at]
         mean, cov = self.estimator.moments(self.options, state, self.model.nx)
+        version = self.log.version + versions_dropped(self.log.events, at - self.log.first)
         name, gathered = self.estimator.name, (evidence.copy(), edge.copy())
-        base = Base(mean, cov, clock, u.copy(), name, state.copy(), at, *gathered)
+        base = Base(mean, cov, clock, u.copy(), name, state.copy(), at, *gathered, version)
         return at - self.log.first, base
 
     def follow(self, log: Log, changed_from: int | None) -> None:

@@ -18,6 +18,7 @@ from estimators.screen import reasons_by_sensor
 from estimators.track import FAILED, HEALTH_NAMES, REASONS, USED
 from estimators.tuning import TOGETHER
 
+from ..intake import WRONG_TIME
 from ..twin.twin import Twin
 
 
@@ -44,9 +45,11 @@ def as_dict(
     """What a script needs of a fold.
 
     `rmse` and `coverage` (the share of errors inside their 95 % band) are by state and `held_out` by sensor row, in
-    their units; `stale` counts the readings that came too late to be among the `readings`, `conditioned` those that a
-    condition of the source's map refused; `screened` counts what the edge refused by sensor and reason, these last
-    among them as `condition`; `health` is the share of the track's rows in each state of health.
+    their units; `stale` counts the readings that came too late to be among the `readings`, `wrong_time` the events that
+    were refused for a time that cannot be true, `inflated` the late ones that were used when they came, `conditioned`
+    those that a condition of the source's map refused; `screened` counts what the edge refused by sensor and reason,
+    these last among them as `condition`; `late` and `degraded_after` say what was decided of time, and why; `health` is
+    the share of the track's rows in each state of health.
     `log_likelihood` has the price of the readings that were refused, which `log_likelihood_used` leaves out; `refused`
     is their share. `calibration` has an entry for each sensor row, used or held out, and each state whose truth is
     told: see estimators/diagnostics/calibration.py.
@@ -72,6 +75,10 @@ def as_dict(
         "log_likelihood_used": number(result.log_likelihood_used),
         "used": int(np.sum(fold.track.verdict == USED)),
         "stale": counts["stale"],
+        "wrong_time": counts[WRONG_TIME],
+        "inflated": counts["inflated"],
+        "late": twin.late._asdict(),
+        "degraded_after": twin.degraded._asdict(),
         "conditioned": sum(count for key, count in counts.items() if key.startswith("condition ")),
         "gated": result.gated,
         "refused": number(result.refused),
@@ -191,6 +198,8 @@ def as_text(
     )
     rows += [
         ("final variances", variances),
+        ("late readings", f"{'used when they come, R inflated' if twin.late.inflate else 'exact'}: {twin.late.reason}"),
+        ("degraded after", f"{twin.degraded.seconds:g} s without a reading: {twin.degraded.reason}"),
         ("health at the end", HEALTH_NAMES[int(track.health[-1])]),
         ("time per event", f"{1e6 * seconds:.2f} µs"),
     ]

@@ -52,6 +52,17 @@ class Reset:
 
 
 @dataclass(frozen=True)
+class Maintenance:
+    """Something of the asset was changed now, `what` in words: the states that it concerns, by name, start again.
+
+    Their covariance is that of the prior, their mean stays, and a new version of the model begins.
+    """
+
+    what: str
+    states: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Pause:
     """Hold a replay or a simulation where it is, or let it go on."""
 
@@ -111,7 +122,7 @@ class ClearFault:
 
 
 Command = (
-    SetEstimator | SetTuning | SetOption | UseSensor | Restore | Reset | Pause | Speed | Step | Seek | Record
-    | InjectFault | ClearFault
+    SetEstimator | SetTuning | SetOption | UseSensor | Restore | Reset | Maintenance | Pause | Speed | Step | Seek
+    | Record | InjectFault | ClearFault
 )  # fmt: skip
 """Any of them."""

@@ -19,12 +19,14 @@ import numpy as np
 from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import EstimatorError, NisusError
 from estimators.fold import Fold
+from estimators.late import inflated
 from estimators.log import TICK, Events, Log
 from estimators.numerics.peaks import peaks_of
 from estimators.registry import find_estimator
 from estimators.snapshots import SPARSE_EVERY, Base
-from estimators.track import TRACKING
+from estimators.versions import model_version_at
 
+from ..intake import Intake
 from ..stderr import complain
 from . import commands
 from .alerts import Alerts
@@ -32,16 +34,19 @@ from .counts import Latency, RowCounts, last_run
 from .execute import Remembered, execute
 from .faults import Faulty
 from .feeder import Feeder, Finished, Restarted
+from .host_clock import HostClock
 from .idle_ticks import IdleTicks
 from .interface import Records
 from .notices import Notices
 from .outputs import Belief, Cursor, Pull, Status
 from .playback import playback_status
 from .refolder import Refolded, Refolder, Requests
+from .silence import Silence
 from .stall import Stall
 
 if TYPE_CHECKING:
     from estimators.diagnostics.field_pictures import Picture
+    from estimators.events.clocks import Passed
     from estimators.tuning import Tuning
     from sources.source import Source
 
@@ -101,7 +106,9 @@ class Engine:
         self._finished = False
         self._idle_ticks = IdleTicks(section.tick)
         self._latency = Latency()
+        self._clock = HostClock(self.notices, section.horizon)
         self._alerts = Alerts(self.notices)
+        self._silence = Silence(self.notices, section.stale_after)
         self._stall = Stall(self._say_stalled)
         self._status: tuple[float, Status] | None = None
         self.recorder: Records | None = None
@@ -111,11 +118,13 @@ class Engine:
         """An empty log and the fold that follows it."""
         self._log = Log.of(self.model, capacity=self._history + 4 * SPARSE_EVERY)
         if base is not None:
-            self._log.first, self._log.floor = base.first, base.clock
+            self._log.first, self._log.floor, self._log.version = base.first, base.clock, base.version
         self._logs += 1
         self._base = base
         self._fold = self._make_fold(self.estimator, self.tuning, self._log, base)
         self._row_counts = RowCounts(self.model)
+        self._late = 0
+        self._intake = Intake(self.model, self._horizon, self.notices.report, self.twin.maintenance)
 
     def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
         period = self.twin.picture if self.model.grid is not None else None
@@ -270,11 +279,15 @@ class Engine:
                 revision=self._revision,
                 refolding=self._requests.waiting,
                 t=int(log.t[last]) if last >= 0 else None,
-                health=int(track.health[last]) if last >= 0 else TRACKING,
+                health=int(track.health[last]) if last >= 0 else self._silence.health,
                 since=int(log.t[last_run(track.health)]) if last >= 0 else None,
                 lost=self._alerts.lost,
+                model_version=model_version_at(log, int(log.t[last])) if last >= 0 else log.version,
+                clock=self._clock.estimate,
                 counts={
                     **self.notices.counts(),
+                    **({"inflated": self._late} if self._late else {}),
+                    **({"held": self._intake.held} if self._intake.held else {}),
                     **self._row_counts.count(track, log.channel),
                     **({"recovered": fold.recoveries()} if fold.recoveries() else {}),
                     **({"silenced": lost} if lost else {}),
@@ -330,20 +343,31 @@ class Engine:
         if not batches:
             return
         batch = batches[0] if len(batches) == 1 else Events.concat(batches, self.model.width)
+        passed = self._intake.take(batch)
+        self._put(passed)
+        if self._feeder.live:
+            self._latency.note(batch)
+            self._clock.note(passed.events)
+
+    def _put(self, passed: Passed) -> None:
         with self._lock, self._stall.watched(self._fold):
-            stale = self._take(batch, self._horizon)
+            events = passed.events
+            if self._horizon is not None and self.twin.late.inflate:
+                events, late = inflated(events, self._fold, self._log.newest, self._horizon)
+                self._late += late
+            stale = self._take(events, self._horizon, passed.settled)
             self._idle_ticks.broken(self._log.newest)
+            if self._log.n:
+                self._silence.broken()
             if self._log.n > self._history + 3 * SPARSE_EVERY:
                 self._forget()
         if stale:
             text = f"{stale} reading(s) later than the horizon, or older than the history, dropped"
             self.notices.report("stale", text, times=stale)
-        if self._feeder.live:
-            self._latency.note(batch)
 
-    def _take(self, batch: Events, horizon: int | None = None) -> int:
+    def _take(self, batch: Events, horizon: int | None = None, settled: np.ndarray | None = None) -> int:
         """Put events where they belong, and fold from there on; how many were stale."""
-        first, stale = self._log.extend(batch, horizon)
+        first, stale = self._log.extend(batch, horizon, settled)
         before = min(first, self._fold.n)
         if first < self._fold.n:
             self._go_back(first)
@@ -371,7 +395,10 @@ class Engine:
             self._log.drop_front(count)
 
     def _when_silent(self) -> None:
-        if self._finished or not self._log.n:
+        if self._finished:
+            return
+        if not self._log.n:
+            self._silence.look(live=self._feeder.live)
             return
         now = self._idle_ticks.asks(self._feeder.source, int(self._log.t[self._log.n - 1]))
         if now is not None:
@@ -388,6 +415,7 @@ class Engine:
         elif isinstance(item, Restarted):
             self._restart()
         elif isinstance(item, Finished):
+            self._put(self._intake.finish())
             with self._lock, self._stall.watched(self._fold):
                 self._fold.finish()
             self._finished = True

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from estimators.diagnostics.clock_fit import ClockFit
 from estimators.diagnostics.field_pictures import Picture
 from estimators.log import Events
 from estimators.numerics.peaks import Peak
@@ -67,9 +68,10 @@ class Status:
     """The state of the running twin, for panels and the API.
 
     `t` is the time of the last event (ns), `since` the time when the present health began, `lost` the time from which
-    the estimate has not been a number (None if it is one). `counts` are those of the rows of this revision, and of
-    other things that happened to the twin. `latency_ms` is the 99th percentile from a reading's arrival to its row.
-    `faults` are those that were put into the source, and hold or will.
+    the estimate has not been a number (None if it is one). `model_version` counts up with each maintenance. `clock` is
+    that of a live source against this machine's, None while it is not known. `counts` are those of the rows of this
+    revision, and of other things that happened to the twin. `latency_ms` is the 99th percentile from a reading's
+    arrival to its row. `faults` are those that were put into the source, and hold or will.
     """
 
     estimator: str
@@ -81,6 +83,8 @@ class Status:
     health: int
     since: int | None
     lost: int | None
+    model_version: int
+    clock: ClockFit | None
     counts: dict[str, int]
     nis: float
     nis_low: float

@@ -69,8 +69,8 @@ def base_to_json(base: Base | None) -> str:
     if base is None:
         return "null"
     moments = {"mean": base.mean.tolist(), "cov": base.cov.tolist(), "clock": base.clock, "u": base.u.tolist()}
-    moments["first"] = base.first
-    arrays = {"state": base.state, "edge": base.edge}
+    moments |= {"first": base.first, "version": base.version}
+    arrays = {"state": base.state, "edge": base.edge, "evidence": base.evidence}
     held = {key: _encoded(array) for key, array in arrays.items() if array is not None}
     return json.dumps({**moments, "estimator": base.estimator, **held})
 
@@ -96,7 +96,9 @@ def base_from_json(text: str) -> Base | None:
         values.get("estimator", ""),
         _decoded(values.get("state")),
         int(values.get("first", 0)),
+        evidence=_decoded(values.get("evidence")),
         edge=_decoded(values.get("edge")),
+        version=int(values.get("version", 1)),
     )
 
 

@@ -20,6 +20,7 @@ from ..engine import commands, faults
 from ..engine.changes import began_as, turned
 from ..engine.execute import Refolding, retuned
 from ..engine.interface import Running
+from ..engine.maintenance import check_maintenance
 from ..engine.playback import PLAYBACK, check_playback
 
 LONGEST_NAME = 255
@@ -63,6 +64,12 @@ def status_json(engine: Running) -> dict[str, Any]:
         "nis": _plain(status.nis),
         "nis_low": _plain(status.nis_low),
         "nis_high": _plain(status.nis_high),
+        "late": {"inflate": engine.twin.late.inflate, "reason": engine.twin.late.reason},
+        "degraded_after": {"seconds": engine.twin.degraded.seconds, "reason": engine.twin.degraded.reason},
+        "model_version": status.model_version,
+        "clock": None
+        if status.clock is None
+        else {key: _plain(value) for key, value in status.clock._asdict().items()},
         "counts": dict(status.counts),
         "paused": status.paused,
         "finished": status.finished,
@@ -116,6 +123,8 @@ def command_from_json(body: Any, engine: Running) -> commands.Command:
 def _check(command: commands.Command, engine: Running) -> None:
     if isinstance(command, Refolding):
         retuned(command, engine)
+    elif isinstance(command, commands.Maintenance):
+        check_maintenance(command.what, command.states, engine.model)
     elif isinstance(command, commands.Record) and engine.recorder is None:
         raise ConfigError("Record: this session cannot record")
     elif isinstance(command, commands.InjectFault | commands.ClearFault):
@@ -149,6 +158,8 @@ def _converted(command: str, name: str, value: Any, hint: Any) -> Any:
             return value
         if kind is int and isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**53:
             return value
+        if typing.get_origin(kind) is tuple and isinstance(value, list) and all(isinstance(v, str) for v in value):
+            return tuple(value)
         if kind is float and not isinstance(value, bool) and (isinstance(value, (int, float)) or value == "inf"):
             try:
                 number = float(value)
@@ -159,5 +170,6 @@ def _converted(command: str, name: str, value: Any, hint: Any) -> Any:
         if kind is Path and isinstance(value, str):
             return _recording(f"{command}: {name} is {value!r}", value)
     wanted = " or ".join({"float": "a number", "int": "a whole number", "bool": "true or false", "NoneType": "null",
-                          "str": "a text", "Path": "a path"}[kind.__name__] for kind in allowed)  # fmt: skip
+                          "str": "a text", "Path": "a path", "tuple": "a list of texts"}[kind.__name__]
+                         for kind in allowed)  # fmt: skip
     raise ConfigError(f"{command}: {name} is {value!r}; it must be {wanted}")

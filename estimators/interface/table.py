@@ -7,18 +7,22 @@ from typing import Any
 import numpy as np
 
 from ..events.batch import KIND_NAMES, READING, Events, truth_of
+from ..events.maintenance import model_versions
 from ..model.state_space import StateSpaceModel
 from ..track import HEALTH_NAMES, REASONS, VERDICT_NAMES, Track
 
 
-def table_of(model: StateSpaceModel, events: Events, track: Track) -> Any:
+def table_of(
+    model: StateSpaceModel, events: Events, track: Track, *, tuning_version: int = 1, model_version: int = 1
+) -> Any:
     """A pyarrow.Table of events and track.
 
     Columns: `t_ns` and `arrival_ns`; `seconds`; `event`, `channel`, and `sensor` (null unless it is a reading);
     `value_k` and, where a reading brought its own, `variance_k`; for each state `NAME_true` (NaN where it is not
     known), `NAME` and `NAME_std`; `innovation_k` and `innovation_std_k`; NIS with its windowed mean and bounds,
-    log-likelihood; verdict and health in words; `screened`: why the edge refused rows of the reading, null
-    if it did not.
+    log-likelihood; verdict and health in words; `screened`: why the edge refused rows of the reading, null if it did
+    not; `model_version`, which counts up with each maintenance from that at the first event, and `tuning_version`, of
+    the tuning that the track was folded with.
     """
     import pyarrow as pa
 
@@ -49,6 +53,8 @@ def table_of(model: StateSpaceModel, events: Events, track: Track) -> Any:
     columns["verdict"] = np.array(VERDICT_NAMES)[track.verdict]
     columns["screened"] = _reasons(track.screened)
     columns["health"] = np.array(HEALTH_NAMES)[track.health]
+    columns["model_version"] = model_versions(events, model_version)
+    columns["tuning_version"] = np.full(len(events), tuning_version, np.int64)
     plain = {k: np.ascontiguousarray(c) if isinstance(c, np.ndarray) else c for k, c in columns.items()}
     return pa.table(plain)
 
