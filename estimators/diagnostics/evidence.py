@@ -423,9 +423,10 @@ def _hear(i, now, y, s, watch, policy, state, track):
             said = _add(each, AT_REFUSALS, ratio, h, base[3 + AT_REFUSALS])
             mask = mask & ~REFUSED | _alarm(said, REFUSED, before)
         if judged:
-            e = track.innovation[i, k] / track.innovation_std[i, k]
-            if watch.marginal != 0 and np.isfinite(track.whitened[i, k]):
-                e = track.whitened[i, k]
+            # A prediction that is not Gaussian says nothing where its distribution function is not known.
+            e = track.whitened[i, k]
+            if watch.marginal == 0:
+                e = track.innovation[i, k] / track.innovation_std[i, k]
             if np.isfinite(e):
                 mask = mask & LOST | _weigh(each, e, h, base, before)
         if k == 0:

@@ -138,7 +138,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     X = ensemble(context, state)
     a, rest = begin_analysis(context, sensor, X.shape[0], work)
     # Z = (h(xᵢ) - ȳ) R^(-1/2) / √(N - 1),  d = R^(-1/2) (y - ȳ)
-    m = observe(context, sensor, u, y, X, a, innovation, innovation_std)
+    m = observe(context, sensor, u, y, X, a, innovation, innovation_std, score)
     verdict = judge_reading(context, sensor, m, a, score)
     if verdict != USED:
         return verdict

@@ -43,7 +43,7 @@ from .cloud import (
     tune,
 )
 from .describe import describe, moments, peaks, points, recoveries
-from .innovation import finite_rows, predicted
+from .innovation import finite_rows, predicted, score_rows
 from .propagate import propagate_block, smooth_block, work_size
 from .recovery import recover, start
 from .steps import NO_KEY, add_up, sweep, work_of
@@ -88,6 +88,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     add_up(context, work)
     m = predicted(context, u, sensor, y, cloud.records[0], shared, innovation, innovation_std)
     verdict = admit(context, sensor, m, shared.nu, shared.S, shared.U, score)
+    score_rows(context, sensor, y, shared, score)
     state[SETTLED] = settled
     # w_i ← w_i p(y | x_i) / Σ w p(y | x), and log p(y) = log Σ w p(y | x)
     log_sum = normalise(context, state, work)

@@ -47,7 +47,7 @@ from .cloud import (
 )
 from .cloud import OPTIONS as CLOUD_OPTIONS
 from .describe import DRAWN, describe, moments, recoveries
-from .innovation import finite_rows
+from .innovation import finite_rows, score_rows
 from .mode_draws import any_mode, jump_key, nearest_mode
 from .moments import cloud_moments
 from .rbpf_condition import adopt_block, condition_block, mixture, refer
@@ -177,6 +177,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     add_up(context, work)
     m = mixture(context, sensor, y, shared, innovation, innovation_std)
     verdict = admit(context, sensor, m, shared.nu, shared.S, shared.U, score)
+    score_rows(context, sensor, y, shared, score)
     state[SETTLED] = settled
     score[2] = np.nan
     if verdict == USED:
