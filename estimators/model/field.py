@@ -17,7 +17,8 @@ from ..errors import ModelError
 class State:
     """One entry of x with its prior N(mean, std²); a `circular` one is an angle in radians and wraps to ±π.
 
-    `position` says where it is, for filters that let a reading act only near its sensor.
+    `position` says where it is, for filters that let a reading act only near its sensor; `fitted` the range in which
+    the model was fitted.
     """
 
     name: str
@@ -26,6 +27,7 @@ class State:
     std: float = 1.0
     circular: bool = False
     position: tuple[float, ...] | None = None
+    fitted: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

@@ -48,11 +48,15 @@ class Noise:
 
 @dataclass(frozen=True)
 class Input:
-    """One entry of u, a known input, held between its readings; `default` until the first."""
+    """One entry of u, a known input, held between its readings; `default` until the first.
+
+    `fitted`: the range in which the model was fitted; outside, the twin says so.
+    """
 
     name: str
     unit: str
     default: float = 0.0
+    fitted: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,111 @@
+"""How a run of standardised innovations differs from white noise N(0, 1): by how much, since when, and how surely.
+
+Each way of being wrong has a size with a 95 % interval, and the generalised likelihood ratio of that size against
+none, in nats; the way with the largest ratio explains the run best.
+
+Source: Basseville & Nikiforov (1993), Detection of Abrupt Changes, 2.4 and 4.2.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..numerics.quantiles import normal_quantile
+
+SIDE = float(normal_quantile(0.975))
+
+SPIKE = 4.0
+"""|e| from which an innovation is a spike where the others are in order."""
+
+
+class Effect(NamedTuple):
+    """One way in which innovations differ from white noise.
+
+    `cause`: shifted, narrow, wide, correlated, alternating or spiky. `size` with its 95 % interval `low` to `high`: the
+    mean in σ, the ratio of the innovations' deviation to what the filter believes, the lag-1 correlation, or the share
+    of spikes. `ratio`: log Λ, nats.
+    """
+
+    cause: str
+    size: float
+    low: float
+    high: float
+    ratio: float
+
+
+def effects(e: np.ndarray) -> list[Effect]:
+    """All ways in which a run e (n,), finite, differs from white noise, the likeliest first.
+
+    The mean is taken out before the scale, both before the correlation, and spikes are told from scale by what the
+    innovations without them have.
+    """
+    n = e.size
+    if n < 2:
+        size = float(e[0]) if n else 0.0
+        return [Effect("shifted", size, size - SIDE, size + SIDE, 0.5 * size * size)]
+    mean = float(e.mean())
+    rest = e - mean
+    variance = float(np.mean(rest**2))
+    floor = max(variance, 1e-12)
+    phi = float(np.sum(rest[1:] * rest[:-1]) / max(float(np.sum(rest**2)), 1e-300))
+    bounded = float(np.clip(phi, -0.995, 0.995))
+    # With correlated noise a mean is known less well than with white.
+    wide = np.sqrt(floor * (1.0 + max(bounded, 0.0)) / (1.0 - max(bounded, 0.0)) / n)
+    found = [Effect("shifted", mean, mean - SIDE * wide, mean + SIDE * wide, 0.5 * n * mean**2)]
+    spikes = np.abs(rest) > SPIKE
+    calm = rest[~spikes]
+    share = float(np.mean(spikes))
+    if spikes.any() and calm.size > 1:
+        own = max(float(np.mean(calm**2)), 1e-12)
+        # A few spikes among innovations that are otherwise in order; else it is the scale.
+        gain = 0.5 * float(np.sum(rest[spikes] ** 2)) - int(spikes.sum()) * np.log(max(1.0 / max(share, 1e-9), 1.0))
+        if own < 1.5 and share < 0.2:
+            half = SIDE * np.sqrt(share * (1.0 - share) / n)
+            found.append(Effect("spiky", share, max(0.0, share - half), min(1.0, share + half), gain))
+            variance, floor = own, own
+    deviation = float(np.sqrt(floor))
+    half = SIDE / np.sqrt(2.0 * n) * deviation
+    cause = "narrow" if variance > 1.0 else "wide"
+    gain = 0.5 * n * (variance - 1.0 - np.log(floor))
+    found.append(Effect(cause, deviation, max(0.0, deviation - half), deviation + half, gain))
+    spread = SIDE * np.sqrt((1.0 - bounded**2) / n)
+    found.append(
+        Effect(
+            "correlated" if phi > 0 else "alternating",
+            phi,
+            max(-1.0, phi - spread),
+            min(1.0, phi + spread),
+            -0.5 * n * float(np.log(1.0 - bounded**2)),
+        )
+    )
+    return sorted(found, key=lambda effect: -effect.ratio)
+
+
+def onset(e: np.ndarray, cause: str) -> int:
+    """The index of e (n,), up to which nothing was wrong, most likely, if `cause` is what is wrong at the end.
+
+    The start that maximises the generalised likelihood ratio of what follows it; the estimate of the time of change of
+    Basseville & Nikiforov (1993), 2.6.
+    """
+    back = e[::-1]
+    n = np.arange(1, e.size + 1)
+    if cause == "shifted":
+        gain = 0.5 * np.cumsum(back) ** 2 / n
+    elif cause in ("narrow", "wide"):
+        variance = np.maximum(np.cumsum(back**2) / n, 1e-12)
+        side = variance > 1.0 if cause == "narrow" else variance < 1.0
+        gain = np.where(side, 0.5 * n * (variance - 1.0 - np.log(variance)), 0.0)
+    elif cause in ("correlated", "alternating") and e.size > 2:
+        products = np.cumsum(back[:-1] * back[1:])
+        squares = np.maximum(np.cumsum(back[1:] ** 2), 1e-12)
+        phi = np.clip(products / squares, -0.995, 0.995)
+        side = phi > 0 if cause == "correlated" else phi < 0
+        gain = np.append(0.0, np.where(side & (n[1:] > 4), -0.5 * n[1:] * np.log(1.0 - phi**2), 0.0))
+    elif cause == "spiky":
+        far = np.flatnonzero(np.abs(e) > SPIKE)
+        return int(far[0]) if far.size else e.size - 1
+    else:
+        return e.size - 1
+    return e.size - 1 - int(np.argmax(gain))
