@@ -16,7 +16,7 @@ from .interpreted.fold_loop import LONGEST, UNSET
 from .log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, inlined, jit
 from .numerics.steps import steps_of
-from .track import MISSING, NONE, WHITENED, track_type
+from .track import ANCESTORS, EFFECTIVE, MISSING, NONE, WHITENED, track_type
 
 
 @jit
@@ -85,6 +85,8 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
         score[0] = np.nan
         score[1] = 0.0
         score[2] = np.nan
+        score[EFFECTIVE] = np.nan
+        score[ANCESTORS] = np.nan
         verdict = NONE
         if what == READING or what == INPUT:
             advance_to(code, context, u, clock[0], t[i], index, state, work)
@@ -133,6 +135,8 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
         track.dof[i] = int(score[1])
         track.log_likelihood[i] = score[2]
         track.verdict[i] = verdict
+        track.effective[i] = score[EFFECTIVE]
+        track.ancestors[i] = score[ANCESTORS]
         for j in range(whitened.shape[1]):
             whitened[i, j] = score[WHITENED + j]
 

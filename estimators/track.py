@@ -19,8 +19,9 @@ WAITING, TRACKING, SUSPECT, DEGRADED, DIVERGED, STALE = range(6)
 """Health: no reading has come; consistent; consistent no more; a sensor is lost or readings are late; the estimate is
 lost; nothing arrives."""
 
-WHITENED = 3
-"""Where in what a filter scores (NIS, degrees of freedom, log-likelihood) the whitened rows of the reading begin."""
+EFFECTIVE, ANCESTORS, WHITENED = range(3, 6)
+"""Where in what a filter scores, after NIS, degrees of freedom and log-likelihood, the particles that count stand and
+those from which they descend, and where the whitened rows of the reading begin."""
 
 HEALTH_NAMES = ("waiting", "tracking", "suspect", "degraded", "diverged", "stale")
 
@@ -36,6 +37,8 @@ class Track(NamedTuple):
     whitened (N, ny): the innovation as it would be drawn from N(0, I), by row of the reading; of a prediction that is
     not Gaussian each row by itself, Φ⁻¹(F(y)). alarms (N, width): bits of the causes that are in alarm after this
     event, by row of the reading or state of the truth; flags: bits of what else is wrong (diagnostics/evidence.py).
+    effective: of particles, their effective sample size after a reading that was used, before resampling; ancestors:
+    how many of some readings ago these descend from (particle/lineage.py); NaN elsewhere.
     """
 
     mean: Any
@@ -56,6 +59,8 @@ class Track(NamedTuple):
     whitened: Any
     alarms: Any
     flags: Any
+    effective: Any
+    ancestors: Any
 
     @staticmethod
     def allocate(rows: int, nx: int, pairs: int, ny: int, width: int | None = None) -> Track:
@@ -66,7 +71,8 @@ class Track(NamedTuple):
         windowed = [np.full(rows, np.nan) for _ in range(4)]
         health = [np.zeros(rows, np.int8) for _ in range(2)]
         evidence = [np.full((rows, ny), np.nan), np.zeros((rows, width or ny), np.int32), np.zeros(rows, np.int64)]
-        columns: list[Any] = [*matrix, *vectors, *codes, *windowed, *health, *evidence]
+        particles = [np.full(rows, np.nan) for _ in range(2)]
+        columns: list[Any] = [*matrix, *vectors, *codes, *windowed, *health, *evidence, *particles]
         return Track(*columns)
 
     def select(self, index: object) -> Track:
@@ -86,4 +92,4 @@ class Track(NamedTuple):
 Track._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[method-assign, assignment]
 
 _A2 = types.Array(types.int32, 2, "C")
-track_type = types.NamedTuple((F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, F1, B1, B1, F2, _A2, I1), Track)
+track_type = types.NamedTuple((F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, F1, B1, B1, F2, _A2, I1, F1, F1), Track)

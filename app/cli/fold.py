@@ -106,7 +106,8 @@ def _as_dict(twin: Twin, result: Score, seconds: float, counts: Counter[str], fo
 
     `rmse` and `coverage` (the share of errors inside their 95 % band) are by state and `held_out` by sensor row, in
     their units; `stale` counts the readings that came too late to be among the `readings`, `conditioned` those that a
-    condition of the source's map refused; `health` is the share of the track's rows in each state of health.
+    condition of the source's map refused; `health` is the share of the track's rows in each state of health; `account`
+    is what the filter says of itself at the end (see `Fold.account`).
     """
 
     def number(value: float) -> float | None:
@@ -137,6 +138,7 @@ def _as_dict(twin: Twin, result: Score, seconds: float, counts: Counter[str], fo
         "missing": result.missing,
         "failed": int(np.sum(fold.track.verdict == FAILED)),
         "failure": _why(fold),
+        "account": {name: said if isinstance(said, list) else number(said) for name, said in fold.account().items()},
         "health": {
             name: float(share)
             for name, share in zip(

@@ -67,7 +67,8 @@ class Status:
 
     `t` is the time of the last event (ns), `since` the time when the present health began, `lost` the time from which
     the estimate has not been a number (None if it is one). `counts` are those of the rows of this revision, and of
-    other things that happened to the twin. `latency_ms` is the 99th percentile from a reading's arrival to its row.
+    other things that happened to the twin. `account` is what the filter says of itself (see `Fold.account`).
+    `latency_ms` is the 99th percentile from a reading's arrival to its row.
     """
 
     estimator: str
@@ -80,6 +81,7 @@ class Status:
     since: int | None
     lost: int | None
     counts: dict[str, int]
+    account: dict[str, float | list[float]]
     nis: float
     nis_low: float
     nis_high: float

@@ -64,6 +64,7 @@ def status_json(engine: Running) -> dict[str, Any]:
         "nis_low": _plain(status.nis_low),
         "nis_high": _plain(status.nis_high),
         "counts": dict(status.counts),
+        "account": _plain(status.account),
         "paused": status.paused,
         "finished": status.finished,
         "speed": _plain(status.speed),
@@ -77,6 +78,8 @@ def _plain(value: Any) -> Any:
     """JSON has no infinity and no NaN."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
     if value is None or isinstance(value, (bool, str, int)):
         return value
     number = float(value)

@@ -60,9 +60,9 @@ NARROW, WIDE, HIGH, LOW, CORRELATED, ALTERNATING, SPIKY, REFUSED, STUCK, DISAGRE
 LOST = REFUSED | STUCK
 """Causes for which a sensor tells nothing more."""
 
-OUTSIDE, TRUTH_MISSED = 1 << 60, 1 << 61
-"""Bits of `Track.flags` beside those of the sensors that are silent: outside the range in which the model was fitted;
-the truth that was told is missed."""
+IMPOVERISHED, OUTSIDE, TRUTH_MISSED = 1 << 59, 1 << 60, 1 << 61
+"""Bits of `Track.flags` beside those of the sensors that are silent: a few particles carry the estimate; outside the
+range in which the model was fitted; the truth that was told is missed."""
 
 SENSORS = 58
 """Sensors that have a bit of their own in `Track.flags`; the others share the last."""
@@ -98,6 +98,12 @@ MISSES, MISSES_NO_MORE = 4.5, 3.0
 """Root mean square of (estimate - truth) / σ, over about `TOLD` tellings, from which a truth is missed, and no more."""
 
 TOLD = 10
+
+FEW_PARTICLES = 4.0
+"""Effective sample size below which a cloud is poor; it is too if all of it descends from one particle."""
+
+PATIENCE = 20
+"""Readings more, poor than not, from which a cloud is impoverished; it is no more at half as many."""
 
 _QUADRATIC = len(SCALES) + len(SHIFTS) + len(CORRELATIONS)
 TESTS = _QUADRATIC + 3
@@ -135,8 +141,8 @@ SENSOR = JOINT + 8
 """Numbers in the state for each sensor."""
 
 # The twin's part.
-_SUSPECTS, _GONE, _NEXT_DUE, _BEGUN, _HEARD, _MISSED = range(6)
-TWIN = 6
+_SUSPECTS, _GONE, _NEXT_DUE, _BEGUN, _HEARD, _MISSED, _POOR, _IMPOVERISHED = range(8)
+TWIN = 8
 
 # A shown state's part: the mean square of its standardised errors, how often it was told, whether it is missed. After
 # them the inputs that hold.
@@ -389,7 +395,7 @@ def _forget(state, sensors, rows, states):
         own[_RAW] = own[_BEFORE] = np.nan
     begin = TWIN + sensors * SENSOR + rows * ROW
     state[begin : begin + states * STATE] = 0.0
-    state[_SUSPECTS] = state[_GONE] = state[_MISSED] = 0.0
+    state[_SUSPECTS] = state[_GONE] = state[_MISSED] = state[_POOR] = state[_IMPOVERISHED] = 0.0
 
 
 @jit
@@ -435,6 +441,19 @@ def _hear(i, now, y, s, watch, policy, state, track):
         track.alarms[i, k] = mask
         state[_SUSPECTS] += (mask != 0) - (before != 0)
         state[_GONE] += (mask & LOST != 0) - (before & LOST != 0)
+
+
+@jit
+def _count_particles(effective, ancestors, state):
+    """Whether a cloud is impoverished, after another reading that it used."""
+    if effective < FEW_PARTICLES or ancestors < 2.0:
+        state[_POOR] = min(state[_POOR] + 1.0, float(PATIENCE))
+    else:
+        state[_POOR] = max(state[_POOR] - 1.0, 0.0)
+    if state[_POOR] == PATIENCE:
+        state[_IMPOVERISHED] = 1.0
+    elif state[_POOR] <= PATIENCE // 2:
+        state[_IMPOVERISHED] = 0.0
 
 
 @jit
@@ -493,6 +512,8 @@ def watch_rows(first, last, t, kind, channel, value, watch, policy, state, track
             if track.verdict[i] != SCREENED:
                 state[_HEARD] = 1.0
             _hear(i, now, value[i], channel[i], watch, policy, state, track)
+            if np.isfinite(track.effective[i]):
+                _count_particles(track.effective[i], track.ancestors[i], state)
         elif kind[i] == TRUTH:
             _tell(
                 i,
@@ -519,6 +540,8 @@ def watch_rows(first, last, t, kind, channel, value, watch, policy, state, track
             flags |= OUTSIDE
         if state[_MISSED] > 0.0:
             flags |= TRUTH_MISSED
+        if state[_IMPOVERISHED] != 0.0:
+            flags |= IMPOVERISHED
         track.flags[i] = flags
         track.health[i] = _health(i, now, silent, flags, state, policy, track)
 

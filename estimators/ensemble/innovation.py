@@ -22,10 +22,12 @@ from ..numerics.symmetric import factor, gram
 from ..numerics.vectors import add_scaled
 from ..track import FAILED, MISSING, WHITENED
 from .localisation import between_rows
+from .ranks import count_ranks
+from .shared import ensemble
 
 
 @jit
-def observe(context, sensor, u, y, X, a, innovation, innovation_std, score):
+def observe(context, sensor, u, y, state, a, innovation, innovation_std, score):
     """What the members expect of the finite rows of a reading, whitened.
 
     Args:
@@ -33,7 +35,7 @@ def observe(context, sensor, u, y, X, a, innovation, innovation_std, score):
         sensor: Its index.
         u: Inputs (nu,).
         y: The reading (ny,).
-        X: Members (N, nx).
+        state: The filter's state; its rank histogram counts the reading.
         a: The analysis; gets Zᵀ, d, the row of the reading that each of the m is, and the variances r whose product is
             det R.
         innovation: Gets the innovation itself, by row of the reading.
@@ -43,6 +45,7 @@ def observe(context, sensor, u, y, X, a, innovation, innovation_std, score):
     Returns:
         The number m of finite rows.
     """
+    X = ensemble(context, state)
     N = X.shape[0]
     ZT, d, rows, expected = a.ZT, a.d, a.rows, a.expected
     r = sensor_variances(context, sensor)
@@ -80,6 +83,7 @@ def observe(context, sensor, u, y, X, a, innovation, innovation_std, score):
         score[WHITENED + row] = score_of(residual, r[row], square, N)
         d[k] = residual / np.sqrt(r[row])
         a.r[k] = r[row]
+    count_ranks(context, m, ZT, d, rows, state)
     if has_correlated_rows(context, sensor):
         decorrelate(context, sensor, y, m, a)
     return m

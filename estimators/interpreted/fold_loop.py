@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import ModelError
 from ..log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from ..numerics.steps import steps_of
-from ..track import FAILED, MISSING, NONE, WHITENED, Track
+from ..track import ANCESTORS, EFFECTIVE, FAILED, MISSING, NONE, WHITENED, Track
 
 UNSET = int(np.iinfo(np.int64).min)
 """The clock before the first event, which sets it: the prior holds at that time."""
@@ -122,4 +122,6 @@ def run(
             track.dof[i] = int(score[1])
             track.log_likelihood[i] = score[2]
             track.verdict[i] = verdict
+            track.effective[i] = score[EFFECTIVE]
+            track.ancestors[i] = score[ANCESTORS]
             track.whitened[i] = score[WHITENED:]

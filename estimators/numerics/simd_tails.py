@@ -52,9 +52,7 @@ def _beyond(builder: Any, z: Any) -> Any:
 
 
 @intrinsic
-def add_tails(
-    typing_context: Any, n: Any, d: Any, shift: Any, scale: Any, w: Any, tails: Any
-) -> Any:
+def add_tails(typing_context: Any, n: Any, d: Any, shift: Any, scale: Any, w: Any, tails: Any) -> Any:
     """tails[0] += Σ w[:n] Φ(z) and tails[1] += Σ w[:n] Φ(-z) of z = scale (d[:n] + shift)."""
 
     def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
@@ -85,9 +83,7 @@ def add_tails(
             builder,
             n,
             lambda i: add(simd_ir.load(builder, d, i), simd_ir.load(builder, w, i), wide_shift, wide_scale, wide),
-            lambda i: add(
-                builder.load(builder.gep(d, [i])), builder.load(builder.gep(w, [i])), shift, scale, numbers
-            ),
+            lambda i: add(builder.load(builder.gep(d, [i])), builder.load(builder.gep(w, [i])), shift, scale, numbers),
         )
         for total, number in zip(wide, numbers, strict=True):
             summed = simd_ir.sum_of(builder, builder.load(total))

@@ -30,7 +30,8 @@ from .steps import block_of, range_of, work_of
 def weigh_block(context, u, dt, sensor, y, key, value, state, work, number):
     """joint = log w + log p(y | x), and the sums of the residuals' mean and covariance under the predicted weights.
 
-    And of the two tails of each row, see `score_rows`. A density that is NaN counts as zero. The sums are about `first_residual`.
+    And of the two tails of each row, see `score_rows`. A density that is NaN counts as zero. The sums are about
+    `first_residual`.
     """
     n = int(numbers(context)[MEMBERS])
     shared, cloud = work_of(context, work), cloud_of(state, context.nx, n)
