@@ -102,8 +102,9 @@ TOLD = 10
 FEW_PARTICLES = 4.0
 """Effective sample size below which a cloud is poor; it is too if all of it descends from one particle."""
 
-PATIENCE = 20
-"""Readings more, poor than not, from which a cloud is impoverished; it is no more at half as many."""
+PATIENCE = 60
+"""Readings more, poor than not, from which a cloud is impoverished; it is no more at half as many. Three times as many
+as lie between two counts of ancestors: of a sound cloud a count may be 1 by chance, hardly three in a row."""
 
 _QUADRATIC = len(SCALES) + len(SHIFTS) + len(CORRELATIONS)
 TESTS = _QUADRATIC + 3

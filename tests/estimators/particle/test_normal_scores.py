@@ -224,7 +224,7 @@ def test_a_poor_cloud_is_told():
     rng = np.random.default_rng(5)
     for variance, poor in ((1e-6, True), (0.3, False)):
         model = scalar(sensors=(Sensor("y", (Row("y", "m", variance),), h=itself),), f=still)
-        values = 2.0 + np.cumsum(rng.normal(0, np.sqrt(0.3), 60)) + rng.normal(0, np.sqrt(variance), 60)
+        values = 2.0 + np.cumsum(rng.normal(0, np.sqrt(0.3), 100)) + rng.normal(0, np.sqrt(variance), 100)
         tuning = replace(Tuning.of(model).with_options({"particles": 300}), gate=None)
         log = log_of(1, *((1.0 * k, READING, value) for k, value in enumerate(values)))
         growing = Fold("pf", model, tuning, log)
