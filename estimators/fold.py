@@ -16,6 +16,7 @@ import numpy as np
 
 from .compiled.context import context_of
 from .compiled.model import CompiledModel, compile_model
+from .diagnostics.account import spread_ratio
 from .diagnostics.evidence import fresh, no_baseline, watched
 from .diagnostics.failure_cause import Estimate, around, cause, failures, questions
 from .diagnostics.field_pictures import Pictures
@@ -212,6 +213,17 @@ class Fold:
     def recoveries(self) -> int:
         """Number of recoveries since the filter started: a cloud of particles that had lost the asset was widened."""
         return 0 if self.estimator.recoveries is None else self.estimator.recoveries(self._state)
+
+    def account(self) -> dict[str, float | list[float]]:
+        """What the filter says of itself: `spread`, see diagnostics/account.py, and what only this kind of it can say.
+
+        Particles: how many there are (`particles`), how many count (`effective`), from how many of `lag` readings ago
+        they descend (`ancestors`), how often they were resampled and recovered. Ensembles: `members`, and the counts of
+        the rank histogram (`ranks`).
+        """
+        own = self.estimator.account
+        said = {} if own is None else own(self.options, self._state, self.model.nx)
+        return {"spread": spread_ratio(self.track, self.policy.window), **said}
 
     @property
     def failures(self) -> int:

@@ -17,7 +17,7 @@ from .log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, inlined, jit
 from .numerics.steps import steps_of
 from .screen import any_refused, pass_on, screen_rows, screen_signature
-from .track import MISSING, NONE, SCREENED, WHITENED, track_type
+from .track import ANCESTORS, EFFECTIVE, MISSING, NONE, SCREENED, WHITENED, track_type
 
 
 @jit
@@ -89,6 +89,8 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
         score[0] = np.nan
         score[1] = 0.0
         score[2] = np.nan
+        score[EFFECTIVE] = np.nan
+        score[ANCESTORS] = np.nan
         verdict = NONE
         if what == READING or what == INPUT:
             advance_to(code, context, u, clock[0], t[i], index, state, work)
@@ -140,6 +142,8 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
         track.dof[i] = int(score[1])
         track.log_likelihood[i] = score[2]
         track.verdict[i] = verdict
+        track.effective[i] = score[EFFECTIVE]
+        track.ancestors[i] = score[ANCESTORS]
         for j in range(whitened.shape[1]):
             whitened[i, j] = score[WHITENED + j]
 

@@ -25,8 +25,9 @@ WAITING, TRACKING, SUSPECT, DEGRADED, DIVERGED, STALE = range(6)
 """Health: no reading has come; consistent; consistent no more; a sensor is lost or readings are late; the estimate is
 lost; nothing arrives."""
 
-WHITENED = 3
-"""Where in what a filter scores (NIS, degrees of freedom, log-likelihood) the whitened rows of the reading begin."""
+EFFECTIVE, ANCESTORS, WHITENED = range(3, 6)
+"""Where in what a filter scores, after NIS, degrees of freedom and log-likelihood, the particles that count stand and
+those from which they descend, and where the whitened rows of the reading begin."""
 
 HEALTH_NAMES = ("waiting", "tracking", "suspect", "degraded", "diverged", "stale")
 
@@ -43,6 +44,8 @@ class Track(NamedTuple):
     not Gaussian each row by itself, Φ⁻¹(F(y)). alarms (N, width): bits of the causes that are in alarm after this
     event, by row of the reading or state of the truth; flags: bits of what else is wrong (diagnostics/evidence.py).
     screened (N, ny): bits of `REASONS` for which a row of the reading was refused at the edge.
+    effective: of particles, their effective sample size after a reading that was used, before resampling; ancestors:
+    how many of some readings ago these descend from (particle/lineage.py); NaN elsewhere.
     """
 
     mean: Any
@@ -64,6 +67,8 @@ class Track(NamedTuple):
     alarms: Any
     flags: Any
     screened: Any
+    effective: Any
+    ancestors: Any
 
     @staticmethod
     def allocate(rows: int, nx: int, pairs: int, ny: int, width: int | None = None) -> Track:
@@ -75,7 +80,8 @@ class Track(NamedTuple):
         health = [np.zeros(rows, np.int8) for _ in range(2)]
         evidence = [np.full((rows, ny), np.nan), np.zeros((rows, width or ny), np.int32), np.zeros(rows, np.int64)]
         screened = np.zeros((rows, ny), np.int8)
-        columns: list[Any] = [*matrix, *vectors, *codes, *windowed, *health, *evidence, screened]
+        particles = [np.full(rows, np.nan) for _ in range(2)]
+        columns: list[Any] = [*matrix, *vectors, *codes, *windowed, *health, *evidence, screened, *particles]
         return Track(*columns)
 
     def select(self, index: object) -> Track:
@@ -95,7 +101,9 @@ class Track(NamedTuple):
 Track._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[method-assign, assignment]
 
 _A2, _B2 = types.Array(types.int32, 2, "C"), types.Array(types.int8, 2, "C")
-track_type = types.NamedTuple((F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, F1, B1, B1, F2, _A2, I1, _B2), Track)
+track_type = types.NamedTuple(
+    (F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, F1, B1, B1, F2, _A2, I1, _B2, F1, F1), Track
+)
 
 
 @jit
@@ -122,4 +130,6 @@ def borrowed_columns(track):
         masks(track.alarms.ctypes.data, n, width),
         ints(track.flags.ctypes.data, n),
         flag_rows(track.screened.ctypes.data, n, track.screened.shape[1]),
+        borrowed(track.effective),
+        borrowed(track.ancestors),
     )

@@ -86,6 +86,7 @@ def as_dict(
         "failed": int(np.sum(fold.track.verdict == FAILED)),
         "screened": _screened(twin, counts, fold),
         "failure": _why(fold),
+        "account": {name: said if isinstance(said, list) else number(said) for name, said in fold.account().items()},
         "health": {
             name: float(share)
             for name, share in zip(

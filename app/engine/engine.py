@@ -292,6 +292,7 @@ class Engine:
                     **({"recovered": fold.recoveries()} if fold.recoveries() else {}),
                     **({"silenced": lost} if lost else {}),
                 },
+                account=fold.account(),
                 nis=float(track.nis_mean[last]) if last >= 0 else np.nan,
                 nis_low=float(track.nis_low[last]) if last >= 0 else np.nan,
                 nis_high=float(track.nis_high[last]) if last >= 0 else np.nan,

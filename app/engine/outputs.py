@@ -70,8 +70,9 @@ class Status:
     `t` is the time of the last event (ns), `since` the time when the present health began, `lost` the time from which
     the estimate has not been a number (None if it is one). `model_version` counts up with each maintenance. `clock` is
     that of a live source against this machine's, None while it is not known. `counts` are those of the rows of this
-    revision, and of other things that happened to the twin. `latency_ms` is the 99th percentile from a reading's
-    arrival to its row. `faults` are those that were put into the source, and hold or will.
+    revision, and of other things that happened to the twin. `account` is what the filter says of itself (see
+    `Fold.account`). `latency_ms` is the 99th percentile from a reading's arrival to its row. `faults` are those that
+    were put into the source, and hold or will.
     """
 
     estimator: str
@@ -86,6 +87,7 @@ class Status:
     model_version: int
     clock: ClockFit | None
     counts: dict[str, int]
+    account: dict[str, float | list[float]]
     nis: float
     nis_low: float
     nis_high: float

@@ -71,6 +71,7 @@ def status_json(engine: Running) -> dict[str, Any]:
         if status.clock is None
         else {key: _plain(value) for key, value in status.clock._asdict().items()},
         "counts": dict(status.counts),
+        "account": _plain(status.account),
         "paused": status.paused,
         "finished": status.finished,
         "speed": _plain(status.speed),
@@ -90,6 +91,8 @@ def _plain(value: Any) -> Any:
     """JSON has no infinity and no NaN."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
     if value is None or isinstance(value, (bool, str, int)):
         return value
     number = float(value)

@@ -16,8 +16,8 @@ from ..model.state_space import Input, State, StateSpaceModel
 from ..track import DIVERGED, GATED, HEALTH_NAMES, STALE, USED, Track
 from ..tuning import Tuning
 from .effects import Effect, effects, onset
-from .evidence import AGREEING, DISAGREEING, MISSED, OUTSIDE, REFUSED, SENSORS, STUCK
-from .words import of_sensor, of_silence, of_truth, of_twin, since
+from .evidence import AGREEING, DISAGREEING, IMPOVERISHED, MISSED, OUTSIDE, REFUSED, SENSORS, STUCK
+from .words import of_particles, of_sensor, of_silence, of_truth, of_twin, since
 
 JOINED = 30
 """Readings without an alarm after which another is another episode."""
@@ -79,6 +79,7 @@ def episodes(fold: Folded) -> list[Episode]:
         *_of_silence(fold),
         *_of_truth(fold),
         *_of_ranges(fold),
+        *_of_particles(fold),
         *_of_twin(fold),
     ]
     return sorted(found, key=lambda episode: (episode.start, episode.subject))
@@ -100,8 +101,7 @@ def standardised(fold: Folded, rows: np.ndarray, k: int) -> np.ndarray:
     track = fold.track
     e = track.innovation[rows, k] / track.innovation_std[rows, k]
     if fold.marginal:
-        own = track.whitened[rows, k]
-        e = np.where(np.isfinite(own), own, e)
+        e = track.whitened[rows, k]
     verdict = track.verdict[rows]
     return np.where((verdict == USED) | (verdict == GATED), e, np.nan)
 
@@ -290,6 +290,27 @@ def _outside(item: State | Input, value: np.ndarray, t: np.ndarray) -> Iterator[
             unit=item.unit,
             text=f"{item.name} is {size:.4g} {item.unit}, outside {low:g} to {high:g} where the model was fitted, "
             f"{since(start)}: bands hold only inside; use a model fitted there",
+        )
+
+
+def _of_particles(fold: Folded) -> Iterator[Episode]:
+    t, track = fold.log.t[: fold.n], fold.track
+    for begin, end, lasts in _runs(track.flags & IMPOVERISHED != 0):
+        effective = track.effective[begin:end]
+        effective = effective[np.isfinite(effective)]
+        if not effective.size:
+            continue
+        start, size = t[begin] * 1e-9, float(np.median(effective))
+        yield Episode(
+            start=start,
+            end=None if lasts else t[min(end, fold.n - 1)] * 1e-9,
+            subject="twin",
+            cause="impoverished",
+            size=size,
+            low=float(np.quantile(effective, 0.025)),
+            high=float(np.quantile(effective, 0.975)),
+            unit="",
+            text=of_particles(size, float(np.nanmin(track.ancestors[begin:end])), start),
         )
 
 

@@ -60,9 +60,9 @@ NARROW, WIDE, HIGH, LOW, CORRELATED, ALTERNATING, SPIKY, REFUSED, STUCK, DISAGRE
 LOST = REFUSED | STUCK
 """Causes for which a sensor tells nothing more."""
 
-OUTSIDE, TRUTH_MISSED = 1 << 60, 1 << 61
-"""Bits of `Track.flags` beside those of the sensors that are silent: outside the range in which the model was fitted;
-the truth that was told is missed."""
+IMPOVERISHED, OUTSIDE, TRUTH_MISSED = 1 << 59, 1 << 60, 1 << 61
+"""Bits of `Track.flags` beside those of the sensors that are silent: a few particles carry the estimate; outside the
+range in which the model was fitted; the truth that was told is missed."""
 
 SENSORS = 58
 """Sensors that have a bit of their own in `Track.flags`; the others share the last."""
@@ -98,6 +98,13 @@ MISSES, MISSES_NO_MORE = 4.5, 3.0
 """Root mean square of (estimate - truth) / σ, over about `TOLD` tellings, from which a truth is missed, and no more."""
 
 TOLD = 10
+
+FEW_PARTICLES = 4.0
+"""Effective sample size below which a cloud is poor; it is too if all of it descends from one particle."""
+
+PATIENCE = 60
+"""Readings more, poor than not, from which a cloud is impoverished; it is no more at half as many. Three times as many
+as lie between two counts of ancestors: of a sound cloud a count may be 1 by chance, hardly three in a row."""
 
 _QUADRATIC = len(SCALES) + len(SHIFTS) + len(CORRELATIONS)
 TESTS = _QUADRATIC + 3
@@ -142,8 +149,8 @@ SENSOR = JOINT + 8
 """Numbers in the state for each sensor."""
 
 # The twin's part.
-_SUSPECTS, _GONE, _NEXT_DUE, _BEGUN, _HEARD, _MISSED, _QUIET = range(7)
-TWIN = 7
+_SUSPECTS, _GONE, _NEXT_DUE, _BEGUN, _HEARD, _MISSED, _QUIET, _POOR, _IMPOVERISHED = range(9)
+TWIN = 9
 
 # A shown state's part: the mean square of its standardised errors, how often it was told, whether it is missed. After
 # them the inputs that hold.
@@ -441,7 +448,7 @@ def _forget(state, sensors, rows, states):
         own[_RAW] = own[_BEFORE] = np.nan
     begin = TWIN + sensors * SENSOR + rows * ROW
     state[begin : begin + states * STATE] = 0.0
-    state[_SUSPECTS] = state[_GONE] = state[_MISSED] = 0.0
+    state[_SUSPECTS] = state[_GONE] = state[_MISSED] = state[_POOR] = state[_IMPOVERISHED] = 0.0
 
 
 @inlined
@@ -491,9 +498,10 @@ def _hear(i, now, y, s, context, policy, state, track):
             said = _add(each, AT_REFUSALS, ratio, h, base[3 + AT_REFUSALS])
             mask = mask & ~REFUSED | _alarm(said, REFUSED, before)
         if judged and not screened:
-            e = track.innovation[i, k] / track.innovation_std[i, k]
-            if context.marginal != 0 and np.isfinite(track.whitened[i, k]):
-                e = track.whitened[i, k]
+            # A prediction that is not Gaussian says nothing where its distribution function is not known.
+            e = track.whitened[i, k]
+            if context.marginal == 0:
+                e = track.innovation[i, k] / track.innovation_std[i, k]
             if np.isfinite(e):
                 mask = mask & LOST | _weigh(each, e, h, base, before)
         if k == 0:
@@ -502,6 +510,19 @@ def _hear(i, now, y, s, context, policy, state, track):
         track.alarms[i, k] = mask
         state[_SUSPECTS] += (mask != 0) - (before != 0)
         state[_GONE] += (mask & LOST != 0) - (before & LOST != 0)
+
+
+@jit
+def _count_particles(effective, ancestors, state):
+    """Whether a cloud is impoverished, after another reading that it used."""
+    if effective < FEW_PARTICLES or ancestors < 2.0:
+        state[_POOR] = min(state[_POOR] + 1.0, float(PATIENCE))
+    else:
+        state[_POOR] = max(state[_POOR] - 1.0, 0.0)
+    if state[_POOR] == PATIENCE:
+        state[_IMPOVERISHED] = 1.0
+    elif state[_POOR] <= PATIENCE // 2:
+        state[_IMPOVERISHED] = 0.0
 
 
 @jit
@@ -568,6 +589,8 @@ def watch_rows(first, last, t, kind, channel, value, context, policy, state, tra
             if not _is_copy(i, track):
                 y = floats(value[i:].ctypes.data, value.shape[1])
                 _hear(i, now, y, channel[i], context, policy, state, track)
+            if np.isfinite(track.effective[i]):
+                _count_particles(track.effective[i], track.ancestors[i], state)
         elif kind[i] == TRUTH:
             truth = floats(value[i:].ctypes.data, min(width, context.nx - channel[i]))
             _tell(i, channel[i], truth, context, state, track)
@@ -588,6 +611,8 @@ def watch_rows(first, last, t, kind, channel, value, context, policy, state, tra
             flags |= OUTSIDE
         if state[_MISSED] > 0.0:
             flags |= TRUTH_MISSED
+        if state[_IMPOVERISHED] != 0.0:
+            flags |= IMPOVERISHED
         track.flags[i] = flags
         track.health[i] = _health(i, now, silent, flags, state, policy, track)
 

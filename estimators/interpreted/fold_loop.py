@@ -15,7 +15,7 @@ from ..errors import ModelError
 from ..log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from ..numerics.steps import steps_of
 from ..screen import pass_on
-from ..track import FAILED, MISSING, NONE, SCREENED, WHITENED, Track
+from ..track import ANCESTORS, EFFECTIVE, FAILED, MISSING, NONE, SCREENED, WHITENED, Track
 
 UNSET = int(np.iinfo(np.int64).min)
 """The clock before the first event, which sets it: the prior holds at that time."""
@@ -128,6 +128,8 @@ def run(
             track.dof[i] = int(score[1])
             track.log_likelihood[i] = score[2]
             track.verdict[i] = verdict
+            track.effective[i] = score[EFFECTIVE]
+            track.ancestors[i] = score[ANCESTORS]
             track.whitened[i] = score[WHITENED:]
 
 
