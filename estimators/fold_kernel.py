@@ -9,14 +9,17 @@ import numpy as np
 from numba import types
 
 from .compiled.context import context_type, prior, sensor_rows
+from .compiled.verdict import limit_of
 from .diagnostics.evidence import watch_rows, watch_signature
 from .diagnostics.health import assess, assess_signature
 from .estimator import call_describe, call_predict, call_start, call_update, code_type
+from .gate.doubt import forget, note, rule_type
+from .gate.soften import soften
 from .interpreted.fold_loop import LONGEST, UNSET
 from .log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, inlined, jit
 from .numerics.steps import steps_of
-from .track import MISSING, NONE, WHITENED, track_type
+from .track import GATED, MISSING, NONE, USED, WHITENED, track_type
 
 
 @jit
@@ -53,8 +56,14 @@ def exchange(r, own, kept):
 
 
 @jit
-def run(code, context, first, start, end, t, kind, channel, value, width, clock, u, state, spare, work, score, track):
+def run(
+    code, context, rule, first, start, end, t, kind, channel, value, width,
+    clock, u, state, doubt, spare, work, score, track,
+):  # fmt: skip
     """Fold events `start` to `end`: clock (1,), u (nu,) and state move on in place, one track row is filled an event.
+
+    Stops behind the first reading that asks for a decision on its sensor (gate/doubt.py), and returns its row; -1 if
+    none does.
 
     A tick, a truth or a mark is a query: it is answered from a copy of the state, so it never changes the estimate.
     Variances that a reading brings (columns of `value` from `width` on) take the place of the tuned R while it is
@@ -86,6 +95,7 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
         score[1] = 0.0
         score[2] = np.nan
         verdict = NONE
+        asked = False
         if what == READING or what == INPUT:
             advance_to(code, context, u, clock[0], t[i], index, state, work)
             clock[0] = t[i]
@@ -111,13 +121,31 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
                     innovation_std[i],
                     score,
                 )
+                if verdict == GATED and rule.soft != 0:
+                    verdict = soften(
+                        code,
+                        context,
+                        u,
+                        channel[i],
+                        value[i],
+                        index,
+                        state,
+                        work,
+                        innovation[i],
+                        innovation_std[i],
+                        score,
+                    )
                 if variances:
                     for k in range(rows):
                         r[k] = kept[k]
+                if verdict == GATED or verdict == USED:
+                    beyond = score[0] > limit_of(context, channel[i], int(score[1]))
+                    asked = note(doubt[channel[i]], rule.most, beyond, index, float(t[i]))
             call_describe(code.describe, context, state, mean[i], std[i], cross[i])
         elif what == RESET:
             prior_mean, prior_cov = prior(context)
             call_start(code.start, context, prior_mean, prior_cov, state)
+            forget(doubt)
             clock[0] = t[i]
             call_describe(code.describe, context, state, mean[i], std[i], cross[i])
         else:
@@ -135,6 +163,9 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
         track.verdict[i] = verdict
         for j in range(whitened.shape[1]):
             whitened[i, j] = score[WHITENED + j]
+        if asked:
+            return i
+    return -1
 
 
 @jit
@@ -145,8 +176,8 @@ def begin(code, context, mean, cov, state):
 
 I4 = types.int32[::1]
 begin_signature = types.void(code_type, context_type, F1, F2, F1)
-run_signature = types.void(
-    code_type, context_type, i64, i64, i64, I1, B1, I4, F2, i64, I1, F1, F1, F1, F1, F1, track_type
+run_signature = i64(
+    code_type, context_type, rule_type, i64, i64, i64, I1, B1, I4, F2, i64, I1, F1, F1, F2, F1, F1, F1, track_type
 )
 
 

@@ -19,6 +19,9 @@ WAITING, TRACKING, SUSPECT, DEGRADED, DIVERGED, STALE = range(6)
 """Health: no reading has come; consistent; consistent no more; a sensor is lost or readings are late; the estimate is
 lost; nothing arrives."""
 
+LOG_LIKELIHOOD = 2
+"""Where in what a filter scores its log-likelihood is."""
+
 WHITENED = 3
 """Where in what a filter scores (NIS, degrees of freedom, log-likelihood) the whitened rows of the reading begin."""
 

@@ -17,6 +17,8 @@ from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.score import Score, score
 from estimators.errors import ConfigError, SourceError
 from estimators.fold import Fold
+from estimators.gate.reopening import Decision
+from estimators.gate.stories import softened
 from estimators.interface.table import table_of
 from estimators.log import Log
 from estimators.track import FAILED, HEALTH_NAMES, USED, Track
@@ -31,6 +33,10 @@ from .remarks import remarking
 
 if TYPE_CHECKING:
     from .arguments import Fold as Arguments
+
+
+DECISIONS = 10
+"""On sensors that stayed refused, that are printed at most: the last ones; --json has all."""
 
 
 def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
@@ -134,6 +140,8 @@ def _as_dict(twin: Twin, result: Score, seconds: float, counts: Counter[str], fo
         "stale": counts["stale"],
         "conditioned": sum(count for key, count in counts.items() if key.startswith("condition ")),
         "gated": result.gated,
+        "softened": _softened(fold),
+        "gate": [_decision(decision) for decision in fold.decisions],
         "missing": result.missing,
         "failed": int(np.sum(fold.track.verdict == FAILED)),
         "failure": _why(fold),
@@ -145,6 +153,17 @@ def _as_dict(twin: Twin, result: Score, seconds: float, counts: Counter[str], fo
         },
         "seconds_per_event": seconds,
     }
+
+
+def _softened(fold: Fold) -> int:
+    """How many readings lay beyond a soft gate and counted with their noise inflated."""
+    return int(np.sum(softened(fold.track, fold.gate_limits)))
+
+
+def _decision(decision: Decision) -> dict[str, Any]:
+    """A decision on a sensor that stayed refused; times in seconds of the log, evidence null where none was weighed."""
+    values = decision._asdict()
+    return {**values, "evidence": float(decision.evidence) if np.isfinite(decision.evidence) else None}
 
 
 def _why(fold: Fold) -> str | None:
@@ -187,6 +206,7 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], fold
     rows += [
         ("log-likelihood", f"{result.log_likelihood:.2f}"),
         ("gated", f"{result.gated}"),
+        *([("softened", f"{_softened(fold)}")] if fold.tuning.gate_kind == "soft" else []),
         ("missing", f"{result.missing}"),
     ]
     failed = int(np.sum(track.verdict == FAILED))
@@ -215,6 +235,7 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], fold
     )
     rows += [
         ("final variances", variances),
+        *((f"at {decision.time:.1f} s", decision.text) for decision in fold.decisions[-DECISIONS:]),
         ("health at the end", HEALTH_NAMES[int(track.health[-1])]),
         ("time per event", f"{1e6 * seconds:.2f} µs"),
     ]

@@ -11,10 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from ..compiled.verdict import limit_of
 from ..errors import ModelError
+from ..gate.doubt import Rule, forget, note
+from ..gate.soften import inflation
 from ..log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from ..numerics.steps import steps_of
-from ..track import FAILED, MISSING, NONE, WHITENED, Track
+from ..track import FAILED, GATED, LOG_LIKELIHOOD, MISSING, NONE, USED, WHITENED, Track
 
 UNSET = int(np.iinfo(np.int64).min)
 """The clock before the first event, which sets it: the prior holds at that time."""
@@ -49,6 +52,7 @@ def _advance_to(
 def run(
     code: Any,
     context: Any,
+    rule: Rule,
     first: int,
     start: int,
     end: int,
@@ -60,11 +64,12 @@ def run(
     clock: np.ndarray,
     u: np.ndarray,
     state: np.ndarray,
+    doubt: np.ndarray,
     spare: np.ndarray,
     work: np.ndarray,
     score: np.ndarray,
     track: Track,
-) -> None:
+) -> int:
     """Fold events `start` to `end` as the kernel does; see `fold.run`.
 
     Where a model's own Python fails, the view counts it and the fold goes on: a reading has failed, an estimate that
@@ -80,6 +85,7 @@ def run(
             score[:] = np.nan
             score[1] = 0.0
             verdict = NONE
+            asked = False
             told = state
             known = True
             if what in (READING, INPUT):
@@ -94,6 +100,23 @@ def run(
                             verdict = code.update(
                                 context, u, sensor, value[i], index, state, work, innovation, innovation_std, score
                             )
+                            if verdict == GATED and rule.soft:
+                                verdict = _soften(
+                                    code,
+                                    context,
+                                    u,
+                                    sensor,
+                                    value[i],
+                                    index,
+                                    state,
+                                    work,
+                                    innovation,
+                                    innovation_std,
+                                    score,
+                                )
+                        if verdict in (GATED, USED):
+                            beyond = score[0] > limit_of(context.context, sensor, int(score[1]))
+                            asked = note(doubt[sensor], rule.most, beyond, index, float(now))
                 except ModelError as error:
                     context.failed(error)
                     verdict = FAILED if what == READING else NONE
@@ -102,6 +125,7 @@ def run(
                     np.copyto(u, given, where=np.isfinite(given))
             elif what == RESET:
                 code.start(context, *context.prior(), state)
+                forget(doubt)
                 clock[0] = now
             else:
                 if clock[0] == UNSET:
@@ -123,3 +147,33 @@ def run(
             track.log_likelihood[i] = score[2]
             track.verdict[i] = verdict
             track.whitened[i] = score[WHITENED:]
+            if asked:
+                return i
+    return -1
+
+
+def _soften(
+    code: Any,
+    context: Any,
+    u: np.ndarray,
+    sensor: int,
+    y: np.ndarray,
+    index: int,
+    state: np.ndarray,
+    work: np.ndarray,
+    innovation: np.ndarray,
+    innovation_std: np.ndarray,
+    score: np.ndarray,
+) -> int:
+    """As gate/soften.py does."""
+    w = inflation(context.context, sensor, y, innovation, score[0], int(score[1]))
+    if not w < np.inf:
+        return GATED
+    nu, std, scored = innovation.copy(), innovation_std.copy(), score.copy()
+    with context.brought(sensor, w * context.variances(sensor)):
+        verdict = int(code.update(context, u, sensor, y, index, state, work, innovation, innovation_std, score))
+    innovation[:], innovation_std[:] = nu, std
+    if verdict == USED:
+        scored[LOG_LIKELIHOOD] = score[LOG_LIKELIHOOD]
+    score[:] = scored
+    return verdict
