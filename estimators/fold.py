@@ -373,7 +373,7 @@ class Fold:
         prior = self._held["prior_cov"]
         diagonals = [matrix[0] if len(matrix) == 1 else np.diag(matrix) for matrix in (cov, prior)]
         H = self._slope(sensor, mean, u)
-        added = widening(*diagonals, H, self._rows.innovation[start, : len(H)])
+        added = widening(diagonals[0], diagonals[1], H, self._rows.innovation[start, : len(H)])
         cov = cov + (added if len(cov) == 1 else np.diag(added))
         self._begin(self._code, self._context, np.ascontiguousarray(mean), cov, state)
         self._held["gate"][sensor] = np.inf

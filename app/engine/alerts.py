@@ -92,7 +92,7 @@ class Alerts:
         return log.first + end, int(log.t[end])
 
     def _look_at_decisions(self, fold: Fold) -> None:
-        """Tell what was decided of sensors that stayed refused; nothing twice though a late reading has it done again."""
+        """Tell what was decided of sensors that stayed refused; nothing twice, though a late reading decides again."""
         new = [decision for decision in fold.decisions if decision.time > self._decided]
         for decision in new:
             level = "info" if decision.outcome == AGREES else "warn"

@@ -19,8 +19,9 @@ class SetEstimator:
 
 @dataclass(frozen=True)
 class SetTuning:
-    """Turn one entry of the tuning: `Q.<noise>`, `R.<row>`, `p.<parameter>`, `gate` (None: no gate), `gate.kind` or
-    `gate.reopen` (None: never).
+    """Turn one entry of the tuning: `Q.<noise>`, `R.<row>`, `p.<parameter>`, or one of the gate.
+
+    These are `gate` (None: no gate), `gate.kind` (hard or soft) and `gate.reopen` (None: never).
     """
 
     key: str

@@ -31,6 +31,9 @@ from ..track import GATED, HELD_OUT, USED, Track
 DECISIVE = float(np.log(1000.0))
 """|Δ| from which a story is believed: the one is a thousand times likelier than the other."""
 
+SHARE = 0.01
+"""Of the variance that the prior gives a row: a state with less of it is not widened."""
+
 NAMED = 4
 """States, at most, that a sentence names."""
 
@@ -104,8 +107,10 @@ def weigh(
 def widening(cov: np.ndarray, prior: np.ndarray, H: np.ndarray, innovation: np.ndarray) -> np.ndarray:
     """What to add to P's diagonal: α Σ, of the states that a sensor sees, α so that ν² ≤ α H Σ Hᵀ in every row.
 
-    Σ holds the prior's variances: they say what is believed of the states when nothing is known, one in relation to the
-    other. The NIS is then the number of rows at most.
+    A state is seen that has a share in H Σ Hᵀ. One that hardly moves a reading, as the speed moves a late fix, would be
+    widened in vain: all that knew it better would speak against the second story. Σ holds the prior's variances: they
+    say what is believed of the states when nothing is known, one in relation to the other. The NIS is then the number
+    of rows at most.
 
     Args:
         cov: Diagonal of P (nx,), which takes the place of Σ where that holds nothing that the sensor sees.
@@ -116,10 +121,11 @@ def widening(cov: np.ndarray, prior: np.ndarray, H: np.ndarray, innovation: np.n
     Returns:
         Variances (nx,).
     """
-    seen = np.any(H != 0.0, axis=0)
     nu = np.where(np.isfinite(innovation), innovation, 0.0)
     for variances in (prior, cov):
-        added = np.where(seen & np.isfinite(variances), variances, 0.0)
+        added = np.where(np.isfinite(variances), variances, 0.0)
+        parts = np.square(H) * added
+        added[~np.any(parts > SHARE * parts.sum(axis=1)[:, None], axis=0)] = 0.0
         spread = np.square(H) @ added
         reached = (spread > 0.0) & (nu != 0.0)
         if np.any(reached):
@@ -152,7 +158,7 @@ def told(
         return f"{begun}; the sensor is wrong, {why}: it stays refused, asked again in {wait:g} s"
     if outcome == DOUBTED:
         return (
-            f"{begun}; it or the twin is wrong, nothing else tells which: it is believed {reopen:g} s after the first"
+            f"{begun}; it or the twin is wrong, nothing tells which: it is believed {reopen:g} s after the first"
         )
     most = np.argsort(-added, kind="stable")[:NAMED]
     units = {state.name: state.unit for state in model.shown_states}
@@ -164,5 +170,5 @@ def told(
     if never_agreed:
         return f"{begun}, from its first; nothing confirms where the twin began: {wide}"
     return (
-        f"{begun}; nothing else told for {reopen:g} s whether it or the twin is wrong, so the asset is believed: {wide}"
+        f"{begun}; nothing told for {reopen:g} s whether it or the twin is wrong: believed, {wide}"
     )
