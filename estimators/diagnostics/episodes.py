@@ -7,19 +7,17 @@ show since its onset names the cause (effects.py). ALARMS.md says for each cause
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ..log import INPUT, READING, TRUTH, truth_of
-from ..model.state_space import Input, State
-from ..track import DIVERGED, GATED, HEALTH_NAMES, STALE, USED
+from ..log import INPUT, READING, TRUTH, Log, truth_of
+from ..model.state_space import Input, State, StateSpaceModel
+from ..track import DIVERGED, GATED, HEALTH_NAMES, STALE, USED, Track
+from ..tuning import Tuning
 from .effects import Effect, effects, onset
 from .evidence import AGREEING, DISAGREEING, MISSED, OUTSIDE, REFUSED, SENSORS, STUCK
 from .words import of_sensor, of_silence, of_truth, of_twin, since
-
-if TYPE_CHECKING:
-    from ..fold import Fold
 
 JOINED = 30
 """Readings without an alarm after which another is another episode."""
@@ -36,8 +34,8 @@ class Episode(NamedTuple):
     """Something that was wrong.
 
     `start` and `end` in seconds of the log; `end` None while it lasts. `subject`: a sensor, one of its rows, a state,
-    an input, or "twin". `cause`: a key of ALARMS.md. `size` in `unit` with its 95 % interval, `low` to `high` (NaN where
-    there is none). `text`: one sentence with the remedy.
+    an input, or "twin". `cause`: a key of ALARMS.md. `size` in `unit` with its 95 % interval, `low` to `high` (NaN
+    where there is none). `text`: one sentence with the remedy.
     """
 
     start: float
@@ -51,7 +49,27 @@ class Episode(NamedTuple):
     text: str
 
 
-def episodes(fold: Fold) -> list[Episode]:
+class Folded(Protocol):
+    """What episodes are read from: a Fold, or whatever has its log and track.
+
+    `marginal`: whether `Track.whitened` holds each row by itself, as for predictions that are not Gaussian.
+    """
+
+    @property
+    def model(self) -> StateSpaceModel: ...  # noqa: D102
+    @property
+    def tuning(self) -> Tuning: ...  # noqa: D102
+    @property
+    def log(self) -> Log: ...  # noqa: D102
+    @property
+    def track(self) -> Track: ...  # noqa: D102
+    @property
+    def n(self) -> int: ...  # noqa: D102
+    @property
+    def marginal(self) -> bool: ...  # noqa: D102
+
+
+def episodes(fold: Folded) -> list[Episode]:
     """All episodes of a fold, in the order of their start."""
     found = [
         *_of_sensors(fold),
@@ -74,18 +92,18 @@ def _runs(on: np.ndarray, joined: int = 0) -> Iterator[tuple[int, int, bool]]:
         yield int(begin), int(end), bool(on.size - end <= joined)
 
 
-def standardised(fold: Fold, rows: np.ndarray, k: int) -> np.ndarray:
+def standardised(fold: Folded, rows: np.ndarray, k: int) -> np.ndarray:
     """e of row k of the readings at `rows`, as the bank sees it; NaN where there is none."""
     track = fold.track
     e = track.innovation[rows, k] / track.innovation_std[rows, k]
-    if fold.estimator.family in ("particle", "ensemble"):
+    if fold.marginal:
         own = track.whitened[rows, k]
         e = np.where(np.isfinite(own), own, e)
     verdict = track.verdict[rows]
     return np.where((verdict == USED) | (verdict == GATED), e, np.nan)
 
 
-def _of_sensors(fold: Fold) -> Iterator[Episode]:
+def _of_sensors(fold: Folded) -> Iterator[Episode]:
     log, track, model = fold.log, fold.track, fold.model
     kind, channel = log.kind[: fold.n], log.channel[: fold.n]
     for s, sensor in enumerate(model.sensors):
@@ -95,7 +113,7 @@ def _of_sensors(fold: Fold) -> Iterator[Episode]:
             yield _of_sensor(fold, s, rows, masks, begin, end, lasts)
 
 
-def _of_sensor(fold: Fold, s: int, rows: np.ndarray, masks: np.ndarray, begin: int, end: int, lasts: bool) -> Episode:
+def _of_sensor(fold: Folded, s: int, rows: np.ndarray, masks: np.ndarray, begin: int, end: int, lasts: bool) -> Episode:
     """The episode of the readings `begin` to `end` of a sensor, whose events are `rows`."""
     log, track, model = fold.log, fold.track, fold.model
     said = np.bitwise_or.reduce(masks[begin:end])
@@ -140,7 +158,7 @@ def _of_sensor(fold: Fold, s: int, rows: np.ndarray, masks: np.ndarray, begin: i
 
 
 def _most_telling(
-    fold: Fold, rows: np.ndarray, said: np.ndarray, begin: int, end: int
+    fold: Folded, rows: np.ndarray, said: np.ndarray, begin: int, end: int
 ) -> tuple[int, int, list[Effect]]:
     """The row that shows most of what is wrong, the reading since when, and what it shows, the likeliest first."""
     first = max(0, begin - LOOKED_AT)
@@ -169,7 +187,7 @@ def _same_since(values: np.ndarray, at: int) -> int:
     return int(others[-1]) + 1 if others.size else 0
 
 
-def _of_silence(fold: Fold) -> Iterator[Episode]:
+def _of_silence(fold: Folded) -> Iterator[Episode]:
     log, model = fold.log, fold.model
     t, flags = log.t[: fold.n], fold.track.flags
     if not flags.any():
@@ -193,7 +211,7 @@ def _of_silence(fold: Fold) -> Iterator[Episode]:
             )
 
 
-def _of_truth(fold: Fold) -> Iterator[Episode]:
+def _of_truth(fold: Folded) -> Iterator[Episode]:
     log, model, track = fold.log, fold.model, fold.track
     kind = log.kind[: fold.n]
     told = np.flatnonzero(kind == TRUTH)
@@ -229,7 +247,7 @@ def _of_truth(fold: Fold) -> Iterator[Episode]:
             )
 
 
-def _of_ranges(fold: Fold) -> Iterator[Episode]:
+def _of_ranges(fold: Folded) -> Iterator[Episode]:
     log, model, track = fold.log, fold.model, fold.track
     t = log.t[: fold.n]
     if not np.any(track.flags & OUTSIDE):
@@ -265,7 +283,7 @@ def _outside(item: State | Input, value: np.ndarray, t: np.ndarray) -> Iterator[
         )
 
 
-def _of_twin(fold: Fold) -> Iterator[Episode]:
+def _of_twin(fold: Folded) -> Iterator[Episode]:
     t, health = fold.log.t[: fold.n], fold.track.health
     for code in (STALE, DIVERGED):
         for begin, end, lasts in _runs(health == code):

@@ -177,3 +177,18 @@ def _soften(
         scored[LOG_LIKELIHOOD] = score[LOG_LIKELIHOOD]
     score[:] = scored
     return verdict
+
+
+def run_and_judge(judge: Any, seen: np.void, *given: Any) -> int:
+    """Fold events, and judge their rows as those of a compiled filter are.
+
+    Args:
+        judge: The compiled judgement.
+        seen: The context that `View` stands for.
+        given: As the kernel's.
+    """
+    *folded, policy, bounds, evidence = given
+    _, _, _, _, start, end, t, kind, channel, value, *_, track = folded
+    asking = run(*folded)
+    judge(start, end if asking < 0 else asking + 1, t, kind, channel, value, seen, policy, bounds, evidence, track)
+    return asking
