@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from ..diagnostics.words import since
-from ..log import READING
-from ..track import GATED, USED
+from ..log import READING, Log
+from ..model.state_space import StateSpaceModel
+from ..snapshots import Story
+from ..track import GATED, USED, Track
 from .doubt import ASKED, DUE, EVER, FROM, PASSED, RUN, SINCE, WAIT
 from .stories import AGREES, BELIEVED, ISOLATED, REOPENED, Evidence, decided, told, weigh
-
-if TYPE_CHECKING:
-    from ..fold import Fold
 
 STRETCH = 2048
 """Events, at most, over which two stories are compared: the work of a decision is bounded."""
@@ -45,7 +44,25 @@ class Decision(NamedTuple):
     text: str
 
 
-def decide(fold: Fold, row: int, doubt: np.ndarray, reopen: float) -> tuple[Decision | None, bool]:
+class Told(Protocol):
+    """What a decision needs of a fold."""
+
+    model: StateSpaceModel
+    log: Log
+    gate_limits: np.ndarray
+
+    @property
+    def track(self) -> Track:
+        """The rows folded so far."""
+
+    def second_story(self, start: int, stop: int, sensor: int) -> Story:
+        """The events from `start` to `stop` folded apart, as if the twin had been wrong before."""
+
+    def go_on_with(self, story: Story) -> None:
+        """Take its state for one's own."""
+
+
+def decide(fold: Told, row: int, doubt: np.ndarray, reopen: float) -> tuple[Decision | None, bool]:
     """Decide what to do about the sensor whose reading in a row of the track asks for it.
 
     Args:
@@ -91,7 +108,7 @@ def decide(fold: Fold, row: int, doubt: np.ndarray, reopen: float) -> tuple[Deci
     return Decision(index, time, name, outcome, run, begun * 1e-9, evidence.total, evidence.witnesses, text), changed
 
 
-def _first_refused(fold: Fold, row: int, sensor: int, since: int) -> int:
+def _first_refused(fold: Told, row: int, sensor: int, since: int) -> int:
     """The first refused reading of a sensor from row `since` on, of those within reach before `row`."""
     log, begin = fold.log, max(since, row - STRETCH, 0)
     verdict, channel = fold.track.verdict[begin : row + 1], log.channel[begin : row + 1]

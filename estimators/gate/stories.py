@@ -157,9 +157,7 @@ def told(
         why = "its readings contradict one another" if alone else f"{others}, contradict it"
         return f"{begun}; the sensor is wrong, {why}: it stays refused, asked again in {wait:g} s"
     if outcome == DOUBTED:
-        return (
-            f"{begun}; it or the twin is wrong, nothing tells which: it is believed {reopen:g} s after the first"
-        )
+        return f"{begun}; it or the twin is wrong, nothing tells which: it is believed {reopen:g} s after the first"
     most = np.argsort(-added, kind="stable")[:NAMED]
     units = {state.name: state.unit for state in model.shown_states}
     names = [model.state_names[j] for j in most if added[j] > 0.0]
@@ -169,6 +167,4 @@ def told(
         return f"{begun}; the twin was wrong, {others}, agree with it: {wide}"
     if never_agreed:
         return f"{begun}, from its first; nothing confirms where the twin began: {wide}"
-    return (
-        f"{begun}; nothing told for {reopen:g} s whether it or the twin is wrong: believed, {wide}"
-    )
+    return f"{begun}; nothing told for {reopen:g} s whether it or the twin is wrong: believed, {wide}"

@@ -186,5 +186,3 @@ def test_what_follows_from_the_evidence():
     assert decided(Evidence(6.0, 3, 0.0), False, False) == "doubted"
     assert decided(Evidence(-6.0, 3, 0.0), False, True) == "believed"
     assert decided(Evidence(-6.0, 3, 0.0), True, False) == "believed"
-
-

@@ -47,7 +47,7 @@ def test_the_further_off_the_less_it_moves():
 
 @pytest.mark.parametrize("name", ["pf", "enkf"])
 def test_members_move_as_the_closed_form_says(name):
-    """Within four Monte Carlo deviations of a mean of N draws of the belief; the gate's g/y is 0.38 of its deviation."""
+    """Within four Monte Carlo deviations of a mean of N draws of the belief."""
     growing = one_reading(name, SOFT)
     members = growing.options.get("particles") or growing.options["members"]
     assert growing.track.verdict[0] == USED
