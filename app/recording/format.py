@@ -76,6 +76,8 @@ def base_to_json(base: Base | None) -> str:
         return "null"
     moments = {"mean": base.mean.tolist(), "cov": base.cov.tolist(), "clock": base.clock, "u": base.u.tolist()}
     moments["first"] = base.first
+    if base.evidence is not None:
+        moments["evidence"] = _packed(base.evidence)
     if base.doubt is not None:
         moments["doubt"] = _packed(base.doubt)
     if base.state is None:
@@ -105,6 +107,7 @@ def base_from_json(text: str) -> Base | None:
         values.get("estimator", ""),
         _unpacked(values.get("state")),
         int(values.get("first", 0)),
+        evidence=_unpacked(values.get("evidence")),
         doubt=None if doubt is None else doubt.reshape(-1, REMEMBERED),
     )
 

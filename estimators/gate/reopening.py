@@ -14,14 +14,14 @@ from ..track import GATED, USED, Track
 from .doubt import ASKED, DUE, EVER, FROM, PASSED, RUN, SINCE, WAIT
 from .stories import AGREES, BELIEVED, ISOLATED, REOPENED, Evidence, decided, told, weigh
 
-STRETCH = 2048
+STRETCH = 1024
 """Events, at most, over which two stories are compared: the work of a decision is bounded."""
 
 ASKS = 64
 """Of the seconds until the asset is believed, the least part between two questions."""
 
 LONGEST_WAIT = 3600.0
-"""Seconds, at most, before a sensor that was isolated is asked again."""
+"""Seconds, at most, before a sensor that was isolated is asked again; `reopen` where that is longer."""
 
 
 class Decision(NamedTuple):
@@ -98,7 +98,7 @@ def decide(fold: Told, row: int, doubt: np.ndarray, reopen: float) -> tuple[Deci
         doubt[:, RUN] = 0.0
         own[PASSED], own[WAIT], own[ASKED], own[EVER], own[DUE] = 0.0, 0.0, 0.0, 1.0, -np.inf
     elif outcome == ISOLATED:
-        own[WAIT] = min(max(reopen, 2.0 * own[WAIT]), LONGEST_WAIT)
+        own[WAIT] = max(reopen, min(2.0 * own[WAIT], LONGEST_WAIT))
         own[RUN], own[DUE] = 0.0, now + own[WAIT] * 1e9
     else:
         own[DUE] = min(now + 1e9 * max(0.5e-9 * (now - begun), reopen / ASKS), begun + reopen * 1e9)
