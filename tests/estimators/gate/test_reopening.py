@@ -6,7 +6,7 @@ import pytest
 from estimators.fold import Fold
 from estimators.gate.doubt import CHANCE, FEWEST, rule_of
 from estimators.gate.stories import SHARE, Evidence, cost, decided, widening
-from estimators.log import RESET, Events, Log
+from estimators.log import READING, RESET, Events, Log
 from estimators.track import GATED, USED
 from tests.support import SECOND, as_log, assert_same
 
@@ -186,3 +186,14 @@ def test_what_follows_from_the_evidence():
     assert decided(Evidence(6.0, 3, 0.0), False, False) == "doubted"
     assert decided(Evidence(-6.0, 3, 0.0), False, True) == "believed"
     assert decided(Evidence(-6.0, 3, 0.0), True, False) == "believed"
+
+
+def test_a_story_that_begins_after_another_starts_from_what_that_one_left():
+    """Widening leaves the mean, so the first innovation of the second story is that of the first."""
+    growing = folded("kf", series(1, a=5.0, with_b=False), TUNING.set("gate.reopen", 1.0))
+    believed = next(d.row for d in growing.decisions if d.outcome == "believed")
+    start = believed + 1
+    while growing.log.kind[start] != READING:
+        start += 1
+    story = growing.second_story(start, start + 1, 0)
+    assert story.track.innovation[0, 0] == pytest.approx(growing.track.innovation[start, 0], abs=1e-12)
