@@ -171,10 +171,12 @@ def screen_reading(i, now, s, y, context, state, screened):
     own = s * SENSOR
     within = ints(context.duplicates, context.n_sensors)[s]
     if _is_duplicate(now, y, s, first, count, within, begin, state, times):
+        told = False
         for k in range(count):
             if not np.isnan(y[k]):
                 screened[i, k] = DUPLICATE
-        return True
+                told = True
+        return told
     if state[own + _COUNT] == 0.0:
         times[own + _FIRST] = now
     times[own + _ORIGINAL] = now
