@@ -184,6 +184,11 @@ class Fold:
         """Inputs that hold now."""
         return self._u.copy()
 
+    @property
+    def evidence(self) -> np.ndarray:
+        """What has been gathered against the filter, see diagnostics/evidence.py; it changes with the fold."""
+        return self._evidence
+
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean (nx,) and covariance (nx, nx) at `clock`; beyond `LARGE` states the variances (1, nx) instead."""
         return self.estimator.moments(self.options, self._state, self.model.nx)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow.parquet as pq
 
+from estimators.diagnostics.episodes import Episode, as_dict, episodes
 from estimators.diagnostics.failure_cause import failures
 from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.score import Score, score
@@ -26,6 +27,7 @@ from sources.source import Endless
 from ..engine.stall import interruptible
 from ..twin.twin import Twin, load_twin
 from .arguments import settings
+from .fold_episodes import episode_lines
 from .prepare import prepare
 from .remarks import remarking
 
@@ -88,7 +90,7 @@ def fold_twin(arguments: Arguments) -> int:
     pictures = fold.pictures.taken if fold.pictures is not None else []
     result = score(fold.track, log.events, twin.model, pictures)
     if arguments.out is not None:
-        _write(arguments.out, twin, log, fold.track, pictures)
+        _write(arguments.out, twin, log, fold.track, pictures, episodes(fold))
     if arguments.json:
         print(json.dumps(_as_dict(twin, result, seconds, counts, fold)))
     else:
@@ -106,7 +108,8 @@ def _as_dict(twin: Twin, result: Score, seconds: float, counts: Counter[str], fo
 
     `rmse` and `coverage` (the share of errors inside their 95 % band) are by state and `held_out` by sensor row, in
     their units; `stale` counts the readings that came too late to be among the `readings`, `conditioned` those that a
-    condition of the source's map refused; `health` is the share of the track's rows in each state of health.
+    condition of the source's map refused; `health` is the share of the track's rows in each state of health;
+    `episodes` have start and end in seconds of the log (end null while one lasts).
     """
 
     def number(value: float) -> float | None:
@@ -143,6 +146,7 @@ def _as_dict(twin: Twin, result: Score, seconds: float, counts: Counter[str], fo
                 HEALTH_NAMES, np.bincount(fold.track.health, minlength=len(HEALTH_NAMES)) / len(fold.track), strict=True
             )
         },
+        "episodes": [as_dict(episode) for episode in episodes(fold)],
         "seconds_per_event": seconds,
     }
 
@@ -221,12 +225,16 @@ def _print(twin: Twin, result: Score, seconds: float, counts: Counter[str], fold
     width = max(len(name) for name, _ in rows)
     for name, value in rows:
         print(f"{name:<{width}}  {value}")
+    for line in episode_lines(episodes(fold)):
+        print(line)
 
 
-def _write(path: Path, twin: Twin, log: Log, track: Track, pictures: Sequence[Picture]) -> None:
+def _write(
+    path: Path, twin: Twin, log: Log, track: Track, pictures: Sequence[Picture], found: Sequence[Episode]
+) -> None:
     if path.suffix == ".rrd":
         from ..recording.writer import write_recording
 
-        write_recording(path, twin, log, track, pictures)
+        write_recording(path, twin, log, track, pictures, found)
         return
-    pq.write_table(table_of(twin.model, log.events, track), path)
+    pq.write_table(table_of(twin.model, log.events, track, found), path)

@@ -17,17 +17,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from estimators.diagnostics.health import HealthPolicy
+from estimators.diagnostics.sensor_states import sensor_states
 from estimators.errors import EstimatorError, NisusError
 from estimators.fold import Fold
 from estimators.log import TICK, Events, Log
 from estimators.numerics.peaks import peaks_of
 from estimators.registry import find_estimator
 from estimators.snapshots import SPARSE_EVERY, Base
-from estimators.track import TRACKING
+from estimators.track import TRACKING, WAITING
 
 from ..stderr import complain
 from . import commands
 from .alerts import Alerts
+from .chronicle import Chronicle
 from .counts import Latency, RowCounts, last_run
 from .execute import Remembered, execute
 from .feeder import Feeder, Finished, Restarted
@@ -40,6 +42,7 @@ from .refolder import Refolded, Refolder, Requests
 from .stall import Stall
 
 if TYPE_CHECKING:
+    from estimators.diagnostics.episodes import Episode
     from estimators.diagnostics.field_pictures import Picture
     from estimators.tuning import Tuning
     from sources.source import Source
@@ -100,7 +103,8 @@ class Engine:
         self._finished = False
         self._idle_ticks = IdleTicks(section.tick)
         self._latency = Latency()
-        self._alerts = Alerts(self.notices)
+        self._chronicle = Chronicle(self)
+        self._alerts = Alerts(self.notices, lambda: self._chronicle.account.refused)
         self._stall = Stall(self._say_stalled)
         self._status: tuple[float, Status] | None = None
         self.recorder: Records | None = None
@@ -140,6 +144,7 @@ class Engine:
         self._stall.start()
         self._refolder.start()
         self._thread.start()
+        self._chronicle.start()
         self._feeder.start()
 
     def stop(self) -> None:
@@ -149,6 +154,7 @@ class Engine:
         self._refolder.stop()
         if self._thread.is_alive():
             self._thread.join(timeout=5.0 if self._stall.text is None else 0.1)
+        self._chronicle.stop()
         self._stall.stop()
 
     def submit(self, command: commands.Command) -> None:
@@ -236,6 +242,10 @@ class Engine:
         with self._reading():
             return self._fold.tuning, self._fold.estimator.name
 
+    def episodes(self) -> list[Episode]:
+        """What was and is wrong, in the order of its start; at most a second behind the rows."""
+        return list(self._chronicle.account.episodes)
+
     def previous(self) -> Pull | None:
         """The whole previous revision, for comparison; its arrays never change."""
         return self._previous
@@ -259,6 +269,10 @@ class Engine:
             log, fold = self._log, self._fold
             track = fold.track
             last = fold.n - 1
+            now = log.t[last] * 1e-9 if last >= 0 else 0.0
+            states = sensor_states(self.model, fold.tuning.used, fold.evidence, now, self._policy)
+            health = int(track.health[last]) if last >= 0 else WAITING
+            account = self._chronicle.account
             status = Status(
                 estimator=self.estimator,
                 tuning=self.tuning,
@@ -266,8 +280,11 @@ class Engine:
                 revision=self._revision,
                 refolding=self._requests.waiting,
                 t=int(log.t[last]) if last >= 0 else None,
-                health=int(track.health[last]) if last >= 0 else TRACKING,
+                health=health,
                 since=int(log.t[last_run(track.health)]) if last >= 0 else None,
+                cause=account.leading.text if account.leading and health not in (WAITING, TRACKING) else "",
+                sensors=account.of_sensors(self.model.sensor_names, states),
+                episodes_open=len(account.lasting),
                 lost=self._alerts.lost,
                 counts={
                     **self.notices.counts(),

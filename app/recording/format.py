@@ -72,25 +72,33 @@ def base_to_json(base: Base | None) -> str:
     moments["first"] = base.first
     if base.state is None:
         return json.dumps(moments)
-    state = base64.b64encode(np.ascontiguousarray(base.state, "<f8").tobytes()).decode()
-    return json.dumps({**moments, "estimator": base.estimator, "state": state})
+    numbers = {"state": _text(base.state), "evidence": None if base.evidence is None else _text(base.evidence)}
+    return json.dumps({**moments, "estimator": base.estimator, **numbers})
 
 
 def base_from_json(text: str) -> Base | None:
-    """The base that `base_to_json` wrote; older recordings hold moments only, and no index."""
+    """The base that `base_to_json` wrote; older recordings hold moments only, and no index or evidence."""
     values = json.loads(text)
     if values is None:
         return None
-    state = values.get("state")
     return Base(
         np.array(values["mean"]),
         np.array(values["cov"]),
         int(values["clock"]),
         np.array(values["u"], float),
         values.get("estimator", ""),
-        None if state is None else np.frombuffer(base64.b64decode(state), "<f8").astype(float),
+        _numbers(values.get("state")),
         int(values.get("first", 0)),
+        _numbers(values.get("evidence")),
     )
+
+
+def _text(numbers: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(numbers, "<f8").tobytes()).decode()
+
+
+def _numbers(text: str | None) -> np.ndarray | None:
+    return None if text is None else np.frombuffer(base64.b64decode(text), "<f8").astype(float)
 
 
 TAKEN = "is there already; choose another name, or remove it"

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from ..diagnostics.episodes import Episode, as_dict
+from ..diagnostics.evidence import CAUSES, OUTSIDE, SENSORS, TRUTH_MISSED
 from ..events.batch import KIND_NAMES, READING, Events, truth_of
 from ..model.state_space import StateSpaceModel
 from ..track import HEALTH_NAMES, VERDICT_NAMES, Track
 
 
-def table_of(model: StateSpaceModel, events: Events, track: Track) -> Any:
+def table_of(model: StateSpaceModel, events: Events, track: Track, episodes: Sequence[Episode] = ()) -> Any:
     """A pyarrow.Table of events and track.
 
     Columns: `t_ns` and `arrival_ns`; `seconds`; `event`, `channel`, and `sensor` (null unless it is a reading);
     `value_k` and, where a reading brought its own, `variance_k`; for each state `NAME_true` (NaN where it is not
     known), `NAME` and `NAME_std`; `innovation_k` and `innovation_std_k`; NIS with its windowed mean and bounds,
-    log-likelihood; verdict and health in words.
+    log-likelihood; verdict and health in words; `alarms`, the causes that are in alarm after a reading or a truth, and
+    `flags`, what else is wrong (sensors that are silent, a range that is left, a truth that is missed), both joined by
+    commas, null where there is none. The schema's metadata have `episodes`, as JSON.
     """
     import pyarrow as pa
 
@@ -47,5 +53,22 @@ def table_of(model: StateSpaceModel, events: Events, track: Track) -> Any:
         columns[name] = getattr(track, name)
     columns["verdict"] = np.array(VERDICT_NAMES)[track.verdict]
     columns["health"] = np.array(HEALTH_NAMES)[track.health]
+    columns["alarms"] = pa.array(
+        _words(np.bitwise_or.reduce(track.alarms, axis=1, dtype=np.int64), _CAUSES), pa.string()
+    )
+    bits = {1 << k: f"{name} silent" for k, name in enumerate(model.sensor_names[:SENSORS])} | _FLAGS
+    columns["flags"] = pa.array(_words(track.flags, bits), pa.string())
     plain = {k: np.ascontiguousarray(c) if isinstance(c, np.ndarray) else c for k, c in columns.items()}
-    return pa.table(plain)
+    metadata = {"episodes": json.dumps([as_dict(episode) for episode in episodes])}
+    return pa.table(plain).replace_schema_metadata(metadata)
+
+
+_CAUSES = {1 << k: cause for k, cause in enumerate(CAUSES)}
+_FLAGS = {OUTSIDE: "outside the fitted range", TRUTH_MISSED: "truth missed"}
+
+
+def _words(masks: np.ndarray, bits: dict[int, str]) -> np.ndarray:
+    """What the bits of each mask say; None where there are none."""
+    kinds, which = np.unique(masks, return_inverse=True)
+    said = [", ".join(word for bit, word in bits.items() if int(mask) & bit) or None for mask in kinds]
+    return np.array(said, object)[which.reshape(-1)]
