@@ -34,11 +34,18 @@ MOST = 0.5
 """Share of refused readings from which an episode is one of refusals."""
 
 
+CAUSES = (
+    "shifted", "narrow", "wide", "correlated", "alternating", "spiky", "refused", "stuck", "disagreeing", "agreeing",
+    "silent", "never heard", "missed", "outside", "stale", "diverged",
+)  # fmt: skip
+"""Of episodes; each has its heading in ALARMS.md."""
+
+
 class Episode(NamedTuple):
     """Something that was wrong.
 
     `start` and `end` in seconds of the log; `end` None while it lasts. `subject`: a sensor, one of its rows, a state,
-    an input, or "twin". `cause`: a key of ALARMS.md. `size` in `unit` with its 95 % interval, `low` to `high` (NaN
+    an input, or "twin". `cause`: one of `CAUSES`. `size` in `unit` with its 95 % interval, `low` to `high` (NaN
     where there is none). `text`: one sentence with the remedy.
     """
 
