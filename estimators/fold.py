@@ -9,13 +9,14 @@ brief: a model's function that never returns must not keep the interpreter with 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from .compiled.context import context_of
 from .compiled.model import compile_model
-from .diagnostics.evidence import fresh, watch_of
+from .diagnostics.evidence import fresh, watched
 from .diagnostics.failure_cause import Estimate, around, cause, failures, questions
 from .diagnostics.field_pictures import Pictures
 from .diagnostics.health import Bounds, HealthPolicy, chi_square_bounds
@@ -97,14 +98,14 @@ class Fold:
         self._code: Code = driven(self.estimator) if model.black_box else self.estimator.code()
         most = model.width * max(1, self.policy.window)
         self._bounds: Bounds = chi_square_bounds(most)
-        self._context: Any = self._see()
+        self.marginal = self.estimator.family in ("particle", "ensemble")
+        self._seen = self._see(baseline, expected)
+        self._context: Any = self._seen
         numbers = self.estimator.state_size(self.options, model.nx) + self.estimator.memory(self.options, model)
         self._state = np.empty(numbers)
         self._spare = np.empty_like(self._state)
         self._work = _scratch(self.estimator.work_size(self.options, model.nx, model.width) + 1)
         self._score = np.empty(WHITENED + model.ny)
-        marginal = self.estimator.family in ("particle", "ensemble")
-        self._watch = watch_of(model, tuning.r, tuning.gate, marginal, baseline, expected)
         self._evidence = fresh(model)
         self._clock = np.array([UNSET])
         self._u = np.array([item.default for item in model.inputs], float)
@@ -114,10 +115,10 @@ class Fold:
         if base is not None:
             check_base(base, model)
             mean, cov, self._clock[0], self._u[:] = base.mean, base.cov, base.clock, base.u
-        self._run, self._assess, self._watch_rows, begin = compiled()
+        self._run, judge, begin = compiled()
         if model.black_box or self.estimator.interpreted:
             self._context = View(self._compiled, self._context, tuning, self.options, self.pairs, self._held)
-            self._run = fold_loop.run
+            self._run = partial(fold_loop.run_and_judge, judge, self._seen)
             begin = fold_loop.begin
         begin(self._code, self._context, np.ascontiguousarray(mean), np.ascontiguousarray(cov), self._state)
         left = base.state if base is not None and base.estimator == estimator else None
@@ -131,7 +132,7 @@ class Fold:
         self._remember()
         self._rows = Track.allocate(log.capacity, len(model.shown), len(self.pairs), model.ny, model.width)
 
-    def _see(self) -> np.void:
+    def _see(self, baseline: np.ndarray | None, expected: np.ndarray | None) -> np.void:
         """The context of this model and tuning; the arrays that it points to are kept in `self._held`."""
         model, tuning = self.model, self.tuning
         gate = np.full(model.width + 1, np.inf)
@@ -147,6 +148,7 @@ class Fold:
             "options": np.ascontiguousarray(self.estimator.tune(self.options, model, tuning), float),
             "pairs": self.pairs,
             "prepared": self.estimator.prepare(model, self.options),
+            **watched(model, tuning.gate, self.marginal, baseline, expected),
         }
         values: dict[str, Any] = {**self._compiled.static, **held}
         if self._own_prior is not None:
@@ -163,6 +165,7 @@ class Fold:
             "n_pairs": len(self.pairs),
             "n_shown": len(model.shown),
             "n_prepared": held["prepared"].size,
+            "n_baseline": held["baseline"].size,
             "width": model.width,
             "seed": tuning.seed,
         }
@@ -312,28 +315,10 @@ class Fold:
                 self._held["r"][:] = self.tuning.r
                 self._restore(self.n)
                 raise
-            self._judge(self.n, stop)
             self.n = stop
             if stop == boundary:
                 self._remember()
         return end - begun
-
-    def _judge(self, start: int, stop: int) -> None:
-        """What the rows from `start` on say of the estimate."""
-        log = self.log
-        self._assess(start, stop, log.t, log.kind, self._rows, self.policy, self._bounds)
-        self._watch_rows(
-            start,
-            stop,
-            log.t,
-            log.kind,
-            log.channel,
-            log.value,
-            self._watch,
-            self.policy,
-            self._evidence,
-            self._rows,
-        )
 
     def _run_events(self, start: int, stop: int) -> None:
         log = self.log
@@ -355,6 +340,9 @@ class Fold:
             self._work,
             self._score,
             self._rows,
+            self.policy,
+            self._bounds,
+            self._evidence,
         )
         self._asked = stop - 1
 
@@ -371,7 +359,9 @@ class Fold:
         last = self.n - 1
         query = self.log.kind[last] in (TRUTH, TICK)
         if query and self._asked != last:
+            evidence = self._evidence.copy()
             self._run_events(last, self.n)
+            self._evidence[:] = evidence
         state = self._spare if query else self._state
         mean, cov = self.estimator.moments(self.options, state, self.model.nx)
         self.pictures.take(self.log, self.n, mean, cov[0] if cov.shape[0] == 1 else np.diag(cov))

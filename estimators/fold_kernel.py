@@ -9,8 +9,8 @@ import numpy as np
 from numba import types
 
 from .compiled.context import context_type, prior, sensor_rows
-from .diagnostics.evidence import watch_rows, watch_signature
-from .diagnostics.health import assess, assess_signature
+from .diagnostics.evidence import watch_rows
+from .diagnostics.health import assess, bounds_type, policy_type
 from .estimator import call_describe, call_predict, call_start, call_update, code_type
 from .interpreted.fold_loop import LONGEST, UNSET
 from .log import INPUT, MARK, READING, RESET, TICK, TRUTH
@@ -143,18 +143,37 @@ def begin(code, context, mean, cov, state):
     call_start(code.start, context, mean, cov, state)
 
 
+@jit
+def judge(start, end, t, kind, channel, value, context, policy, bounds, evidence, track):
+    """What the rows `start` to `end`, which are folded, say of the estimate: windowed NIS, alarms, health."""
+    assess(start, end, t, kind, track, policy, bounds)
+    watch_rows(start, end, t, kind, channel, value, context, policy, evidence, track)
+
+
+@jit
+def run_and_judge(
+    code, context, first, start, end, t, kind, channel, value, width, clock, u, state, spare, work, score, track,
+    policy, bounds, evidence,
+):  # fmt: skip
+    """Both in one call: of a few events, the handing over takes longer than the work."""
+    run(code, context, first, start, end, t, kind, channel, value, width, clock, u, state, spare, work, score, track)
+    judge(start, end, t, kind, channel, value, context, policy, bounds, evidence, track)
+
+
 I4 = types.int32[::1]
+_log = (I1, B1, I4, F2)
 begin_signature = types.void(code_type, context_type, F1, F2, F1)
+judge_signature = types.void(i64, i64, *_log, context_type, policy_type, bounds_type, F1, track_type)
 run_signature = types.void(
-    code_type, context_type, i64, i64, i64, I1, B1, I4, F2, i64, I1, F1, F1, F1, F1, F1, track_type
-)
+    code_type, context_type, i64, i64, i64, *_log, i64, I1, F1, F1, F1, F1, F1, track_type,
+    policy_type, bounds_type, F1,
+)  # fmt: skip
 
 
 @lru_cache(maxsize=1)
 def compiled() -> tuple[Any, ...]:
     """The entry points, compiled for their one signature (or loaded from the cache)."""
-    functions = (run, assess, watch_rows, begin)
-    signatures = (run_signature, assess_signature, watch_signature, begin_signature)
-    for function, signature in zip(functions, signatures, strict=True):
+    functions = (run_and_judge, judge, begin)
+    for function, signature in zip(functions, (run_signature, judge_signature, begin_signature), strict=True):
         function.compile(signature.args)
     return functions

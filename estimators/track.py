@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from .numerics.jit import B1, F1, F2, I1
+from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, flags, ints, jit, masks
 
 NONE, USED, GATED, HELD_OUT, MISSING, FAILED, SCREENED = range(7)
 """Verdict on an event: not a reading; used; refused by the gate; held out and scored; no finite row; not usable,
@@ -87,3 +87,29 @@ Track._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[me
 
 _A2 = types.Array(types.int32, 2, "C")
 track_type = types.NamedTuple((F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, F1, B1, B1, F2, _A2, I1), Track)
+
+
+@jit
+def borrowed_columns(track):
+    """The same columns, not reference-counted."""
+    n, width = track.alarms.shape
+    return Track(
+        borrowed_rows(track.mean),
+        borrowed_rows(track.std),
+        borrowed_rows(track.cross),
+        borrowed_rows(track.innovation),
+        borrowed_rows(track.innovation_std),
+        borrowed(track.nis),
+        borrowed(track.log_likelihood),
+        flags(track.dof.ctypes.data, n),
+        flags(track.verdict.ctypes.data, n),
+        borrowed(track.age),
+        borrowed(track.nis_mean),
+        borrowed(track.nis_low),
+        borrowed(track.nis_high),
+        flags(track.consistency.ctypes.data, n),
+        flags(track.health.ctypes.data, n),
+        borrowed_rows(track.whitened),
+        masks(track.alarms.ctypes.data, n, width),
+        ints(track.flags.ctypes.data, n),
+    )

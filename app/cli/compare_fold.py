@@ -43,8 +43,8 @@ class Row:
     `rmse` by unit: the root mean square over the states of that unit whose truth is known, or, where no truth is,
     over the sensors held out. `coverage` is the share of those errors inside their 95 % band. `span` is the part of
     the log that was folded, s, or None for all of it. `diverged` is how many of the `seeds` folds did, `since` when
-    the first of them did (s from the log's start), `lost` the share of all events. `failure` says why there are no
-    numbers.
+    the first of them did (s from the log's start), `lost` the share of all events. `refused` is the share of the
+    readings that the gate refused, which are in no other figure. `failure` says why there are no numbers.
     """
 
     estimator: str
@@ -59,6 +59,7 @@ class Row:
     diverged: int = 0
     since: float = np.nan
     lost: float = 0.0
+    refused: float = 0.0
     failure: str = ""
 
 
@@ -72,6 +73,7 @@ class Outcome(NamedTuple):
     seconds_per_step: float
     since: float
     lost: float
+    refused: float
 
 
 def draws(entry: Estimator) -> bool:
@@ -160,7 +162,7 @@ def outcome_of(fold: Fold, events: Events, seconds: float) -> Outcome:
     model, track = fold.model, fold.track.select(slice(0, len(events)))
     fold.finish()
     pictures = () if fold.pictures is None else [one for one in fold.pictures.taken if one.before <= len(events)]
-    result = score(track, events, model, pictures)
+    result = score(track, events, model, pictures, gate=fold.tuning.gate)
     fits, units = result.states, {state.name: state.unit for state in model.shown_states}
     if result.field is not None and model.grid is not None:
         fits, units = {model.grid.name: result.field}, {model.grid.name: model.grid.unit}
@@ -183,6 +185,7 @@ def outcome_of(fold: Fold, events: Events, seconds: float) -> Outcome:
         seconds_per_step=seconds,
         since=float((events.t[lost[0]] - events.t[0]) * 1e-9) if lost.size else np.nan,
         lost=lost.size / len(track),
+        refused=result.refused if result.gated else 0.0,
     )
 
 
@@ -202,6 +205,7 @@ def row_of(estimator: str, outcomes: Sequence[Outcome], options: Mapping[str, fl
         diverged=len(since),
         since=min(since, default=np.nan),
         lost=float(np.mean([outcome.lost for outcome in outcomes])),
+        refused=float(np.mean([outcome.refused for outcome in outcomes])),
     )
 
 

@@ -15,6 +15,7 @@ GAP = "  "
 NIS, BAND, COST = "mean NIS", "in band [%]", "cost [µs/step]"
 SPAN, EVENTS, LENGTH = "span [s]", "events", "log [s]"
 LOST = "diverged [% of events]"
+REFUSED = "refused [%]"
 
 
 class Cell(NamedTuple):
@@ -34,12 +35,15 @@ def spread(title: str) -> str:
 def cells(rows: Sequence[Row], events: int, seconds: float) -> list[dict[str, str]]:
     """The rows as text by column, empty where there is nothing to say; every row has the same columns.
 
+    What the gate refuses has a column where it refuses anything.
+
     Args:
         rows: Of the filters.
         events: Of the whole log.
         seconds: Of the whole log.
     """
     units = list(dict.fromkeys(unit for row in rows for unit in row.rmse))
+    gated = any(row.refused > 0.0 for row in rows)
     found = []
     for row in rows:
         line = {"filter": row.estimator}
@@ -55,6 +59,7 @@ def cells(rows: Sequence[Row], events: int, seconds: float) -> list[dict[str, st
             "diverged": str(row.diverged),
             "diverged at [s]": _number(row.since, ".4g"),
             LOST: _number(100.0 * row.lost, ".2g") if row.diverged else "",
+            **({REFUSED: "" if row.failure else _number(100.0 * row.refused, ".2g")} if gated else {}),
             SPAN: "" if row.span is None else f"{row.span:g}",
             "options": " ".join(f"{name}={value:g}" for name, value in row.options.items()),
             "failure": row.failure,
@@ -116,11 +121,13 @@ def printed(name: str, lines: Sequence[Mapping[str, str]], logs: int = 1) -> lis
 
 
 def _notes(line: Mapping[str, str]) -> str:
-    """What else there is to say of a row: when it diverged, the part of the log it folded, options, why it failed."""
+    """What else there is to say of a row: when it diverged, what it refused, the part of the log, options, failure."""
     said = []
     if int(line["diverged"]):
         seeds = f"in {line['diverged']} of {line['seeds']} " if int(line["seeds"]) > 1 else ""
         said.append(f"diverged {seeds}at {line['diverged at [s]']} s, {line[LOST]} % of events")
+    if line.get(REFUSED, "") not in ("", "0"):
+        said.append(f"refused {line[REFUSED]} % of the readings")
     if line[SPAN]:
         said.append(f"first {line[SPAN]} s")
     said += [option.replace("=", " ") for option in line["options"].split()]

@@ -13,7 +13,7 @@ from typing import Any
 
 from starlette.responses import JSONResponse
 
-from estimators.diagnostics.episodes import anchor, as_dict
+from estimators.diagnostics.episodes import anchor, episode_json
 from estimators.errors import ConfigError, printable
 from estimators.track import HEALTH_NAMES
 
@@ -79,7 +79,7 @@ def status_json(engine: Running) -> dict[str, Any]:
 
 def episodes_json(engine: Running) -> list[dict[str, Any]]:
     """What was and is wrong, in the order of its start: times in seconds of the log, `help` in ALARMS.md."""
-    return [as_dict(episode) | {"help": f"ALARMS.md#{anchor(episode.cause)}"} for episode in engine.episodes()]
+    return [episode_json(episode) | {"help": f"ALARMS.md#{anchor(episode.cause)}"} for episode in engine.episodes()]
 
 
 def _plain(value: Any) -> Any:

@@ -60,8 +60,8 @@ class Episode(NamedTuple):
     text: str
 
 
-def as_dict(episode: Episode) -> dict[str, float | str | None]:
-    """Its fields by name; null for what is not a number, which JSON does not have."""
+def episode_json(episode: Episode) -> dict[str, float | str | None]:
+    """An episode for JSON: its fields by name; null for what is not a number, which JSON does not have."""
     return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in episode._asdict().items()}
 
 
@@ -100,8 +100,7 @@ class Found(NamedTuple):
 
 def course_of(fold: Fold) -> Course:
     """What a fold has come to so far: views, which change with it."""
-    marginal = fold.estimator.family in ("particle", "ensemble")
-    return Course(fold.model, fold.tuning, marginal, fold.log.events.select(slice(0, fold.n)), fold.track)
+    return Course(fold.model, fold.tuning, fold.marginal, fold.log.events.select(slice(0, fold.n)), fold.track)
 
 
 def episodes(fold: Fold) -> list[Episode]:

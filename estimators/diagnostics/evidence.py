@@ -20,14 +20,14 @@ doi:10.51387/23-NEJSDS51.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numba import types
 
+from ..compiled.context import circular_states, sensor_rows, sensor_variances
 from ..log import INPUT, READING, RESET, TRUTH
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import B1, F1, F2, I1, i64, inlined, jit
+from ..numerics.jit import borrowed, borrowed_rows, floats, inlined, ints, jit
 from ..numerics.linalg import wrap
 from ..track import (
     DEGRADED,
@@ -40,9 +40,8 @@ from ..track import (
     TRACKING,
     USED,
     WAITING,
-    track_type,
+    borrowed_columns,
 )
-from .health import policy_type
 
 CAUSES = (
     "narrow", "wide", "high", "low", "correlated", "alternating", "spiky", "refused", "stuck", "disagreeing",
@@ -103,6 +102,8 @@ _QUADRATIC = len(SCALES) + len(SHIFTS) + len(CORRELATIONS)
 TESTS = _QUADRATIC + 3
 """Tests of a row: the quadratic ones, spikes, refusals, repetition."""
 
+_OTHER = math.log((1.0 - REPEATING) / (1.0 - UNKNOWN_QUANTUM))
+
 AT_SPIKES, AT_REFUSALS, AT_REPETITION = range(_QUADRATIC, TESTS)
 
 JOINT = len(SCALES)
@@ -120,6 +121,11 @@ def _ratios() -> np.ndarray:
 
 
 _RATIOS = _ratios()
+_SPIKE_STEPS = 64.0
+_SQUARES = np.arange(FURTHEST**2 * _SPIKE_STEPS + 2.0) / _SPIKE_STEPS
+_SPIKE_RATIO = np.log1p(SPIKE_SHARE * (np.exp(0.5 * _SQUARES * (1.0 - 1.0 / SPIKE**2)) / SPIKE - 1.0))
+"""log Λ of spikes at so many e² a step, between which it is nearly straight (to 1e-5)."""
+
 _BITS = np.array(
     [*[NARROW] * 3, *[WIDE] * 3, *[HIGH] * 3, *[LOW] * 3, *[CORRELATED] * 2, *[ALTERNATING] * 2, SPIKY, REFUSED, STUCK]
 )
@@ -135,40 +141,12 @@ SENSOR = JOINT + 8
 """Numbers in the state for each sensor."""
 
 # The twin's part.
-_SUSPECTS, _GONE, _NEXT_DUE, _BEGUN, _HEARD, _MISSED = range(6)
-TWIN = 6
+_SUSPECTS, _GONE, _NEXT_DUE, _BEGUN, _HEARD, _MISSED, _QUIET = range(7)
+TWIN = 7
 
 # A shown state's part: the mean square of its standardised errors, how often it was told, whether it is missed. After
 # them the inputs that hold.
 STATE = 3
-
-
-class Watch(NamedTuple):
-    """What the bank knows of model and tuning.
-
-    row_start, row_count (sensors,) int64; variances r (rows,); baseline (rows, 3 + TESTS): bias, scale, correlation of
-    what was normal, and the highest W of each test; ranges (shown + inputs, 2) in which the model was fitted; column
-    (nx,) of a state in the track, or -1; circular (nx,) int64; expected (sensors,) int64: 1 where the source feeds it;
-    chances (2,): log Λ of a refused and of an accepted reading; fitted: 1 if there is any range; marginal: 1 if
-    `Track.whitened` holds each row by itself, 0 if the rows of a reading together; tests: how many there are in all.
-    """
-
-    row_start: Any
-    row_count: Any
-    variances: Any
-    baseline: Any
-    ranges: Any
-    column: Any
-    circular: Any
-    expected: Any
-    chances: Any
-    fitted: int
-    marginal: int
-    tests: int
-
-
-I4 = types.int32[::1]
-watch_type = types.NamedTuple((I1, I1, F1, F2, F2, I1, I1, I1, F1, i64, i64, i64), Watch)
 
 
 def no_baseline(model: StateSpaceModel) -> np.ndarray:
@@ -178,23 +156,27 @@ def no_baseline(model: StateSpaceModel) -> np.ndarray:
     return baseline
 
 
-def watch_of(
+def watched(
     model: StateSpaceModel,
-    variances: np.ndarray,
     gate: float | None,
     marginal: bool,
     baseline: np.ndarray | None = None,
     expected: np.ndarray | None = None,
-) -> Watch:
-    """What the bank needs to know.
+) -> dict[str, Any]:
+    """What the bank finds in a context.
 
     Args:
         model: The model.
-        variances: r of the tuning, (rows,).
         gate: Probability that a good reading passes, or None.
         marginal: Whether the filter's predictions are not Gaussian, and `Track.whitened` holds each row by itself.
-        baseline: See `Watch`; None for white innovations.
+        baseline: Bias, scale and correlation of what was normal, and the highest W of each test, (rows, 3 + TESTS);
+            None for white innovations.
         expected: Sensors that must speak, (sensors,); None for those that have spoken.
+
+    Returns:
+        `baseline` (rows, 3 + TESTS); `ranges` (shown + inputs, 2) in which the model was fitted, and `fitted`, 1 if
+        there is any; `column` (nx,) of a state in the track, or -1; `expected` (sensors,); `chances` (2,), log Λ of a
+        refused and of an accepted reading; `marginal`; `n_tests` in all.
     """
     shown = model.shown
     column = np.full(model.nx, -1, np.int64)
@@ -202,27 +184,23 @@ def watch_of(
     if model.mode >= 0:
         column[model.mode] = -1
     ranges = np.full((len(shown) + model.nu, 2), [-np.inf, np.inf])
-    for k, item in enumerate([*model.shown_states, *model.inputs]):
-        fitted = getattr(item, "fitted", None)
-        if fitted is not None:
-            ranges[k] = fitted
+    fitted = [item.fitted for item in model.shown_states] + [item.fitted for item in model.inputs]
+    for k, given in enumerate(fitted):
+        if given is not None:
+            ranges[k] = given
     chance = min(max(1e-6, 1.0 - gate), 0.5 * REFUSED_SHARE) if gate is not None else 0.5 * REFUSED_SHARE
     counts = np.array([len(sensor.rows) for sensor in model.sensors], np.int64)
     several = int(np.sum(counts > 1))
-    return Watch(
-        row_start=np.array(model.row_start[: len(counts)], np.int64),
-        row_count=counts,
-        variances=np.ascontiguousarray(variances, float),
-        baseline=np.ascontiguousarray(no_baseline(model) if baseline is None else baseline, float),
-        ranges=ranges,
-        column=column,
-        circular=np.asarray(model.circular, np.int64),
-        expected=np.zeros(len(counts), np.int64) if expected is None else np.asarray(expected, np.int64),
-        chances=np.log([REFUSED_SHARE / chance, (1.0 - REFUSED_SHARE) / (1.0 - chance)]),
-        fitted=int(np.any(np.isfinite(ranges))),
-        marginal=int(marginal),
-        tests=int(counts.sum()) * TESTS + several * JOINT,
-    )
+    return {
+        "baseline": np.ascontiguousarray(no_baseline(model) if baseline is None else baseline, float),
+        "ranges": ranges,
+        "fitted": int(np.any(np.isfinite(ranges))),
+        "column": column,
+        "expected": np.zeros(len(counts), np.int64) if expected is None else np.ascontiguousarray(expected, np.int64),
+        "chances": np.log([REFUSED_SHARE / chance, (1.0 - REFUSED_SHARE) / (1.0 - chance)]),
+        "marginal": int(marginal),
+        "n_tests": int(counts.sum()) * TESTS + several * JOINT,
+    }
 
 
 def fresh(model: StateSpaceModel) -> np.ndarray:
@@ -259,6 +237,18 @@ def heard_last(model: StateSpaceModel, state: np.ndarray) -> np.ndarray:
 
 
 @inlined
+def _sensor(state, s):
+    """The part of sensor s."""
+    return floats(state.ctypes.data + 8 * (TWIN + s * SENSOR), SENSOR)
+
+
+@inlined
+def _row(state, sensors, row):
+    """The part of a row."""
+    return floats(state.ctypes.data + 8 * (TWIN + sensors * SENSOR + row * ROW), ROW)
+
+
+@inlined
 def _add(W, k, ratio, h, peak):
     """Put log Λ of one more reading to test k; 2 where it is in alarm, 1 where an alarm may last, else 0.
 
@@ -277,6 +267,14 @@ def _alarm(said, bit, before):
     return bit if said == 2 or said == 1 and before & bit != 0 else 0
 
 
+@inlined
+def _spike_ratio(square):
+    """log Λ of spikes against none, from e²."""
+    at = square * _SPIKE_STEPS
+    k = int(at)
+    return _SPIKE_RATIO[k] + (at - k) * (_SPIKE_RATIO[k + 1] - _SPIKE_RATIO[k])
+
+
 @jit
 def _weigh(own, e, h, base, before):
     """Put one standardised innovation to the tests of its row; the causes that are in alarm."""
@@ -285,22 +283,36 @@ def _weigh(own, e, h, base, before):
     white = raw
     if phi != 0.0 and np.isfinite(own[_RAW]):
         white = (raw - phi * own[_RAW]) / math.sqrt(1.0 - phi * phi)
+        white = min(max(white, -FURTHEST), FURTHEST)
     own[_RAW] = raw
     last = own[_BEFORE]
-    first = not np.isfinite(last)
-    if first:
+    # Of the first there is nothing that it could be correlated with.
+    tests = _QUADRATIC
+    if not np.isfinite(last):
         last = 0.0
+        tests -= len(CORRELATIONS)
     own[_BEFORE] = white
     square, product, old = white * white, white * last, last * last
+    highest = -1.0
+    for k in range(tests):
+        ratio = (
+            _RATIOS[k, 0] * square
+            + _RATIOS[k, 1] * product
+            + _RATIOS[k, 2] * old
+            + _RATIOS[k, 3] * white
+            + _RATIOS[k, 4]
+        )
+        W = min(max(own[k], 0.0) + min(ratio, 0.5 * h), h + base[3 + k] + SPARE)
+        own[k] = W
+        highest = max(highest, W - 0.5 * base[3 + k])
     mask = 0
-    # Of the first there is nothing that it could be correlated with.
-    for k in range(_QUADRATIC - len(CORRELATIONS) if first else _QUADRATIC):
-        c = _RATIOS[k]
-        ratio = c[0] * square + c[1] * product + c[2] * old + c[3] * white + c[4]
-        mask |= _alarm(_add(own, k, ratio, h, base[3 + k]), _BITS[k], before)
-    more = SPIKE_SHARE / SPIKE * math.exp(0.5 * square * (1.0 - 1.0 / (SPIKE * SPIKE)))
-    ratio = math.log(1.0 - SPIKE_SHARE + more)
-    return mask | _alarm(_add(own, AT_SPIKES, ratio, h, base[3 + AT_SPIKES]), SPIKY, before)
+    if highest >= 0.5 * h:
+        for k in range(tests):
+            threshold = h + base[3 + k]
+            if own[k] >= threshold or own[k] >= 0.5 * threshold and before & _BITS[k] != 0:
+                mask |= _BITS[k]
+    said = _add(own, AT_SPIKES, _spike_ratio(square), h, base[3 + AT_SPIKES])
+    return mask | _alarm(said, SPIKY, before)
 
 
 @jit
@@ -323,7 +335,7 @@ def _repeat(own, y, r, h, base, before):
         step = abs(y - last)
         if own[_QUANTUM] == 0.0 or step < own[_QUANTUM]:
             own[_QUANTUM] = step
-        ratio = math.log((1.0 - REPEATING) / (1.0 - UNKNOWN_QUANTUM)) - h
+        ratio = _OTHER - h
     return _alarm(_add(own, AT_REPETITION, ratio, h, base[3 + AT_REPETITION]), STUCK, before)
 
 
@@ -363,8 +375,9 @@ def _listen(state, sensors, now):
     """Which sensors are silent; from when on the next will be."""
     due = np.inf
     for s in range(sensors):
-        own = state[TWIN + s * SENSOR :]
+        own = _sensor(state, s)
         if now > own[_DUE]:
+            state[_QUIET] += 1.0 - own[_SILENT]
             own[_SILENT] = 1.0
         elif own[_DUE] < due:
             due = own[_DUE]
@@ -385,11 +398,11 @@ def _miss(own, z, before):
 def _forget(state, sensors, rows, states):
     """A reset: what the readings said of the estimate before, they do not say of the new one."""
     for s in range(sensors):
-        own = state[TWIN + s * SENSOR :]
+        own = _sensor(state, s)
         own[_ALL] = 0.0
         own[:JOINT] = 0.0
     for k in range(rows):
-        own = state[TWIN + sensors * SENSOR + k * ROW :]
+        own = _row(state, sensors, k)
         own[:TESTS] = 0.0
         own[_MASK] = 0.0
         own[_RAW] = own[_BEFORE] = np.nan
@@ -399,38 +412,42 @@ def _forget(state, sensors, rows, states):
 
 
 @jit
-def _hear(i, now, y, s, watch, policy, state, track):
-    """Put a reading of sensor s to all tests."""
+def _hear(i, now, y, s, context, policy, state, track):
+    """Put a reading y of sensor s, and the variances that it may have brought, to all tests."""
     width = track.alarms.shape[1]
-    sensors = watch.row_count.size
-    own = state[TWIN + s * SENSOR :]
-    _time(own, now, policy.false_alarm_every, watch.tests, policy)
+    sensors = context.n_sensors
+    chances = floats(context.chances, 2)
+    variances = sensor_variances(context, s)
+    first, count = sensor_rows(context, s)
+    own = _sensor(state, s)
+    state[_QUIET] -= own[_SILENT]
+    _time(own, now, policy.false_alarm_every, context.n_tests, policy)
     state[_NEXT_DUE] = min(state[_NEXT_DUE], own[_DUE])
     h = own[_THRESHOLD]
     verdict = track.verdict[i]
     judged = verdict == USED or verdict == GATED
     together = 0
-    if judged and watch.marginal == 0 and watch.row_count[s] > 1:
+    if judged and context.marginal == 0 and count > 1:
         together = _weigh_together(own, track.nis[i], track.dof[i], h, int(own[_ALL]))
         own[_ALL] = together
-    for k in range(watch.row_count[s]):
+    for k in range(count):
         if not np.isfinite(y[k]):
             continue
-        row = watch.row_start[s] + k
-        each = state[TWIN + sensors * SENSOR + row * ROW :]
+        row = first + k
+        each = _row(state, sensors, row)
         before = int(each[_MASK])
-        base = watch.baseline[row]
-        r = watch.variances[row]
+        base = floats(context.baseline + 8 * row * (3 + TESTS), 3 + TESTS)
+        r = variances[k]
         if width + k < y.size and np.isfinite(y[width + k]):
             r = y[width + k]
         mask = before & ~STUCK | _repeat(each, y[k], r, h, base, before)
         if judged or verdict == FAILED:
-            ratio = watch.chances[1] if verdict == USED else watch.chances[0]
+            ratio = chances[1] if verdict == USED else chances[0]
             said = _add(each, AT_REFUSALS, ratio, h, base[3 + AT_REFUSALS])
             mask = mask & ~REFUSED | _alarm(said, REFUSED, before)
         if judged:
             e = track.innovation[i, k] / track.innovation_std[i, k]
-            if watch.marginal != 0 and np.isfinite(track.whitened[i, k]):
+            if context.marginal != 0 and np.isfinite(track.whitened[i, k]):
                 e = track.whitened[i, k]
             if np.isfinite(e):
                 mask = mask & LOST | _weigh(each, e, h, base, before)
@@ -443,19 +460,20 @@ def _hear(i, now, y, s, watch, policy, state, track):
 
 
 @jit
-def _tell(i, first, truth, watch, state, track):
+def _tell(i, first, truth, context, state, track):
     """Compare the estimate with the truth of some states, from `first` on."""
-    begin = TWIN + watch.row_count.size * SENSOR + watch.variances.size * ROW
+    begin = TWIN + context.n_sensors * SENSOR + context.n_rows * ROW
+    columns, circular = ints(context.column, context.nx), circular_states(context)
     for k in range(truth.size):
         if not np.isfinite(truth[k]):
             continue
-        column = watch.column[first + k]
+        column = columns[first + k]
         if column < 0 or not track.std[i, column] > 0.0:
             continue
         error = track.mean[i, column] - truth[k]
-        if watch.circular[first + k] != 0:
+        if circular[first + k] != 0:
             error = wrap(error)
-        own = state[begin + column * STATE :]
+        own = floats(state.ctypes.data + 8 * (begin + column * STATE), STATE)
         before = own[2] != 0.0
         missed = _miss(own, error / track.std[i, column], before)
         own[2] = missed
@@ -464,49 +482,49 @@ def _tell(i, first, truth, watch, state, track):
 
 
 @jit
-def _range(i, u, watch, track):
+def _range(i, u, context, track):
     """Whether a state, or an input that holds, is outside the range in which the model was fitted."""
     states = track.mean.shape[1]
-    for k in range(watch.ranges.shape[0]):
+    ranges = floats(context.ranges, 2 * (states + u.size))
+    for k in range(states + u.size):
         value = track.mean[i, k] if k < states else u[k - states]
-        if value < watch.ranges[k, 0] or value > watch.ranges[k, 1]:
+        if value < ranges[2 * k] or value > ranges[2 * k + 1]:
             return True
     return False
 
 
 @jit
-def watch_rows(first, last, t, kind, channel, value, watch, policy, state, track):
+def watch_rows(first, last, t, kind, channel, value, context, policy, state, track):
     """Fill alarms, flags and health of rows `first` to `last` of a track, whose other columns are there.
 
     `state` moves on with them, as a filter's state does with the events, so the outcome does not depend on how a fold
     was cut into pieces.
     """
-    sensors, rows = watch.row_count.size, watch.variances.size
-    nu = watch.ranges.shape[0] - track.mean.shape[1]
-    u = state[state.size - nu :]
+    sensors, rows, nu = context.n_sensors, context.n_rows, context.nu
+    track = borrowed_columns(track)
+    value = borrowed_rows(value)
+    state = borrowed(state)
+    width = track.alarms.shape[1]
+    expected = ints(context.expected, sensors)
+    u = floats(state.ctypes.data + 8 * (state.size - nu), nu)
     for i in range(first, last):
         now = t[i] * 1e-9
         if not np.isfinite(state[_BEGUN]):
             state[_BEGUN] = now
             for s in range(sensors):
-                if watch.expected[s] != 0:
-                    state[TWIN + s * SENSOR + _DUE] = now + policy.stale_after
+                if expected[s] != 0:
+                    _sensor(state, s)[_DUE] = now + policy.stale_after
             state[_NEXT_DUE] = now + policy.stale_after
-        for k in range(track.alarms.shape[1]):
+        for k in range(width):
             track.alarms[i, k] = 0
         if kind[i] == READING:
             if track.verdict[i] != SCREENED:
                 state[_HEARD] = 1.0
-            _hear(i, now, value[i], channel[i], watch, policy, state, track)
+            y = floats(value[i:].ctypes.data, value.shape[1])
+            _hear(i, now, y, channel[i], context, policy, state, track)
         elif kind[i] == TRUTH:
-            _tell(
-                i,
-                channel[i],
-                value[i, : min(track.alarms.shape[1], watch.column.size - channel[i])],
-                watch,
-                state,
-                track,
-            )
+            truth = floats(value[i:].ctypes.data, min(width, context.nx - channel[i]))
+            _tell(i, channel[i], truth, context, state, track)
         elif kind[i] == INPUT:
             for k in range(nu):
                 if np.isfinite(value[i, k]):
@@ -516,11 +534,11 @@ def watch_rows(first, last, t, kind, channel, value, watch, policy, state, track
         if now > state[_NEXT_DUE]:
             _listen(state, sensors, now)
         flags = 0
-        for s in range(sensors):
-            if state[TWIN + s * SENSOR + _SILENT] != 0.0:
+        for s in range(sensors if state[_QUIET] > 0.0 else 0):
+            if _sensor(state, s)[_SILENT] != 0.0:
                 flags |= 1 << min(s, SENSORS - 1)
         silent = flags
-        if watch.fitted != 0 and _range(i, u, watch, track):
+        if context.fitted != 0 and _range(i, u, context, track):
             flags |= OUTSIDE
         if state[_MISSED] > 0.0:
             flags |= TRUTH_MISSED
@@ -547,6 +565,3 @@ def _health(i, now, silent, flags, state, policy, track):
     if state[_SUSPECTS] > 0.0 or flags != 0:
         return SUSPECT
     return TRACKING
-
-
-watch_signature = types.void(i64, i64, I1, B1, I4, F2, watch_type, policy_type, F1, track_type)

@@ -8,10 +8,10 @@ import numpy as np
 from numba import types
 
 from ..log import RESET
-from ..numerics.jit import B1, F1, I1, f64, i64, inlined, jit
+from ..numerics.jit import F1, f64, i64, inlined, jit
 from ..numerics.quantiles import chi_square_quantile
 from ..numerics.simd import total as sum_of
-from ..track import DIVERGED, FAILED, GATED, TRACKING, USED, track_type
+from ..track import DIVERGED, FAILED, GATED, TRACKING, USED
 
 PROBABILITY = 0.95
 """Of the bounds that charts and reports show."""
@@ -166,6 +166,3 @@ def assess(first, last, t, kind, track, policy, bounds):
             track.nis_low[i] = track.nis_low[i - 1]
             track.nis_high[i] = track.nis_high[i - 1]
             track.consistency[i] = track.consistency[i - 1]
-
-
-assess_signature = types.void(i64, i64, I1, B1, track_type, policy_type, bounds_type)

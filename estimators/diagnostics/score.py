@@ -1,4 +1,8 @@
-"""What a fold was worth: NIS in its bounds, errors where the truth is known, predictions of sensors held out."""
+"""What a fold was worth: NIS in its bounds, errors where the truth is known, predictions of sensors held out.
+
+The log-likelihood counts the readings that the gate refused (see refusals.py); else it would prefer the filter that
+refuses what it does not expect.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +17,7 @@ from ..numerics.quantiles import normal_quantile
 from ..track import GATED, HELD_OUT, MISSING, USED, VERDICT_NAMES, Track
 from .field_pictures import Picture
 from .health import PROBABILITY, nis_bounds
+from .refusals import log_density
 
 
 class Fit(NamedTuple):
@@ -27,7 +32,11 @@ class Fit(NamedTuple):
 
 
 class Score(NamedTuple):
-    """Mean NIS of the used readings with its 95 % bounds, their log-likelihood, counts, and fits.
+    """Mean NIS of the used readings with its 95 % bounds, log-likelihoods, counts, and fits.
+
+    `log_likelihood` is that of the readings used and refused, `log_likelihood_used` that of the used ones alone, which
+    compares filters only where none refuses any. Readings that failed are in neither: they have no density. `refused`
+    is the share of the gate's verdicts that were refusals; NaN without any.
 
     `states` are fits against the truth, by state; `held_out` fits of the readings of sensors held out, by sensor row.
     `field` is that of all cells of a large field, over the times at which they were told; None without such.
@@ -38,31 +47,50 @@ class Score(NamedTuple):
     nis_high: float
     nis_readings: int
     log_likelihood: float
+    log_likelihood_used: float
     readings: int
     gated: int
+    refused: float
     missing: int
     states: dict[str, Fit]
     held_out: dict[str, Fit]
     field: Fit | None = None
 
 
-def score(track: Track, events: Events, model: StateSpaceModel, pictures: Sequence[Picture] = ()) -> Score:
+def score(
+    track: Track,
+    events: Events,
+    model: StateSpaceModel,
+    pictures: Sequence[Picture] = (),
+    *,
+    gate: float | None = None,
+) -> Score:
     """Sum a track up. Errors are taken at the truth events, whose rows hold the estimate at that time.
 
-    Of a large field the fold's `pictures` are summed up too; the track knows a few cells only.
+    Args:
+        track: What was concluded.
+        events: Of what.
+        model: Whose sensors and states.
+        pictures: Of a large field, which are summed up too; the track knows a few cells only.
+        gate: That of the tuning, the probability that a good reading passes: it sets the price of a refusal. Where
+            readings were refused and it is not given, the log-likelihood is NaN.
     """
     used = track.verdict == USED
     dof, count = int(track.dof[used].sum()), int(used.sum())
     low, high = nis_bounds(dof, count) if count else (np.nan, np.nan)
     verdicts = np.bincount(track.verdict, minlength=len(VERDICT_NAMES))
+    gated = int(verdicts[GATED])
+    likelihood = float(track.log_likelihood[used].sum())
     return Score(
         nis=float(track.nis[used].mean()) if count else np.nan,
         nis_low=low,
         nis_high=high,
         nis_readings=count,
-        log_likelihood=float(track.log_likelihood[used].sum()),
+        log_likelihood=likelihood + float(log_density(track.select(track.verdict == GATED), gate).sum()),
+        log_likelihood_used=likelihood,
         readings=int((events.kind == READING).sum()),
-        gated=int(verdicts[GATED]),
+        gated=gated,
+        refused=gated / (gated + count) if gated + count else np.nan,
         missing=int(verdicts[MISSING]),
         states=_against_truth(track, events, model),
         held_out=_held_out(track, events, model),

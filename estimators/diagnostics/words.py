@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
-
 import numpy as np
 
 from ..compiled.model import compile_model
@@ -48,7 +46,7 @@ def only_seen_by(model: StateSpaceModel, s: int) -> list[str]:
         return []
     seen = seen_by(model)
     others = np.delete(seen, s, axis=0).any(axis=0)
-    return [model.state_names[j] for j in np.flatnonzero(seen[s] & ~others)]
+    return [model.state_names[int(j)] for j in np.flatnonzero(seen[s] & ~others)]
 
 
 def noises_behind(model: StateSpaceModel, s: int) -> str:
@@ -96,11 +94,11 @@ def of_sensor(
     if cause == "narrow":
         why = f"{noises_behind(model, s)} too small" if correlation > CORRELATED else f"R.{name} too small"
         return (
-            f"bands of {name} are too narrow {when}: {size:.2f} times as far off as predicted; {why}, or it got noisier"
+            f"bands of {name} are too narrow {when}: off {size:.2f} times as far as predicted; {why}, or it got noisier"
         )
     if cause == "wide":
         why = f"{noises_behind(model, s)} too large" if correlation < -CORRELATED else f"R.{name} too large"
-        return f"bands of {name} are too wide {when}: {size:.2f} times as far off as predicted; {why}"
+        return f"bands of {name} are too wide {when}: off {size:.2f} times as far as predicted; {why}"
     if cause == "correlated":
         why = f"{noises_behind(model, s)} too small, or a missing state"
         return f"innovations of {name} are correlated ({size:+.2f}) {when}: {why}"

@@ -77,7 +77,7 @@ class Estimates:
 
     @property
     def log_likelihood(self) -> float:
-        """Sum over the readings that were used."""
+        """Sum over the readings that were used or refused; see diagnostics/refusals.py."""
         return self.score().log_likelihood
 
     def readings(self, sensor: str) -> np.ndarray:
@@ -105,7 +105,7 @@ class Estimates:
 
     def score(self) -> Score:
         """NIS and its bounds, errors against the truth, predictions of sensors held out."""
-        return score(self.track, self.events, self.model)
+        return score(self.track, self.events, self.model, gate=self.tuning.gate)
 
     def nees(self) -> Nees:
         """Normalised estimation error squared wherever the truth is known.

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..diagnostics.episodes import Episode, as_dict
+from ..diagnostics.episodes import Episode, episode_json
 from ..diagnostics.evidence import CAUSES, OUTSIDE, SENSORS, TRUTH_MISSED
 from ..events.batch import KIND_NAMES, READING, Events, truth_of
 from ..model.state_space import StateSpaceModel
@@ -59,7 +59,7 @@ def table_of(model: StateSpaceModel, events: Events, track: Track, episodes: Seq
     bits = {1 << k: f"{name} silent" for k, name in enumerate(model.sensor_names[:SENSORS])} | _FLAGS
     columns["flags"] = pa.array(_words(track.flags, bits), pa.string())
     plain = {k: np.ascontiguousarray(c) if isinstance(c, np.ndarray) else c for k, c in columns.items()}
-    metadata = {"episodes": json.dumps([as_dict(episode) for episode in episodes])}
+    metadata = {"episodes": json.dumps([episode_json(episode) for episode in episodes])}
     return pa.table(plain).replace_schema_metadata(metadata)
 
 

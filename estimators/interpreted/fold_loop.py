@@ -123,3 +123,17 @@ def run(
             track.log_likelihood[i] = score[2]
             track.verdict[i] = verdict
             track.whitened[i] = score[WHITENED:]
+
+
+def run_and_judge(judge: Any, seen: np.void, *given: Any) -> None:
+    """Fold events, and judge their rows as those of a compiled filter are.
+
+    Args:
+        judge: The compiled judgement.
+        seen: The context that `View` stands for.
+        given: As the kernel's.
+    """
+    *folded, policy, bounds, evidence = given
+    _, _, _, start, end, t, kind, channel, value, *_, track = folded
+    run(*folded)
+    judge(start, end, t, kind, channel, value, seen, policy, bounds, evidence, track)

@@ -131,6 +131,7 @@ def _pointer_to(element: Any) -> Any:
 _to_float = _pointer_to(types.float64)
 _to_int = _pointer_to(types.int64)
 _to_byte = _pointer_to(types.int8)
+_to_mask = _pointer_to(types.int32)
 _to_complex = _pointer_to(types.complex128)
 
 
@@ -150,6 +151,12 @@ def ints(target, n):
 def flags(target, n):
     """The n int8s at an address."""
     return carray(_to_byte(target), (n,))
+
+
+@jit
+def masks(target, rows, columns):
+    """The (rows, columns) int32s at an address."""
+    return carray(_to_mask(target), (rows, columns))
 
 
 @jit

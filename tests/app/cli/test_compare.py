@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,10 @@ from app.cli.scores import SCORES, read_scores, scores_file, write_scores
 from app.twin.twin import load_twin
 from config.loader import load, shipped
 from estimators.errors import ConfigError
-from estimators.fold import Fold
+from estimators.fold import Fold, fold
 from estimators.registry import ESTIMATORS
+from estimators.track import GATED, USED
+from tests.support import as_log
 
 NOTHING = Figure(np.nan)
 ROWS = [
@@ -115,6 +118,24 @@ def test_the_printed_table_says_what_the_cells_say():
         ["ukf", "-", "-", "-", "-", "-", "no factor"],
     ]  # fmt: skip
     assert printed("pump", LINES, logs=20)[0].endswith("± one of 20 logs")
+
+
+def test_what_the_gate_refuses_is_told_where_it_refuses_anything():
+    """Every figure of a row leaves the refused readings out."""
+    rows = [replace(ROWS[0], refused=0.2372), replace(ROWS[1], refused=0.0), ROWS[2]]
+    lines = cells(rows, events=241, seconds=120.0)
+    assert [line["refused [%]"] for line in lines] == ["24", "0", ""]
+    _, _, kf, pf, ukf = printed("pump", lines)
+    assert kf.endswith("refused 24 % of the readings") and "refused" not in pf + ukf
+    assert "refused [%]" not in LINES[0]
+
+
+def test_the_share_refused_is_that_of_a_fold():
+    twin = load_twin("motor_winding", overrides={"gate": "0.8"})
+    events = read_log(twin, 60)[0].events
+    verdicts = fold("kf", twin.model, twin.tuning, as_log(events)).verdict
+    refused = np.mean(verdicts[(verdicts == USED) | (verdicts == GATED)] == GATED)
+    assert fold_row(twin, "kf", [events]).refused == refused > 0.05
 
 
 def test_columns_stand_under_their_titles():

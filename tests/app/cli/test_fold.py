@@ -13,6 +13,7 @@ from app.cli.arguments import Fold
 from app.cli.compare_fold import fold_row
 from app.cli.fold import fold_twin, read_log
 from app.twin.twin import load_twin
+from estimators.track import HEALTH_NAMES
 
 DRIVE = """\
 model: motor_winding
@@ -90,6 +91,18 @@ def test_what_a_black_box_failed_with_is_told(tmp_path: Path, capsys: pytest.Cap
     assert row.failure.startswith(said)
 
 
+def test_the_calibration_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """R as declared is 4; readings of a deviation of 3, and an estimate that is told to be 10 °C off at the end."""
+    rng = np.random.default_rng(4)
+    lines = [f"{t},{40 + 6 * rng.standard_normal()},{50 if t > 30 else ''}," for t in range(200)]
+    (tmp_path / "drive.csv").write_text("\n".join(["t,y,temperature,rate", *lines]))
+    (tmp_path / "drive.yaml").write_text(DRIVE)
+    assert fold_twin(Fold(str(tmp_path / "drive.yaml"))) == 0
+    head, *said = capsys.readouterr().out.partition("calibration, 95 % intervals:\n")[1:]
+    assert head and re.search(r"^  winding: bands too narrow by a factor of 2\.\d \(scale 2\.\d\d, ", said[0])
+    assert re.search(r"^  temperature: truth in its 95 % band \d\.?\d* % \(\S+ to \S+\) of the time$", said[0], re.M)
+
+
 def test_what_of_the_model_made_a_reading_fail_is_told(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """h ends at 42 m, beyond which the level rises: √ of a negative number."""
     box = """\
@@ -150,11 +163,25 @@ def test_the_json_says_what_a_script_needs(tmp_path: Path, capsys: pytest.Captur
     assert told["stale"] == 1 and told["readings"] == 401 and told["gated"] == 1
     assert told["conditioned"] == told["missing"] == np.sum(~good) > 20
     assert told["used"] == np.sum(good) == np.sum(table.verdict == "used")
-    assert set(told["health"]) == {"tracking", "degraded", "diverged", "stale"}
+    assert tuple(told["health"]) == HEALTH_NAMES
     for name, share in told["health"].items():
         assert share == np.mean(table.health == name)
     assert told["health"]["tracking"] > 0.5 and sum(told["health"].values()) == pytest.approx(1.0)
     assert told["held_out"] == {}
+    # The one that was refused lay at 160 °C, 50 deviations off: it costs at least log(1e4) beside its density.
+    assert told["refused"] == pytest.approx(1 / (1 + told["used"]))
+    used = table.verdict == "used"
+    assert told["log_likelihood_used"] == pytest.approx(table.log_likelihood[used].sum())
+    assert told["log_likelihood"] < told["log_likelihood_used"] - np.log(1e4)
+    winding, temperature, rate = told["calibration"]
+    assert (winding["subject"], winding["role"], winding["n"]) == ("winding", "used", told["used"] + 1)
+    # Clipped at the gate, 3.89 deviations, the outlier adds 15.1 to the squares; one in 10,000 would be clipped anyway.
+    e = (table.innovation_0 / table.innovation_std_0)[used]
+    assert winding["ratio"]["value"] == pytest.approx((np.sum(e**2) + 15.137) / (e.size + 1), rel=1e-3)
+    assert winding["refused"]["value"] == told["refused"] and winding["words"] == []
+    assert (temperature["role"], rate["subject"], temperature["n"]) == ("truth", "rate", len(truth))
+    assert temperature["coverage"]["95"]["value"] == told["coverage"]["temperature"]
+    assert temperature["correlation"] == {"value": None, "low": None, "high": None}
     told, table = figures[False]
     rows = table[(table.event == "reading") & np.isfinite(table.value_0)]
     # What is held out is never used: the prediction is the temperature, as h says.
@@ -165,3 +192,5 @@ def test_the_json_says_what_a_script_needs(tmp_path: Path, capsys: pytest.Captur
     assert fit["rmse"] == pytest.approx(np.sqrt(np.mean(error**2)))
     inside = np.abs(error) <= 1.959963984540054 * np.sqrt(rows.temperature_std**2 + 9.0)
     assert fit["coverage"] == inside.mean()
+    winding = told["calibration"][0]
+    assert winding["role"] == "held out" and winding["coverage"]["95"]["value"] == inside.mean()

@@ -99,13 +99,13 @@ def test_score_is_the_definitions():
     log = simulated(3)
     track = fold("kf", MOTOR, Tuning.of(MOTOR).set("gate", 0.9), log)
     events = log.events
-    result = score(track, events, MOTOR)
+    result = score(track, events, MOTOR, gate=0.9)
     used = track.verdict == USED
     assert result.gated == np.sum(track.verdict == GATED) > 0
     assert result.readings == STEPS
     assert result.nis_readings == used.sum()
     np.testing.assert_allclose(result.nis, track.nis[used].mean(), rtol=1e-14)
-    np.testing.assert_allclose(result.log_likelihood, track.log_likelihood[used].sum(), rtol=1e-14)
+    np.testing.assert_allclose(result.log_likelihood_used, track.log_likelihood[used].sum(), rtol=1e-14)
     for j, name in enumerate(MOTOR.state_names):
         rows = (events.kind == TRUTH) & (events.channel == j)
         error = track.mean[rows, j] - events.value[rows, 0]

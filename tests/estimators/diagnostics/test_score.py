@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import chi2, f, multivariate_t
 
 from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.score import score
@@ -36,6 +36,7 @@ MODEL = StateSpaceModel(
     f=still,
 )
 NAN = np.nan
+GATE = 0.99
 # Sensor, verdict, innovations and their deviations, NIS, log-likelihood.
 ROWS = (
     (0, USED, (1.0, NAN), (1.0, NAN), 1.0, -1.5),
@@ -59,12 +60,16 @@ def result():
         track.nis[i], track.log_likelihood[i] = nis, log_likelihood
     t = np.arange(n, dtype=np.int64) * 10**9
     sensors = np.array([row[0] for row in ROWS], np.int32)
-    return score(track, Events(t, t, np.full(n, READING, np.int8), sensors, np.zeros((n, 2))), MODEL)
+    return score(track, Events(t, t, np.full(n, READING, np.int8), sensors, np.zeros((n, 2))), MODEL, gate=GATE)
 
 
 def test_the_used_readings_are_summed_and_the_others_counted(result):
     assert (result.readings, result.nis_readings, result.gated, result.missing) == (8, 3, 1, 2)
-    assert result.nis == 2.0 and result.log_likelihood == -6.0
+    assert result.nis == 2.0 and result.log_likelihood_used == -6.0 and result.refused == 0.25
+    # The refused one: 9 and 9 at deviations of 1, of NIS 99 (its rows are correlated), in a Cauchy density's tail.
+    outside = f.sf(chi2.ppf(GATE, 2) / 2, 2, 1)
+    density = multivariate_t(df=1, shape=np.eye(2)).pdf([np.sqrt(99.0), 0.0]) * (1 - GATE) / outside
+    assert result.log_likelihood == pytest.approx(-6.0 + np.log(density), rel=1e-10)
     # Three readings with 1 + 2 + 2 degrees of freedom.
     assert result.nis_low == pytest.approx(chi2.ppf(0.025, 5) / 3, rel=1e-10)
     assert result.nis_high == pytest.approx(chi2.ppf(0.975, 5) / 3, rel=1e-10)

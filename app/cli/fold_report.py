@@ -1,0 +1,224 @@
+"""What `nisus fold` says of a fold: as lines of text, and as JSON for a script."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from estimators.diagnostics.calibration import BANDS, Calibration, calibrations, truth_calibration
+from estimators.diagnostics.episodes import episode_json, episodes
+from estimators.diagnostics.failure_cause import failures
+from estimators.diagnostics.intervals import Interval
+from estimators.diagnostics.score import Score
+from estimators.fold import Fold
+from estimators.model.state_space import StateSpaceModel
+from estimators.track import FAILED, HEALTH_NAMES, USED
+from estimators.tuning import TOGETHER
+
+from ..twin.twin import Twin
+
+
+def calibration_of(twin: Twin, fold: Fold) -> list[Calibration]:
+    """How far the bands can be believed: of every sensor row, and of every state whose truth is told."""
+    events, track = fold.log.events, fold.track
+    rows = calibrations(twin.model, events, track, gate=twin.tuning.gate, marginal=fold.marginal)
+    return rows + truth_calibration(twin.model, events, track)
+
+
+def number(value: float) -> float | None:
+    """As JSON has it: null where there is none."""
+    return float(value) if np.isfinite(value) else None
+
+
+def _decimals(number: float) -> str:
+    """A number with four decimals, or four digits where that is more than a line can hold."""
+    return f"{number:.4f}" if abs(number) < 1e6 else f"{number:.4g}"
+
+
+def as_dict(
+    twin: Twin, result: Score, found: Sequence[Calibration], seconds: float, counts: Counter[str], fold: Fold
+) -> dict[str, Any]:
+    """What a script needs of a fold.
+
+    `rmse` and `coverage` (the share of errors inside their 95 % band) are by state and `held_out` by sensor row, in
+    their units; `stale` counts the readings that came too late to be among the `readings`, `conditioned` those that a
+    condition of the source's map refused; `health` is the share of the track's rows in each state of health.
+    `log_likelihood` has the price of the readings that were refused, which `log_likelihood_used` leaves out; `refused`
+    is their share. `calibration` has an entry for each sensor row, used or held out, and each state whose truth is
+    told: see estimators/diagnostics/calibration.py. `episodes` have start and end in seconds of the log (end null while
+    one lasts): see estimators/diagnostics/episodes.py.
+    """
+    return {
+        "twin": twin.name,
+        "estimator": twin.estimator,
+        "readings": result.readings,
+        **({"field": {"rmse": result.field.rmse, "coverage": result.field.coverage}} if result.field else {}),
+        "rmse": {name: number(fit.rmse) for name, fit in result.states.items()},
+        "coverage": {name: number(fit.coverage) for name, fit in result.states.items()},
+        "held_out": {
+            name: {"rmse": number(fit.rmse), "bias": number(fit.bias), "coverage": number(fit.coverage)}
+            for name, fit in result.held_out.items()
+        },
+        "nis": {
+            "mean": number(result.nis),
+            "low": number(result.nis_low),
+            "high": number(result.nis_high),
+            "n": result.nis_readings,
+        },
+        "log_likelihood": number(result.log_likelihood),
+        "log_likelihood_used": number(result.log_likelihood_used),
+        "used": int(np.sum(fold.track.verdict == USED)),
+        "stale": counts["stale"],
+        "conditioned": sum(count for key, count in counts.items() if key.startswith("condition ")),
+        "gated": result.gated,
+        "refused": number(result.refused),
+        "missing": result.missing,
+        "failed": int(np.sum(fold.track.verdict == FAILED)),
+        "failure": _why(fold),
+        "health": {
+            name: float(share)
+            for name, share in zip(
+                HEALTH_NAMES, np.bincount(fold.track.health, minlength=len(HEALTH_NAMES)) / len(fold.track), strict=True
+            )
+        },
+        "calibration": [_calibration(entry) for entry in found],
+        "episodes": [episode_json(episode) for episode in episodes(fold)],
+        "seconds_per_event": seconds,
+    }
+
+
+def _calibration(entry: Calibration) -> dict[str, Any]:
+    def figure(found: Interval) -> dict[str, float | None]:
+        return {name: number(value) for name, value in zip(Interval._fields, found, strict=True)}
+
+    return {
+        **{name: getattr(entry, name) for name in ("subject", "role", "start", "end", "n")},
+        **{name: figure(getattr(entry, name)) for name in ("ratio", "scale", "bias", "correlation", "refused")},
+        "coverage": {f"{100 * band:.0f}": figure(share) for band, share in zip(BANDS, entry.coverage, strict=True)},
+        "words": list(entry.words),
+    }
+
+
+def _why(fold: Fold) -> str | None:
+    """What of the model made the first reading or estimate fail that did."""
+    rows = failures(fold.track)
+    return fold.cause(int(rows[0])) if rows.size else None
+
+
+def as_text(
+    twin: Twin, result: Score, found: Sequence[Calibration], seconds: float, counts: Counter[str], fold: Fold
+) -> list[str]:
+    """Lines: names and values, then the calibration."""
+    track = fold.track
+    units = {state.name: state.unit for state in twin.model.shown_states}
+    grid = twin.model.grid
+    rows = [
+        ("twin", f"{twin.name}: {twin.title}"),
+        ("estimator", twin.estimator),
+        ("readings", f"{result.readings}"),
+    ]
+    model = twin.model
+    if result.field is not None and grid is not None:
+        fit = result.field
+        inside = f"in the 95 % band: {100 * fit.coverage:.1f} %"
+        rows.append((f"RMSE {grid.name}, all cells whose truth is known", f"{fit.rmse:.5g} {grid.unit}   {inside}"))
+    rows += [
+        (model.label(name), f"{track.mean[-1, k]:.3f} at the end   Brier score (mean square error): {fit.rmse**2:.5g}")
+        if model.mode >= 0 and name == model.state_names[model.mode]
+        else (f"RMSE {name}", f"{fit.rmse:.5g} {units[name]}   in the 95 % band: {100 * fit.coverage:.1f} %")
+        for k, (name, fit) in enumerate(result.states.items())
+    ]
+    if result.nis_readings:
+        inside = "inside" if result.nis_low <= result.nis <= result.nis_high else "OUTSIDE"
+        bounds = f"{result.nis_low:.4f} to {result.nis_high:.4f} of {result.nis_readings} readings"
+        rows.append(("mean NIS", f"{_decimals(result.nis)}   {inside} its 95 % bounds {bounds}"))
+    # The many rows of one sensor are one line.
+    together = {}
+    for sensor, start in zip(twin.model.sensors, twin.model.row_start, strict=True):
+        names = [name for name in twin.model.row_names[start : start + len(sensor.rows)] if name in result.held_out]
+        if len(names) >= TOGETHER and len({row.unit for row in sensor.rows}) == 1:
+            together[sensor.name] = names
+    many = {name for names in together.values() for name in names}
+    refusals = f"   without what was refused {result.log_likelihood_used:.2f}" if result.gated else ""
+    rows += [
+        ("log-likelihood", f"{result.log_likelihood:.2f}" + refusals),
+        ("gated", f"{result.gated}" + (f"   {100 * result.refused:.2g} % of the readings" if result.gated else "")),
+        ("missing", f"{result.missing}"),
+    ]
+    failed = int(np.sum(track.verdict == FAILED))
+    if failed:
+        rows.append(("failed", f"{failed}: no estimate, or none with this reading, is a number"))
+    why = _why(fold)
+    if why:
+        rows.append((f"the model failed {fold.failures} time(s)" if fold.failures else "because", why))
+    row_units = dict(
+        zip(twin.model.row_names, [row.unit for sensor in twin.model.sensors for row in sensor.rows], strict=True)
+    )
+    rows += [
+        (f"held out {name}", f"RMSE {fit.rmse:.5g} {row_units[name]}   in the 95 % band: {100 * fit.coverage:.1f} %")
+        for name, fit in result.held_out.items()
+        if name not in many
+    ]
+    for sensor_name, own in together.items():
+        fits = [result.held_out[name] for name in own]
+        rmse = float(np.sqrt(np.mean([fit.rmse**2 for fit in fits])))
+        share = 100 * float(np.mean([fit.coverage for fit in fits]))
+        text = f"RMSE {rmse:.5g} {row_units[own[0]]}   in the 95 % band: {share:.1f} %"
+        rows.append((f"held out {sensor_name}, {len(own)} rows", text))
+    rows += [(key, f"{count}") for key, count in sorted(counts.items())]
+    variances = ", ".join(
+        f"{twin.model.state_names[j]} {value**2:.5g}" for j, value in zip(twin.model.shown, track.std[-1], strict=True)
+    )
+    rows += [
+        ("final variances", variances),
+        ("health at the end", HEALTH_NAMES[int(track.health[-1])]),
+        ("time per event", f"{1e6 * seconds:.2f} µs"),
+    ]
+    width = max(len(name) for name, _ in rows)
+    lines = [f"{name:<{width}}  {value}" for name, value in rows]
+    said = calibration_lines(found, twin.model)
+    return lines + (["calibration, 95 % intervals:", *(f"  {line}" for line in said)] if said else [])
+
+
+def calibration_lines(found: Sequence[Calibration], model: StateSpaceModel) -> list[str]:
+    """A line for what each row or state has to say; the many rows of one sensor, or many states, are one."""
+    many = {
+        model.row_names[start + k]: sensor.name
+        for sensor, start in zip(model.sensors, model.row_start, strict=True)
+        for k in range(len(sensor.rows))
+        if len(sensor.rows) >= TOGETHER
+    }
+    lines: list[str] = []
+    groups: dict[tuple[str, str], list[Calibration]] = {}
+    states = sum(entry.role == "truth" for entry in found)
+    for entry in found:
+        group = "states" if entry.role == "truth" and states >= TOGETHER else many.get(entry.subject)
+        if group is not None:
+            groups.setdefault((group, entry.role), []).append(entry)
+        elif entry.words:
+            lines += entry.words
+        else:
+            lines.append(f"{entry.subject}{', truth' if entry.role == 'truth' else ''}: {_figures(entry)}")
+    for (group, role), entries in groups.items():
+        inside = 100 * float(np.mean([entry.coverage[-1].value for entry in entries]))
+        bad = [entry for entry in entries if entry.words]
+        counted = f"{len(entries)} {'of them' if role == 'truth' else f'rows {role}'}"
+        beyond = f"beyond the limits {len(bad)}, as {bad[0].words[0]}" if bad else "none beyond the limits"
+        lines.append(f"{group}, {counted}: in the 95 % band {inside:.3g} %; {beyond}")
+    return lines
+
+
+def _figures(entry: Calibration) -> str:
+    """The figures of a row or state of which nothing need be said."""
+    shares = ", ".join(f"{100 * share.value:.3g}" for share in entry.coverage)
+    bands = ", ".join(f"{100 * band:.0f}" for band in BANDS)
+    said = [f"{shares} % in the {bands} % bands"]
+    if np.isfinite(entry.scale.value):
+        low, high = f"{entry.scale.low:.2f}", f"{entry.scale.high:.2f}"
+        said = [f"scale {entry.scale.value:.2f} ({low} to {high})", f"bias {entry.bias.value:+.2f} σ", *said]
+    if np.isfinite(entry.correlation.value):
+        said.insert(2, f"correlation {entry.correlation.value:+.2f}")
+    return ", ".join(said)

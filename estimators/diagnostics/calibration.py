@@ -1,0 +1,191 @@
+"""How far the bands can be believed: by how much they are too narrow or too wide, not whether a test would say so.
+
+On a real asset no filter is exactly consistent, and with enough readings every test says that. So each figure is the
+size of an effect with its 95 % interval, which allows for correlation in time and for heavy tails (intervals.py), and
+words are said of it only where the whole interval lies beyond the size that matters.
+
+A window is a slice of the events and of the track.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import ndtr
+
+from ..events.batch import READING, Events, truth_of
+from ..model.state_space import StateSpaceModel
+from ..numerics.quantiles import chi_square_quantile, normal_quantile
+from ..track import GATED, HELD_OUT, USED, Track
+from .calibration_words import Limits, Verdict, held_out_words, reading_words, truth_words
+from .intervals import UNKNOWN, Interval, correlation_interval, mean_interval, scale_interval, share_interval
+
+BANDS = (0.50, 0.90, 0.95)
+"""Shares of the readings, or of the truth, that these bands should hold."""
+
+LIMITS = Limits()
+
+
+class Calibration(NamedTuple):
+    """How far the bands of one sensor row, or of one state, can be believed; in units of its band, σ.
+
+    Of a row it is the band of the prediction, S^½, and e = innovation / S^½; of a state its standard deviation, and
+    e = (truth - estimate) / std. `ratio` is the mean of e², 1 if the band is right, and `scale` its root: the bands
+    would have to be so many times as wide. `bias` is the mean of e; `correlation` that of each e with the next;
+    `refused` the share of readings that the gate refused; `coverage` the shares inside the bands `BANDS`. A sensor held
+    out has `coverage` alone, a state neither `correlation` nor `refused`. `words` say what matters, if anything does.
+
+    `start` and `end` are the times of the first and the last value, s, `n` how many there are.
+    """
+
+    subject: str
+    role: str
+    start: float
+    end: float
+    n: int
+    ratio: Interval
+    scale: Interval
+    bias: Interval
+    correlation: Interval
+    refused: Interval
+    coverage: tuple[Interval, ...]
+    words: tuple[str, ...]
+
+
+def calibrations(
+    model: StateSpaceModel,
+    events: Events,
+    track: Track,
+    *,
+    gate: float | None = None,
+    marginal: bool = False,
+    limits: Limits = LIMITS,
+) -> list[Calibration]:
+    """Calibration of every sensor row with readings, those that were used or refused and those held out apart.
+
+    A refused reading counts as one at the gate: as it is, one spike would speak for all; without it, the gate would
+    hide what it refuses. The mean of e² is divided by what this leaves of it in a consistent filter.
+
+    Args:
+        model: Whose sensors.
+        events: What was folded, or a window of it.
+        track: What was concluded of these events.
+        gate: That of the tuning; None where nothing is refused.
+        marginal: Whether the filter's predictions are not Gaussian, and `Track.whitened` holds each row by itself.
+        limits: What matters.
+    """
+    found = []
+    judged = (track.verdict == USED) | (track.verdict == GATED)
+    limit = chi_square_quantile(gate, np.arange(1, model.width + 1)) if gate is not None else None
+    for i, (sensor, start) in enumerate(zip(model.sensors, model.row_start, strict=True)):
+        own = (events.kind == READING) & (events.channel == i)
+        for k in range(len(sensor.rows)):
+            e = standardised(track, k, marginal)
+            there = own & np.isfinite(e)
+            rows = np.flatnonzero(there & judged)
+            if rows.size:
+                edge = np.full(rows.size, np.inf) if limit is None else np.sqrt(limit[track.dof[rows] - 1])
+                refused = (track.verdict[rows] == GATED).astype(bool)
+                found.append(_of_row(model.row_names[start + k], events.t[rows], e[rows], edge, refused, limits))
+            rows = np.flatnonzero(there & (track.verdict == HELD_OUT))
+            if rows.size:
+                found.append(_held_out(model.row_names[start + k], events.t[rows], e[rows], limits))
+    return found
+
+
+def truth_calibration(
+    model: StateSpaceModel, events: Events, track: Track, *, limits: Limits = LIMITS
+) -> list[Calibration]:
+    """Calibration of every state whose truth is told, at those times; a mode that jumps has no band and is left out.
+
+    `ratio` is the state's NEES. Args: see `calibrations`.
+    """
+    found = []
+    mode = model.jump.state if model.jump else None
+    for k, (j, state) in enumerate(zip(model.shown, model.shown_states, strict=True)):
+        rows, truth = truth_of(events, int(j))
+        error = truth - track.mean[rows, k]
+        if state.circular:
+            error = (error + np.pi) % (2.0 * np.pi) - np.pi
+        with np.errstate(all="ignore"):
+            e = error / track.std[rows, k]
+        known = np.isfinite(e)
+        if state.name == mode or not known.any():
+            continue
+        e = e[known]
+        coverage, verdicts = _coverage(e, limits)
+        ratio, bias = scale_interval(e**2), mean_interval(e)
+        found.append(
+            Calibration(
+                state.name,
+                "truth",
+                *_window(events.t[rows[known]]),
+                ratio,
+                _root(ratio),
+                bias,
+                UNKNOWN,
+                UNKNOWN,
+                coverage,
+                truth_words(state.name, verdicts, bias, limits),
+            )
+        )
+    return found
+
+
+def standardised(track: Track, row: int, marginal: bool) -> np.ndarray:
+    """e of one row of each event's sensor, (N,), as it would be drawn from N(0, 1); NaN where there is none.
+
+    The innovation over its standard deviation, or, with `marginal`, what the predictive distribution makes of it.
+    """
+    with np.errstate(all="ignore"):
+        e: np.ndarray = track.innovation[:, row] / track.innovation_std[:, row]
+    own = track.whitened[:, row]
+    return np.where(np.isfinite(own), own, e) if marginal else e
+
+
+def _of_row(
+    name: str, t: np.ndarray, e: np.ndarray, edge: np.ndarray, refused: np.ndarray, limits: Limits
+) -> Calibration:
+    coverage, _ = _coverage(e, limits)
+    clipped = np.clip(e, -edge, edge)
+    # E min(z², g²) of a normal z: that of z² inside, and g² outside.
+    edge = np.minimum(edge, 40.0)
+    tail = 2.0 * ndtr(-edge)
+    left = 1.0 - tail - 2.0 * edge * np.exp(-0.5 * edge**2) / np.sqrt(2.0 * np.pi) + edge**2 * tail
+    ratio = scale_interval(clipped**2 / left)
+    scale, bias, correlation = _root(ratio), mean_interval(clipped), correlation_interval(clipped)
+    share = share_interval(refused, clipped)
+    words = reading_words(name, scale, bias, correlation, share, limits)
+    return Calibration(name, "used", *_window(t), ratio, scale, bias, correlation, share, coverage, words)
+
+
+def _held_out(name: str, t: np.ndarray, e: np.ndarray, limits: Limits) -> Calibration:
+    coverage, verdicts = _coverage(e, limits)
+    words = held_out_words(name, verdicts)
+    unknown = UNKNOWN, UNKNOWN, UNKNOWN, UNKNOWN, UNKNOWN
+    return Calibration(name, "held out", *_window(t), *unknown, coverage, words)
+
+
+def _coverage(e: np.ndarray, limits: Limits) -> tuple[tuple[Interval, ...], Sequence[Verdict]]:
+    """Shares inside the bands, and those that are beyond what bands as wrong as the limits allow would hold."""
+    shares, verdicts = [], []
+    for band in BANDS:
+        half = normal_quantile(0.5 + 0.5 * band)
+        share = share_interval(np.abs(e) <= half, e)
+        low, high = (
+            float(2.0 * ndtr(half * width) - 1.0) for width in (1.0 / (1.0 + limits.width), 1.0 + limits.width)
+        )
+        shares.append(share)
+        if share.beyond(low, high):
+            verdicts.append(Verdict(band, share))
+    return tuple(shares), verdicts[::-1]
+
+
+def _root(ratio: Interval) -> Interval:
+    return Interval(*(float(np.sqrt(value)) for value in ratio))
+
+
+def _window(t: np.ndarray) -> tuple[float, float, int]:
+    return float(t[0]) * 1e-9, float(t[-1]) * 1e-9, int(t.size)

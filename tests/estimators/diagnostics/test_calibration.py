@@ -1,0 +1,210 @@
+"""Tracks whose innovations are drawn with known faults: what is said, and that nothing is said of the others."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import chi2, norm
+
+from estimators.diagnostics.calibration import calibrations, truth_calibration
+from estimators.diagnostics.calibration_words import Limits
+from estimators.events.batch import READING, TRUTH, Events
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.track import GATED, HELD_OUT, MISSING, USED, Track
+from tests.support import SECOND
+
+
+def still(x, u, p, dt, out):
+    out[0] = x[0]
+    out[1] = x[1]
+
+
+def one(x, u, p, out):
+    out[0] = x[0]
+
+
+def two(x, u, p, out):
+    out[0] = x[0]
+    out[1] = x[0]
+
+
+MODEL = StateSpaceModel(
+    name="level",
+    title="level",
+    states=(State("level", "m", 0.0, 1.0), State("heading", "rad", 0.0, 1.0, circular=True)),
+    noises=(Noise("level", "m²/s", 0.1),),
+    sensors=(
+        Sensor("float", (Row("float", "m", 1.0),), h=one),
+        Sensor("sonar", (Row("near", "m", 1.0), Row("far", "m", 1.0)), h=two),
+    ),
+    f=still,
+)
+
+
+def read(e: np.ndarray, gate: float | None = None, std: float = 3.0) -> tuple[Events, Track]:
+    """Readings of the float with these standardised innovations, refused beyond the gate."""
+    n = e.size
+    track = Track.allocate(n, 2, 0, 2)
+    track.innovation[:, 0], track.innovation_std[:, 0] = std * e, std
+    track.nis[:], track.dof[:] = e**2, 1
+    track.verdict[:] = USED if gate is None else np.where(e**2 > chi2.ppf(gate, 1), GATED, USED)
+    t = SECOND * np.arange(n)
+    return Events(t, t, np.full(n, READING, np.int8), np.zeros(n, np.int32), np.zeros((n, 2))), track
+
+
+def of(e: np.ndarray, gate: float | None = None, **more):
+    (found,) = calibrations(MODEL, *read(e, gate), gate=gate, **more)
+    return found
+
+
+def normal(seed: int, n: int = 2000, rho: float = 0.0) -> np.ndarray:
+    white = np.sqrt(1 - rho**2) * np.random.default_rng(seed).standard_normal(n + 200)
+    return lfilter([1.0], [1.0, -rho], white)[200:]
+
+
+def test_each_fault_is_said_and_no_other():
+    e = normal(1)
+    assert of(e).words == ()
+    (said,) = of(1.36 * e).words
+    assert said.startswith("float: bands a third too narrow (scale 1.3")
+    (said,) = of(e / 1.5).words
+    assert said.startswith("float: bands a half too wide (scale 0.6")
+    (said,) = of(0.2 * e).words
+    assert said.startswith("float: bands too wide by a factor of 4.9 (scale 0.20, ")
+    said = of(e + 0.5).words
+    assert said[-1].startswith("float: reads above the prediction (bias +0.5") and len(said) == 1
+    (said,) = of(normal(1, rho=0.5)).words
+    assert said.startswith("float: innovations are correlated (+0.5") and "Q too small" in said
+    (said,) = of(normal(1, rho=-0.5)).words
+    assert said.startswith("float: innovations are correlated (-0.49, ") and "Q too large" in said
+    spiky = np.where(np.arange(e.size) % 10 == 3, 1e5, e)
+    said = of(spiky, 0.9999).words
+    assert any(line.startswith("float: the gate refuses 10 % (") for line in said)
+
+
+def test_only_what_surely_matters_is_said():
+    """A band a tenth too narrow, however many readings tell; a larger size of which the interval is too wide."""
+    assert of(1.1 * normal(2, 50_000)).words == ()
+    assert of(1.1 * normal(2, 50_000), limits=Limits(width=0.05)).words != ()
+    short = of(1.4 * normal(3, 24))
+    assert short.words == () and short.scale.low < 1.25
+
+
+def test_consistent_readings_are_not_spoken_of():
+    """500 windows of 200: each figure would have to be off by its limit with its whole interval, many deviations."""
+    assert not any(of(normal(seed, 200), 0.999).words for seed in range(500))
+
+
+@pytest.mark.parametrize("gate", [0.8, 0.99, None])
+def test_a_gate_does_not_make_a_consistent_filter_look_wide(gate):
+    """Means over 400,000: of e², clipped or not, the deviation is √2 / √400000 = 0.0022 at most."""
+    found = of(normal(4, 400_000), gate)
+    assert abs(found.ratio.value - 1.0) < 4 * 0.0023
+    assert found.scale.value == pytest.approx(np.sqrt(found.ratio.value))
+    share = 0.0 if gate is None else 1.0 - gate
+    assert abs(found.refused.value - share) < 4 * np.sqrt(0.25 / 400_000)
+
+
+def test_a_spike_that_was_refused_does_not_speak_for_all():
+    e = normal(5, 1000)
+    spiked = e.copy()
+    spiked[500] = 1e9
+    before, after = of(e, 0.9999), of(spiked, 0.9999)
+    assert 0.0 < after.ratio.value - before.ratio.value <= 1.001 * chi2.ppf(0.9999, 1) / 1000
+    assert abs(after.bias.value - before.bias.value) < 0.01
+
+
+def test_figures_are_their_definitions():
+    e = normal(6, 500) + 0.1
+    found = of(e)
+    assert (found.subject, found.role, found.start, found.n) == ("float", "used", 0.0, 500)
+    assert found.end == pytest.approx(499.0)
+    assert found.ratio.value == pytest.approx(np.mean(e**2), rel=1e-12)
+    assert found.bias.value == pytest.approx(np.mean(e), rel=1e-12)
+    z = e - e.mean()
+    assert found.correlation.value == pytest.approx(np.sum(z[1:] * z[:-1]) / np.sum(z**2), rel=1e-12)
+    for band, share in zip((0.5, 0.9, 0.95), found.coverage, strict=True):
+        assert share.value == np.mean(np.abs(e) <= norm.ppf(0.5 + band / 2))
+
+
+def test_a_window_is_a_slice():
+    events, track = read(np.concatenate((normal(7, 400), 3.0 * normal(8, 400))))
+    first, last = slice(0, 400), slice(400, 800)
+    (calm,) = calibrations(MODEL, events.select(first), track.select(first))
+    (wild,) = calibrations(MODEL, events.select(last), track.select(last))
+    assert calm.words == () and "too narrow by a factor of 3" in wild.words[0] and wild.start == 400.0
+
+
+def test_sensors_held_out_have_their_coverage_and_rows_their_own():
+    """Row near is as predicted, far is three times as far off; every tenth row of near is missing."""
+    n = 1000
+    track = Track.allocate(n, 2, 0, 2)
+    e = np.column_stack((normal(9, n), 3.0 * normal(10, n)))
+    e[::10, 0] = np.nan
+    track.innovation[:], track.innovation_std[:] = 2.0 * e, 2.0
+    track.verdict[:] = HELD_OUT
+    track.verdict[5] = MISSING
+    t = SECOND * np.arange(n)
+    events = Events(t, t, np.full(n, READING, np.int8), np.ones(n, np.int32), np.zeros((n, 2)))
+    near, far = calibrations(MODEL, events, track, gate=0.99)
+    assert (near.subject, near.role, near.n, far.n) == ("sonar.near", "held out", 899, 999)
+    assert np.isnan(near.scale).all() and near.words == ()
+    # Of N(0, 9) the band ± 1.96 holds 48.6 %.
+    assert far.coverage[2].low < 2 * norm.cdf(1.96 / 3) - 1 < far.coverage[2].high
+    assert len(far.words) == 1 and far.words[0].startswith("sonar.far: ") and "in the 95 % band" in far.words[0]
+
+
+def test_predictions_that_are_not_gaussian_are_judged_by_their_distribution():
+    events, track = read(2.0 * normal(11))
+    track.whitened[:, 0] = normal(12)
+    (by_moments,) = calibrations(MODEL, events, track)
+    (own,) = calibrations(MODEL, events, track, marginal=True)
+    assert by_moments.words and own.words == ()
+    assert own.bias.value == pytest.approx(np.mean(normal(12)))
+
+
+def told(level: np.ndarray, heading: np.ndarray, std: float = 0.1) -> tuple[Events, Track]:
+    """True states, told together, of estimates that stay at 0 and 3 rad."""
+    n = level.size
+    track = Track.allocate(n, 2, 0, 2)
+    track.mean[:], track.std[:] = (0.0, 3.0), std
+    t = SECOND * np.arange(n)
+    values = np.column_stack((level, heading))
+    return Events(t, t, np.full(n, TRUTH, np.int8), np.zeros(n, np.int32), values), track
+
+
+def test_truth_outside_its_band_is_said():
+    n = 1000
+    lost = 0.1 * normal(13, n) + 1.0
+    lost[::33] = 0.0
+    level, heading = truth_calibration(MODEL, *told(lost, 3.0 + 0.1 * normal(14, n)))
+    share, bias = level.words
+    assert share.startswith("level: truth in its 95 % band 3.1 % (") and share.endswith(") of the time")
+    assert bias.startswith("level: truth above the estimate (bias +9.")
+    assert heading.words == () and heading.role == "truth"
+    assert heading.ratio.low < 1.0 < heading.ratio.high
+
+
+def test_angles_are_off_the_short_way_and_wide_bands_are_said():
+    n = 400
+    level, heading = truth_calibration(MODEL, *told(0.02 * normal(15, n), 3.0 - 2 * np.pi + 0.1 * normal(16, n)))
+    assert heading.words == () and abs(heading.bias.value) < 0.3
+    (said,) = level.words
+    assert said.startswith("level: truth in its 90 % band 100 % (") or said.startswith("level: truth in its 95 % band")
+    assert said.endswith("of the time, too wide")
+
+
+def test_an_error_that_hardly_moves_is_no_certainty():
+    """An estimate that was off once, slowly, by as much as its band allows: nothing sure can be said."""
+    n = 5000
+    slow = 0.15 * np.sin(np.linspace(0.0, 2 * np.pi, n))
+    level, _ = truth_calibration(MODEL, *told(slow, 3.0 + 0.1 * normal(17, n)))
+    assert level.words == () and level.scale.high / level.scale.low > 1.5
+
+
+def test_few_readings_have_figures_and_no_words():
+    found = of(5.0 * normal(18, 5))
+    assert found.n == 5 and found.words == () and np.isnan(found.scale.low) and found.scale.value > 1.0
+    events, track = read(np.zeros(0))
+    assert calibrations(MODEL, events, track) == [] == truth_calibration(MODEL, events, track)
+    (said,) = of(np.zeros(50)).words
+    assert said.startswith("float: bands far too wide: the readings never differ from the prediction (scale 0.00")
