@@ -20,7 +20,8 @@ def since(seconds: float) -> str:
     """From when on, as a clock shows it, or in seconds of the log."""
     if seconds < EPOCH:
         return f"since {seconds:.1f} s"
-    return f"since {datetime.fromtimestamp(seconds, UTC):%H:%M:%S} UTC"
+    of_day = int(seconds) % 86400
+    return f"since {of_day // 3600:02}:{of_day // 60 % 60:02}:{of_day % 60:02} UTC"
 
 
 def seen_by(model: StateSpaceModel) -> np.ndarray:
