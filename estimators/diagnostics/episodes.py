@@ -8,20 +8,17 @@ do.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ..log import INPUT, READING, TRUTH, Events, truth_of
+from ..log import INPUT, READING, TRUTH, Events, Log, truth_of
 from ..model.state_space import Input, State, StateSpaceModel
 from ..track import DIVERGED, GATED, HEALTH_NAMES, STALE, USED, Track
 from ..tuning import Tuning
 from .effects import Effect, effects, onset
 from .evidence import AGREEING, DISAGREEING, MISSED, OUTSIDE, REFUSED, SENSORS, STUCK
 from .words import of_sensor, of_silence, of_truth, of_twin, since
-
-if TYPE_CHECKING:
-    from ..fold import Fold
 
 JOINED = 30
 """Readings without an alarm after which another is another episode."""
@@ -85,6 +82,23 @@ class Course(NamedTuple):
     heard: np.ndarray | None = None
 
 
+class Folded(Protocol):
+    """A fold, as far as episodes need it; see `Course`."""
+
+    @property
+    def model(self) -> StateSpaceModel: ...  # noqa: D102
+    @property
+    def tuning(self) -> Tuning: ...  # noqa: D102
+    @property
+    def marginal(self) -> bool: ...  # noqa: D102
+    @property
+    def log(self) -> Log: ...  # noqa: D102
+    @property
+    def n(self) -> int: ...  # noqa: D102
+    @property
+    def track(self) -> Track: ...  # noqa: D102
+
+
 class Found(NamedTuple):
     """An episode, and where it was found.
 
@@ -98,12 +112,12 @@ class Found(NamedTuple):
     episode: Episode
 
 
-def course_of(fold: Fold) -> Course:
+def course_of(fold: Folded) -> Course:
     """What a fold has come to so far: views, which change with it."""
     return Course(fold.model, fold.tuning, fold.marginal, fold.log.events.select(slice(0, fold.n)), fold.track)
 
 
-def episodes(fold: Fold) -> list[Episode]:
+def episodes(fold: Folded) -> list[Episode]:
     """All episodes of a fold, in the order of their start."""
     return [item.episode for item in found_in(course_of(fold))]
 
