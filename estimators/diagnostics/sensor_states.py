@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..events.batch import READING, Events
 from ..model.state_space import StateSpaceModel
-from .evidence import LOST, causes_now, heard_last
+from ..track import HELD_OUT, MISSING, Track
+from .evidence import LOST, SENSORS, causes_now, heard_last
 from .health import HealthPolicy
 
 STATES = ("waiting", "tracking", "suspect", "degraded", "stale", "held out")
@@ -43,3 +45,19 @@ def sensor_states(
             word = "suspect" if said else "tracking"
         found.append(word)
     return found
+
+
+def states_along(events: Events, track: Track, s: int) -> tuple[np.ndarray, np.ndarray]:
+    """The state of sensor s over time, as far as single rows tell it: one that is stale is degraded here.
+
+    Returns:
+        Indices of the rows that say something of the sensor, ascending (k,), and indices into `STATES` (k,).
+    """
+    silent = track.flags >> s & 1 != 0 if s < SENSORS else np.zeros(len(events), bool)
+    spoke = (events.kind == READING) & (events.channel == s) & (track.verdict != MISSING)
+    rows = np.flatnonzero(silent | spoke)
+    said = np.bitwise_or.reduce(track.alarms[rows], axis=1) * spoke[rows]
+    words = ("held out", "degraded", "suspect")
+    cases = (track.verdict[rows] == HELD_OUT, silent[rows] | (said & LOST != 0), said != 0)
+    states = np.select(cases, [STATES.index(word) for word in words], STATES.index("tracking"))
+    return rows, states
