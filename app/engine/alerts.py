@@ -19,9 +19,9 @@ TRIES = 3
 class Alerts:
     """Reports the rows of a fold as they come."""
 
-    def __init__(self, notices: Notices, refused: Callable[[], frozenset[str]] = frozenset) -> None:
-        """`refused`: sensors of which it is said already that the gate refuses them."""
-        self._notices, self._refused = notices, refused
+    def __init__(self, notices: Notices, in_alarm: Callable[[], frozenset[str]] = frozenset) -> None:
+        """`in_alarm`: sensors of which it is said already that something is wrong."""
+        self._notices, self._in_alarm = notices, in_alarm
         self._recoveries = 0
         self._lost: tuple[int, int] | None = None
         self._failures = 0
@@ -44,7 +44,7 @@ class Alerts:
     def look(self, fold: Fold, before: int) -> None:
         """Report the rows from `before` on."""
         track, log = fold.track, fold.log
-        known = {f"gated {name}" for name in self._refused()}
+        known = {f"gated {name}" for name in self._in_alarm()}
         for key, text in complaints(fold.model, log.channel, track, before):
             if key not in known:
                 self._notices.report(key, text, counted=False)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -48,6 +48,11 @@ RANKS = {
 }  # fmt: skip
 """How bad causes are, the worst first; the others come last."""
 
+UNRANKED = 4
+
+OF_SENSORS = ("sensor", "silence")
+"""What is tested of sensors; the second part of such a key is the sensor's name."""
+
 LOST = ("stuck", "refused")
 """Causes that take the place of any other."""
 
@@ -66,28 +71,34 @@ class Account(NamedTuple):
     episodes: tuple[Episode, ...] = ()
     lasting: tuple[Entry, ...] = ()
 
-    @property
-    def leading(self) -> Episode | None:
-        """The worst of those that last, and the earliest of them."""
-        return min((entry.episode for entry in self.lasting), key=_badness, default=None)
+    def leading(self, states: Mapping[str, str]) -> Episode | None:
+        """The worst of those that last, the earliest of them; `states` of the sensors tell which of them is lost."""
+
+        def badness(entry: Entry) -> tuple[int, float]:
+            kind, name = entry.key
+            lost = kind in OF_SENSORS and states.get(name) in ("degraded", "stale")
+            return min(_badness(entry.episode)[0], RANKS["silent"] if lost else UNRANKED), entry.episode.start
+
+        first = min(self.lasting, key=badness, default=None)
+        return None if first is None else first.episode
 
     @property
-    def refused(self) -> frozenset[str]:
-        """Sensors whose readings the gate refuses: known, so that each reading need not be said."""
-        return frozenset(entry.key[1] for entry in self.lasting if entry.episode.cause == "refused")
+    def in_alarm(self) -> frozenset[str]:
+        """Sensors of which something is known to be wrong, so that each refused reading need not be said."""
+        return frozenset(entry.key[1] for entry in self.lasting if entry.key[0] == "sensor")
 
     def of_sensors(self, names: Sequence[str], states: Sequence[str]) -> dict[str, tuple[str, str]]:
         """State of each sensor, with the text of the worst that lasts of it."""
         found = {name: (state, "") for name, state in zip(names, states, strict=True)}
         for entry in sorted(self.lasting, key=lambda entry: _badness(entry.episode), reverse=True):
             kind, name = entry.key
-            if kind in ("sensor", "silence") and found[name][0] not in ("waiting", "tracking"):
+            if kind in OF_SENSORS and found[name][0] not in ("waiting", "tracking"):
                 found[name] = (found[name][0], entry.episode.text)
         return found
 
 
 def _badness(episode: Episode) -> tuple[int, float]:
-    return RANKS.get(episode.cause, 4), episode.start
+    return RANKS.get(episode.cause, UNRANKED), episode.start
 
 
 class Chronicle:
@@ -195,7 +206,8 @@ class Chronicle:
         """Say what is new against the entries before; `again`: those of another revision, or of rows taken back."""
         begun, over = _changes(before, self._entries, again)
         notices, track, t = self._engine.notices, self._tail.track, self._tail.events.t
-        leading = self.account.leading
+        states = {name: state for name, (state, _) in self._engine.status().sensors.items()}
+        leading = self.account.leading(states)
         health = int(track.health[-1])
         if health != self._health:
             self._health = health

@@ -104,7 +104,7 @@ class Engine:
         self._idle_ticks = IdleTicks(section.tick)
         self._latency = Latency()
         self._chronicle = Chronicle(self)
-        self._alerts = Alerts(self.notices, lambda: self._chronicle.account.refused)
+        self._alerts = Alerts(self.notices, lambda: self._chronicle.account.in_alarm)
         self._stall = Stall(self._say_stalled)
         self._status: tuple[float, Status] | None = None
         self.recorder: Records | None = None
@@ -273,6 +273,7 @@ class Engine:
             states = sensor_states(self.model, fold.tuning.used, fold.evidence, now, self._policy)
             health = int(track.health[last]) if last >= 0 else WAITING
             account = self._chronicle.account
+            leading = account.leading(dict(zip(self.model.sensor_names, states, strict=True)))
             status = Status(
                 estimator=self.estimator,
                 tuning=self.tuning,
@@ -282,7 +283,7 @@ class Engine:
                 t=int(log.t[last]) if last >= 0 else None,
                 health=health,
                 since=int(log.t[last_run(track.health)]) if last >= 0 else None,
-                cause=account.leading.text if account.leading and health not in (WAITING, TRACKING) else "",
+                cause=leading.text if leading is not None and health not in (WAITING, TRACKING) else "",
                 sensors=account.of_sensors(self.model.sensor_names, states),
                 episodes_open=len(account.lasting),
                 lost=self._alerts.lost,

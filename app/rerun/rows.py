@@ -16,7 +16,7 @@ from ..engine.interface import Running
 from ..engine.notices import Notice
 from ..engine.outputs import Pull
 from .field import FieldDrawing
-from .layout import blueprint, styles
+from .layout import LANES, blueprint, styles
 from .pairs import PairDrawing
 from .sink import Sink
 from .style import EVENTS, HEALTH_COLORS, SENSOR_COLORS, pair_name
@@ -24,9 +24,6 @@ from .thin import last_of_each_time
 
 PIXELS = 1200
 """Stretches into which the charts' window is cut; each is drawn by its extremes."""
-
-LANES = 6
-"""Sensors at most whose states are drawn beneath the twin's health."""
 
 REMEMBERED = 30 * 10**9
 """Nanoseconds back to which late readings are told from those drawn already."""
@@ -82,7 +79,7 @@ class RerunRows:
         self._states_of = dict.fromkeys(self._sensors, -1)
         for name in self._sensors:
             self.sink.static(
-                f"/health/{name}",
+                f"/sensor/{name}",
                 rr.StateConfiguration(
                     values=list(STATES), labels=list(STATES), colors=np.array(SENSOR_COLORS, np.uint32)
                 ),
@@ -235,7 +232,7 @@ class RerunRows:
                 self._states_of[name] = int(states[-1])
             if changes.size:
                 words = [STATES[states[k]] for k in changes]
-                self.sink.columns(f"/health/{name}", events.t[rows[changes]], rr.StateChange.columns(state=words))
+                self.sink.columns(f"/sensor/{name}", events.t[rows[changes]], rr.StateChange.columns(state=words))
 
     def _readings(self, events: Events, track: Track, width: int) -> None:
         channel, t = events.channel, events.t

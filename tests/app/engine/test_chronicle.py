@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from app.engine import commands
-from app.engine.chronicle import Chronicle
+from app.engine.chronicle import Account, Chronicle, Entry
 from app.engine.engine import Engine
-from estimators.diagnostics.episodes import episodes
+from estimators.diagnostics.episodes import Episode, episodes
 from estimators.fold import Fold
 from estimators.log import Log
 from estimators.track import GATED
@@ -178,7 +178,7 @@ def test_a_refused_sensor_is_said_once_and_not_reading_by_reading(asset):
     moved[300:] += 100.0
     told, refused = [], 0
     for start in range(0, 600, 10):
-        known = "winding" in engine._chronicle.account.refused
+        known = "winding" in engine._chronicle.account.in_alarm
         lines = len(engine.notices.since(0))
         # As if each batch came a second after the one before.
         engine.notices._last.clear()
@@ -190,3 +190,17 @@ def test_a_refused_sensor_is_said_once_and_not_reading_by_reading(asset):
         engine._chronicle.look()
     assert refused > 3 and all(line != known for known, line in told)
     assert sum("is refused by the gate" in text for text in said(engine)) == 1
+
+
+def test_the_cause_is_that_of_a_sensor_that_is_lost_before_that_of_one_that_is_noisy():
+    def entry(kind, name, cause, start):
+        return Entry((kind, name), 0, Episode(start, None, name, cause, 1.0, 0.0, 2.0, "", f"{name} {cause}"))
+
+    noisy, lost = entry("sensor", "a", "wide", 1.0), entry("sensor", "b", "narrow", 2.0)
+    account = Account((noisy.episode, lost.episode), (noisy, lost))
+    assert account.leading({"a": "suspect", "b": "suspect"}).text == "a wide"
+    assert account.leading({"a": "suspect", "b": "degraded"}).text == "b narrow"
+    silent, gone = entry("silence", "c", "silent", 3.0), entry("twin", "diverged", "diverged", 4.0)
+    assert Account((), (noisy, silent)).leading({"a": "suspect", "c": "degraded"}).text == "c silent"
+    assert Account((), (noisy, silent, gone)).leading({"c": "stale"}).text == "diverged diverged"
+    assert Account().leading({}) is None
