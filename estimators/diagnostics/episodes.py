@@ -298,7 +298,8 @@ def _of_truth(course: Course) -> Iterator[Found]:
             error = track.mean[own, column] - values[begin:end]
             if state.circular:
                 error = (error + np.pi) % (2.0 * np.pi) - np.pi
-            off = np.abs(error) / track.std[own, column]
+            sure = track.std[own, column] > 0.0
+            off = np.abs(error[sure]) / track.std[own[sure], column]
             start = events.t[rows[begin]] * 1e-9
             size = float(np.sqrt(np.mean(off**2)))
             episode = Episode(
