@@ -11,6 +11,7 @@ from estimators.fold import Fold
 
 from .counts import UNSETTLED, complaints, estimated_rows
 from .notices import Notices
+from .refusals import refusals
 
 TRIES = 3
 """Failures of one fold whose cause is sought; a reading of 1e300 has none in the model, so more than one."""
@@ -48,6 +49,8 @@ class Alerts:
         for key, text in complaints(fold.model, log.channel, track, before):
             if key not in known:
                 self._notices.report(key, text, counted=False)
+        for key, text in refusals(fold.model, log, track, before):
+            self._notices.report(key, text, counted=False)
         self._look_at_failures(fold)
         self._look_for_cause(fold, before)
         count, told = fold.recoveries(), self._recoveries

@@ -69,11 +69,18 @@ def base_to_json(base: Base | None) -> str:
     if base is None:
         return "null"
     moments = {"mean": base.mean.tolist(), "cov": base.cov.tolist(), "clock": base.clock, "u": base.u.tolist()}
-    moments["first"] = base.first
-    if base.state is None:
-        return json.dumps(moments)
-    numbers = {"state": _text(base.state), "evidence": None if base.evidence is None else _text(base.evidence)}
-    return json.dumps({**moments, "estimator": base.estimator, **numbers})
+    moments |= {"first": base.first, "version": base.version}
+    arrays = {"state": base.state, "edge": base.edge, "evidence": base.evidence}
+    held = {key: _encoded(array) for key, array in arrays.items() if array is not None}
+    return json.dumps({**moments, "estimator": base.estimator, **held})
+
+
+def _encoded(array: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(array, "<f8").tobytes()).decode()
+
+
+def _decoded(text: str | None) -> np.ndarray | None:
+    return None if text is None else np.frombuffer(base64.b64decode(text), "<f8").astype(float)
 
 
 def base_from_json(text: str) -> Base | None:
@@ -87,18 +94,12 @@ def base_from_json(text: str) -> Base | None:
         int(values["clock"]),
         np.array(values["u"], float),
         values.get("estimator", ""),
-        _numbers(values.get("state")),
+        _decoded(values.get("state")),
         int(values.get("first", 0)),
-        _numbers(values.get("evidence")),
+        evidence=_decoded(values.get("evidence")),
+        edge=_decoded(values.get("edge")),
+        version=int(values.get("version", 1)),
     )
-
-
-def _text(numbers: np.ndarray) -> str:
-    return base64.b64encode(np.ascontiguousarray(numbers, "<f8").tobytes()).decode()
-
-
-def _numbers(text: str | None) -> np.ndarray | None:
-    return None if text is None else np.frombuffer(base64.b64decode(text), "<f8").astype(float)
 
 
 TAKEN = "is there already; choose another name, or remove it"

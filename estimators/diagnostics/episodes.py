@@ -17,8 +17,8 @@ from ..model.state_space import Input, State, StateSpaceModel
 from ..track import DIVERGED, GATED, HEALTH_NAMES, STALE, USED, Track
 from ..tuning import Tuning
 from .effects import Effect, effects, onset
-from .evidence import AGREEING, DISAGREEING, MISSED, OUTSIDE, REFUSED, SENSORS, STUCK
-from .words import of_sensor, of_silence, of_truth, of_twin, since
+from .evidence import AGREEING, DISAGREEING, IMPOVERISHED, MISSED, OUTSIDE, REFUSED, SENSORS, STUCK
+from .words import of_particles, of_sensor, of_silence, of_truth, of_twin, since
 
 JOINED = 30
 """Readings without an alarm after which another is another episode."""
@@ -33,7 +33,7 @@ MOST = 0.5
 
 CAUSES = (
     "shifted", "narrow", "wide", "correlated", "alternating", "spiky", "refused", "stuck", "disagreeing", "agreeing",
-    "silent", "never heard", "missed", "outside", "stale", "diverged",
+    "silent", "never heard", "missed", "outside", "impoverished", "stale", "diverged",
 )  # fmt: skip
 """Of episodes; each has its heading in ALARMS.md."""
 
@@ -129,6 +129,7 @@ def found_in(course: Course) -> list[Found]:
         *_of_silence(course),
         *_of_truth(course),
         *_of_ranges(course),
+        *_of_particles(course),
         *_of_twin(course),
     ]
     plain = [item._replace(episode=_plain(item.episode)) for item in found]
@@ -158,10 +159,18 @@ def standardised(course: Course, rows: np.ndarray, k: int) -> np.ndarray:
     track = course.track
     e = track.innovation[rows, k] / track.innovation_std[rows, k]
     if course.marginal:
-        own = track.whitened[rows, k]
-        e = np.where(np.isfinite(own), own, e)
+        e = track.whitened[rows, k]
     verdict = track.verdict[rows]
     return np.where((verdict == USED) | (verdict == GATED), e, np.nan)
+
+
+def unusual(course: Course, s: int, k: int, e: np.ndarray) -> np.ndarray:
+    """Finite e (n,) of row k of sensor s as it would be drawn from N(0, 1) if it were as it was when accepted."""
+    if course.tuning.baseline is None:
+        return e
+    bias, scale, phi = course.tuning.baseline[course.model.row_start[s] + k, :3]
+    e = (e - bias) / scale
+    return np.append(e[:1], (e[1:] - phi * e[:-1]) / np.sqrt(1.0 - phi**2)) if phi else e
 
 
 def _of_sensors(course: Course) -> Iterator[Found]:
@@ -182,7 +191,7 @@ def _of_sensor(
     """The episode of the readings `begin` to `end` of a sensor, whose events are `rows`."""
     events, track, model = course.events, course.track, course.model
     said = np.bitwise_or.reduce(masks[begin:end])
-    k, begun, ranked = _most_telling(course, rows, np.flatnonzero(said), begin, end)
+    k, begun, ranked = _most_telling(course, s, rows, np.flatnonzero(said), begin, end)
     effect = ranked[0]
     cause, size, low, high = effect.cause, effect.size, effect.low, effect.high
     values, verdict = events.value[rows], track.verdict[rows]
@@ -223,7 +232,7 @@ def _of_sensor(
 
 
 def _most_telling(
-    course: Course, rows: np.ndarray, said: np.ndarray, begin: int, end: int
+    course: Course, s: int, rows: np.ndarray, said: np.ndarray, begin: int, end: int
 ) -> tuple[int, int, list[Effect]]:
     """The row that shows most of what is wrong, the reading since when, and what it shows, the likeliest first."""
     first = max(0, begin - LOOKED_AT)
@@ -233,7 +242,7 @@ def _most_telling(
         known = np.flatnonzero(np.isfinite(e))
         if known.size < 2:
             continue
-        e = e[known]
+        e = unusual(course, s, int(k), e[known])
         alarm = min(int(np.searchsorted(known, begin - first)), e.size - 1)
         guess = effects(e[max(0, alarm - JOINED) :][:LOOKED_AT])[0]
         begun = onset(e[: alarm + 1], guess.cause)
@@ -351,6 +360,28 @@ def _outside(item: State | Input, value: np.ndarray, t: np.ndarray) -> Iterator[
             f"{since(start)}: bands hold only inside; use a model fitted there",
         )
         yield Found(("range", item.name), begin, int(t[begin]), episode)
+
+
+def _of_particles(course: Course) -> Iterator[Found]:
+    t, track = course.events.t, course.track
+    for begin, end, lasts in _runs(track.flags & IMPOVERISHED != 0):
+        effective = track.effective[begin:end]
+        effective = effective[np.isfinite(effective)]
+        if not effective.size:
+            continue
+        start, size = t[begin] * 1e-9, float(np.median(effective))
+        episode = Episode(
+            start=start,
+            end=None if lasts else t[min(end, t.size - 1)] * 1e-9,
+            subject="twin",
+            cause="impoverished",
+            size=size,
+            low=float(np.quantile(effective, 0.025)),
+            high=float(np.quantile(effective, 0.975)),
+            unit="",
+            text=of_particles(size, float(np.nanmin(track.ancestors[begin:end])), start),
+        )
+        yield Found(("particles", "twin"), begin, int(t[begin]), episode)
 
 
 def _of_twin(course: Course) -> Iterator[Found]:

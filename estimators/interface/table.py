@@ -9,21 +9,32 @@ from typing import Any
 import numpy as np
 
 from ..diagnostics.episodes import Episode, episode_json
-from ..diagnostics.evidence import CAUSES, OUTSIDE, SENSORS, TRUTH_MISSED
+from ..diagnostics.evidence import CAUSES, IMPOVERISHED, OUTSIDE, SENSORS, TRUTH_MISSED
 from ..events.batch import KIND_NAMES, READING, Events, truth_of
+from ..events.maintenance import model_versions
 from ..model.state_space import StateSpaceModel
-from ..track import HEALTH_NAMES, VERDICT_NAMES, Track
+from ..track import HEALTH_NAMES, REASONS, VERDICT_NAMES, Track
 
 
-def table_of(model: StateSpaceModel, events: Events, track: Track, episodes: Sequence[Episode] = ()) -> Any:
+def table_of(
+    model: StateSpaceModel,
+    events: Events,
+    track: Track,
+    episodes: Sequence[Episode] = (),
+    *,
+    tuning_version: int = 1,
+    model_version: int = 1,
+) -> Any:
     """A pyarrow.Table of events and track.
 
     Columns: `t_ns` and `arrival_ns`; `seconds`; `event`, `channel`, and `sensor` (null unless it is a reading);
     `value_k` and, where a reading brought its own, `variance_k`; for each state `NAME_true` (NaN where it is not
     known), `NAME` and `NAME_std`; `innovation_k` and `innovation_std_k`; NIS with its windowed mean and bounds,
-    log-likelihood; verdict and health in words; `alarms`, the causes that are in alarm after a reading or a truth, and
-    `flags`, what else is wrong (sensors that are silent, a range that is left, a truth that is missed), both joined by
-    commas, null where there is none. The schema's metadata have `episodes`, as JSON.
+    log-likelihood; verdict and health in words; `screened`: why the edge refused rows of the reading, null if it did
+    not; `model_version`, which counts up with each maintenance from that at the first event, and `tuning_version`, of
+    the tuning that the track was folded with; `alarms`, the causes that are in alarm after a reading or a
+    truth, and `flags`, what else is wrong, both joined by commas, null where there is none. The schema's metadata have
+    `episodes`, as JSON.
     """
     import pyarrow as pa
 
@@ -52,7 +63,10 @@ def table_of(model: StateSpaceModel, events: Events, track: Track, episodes: Seq
     for name in ("nis", "nis_mean", "nis_low", "nis_high", "log_likelihood"):
         columns[name] = getattr(track, name)
     columns["verdict"] = np.array(VERDICT_NAMES)[track.verdict]
+    columns["screened"] = _reasons(track.screened)
     columns["health"] = np.array(HEALTH_NAMES)[track.health]
+    columns["model_version"] = model_versions(events, model_version)
+    columns["tuning_version"] = np.full(len(events), tuning_version, np.int64)
     columns["alarms"] = pa.array(
         _words(np.bitwise_or.reduce(track.alarms, axis=1, dtype=np.int64), _CAUSES), pa.string()
     )
@@ -64,7 +78,7 @@ def table_of(model: StateSpaceModel, events: Events, track: Track, episodes: Seq
 
 
 _CAUSES = {1 << k: cause for k, cause in enumerate(CAUSES)}
-_FLAGS = {OUTSIDE: "outside the fitted range", TRUTH_MISSED: "truth missed"}
+_FLAGS = {IMPOVERISHED: "impoverished", OUTSIDE: "outside the fitted range", TRUTH_MISSED: "truth missed"}
 
 
 def _words(masks: np.ndarray, bits: dict[int, str]) -> np.ndarray:
@@ -72,3 +86,13 @@ def _words(masks: np.ndarray, bits: dict[int, str]) -> np.ndarray:
     kinds, which = np.unique(masks, return_inverse=True)
     said = [", ".join(word for bit, word in bits.items() if int(mask) & bit) or None for mask in kinds]
     return np.array(said, object)[which.reshape(-1)]
+
+
+def _reasons(screened: np.ndarray) -> Any:
+    """Why readings were refused, as `range, rate`; null where they were not."""
+    import pyarrow as pa
+
+    every = range(1 << len(REASONS))
+    words = [", ".join(name for k, name in enumerate(REASONS) if bits & (1 << k)) or None for bits in every]
+    bits = np.bitwise_or.reduce(screened, axis=1)
+    return pa.array(np.array(words, object)[bits], pa.string())
