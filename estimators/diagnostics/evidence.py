@@ -247,6 +247,12 @@ def causes_now(model: StateSpaceModel, state: np.ndarray) -> tuple[np.ndarray, n
     return each[:, _MASK].astype(int), own[:, _ALL].astype(int), own[:, _SILENT] > 0.0
 
 
+def heard_last(model: StateSpaceModel, state: np.ndarray) -> np.ndarray:
+    """When each sensor spoke last, s (sensors,); NaN for one that has not."""
+    own = state[TWIN : TWIN + len(model.sensors) * SENSOR].reshape(-1, SENSOR)
+    return np.where(own[:, _COUNT] > 0.0, own[:, _LAST], np.nan)
+
+
 @inlined
 def _sensor(state, s):
     """The part of sensor s."""
