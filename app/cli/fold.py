@@ -97,7 +97,16 @@ def fold_twin(arguments: Arguments) -> int:
     prepare(twin)
     log, counts = read_log(twin, arguments.duration)
     period = twin.picture if arguments.out is not None and arguments.out.suffix == ".rrd" else None
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log, pairs=twin.pairs, policy=twin.policy, picture=period)
+    fold = Fold(
+        twin.estimator,
+        twin.model,
+        twin.tuning,
+        log,
+        pairs=twin.pairs,
+        policy=twin.policy,
+        picture=period,
+        expected=twin.expected,
+    )
     begun = time.perf_counter()
 
     def work() -> None:

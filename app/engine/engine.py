@@ -134,7 +134,15 @@ class Engine:
     def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
         period = self.twin.picture if self.model.grid is not None else None
         return Fold(
-            estimator, self.model, tuning, log, pairs=self.pairs, policy=self._policy, base=base, picture=period
+            estimator,
+            self.model,
+            tuning,
+            log,
+            pairs=self.pairs,
+            policy=self._policy,
+            base=base,
+            picture=period,
+            expected=self.twin.expected,
         )
 
     @contextmanager

@@ -191,7 +191,7 @@ def _of_sensor(
     """The episode of the readings `begin` to `end` of a sensor, whose events are `rows`."""
     events, track, model = course.events, course.track, course.model
     said = np.bitwise_or.reduce(masks[begin:end])
-    k, begun, ranked = _most_telling(course, s, rows, np.flatnonzero(said), begin, end)
+    k, begun, over, ranked = _most_telling(course, s, rows, np.flatnonzero(said), begin, end, lasts)
     effect = ranked[0]
     cause, size, low, high = effect.cause, effect.size, effect.low, effect.high
     values, verdict = events.value[rows], track.verdict[rows]
@@ -203,15 +203,18 @@ def _of_sensor(
     if stuck.size:
         k, cause = int(stuck[0]), "stuck"
         begun = _same_since(values[:, k], begin)
+        others = np.flatnonzero(values[begun:end, k] != values[begun, k])
+        over = end if lasts or not others.size else begun + int(others[0])
         size, low, high = float(values[begun, k]), np.nan, np.nan
     elif refused.size:
         k, cause = int(refused[0]), "refused"
         used = np.flatnonzero(verdict[:begin] == USED)
         begun = int(used[-1]) + 1 if used.size else 0
-        size, low, high = float(np.mean(verdict[begun:end] == GATED)), np.nan, np.nan
+        over = end if lasts else begun + int(np.flatnonzero(verdict[begun:end] == GATED)[-1]) + 1
+        size, low, high = float(np.mean(verdict[begun:over] == GATED)), np.nan, np.nan
     elif said[0] & (DISAGREEING | AGREEING) and not np.any(said & ~(DISAGREEING | AGREEING)):
         cause = "disagreeing" if said[0] & DISAGREEING else "agreeing"
-    nu = track.innovation[rows[begun:end], k]
+    nu = track.innovation[rows[begun:over], k]
     about = float(np.nanmean(nu)) if np.isfinite(nu).any() else np.nan
     row = model.sensors[s].rows[k]
     unit = {"shifted": "σ", "narrow": "×", "wide": "×", "disagreeing": "×", "agreeing": "×", "stuck": row.unit}
@@ -220,7 +223,7 @@ def _of_sensor(
     correlation = next((item.size for item in ranked if item.cause in ("correlated", "alternating")), 0.0)
     return Episode(
         start=start,
-        end=None if lasts else events.t[rows[end - 1]] * 1e-9,
+        end=None if lasts else events.t[rows[max(over - 1, begun)]] * 1e-9,
         subject=subject,
         cause=cause,
         size=size,
@@ -232,11 +235,14 @@ def _of_sensor(
 
 
 def _most_telling(
-    course: Course, s: int, rows: np.ndarray, said: np.ndarray, begin: int, end: int
-) -> tuple[int, int, list[Effect]]:
-    """The row that shows most of what is wrong, the reading since when, and what it shows, the likeliest first."""
+    course: Course, s: int, rows: np.ndarray, said: np.ndarray, begin: int, end: int, lasts: bool
+) -> tuple[int, int, int, list[Effect]]:
+    """The row that shows most of what is wrong, the readings from when to when, and what it shows, the likeliest first.
+
+    A test falls more slowly than its cause goes: an episode that is over ended where that is most likely.
+    """
     first = max(0, begin - LOOKED_AT)
-    best: tuple[int, int, list[Effect]] = (int(said[0]) if said.size else 0, begin, [_UNKNOWN])
+    best: tuple[int, int, int, list[Effect]] = (int(said[0]) if said.size else 0, begin, end, [_UNKNOWN])
     for k in said:
         e = standardised(course, rows[first:end], int(k))
         known = np.flatnonzero(np.isfinite(e))
@@ -244,11 +250,12 @@ def _most_telling(
             continue
         e = unusual(course, s, int(k), e[known])
         alarm = min(int(np.searchsorted(known, begin - first)), e.size - 1)
-        guess = effects(e[max(0, alarm - JOINED) :][:LOOKED_AT])[0]
+        guess = effects(e[max(0, alarm - JOINED) : alarm + JOINED])[0]
         begun = onset(e[: alarm + 1], guess.cause)
-        ranked = effects(e[begun:][:LOOKED_AT])
-        if ranked[0].ratio > best[2][0].ratio:
-            best = int(k), first + int(known[begun]), ranked
+        over = e.size if lasts else max(e.size - onset(e[begun:][::-1], guess.cause), alarm + 1)
+        ranked = effects(e[begun:over][:LOOKED_AT])
+        if ranked[0].ratio > best[3][0].ratio:
+            best = int(k), first + int(known[begun]), first + int(known[over - 1]) + 1, ranked
     return best
 
 

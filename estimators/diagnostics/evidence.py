@@ -3,7 +3,7 @@
 Under the model the standardised innovations e of a row are N(0, 1) and white. Each way of being wrong is another
 density of e given the one before, and the cumulated log-likelihood ratio tests it:
 
-    W ← min(max(W, 0) + log Λ, cap);  alarm when W ≥ h,  over when W < h/2
+    W ← min(max(W, 0) + log Λ, cap);  alarm when W ≥ h,  over when W < ¾ h
 
 With h = log(readings between false alarms × tests) the mean time between false alarms of the whole bank is at least
 what was asked for, whatever is wrong and however long it lasts. The test that speaks names the cause.
@@ -91,8 +91,11 @@ REPEATING = 0.999
 UNKNOWN_QUANTUM = 0.5
 """Probability of a repeated value that is granted to a sensor which has never changed: its quantum is not known yet."""
 
-SPARE = 8.0
+SPARE = 3.0
 """By which W may pass its threshold, so that it falls again when the cause has gone."""
+
+LASTING = 0.75
+"""Share of the threshold above which an alarm lasts."""
 
 MISSES, MISSES_NO_MORE = 4.5, 3.0
 """Root mean square of (estimate - truth) / σ, over about `TOLD` tellings, from which a truth is missed, and no more."""
@@ -275,7 +278,7 @@ def _add(W, k, ratio, h, peak):
     W[k] = min(max(W[k], 0.0) + min(ratio, 0.5 * h), threshold + SPARE)
     if W[k] >= threshold:
         return 2
-    return 1 if W[k] >= 0.5 * threshold else 0
+    return 1 if W[k] >= LASTING * threshold else 0
 
 
 @inlined
@@ -321,12 +324,12 @@ def _weigh(own, e, h, base, before):
         )
         W = min(max(own[k], 0.0) + min(ratio, 0.5 * h), h + base[3 + k] + SPARE)
         own[k] = W
-        highest = max(highest, W - 0.5 * base[3 + k])
+        highest = max(highest, W - LASTING * base[3 + k])
     mask = 0
-    if highest >= 0.5 * h:
+    if highest >= LASTING * h:
         for k in range(tests):
             threshold = h + base[3 + k]
-            if own[k] >= threshold or own[k] >= 0.5 * threshold and before & BITS[k] != 0:
+            if own[k] >= threshold or own[k] >= LASTING * threshold and before & BITS[k] != 0:
                 mask |= BITS[k]
     said = _add(own, AT_SPIKES, _spike_ratio(square), h, base[3 + AT_SPIKES])
     return mask | _alarm(said, SPIKY, before)
