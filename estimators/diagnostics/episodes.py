@@ -16,7 +16,7 @@ from ..log import INPUT, READING, TRUTH, Events, Log, truth_of
 from ..model.state_space import Input, State, StateSpaceModel
 from ..track import DIVERGED, GATED, HEALTH_NAMES, STALE, USED, Track
 from ..tuning import Tuning
-from .effects import Effect, effects, onset
+from .effects import KINDS, Effect, effects, onset
 from .evidence import AGREEING, DISAGREEING, IMPOVERISHED, MISSED, OUTSIDE, REFUSED, SENSORS, STUCK
 from .words import of_particles, of_sensor, of_silence, of_truth, of_twin, since
 
@@ -250,12 +250,13 @@ def _most_telling(
             continue
         e = unusual(course, s, int(k), e[known])
         alarm = min(int(np.searchsorted(known, begin - first)), e.size - 1)
-        guess = effects(e[max(0, alarm - JOINED) : alarm + JOINED])[0]
-        begun = onset(e[: alarm + 1], guess.cause)
-        over = e.size if lasts else max(e.size - onset(e[begun:][::-1], guess.cause), alarm + 1)
-        ranked = effects(e[begun:over][:LOOKED_AT])
-        if ranked[0].ratio > best[3][0].ratio:
-            best = int(k), first + int(known[begun]), first + int(known[over - 1]) + 1, ranked
+        for cause in KINDS:
+            begun = onset(e[: alarm + 1], cause)
+            run = e[begun : begun + LOOKED_AT]
+            over = max(begun + run.size - onset(run[::-1], cause), min(alarm + 1, begun + run.size))
+            ranked = effects(e[begun:over])
+            if ranked[0].cause == cause and ranked[0].ratio > best[3][0].ratio:
+                best = int(k), first + int(known[begun]), first + int(known[over - 1]) + 1, ranked
     return best
 
 
