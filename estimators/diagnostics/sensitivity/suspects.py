@@ -4,7 +4,8 @@ A fault of size θ moves the whitened innovations by θ Δν, as a refold with t
 
     θ̂ = Σ Δνᵀν / Σ ΔνᵀΔν,   log Λ = ½ (Σ Δνᵀν)² / Σ ΔνᵀΔν
 
-is its most likely size and how much likelier than no fault it makes what was seen. Faults that nothing in the data
+is its most likely size and how much likelier than no fault it makes what was seen. A size says by how much a sensor, or
+what the filter is told or believes, is off. Faults that nothing in the data
 tells apart have the same log Λ, and are named together.
 
 Source: Willsky & Jones (1976), doi:10.1109/TAC.1976.1101146, the generalised likelihood ratio of additive faults.
