@@ -1,0 +1,180 @@
+"""Observability along the track: what readings tell of the state in which they began.
+
+The prior mean of each state is nudged, in units of its deviation, and the same log folded again. With P₀ = I in these
+units, and J = Oᵀ N⁻¹ O the information of the readings on the state at their beginning (process noise is in N),
+
+    G_ij = Σ dν_iᵀ S⁻¹ dν_j = (I + J⁻¹)⁻¹,        I - G = (I + J)⁻¹
+
+so I - G is the covariance of that state after the readings, as a share of what it was before them, and the eigenvalues
+g of G give those of J, the stochastic observability Gramian: g / (1 - g). Exact for linear models, the derivative along
+the track for others.
+
+Source: Σ dνᵀS⁻¹dν is the information of the marginal likelihood, Oᵀ (O Oᵀ + N)⁻¹ O; the second form is Woodbury's
+identity. For the Gramian: Jazwinski (1970), Stochastic Processes and Filtering Theory, 7.5.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from typing import NamedTuple
+
+import numpy as np
+
+from ...fold import Fold
+from ...log import Log
+from ...model.state_space import StateSpaceModel
+from ...snapshots import Base
+from ...track import USED
+from ...tuning import Tuning
+from .information import information
+from .nudges import STEP, Given
+from .responses import Start, each, moved, refold, stand_in
+from .size import most_events, reason_against
+
+TOLD = 1.0
+"""Information, in units of the prior's, from which on the readings tell more of a direction than the prior did."""
+
+SURE = 1e-9
+"""Least share of the prior's variance that differences tell from zero; no eigenvalue is larger than its reciprocal."""
+
+BEYOND = 1.05
+"""Eigenvalue of G from which on the filter does not follow nudges in proportion: of a linear model none is above 1."""
+
+
+class View(NamedTuple):
+    """What the readings of a part of the log tell of the state at its beginning.
+
+    begin, end: ns. gramian (nx, nx) is J, in the prior's deviations, and eigenvalues (nx,) its own, rising. `rank`
+    counts those of which the readings tell more than the prior did; `conditioning` is the ratio of the largest to the
+    smallest. deviation (nx,): share of each state's prior deviation that is left. weakest (nx,): the direction of the
+    smallest eigenvalue, in the prior's deviations; `text` has it in words. `beyond`: nudges were not followed in
+    proportion, so this says little.
+    """
+
+    begin: int
+    end: int
+    gramian: np.ndarray
+    eigenvalues: np.ndarray
+    rank: int
+    conditioning: float
+    deviation: np.ndarray
+    weakest: np.ndarray
+    text: str
+    beyond: bool
+
+
+class Gramian(NamedTuple):
+    """Observability from a whole log, and from each of its windows alone; `reason`, `note` as in `Sensitivity`."""
+
+    estimator: str
+    reason: str
+    note: str
+    whole: View | None
+    windows: tuple[View, ...]
+
+
+def gramian(
+    estimator: str,
+    model: StateSpaceModel,
+    tuning: Tuning,
+    log: Log,
+    *,
+    base: Base | None = None,
+    windows: int = 8,
+    most: int | None = None,
+    executor: Executor | str | None = "threads",
+) -> Gramian:
+    """Nudge the prior mean of each state, and see what the readings of a log tell of it.
+
+    Args:
+        estimator: Of the twin; particles and ensembles are replaced by a filter without chance, see `note`.
+        model: Of at most 64 states.
+        tuning: As the twin's.
+        log: The events; it must not grow meanwhile (give a copy).
+        base: Where the log starts, if older events were dropped.
+        windows: Parts of equal time. Each begins at the estimate of that time with the covariance of the prior.
+        most: Events to look at, from the end; None for what takes seconds.
+        executor: As `sensitivity`.
+
+    Raises:
+        EstimatorError: As `Fold`.
+        ModelError: As `Fold`.
+    """
+    name, note = stand_in(estimator, model)
+    reason = reason_against(model, log)
+    if reason:
+        return Gramian(name, reason, note, None, ())
+    if name != estimator:
+        tuning = tuning.with_options({})
+    fold = Fold(name, model, tuning, log, base=base)
+    t = log.t[: log.n]
+    begin = max(0, log.n - (most or most_events(model, 2 * model.nx)))
+    cuts = np.searchsorted(t, np.linspace(t[begin], t[-1], windows + 1)[1:-1])
+    begins = [begin, *(int(k) for k in cuts)]
+    bases = []
+    for k in begins:
+        fold.advance(k - fold.n)
+        mean, _ = fold.moments()
+        bases.append(Base(mean, np.diag(model.prior_std**2), fold.clock, fold.u))
+    spans = list(zip(begins, [*begins[1:], log.n], bases, strict=True))
+    parts = [(begin, log.n, bases[0]), *(span for span in spans if span[1] > span[0])]
+    views = each(lambda part: _view(name, model, tuning, log, *part), parts, executor)
+    if any(view.beyond for view in views):
+        note = "; ".join(filter(None, [note, f"{name} does not follow nudges in proportion: the Gramian says little"]))
+    return Gramian(name, "", note, views[0], tuple(views[1:]))
+
+
+def _view(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, begin: int, end: int, base: Base) -> View:
+    part = log.copy()
+    part.n = end
+    if begin:
+        part.drop_front(begin)
+    given = Given(tuning, part, base)
+    begun = Start(estimator, given, refold(estimator, given), begin, "")
+    used = begun.track.verdict == USED
+    told = [_response(begun, j, std)[used] for j, std in enumerate(model.prior_std.tolist())]
+    g = information(told)
+    values, vectors = np.linalg.eigh(g)
+    left = np.clip(1.0 - values, SURE, 1.0)
+    # A state that is certain at first cannot be nudged, and nothing need be told of it.
+    free = model.prior_std > 0.0
+    eigenvalues = np.clip(values, 0.0, None) / left
+    order = [k for k in range(model.nx) if np.any(np.abs(vectors[free, k]) > SURE)]
+    weak = vectors[:, order[0]] if order else np.zeros(model.nx)
+    weak = weak * (np.sign(weak[np.argmax(np.abs(weak))]) or 1.0)
+    kept = eigenvalues[order]
+    return View(
+        begin=int(part.t[0]),
+        end=int(part.t[part.n - 1]),
+        gramian=(vectors * eigenvalues) @ vectors.T,
+        eigenvalues=eigenvalues,
+        rank=int(np.sum(eigenvalues > TOLD)),
+        conditioning=float(kept[-1] / kept[0]) if kept.size and kept[0] > 0.0 else np.inf,
+        deviation=np.sqrt((vectors**2) @ left),
+        weakest=weak,
+        text=_in_words(weak, model, float(left[order[0]]) if order else 0.0),
+        beyond=bool(np.any(values > BEYOND)),
+    )
+
+
+def _response(begun: Start, j: int, std: float) -> np.ndarray:
+    """S^-1/2 dν (N, ny) by one prior deviation of state j."""
+    base, tracks = begun.given.base, []
+    for size in (-STEP, STEP):
+        mean = base.mean.copy()
+        mean[j] += size * std
+        tracks.append(refold(begun.estimator, begun.given._replace(base=base._replace(mean=mean))))
+    return moved(begun, tracks[1], tracks[0]).whitened / (2.0 * STEP)
+
+
+def _in_words(weights: np.ndarray, model: StateSpaceModel, left: float) -> str:
+    """The weakest direction, its largest parts in units, and how much of the prior's deviation is left in it."""
+    parts = [
+        f"{model.state_names[int(j)]} {weights[j] * model.prior_std[j]:+.3g} {model.states[int(j)].unit}"
+        for j in np.argsort(-np.abs(weights), kind="stable")[:4]
+        if np.abs(weights[j]) >= 0.1 * np.abs(weights).max(initial=0.0) and weights[j] != 0.0
+    ]
+    if not parts:
+        return "every state is certain"
+    together = f"{parts[0]} with {', '.join(parts[1:])}" if len(parts) > 1 else parts[0]
+    return f"{together}: {100 * np.sqrt(left):.3g} % of its prior deviation is left"

@@ -1,0 +1,211 @@
+"""What could be wrong without anyone noticing: every sensor, input and parameter off by a little, and what moves.
+
+From folds of the same log alone, no new mathematics: the smallest visible fault of each, the bound of the error of each
+state under a fault that is not seen, and what the log can tell of several unknowns at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from typing import NamedTuple
+
+import numpy as np
+
+from ...errors import EstimatorError
+from ...log import Log
+from ...model.state_space import StateSpaceModel
+from ...registry import find_estimator
+from ...snapshots import Base
+from ...track import USED
+from ...tuning import Tuning
+from ..health import HealthPolicy
+from .faults import fault
+from .information import Uncertainty, information, uncertainty
+from .integrity import Integrity, integrity
+from .nudges import KINDS, Nudge, nudges_of
+from .responses import Response, each, respond, start
+from .size import most_events, reason_against
+from .visibility import tests_of
+
+CURVED = 0.5
+"""Nonlinearity from which on a derivative says little; where half the nudges are beyond it, the result says so."""
+
+BANK, BEST = WITNESSES = ("bank", "best")
+"""By whom a fault is seen: the bank of tests that watches the twin, or the best test that there could be."""
+
+
+class Sensitivity(NamedTuple):
+    """What nudges of a fold do, and what follows; k nudges, N events, the last of the log.
+
+    estimator is the filter that was nudged. `reason` is empty, or says why nothing was done: then all arrays are
+    empty; `note` says what to know of the result. t (N,) are the events' times, ns; `first` the index in the log of the
+    first. std (N, shown): σ of the states without nudge.
+
+    fisher (k, k), deviation (k,) and correlation (k, k): see `Uncertainty`, for all nudges unknown together; `among`
+    gives them for some.
+
+    h (rows,) are the thresholds of the tests by sensor row, noncentrality the λ that passes them with the probability
+    asked for. smallest_visible (k,): the size of the smallest fault of each nudge that is seen, if it is there in all N
+    events; infinite if none in its range is. unseen (k, 2): from where to where faults can pass, both signs, within
+    the range. nonlinearity (k,): how much another size is visible than the derivative says, as a share.
+
+    integrity_bias, integrity (shown,): at the end, the largest error of each state by one unseen fault, and the same
+    plus 1.96 σ; integrity_cause (shown,): index of the nudge that causes it, -1 for none. `over_time` has the same for
+    every event.
+    """
+
+    estimator: str
+    reason: str
+    note: str
+    first: int
+    t: np.ndarray
+    std: np.ndarray
+    responses: tuple[Response, ...]
+    fisher: np.ndarray
+    deviation: np.ndarray
+    correlation: np.ndarray
+    h: np.ndarray
+    noncentrality: float
+    smallest_visible: np.ndarray
+    unseen: np.ndarray
+    nonlinearity: np.ndarray
+    integrity_bias: np.ndarray
+    integrity: np.ndarray
+    integrity_cause: np.ndarray
+    over_time: Integrity
+
+    @property
+    def nudges(self) -> tuple[Nudge, ...]:
+        """The nudges, in the order of the arrays."""
+        return tuple(response.nudge for response in self.responses)
+
+    def place(self, kind: str, name: str) -> int:
+        """Where a nudge stands in the arrays.
+
+        Raises:
+            KeyError: If there is no such nudge.
+        """
+        for k, nudge in enumerate(self.nudges):
+            if (nudge.kind, nudge.name) == (kind, name):
+                return k
+        raise KeyError(f"no nudge of {kind} {name!r}; there are {', '.join(n.name for n in self.nudges)}")
+
+    def among(self, indices: Sequence[int]) -> Uncertainty:
+        """What the log tells of some nudges, if these are unknown and all others are known."""
+        some = list(indices)
+        return uncertainty(self.fisher[np.ix_(some, some)], [self.nudges[k] for k in some])
+
+
+def sensitivity(
+    estimator: str,
+    model: StateSpaceModel,
+    tuning: Tuning,
+    log: Log,
+    *,
+    base: Base | None = None,
+    kinds: Sequence[str] = KINDS,
+    most: int | None = None,
+    seen_by: str = BANK,
+    false_alarm: float = HealthPolicy().false_alarm_every,
+    detection: float = 0.95,
+    baseline: np.ndarray | None = None,
+    executor: Executor | str | None = "threads",
+) -> Sensitivity:
+    """Nudge every sensor row, input and parameter, fold the log again, and look at what moved.
+
+    A fault is a constant that is there from the first of the events looked at to the last. What it does is folded at
+    its own size, so the model need not be linear; `fisher` is of derivatives.
+
+    Args:
+        estimator: Of the twin; particles and ensembles are replaced by a filter without chance, see `note`.
+        model: Of at most 64 states.
+        tuning: As the twin's.
+        log: The events; it must not grow meanwhile (give a copy). Refused readings stay refused.
+        base: Where the log starts, if older events were dropped; see `Fold.base_at`.
+        kinds: Which nudges, of "sensor", "input", "parameter".
+        most: Events to look at, from the end; None for what takes seconds and 256 MB at most.
+        seen_by: "bank" for the tests that watch the twin, "best" for a test that would know what each fault looks like:
+            what it does not see, nobody can.
+        false_alarm: Mean time between false alarms of all tests together, s.
+        detection: Probability with which the smallest visible fault is seen.
+        baseline: What was normal when the tuning was accepted, as `Fold`; without it, white innovations.
+        executor: "threads", an Executor, or None to fold one after the other. The results are the same bits.
+
+    Raises:
+        EstimatorError: As `Fold`; if nobody is called `seen_by`.
+        ModelError: As `Fold`.
+    """
+    find_estimator(estimator, model)
+    if seen_by not in WITNESSES:
+        raise EstimatorError(f"seen_by is {seen_by!r}; it must be one of {', '.join(WITNESSES)}")
+    reason = reason_against(model, log)
+    if reason:
+        return _nothing(estimator, reason, len(model.shown))
+    count = len(model.row_names) + model.nu + len(model.parameters)
+    begun = start(estimator, model, tuning, log, base, most or most_events(model, count))
+    nudges = nudges_of(model, tuning, begun.given.log, kinds)
+    if not nudges:
+        return _nothing(estimator, f"{model.name} has nothing to nudge of {', '.join(kinds)}", len(model.shown))
+    responses = each(lambda nudge: respond(begun, nudge), nudges, executor)
+    track, still = begun.track, begun.given.log
+    used = track.verdict == USED
+    fisher = information([response.whitened[used] for response in responses])
+    told = uncertainty(fisher, nudges)
+    t = still.t[: still.n].copy()
+    tests = tests_of(
+        model, tuning, still, track, every=false_alarm, detection=detection, bank=seen_by == BANK, baseline=baseline
+    )
+    faults = each(lambda response: fault(begun, response, tests), responses, executor)
+    bounds = integrity([item.error for item in faults], track.std)
+    notes = [begun.note]
+    if np.median([item.nonlinearity for item in faults]) > CURVED:
+        notes.append(f"{begun.estimator} does not follow nudges in proportion: Fisher information says little here")
+    return Sensitivity(
+        estimator=begun.estimator,
+        reason="",
+        note="; ".join(filter(None, notes)),
+        first=begun.first,
+        t=t,
+        std=track.std.copy(),
+        responses=tuple(responses),
+        fisher=fisher,
+        deviation=told.deviation,
+        correlation=told.correlation,
+        h=tests.h,
+        noncentrality=tests.noncentrality,
+        smallest_visible=np.array([item.visible for item in faults]),
+        unseen=np.array([(item.low, item.high) for item in faults]),
+        nonlinearity=np.array([item.nonlinearity for item in faults]),
+        integrity_bias=bounds.bias[-1],
+        integrity=bounds.bound[-1],
+        integrity_cause=bounds.cause[-1],
+        over_time=bounds,
+    )
+
+
+def _nothing(estimator: str, reason: str, shown: int) -> Sensitivity:
+    none, rows, square = np.zeros(0), np.zeros((0, shown)), np.zeros((0, 0))
+    unknown = np.full(shown, np.nan)
+    cause = np.full(shown, -1)
+    return Sensitivity(
+        estimator=estimator,
+        reason=reason,
+        note="",
+        first=0,
+        t=np.zeros(0, np.int64),
+        std=rows,
+        responses=(),
+        fisher=square,
+        deviation=none,
+        correlation=square,
+        h=none,
+        noncentrality=np.nan,
+        smallest_visible=none,
+        unseen=np.zeros((0, 2)),
+        nonlinearity=none,
+        integrity_bias=unknown,
+        integrity=unknown,
+        integrity_cause=cause,
+        over_time=Integrity(rows, rows, np.zeros((0, shown), int)),
+    )

@@ -1,0 +1,306 @@
+"""Nudges of models whose answers are known in closed form, or by Monte Carlo."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.stats import binom, norm
+
+from estimators.diagnostics.evidence import TESTS
+from estimators.diagnostics.sensitivity import sensitivity
+from estimators.diagnostics.sensitivity.visibility import noncentrality, threshold
+from estimators.fold import Fold, fold
+from estimators.log import READING, Log
+from estimators.models import MODELS
+from estimators.track import GATED
+from estimators.tuning import Tuning
+
+from .models import COUPLED, KEPT, TWICE, WALK, Q, R, S, simulate
+
+N = 60
+STEPS = np.arange(N)
+SENSOR = KEPT**STEPS
+"""dν of a bias of the sensor: each reading takes a share K of what it still differs by."""
+DRIFT = -(1.0 - KEPT**STEPS) / (1.0 - KEPT)
+"""dν of a drift: the prediction is off by one step's, and by what the readings left of the steps before."""
+CENTRAL = 1e-5
+"""Of a central difference with a step of 1e-3: its square, and a factor of ten for a curvature above one."""
+
+
+def walk_log(seed=0, n=N):
+    log = Log.of(WALK)
+    log.add_inputs(np.arange(n), push=np.full(n, -1.0))
+    log.add("level", np.arange(n), np.random.default_rng(seed).normal(size=n))
+    return log
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return sensitivity("ekf", WALK, Tuning.of(WALK), walk_log(), seen_by="best")
+
+
+def readings(found, array):
+    return array[np.isfinite(found.responses[0].innovation[:, 0])]
+
+
+def test_responses_of_a_walk_in_closed_form(walk):
+    sensor, push, slope, delay = walk.responses
+    assert [(n.kind, n.name) for n in walk.nudges] == [
+        ("sensor", "level"),
+        ("input", "push"),
+        ("parameter", "slope"),
+        ("parameter", "delay"),
+    ]
+    for response, dnu, tolerance in (
+        (sensor, SENSOR, 1e-9),
+        (push, DRIFT, 1e-9),
+        (slope, DRIFT, 1e-9),
+        (delay, -DRIFT, CENTRAL),
+    ):
+        scale = np.abs(dnu).max()
+        np.testing.assert_allclose(readings(walk, response.innovation)[:, 0], dnu, atol=tolerance * scale)
+        np.testing.assert_allclose(readings(walk, response.whitened)[:, 0], dnu / np.sqrt(S), atol=tolerance * scale)
+    # The estimate follows a biased sensor in the end, and is behind the drift by what a reading leaves of it.
+    np.testing.assert_allclose(readings(walk, sensor.states)[:, 0], 1.0 - KEPT ** (STEPS + 1), atol=1e-9)
+    np.testing.assert_allclose(readings(walk, push.states)[:, 0], -KEPT * DRIFT, atol=1e-8)
+
+
+def test_information_and_smallest_visible_faults_in_closed_form(walk):
+    whitened = np.stack([SENSOR, DRIFT, DRIFT, -DRIFT]) / np.sqrt(S)
+    expected = whitened @ whitened.T
+    np.testing.assert_allclose(walk.fisher, expected, rtol=10 * CENTRAL)
+    # (1 - ρ²ᴺ) / (1 - ρ²) is the sum of a geometric series.
+    assert walk.fisher[0, 0] == pytest.approx((1 - KEPT ** (2 * N)) / (1 - KEPT**2) / S, rel=1e-9)
+    # Readings in a day, one a second, times the tests of the one row.
+    assert walk.h[0] == pytest.approx(np.log(86400.0 * TESTS), rel=1e-9)
+    visible = np.sqrt(walk.noncentrality / np.diag(expected))
+    np.testing.assert_allclose(walk.smallest_visible[:3], visible[:3], rtol=1e-6)
+    np.testing.assert_allclose(walk.unseen[:3], np.stack([-visible[:3], visible[:3]], axis=1), rtol=1e-6)
+
+
+def test_what_the_readings_cannot_tell_apart(walk):
+    # An input, and two parameters that do the same: the log tells their sum, and the sensor's bias beside it.
+    assert np.isfinite(walk.deviation[0]) and np.all(np.isinf(walk.deviation[1:]))
+    pair = walk.among([0, 1])
+    cov = np.linalg.inv(np.stack([SENSOR, DRIFT]) @ np.stack([SENSOR, DRIFT]).T / S)
+    np.testing.assert_allclose(pair.deviation, np.sqrt(np.diag(cov)), rtol=1e-6)
+    np.testing.assert_allclose(walk.deviation[0], pair.deviation[0], rtol=1e-6)
+    assert pair.correlation[0, 1] == pytest.approx(cov[0, 1] / np.sqrt(cov[0, 0] * cov[1, 1]), abs=1e-6)
+    # One at the other's cost: the sum stays when one rises and the other falls.
+    assert walk.among([1, 2]).correlation[0, 1] == pytest.approx(-1.0, abs=1e-6)
+    worst = walk.among([1, 2]).directions[0]
+    assert np.isinf(worst.deviation) and np.prod(worst.weights) < 0
+    assert "slope" in worst.text and "input push" in worst.text
+
+
+def test_a_fault_is_as_large_as_the_model_bends(walk):
+    # The drift is 1/delay: a longer one changes it by 1 at most, a shorter one without limit.
+    change = np.sqrt(walk.noncentrality / (DRIFT @ DRIFT / S))
+    assert change < 0.95  # else a longer delay could never be seen, and this shows nothing
+    k = walk.place("parameter", "delay")
+    low, high = walk.unseen[k]
+    # Sizes are sought until √λ is within 5 % and then scaled: the change of the drift is, too, within its square.
+    for size in (low, high):
+        assert abs(1.0 / (1.0 + size) - 1.0) == pytest.approx(change, rel=0.06)
+    assert high > 1.2 * -low
+    assert walk.smallest_visible[k] == pytest.approx(-low)
+    assert walk.nonlinearity[k] > 0.1 > 1e-6 > walk.nonlinearity[0]
+    # What it does to the state is what that change of the drift does, not what the derivative says.
+    assert walk.over_time.bias[-1, 0] == pytest.approx(
+        max(abs(walk.responses[0].states[-1, 0] * walk.unseen[0, 1]), abs(change * KEPT * DRIFT[-1])), rel=0.06
+    )
+
+
+def test_the_range_of_a_parameter_ends_its_faults():
+    tuning = Tuning.of(WALK).set("p.slope", 4.99)
+    found = sensitivity("ekf", WALK, tuning, walk_log(), kinds=("parameter",))
+    assert found.unseen[0, 1] == pytest.approx(0.01) and found.unseen[0, 0] < -0.1
+    assert found.smallest_visible[0] == pytest.approx(-found.unseen[0, 0])
+
+
+def test_the_noncentrality_passes_the_threshold_with_its_probability():
+    for readings, tests, probability in ((86400.0, 17, 0.95), (1e7, 51, 0.5), (100.0, 1, 0.99)):
+        h = threshold(readings, tests)
+        assert np.exp(-h) == pytest.approx(1.0 / (readings * tests))
+        lam = noncentrality(h, norm.ppf(probability))
+        assert norm.sf(h, loc=lam / 2.0, scale=np.sqrt(lam)) == pytest.approx(probability)
+
+
+def test_a_fault_of_the_smallest_visible_size_is_seen():
+    """A cumulative sum that knows the fault's shape finds it in 95 %, counted over simulated innovations."""
+    found = sensitivity("ekf", WALK, Tuning.of(WALK), walk_log(), kinds=("sensor",), seen_by="best")
+    shape = readings(found, found.responses[0].whitened)[:, 0] * found.smallest_visible[0]
+    runs = 2000
+    e = np.random.default_rng(3).normal(size=(runs, N)) + shape
+    ratios = np.concatenate([np.zeros((runs, 1)), np.cumsum(shape * e - 0.5 * shape**2, axis=1)], axis=1)
+    passed = (ratios - np.minimum.accumulate(ratios, axis=1)).max(axis=1) >= found.h[0]
+    assert passed.sum() >= binom.ppf(1e-4, runs, 0.95)
+
+
+def test_deviations_agree_with_the_spread_of_fitted_parameters():
+    """Maximum likelihood over simulated logs; the standard error of a deviation from n logs is 1/√(2n) = 4.6 %."""
+    rng = np.random.default_rng(5)
+    tuning = Tuning.of(COUPLED)
+    true = tuning.p[:2].copy()
+    fitted = []
+    logs = [simulate(rng, 200)[0] for _ in range(240)]
+
+    def misfit(scaled, log):
+        p = tuning.p.copy()
+        p[:2] = true * scaled
+        track = fold("ekf", COUPLED, Tuning(COUPLED, tuning.q, tuning.r, p, tuning.used), log)
+        return -np.nansum(track.log_likelihood)
+
+    for log in logs:
+        fitted.append(minimize(misfit, np.ones(2), args=(log,), method="BFGS", options={"gtol": 1e-2}).x * true)
+    found = sensitivity("ekf", COUPLED, tuning, logs[0], kinds=("parameter",))
+    told = found.among([found.place("parameter", "exchange"), found.place("parameter", "uptake")])
+    # 20 % is four of its standard errors.
+    np.testing.assert_allclose(np.std(fitted, axis=0), told.deviation, rtol=0.2)
+    spread = np.corrcoef(np.array(fitted).T)[0, 1]
+    # Fisher's z is normal with deviation 1/√(n - 3) = 0.065.
+    assert np.arctanh(spread) == pytest.approx(np.arctanh(told.correlation[0, 1]), abs=4 * 0.065)
+    # Each alone would be told better: they are told together.
+    assert np.all(told.deviation > 1.05 * told.alone)
+
+
+def faulty(rng, n, nudge, size):
+    """A log of an asset with a fault, and its true states at the readings."""
+    p, sensor, given = Tuning.of(COUPLED).p.copy(), 0.0, [0.0, 0.0]
+    if nudge.kind == "sensor":
+        sensor = size
+    elif nudge.kind == "input":
+        given[COUPLED.input_names.index(nudge.name)] = size
+    else:
+        p[[item.name for item in COUPLED.parameters].index(nudge.name)] += size
+    return simulate(rng, n, p, sensor, given)
+
+
+@pytest.mark.parametrize("seen_by", ["bank", "best"])
+def test_errors_under_unseen_faults_stay_below_the_bound(seen_by):
+    rng = np.random.default_rng(7)
+    n, runs, tuning = 150, 500, Tuning.of(COUPLED)
+    log, _ = simulate(rng, n)
+    found = sensitivity("ekf", COUPLED, tuning, log, seen_by=seen_by)
+    assert np.all(np.isfinite(found.integrity))
+    np.testing.assert_array_equal(found.integrity, found.integrity_bias + norm.ppf(0.975) * found.std[-1])
+    rows = np.flatnonzero(np.isfinite(found.responses[0].innovation[:, 0]))
+    inside = beyond = 0
+    for _ in range(runs):
+        k = rng.integers(len(found.nudges))
+        log, xs = faulty(rng, n, found.nudges[k], rng.uniform(*found.unseen[k]))
+        track = fold("ekf", COUPLED, tuning, log)
+        j, at = rng.integers(2), rng.integers(n)
+        error = abs(track.mean[rows[at], j] - xs[at, j])
+        inside += error <= found.over_time.bound[rows[at], j]
+        beyond += error > norm.ppf(0.975) * track.std[rows[at], j]
+    # Fewer would come about once in a thousand, if 95 % were inside.
+    assert inside >= binom.ppf(1e-3, runs, 0.95)
+    # The filter's own band does not hold them: the faults matter.
+    assert beyond > binom.ppf(0.999, runs, 0.05)
+
+
+def test_the_worst_fault_is_as_bad_as_the_bound_says():
+    rng = np.random.default_rng(19)
+    n, runs, tuning = 150, 100, Tuning.of(COUPLED)
+    found = sensitivity("ekf", COUPLED, tuning, simulate(rng, n)[0])
+    for j in range(2):
+        k = found.integrity_cause[j]
+        # A bias of the sensor: what it does is linear in it, whatever the log.
+        assert found.nudges[k].kind == "sensor"
+        for end in found.unseen[k]:
+            errors = []
+            for _ in range(runs):
+                log, xs = faulty(rng, n, found.nudges[k], end)
+                errors.append(fold("ekf", COUPLED, tuning, log).mean[-1, j] - xs[-1, j])
+            assert abs(np.mean(errors)) == pytest.approx(
+                found.integrity_bias[j], abs=4.0 * found.std[-1, j] / np.sqrt(runs)
+            )
+
+
+def test_rows_that_share_an_uncertain_state_are_told_together():
+    """Against F = BᵀC⁻¹B, C the covariance of all readings at once: their rows are far from independent."""
+    n = 20
+    log = Log.of(TWICE)
+    log.add("level", np.arange(n), np.random.default_rng(23).normal(size=(n, 2)))
+    found = sensitivity("ekf", TWICE, Tuning.of(TWICE), log)
+    steps = np.arange(n)
+    walk = 1.0 + Q * np.minimum(steps[:, None], steps)
+    cov = np.kron(walk, np.ones((2, 2))) + np.kron(np.eye(n), np.diag([R, 0.5 * R]))
+    biases = np.kron(np.ones((n, 1)), np.eye(2))
+    np.testing.assert_allclose(found.fisher, biases.T @ np.linalg.solve(cov, biases), rtol=1e-8)
+
+
+def test_the_bank_sees_faults_of_the_smallest_visible_size():
+    rng = np.random.default_rng(17)
+    n, runs, tuning = 150, 60, Tuning.of(COUPLED)
+    found = sensitivity("ekf", COUPLED, tuning, simulate(rng, n)[0])
+    best = sensitivity("ekf", COUPLED, tuning, simulate(rng, n)[0], seen_by="best")
+    assert np.all(found.smallest_visible >= best.smallest_visible * 0.9)
+    for k, nudge in enumerate(found.nudges):
+        low, high = found.unseen[k]
+        size = high if high == found.smallest_visible[k] else low
+        assert abs(size) == found.smallest_visible[k]
+        said = {
+            factor: sum(
+                bool(np.any(fold("ekf", COUPLED, tuning, faulty(rng, n, nudge, factor * size)[0]).alarms))
+                for _ in range(runs)
+            )
+            for factor in (0.25, 1.0)
+        }
+        assert said[1.0] >= binom.ppf(1e-3, runs, 0.95), nudge.name
+        # A quarter of it has a sixteenth of the noncentrality: it should hardly ever be seen.
+        assert said[0.25] <= 0.1 * runs, nudge.name
+
+
+def test_what_was_refused_stays_refused():
+    log = walk_log()
+    value = log.value[: log.n]
+    spike = np.flatnonzero(log.kind[: log.n] == READING)[30]
+    value[spike, 0] += 10.0
+    tuning = Tuning.of(WALK).set("gate", 1.0 - 1e-9)
+    assert np.flatnonzero(fold("ekf", WALK, tuning, log).verdict == GATED).tolist() == [spike]
+    found = sensitivity("ekf", WALK, tuning, log)
+    value[spike, 0] = np.nan
+    without = sensitivity("ekf", WALK, Tuning.of(WALK), log)
+    np.testing.assert_array_equal(found.fisher, without.fisher)
+    np.testing.assert_array_equal(found.integrity, without.integrity)
+    assert np.isnan(found.responses[0].innovation[spike, 0])
+
+
+def test_the_last_part_of_a_log_is_that_log_from_a_base():
+    log, _ = simulate(np.random.default_rng(11), 1500)
+    tuning = Tuning.of(COUPLED)
+    found = sensitivity("ekf", COUPLED, tuning, log, most=1000)
+    whole = Fold("ekf", COUPLED, tuning, log)
+    whole.advance()
+    at, base = whole.base_at(log.n - 1000)
+    assert (found.first, len(found.t)) == (at, log.n - at) and at > 0
+    rest = log.copy()
+    rest.drop_front(at)
+    again = sensitivity("ekf", COUPLED, tuning, rest, base=base, executor=None)
+    np.testing.assert_array_equal(found.fisher, again.fisher)
+    np.testing.assert_array_equal(found.over_time.bound, again.over_time.bound)
+
+
+def test_a_sensor_held_out_is_neither_nudged_nor_a_witness():
+    log = walk_log()
+    found = sensitivity("ekf", WALK, Tuning.of(WALK).set("use.level", False), log)
+    assert found.nudges[0].kind == "input"
+    # Nobody sees it, and the drift carries the state away without limit.
+    assert np.all(found.fisher == 0.0) and np.isinf(found.smallest_visible[0])
+    assert np.isinf(found.integrity[0]) and found.integrity_cause[0] == 0
+
+
+def test_particles_are_replaced():
+    log, _ = simulate(np.random.default_rng(13), 60)
+    tuning = Tuning.of(COUPLED)
+    found = sensitivity("pf", COUPLED, tuning, log)
+    assert found.estimator == "ekf" and "pf draws at random" in found.note
+    np.testing.assert_array_equal(found.fisher, sensitivity("ekf", COUPLED, tuning, log).fisher)
+
+
+def test_what_is_too_large_or_silent_is_refused_with_a_reason():
+    model = MODELS["thermal_field"]
+    found = sensitivity("enkf", model, Tuning.of(model), Log.of(model))
+    assert "states; sensitivities are computed up to 64" in found.reason and not found.responses
+    assert "no reading" in sensitivity("ekf", WALK, Tuning.of(WALK), Log.of(WALK)).reason
