@@ -8,7 +8,7 @@ import numpy as np
 
 from .nudges import nudged
 from .responses import Response, Start, moved, refold
-from .visibility import Tests
+from .visibility import Witness
 
 NEAR = 0.05
 """Share by which a fault may miss the size that is seen, to be scaled to it."""
@@ -35,7 +35,7 @@ class Fault(NamedTuple):
     nonlinearity: float
 
 
-def fault(begun: Start, response: Response, tests: Tests) -> Fault:
+def fault(begun: Start, response: Response, tests: Witness) -> Fault:
     """The faults of a nudge that the tests do not see, both ways."""
     nudge = response.nudge
     size = tests.multiple(response.whitened, response.innovation / begun.track.innovation_std)
@@ -59,7 +59,7 @@ class _Side(NamedTuple):
     nonlinearity: float
 
 
-def _search(begun: Start, response: Response, tests: Tests, linear: float, sign: float) -> _Side:
+def _search(begun: Start, response: Response, tests: Witness, linear: float, sign: float) -> _Side:
     """The size that is just seen: scaled by the multiple that would be, and between seen and unseen by halving."""
     nudge = response.nudge
     limit = nudge.high if sign > 0.0 else -nudge.low

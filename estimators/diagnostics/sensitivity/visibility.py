@@ -29,7 +29,7 @@ from ...numerics.quantiles import normal_quantile
 from ...track import USED, Track
 from ...tuning import Tuning
 from ..evidence import _RATIOS as RATIOS
-from ..evidence import FURTHEST, watch_of
+from ..evidence import FURTHEST, watched
 
 HALVINGS = 10
 """Of the bracket of a multiple, a factor of two wide: to 0.1 %."""
@@ -38,7 +38,7 @@ WIDEST = 2.0**12
 """Multiple of what the best test sees, beyond which the bank sees nothing."""
 
 
-class Tests(NamedTuple):
+class Witness(NamedTuple):
     """What watches the innovations of a fold.
 
     h (rows,) are thresholds by sensor row, z the quantile of the probability of detection; `used` (N,) marks the used
@@ -105,9 +105,9 @@ def tests_of(
     detection: float,
     bank: bool,
     baseline: np.ndarray | None = None,
-) -> Tests:
+) -> Witness:
     """The tests of a fold: thresholds as the bank's, log(readings between false alarms · tests) of each sensor."""
-    watch = watch_of(model, tuning.r, tuning.gate, False, baseline)
+    watch = watched(model, tuning.gate, False, baseline)
     t, kind, channel = log.t[: log.n], log.kind[: log.n], log.channel[: log.n]
     used = track.verdict == USED
     h, places, columns = [], [], []
@@ -116,10 +116,12 @@ def tests_of(
         mine = own[used[own]]
         period = float(t[own[-1]] - t[own[0]]) * 1e-9 / (own.size - 1) if own.size > 1 else every
         for k in range(len(sensor.rows)):
-            h.append(threshold(every / max(period, 1e-3), watch.tests))
+            h.append(threshold(every / max(period, 1e-3), watch["n_tests"]))
             places.append(mine)
             columns.append(k)
-    return Tests(np.array(h), normal_quantile(detection), used, tuple(places), tuple(columns), watch.baseline, bank)
+    return Witness(
+        np.array(h), normal_quantile(detection), used, tuple(places), tuple(columns), watch["baseline"], bank
+    )
 
 
 def threshold(readings: float, tests: int) -> float:

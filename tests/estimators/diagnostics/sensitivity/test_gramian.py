@@ -15,16 +15,19 @@ STEP = 1e-7
 """Central differences of a linear model are exact but for rounding, 1e-16 of values near 10 over a step of 1e-3."""
 
 
-def dense(n, transition, noise, row, variance, std):
-    """Oᵀ N⁻¹ O of readings a step apart, in units of `std`: N has the process noise that reading k shares with l."""
+def dense(n, transition, noise, row, variance, std, first=0):
+    """Oᵀ N⁻¹ O of n readings a step apart, in units of `std`: N has the process noise that two readings share.
+
+    The state is that of `first` steps before the first reading.
+    """
     states = len(std)
-    powers = [np.linalg.matrix_power(transition, k) for k in range(n)]
-    observed = np.stack([row @ power for power in powers])
+    powers = [np.linalg.matrix_power(transition, k) for k in range(n + first)]
+    observed = np.stack([row @ power for power in powers[first:]])
     cov = np.eye(n) * variance
     for k in range(n):
         for j in range(n):
-            for i in range(1, min(k, j) + 1):
-                cov[k, j] += row @ powers[k - i] @ noise @ powers[j - i].T @ row
+            for i in range(1, min(k, j) + first + 1):
+                cov[k, j] += row @ powers[k + first - i] @ noise @ powers[j + first - i].T @ row
     assert observed.shape == (n, states)
     scaled = observed * std
     return scaled.T @ np.linalg.solve(cov, scaled)
@@ -59,6 +62,8 @@ def test_windows_are_logs_of_their_own():
     for before, after in zip(found.windows, found.windows[1:]):
         assert before.end < after.begin
     # A linear model is as observable at one time as at another.
+    later = dense(N, coupled_matrix(), 0.01 * np.eye(2), np.array([1.0, 0.0]), 0.04, COUPLED.prior_std, first=1)
+    np.testing.assert_allclose(found.windows[1].gramian, later, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(found.windows[1].gramian, found.windows[2].gramian, rtol=1e-5, atol=1e-6)
 
 

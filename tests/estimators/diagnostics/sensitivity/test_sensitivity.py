@@ -5,9 +5,9 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import binom, norm
 
-from estimators.diagnostics.evidence import TESTS
+from estimators.diagnostics.evidence import SHIFTS, TESTS, no_baseline
 from estimators.diagnostics.sensitivity import sensitivity
-from estimators.diagnostics.sensitivity.visibility import noncentrality, threshold
+from estimators.diagnostics.sensitivity.visibility import Witness, noncentrality, threshold
 from estimators.fold import Fold, fold
 from estimators.log import READING, Log
 from estimators.models import MODELS
@@ -134,6 +134,23 @@ def test_a_fault_of_the_smallest_visible_size_is_seen():
     ratios = np.concatenate([np.zeros((runs, 1)), np.cumsum(shape * e - 0.5 * shape**2, axis=1)], axis=1)
     passed = (ratios - np.minimum.accumulate(ratios, axis=1)).max(axis=1) >= found.h[0]
     assert passed.sum() >= binom.ppf(1e-4, runs, 0.95)
+
+
+def test_the_bank_sees_a_shift_of_a_white_row_with_the_probability_asked_for():
+    """Its sums over simulated e, run here by themselves: log densities of the shifted and the white one."""
+    n, runs, h, z = 4000, 1000, 16.0, norm.ppf(0.95)
+    row = np.full((n, 1), 1.0)
+    tests = Witness(np.array([h]), z, np.ones(n, bool), (np.arange(n),), (0,), no_baseline(WALK), True)
+    size = tests.multiple(row, row)
+    # The best test has no lower bound for how small a lasting shift may be; the bank's smallest is 0.2, half of it too.
+    assert max(0.1, tests.best(row)) < size < 2.0 * tests.best(row)
+    e = np.random.default_rng(29).normal(size=(runs, n)) + size
+    seen = np.zeros(runs, bool)
+    for shift in SHIFTS:
+        ratios = norm.logpdf(e, loc=shift) - norm.logpdf(e)
+        sums = np.concatenate([np.zeros((runs, 1)), np.cumsum(ratios, axis=1)], axis=1)
+        seen |= (sums - np.minimum.accumulate(sums, axis=1)).max(axis=1) >= h
+    assert seen.sum() >= binom.ppf(1e-4, runs, 0.95)
 
 
 def test_deviations_agree_with_the_spread_of_fitted_parameters():
