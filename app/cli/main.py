@@ -1,4 +1,4 @@
-"""The command line: `nisus run`, `fold`, `compare`, `filters`, `review`, `bus`, `twins`, `schema`, `log`, `new`."""
+"""The command line: `nisus run`, `fold`, `check`, `compare`, `filters`, `review`, `bus`, `twins` and others."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import tyro
 from estimators.errors import NisusError
 
 from ..stderr import complain
-from .arguments import COMMANDS, Bus, Command, Compare, Filters, Fold, Log, Review, Run, Schema, Twins
+from .arguments import COMMANDS, Bus, Check, Command, Compare, Filters, Fold, Log, Review, Run, Schema, Twins
 
 
 def carry_out(command: Command) -> int:
@@ -27,6 +27,10 @@ def carry_out(command: Command) -> int:
         from .fold import fold_twin
 
         return fold_twin(command)
+    if isinstance(command, Check):
+        from .check import check_twin
+
+        return check_twin(command)
     if isinstance(command, Compare):
         from .compare import compare_twin
 
