@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from estimators.diagnostics.calibration import BANDS
-from estimators.diagnostics.sensitivity import Sensitivity, View
+from estimators.diagnostics.sensitivity import Sensitivity, View, bounds_of
 from estimators.track import HEALTH_NAMES
 
 from .check_list import blamed, checklist, stamps
-from .check_words import TWO_SIGMA, range_text
 from .fold_report import calibration_dict, number
 
 if TYPE_CHECKING:
@@ -112,17 +111,10 @@ def _integrity(checked: Checked) -> dict[str, Any]:
     found = checked.sensitivity
     if found.reason:
         return {"reason": found.reason, "states": {}}
-    states = {}
-    for k, state in enumerate(checked.twin.model.shown_states):
-        cause = int(found.integrity_cause[k])
-        nudge = found.nudges[cause] if cause >= 0 else None
-        states[state.name] = {
-            "unit": state.unit,
-            "bound": number(found.integrity[k]),
-            "bias": number(found.integrity_bias[k]),
-            "two_sigma": number(TWO_SIGMA * found.std[-1, k]),
-            "fault": None if nudge is None else range_text(nudge, *found.unseen[cause]),
-        }
+    states = {
+        name: {**_plain(bound), "fault": bound.fault or None}
+        for name, bound in bounds_of(checked.twin.model, found).items()
+    }
     return {"reason": "", "note": found.note, "estimator": found.estimator, "states": states}
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from estimators.diagnostics.calibration import BANDS
+from estimators.diagnostics.sensitivity import bounds_of
+from estimators.diagnostics.sensitivity.words import range_text, size_text, subject_text
 from estimators.track import HEALTH_NAMES
 
 from .check_list import blamed, checklist
-from .check_words import TWO_SIGMA, range_text, size_text, subject_text
 from .fold_report import calibration_lines
 
 if TYPE_CHECKING:
@@ -61,7 +63,7 @@ def _number(value: float) -> str:
     return f"{value:.3g}" if np.isfinite(value) else "-"
 
 
-def _cut(rows: list[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
+def _cut(rows: Sequence[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
     """At most `MOST` rows, and one that says how many more there are."""
     if len(rows) <= MOST + 1:
         return tuple(rows)
@@ -86,12 +88,12 @@ def _integrity(checked: Checked) -> Part:
     title = "How wrong a state can be by one fault that nobody notices"
     if found.reason:
         return Part(title, (f"Not computed: {found.reason}.",))
-    rows, bars = [], []
-    for k, state in enumerate(checked.twin.model.shown_states):
-        cause, two_sigma = int(found.integrity_cause[k]), TWO_SIGMA * float(found.std[-1, k])
-        fault = range_text(found.nudges[cause], *found.unseen[cause]) if cause >= 0 else "none"
-        rows.append((state.name, state.unit, _number(two_sigma), _number(found.integrity[k]), fault))
-        bars.append(Bar(state.name, state.unit, two_sigma, float(found.integrity[k])))
+    bounds = bounds_of(checked.twin.model, found)
+    rows = [
+        (name, item.unit, _number(item.two_sigma), _number(item.bound), item.fault or "none")
+        for name, item in bounds.items()
+    ]
+    bars = [Bar(name, item.unit, item.two_sigma, item.bound) for name, item in bounds.items()]
     said = (f"{found.note}.",) if found.note else ()
     head = ("state", "unit", "± 2 σ", "integrity bound", "by")
     return Part(title, said, head, _cut(rows), tuple(bars[:MOST]), ("± 2 σ", "integrity bound"))
@@ -106,7 +108,7 @@ def _visible(checked: Checked) -> Part:
     rows = []
     for nudge, size, (low, high) in zip(found.nudges, found.smallest_visible, found.unseen, strict=True):
         seen = size_text(nudge, size) if np.isfinite(size) else "cannot be seen within its range"
-        rows.append((subject_text(nudge), seen, range_text(nudge, low, high).partition(", ")[2]))
+        rows.append((subject_text(nudge), seen, range_text(nudge, low, high)))
     said = f"A constant fault, there for all of {seconds:.4g} s, seen with 95 %."
     return Part(title, (said,), ("fault", "smallest visible", "passes unseen"), _cut(rows))
 

@@ -32,6 +32,7 @@ from .counts import Latency, RowCounts, last_run
 from .execute import Remembered, execute
 from .feeder import Feeder, Finished, Restarted
 from .idle_ticks import IdleTicks
+from .integrity import IntegrityWatch, Window, window
 from .interface import Records
 from .notices import Notices
 from .outputs import Belief, Cursor, Pull, Status
@@ -102,6 +103,7 @@ class Engine:
         self._latency = Latency()
         self._alerts = Alerts(self.notices)
         self._stall = Stall(self._say_stalled)
+        self._integrity = IntegrityWatch(self.model, self._window, self._policy.false_alarm_every)
         self._status: tuple[float, Status] | None = None
         self.recorder: Records | None = None
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
@@ -141,10 +143,12 @@ class Engine:
         self._refolder.start()
         self._thread.start()
         self._feeder.start()
+        self._integrity.start()
 
     def stop(self) -> None:
         """Stop reading and folding."""
         self._stopping.set()
+        self._integrity.stop()
         self._feeder.stop()
         self._refolder.stop()
         if self._thread.is_alive():
@@ -282,9 +286,15 @@ class Engine:
                 recording=self.recorder.path if self.recorder is not None else None,
                 latency_ms=self._latency.percentile(99.0),
                 latency_p50_ms=self._latency.percentile(50.0),
+                integrity=self._integrity.of(self._revision),
             )
         self._status = (time.monotonic(), status)
         return status
+
+    def _window(self) -> Window | None:
+        """What the integrity bounds are computed from; nothing while a refold is waited for."""
+        with self._reading():
+            return None if self._requests.waiting else window(self._fold, self._revision)
 
     # The engine's own thread
 

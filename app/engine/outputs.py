@@ -13,6 +13,7 @@ from estimators.numerics.peaks import Peak
 from estimators.track import Track
 from estimators.tuning import Tuning
 
+from .integrity import Integrity
 from .notices import Notice
 
 
@@ -68,6 +69,7 @@ class Status:
     `t` is the time of the last event (ns), `since` the time when the present health began, `lost` the time from which
     the estimate has not been a number (None if it is one). `counts` are those of the rows of this revision, and of
     other things that happened to the twin. `latency_ms` is the 99th percentile from a reading's arrival to its row.
+    `integrity` bounds what could be wrong with each state unnoticed; None until it is known.
     """
 
     estimator: str
@@ -91,3 +93,4 @@ class Status:
     recording: Path | None
     latency_ms: float | None
     latency_p50_ms: float | None
+    integrity: Integrity | None = None

@@ -20,6 +20,7 @@ from ..engine import commands
 from ..engine.changes import began_as, turned
 from ..engine.execute import Refolding, retuned
 from ..engine.interface import Running
+from ..engine.outputs import Status
 from ..engine.playback import PLAYBACK, check_playback
 
 LONGEST_NAME = 255
@@ -70,7 +71,20 @@ def status_json(engine: Running) -> dict[str, Any]:
         "seekable": status.seekable,
         "recording": str(status.recording) if status.recording is not None else None,
         "latency_ms": _plain(status.latency_ms),
+        **_integrity(status),
     }
+
+
+def _integrity(status: Status) -> dict[str, Any]:
+    """By state the bound of its error under one unseen fault, beside 2 σ; how old that is, s; why there is none."""
+    found = status.integrity
+    if found is None:
+        return {"integrity": {}, "integrity_age": None, "integrity_note": "not computed yet"}
+    bounds = {
+        name: {"bound": _plain(item.bound), "two_sigma": _plain(item.two_sigma), "unit": item.unit, "fault": item.fault}
+        for name, item in found.bounds.items()
+    }
+    return {"integrity": bounds, "integrity_age": found.age(status.t), "integrity_note": found.reason}
 
 
 def _plain(value: Any) -> Any:

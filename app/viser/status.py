@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 
 from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
 
@@ -12,6 +13,9 @@ from .time_units import SECONDS, Unit
 
 COLORS = {"tracking": "#16a34a", "degraded": "#d97706", "diverged": "#dc2626", "stale": "#6b7280"}
 LEVELS = {"info": "#6b7280", "warn": "#d97706", "error": "#dc2626"}
+SHOWN = 8
+"""States whose integrity is shown."""
+
 COUNTED = ("readings", "gated", "missing", "stale")
 
 
@@ -48,8 +52,31 @@ def status_html(status: Status, origin: int | None, unit: Unit = SECONDS) -> str
         'font-variant-numeric:tabular-nums">'
         '<div style="display:flex;justify-content:space-between;gap:0.5em">'
         f'<b style="color:{COLORS.get(health, "#6b7280")}">● {health}{since}</b>'
-        f"<span>{state}</span><span>{fold}</span><span>{at}</span></div><div>{cells}</div><div>{remedy}</div></div>"
+        f"<span>{state}</span><span>{fold}</span><span>{at}</span></div><div>{cells}</div><div>{remedy}</div>"
+        f"{integrity_html(status)}</div>"
     )
+
+
+def integrity_html(status: Status) -> str:
+    """How wrong each state can be by one fault that nobody notices, beside ± 2 σ; nothing until it is known."""
+    found = status.integrity
+    if found is None:
+        return ""
+    muted = '<span style="opacity:0.65">'
+    if found.reason:
+        return f"<div>{muted}integrity not watched: {html.escape(found.reason)}</span></div>"
+    cells = "".join(
+        f'<span style="margin-right:0.9em;white-space:nowrap" title="{html.escape(item.fault, quote=True)}">{muted}'
+        f"{html.escape(name)}</span> ±{_size(item.two_sigma)} / {_size(item.bound)} {html.escape(item.unit)}</span>"
+        for name, item in list(found.bounds.items())[:SHOWN]
+    )
+    age = found.age(status.t)
+    old = "" if age is None else f", {age:.0f} s ago"
+    return f"<div>{muted}± 2 σ / integrity bound under one unseen fault{old}:</span> {cells}</div>"
+
+
+def _size(value: float) -> str:
+    return f"{value:.3g}" if math.isfinite(value) else "∞"
 
 
 def events_html(notices: list[Notice], origin: int | None, unit: Unit = SECONDS) -> str:
