@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from .fault_schema import FaultSection
 from .fields import (
     Count,
     Flag,
@@ -22,6 +23,7 @@ from .fields import (
     SpreadSection,
     Text,
 )
+from .limits_schema import DuplicatesSection, Positives, Ranges, StuckSection, Validity
 from .source_schema import SourceSection
 
 
@@ -45,14 +47,41 @@ class UnknownSection(Section):
 
 
 class SensorSection(SpreadSection):
-    """The noise of one sensor as the estimator assumes it, and whether the estimate uses it."""
+    """The noise of one sensor as the estimator assumes it, what it can say, and whether the estimate uses it."""
 
     correlation: tuple[tuple[Number, ...], ...] | None = None
     """Correlation of the noise of its rows, for example [[1, 0.5], [0.5, 1]], with R_ij = correlation_ij √(R_ii R_jj):
     it stays while the variances are tuned. Particle and ensemble filters take independent rows, [[1, 0], [0, 1]].
     Default: the model's."""
+    range: Ranges | None = None
+    """Least and greatest value that can be, in the sensor's unit, for example [-40, 180], null for none; a list of
+    pairs gives one a row. What lies outside is kept in the log and not used. Default: every value can be."""
+    saturation: Ranges | None = None
+    """The values at which its converter clips: a reading at one of them or beyond is not used. As `range`. Default:
+    none."""
+    rate: Positives | None = None
+    """Greatest change in a second, in the sensor's unit, against the last reading that kept all limits; noise may add
+    8 standard deviations. A list gives one a row. Default: any change can be."""
+    stuck: StuckSection | None = None
+    """When readings that repeat themselves are not used any more. Default: never."""
+    duplicates: DuplicatesSection | None = None
+    """When a reading of the same values is the same reading, which counts once. Default: when it is of the same
+    time."""
     use: Flag = True
     """false holds the sensor out: the estimate ignores it, and its prediction of it is scored. Default: true."""
+
+
+class NormalSection(Section):
+    """What was normal of one sensor row when this tuning was accepted; `nisus commission` writes it."""
+
+    bias: Number = 0.0
+    """Mean of its standardised innovations. Default: 0."""
+    scale: Positive = 1.0
+    """Their standard deviation. Default: 1."""
+    correlation: Annotated[float, Field(strict=True, gt=-1, lt=1)] = 0.0
+    """Their lag-1 correlation. Default: 0, white."""
+    reached: dict[str, NotNegative] = {}
+    """How high the tests of each cause rose on the accepted data, nats: {narrow: 12.5}. Default: 0."""
 
 
 class EstimatorSection(Section):
@@ -70,22 +99,42 @@ class TimeSection(Section):
 
     horizon: NotNegative = 2.0
     """Seconds: a reading later than this is counted as stale and dropped. Size it by the worst credible latency."""
-    degraded_after: Positive = 3.0
-    """Seconds without a used reading after which the twin says that it is degraded."""
+    degraded_after: Positive | None = None
+    """Seconds without a used reading after which the twin says that it is degraded. Default: the slowest time constant
+    of the model at the prior, but at least 3 s and three periods of the slowest simulated sensor, and at most
+    stale_after; `nisus fold` prints where it comes from."""
     stale_after: Positive = 15.0
     """Seconds without a used reading after which the twin says that it is stale. Above degraded_after."""
+    late: Literal["exact", "inflate", "auto"] = "auto"
+    """What becomes of a reading that comes late, within the horizon. exact: it is put where it was measured and the
+    filter goes back; nothing is lost. inflate: it is used when it comes, with a variance larger by what the model says
+    that the reading has moved since; cheap, not exact, and not for filters with a fixed R. auto: exact, unless going
+    back once may take longer than late_allowed, by an arithmetic that `nisus fold` prints. Default: auto."""
+    late_allowed: Positive = 0.25
+    """Seconds that going back for one late reading may take, for late: auto. Default: 0.25."""
     tick: Positive = 0.5
     """Seconds of silence after which the estimate is predicted and shown without a reading."""
 
     @model_validator(mode="after")
     def _order(self) -> TimeSection:
-        if self.stale_after < self.degraded_after:
+        if self.degraded_after is not None and self.stale_after < self.degraded_after:
             raise PydanticCustomError(
                 "order",
                 "is {value} s; it must not be below degraded_after ({other} s)",
                 {"value": self.stale_after, "other": self.degraded_after, "key": "stale_after"},
             )
         return self
+
+
+class MaintenanceSection(Section):
+    """Something of the asset that was changed."""
+
+    at: Number
+    """When, in seconds of the source's time."""
+    what: Text
+    """What was changed, for people."""
+    states: Annotated[tuple[Text, ...], Field(min_length=1)]
+    """The states that it concerns: they are as uncertain as at the start again, and keep their mean."""
 
 
 class SceneSection(Section):
@@ -150,6 +199,9 @@ class TwinSection(Section):
     """Process noise Q by name: how much the model is distrusted. Default: the model's."""
     sensors: dict[str, SensorSection] = {}
     """Sensor noise R by sensor: how much each is distrusted. Default: the model's."""
+    valid: dict[str, Validity] = {}
+    """Range over which the model was fitted or checked, by state or input, in its unit, for example
+    {temperature: {min: 20, max: 38}}. Outside it the twin is suspect. Default: the model's."""
     estimator: Annotated[
         EstimatorSection, BeforeValidator(_estimator, json_schema_input_type=str | EstimatorSection)
     ] = EstimatorSection(name="ekf")
@@ -160,11 +212,19 @@ class TwinSection(Section):
     gate: Annotated[float, Field(strict=True, gt=0, lt=1)] | None = None
     """Probability with which a good reading passes the gate, for example 0.9973; readings outside are not used.
     Default: null, no gate."""
+    commissioned: dict[str, NormalSection] = {}
+    """What was normal when this tuning was accepted, by sensor row: alarms are about what has changed since. Default:
+    innovations that are white and as large as the filter says."""
     time: TimeSection = TimeSection()
     """How the twin treats lateness and silence."""
+    maintenance: tuple[MaintenanceSection, ...] = ()
+    """When something of the asset was changed: each begins a new version of the model. Default: never."""
     history: Count = 200_000
     """Events that are kept, and folded again when the tuning changes; the oldest are forgotten."""
     source: SourceSection
     """Where the readings come from; its `type` is simulator, can, can_log, table or merged."""
+    faults: tuple[FaultSection, ...] = ()
+    """Faults that are put into what the source says: a list of {kind, sensor, input, start, end, size, rate, ...}. They
+    act in their order, after those of a simulator. Default: none."""
     view: ViewSection = ViewSection()
     """What the page draws."""

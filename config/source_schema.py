@@ -8,10 +8,10 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from .fault_schema import FaultSection
 from .fields import (
     Count,
     LevelSection,
-    NotNegative,
     Number,
     Numbers,
     Positive,
@@ -235,52 +235,6 @@ class PlanSection(SpreadSection):
     """One in so many of its readings is lost. Default: null, none."""
 
 
-class FaultSection(Section):
-    """A fault of one simulated sensor; what the estimator assumes of the sensor stays."""
-
-    sensor: Text
-    """The sensor's name."""
-    row: Text | None = None
-    """The row of the sensor that fails. Default: null, all."""
-    kind: Literal["bias", "drift", "stuck", "outliers", "dropout"]
-    """bias: `size` is added. drift: `size` is added for every second since `start`. stuck: the last reading before
-    `start` is repeated. outliers: with probability `rate` a draw of that standard deviation, `size`, is added. dropout:
-    with probability `rate` a reading is lost."""
-    start: NotNegative = 0.0
-    """Seconds after the start of the simulation at which it begins. Default: 0."""
-    end: Positive | None = None
-    """Seconds after the start of the simulation at which it ends. Default: null, never."""
-    size: Number | None = None
-    """How much, in the row's unit (drift: a second). Needed by bias, drift and outliers."""
-    rate: Annotated[float, Field(strict=True, gt=0, le=1)] | None = None
-    """Probability, a reading. Needed by outliers; of a dropout the default is 1."""
-
-    @model_validator(mode="after")
-    def _fits(self) -> FaultSection:
-        if self.end is not None and self.end <= self.start:
-            raise PydanticCustomError(
-                "order", "is {value} s; it must be above start ({other} s)",
-                {"value": self.end, "other": self.start, "key": "end"},
-            )  # fmt: skip
-        for key, takes, needs in (
-            ("size", ("bias", "drift", "outliers"), ("bias", "drift", "outliers")),
-            ("rate", ("outliers", "dropout"), ("outliers",)),
-            ("row", ("bias", "drift", "stuck", "outliers"), ()),
-        ):
-            given = getattr(self, key) is not None
-            if given and self.kind not in takes:
-                raise PydanticCustomError(
-                    "order",
-                    "means nothing to {kind}; leave it out",
-                    {"kind": f"a fault of kind {self.kind}", "key": key},
-                )
-            if self.kind in needs and not given:
-                raise PydanticCustomError(
-                    "neither", "is of kind {kind} and has no {keys}", {"kind": self.kind, "keys": key}
-                )
-        return self
-
-
 class TruthSection(Section):
     """Where the simulated asset differs from the estimator's model."""
 
@@ -313,7 +267,8 @@ class AssetSection(Section):
     sensors: dict[str, PlanSection] = {}
     """Rates, noise and losses by sensor. Default: every sensor at every step."""
     faults: tuple[FaultSection, ...] = ()
-    """Faults of sensors, a list of {sensor, kind, start, end, size, rate, row}. Default: none."""
+    """Faults of what it says, or of itself, as in `faults` of the twin. On a bus they act before its frames are made,
+    and leave no stamp in the log. Default: none."""
 
 
 class SimulatorSection(AssetSection):

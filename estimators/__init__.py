@@ -20,12 +20,14 @@ if TYPE_CHECKING:
     from .model.state_space import Field as Field
     from .model.state_space import Input as Input
     from .model.state_space import Jump as Jump
+    from .model.state_space import Limits as Limits
     from .model.state_space import Noise as Noise
     from .model.state_space import Parameter as Parameter
     from .model.state_space import Row as Row
     from .model.state_space import Sensor as Sensor
     from .model.state_space import State as State
     from .model.state_space import StateSpaceModel as StateSpaceModel
+    from .model.state_space import Stuck as Stuck
     from .models import MODELS as MODELS
     from .registry import ESTIMATORS as ESTIMATORS
     from .tuning import Tuning as Tuning
@@ -39,9 +41,8 @@ _HOMES = {
     "Tuning": "tuning",
     "fold_many": "interface.by_name",
     "mean_nees": "diagnostics.nees",
-    **dict.fromkeys(
-        ("Field", "Input", "Jump", "Noise", "Parameter", "Row", "Sensor", "State", "StateSpaceModel"), "model"
-    ),
+    **dict.fromkeys(("Field", "Input", "Jump", "Limits", "Noise", "Parameter", "Row", "Sensor", "State"), "model"),
+    **dict.fromkeys(("StateSpaceModel", "Stuck"), "model"),
 }
 
 __all__ = ["fold", *_HOMES]

@@ -12,7 +12,8 @@ four functions read the context and change nothing else:
 updates, which is part of the state (`next_draw`): the sub-steps of one event (`max_step`) then differ, queries change
 no draw, and a refold draws what the fold drew.
 
-`work` is scratch that starts as NaN. `score` takes NIS, degrees of freedom and log-likelihood.
+`work` is scratch that starts as NaN. `score` takes NIS, degrees of freedom, log-likelihood, how many particles count,
+from how many they descend, and the normal scores of the rows (`track.WHITENED`).
 
 The functions of an `interpreted` filter are plain Python, and its context is a `View` (interpreted/view.py).
 """
@@ -91,19 +92,19 @@ code_type = types.NamedUniTuple(i64, len(Code._fields), Code)
 class Estimator:
     """One entry of the catalogue.
 
-    `applies(model)` gives the reason why the estimator does not fit a model, or None; `refuses(model, options)` why
-    it does not with these options. `options` are complete here (see `complete`). `state_size(options, nx)` and
+    `applies(model)` gives the reason why the estimator does not fit a model, or None; `refuses(model, options)` why it
+    does not with these options. `options` are complete here (see `complete`). `state_size(options, nx)` and
     `work_size(options, nx, ny)` count float64s; `moments(options, state, nx)` gives mean and covariance,
     `points(options, state, nx)` what to draw beside the mean (sigma points, particles) as (k, nx), `peaks(options,
     state, nx)` the peaks where there can be several, `recoveries(state)` how often the filter had to recover since its
-    start. `tune(options, model, tuning)` turns the options into the numbers that the compiled functions read; it may
-    raise EstimatorError. `memory(options, model)` counts numbers that the state holds beyond `state_size`.
-    `runs(options, nx)` is `model_runs` as a number: how often a step runs f. `prepare(model, options)` computes what
-    depends on the model too, once for a fold, as int64s. `blocks(options, state, nx)` is a view of the members (N, nx)
-    in a state, of a compiled filter that runs f and h at these alone and so can run on a black box (interpreted/).
-    `fixed_r` says that its gain is for one R, so that no reading can bring its own; `needs_factor` that it cannot start
-    from a covariance without a Cholesky factor; `singular` that P and R may be singular: states that are certain at
-    first, rows of a sensor without noise.
+    start, `account(options, state, nx)` what only this filter can say of itself. `tune(options, model, tuning)` turns
+    the options into the numbers that the compiled functions read; it may raise EstimatorError. `memory(options, model)`
+    counts numbers that the state holds beyond `state_size`. `runs(options, nx)` is `model_runs` as a number: how often
+    a step runs f. `prepare(model, options)` computes what depends on the model too, once for a fold, as int64s.
+    `blocks(options, state, nx)` is a view of the members (N, nx) in a state, of a compiled filter that runs f and h at
+    these alone and so can run on a black box (interpreted/). `fixed_r` says that its gain is for one R, so that no
+    reading can bring its own; `needs_factor` that it cannot start from a covariance without a Cholesky factor;
+    `singular` that P and R may be singular: states that are certain at first, rows of a sensor without noise.
     """
 
     name: str
@@ -127,6 +128,7 @@ class Estimator:
     runs: Callable[[Options, int], float] = lambda options, nx: 1.0
     peaks: Callable[[Options, np.ndarray, int], list[Peak]] | None = None
     recoveries: Callable[[np.ndarray], int] | None = None
+    account: Callable[[Options, np.ndarray, int], dict[str, float | list[float]]] | None = None
     interpreted: bool = False
     fixed_r: bool = False
     needs_factor: bool = False

@@ -15,26 +15,29 @@ from typing import Any
 import numpy as np
 
 from .compiled.context import context_of
-from .compiled.model import compile_model
-from .diagnostics.evidence import fresh, watched
+from .compiled.model import CompiledModel, compile_model
+from .diagnostics.account import spread_ratio
+from .diagnostics.evidence import fresh, no_baseline, watched
 from .diagnostics.failure_cause import Estimate, around, cause, failures, questions
 from .diagnostics.field_pictures import Pictures
 from .diagnostics.health import Bounds, HealthPolicy, chi_square_bounds
 from .errors import EstimatorError, ModelError
 from .estimator import Code, Estimator
 from .events.checks import admitted
+from .events.maintenance import versions_dropped, without
 from .fold_checks import check_base, check_pairs, check_prior, check_tuning, check_variances
 from .fold_kernel import compiled
 from .interpreted import fold_loop
 from .interpreted.black_box_filters import driven
 from .interpreted.fold_loop import LONGEST, UNSET
 from .interpreted.view import View
-from .log import BEFORE, INPUT, READING, TICK, TRUTH, Log
+from .log import BEFORE, INPUT, MAINTENANCE, READING, TICK, TRUTH, Log
 from .model.mode_as_number import indicator
 from .model.state_space import StateSpaceModel
 from .numerics.peaks import Peak
 from .numerics.quantiles import chi_square_quantile
 from .registry import find_estimator
+from .screen import fresh_screen, screen_of
 from .snapshots import Base, Snapshot, Snapshots
 from .track import WHITENED, Track
 from .tuning import Tuning
@@ -55,7 +58,6 @@ class Fold:
         base: Base | None = None,
         picture: float | None = None,
         prior: tuple[np.ndarray, np.ndarray] | None = None,
-        baseline: np.ndarray | None = None,
         expected: np.ndarray | None = None,
     ) -> None:
         """Prepare; nothing is folded yet.
@@ -73,8 +75,6 @@ class Fold:
             picture: Seconds of the log between two pictures of a large field; None for those that score it only.
             prior: Mean (nx,) and covariance (nx, nx), positive semidefinite, in place of the model's; beyond `LARGE`
                 states the variances (1, nx). It holds at the log's start, and a reset goes back to it.
-            baseline: What was normal of the innovations when the tuning was accepted, see diagnostics/evidence.py; None
-                for white ones.
             expected: Sensors that must speak, (sensors,) of bool; None for those that have spoken.
 
         Raises:
@@ -99,7 +99,8 @@ class Fold:
         most = model.width * max(1, self.policy.window)
         self._bounds: Bounds = chi_square_bounds(most)
         self.marginal = self.estimator.family in ("particle", "ensemble")
-        self._seen = self._see(baseline, expected)
+        self.baseline = no_baseline(model) if tuning.baseline is None else tuning.baseline
+        self._seen = self._see(expected)
         self._context: Any = self._seen
         numbers = self.estimator.state_size(self.options, model.nx) + self.estimator.memory(self.options, model)
         self._state = np.empty(numbers)
@@ -107,6 +108,7 @@ class Fold:
         self._work = _scratch(self.estimator.work_size(self.options, model.nx, model.width) + 1)
         self._score = np.empty(WHITENED + model.ny)
         self._evidence = fresh(model)
+        self._screen, self._edge = screen_of(model), fresh_screen(model)
         self._clock = np.array([UNSET])
         self._u = np.array([item.default for item in model.inputs], float)
         mean, cov = self._held["prior_mean"], self._held["prior_cov"]
@@ -115,24 +117,27 @@ class Fold:
         if base is not None:
             check_base(base, model)
             mean, cov, self._clock[0], self._u[:] = base.mean, base.cov, base.clock, base.u
-        self._run, judge, begin = compiled()
+        self._run, judge, begin, self._screen_rows = compiled()
         if model.black_box or self.estimator.interpreted:
             self._context = View(self._compiled, self._context, tuning, self.options, self.pairs, self._held)
             self._run = partial(fold_loop.run_and_judge, judge, self._seen)
             begin = fold_loop.begin
+        self._begin = begin
         begin(self._code, self._context, np.ascontiguousarray(mean), np.ascontiguousarray(cov), self._state)
         left = base.state if base is not None and base.estimator == estimator else None
         if left is not None and left.size == self._state.size:
             self._state[:] = left
             if base is not None and base.evidence is not None and base.evidence.size == self._evidence.size:
                 self._evidence[:] = base.evidence
+        if base is not None and base.edge is not None and base.edge.size == self._edge.size:
+            self._edge[:] = base.edge
         self._snapshots = Snapshots(self._state.nbytes)
         self.pictures = Pictures(model.grid, picture) if model.grid is not None else None
         self._asked = -1
         self._remember()
         self._rows = Track.allocate(log.capacity, len(model.shown), len(self.pairs), model.ny, model.width)
 
-    def _see(self, baseline: np.ndarray | None, expected: np.ndarray | None) -> np.void:
+    def _see(self, expected: np.ndarray | None) -> np.void:
         """The context of this model and tuning; the arrays that it points to are kept in `self._held`."""
         model, tuning = self.model, self.tuning
         gate = np.full(model.width + 1, np.inf)
@@ -148,7 +153,7 @@ class Fold:
             "options": np.ascontiguousarray(self.estimator.tune(self.options, model, tuning), float),
             "pairs": self.pairs,
             "prepared": self.estimator.prepare(model, self.options),
-            **watched(model, tuning.gate, self.marginal, baseline, expected),
+            **watched(model, tuning.gate, self.marginal, self.baseline, expected),
         }
         values: dict[str, Any] = {**self._compiled.static, **held}
         if self._own_prior is not None:
@@ -178,6 +183,16 @@ class Fold:
         return self._rows.select(slice(0, self.n))
 
     @property
+    def evidence(self) -> np.ndarray:
+        """The state of the bank of tests now; see diagnostics/evidence.py."""
+        return self._evidence.copy()
+
+    @property
+    def compiled(self) -> CompiledModel:
+        """The model's functions as the filter sees them."""
+        return self._compiled
+
+    @property
     def clock(self) -> int:
         """Time of the state, ns."""
         return int(self._clock[0])
@@ -198,6 +213,17 @@ class Fold:
     def recoveries(self) -> int:
         """Number of recoveries since the filter started: a cloud of particles that had lost the asset was widened."""
         return 0 if self.estimator.recoveries is None else self.estimator.recoveries(self._state)
+
+    def account(self) -> dict[str, float | list[float]]:
+        """What the filter says of itself: `spread`, see diagnostics/account.py, and what only this kind of it can say.
+
+        Particles: how many there are (`particles`), how many count (`effective`), from how many of `lag` readings ago
+        they descend (`ancestors`), how often they were resampled and recovered. Ensembles: `members`, and the counts of
+        the rank histogram (`ranks`).
+        """
+        own = self.estimator.account
+        said = {} if own is None else own(self.options, self._state, self.model.nx)
+        return {"spread": spread_ratio(self.track, self.policy.window), **said}
 
     @property
     def failures(self) -> int:
@@ -303,8 +329,13 @@ class Fold:
             stop = min(end, boundary)
             if self.pictures is not None:
                 stop = self.pictures.next(log, self.n, stop)
+            stop = self._maintenance(stop)
             try:
-                self._run_events(self.n, stop)
+                self._screen_events(self.n, stop)
+                if log.kind[self.n] == MAINTENANCE:
+                    self._maintain(self.n)
+                else:
+                    self._run_events(self.n, stop)
             except BaseException:
                 # Python was stopped between two events: back to where the state is known.
                 self._held["r"][:] = self.tuning.r
@@ -314,6 +345,11 @@ class Fold:
             if stop == boundary:
                 self._remember()
         return end - begun
+
+    def _screen_events(self, start: int, stop: int) -> None:
+        """Which rows of the readings the filter shall not see."""
+        log, screened = self.log, self._rows.screened
+        self._screen_rows(start, stop, log.t, log.kind, log.channel, log.value, self._screen, self._edge, screened)
 
     def _run_events(self, start: int, stop: int) -> None:
         log = self.log
@@ -341,6 +377,24 @@ class Fold:
         )
         self._asked = stop - 1
 
+    def _maintenance(self, stop: int) -> int:
+        """Where to stop, at `stop` at the latest, so that an event of maintenance is dealt with by itself."""
+        found = np.flatnonzero(self.log.kind[self.n : stop] == MAINTENANCE)
+        return stop if not found.size else self.n + max(1, int(found[0]))
+
+    def _maintain(self, i: int) -> None:
+        """Predict to the event; there its state is as unknown as in the prior, and its mean stays.
+
+        The filter begins again from these moments: of particles, members and modes it keeps no more than them.
+        """
+        self._run_events(i, i + 1)
+        mean, cov = self.estimator.moments(self.options, self._spare, self.model.nx)
+        cov = without(cov, self._held["prior_cov"], int(self.log.channel[i]))
+        if np.all(np.isfinite(mean)) and np.all(np.isfinite(cov)):
+            self._begin(self._code, self._context, np.ascontiguousarray(mean), np.ascontiguousarray(cov), self._state)
+            self._clock[0] = self.log.t[i]
+            self._run_events(i, i + 1)
+
     def finish(self) -> None:
         """The log has ended: take the picture for which another event would have been waited."""
         if self.pictures is not None and self.n:
@@ -362,7 +416,8 @@ class Fold:
         self.pictures.take(self.log, self.n, mean, cov[0] if cov.shape[0] == 1 else np.diag(cov))
 
     def _remember(self) -> None:
-        snapshot = Snapshot(int(self._clock[0]), self._u.copy(), self._state.copy(), self._evidence.copy())
+        gathered = self._evidence.copy(), self._edge.copy()
+        snapshot = Snapshot(int(self._clock[0]), self._u.copy(), self._state.copy(), *gathered)
         self._snapshots.keep(self.log.first + self.n, self.log.first, snapshot)
 
     def rewind(self, index: int) -> None:
@@ -373,7 +428,7 @@ class Fold:
     def _restore(self, index: int) -> None:
         at = self._snapshots.last(self.log.first + index)
         self._snapshots.forget_after(at)
-        self._clock[0], self._u[:], self._state[:], self._evidence[:] = self._snapshots[at]
+        self._clock[0], self._u[:], self._state[:], self._evidence[:], self._edge[:] = self._snapshots[at]
         self.n = at - self.log.first
         self._asked = -1
         if self.pictures is not None:
@@ -382,9 +437,11 @@ class Fold:
     def base_at(self, index: int) -> tuple[int, Base]:
         """The last snapshot at or before the event `index`: its index, and the base of a fold that starts there."""
         at = self._snapshots.last(self.log.first + index)
-        clock, u, state, evidence = self._snapshots[at]
+        clock, u, state, evidence, edge = self._snapshots[at]
         mean, cov = self.estimator.moments(self.options, state, self.model.nx)
-        base = Base(mean, cov, clock, u.copy(), self.estimator.name, state.copy(), at, evidence.copy())
+        version = self.log.version + versions_dropped(self.log.events, at - self.log.first)
+        name, gathered = self.estimator.name, (evidence.copy(), edge.copy())
+        base = Base(mean, cov, clock, u.copy(), name, state.copy(), at, *gathered, version)
         return at - self.log.first, base
 
     def follow(self, log: Log, changed_from: int | None) -> None:

@@ -16,7 +16,8 @@ from .interpreted.fold_loop import LONGEST, UNSET
 from .log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, inlined, jit
 from .numerics.steps import steps_of
-from .track import MISSING, NONE, WHITENED, track_type
+from .screen import any_refused, pass_on, screen_rows, screen_signature
+from .track import ANCESTORS, EFFECTIVE, MISSING, NONE, SCREENED, WHITENED, track_type
 
 
 @jit
@@ -58,11 +59,13 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
 
     A tick, a truth or a mark is a query: it is answered from a copy of the state, so it never changes the estimate.
     Variances that a reading brings (columns of `value` from `width` on) take the place of the tuned R while it is
-    folded, so every filter honours them.
+    folded, so every filter honours them. The filter does not see rows of a reading that are screened; of a reading of
+    which nothing is left it only predicts.
     """
     nu = u.size
     variances = value.shape[1] > width
     kept = np.empty(context.n_rows if variances else 0)
+    passed = np.empty(value.shape[1])
     u = borrowed(u)
     state = borrowed(state)
     spare = borrowed(spare)
@@ -75,6 +78,7 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
     innovation = borrowed_rows(track.innovation)
     innovation_std = borrowed_rows(track.innovation_std)
     whitened = borrowed_rows(track.whitened)
+    screened = track.screened
     for i in range(start, end):
         what = kind[i]
         index = first + i
@@ -85,6 +89,8 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
         score[0] = np.nan
         score[1] = 0.0
         score[2] = np.nan
+        score[EFFECTIVE] = np.nan
+        score[ANCESTORS] = np.nan
         verdict = NONE
         if what == READING or what == INPUT:
             advance_to(code, context, u, clock[0], t[i], index, state, work)
@@ -98,19 +104,22 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
                     row, rows = sensor_rows(context, channel[i])
                     r = floats(context.r, context.n_rows)[row : row + rows]
                     exchange(r, value[i, width:], kept)
-                verdict = call_update(
-                    code.update,
-                    context,
-                    u,
-                    channel[i],
-                    value[i],
-                    index,
-                    state,
-                    work,
-                    innovation[i],
-                    innovation_std[i],
-                    score,
-                )
+                refused = any_refused(screened, i)
+                verdict = SCREENED
+                if not refused or pass_on(value, screened, i, passed):
+                    verdict = call_update(
+                        code.update,
+                        context,
+                        u,
+                        channel[i],
+                        passed if refused else value[i],
+                        index,
+                        state,
+                        work,
+                        innovation[i],
+                        innovation_std[i],
+                        score,
+                    )
                 if variances:
                     for k in range(rows):
                         r[k] = kept[k]
@@ -133,6 +142,8 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
         track.dof[i] = int(score[1])
         track.log_likelihood[i] = score[2]
         track.verdict[i] = verdict
+        track.effective[i] = score[EFFECTIVE]
+        track.ancestors[i] = score[ANCESTORS]
         for j in range(whitened.shape[1]):
             whitened[i, j] = score[WHITENED + j]
 
@@ -173,7 +184,8 @@ run_signature = types.void(
 @lru_cache(maxsize=1)
 def compiled() -> tuple[Any, ...]:
     """The entry points, compiled for their one signature (or loaded from the cache)."""
-    functions = (run_and_judge, judge, begin)
-    for function, signature in zip(functions, (run_signature, judge_signature, begin_signature), strict=True):
+    functions = (run_and_judge, judge, begin, screen_rows)
+    signatures = (run_signature, judge_signature, begin_signature, screen_signature)
+    for function, signature in zip(functions, signatures, strict=True):
         function.compile(signature.args)
     return functions

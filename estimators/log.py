@@ -22,6 +22,7 @@ from .events.batch import (
     truth_of,
 )
 from .events.checks import Layout, admitted
+from .events.maintenance import versions_dropped
 from .events.order import in_order, sorted_order
 
 if TYPE_CHECKING:
@@ -39,7 +40,8 @@ class Log:
     Timestamps are int64 nanoseconds. `first` counts the events that were dropped from the front, so `first + i` names
     an event for ever. Columns are full-length arrays of which the first `n` rows are valid. `changes` counts what was
     put in. `start` is the time at which the prior holds, `BEFORE` for that of the first event; an event before `floor`
-    is stale: what it would change has been forgotten.
+    is stale: what it would change has been forgotten. `version` is the model's at the first event: it counts up with
+    each maintenance that was dropped.
     """
 
     def __init__(self, width: int, capacity: int = 1024) -> None:
@@ -49,6 +51,7 @@ class Log:
         self.n = 0
         self.first = 0
         self.changes = 0
+        self.version = 1
         self.newest = BEFORE
         self.start = self.floor = BEFORE
         self._allocate(capacity, width)
@@ -171,7 +174,7 @@ class Log:
         self.extend(batch)
         return self.n
 
-    def extend(self, batch: Events, horizon: int | None = None) -> tuple[int, int]:
+    def extend(self, batch: Events, horizon: int | None = None, settled: np.ndarray | None = None) -> tuple[int, int]:
         """Put a batch where it belongs in time.
 
         Args:
@@ -179,6 +182,7 @@ class Log:
             horizon: Nanoseconds; an event older than the newest before it by more than this is dropped as stale.
                 Judged event by event, so the outcome does not depend on how arrivals were cut into batches. One
                 before `floor` is stale with any horizon.
+            settled: Mask (N,) of the events to which no horizon applies: they came in time and were held on the way.
 
         Returns:
             The lowest index whose event changed (the old `n` if all were appended) and the number dropped.
@@ -196,7 +200,12 @@ class Log:
         self.newest = int(newest[-1])
         stale = 0
         if horizon is not None or batch.t.min() < self.floor:
-            fresh = batch.t >= (self.floor if horizon is None else np.maximum(newest - horizon, self.floor))
+            oldest = np.full(len(batch), self.floor)
+            if horizon is not None:
+                oldest = np.maximum(newest - horizon, oldest)
+            if settled is not None:
+                oldest[settled] = self.floor
+            fresh = batch.t >= oldest
             stale = int(fresh.size - fresh.sum())
             if stale:
                 batch = batch.select(fresh)
@@ -246,6 +255,7 @@ class Log:
         """Forget the oldest `count` events; what comes later of the time before their end is stale."""
         if count:
             self.floor = max(self.floor, int(self.t[count - 1]))
+            self.version += versions_dropped(self.events, count)
         for column in self._columns():
             column[: self.n - count] = column[count : self.n].copy()
         self.n -= count

@@ -24,7 +24,8 @@ class Base(NamedTuple):
     mean (nx,) and cov (nx, nx), or the variances (1, nx) of a large state, stand for it in any filter. `state` is all
     that the filter `estimator` had (modes, members, particles, what an adaptation learned), for that filter alone.
     `first` is the absolute index of the first event that is folded from here. `evidence` is what had been gathered
-    against the filter, for the same filter.
+    against the filter, for the same filter; `edge` what the screen remembers of the sensors, for any. `version` is the
+    model's there (events/maintenance.py).
     """
 
     mean: np.ndarray
@@ -35,15 +36,18 @@ class Base(NamedTuple):
     state: np.ndarray | None = None
     first: int = 0
     evidence: np.ndarray | None = None
+    edge: np.ndarray | None = None
+    version: int = 1
 
 
 class Snapshot(NamedTuple):
-    """Clock (ns), inputs (nu,), state of a filter and evidence against it, before an event."""
+    """Clock (ns), inputs (nu,), state of a filter, evidence against it and state of the screen, before an event."""
 
     clock: int
     u: np.ndarray
     state: np.ndarray
     evidence: np.ndarray
+    edge: np.ndarray
 
 
 class Snapshots:
@@ -57,6 +61,11 @@ class Snapshots:
             self._every *= 2
         self._sparse = max(SPARSE_EVERY, self._every)
         self._kept: dict[int, Snapshot] = {}
+
+    @property
+    def every(self) -> int:
+        """Events between two recent ones: how far a late reading takes a fold back at least, at worst."""
+        return self._every
 
     def __contains__(self, at: int) -> bool:
         """Whether there is one before the event at an absolute index."""

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, flags, ints, jit, masks
+from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, flag_rows, flags, ints, jit, masks
 
 NONE, USED, GATED, HELD_OUT, MISSING, FAILED, SCREENED = range(7)
 """Verdict on an event: not a reading; used; refused by the gate; held out and scored; no finite row; not usable,
@@ -15,12 +15,19 @@ as S was not positive definite beyond rounding or the NIS no finite number; refu
 
 VERDICT_NAMES = ("none", "used", "gated", "held out", "missing", "failed", "screened")
 
+REASONS = ("range", "rate", "stuck", "saturated", "duplicate")
+"""Why a row of a reading is refused at the edge: beyond what can be; changing faster; repeating itself; where its
+converter clips; a reading that came before. Bits of `Track.screened`, in this order."""
+
+RANGE, RATE, REPEATED, SATURATED, DUPLICATE = (1 << k for k in range(len(REASONS)))
+
 WAITING, TRACKING, SUSPECT, DEGRADED, DIVERGED, STALE = range(6)
 """Health: no reading has come; consistent; consistent no more; a sensor is lost or readings are late; the estimate is
 lost; nothing arrives."""
 
-WHITENED = 3
-"""Where in what a filter scores (NIS, degrees of freedom, log-likelihood) the whitened rows of the reading begin."""
+EFFECTIVE, ANCESTORS, WHITENED = range(3, 6)
+"""Where in what a filter scores, after NIS, degrees of freedom and log-likelihood, the particles that count stand and
+those from which they descend, and where the whitened rows of the reading begin."""
 
 HEALTH_NAMES = ("waiting", "tracking", "suspect", "degraded", "diverged", "stale")
 
@@ -36,6 +43,9 @@ class Track(NamedTuple):
     whitened (N, ny): the innovation as it would be drawn from N(0, I), by row of the reading; of a prediction that is
     not Gaussian each row by itself, Φ⁻¹(F(y)). alarms (N, width): bits of the causes that are in alarm after this
     event, by row of the reading or state of the truth; flags: bits of what else is wrong (diagnostics/evidence.py).
+    screened (N, ny): bits of `REASONS` for which a row of the reading was refused at the edge.
+    effective: of particles, their effective sample size after a reading that was used, before resampling; ancestors:
+    how many of some readings ago these descend from (particle/lineage.py); NaN elsewhere.
     """
 
     mean: Any
@@ -56,6 +66,9 @@ class Track(NamedTuple):
     whitened: Any
     alarms: Any
     flags: Any
+    screened: Any
+    effective: Any
+    ancestors: Any
 
     @staticmethod
     def allocate(rows: int, nx: int, pairs: int, ny: int, width: int | None = None) -> Track:
@@ -66,7 +79,9 @@ class Track(NamedTuple):
         windowed = [np.full(rows, np.nan) for _ in range(4)]
         health = [np.zeros(rows, np.int8) for _ in range(2)]
         evidence = [np.full((rows, ny), np.nan), np.zeros((rows, width or ny), np.int32), np.zeros(rows, np.int64)]
-        columns: list[Any] = [*matrix, *vectors, *codes, *windowed, *health, *evidence]
+        screened = np.zeros((rows, ny), np.int8)
+        particles = [np.full(rows, np.nan) for _ in range(2)]
+        columns: list[Any] = [*matrix, *vectors, *codes, *windowed, *health, *evidence, screened, *particles]
         return Track(*columns)
 
     def select(self, index: object) -> Track:
@@ -85,8 +100,10 @@ class Track(NamedTuple):
 # As in log.py: `len` counts rows, not columns.
 Track._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[method-assign, assignment]
 
-_A2 = types.Array(types.int32, 2, "C")
-track_type = types.NamedTuple((F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, F1, B1, B1, F2, _A2, I1), Track)
+_A2, _B2 = types.Array(types.int32, 2, "C"), types.Array(types.int8, 2, "C")
+track_type = types.NamedTuple(
+    (F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, F1, B1, B1, F2, _A2, I1, _B2, F1, F1), Track
+)
 
 
 @jit
@@ -112,4 +129,7 @@ def borrowed_columns(track):
         borrowed_rows(track.whitened),
         masks(track.alarms.ctypes.data, n, width),
         ints(track.flags.ctypes.data, n),
+        flag_rows(track.screened.ctypes.data, n, track.screened.shape[1]),
+        borrowed(track.effective),
+        borrowed(track.ancestors),
     )

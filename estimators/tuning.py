@@ -34,7 +34,9 @@ class Tuning:
 
     q (nw,) is the variance that each process noise adds in one second; r (rows,) the variance of each sensor row;
     p (np,) the model's parameters; `used` (sensors,) is False where a sensor is held out: predicted and scored, never
-    used. `gate` is the probability that a good reading passes, or None. `options` are the estimator's own.
+    used. `gate` is the probability that a good reading passes, or None. `options` are the estimator's own. `baseline`
+    (rows, ...) is what was normal of the innovations when it was accepted (diagnostics/evidence.py), or None for white
+    ones.
     """
 
     model: StateSpaceModel
@@ -45,6 +47,7 @@ class Tuning:
     gate: float | None = None
     options: Mapping[str, float] = field(default_factory=dict)
     seed: int = 0
+    baseline: np.ndarray | None = None
     version: int = field(default_factory=lambda: next(_versions))
 
     @staticmethod

@@ -76,6 +76,33 @@ def _unit(text: str) -> Any:
         raise LookupError(text) from error
 
 
+def _turns(unit: str) -> bool | None:
+    """Whether a frequency is of an angle, as rpm or rad/s, or of events, as Hz; None of what is no frequency."""
+    try:
+        found = _unit(unit)
+    except LookupError:
+        return None
+    if found.dimensionality != _registry().Unit("Hz").dimensionality:
+        return None
+    angles = {"radian", "degree", "turn", "revolution", "revolutions_per_minute", "revolutions_per_second"}
+    return any(name in angles for name in dict(_registry().Quantity(1.0, found).unit_items()))
+
+
+def _refuse_turns(a: str, b: str, given: str, wanted: str, where: str) -> None:
+    """Refuse to make a rotation of a frequency, or the reverse: an angle has no unit, so it would be off by 2π.
+
+    Raises:
+        SourceError: Beginning with `where`.
+    """
+    source, target = _turns(a), _turns(b)
+    if source is None or target is None or source == target:
+        return
+    raise SourceError(
+        f"{where}: {given!r} is {'a rotation' if source else 'a frequency'} and the model's {wanted!r} is not, so they "
+        f"may be 2π apart; say what is meant: under `units` {'Hz' if source else 'rad/s'}, and what is left as `scale`"
+    )
+
+
 @lru_cache(maxsize=256)
 def conversion(given: str | None, wanted: str, where: str) -> tuple[float, float]:
     """Factor and offset that turn a value in `given` into one in `wanted`: factor * value + offset.
@@ -92,6 +119,7 @@ def conversion(given: str | None, wanted: str, where: str) -> tuple[float, float
         return 1.0, 0.0
     import pint
 
+    _refuse_turns(a, b, given, wanted, where)
     remedy = "declare its `units`" if a in ("", "-") else "write one that converts, under `units`"
     try:
         target = _unit(b)

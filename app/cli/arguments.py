@@ -120,6 +120,55 @@ class Compare:
 
 
 @dataclass(frozen=True)
+class Commission:
+    """Fold data on which everything was in order, and write what is normal there: alarms are then about changes.
+
+    Prints the lines of the twin's YAML, or puts them there.
+    """
+
+    twin: Twin
+    """Name of a twin that ships, or path of a YAML file."""
+    estimator: str | None = None
+    """Estimator to use instead of the twin's own."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable, as for `run`."""
+    log: tuple[Path, ...] = ()
+    """Recordings to read instead of the twin's own."""
+    duration: float | None = None
+    """Take only this many seconds of the source."""
+    write: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Put the section `commissioned` into the twin's YAML, in place of the one that is there."""
+
+
+@dataclass(frozen=True)
+class Stress:
+    """Make mistakes with a twin on purpose, and print how soon, and how rightly, it says so.
+
+    Errors of the tuning hold from the start; faults of what the source says from a third to two thirds of the log, so
+    that false alarms before and recovery after them show too. Figures are medians over the seeds.
+    """
+
+    twin: Twin
+    """Name of a twin that ships, or path of a YAML file."""
+    estimators: tuple[str, ...] = ()
+    """The filters to try. Default: the twin's own."""
+    only: tuple[str, ...] = ()
+    """Only mistakes whose name holds one of these texts."""
+    list: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """List the mistakes, and make none."""
+    seeds: int = 3
+    """Number of seeds, of the simulated asset, the faults and the filter."""
+    duration: float = 600.0
+    """Seconds of the log."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable, as for `run`."""
+    log: tuple[Path, ...] = ()
+    """Recordings to read instead of the twin's own."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print one JSON list, an object for each mistake, filter and seed."""
+
+
+@dataclass(frozen=True)
 class Filters:
     """List the estimators: what they assume, their options, what they cost and when they fail."""
 
@@ -211,7 +260,7 @@ class New:
     """Its unit: s, ms, us, ns, min or h."""
 
 
-Command = Run | Fold | Check | Compare | Filters | Review | Bus | Twins | Schema | Log | New
+Command = Run | Fold | Check | Compare | Stress | Commission | Filters | Review | Bus | Twins | Schema | Log | New
 COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in get_args(Command)}
 
 

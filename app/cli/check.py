@@ -93,6 +93,8 @@ def check(twin: Twin, log: Log, counts: Counter[str]) -> Checked:
         span = float(log.t[fold.n - 1] - log.t[0]) * 1e-9
         log.n = fold.log.n = fold.n
     fold.finish()
+    readings = int(np.sum(log.kind[: log.n] == READING))
+    covariance = fold.estimator.family not in ("particle", "ensemble")
     given = model, tuning, log
     return Checked(
         twin=twin,
@@ -100,9 +102,7 @@ def check(twin: Twin, log: Log, counts: Counter[str]) -> Checked:
         fold=fold,
         counts=counts,
         span=span,
-        dimension=dimension(
-            model, _rate(log), seconds, covariance=fold.estimator.family not in ("particle", "ensemble")
-        ),
+        dimension=dimension(model, _rate(log), seconds * log.n / max(1, readings), covariance=covariance),
         linearity=linearity(*given),
         peaks=_peaks(twin, log),
         tails=tails(model, log, fold.track, marginal=fold.marginal),

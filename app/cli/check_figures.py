@@ -154,12 +154,12 @@ def _open_loop(checked: Checked) -> dict[str, Any]:
 
 
 def _timing(checked: Checked) -> dict[str, Any]:
-    section = checked.twin.config.time
+    section, policy = checked.twin.config.time, checked.twin.policy
     return {
         "stamps": stamps(checked),
         "horizon": section.horizon,
-        "degraded_after": section.degraded_after,
-        "stale_after": section.stale_after,
+        "degraded_after": policy.degraded_after,
+        "stale_after": policy.stale_after,
         "stale": checked.counts["stale"],
         "sensors": {item.sensor: _plain(item) for item in checked.arrivals},
     }

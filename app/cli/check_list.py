@@ -11,6 +11,7 @@ from estimators.diagnostics.calibration import LIMITS
 from estimators.diagnostics.dimension import BUSY, spread_error
 from estimators.diagnostics.posterior import OFTEN
 from estimators.diagnostics.sensitivity import Sensitivity
+from estimators.diagnostics.sensitivity.words import subject_text
 from estimators.log import MAINTENANCE
 from estimators.track import HEALTH_NAMES
 
@@ -23,6 +24,9 @@ YES, PARTLY, NO, NONE = "yes", "partly", "no", "not told"
 
 BLAME = 0.9
 """Correlation of two estimates from which on one takes the blame for the other."""
+
+ILL = 1e8
+"""Conditioning from which on the information of the worst direction is rounding."""
 
 LEFT = 0.9
 """Share of the prior deviation; a direction that keeps more is not observed."""
@@ -77,7 +81,7 @@ def _dimension(checked: Checked) -> Line:
     question = "Is n small enough for O(n³) at this rate, or is an ensemble required?"
     figures = (
         f"{found.nx:,} states, {found.rate:.3g} readings a second; a covariance step is {found.flops:.3g} operations "
-        f"on {found.memory / 1e6:.3g} MB; {entry.name} takes {1e6 * found.seconds:.3g} µs a step, "
+        f"on {found.memory / 1e6:.3g} MB; {entry.name} takes {1e6 * found.seconds:.3g} µs a reading, "
         f"{100 * found.share:.2g} % of one processor"
     )
     if np.isfinite(found.largest) and found.largest > found.nx:
@@ -100,6 +104,8 @@ def _posterior(checked: Checked) -> Line:
     found = checked.peaks
     question = "Is the posterior multimodal, or is the noise heavy-tailed?"
     heavy = [tail for tail in checked.tails if tail.heavy]
+    # Of many rows a few look so by chance.
+    heavy = heavy if len(heavy) > OFTEN * len(checked.tails) else []
     if found.reason:
         said = [f"no cloud was looked at: {found.reason}"]
     else:
@@ -111,13 +117,16 @@ def _posterior(checked: Checked) -> Line:
     worst = max(checked.tails, key=lambda tail: tail.kurtosis, default=None)
     if worst is not None:
         said.append(
-            f"innovations: {len(heavy)} of {len(checked.tails)} rows are heavy-tailed, the worst {worst.row} with "
-            f"excess kurtosis {worst.kurtosis:.2g} and {100 * worst.far:.2g} % beyond 4 σ"
+            f"innovations: {sum(tail.heavy for tail in checked.tails)} of {len(checked.tails)} rows are heavy-tailed, "
+            f"the worst {worst.row} with excess kurtosis {worst.kurtosis:.2g} and {100 * worst.far:.2g} % beyond 4 σ"
         )
     peaked = not found.reason and not found.recoveries and found.several > OFTEN
     remedy = ""
-    if peaked and checked.fold.estimator.peaks is None:
-        remedy = f"{checked.twin.estimator} has one peak: use pf, pf_ekf or rbpf"
+    if peaked:
+        one = checked.fold.estimator.peaks is None
+        remedy = (
+            f"{checked.twin.estimator} has one peak: use pf, pf_ekf or rbpf" if one else "particles carry the peaks"
+        )
     elif heavy and checked.twin.tuning.gate is None:
         remedy = "heavy tails need a gate, not particles: set gate: 0.99999"
     elif heavy:
@@ -127,8 +136,14 @@ def _posterior(checked: Checked) -> Line:
 
 
 def blamed(found: Sensitivity) -> list[tuple[str, str, float]]:
-    """Who takes the blame for whom: pairs whose estimates from this log would be correlated beyond 0.9."""
-    c, names = found.correlation, [f"{nudge.kind} {nudge.name}" for nudge in found.nudges]
+    """Who takes the blame for whom: pairs that look alike in the readings.
+
+    Their estimates from this log would be correlated beyond 0.9, if these two were unknown and all others known.
+    """
+    names = [subject_text(nudge) for nudge in found.nudges]
+    root = np.sqrt(np.diag(found.fisher))
+    with np.errstate(all="ignore"):
+        c = -found.fisher / np.outer(root, root)
     pairs = [
         (names[i], names[j], float(c[i, j]))
         for i in range(len(names))
@@ -154,11 +169,13 @@ def _observability(checked: Checked) -> Line:
     pairs = blamed(told)
     if pairs:
         first, second, value = pairs[0]
-        figures += f"; {len(pairs)} pair(s) take the blame for each other, first {first} and {second} ({value:+.3f})"
+        figures += f"; {len(pairs)} pair(s) look alike in the readings, first {first} and {second} ({value:+.3f})"
+    if whole.beyond:
+        return Line("observability", question, NONE, f"{figures}; {found.note}", "")
     free = checked.twin.model.prior_std > 0.0
     left = whole.deviation[free]
     unseen = bool(left.size and left.max() > LEFT)
-    full = whole.rank >= int(free.sum())
+    full = whole.rank >= int(free.sum()) and whole.conditioning < ILL
     remedy = ""
     if unseen or not full:
         remedy = "what is not observed keeps its prior and drifts: add a sensor, or trust it no further than its band"
@@ -178,7 +195,7 @@ def stamps(checked: Checked) -> str:
 
 def _timing(checked: Checked) -> Line:
     question = "Are there source timestamps, a buffer for the worst latency, and a policy for stale data?"
-    section = checked.twin.config.time
+    section, policy = checked.twin.config.time, checked.twin.policy
     spoke = [item for item in checked.arrivals if item.n]
     late = [item for item in spoke if np.isfinite(item.lateness[-1])]
     silent = [item.sensor for item in checked.arrivals if not item.n]
@@ -192,7 +209,7 @@ def _timing(checked: Checked) -> Line:
         said.append(f"worst lateness {most:.3g} s for a horizon of {section.horizon:g} s")
     else:
         said.append(f"when readings arrived is not known; the horizon is {section.horizon:g} s")
-    said.append(f"{stale} stale; degraded after {section.degraded_after:g} s, stale after {section.stale_after:g} s")
+    said.append(f"{stale} stale; degraded after {policy.degraded_after:g} s, stale after {policy.stale_after:g} s")
     if silent:
         said.append(f"never heard: {', '.join(silent)}")
     remedy = ""
@@ -200,8 +217,8 @@ def _timing(checked: Checked) -> Line:
         remedy = f"{stale} reading(s) came later than the horizon: raise time.horizon"
     elif silent:
         remedy = "check the channel map of what is never heard"
-    elif worst is not None and worst.gap > section.degraded_after:
-        remedy = f"{worst.sensor} is silent for longer than time.degraded_after: degraded meanwhile"
+    elif worst is not None and worst.gap > policy.degraded_after:
+        remedy = f"{worst.sensor} is silent for longer than {policy.degraded_after:g} s: degraded meanwhile"
     whole = bool(late) and "measured" in said[0] and not silent
     return Line("timing", question, NO if stale else YES if whole else PARTLY, "; ".join(said), remedy)
 
@@ -223,30 +240,32 @@ def _health(checked: Checked) -> Line:
 
 def _tuning(checked: Checked) -> Line:
     question = "Are Q and R fitted on recorded data, versioned, and covered by regression tests?"
-    kept = scores_file(checked.twin.path)
+    twin = checked.twin
+    kept = scores_file(twin.path)
     scores = kept.exists()
     off = [
         entry.subject
         for entry in checked.calibration
         if entry.role == "used" and entry.scale.beyond(1.0 / (1.0 + LIMITS.width), 1.0 + LIMITS.width)
     ]
+    normal = "what was normal is kept with them" if twin.tuning.baseline is not None else "what was normal is not kept"
     figures = (
-        f"Q and R stand in {checked.twin.path.name}; nothing records on what they were fitted; scores of every filter "
-        f"{'are kept in ' + kept.name if scores else 'are not kept'}; bands off by more than a quarter: "
+        f"Q and R stand in {twin.path.name}, which says no more of a fit than its comments; {normal}; scores of every "
+        f"filter {'are kept in ' + kept.name if scores else 'are not kept'}; bands off by more than a quarter: "
         f"{', '.join(off[:4]) if off else 'none'}{f' and {len(off) - 4} more' if len(off) > 4 else ''}"
     )
-    remedy = "say in the YAML on what recording they were fitted"
+    remedy = []
+    if twin.tuning.baseline is None:
+        remedy.append(f"nisus commission {twin.path.stem} keeps what is normal, so that a change is told")
     if not scores:
-        remedy += f"; nisus compare {checked.twin.path.stem} --write keeps the scores"
-    return Line("tuning", question, PARTLY if scores else NO, figures, remedy)
+        remedy.append(f"nisus compare {twin.path.stem} --write keeps the scores")
+    return Line("tuning", question, PARTLY if scores or not remedy else NO, figures, "; ".join(remedy))
 
 
 def _change(checked: Checked) -> Line:
     question = "Is the model version tied to maintenance events?"
     log = checked.log
     done = int(np.sum(log.kind[: log.n] == MAINTENANCE))
-    figures = (
-        f"{done} maintenance event(s) in this log; the model {checked.twin.model.name} states no version of its own"
-    )
+    figures = f"each maintenance counts the version of {checked.twin.model.name} up; {done} in this log"
     remedy = "tell the twin of maintenance, so that the covariance of what was changed is opened again"
-    return Line("change", question, PARTLY if done else NO, figures, "" if done else remedy)
+    return Line("change", question, YES if done else PARTLY, figures, "" if done else remedy)

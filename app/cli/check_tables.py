@@ -9,6 +9,7 @@ import numpy as np
 
 from estimators.diagnostics.calibration import BANDS
 from estimators.diagnostics.sensitivity import bounds_of
+from estimators.diagnostics.sensitivity.information import directions
 from estimators.diagnostics.sensitivity.words import range_text, size_text, subject_text
 from estimators.track import HEALTH_NAMES
 
@@ -134,6 +135,10 @@ def _observability(checked: Checked) -> Part:
         said.append(f"{one} and {other} take the blame for each other: correlation {value:+.3f}.")
     if len(pairs) > MOST:
         said.append(f"So do {len(pairs) - MOST} more pairs.")
+    told = checked.sensitivity
+    untold = [item for item in directions(told.fisher, told.nudges) if not item.deviation < 1.0] if told.nudges else []
+    if untold:
+        said.append(f"With all unknown together {len(untold)} combination(s) cannot be told, first {untold[0].text}.")
     return Part(title, tuple(said), ("part of the log", "rank", "conditioning", "weakest direction"), _cut(rows))
 
 

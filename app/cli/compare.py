@@ -17,7 +17,7 @@ from config.loader import shipped
 from config.source_schema import SimulatorSection
 from estimators.compiled.orphan import leave_with_parent
 from estimators.errors import ConfigError, SourceError
-from estimators.log import Events
+from estimators.log import MARK, Events
 from estimators.registry import ESTIMATORS, find_estimator, unfit
 
 from ..stderr import complain
@@ -87,13 +87,19 @@ def _compare(arguments: Arguments, name: str) -> None:
 def _logs(twin: Twin, overrides: Mapping[str, str], arguments: Arguments) -> list[Events]:
     """The twin's log, or several of its simulator, whose seeds count up from the twin's own."""
     if arguments.logs == 1:
-        return [read_log(twin, arguments.duration)[0].events]
+        return [events_of(twin, arguments.duration)]
     source = twin.config.source
     if not isinstance(source, SimulatorSection):
         raise ConfigError(f"--logs {arguments.logs}: {twin.name} is not simulated; there is one log of it")
     seeds = range(source.seed, source.seed + arguments.logs)
     twins = (load_twin(arguments.twin, overrides={**overrides, "source.seed": str(seed)}) for seed in seeds)
-    return [read_log(other, arguments.duration)[0].events for other in twins]
+    return [events_of(other, arguments.duration) for other in twins]
+
+
+def events_of(twin: Twin, duration: float | None = None) -> Events:
+    """What the twin's source says, without the stamps of faults: these say nothing of the asset, and are no steps."""
+    events = read_log(twin, duration)[0].events
+    return events.select(events.kind != MARK)
 
 
 def _plain(row: Row) -> dict[str, Any]:

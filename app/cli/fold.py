@@ -17,11 +17,13 @@ from estimators.diagnostics.score import score
 from estimators.errors import ConfigError, SourceError
 from estimators.fold import Fold
 from estimators.interface.table import table_of
+from estimators.late import inflated
 from estimators.log import Log
 from estimators.track import Track
 from sources.source import Endless
 
 from ..engine.stall import interruptible
+from ..intake import Intake
 from ..twin.twin import Twin, load_twin
 from .arguments import settings
 from .fold_report import as_dict, as_text, calibration_of
@@ -29,6 +31,8 @@ from .prepare import prepare
 from .remarks import remarking
 
 if TYPE_CHECKING:
+    from estimators.events.clocks import Passed
+
     from .arguments import Fold as Arguments
 
 
@@ -43,19 +47,35 @@ def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
     def count(key: str, text: str) -> None:
         counts[key] += 1
 
-    source = twin.open_source(remarking(count), live=False)
+    def put(passed: Passed) -> None:
+        events = passed.events
+        if beside is not None:
+            events, late = inflated(events, beside, log.newest, horizon)
+            counts["inflated"] += late
+        first, stale = log.extend(events, horizon, passed.settled)
+        counts["stale"] += stale
+        if beside is not None:
+            beside.rewind(first)
+            beside.advance()
+
+    remark = remarking(count)
+    source = twin.open_source(remark, live=False)
     if duration is None and isinstance(source, Endless) and source.endless:
         source.close()
         raise SourceError(f"{twin.name}: its source has no end; give --duration SECONDS")
     log = Log.of(twin.model)
     horizon = round(twin.config.time.horizon * 1e9)
+    # What a late reading is inflated by is asked of the estimate when it comes.
+    beside = Fold(twin.estimator, twin.model, twin.tuning, log) if twin.late.inflate else None
+    intake = Intake(twin.model, horizon, remark, twin.maintenance)
     try:
         while (batch := source.read(1.0)) is not None:
-            _, stale = log.extend(batch, horizon)
-            counts["stale"] += stale
+            put(intake.take(batch))
             if duration is not None and log.n and log.t[log.n - 1] - log.t[0] > duration * 1e9:
                 log.n = int(np.searchsorted(log.t[: log.n], log.t[0] + round(duration * 1e9), side="right"))
                 break
+        else:
+            put(intake.finish())
     finally:
         source.close()
     if not log.n:
@@ -102,4 +122,5 @@ def _write(path: Path, twin: Twin, log: Log, track: Track, pictures: Sequence[Pi
 
         write_recording(path, twin, log, track, pictures)
         return
-    pq.write_table(table_of(twin.model, log.events, track), path)
+    table = table_of(twin.model, log.events, track, tuning_version=twin.tuning.version, model_version=log.version)
+    pq.write_table(table, path)

@@ -14,9 +14,11 @@ from estimators.diagnostics.intervals import Interval
 from estimators.diagnostics.score import Score
 from estimators.fold import Fold
 from estimators.model.state_space import StateSpaceModel
-from estimators.track import FAILED, HEALTH_NAMES, USED
+from estimators.screen import reasons_by_sensor
+from estimators.track import FAILED, HEALTH_NAMES, REASONS, USED
 from estimators.tuning import TOGETHER
 
+from ..intake import WRONG_TIME
 from ..twin.twin import Twin
 
 
@@ -43,8 +45,11 @@ def as_dict(
     """What a script needs of a fold.
 
     `rmse` and `coverage` (the share of errors inside their 95 % band) are by state and `held_out` by sensor row, in
-    their units; `stale` counts the readings that came too late to be among the `readings`, `conditioned` those that a
-    condition of the source's map refused; `health` is the share of the track's rows in each state of health.
+    their units; `stale` counts the readings that came too late to be among the `readings`, `wrong_time` the events that
+    were refused for a time that cannot be true, `inflated` the late ones that were used when they came, `conditioned`
+    those that a condition of the source's map refused; `screened` counts what the edge refused by sensor and reason,
+    these last among them as `condition`; `late` and `degraded_after` say what was decided of time, and why; `health` is
+    the share of the track's rows in each state of health.
     `log_likelihood` has the price of the readings that were refused, which `log_likelihood_used` leaves out; `refused`
     is their share. `calibration` has an entry for each sensor row, used or held out, and each state whose truth is
     told: see estimators/diagnostics/calibration.py.
@@ -70,12 +75,18 @@ def as_dict(
         "log_likelihood_used": number(result.log_likelihood_used),
         "used": int(np.sum(fold.track.verdict == USED)),
         "stale": counts["stale"],
+        "wrong_time": counts[WRONG_TIME],
+        "inflated": counts["inflated"],
+        "late": twin.late._asdict(),
+        "degraded_after": twin.degraded._asdict(),
         "conditioned": sum(count for key, count in counts.items() if key.startswith("condition ")),
         "gated": result.gated,
         "refused": number(result.refused),
         "missing": result.missing,
         "failed": int(np.sum(fold.track.verdict == FAILED)),
+        "screened": _screened(twin, counts, fold),
         "failure": _why(fold),
+        "account": {name: said if isinstance(said, list) else number(said) for name, said in fold.account().items()},
         "health": {
             name: float(share)
             for name, share in zip(
@@ -99,6 +110,20 @@ def calibration_dict(entry: Calibration) -> dict[str, Any]:
         "coverage": {f"{100 * band:.0f}": figure(share) for band, share in zip(BANDS, entry.coverage, strict=True)},
         "words": list(entry.words),
     }
+
+
+def _screened(twin: Twin, counts: Counter[str], fold: Fold) -> dict[str, dict[str, int]]:
+    """By sensor and reason, how many readings were not to be used, wholly or in part; only sensors that have any.
+
+    `condition`: a signal beside it said that the reading is not valid.
+    """
+    names = twin.model.sensor_names
+    table = reasons_by_sensor(len(names), fold.log.channel[: fold.n], fold.track.screened)
+    found = {name: dict(zip(REASONS, row.tolist(), strict=True)) for name, row in zip(names, table, strict=True)}
+    for name, each in found.items():
+        each["condition"] = counts[f"condition {name}"]
+    every = {name: {reason: count for reason, count in each.items() if count} for name, each in found.items()}
+    return {name: each for name, each in every.items() if each}
 
 
 def _why(fold: Fold) -> str | None:
@@ -150,6 +175,9 @@ def as_text(
     failed = int(np.sum(track.verdict == FAILED))
     if failed:
         rows.append(("failed", f"{failed}: no estimate, or none with this reading, is a number"))
+    for name, reasons in _screened(twin, counts, fold).items():
+        rows.append((f"not used of {name}", ", ".join(f"{reason} {count}" for reason, count in reasons.items())))
+    conditions = {f"condition {name}" for name in twin.model.sensor_names}
     why = _why(fold)
     if why:
         rows.append((f"the model failed {fold.failures} time(s)" if fold.failures else "because", why))
@@ -167,12 +195,14 @@ def as_text(
         share = 100 * float(np.mean([fit.coverage for fit in fits]))
         text = f"RMSE {rmse:.5g} {row_units[own[0]]}   in the 95 % band: {share:.1f} %"
         rows.append((f"held out {sensor_name}, {len(own)} rows", text))
-    rows += [(key, f"{count}") for key, count in sorted(counts.items())]
+    rows += [(key, f"{count}") for key, count in sorted(counts.items()) if key not in conditions]
     variances = ", ".join(
         f"{twin.model.state_names[j]} {value**2:.5g}" for j, value in zip(twin.model.shown, track.std[-1], strict=True)
     )
     rows += [
         ("final variances", variances),
+        ("late readings", f"{'used when they come, R inflated' if twin.late.inflate else 'exact'}: {twin.late.reason}"),
+        ("degraded after", f"{twin.degraded.seconds:g} s without a reading: {twin.degraded.reason}"),
         ("health at the end", HEALTH_NAMES[int(track.health[-1])]),
         ("time per event", f"{1e6 * seconds:.2f} µs"),
     ]

@@ -1,4 +1,4 @@
-"""The command line: `nisus run`, `fold`, `check`, `compare`, `filters`, `review`, `bus`, `twins` and others."""
+"""The command line: `nisus run`, `fold`, `compare`, `review` and the others, one file each."""
 
 from __future__ import annotations
 
@@ -14,7 +14,22 @@ import tyro
 from estimators.errors import NisusError
 
 from ..stderr import complain
-from .arguments import COMMANDS, Bus, Check, Command, Compare, Filters, Fold, Log, Review, Run, Schema, Twins
+from .arguments import (
+    COMMANDS,
+    Bus,
+    Check,
+    Command,
+    Commission,
+    Compare,
+    Filters,
+    Fold,
+    Log,
+    Review,
+    Run,
+    Schema,
+    Stress,
+    Twins,
+)
 
 
 def carry_out(command: Command) -> int:
@@ -35,6 +50,14 @@ def carry_out(command: Command) -> int:
         from .compare import compare_twin
 
         return compare_twin(command)
+    if isinstance(command, Commission):
+        from .commission import commission_twin
+
+        return commission_twin(command)
+    if isinstance(command, Stress):
+        from .stress import stress_twin
+
+        return stress_twin(command)
     if isinstance(command, Filters):
         from .filters import show_filters
 

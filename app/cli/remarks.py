@@ -7,9 +7,13 @@ from collections.abc import Callable
 from sources.source import NEVER, TRUNCATED
 from sources.tables.order import REMARKS as ORDER
 
+from ..intake import CLOCK_MOVED, WRONG_TIME
 from ..stderr import complain
 
-REMARKS = (*ORDER, NEVER, TRUNCATED)
+REMARKS = (*ORDER, NEVER, TRUNCATED, CLOCK_MOVED)
+
+FIRST = (WRONG_TIME,)
+"""Of these only the first is said: there may be as many as there are rows."""
 
 
 def remarking(report: Callable[[str, str], None]) -> Callable[[str, str], None]:
@@ -19,6 +23,9 @@ def remarking(report: Callable[[str, str], None]) -> Callable[[str, str], None]:
     def both(key: str, text: str) -> None:
         if key in REMARKS and text not in said:
             said.add(text)
+            complain(text)
+        elif key in FIRST and key not in said:
+            said.add(key)
             complain(text)
         report(key, text)
 

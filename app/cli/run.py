@@ -27,19 +27,12 @@ if TYPE_CHECKING:
 
 
 def live_source(twin: Twin, speed: float) -> Callable[[Callable[[str, str], None]], Source]:
-    """How to open the twin's source so that it comes in its own time: a bus as it is, anything else paced."""
+    """How to open the twin's source so that it comes in its own time: a bus as it is, anything else paced.
 
-    def open_source(report: Callable[[str, str], None]) -> Source:
-        from sources.pacer import Pacer
-
-        report = remarking(report)
-        source = twin.open_source(report)
-        if source.live:
-            return source
-        source.close()
-        return Pacer(lambda: twin.open_source(report), speed=speed)
-
-    return open_source
+    The faults that were injected last when a bus is opened again.
+    """
+    faults = twin.faults()
+    return lambda report: twin.open_source(remarking(report), speed=speed, faults=faults)
 
 
 SAID = 5

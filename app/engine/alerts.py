@@ -10,6 +10,7 @@ from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
 
 from .counts import UNSETTLED, complaints, estimated_rows, last_run
 from .notices import Notices
+from .refusals import refusals
 
 TRIES = 3
 """Failures of one fold whose cause is sought; a reading of 1e300 has none in the model, so more than one."""
@@ -44,6 +45,8 @@ class Alerts:
         """Report the rows from `before` on."""
         track, log = fold.track, fold.log
         for key, text in complaints(fold.model, log.channel, track, before):
+            self._notices.report(key, text, counted=False)
+        for key, text in refusals(fold.model, log, track, before):
             self._notices.report(key, text, counted=False)
         self._look_at_failures(fold)
         self._look_for_cause(fold, before)

@@ -52,6 +52,17 @@ class Reset:
 
 
 @dataclass(frozen=True)
+class Maintenance:
+    """Something of the asset was changed now, `what` in words: the states that it concerns, by name, start again.
+
+    Their covariance is that of the prior, their mean stays, and a new version of the model begins.
+    """
+
+    what: str
+    states: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Pause:
     """Hold a replay or a simulation where it is, or let it go on."""
 
@@ -84,5 +95,34 @@ class Record:
     path: Path | None
 
 
-Command = SetEstimator | SetTuning | SetOption | UseSensor | Restore | Reset | Pause | Speed | Step | Seek | Record
+@dataclass(frozen=True)
+class InjectFault:
+    """Put a fault into what the source says from now on; kinds and their numbers are those of sources/faults/kinds.py.
+
+    `target` is a sensor, an input or a true parameter of a simulated asset; None is the whole source. `row` is one of a
+    sensor, `other` the sensor with which a swap exchanges it. It ends after `duration` seconds, or by `ClearFault`.
+    """
+
+    kind: str
+    target: str | None = None
+    size: float | None = None
+    rate: float | None = None
+    every: float | None = None
+    count: int | None = None
+    row: str | None = None
+    other: str | None = None
+    duration: float | None = None
+
+
+@dataclass(frozen=True)
+class ClearFault:
+    """End the fault of that number, or all with None."""
+
+    number: int | None = None
+
+
+Command = (
+    SetEstimator | SetTuning | SetOption | UseSensor | Restore | Reset | Maintenance | Pause | Speed | Step | Seek
+    | Record | InjectFault | ClearFault
+)  # fmt: skip
 """Any of them."""

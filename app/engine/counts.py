@@ -9,7 +9,8 @@ import numpy as np
 
 from estimators.log import READING, Events
 from estimators.model.state_space import StateSpaceModel
-from estimators.track import FAILED, GATED, MISSING, VERDICT_NAMES, Track
+from estimators.screen import reasons_by_sensor
+from estimators.track import FAILED, GATED, MISSING, REASONS, SCREENED, VERDICT_NAMES, Track
 
 UNSETTLED = 8192
 """Rows at the end that are counted each time; a late reading rarely reaches back beyond them."""
@@ -18,11 +19,14 @@ LATENCIES = 4096
 
 
 class RowCounts:
-    """Rows by verdict, of each sensor, since the start; those that are settled are counted once."""
+    """Rows by verdict, and by reason why the edge refused them, of each sensor, since the start.
+
+    Those that are settled are counted once.
+    """
 
     def __init__(self, model: StateSpaceModel) -> None:
         self._sensors = model.sensor_names
-        self._forgotten = np.zeros((len(self._sensors), len(VERDICT_NAMES)), np.int64)
+        self._forgotten = np.zeros((len(self._sensors), len(VERDICT_NAMES) + len(REASONS)), np.int64)
         self.again()
 
     def again(self) -> None:
@@ -34,31 +38,36 @@ class RowCounts:
         if index < self._settled:
             self.again()
 
-    def forget(self, verdict: np.ndarray, channel: np.ndarray) -> None:
-        """The oldest rows, with these verdicts and channels, are dropped."""
-        self._forgotten = self._forgotten + self._of(verdict, channel)
+    def forget(self, track: Track, channel: np.ndarray) -> None:
+        """The oldest rows, with these channels, are dropped."""
+        self._forgotten = self._forgotten + self._of(track, channel, slice(0, len(track)))
         self.again()
 
-    def count(self, verdict: np.ndarray, channel: np.ndarray) -> dict[str, int]:
-        """Events in all and by verdict, given the verdicts and channels of all rows; and what went wrong where."""
-        settled = max(self._settled, len(verdict) - UNSETTLED)
-        self._counts += self._of(verdict[self._settled : settled], channel[self._settled : settled])
+    def count(self, track: Track, channel: np.ndarray) -> dict[str, int]:
+        """Events in all and by verdict, given all rows and their channels; and what went wrong where."""
+        settled = max(self._settled, len(track) - UNSETTLED)
+        self._counts += self._of(track, channel, slice(self._settled, settled))
         self._settled = settled
-        each = self._counts + self._of(verdict[settled:], channel[settled : len(verdict)])
+        table = self._counts + self._of(track, channel, slice(settled, len(track)))
+        each, reasons = np.split(table, [len(VERDICT_NAMES)], axis=1)
         totals = each.sum(axis=0)
         counts = {"readings": int(totals[1:].sum())}
         counts |= {name: int(count) for name, count in zip(VERDICT_NAMES[1:], totals[1:], strict=True)}
         if len(self._sensors) > 1:
-            for code in (GATED, MISSING, FAILED):
+            for code in (GATED, MISSING, FAILED, SCREENED):
                 for sensor in np.flatnonzero(each[:, code]):
                     counts[f"{VERDICT_NAMES[code]} {self._sensors[sensor]}"] = int(each[sensor, code])
+        for sensor, reason in np.argwhere(reasons):
+            counts[f"{REASONS[reason]} {self._sensors[sensor]}"] = int(reasons[sensor, reason])
         return counts
 
-    def _of(self, verdict: np.ndarray, channel: np.ndarray) -> np.ndarray:
-        """How many rows have each verdict (columns), by sensor (rows); those without a reading have verdict 0."""
-        kinds = len(VERDICT_NAMES)
+    def _of(self, track: Track, channel: np.ndarray, rows: slice) -> np.ndarray:
+        """How many rows have each verdict, then each reason (columns), by sensor; without a reading it is verdict 0."""
+        verdict, channel = track.verdict[rows], channel[rows]
+        sensors, kinds = len(self._sensors), len(VERDICT_NAMES)
         flat = np.where(verdict == 0, 0, channel * kinds + verdict)
-        return np.bincount(flat, minlength=len(self._sensors) * kinds).reshape(-1, kinds)
+        each = np.bincount(flat, minlength=sensors * kinds).reshape(-1, kinds)
+        return np.hstack((each, reasons_by_sensor(sensors, channel, track.screened[rows])))
 
 
 def complaints(model: StateSpaceModel, channel: np.ndarray, track: Track, first: int) -> Iterator[tuple[str, str]]:

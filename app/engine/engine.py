@@ -19,18 +19,22 @@ import numpy as np
 from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import EstimatorError, NisusError
 from estimators.fold import Fold
+from estimators.late import inflated
 from estimators.log import TICK, Events, Log
 from estimators.numerics.peaks import peaks_of
 from estimators.registry import find_estimator
 from estimators.snapshots import SPARSE_EVERY, Base
-from estimators.track import TRACKING
+from estimators.versions import model_version_at
 
+from ..intake import Intake
 from ..stderr import complain
 from . import commands
 from .alerts import Alerts
 from .counts import Latency, RowCounts, last_run
 from .execute import Remembered, execute
+from .faults import Faulty
 from .feeder import Feeder, Finished, Restarted
+from .host_clock import HostClock
 from .idle_ticks import IdleTicks
 from .integrity import IntegrityWatch, Window, window
 from .interface import Records
@@ -38,10 +42,12 @@ from .notices import Notices
 from .outputs import Belief, Cursor, Pull, Status
 from .playback import playback_status
 from .refolder import Refolded, Refolder, Requests
+from .silence import Silence
 from .stall import Stall
 
 if TYPE_CHECKING:
     from estimators.diagnostics.field_pictures import Picture
+    from estimators.events.clocks import Passed
     from estimators.tuning import Tuning
     from sources.source import Source
 
@@ -101,7 +107,9 @@ class Engine:
         self._finished = False
         self._idle_ticks = IdleTicks(section.tick)
         self._latency = Latency()
+        self._clock = HostClock(self.notices, section.horizon)
         self._alerts = Alerts(self.notices)
+        self._silence = Silence(self.notices, section.stale_after)
         self._stall = Stall(self._say_stalled)
         self._integrity = IntegrityWatch(self.model, self._window, self._policy.false_alarm_every)
         self._status: tuple[float, Status] | None = None
@@ -112,11 +120,13 @@ class Engine:
         """An empty log and the fold that follows it."""
         self._log = Log.of(self.model, capacity=self._history + 4 * SPARSE_EVERY)
         if base is not None:
-            self._log.first, self._log.floor = base.first, base.clock
+            self._log.first, self._log.floor, self._log.version = base.first, base.clock, base.version
         self._logs += 1
         self._base = base
         self._fold = self._make_fold(self.estimator, self.tuning, self._log, base)
         self._row_counts = RowCounts(self.model)
+        self._late = 0
+        self._intake = Intake(self.model, self._horizon, self.notices.report, self.twin.maintenance)
 
     def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
         period = self.twin.picture if self.model.grid is not None else None
@@ -259,6 +269,9 @@ class Engine:
         kept = self._status
         if kept is not None and time.monotonic() - kept[0] < STATUS_AGE:
             return kept[1]
+        source = self._feeder.source
+        layer = source.faults if isinstance(source, Faulty) else None
+        lost = layer.lost if layer is not None else 0
         with self._reading():
             log, fold = self._log, self._fold
             track = fold.track
@@ -270,14 +283,20 @@ class Engine:
                 revision=self._revision,
                 refolding=self._requests.waiting,
                 t=int(log.t[last]) if last >= 0 else None,
-                health=int(track.health[last]) if last >= 0 else TRACKING,
+                health=int(track.health[last]) if last >= 0 else self._silence.health,
                 since=int(log.t[last_run(track.health)]) if last >= 0 else None,
                 lost=self._alerts.lost,
+                model_version=model_version_at(log, int(log.t[last])) if last >= 0 else log.version,
+                clock=self._clock.estimate,
                 counts={
                     **self.notices.counts(),
-                    **self._row_counts.count(track.verdict, log.channel),
+                    **({"inflated": self._late} if self._late else {}),
+                    **({"held": self._intake.held} if self._intake.held else {}),
+                    **self._row_counts.count(track, log.channel),
                     **({"recovered": fold.recoveries()} if fold.recoveries() else {}),
+                    **({"silenced": lost} if lost else {}),
                 },
+                account=fold.account(),
                 nis=float(track.nis_mean[last]) if last >= 0 else np.nan,
                 nis_low=float(track.nis_low[last]) if last >= 0 else np.nan,
                 nis_high=float(track.nis_high[last]) if last >= 0 else np.nan,
@@ -287,6 +306,7 @@ class Engine:
                 latency_ms=self._latency.percentile(99.0),
                 latency_p50_ms=self._latency.percentile(50.0),
                 integrity=self._integrity.of(self._revision),
+                faults=layer.status() if layer is not None else (),
             )
         self._status = (time.monotonic(), status)
         return status
@@ -334,20 +354,31 @@ class Engine:
         if not batches:
             return
         batch = batches[0] if len(batches) == 1 else Events.concat(batches, self.model.width)
+        passed = self._intake.take(batch)
+        self._put(passed)
+        if self._feeder.live:
+            self._latency.note(batch)
+            self._clock.note(passed.events)
+
+    def _put(self, passed: Passed) -> None:
         with self._lock, self._stall.watched(self._fold):
-            stale = self._take(batch, self._horizon)
+            events = passed.events
+            if self._horizon is not None and self.twin.late.inflate:
+                events, late = inflated(events, self._fold, self._log.newest, self._horizon)
+                self._late += late
+            stale = self._take(events, self._horizon, passed.settled)
             self._idle_ticks.broken(self._log.newest)
+            if self._log.n:
+                self._silence.broken()
             if self._log.n > self._history + 3 * SPARSE_EVERY:
                 self._forget()
         if stale:
             text = f"{stale} reading(s) later than the horizon, or older than the history, dropped"
             self.notices.report("stale", text, times=stale)
-        if self._feeder.live:
-            self._latency.note(batch)
 
-    def _take(self, batch: Events, horizon: int | None = None) -> int:
+    def _take(self, batch: Events, horizon: int | None = None, settled: np.ndarray | None = None) -> int:
         """Put events where they belong, and fold from there on; how many were stale."""
-        first, stale = self._log.extend(batch, horizon)
+        first, stale = self._log.extend(batch, horizon, settled)
         before = min(first, self._fold.n)
         if first < self._fold.n:
             self._go_back(first)
@@ -370,12 +401,15 @@ class Engine:
         count = (self._log.n - self._history) // SPARSE_EVERY * SPARSE_EVERY
         count, self._base = self._fold.base_at(count)
         if count:
-            self._row_counts.forget(self._fold.track.verdict[:count], self._log.channel[:count])
+            self._row_counts.forget(self._fold.track.select(slice(0, count)), self._log.channel[:count])
             self._fold.drop_front(count)
             self._log.drop_front(count)
 
     def _when_silent(self) -> None:
-        if self._finished or not self._log.n:
+        if self._finished:
+            return
+        if not self._log.n:
+            self._silence.look(live=self._feeder.live)
             return
         now = self._idle_ticks.asks(self._feeder.source, int(self._log.t[self._log.n - 1]))
         if now is not None:
@@ -392,6 +426,7 @@ class Engine:
         elif isinstance(item, Restarted):
             self._restart()
         elif isinstance(item, Finished):
+            self._put(self._intake.finish())
             with self._lock, self._stall.watched(self._fold):
                 self._fold.finish()
             self._finished = True
@@ -450,7 +485,7 @@ class Engine:
             # What the new revision says of the readings counts, also of those that it loses here; not what others said.
             lost = max(0, log.first - fold.log.first)
             row_counts = RowCounts(self.model)
-            row_counts.forget(fold.track.verdict[:lost], fold.log.channel[:lost])
+            row_counts.forget(fold.track.select(slice(0, lost)), fold.log.channel[:lost])
             try:
                 fold.follow(log, changed_from)
             except EstimatorError:

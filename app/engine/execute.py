@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING
 
 from estimators.errors import ConfigError
 from estimators.estimator import Estimator
+from estimators.events.maintenance import maintained
 from estimators.fold_checks import check_variances
 from estimators.log import RESET, Events
 from estimators.registry import checked, find_estimator
 
+from ..intake import maintenance_text
 from . import commands
+from .faults import carry_out
 from .interface import Running
+from .maintenance import check_maintenance
 from .playback import PLAYBACK, play
 
 if TYPE_CHECKING:
@@ -54,7 +58,7 @@ def retuned(command: Refolding, engine: Running) -> tuple[str, Tuning]:
 def _check(entry: Estimator, engine: Running, options: Mapping[str, float]) -> None:
     """Refuse what a fold would refuse, also of readings that are still to come."""
     values = checked(entry, engine.model, options)
-    if engine.twin.plan.brings_variances:
+    if engine.twin.plan.brings_variances or engine.twin.late.inflate:
         check_variances(entry, values)
 
 
@@ -69,20 +73,31 @@ def execute(command: commands.Command, engine: Running) -> None:
     elif isinstance(command, commands.Reset):
         engine.insert(_reset_now(engine))
         engine.notices.say("estimate reset to the prior")
+    elif isinstance(command, commands.Maintenance):
+        states = check_maintenance(command.what, command.states, engine.model)
+        engine.insert(maintained(_now(engine), time.time_ns(), states, engine.model.width))
+        engine.notices.say(maintenance_text(command.what, states, engine.model))
     elif isinstance(command, commands.Record):
         if engine.recorder is None:
             raise ConfigError("this session cannot record")
         engine.recorder.record(command.path)
+    elif isinstance(command, commands.InjectFault | commands.ClearFault):
+        engine.notices.say(carry_out(command, engine.source, engine.model))
     elif isinstance(command, PLAYBACK):
         play(engine.source, command, engine.span()[0])
 
 
 def _reset_now(engine: Running) -> Events:
     """A reset now: an event of the log, so that refolds and recordings have it where it was."""
+    return Events.one(_now(engine), time.time_ns(), RESET, 0, [], engine.model.width)
+
+
+def _now(engine: Running) -> int:
+    """The time of the last event, ns."""
     now = engine.span()[1]
     if not now:
         raise ConfigError("nothing to reset: no reading has come yet")
-    return Events.one(now, time.time_ns(), RESET, 0, [], engine.model.width)
+    return now
 
 
 class Remembered:

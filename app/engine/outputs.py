@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from estimators.diagnostics.clock_fit import ClockFit
 from estimators.diagnostics.field_pictures import Picture
 from estimators.log import Events
 from estimators.numerics.peaks import Peak
 from estimators.track import Track
 from estimators.tuning import Tuning
+from sources.faults.layer import FaultStatus
 
 from .integrity import Integrity
 from .notices import Notice
@@ -67,9 +69,12 @@ class Status:
     """The state of the running twin, for panels and the API.
 
     `t` is the time of the last event (ns), `since` the time when the present health began, `lost` the time from which
-    the estimate has not been a number (None if it is one). `counts` are those of the rows of this revision, and of
-    other things that happened to the twin. `latency_ms` is the 99th percentile from a reading's arrival to its row.
-    `integrity` bounds what could be wrong with each state unnoticed; None until it is known.
+    the estimate has not been a number (None if it is one). `model_version` counts up with each maintenance. `clock` is
+    that of a live source against this machine's, None while it is not known. `counts` are those of the rows of this
+    revision, and of other things that happened to the twin. `account` is what the filter says of itself (see
+    `Fold.account`). `latency_ms` is the 99th percentile from a reading's arrival to its row. `faults` are those that
+    were put into the source, and hold or will. `integrity` bounds what could be wrong with each state unnoticed; None
+    until it is known.
     """
 
     estimator: str
@@ -81,7 +86,10 @@ class Status:
     health: int
     since: int | None
     lost: int | None
+    model_version: int
+    clock: ClockFit | None
     counts: dict[str, int]
+    account: dict[str, float | list[float]]
     nis: float
     nis_low: float
     nis_high: float
@@ -93,4 +101,5 @@ class Status:
     recording: Path | None
     latency_ms: float | None
     latency_p50_ms: float | None
+    faults: tuple[FaultStatus, ...] = ()
     integrity: Integrity | None = None

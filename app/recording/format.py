@@ -69,11 +69,18 @@ def base_to_json(base: Base | None) -> str:
     if base is None:
         return "null"
     moments = {"mean": base.mean.tolist(), "cov": base.cov.tolist(), "clock": base.clock, "u": base.u.tolist()}
-    moments["first"] = base.first
-    if base.state is None:
-        return json.dumps(moments)
-    state = base64.b64encode(np.ascontiguousarray(base.state, "<f8").tobytes()).decode()
-    return json.dumps({**moments, "estimator": base.estimator, "state": state})
+    moments |= {"first": base.first, "version": base.version}
+    arrays = {"state": base.state, "edge": base.edge, "evidence": base.evidence}
+    held = {key: _encoded(array) for key, array in arrays.items() if array is not None}
+    return json.dumps({**moments, "estimator": base.estimator, **held})
+
+
+def _encoded(array: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(array, "<f8").tobytes()).decode()
+
+
+def _decoded(text: str | None) -> np.ndarray | None:
+    return None if text is None else np.frombuffer(base64.b64decode(text), "<f8").astype(float)
 
 
 def base_from_json(text: str) -> Base | None:
@@ -81,15 +88,17 @@ def base_from_json(text: str) -> Base | None:
     values = json.loads(text)
     if values is None:
         return None
-    state = values.get("state")
     return Base(
         np.array(values["mean"]),
         np.array(values["cov"]),
         int(values["clock"]),
         np.array(values["u"], float),
         values.get("estimator", ""),
-        None if state is None else np.frombuffer(base64.b64decode(state), "<f8").astype(float),
+        _decoded(values.get("state")),
         int(values.get("first", 0)),
+        evidence=_decoded(values.get("evidence")),
+        edge=_decoded(values.get("edge")),
+        version=int(values.get("version", 1)),
     )
 
 

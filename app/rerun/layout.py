@@ -64,7 +64,7 @@ def blueprint(
     states = []
     for j, state in zip(model.shown.tolist(), model.shown_states, strict=True):
         rows = [model.row_names[model.row_start[d.sensor] + d.row] for d in dots if d.state == j]
-        over = [f"/{kind}/{row}" for row in rows for kind in ("reading", "refused")]
+        over = [f"/{kind}/{row}" for row in rows for kind in ("reading", "refused", "screened")]
         contents = [*over, f"/previous/state/{state.name}", f"/state/{state.name}", f"/truth/{state.name}"]
         states.append(chart(with_unit(model.label(state.name), state.unit), contents))
     if model.grid is not None:
@@ -149,9 +149,14 @@ def styles(stream: rr.RecordingStream, model: StateSpaceModel, pairs: np.ndarray
             continue
         words = name.replace("_", " ")
         # Points are drawn over lines, so they must let them shine through.
-        for kind, color, size in (("reading", (*READING, 70), 1.5), ("refused", REFUSED, 3.5)):
-            title = words if kind == "reading" else f"{words}, refused"
-            style(f"/{kind}/{name}", rr.SeriesPoints(colors=[color], names=[title], marker_sizes=[size]))
+        for kind, color, size, mark in (
+            ("reading", (*READING, 70), 1.5, "circle"),
+            ("refused", REFUSED, 3.5, "circle"),
+            ("screened", REFUSED, 4.0, "cross"),
+        ):
+            title = words if kind == "reading" else f"{words}, {kind}"
+            points = rr.SeriesPoints(colors=[color], names=[title], marker_sizes=[size], markers=[mark])
+            style(f"/{kind}/{name}", points)
         if model.grid is None:
             style(f"/innovation/{name}", band("innovation", READING))
     if model.grid is not None:

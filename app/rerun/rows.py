@@ -220,7 +220,8 @@ class RerunRows:
         for item in self._dots:
             name = self.model.row_names[self.model.row_start[item.sensor] + item.row]
             of_sensor = is_reading & (channel == item.sensor)
-            for path, mask in (("reading", track.verdict != GATED), ("refused", track.verdict == GATED)):
+            gated, screened = track.verdict == GATED, track.screened[:, item.row] != 0
+            for path, mask in (("reading", ~gated & ~screened), ("refused", gated & ~screened), ("screened", screened)):
                 rows = of_sensor & mask
                 self.sink.line(f"/{path}/{name}", t[rows], events.value[rows, item.row, None], width)
         if self._field is not None:

@@ -16,10 +16,11 @@ from starlette.responses import JSONResponse
 from estimators.errors import ConfigError, printable
 from estimators.track import HEALTH_NAMES
 
-from ..engine import commands
+from ..engine import commands, faults
 from ..engine.changes import began_as, turned
 from ..engine.execute import Refolding, retuned
 from ..engine.interface import Running
+from ..engine.maintenance import check_maintenance
 from ..engine.outputs import Status
 from ..engine.playback import PLAYBACK, check_playback
 
@@ -64,15 +65,28 @@ def status_json(engine: Running) -> dict[str, Any]:
         "nis": _plain(status.nis),
         "nis_low": _plain(status.nis_low),
         "nis_high": _plain(status.nis_high),
+        "late": {"inflate": engine.twin.late.inflate, "reason": engine.twin.late.reason},
+        "degraded_after": {"seconds": engine.twin.degraded.seconds, "reason": engine.twin.degraded.reason},
+        "model_version": status.model_version,
+        "clock": None
+        if status.clock is None
+        else {key: _plain(value) for key, value in status.clock._asdict().items()},
         "counts": dict(status.counts),
+        "account": _plain(status.account),
         "paused": status.paused,
         "finished": status.finished,
         "speed": _plain(status.speed),
         "seekable": status.seekable,
         "recording": str(status.recording) if status.recording is not None else None,
         "latency_ms": _plain(status.latency_ms),
+        "faults": faults.status_json(status.faults, engine.model),
         **_integrity(status),
     }
+
+
+def faults_json(engine: Running) -> dict[str, Any]:
+    """The faults that can be put into the source."""
+    return faults.catalogue_json(engine.source, engine.model)
 
 
 def _integrity(status: Status) -> dict[str, Any]:
@@ -91,6 +105,8 @@ def _plain(value: Any) -> Any:
     """JSON has no infinity and no NaN."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
     if value is None or isinstance(value, (bool, str, int)):
         return value
     number = float(value)
@@ -112,10 +128,11 @@ def command_from_json(body: Any, engine: Running) -> commands.Command:
     hints = typing.get_type_hints(kind)
     given = {key: value for key, value in body.items() if key != "command"}
     names = [item.name for item in dataclasses.fields(kind)]
-    if sorted(given) != sorted(names):
+    needed = {item.name for item in dataclasses.fields(kind) if item.default is dataclasses.MISSING}
+    if not needed <= set(given) <= set(names):
         has, takes = (", ".join(part) or "no field" for part in (given, names))
         raise ConfigError(f"{kind.__name__}: has {has}; it takes {takes}")
-    command = kind(**{name: _converted(kind.__name__, name, given[name], hints[name]) for name in names})
+    command = kind(**{name: _converted(kind.__name__, name, given[name], hints[name]) for name in given})
     _check(command, engine)
     return command
 
@@ -123,8 +140,12 @@ def command_from_json(body: Any, engine: Running) -> commands.Command:
 def _check(command: commands.Command, engine: Running) -> None:
     if isinstance(command, Refolding):
         retuned(command, engine)
+    elif isinstance(command, commands.Maintenance):
+        check_maintenance(command.what, command.states, engine.model)
     elif isinstance(command, commands.Record) and engine.recorder is None:
         raise ConfigError("Record: this session cannot record")
+    elif isinstance(command, commands.InjectFault | commands.ClearFault):
+        faults.check_fault(command, engine.source, engine.model)
     if isinstance(command, PLAYBACK):
         check_playback(command)
         if not engine.status().seekable:
@@ -152,6 +173,10 @@ def _converted(command: str, name: str, value: Any, hint: Any) -> Any:
             return None
         if kind in (bool, str) and isinstance(value, kind):
             return value
+        if kind is int and isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**53:
+            return value
+        if typing.get_origin(kind) is tuple and isinstance(value, list) and all(isinstance(v, str) for v in value):
+            return tuple(value)
         if kind is float and not isinstance(value, bool) and (isinstance(value, (int, float)) or value == "inf"):
             try:
                 number = float(value)
@@ -161,6 +186,7 @@ def _converted(command: str, name: str, value: Any, hint: Any) -> Any:
                 return number
         if kind is Path and isinstance(value, str):
             return _recording(f"{command}: {name} is {value!r}", value)
-    wanted = " or ".join({"float": "a number", "bool": "true or false", "NoneType": "null", "str": "a text",
-                          "Path": "a path"}[kind.__name__] for kind in allowed)  # fmt: skip
+    wanted = " or ".join({"float": "a number", "int": "a whole number", "bool": "true or false", "NoneType": "null",
+                          "str": "a text", "Path": "a path", "tuple": "a list of texts"}[kind.__name__]
+                         for kind in allowed)  # fmt: skip
     raise ConfigError(f"{command}: {name} is {value!r}; it must be {wanted}")

@@ -27,7 +27,7 @@ from estimators.errors import NisusError
 
 from ..engine.interface import Running
 from ..rerun.feed import RerunFeed
-from .api import Json, command_from_json, one_line, status_json
+from .api import Json, command_from_json, faults_json, one_line, status_json
 from .bounds import BODY, TooLarge, bounded_body, bounds
 from .gate import Gate, session_token
 from .port import listen
@@ -130,6 +130,7 @@ class PageServer:
             Route("/", self._page),
             Route("/api/status", self._status),
             Route("/api/recordings", self._list_recordings),
+            Route("/api/faults", self._faults),
             Route("/api/command", self._command, methods=["POST"]),
             Route(f"/viewer/{viewer_version()}/{{name}}", self._viewer_file),
             Route("/rec/{name}", self._recording),
@@ -159,6 +160,9 @@ class PageServer:
     async def _list_recordings(self, request: Request) -> Response:
         found = {name: path for name, path in self._recordings().items() if path.is_file()}
         return Json([{"name": name, "bytes": path.stat().st_size} for name, path in sorted(found.items())])
+
+    async def _faults(self, request: Request) -> Response:
+        return Json(faults_json(self._engine))
 
     async def _command(self, request: Request) -> Response:
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":

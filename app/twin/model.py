@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from config.limits_schema import bounds
 from config.loader import Loaded, shown_path
 from config.yaml_lines import Key
 from estimators.errors import ModelError, NisusError, nearest
@@ -20,6 +21,8 @@ from estimators.model.joint import Unknown, joint
 from estimators.model.state_space import Field, State, StateSpaceModel
 from estimators.model.user_file import run_file
 from estimators.models import MODELS
+
+from .limits import limits_of
 
 
 def find_model(loaded: Loaded, key: Key, reference: str) -> StateSpaceModel:
@@ -106,6 +109,8 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     parameters = tuple(replace(p, value=config.parameters.get(p.name, p.value)) for p in model.parameters)
     unknowns = {name: Unknown(section.std, section.drift) for name, section in config.estimate.items()}
     model = joint(replace(model, parameters=parameters), unknowns)
+    places = [*(() if isinstance(model.states, Field) else model.state_names), *(item.name for item in model.inputs)]
+    check_names(loaded, ("valid",), config.valid, places, "state or input", model)
     field = isinstance(model.states, Field)
     known = (model.states.name,) if isinstance(model.states, Field) else model.state_names
     check_names(loaded, ("prior",), config.prior, known, "field" if field else "state", model)
@@ -114,6 +119,7 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     return replace(
         model,
         states=_states(model, loaded),
+        inputs=tuple(_in_range(item, loaded) for item in model.inputs),
         noises=tuple(
             replace(noise, variance=config.noise[noise.name].value) if noise.name in config.noise else noise
             for noise in model.noises
@@ -148,8 +154,15 @@ def _states(model: StateSpaceModel, loaded: Loaded) -> Sequence[State]:
     for state in states:
         prior = given.get(state.name)
         mean, std = (prior.mean, prior.std) if prior else (None, None)
-        found.append(replace(state, mean=state.mean if mean is None else mean, std=state.std if std is None else std))
+        state = replace(state, mean=state.mean if mean is None else mean, std=state.std if std is None else std)
+        found.append(_in_range(state, loaded))
     return tuple(found)
+
+
+def _in_range(item: Any, loaded: Loaded) -> Any:
+    """A state or an input with the range over which the YAML says that the model holds."""
+    given = loaded.config.valid.get(item.name)
+    return item if given is None else replace(item, fitted=bounds((given.min, given.max)))
 
 
 def _sensor(sensor: Any, loaded: Loaded) -> Any:
@@ -158,12 +171,12 @@ def _sensor(sensor: Any, loaded: Loaded) -> Any:
         return sensor
     if section.correlation is not None:
         sensor = replace(sensor, correlation=_correlation(sensor, section.correlation, loaded))
-    if section.variances is None:
-        return sensor
-    key = ("sensors", sensor.name, "std" if section.std is not None else "variance")
-    variances = one_each(loaded, key, section.variances, [row.name for row in sensor.rows])
-    rows = tuple(replace(row, variance=variance) for row, variance in zip(sensor.rows, variances, strict=True))
-    return replace(sensor, rows=rows)
+    if section.variances is not None:
+        key = ("sensors", sensor.name, "std" if section.std is not None else "variance")
+        variances = one_each(loaded, key, section.variances, [row.name for row in sensor.rows])
+        rows = tuple(replace(row, variance=variance) for row, variance in zip(sensor.rows, variances, strict=True))
+        sensor = replace(sensor, rows=rows)
+    return replace(sensor, limits=limits_of(sensor, section, loaded))
 
 
 def _correlation(sensor: Any, given: Correlation, loaded: Loaded) -> Correlation | None:

@@ -8,18 +8,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from config.loader import Loaded
+from config.source_schema import AssetSection, CanSection
 from config.yaml_lines import Key
 from estimators.errors import SourceError
 from estimators.log import READING
 from estimators.model.state_space import StateSpaceModel
 
 from .channels import channels
+from .faults import read_faults
 from .sources.can import make_player
 from .sources.kind import Opening
 from .sources.registry import SOURCES
 
 if TYPE_CHECKING:
     from sources.can.player import Player
+    from sources.faults.fault import Fault
+    from sources.faults.layer import Faults
     from sources.source import Report, Source
 
 KEY: Key = ("source",)
@@ -34,16 +38,53 @@ class Plan:
     log_files: tuple[Path, ...] | None
     brings_variances: bool = False
     """Whether some sensor's readings tell their own noise."""
+    scheduled: tuple[Fault, ...] = ()
+    """The faults that the YAML puts into the source."""
 
-    def open(self, report: Report, *, live: bool = True) -> Source:
-        """Open the source; `live` False takes a recording in place of a bus.
+    def faults(self) -> Faults:
+        """A new layer of faults, with those of the YAML."""
+        from sources.faults.layer import Faults
+
+        section = self.loaded.config.source
+        seed = section.seed if isinstance(section, AssetSection) else 0
+        return Faults(self.model, self.scheduled, seed=seed)
+
+    def open(
+        self, report: Report, *, live: bool = True, speed: float | None = None, faults: Faults | None = None
+    ) -> Source:
+        """Open the source, behind its faults.
+
+        Args:
+            report: Told of what is worth counting.
+            live: False takes a recording in place of a bus.
+            speed: Times real time, for what is not live; None gives it as fast as it is asked.
+            faults: A layer that was made before, for a source that is opened again.
 
         Raises:
             SourceError: If it cannot be opened, with the remedy.
         """
+        from sources.faults.source import with_faults
+
+        layer = self.faults() if faults is None else faults
         section = self.loaded.config.source
         opening = Opening(self.loaded, self.model, section, KEY, report, live=live, log_files=self.log_files)
-        return SOURCES[section.type].open(opening)
+
+        def bare() -> Source:
+            source = SOURCES[section.type].open(opening)
+            try:
+                layer.attach(source)
+            except SourceError:
+                source.close()
+                raise
+            return source
+
+        source = bare()
+        if speed is not None and not source.live:
+            from sources.pacer import Pacer
+
+            source.close()
+            source = Pacer(bare, speed=speed)
+        return with_faults(source, layer)
 
     def player(self, report: Report, *, interface: str | None = None, channel: str | int | None = None) -> Player:
         """The twin's asset, ready to play on its bus, or on another one.
@@ -75,5 +116,25 @@ def plan_source(loaded: Loaded, model: StateSpaceModel, log_files: Sequence[Path
         names = ", ".join(model.sensor_names)
         raise loaded.error(KEY, f"feeds no sensor; name at least one of {names} under sensors")
     kind.check(loaded, model, section, KEY)
+    scheduled = _scheduled(loaded, model)
     own = any(item.accuracy is not None for item in found)
-    return Plan(loaded, model, tuple(log_files) if log_files is not None else None, own)
+    return Plan(loaded, model, tuple(log_files) if log_files is not None else None, own, scheduled)
+
+
+def _scheduled(loaded: Loaded, model: StateSpaceModel) -> tuple[Fault, ...]:
+    """The faults of the YAML that act on what the source says: those of a simulator, then those of the twin."""
+    section = loaded.config.source
+    found = read_faults(loaded, loaded.config.faults, ("faults",), model)
+    for k, fault in enumerate(found):
+        if fault.parameter is not None and not isinstance(section, AssetSection) and not _has_asset(section):
+            raise loaded.error(
+                ("faults", k, "kind"),
+                f"is {fault.kind}; it needs a simulated asset, and the source is a {section.type}",
+            )
+    if isinstance(section, AssetSection):
+        found = [*read_faults(loaded, section.faults, (*KEY, "faults"), model), *found]
+    return tuple(found)
+
+
+def _has_asset(section: object) -> bool:
+    return isinstance(section, CanSection) and section.asset is not None

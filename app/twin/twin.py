@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,11 +23,16 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_entry, find_estimator
 from estimators.tuning import Tuning
 
+from ..intake import Planned
+from .commissioned import baseline
+from .dropout import DegradedAfter, degraded_after
+from .late import Late, late_policy
 from .model import check_named, configure, find_model
 from .source import Plan, plan_source
 
 if TYPE_CHECKING:
     from sources.can.player import Player
+    from sources.faults.layer import Faults
     from sources.source import Report, Source
 
 
@@ -79,10 +85,29 @@ class Twin:
         return (view.picture or view.window / 60.0) if self.model.grid is not None else None
 
     @property
+    def maintenance(self) -> tuple[Planned, ...]:
+        """What of the asset was changed, as the YAML says."""
+        names = self.model.state_names
+        return tuple(
+            Planned(round(item.at * 1e9), item.what, tuple(sorted(names.index(name) for name in item.states)))
+            for item in self.config.maintenance
+        )
+
+    @property
     def policy(self) -> HealthPolicy:
         """When the estimate may be trusted."""
         section = self.config.time
-        return HealthPolicy(degraded_after=section.degraded_after, stale_after=section.stale_after)
+        return HealthPolicy(degraded_after=self.degraded.seconds, stale_after=section.stale_after)
+
+    @cached_property
+    def late(self) -> Late:
+        """What becomes of late readings, and why."""
+        return late_policy(self.config, self.model, find_estimator(self.estimator, self.model), self.tuning)
+
+    @cached_property
+    def degraded(self) -> DegradedAfter:
+        """After how long without a reading the twin is degraded, and why then."""
+        return degraded_after(self.config, self.model)
 
     @property
     def tells_field(self) -> bool:
@@ -98,17 +123,25 @@ class Twin:
         """The options that the YAML gives for an estimator; of a choice its number."""
         return _options(self.config, estimator)
 
-    def open_source(self, report: Report, *, live: bool = True) -> Source:
-        """Open the source.
+    def faults(self) -> Faults:
+        """A new layer of faults for `open_source`, with those of the YAML; more can be injected while it runs."""
+        return self.plan.faults()
+
+    def open_source(
+        self, report: Report, *, live: bool = True, speed: float | None = None, faults: Faults | None = None
+    ) -> Source:
+        """Open the source, behind its faults.
 
         Args:
             report: Called as report(key, text) with what is worth counting; from the source's thread.
             live: False asks for events that end: a recording in place of a bus.
+            speed: Times real time, for what is not live; None gives it as fast as it is asked.
+            faults: A layer of `faults`, for a source that is opened again; None makes one.
 
         Raises:
             SourceError: If it cannot be opened, with the remedy.
         """
-        return self.plan.open(report, live=live)
+        return self.plan.open(report, live=live, speed=speed, faults=faults)
 
     def player(self, report: Report, *, interface: str | None = None, channel: str | int | None = None) -> Player:
         """The asset of a twin on a CAN bus, ready to play there, or on another `interface` and `channel`.
@@ -166,15 +199,23 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
         entry = find_estimator(first.name, model)
     _check_options(loaded, ("estimator", "options"), first.name, first.options, model)
     tuning = Tuning.of(model).with_options(_options(config, first.name)).set("gate", config.gate)
+    tuning = replace(tuning, baseline=baseline(loaded, model))
     for name, section in config.sensors.items():
         if not section.use:
             tuning = tuning.set(f"use.{name}", False)
     for key, value in overrides.items():
         if key not in _of_yaml(overrides):
             tuning = _set(tuning, key, value)
+    for k, item in enumerate(config.maintenance):
+        check_named(loaded, ("maintenance", k, "states"), item.states, model)
+        if len(set(item.states)) != len(item.states):
+            raise loaded.error(("maintenance", k, "states"), "names a state twice; name each once")
     plan = plan_source(loaded, model, [Path(file) for file in log_files] if log_files else None)
     if plan.brings_variances:
         with _placed(loaded, ("estimator",)):
+            check_variances(entry, entry.complete(tuning.options))
+    if config.time.late == "inflate":
+        with _placed(loaded, ("time", "late")):
             check_variances(entry, entry.complete(tuning.options))
     return Twin(
         loaded=loaded,

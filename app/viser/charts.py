@@ -26,6 +26,9 @@ BUCKETS = 300
 RUNS = 6
 """Stretches without a gap in which a line is drawn at most."""
 
+MARKS = 5
+"""Series of dots in a state's chart: readings of up to three sensors, those that the gate refused, and the edge."""
+
 SHOWN = 6
 """States that have a chart of their own; of more, the last chart shows the one chosen."""
 
@@ -61,9 +64,9 @@ class Charts:
         self.window: float | None = window
         self._previous: tuple[np.ndarray, np.ndarray] | None = None
         nx = len(model.shown)
-        self._dot_columns = [[4 * nx + j * 4 + d for d in range(min(3, len(self.direct[j])))] for j in range(nx)]
-        self._nis = 8 * nx
-        self._columns = 8 * nx + 4
+        self._dot_columns = [[4 * nx + j * MARKS + d for d in range(min(3, len(self.direct[j])))] for j in range(nx)]
+        self._nis = (4 + MARKS) * nx
+        self._columns = self._nis + 4
         self._buckets = Buckets(self._columns, 1)
         self._shown = list(range(min(nx, SHOWN)))
         self._ranges = [Range() for _ in range(nx + 1)]
@@ -159,15 +162,17 @@ class Charts:
         if self.model.mode >= 0:
             # A probability has no band: the standard deviation of what is 0 or 1 says nothing more.
             out[:, nx + self.model.mode] = out[:, 2 * nx + self.model.mode] = mean[:, self.model.mode]
-        reading, gated = events.kind == READING, verdict == GATED
+        reading, gated, screened = events.kind == READING, verdict == GATED, history.column("screened")[rows]
         for j in range(nx):
             true, values = truth_of(events, int(self.model.shown[j]))
             out[true, 3 * nx + j] = values
             for column, (sensor, row) in zip(self._dot_columns[j], self.direct[j], strict=False):
                 mine = reading & (events.channel == sensor)
-                out[:, column] = np.where(mine & ~gated, events.value[:, row], np.nan)
-                refused = np.flatnonzero(mine & gated)
-                out[refused, 4 * nx + j * 4 + 3] = events.value[refused, row]
+                refused = screened[:, row] != 0
+                out[:, column] = np.where(mine & ~gated & ~refused, events.value[:, row], np.nan)
+                for mark, which in ((3, mine & gated & ~refused), (4, mine & refused)):
+                    at = np.flatnonzero(which)
+                    out[at, 4 * nx + j * MARKS + mark] = events.value[at, row]
         for k, name in enumerate(("nis", "nis_mean", "nis_low", "nis_high")):
             out[:, self._nis + k] = history.column(name)[rows]
         return out
@@ -181,7 +186,7 @@ class Charts:
         if self._previous is not None and self._previous[0].size:
             t, mean = self._previous
             previous = np.interp(times, t, mean[:, j], left=np.nan, right=np.nan)
-        dots = [values[:, 4 * nx + j * 4 + d] for d in range(4)]
+        dots = [values[:, 4 * nx + j * MARKS + d] for d in range(MARKS)]
         mean, high, low = (values[:, k * nx + j] for k in range(3))
         # One state that is not a number leaves no estimate, whatever the others say.
         known = np.isfinite(values[:, : 3 * nx]).all(axis=1)
@@ -189,7 +194,7 @@ class Charts:
         means, before = runs(mean, known, RUNS), runs(previous, np.isfinite(previous), RUNS)
         # Where the estimate is not a number, the band has no width, so it is not seen.
         band = [np.where(known, edge, extended(mean)) for edge in (high, low)]
-        columns = [*band, *dots[:3], *before, bridge(values[:, 3 * nx + j]), *means, dots[3]]
+        columns = [*band, *dots[:3], *before, bridge(values[:, 3 * nx + j]), *means, *dots[3:]]
         return [x, *columns, self._ranges[j].series(columns)], state_series(len(before), len(means))
 
     def _nis_data(self, x: np.ndarray, values: np.ndarray) -> tuple[list[np.ndarray], tuple[dict[str, Any], ...]]:
@@ -237,6 +242,7 @@ class Charts:
             mark("#93b4f5", "▮ ±2σ"),
             mark(DOTS[0], "● reading"),
             mark(RED, "● gated"),
+            mark(RED, "○ screened"),
             mark(GREEN, "━ truth"),
             mark(GREY, "━ previous revision"),
         ]

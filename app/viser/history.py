@@ -8,7 +8,8 @@ from estimators.log import Events
 
 from ..engine.outputs import Pull
 
-_COLUMNS = ("t", "kind", "channel", "value", "mean", "std", "nis", "nis_mean", "nis_low", "nis_high", "verdict")
+_EVENTS = ("t", "kind", "channel", "value")
+_COLUMNS = (*_EVENTS, "mean", "std", "nis", "nis_mean", "nis_low", "nis_high", "verdict", "screened")
 
 
 class History:
@@ -26,8 +27,8 @@ class History:
         self.n = 0
         self.origin: int | None = None
         """Time of the first event ever seen, from which the charts count seconds."""
-        shapes = {"value": (width,), "mean": (nx,), "std": (nx,)}
-        kinds = {"t": np.int64, "kind": np.int8, "channel": np.int32, "verdict": np.int8}
+        shapes = {"value": (width,), "screened": (width,), "mean": (nx,), "std": (nx,)}
+        kinds = {"t": np.int64, "kind": np.int8, "channel": np.int32, "verdict": np.int8, "screened": np.int8}
         # Filled, not empty: the pages are paid for now, and memory stays flat.
         self._columns = {
             name: np.full((2 * limit, *shapes.get(name, ())), 0, kinds.get(name, np.float64)) for name in _COLUMNS
@@ -69,9 +70,14 @@ class History:
         if start + count > 2 * self.limit:
             start -= self._drop(start - self.limit)
         for name, column in self._columns.items():
-            batch = getattr(pull.events if name in ("t", "kind", "channel", "value") else pull.track, name)
-            # Charts have no use for the variances that readings bring, in columns after the values.
-            column[start : start + count] = batch[:, : column.shape[1]] if name == "value" else batch
+            batch = getattr(pull.events if name in _EVENTS else pull.track, name)
+            # Charts have no use for the variances that readings bring, in columns after the values; rows of a reading
+            # are fewer than values of an event can be.
+            at = column[start : start + count]
+            if at.ndim > 1:
+                at[:, : batch.shape[1]] = batch[:, : at.shape[1]]
+            else:
+                at[:] = batch
         self.n = start + count
         return start
 

@@ -14,11 +14,25 @@ import viser
 
 from estimators.registry import ESTIMATORS, unfit
 
-from ..engine.commands import Command, Pause, Record, Reset, Seek, SetEstimator, SetTuning, Speed, Step, UseSensor
+from ..engine.commands import (
+    Command,
+    Maintenance,
+    Pause,
+    Record,
+    Reset,
+    Seek,
+    SetEstimator,
+    SetTuning,
+    Speed,
+    Step,
+    UseSensor,
+)
 from ..engine.interface import Running
+from ..engine.maintenance import LONGEST
 from ..engine.notices import Notice
 from ..engine.outputs import Status
 from .coalescer import Coalescer
+from .faults import FaultRows
 from .options import OptionRows
 from .restore import BeganRows
 from .rows import ChoiceRow, Held, NumberRow
@@ -27,6 +41,7 @@ from .time_units import SECONDS, Unit
 
 SPEEDS = {"0.1×": 0.1, "0.25×": 0.25, "0.5×": 0.5, "1×": 1.0, "2×": 2.0, "5×": 5.0, "10×": 10.0, "max": np.inf}
 GATES = {"off": None, "95 %": 0.95, "99 %": 0.99, "99.73 %": 0.9973, "99.99 %": 0.9999}
+EVERY = "all"
 PAUSE, RESUME, STEP, RESET = "Pause", "Resume", "Step", "Reset"
 
 
@@ -55,6 +70,7 @@ class Panel:
             gui.add_html('<div style="font-size:0.8em;padding:0 0.9em 0.6em">Off: held out. Predicted and scored, '
                          "never used.</div>")  # fmt: skip
             self.sensors = {name: self._sensor(gui, name, status) for name in engine.model.sensor_names}
+            self.faults = FaultRows(gui, engine.model, engine.submit, self.complain)
         with tabs.add_tab("Play"):
             self._build_play(gui, status)
             self.scene_folder = gui.add_folder("Scene")
@@ -122,6 +138,14 @@ class Panel:
         self.seek = gui.add_slider("Position [s]", 0.0, 1.0, 1.0, 0.0, marks=(), visible=False)
         self.seek.on_update(self._sought)
         self._sought_to = Held()
+        with gui.add_folder("Maintenance", expand_by_default=False):
+            names = [self._engine.model.state_names[k] for k in self._engine.model.shown]
+            self.changed = gui.add_text("Changed", "", hint="What was changed in the asset")
+            self.concerns = gui.add_dropdown(
+                "State", (EVERY, *names), initial_value=EVERY, hint="Starts again as uncertain as at the beginning"
+            )
+            self.maintain = gui.add_button("Done", hint="Begins a new version of the model")
+        self.maintain.on_click(self._maintained)
         with gui.add_folder("Recording"):
             self.file = gui.add_text("File", "", hint="Name of the .rrd file; empty: the twin's name and the time")
             self.record = gui.add_button("Record", color="red")
@@ -148,6 +172,7 @@ class Panel:
         self.gate.sync(self._gate_text(status.tuning.gate))
         for name, box in self.sensors.items():
             box.sync(bool(status.tuning.get(f"use.{name}")))
+        self.faults.sync(status)
         self._sync_play(status)
         recording = status.recording
         label = "Record" if recording is None else "Stop recording"
@@ -193,6 +218,18 @@ class Panel:
         command = buttons.get(event.target.value)
         if command is not None:
             self._engine.submit(command)
+
+    def _maintained(self, event: viser.GuiEvent) -> None:
+        if event.client is None:
+            return
+        chosen = self.concerns.value
+        names = [name for name in self.concerns.options if name != EVERY] if chosen == EVERY else [chosen]
+        what = " ".join(self.changed.value.split())[:LONGEST]
+        if not what:
+            self.complain("Maintenance: say what was changed")
+            return
+        self.complain("")
+        self._engine.submit(Maintenance(what, tuple(names)))
 
     def _sought(self, event: viser.GuiEvent) -> None:
         if event.client is not None:

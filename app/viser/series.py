@@ -36,6 +36,12 @@ def dots(color: str, size: float) -> dict[str, Any]:
     }
 
 
+def rings(color: str, size: float) -> dict[str, Any]:
+    """A series that is drawn as rings."""
+    ring = dots(color, size)
+    return {**ring, "points": {**ring["points"], "fill": "rgba(0,0,0,0)", "width": 1.5}}
+
+
 BAND = (line("rgba(0,0,0,0)", 0, label="high"), line("rgba(0,0,0,0)", 0, label="low"))
 """The edges between which a band is filled, not seen themselves."""
 
@@ -50,6 +56,7 @@ def state_series(before: int, means: int) -> tuple[dict[str, Any], ...]:
         line(GREEN, 1.5, label="truth"),
         *(line(BLUE, 1.5, label="mean") for _ in range(means)),
         dots(RED, 5),
+        rings(RED, 7),
         frame_series(),
     )
 

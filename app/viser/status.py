@@ -7,6 +7,7 @@ import math
 
 from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
 
+from ..engine.host_clock import clock_text
 from ..engine.notices import Notice
 from ..engine.outputs import Status
 from .time_units import SECONDS, Unit
@@ -17,6 +18,7 @@ SHOWN = 8
 """States whose integrity is shown."""
 
 COUNTED = ("readings", "gated", "missing", "stale")
+SELDOM = ("held out", "screened", "failed", "recovered", "wrong time", "clock moved")
 
 
 def status_html(status: Status, origin: int | None, unit: Unit = SECONDS) -> str:
@@ -39,7 +41,7 @@ def status_html(status: Status, origin: int | None, unit: Unit = SECONDS) -> str
     latency = status.latency_ms
     counts = dict(status.counts)
     known = [(name, counts.pop(name, 0)) for name in COUNTED]
-    known += [(name, counts[name]) for name in ("held out", "failed", "recovered") if counts.get(name)]
+    known += [(name, counts[name]) for name in SELDOM if counts.get(name)]
     cells = "".join(
         f'<span style="margin-right:0.9em;white-space:nowrap"><span style="opacity:0.65">{html.escape(name)}</span> '
         f"{count:,}</span>"
@@ -47,6 +49,9 @@ def status_html(status: Status, origin: int | None, unit: Unit = SECONDS) -> str
     )
     if latency is not None:
         cells += f'<span style="white-space:nowrap"><span style="opacity:0.65">latency</span> {latency:.1f} ms</span>'
+    if status.clock is not None:
+        text = html.escape(clock_text(status.clock))
+        cells += f' <span style="white-space:nowrap"><span style="opacity:0.65">clock</span> {text}</span>'
     return (
         '<div style="padding:0.2em 1.4em 0.6em 0.9em;font-size:0.8em;line-height:1.6;'
         'font-variant-numeric:tabular-nums">'

@@ -20,7 +20,7 @@ class Dimension(NamedTuple):
 
     `flops` are those of a covariance step of n states and m rows, 4 n³ for F P Fᵀ and 6 m n² for the update; `memory`
     is the covariance's, bytes. `share` of one processor is taken at `rate` readings a second by the filter in use, at
-    `seconds` a step. `largest` is the n at which a covariance would take all of the processor, if n³ were all.
+    `seconds` a reading. `largest` is the n at which a covariance would take all of the processor, if n³ were all.
     `members` is the ensemble whose σ is within 10 %: one of m members is off by 1 / √(2 (m - 1)). `passes`: `share` is
     not above a half, and no covariance is needed that cannot be formed.
     """
@@ -43,7 +43,7 @@ def dimension(model: StateSpaceModel, rate: float, seconds: float, *, covariance
     Args:
         model: Whose states.
         rate: Readings a second.
-        seconds: That one step of the filter in use takes, measured.
+        seconds: That the filter in use takes for each reading, with what comes between two, measured.
         covariance: Whether that filter carries one.
     """
     n = model.nx

@@ -16,8 +16,8 @@ from ..model.state_space import Input, State, StateSpaceModel
 from ..track import DIVERGED, GATED, HEALTH_NAMES, STALE, USED, Track
 from ..tuning import Tuning
 from .effects import Effect, effects, onset
-from .evidence import AGREEING, DISAGREEING, MISSED, OUTSIDE, REFUSED, SENSORS, STUCK
-from .words import of_sensor, of_silence, of_truth, of_twin, since
+from .evidence import AGREEING, DISAGREEING, IMPOVERISHED, MISSED, OUTSIDE, REFUSED, SENSORS, STUCK
+from .words import of_particles, of_sensor, of_silence, of_truth, of_twin, since
 
 JOINED = 30
 """Readings without an alarm after which another is another episode."""
@@ -52,7 +52,8 @@ class Episode(NamedTuple):
 class Folded(Protocol):
     """What episodes are read from: a Fold, or whatever has its log and track.
 
-    `marginal`: whether `Track.whitened` holds each row by itself, as for predictions that are not Gaussian.
+    `marginal`: whether `Track.whitened` holds each row by itself, as for predictions that are not Gaussian. `baseline`:
+    what was normal, see evidence.py.
     """
 
     @property
@@ -67,6 +68,8 @@ class Folded(Protocol):
     def n(self) -> int: ...  # noqa: D102
     @property
     def marginal(self) -> bool: ...  # noqa: D102
+    @property
+    def baseline(self) -> np.ndarray: ...  # noqa: D102
 
 
 def episodes(fold: Folded) -> list[Episode]:
@@ -76,6 +79,7 @@ def episodes(fold: Folded) -> list[Episode]:
         *_of_silence(fold),
         *_of_truth(fold),
         *_of_ranges(fold),
+        *_of_particles(fold),
         *_of_twin(fold),
     ]
     return sorted(found, key=lambda episode: (episode.start, episode.subject))
@@ -97,10 +101,16 @@ def standardised(fold: Folded, rows: np.ndarray, k: int) -> np.ndarray:
     track = fold.track
     e = track.innovation[rows, k] / track.innovation_std[rows, k]
     if fold.marginal:
-        own = track.whitened[rows, k]
-        e = np.where(np.isfinite(own), own, e)
+        e = track.whitened[rows, k]
     verdict = track.verdict[rows]
     return np.where((verdict == USED) | (verdict == GATED), e, np.nan)
+
+
+def unusual(fold: Folded, s: int, k: int, e: np.ndarray) -> np.ndarray:
+    """Finite e (n,) of row k of sensor s as it would be drawn from N(0, 1) if it were as it was when accepted."""
+    bias, scale, phi = fold.baseline[fold.model.row_start[s] + k, :3]
+    e = (e - bias) / scale
+    return np.append(e[:1], (e[1:] - phi * e[:-1]) / np.sqrt(1.0 - phi**2)) if phi else e
 
 
 def _of_sensors(fold: Folded) -> Iterator[Episode]:
@@ -117,7 +127,7 @@ def _of_sensor(fold: Folded, s: int, rows: np.ndarray, masks: np.ndarray, begin:
     """The episode of the readings `begin` to `end` of a sensor, whose events are `rows`."""
     log, track, model = fold.log, fold.track, fold.model
     said = np.bitwise_or.reduce(masks[begin:end])
-    k, begun, ranked = _most_telling(fold, rows, np.flatnonzero(said), begin, end)
+    k, begun, ranked = _most_telling(fold, s, rows, np.flatnonzero(said), begin, end)
     effect = ranked[0]
     cause, size, low, high = effect.cause, effect.size, effect.low, effect.high
     values, verdict = log.value[rows], track.verdict[rows]
@@ -158,7 +168,7 @@ def _of_sensor(fold: Folded, s: int, rows: np.ndarray, masks: np.ndarray, begin:
 
 
 def _most_telling(
-    fold: Folded, rows: np.ndarray, said: np.ndarray, begin: int, end: int
+    fold: Folded, s: int, rows: np.ndarray, said: np.ndarray, begin: int, end: int
 ) -> tuple[int, int, list[Effect]]:
     """The row that shows most of what is wrong, the reading since when, and what it shows, the likeliest first."""
     first = max(0, begin - LOOKED_AT)
@@ -168,7 +178,7 @@ def _most_telling(
         known = np.flatnonzero(np.isfinite(e))
         if known.size < 2:
             continue
-        e = e[known]
+        e = unusual(fold, s, int(k), e[known])
         alarm = min(int(np.searchsorted(known, begin - first)), e.size - 1)
         guess = effects(e[max(0, alarm - JOINED) :][:LOOKED_AT])[0]
         begun = onset(e[: alarm + 1], guess.cause)
@@ -280,6 +290,27 @@ def _outside(item: State | Input, value: np.ndarray, t: np.ndarray) -> Iterator[
             unit=item.unit,
             text=f"{item.name} is {size:.4g} {item.unit}, outside {low:g} to {high:g} where the model was fitted, "
             f"{since(start)}: bands hold only inside; use a model fitted there",
+        )
+
+
+def _of_particles(fold: Folded) -> Iterator[Episode]:
+    t, track = fold.log.t[: fold.n], fold.track
+    for begin, end, lasts in _runs(track.flags & IMPOVERISHED != 0):
+        effective = track.effective[begin:end]
+        effective = effective[np.isfinite(effective)]
+        if not effective.size:
+            continue
+        start, size = t[begin] * 1e-9, float(np.median(effective))
+        yield Episode(
+            start=start,
+            end=None if lasts else t[min(end, fold.n - 1)] * 1e-9,
+            subject="twin",
+            cause="impoverished",
+            size=size,
+            low=float(np.quantile(effective, 0.025)),
+            high=float(np.quantile(effective, 0.975)),
+            unit="",
+            text=of_particles(size, float(np.nanmin(track.ancestors[begin:end])), start),
         )
 
 

@@ -32,6 +32,7 @@ from ..numerics.linalg import wrap
 from ..track import (
     DEGRADED,
     DIVERGED,
+    DUPLICATE,
     FAILED,
     GATED,
     SCREENED,
@@ -59,9 +60,9 @@ NARROW, WIDE, HIGH, LOW, CORRELATED, ALTERNATING, SPIKY, REFUSED, STUCK, DISAGRE
 LOST = REFUSED | STUCK
 """Causes for which a sensor tells nothing more."""
 
-OUTSIDE, TRUTH_MISSED = 1 << 60, 1 << 61
-"""Bits of `Track.flags` beside those of the sensors that are silent: outside the range in which the model was fitted;
-the truth that was told is missed."""
+IMPOVERISHED, OUTSIDE, TRUTH_MISSED = 1 << 59, 1 << 60, 1 << 61
+"""Bits of `Track.flags` beside those of the sensors that are silent: a few particles carry the estimate; outside the
+range in which the model was fitted; the truth that was told is missed."""
 
 SENSORS = 58
 """Sensors that have a bit of their own in `Track.flags`; the others share the last."""
@@ -98,6 +99,13 @@ MISSES, MISSES_NO_MORE = 4.5, 3.0
 
 TOLD = 10
 
+FEW_PARTICLES = 4.0
+"""Effective sample size below which a cloud is poor; it is too if all of it descends from one particle."""
+
+PATIENCE = 60
+"""Readings more, poor than not, from which a cloud is impoverished; it is no more at half as many. Three times as many
+as lie between two counts of ancestors: of a sound cloud a count may be 1 by chance, hardly three in a row."""
+
 _QUADRATIC = len(SCALES) + len(SHIFTS) + len(CORRELATIONS)
 TESTS = _QUADRATIC + 3
 """Tests of a row: the quadratic ones, spikes, refusals, repetition."""
@@ -126,13 +134,13 @@ _SQUARES = np.arange(FURTHEST**2 * _SPIKE_STEPS + 2.0) / _SPIKE_STEPS
 _SPIKE_RATIO = np.log1p(SPIKE_SHARE * (np.exp(0.5 * _SQUARES * (1.0 - 1.0 / SPIKE**2)) / SPIKE - 1.0))
 """log Λ of spikes at so many e² a step, between which it is nearly straight (to 1e-5)."""
 
-_BITS = np.array(
+BITS = np.array(
     [*[NARROW] * 3, *[WIDE] * 3, *[HIGH] * 3, *[LOW] * 3, *[CORRELATED] * 2, *[ALTERNATING] * 2, SPIKY, REFUSED, STUCK]
 )
 
 # A row's part of the state: its tests' W, then these.
-_MASK, _RAW, _BEFORE, _VALUE, _QUANTUM = range(TESTS, TESTS + 5)
-ROW = TESTS + 5
+_MASK, _RAW, _BEFORE, _VALUE, _QUANTUM, _RUN, _EQUAL, _COUNTED = range(TESTS, TESTS + 8)
+ROW = TESTS + 8
 """Numbers in the state for each row."""
 
 # A sensor's part: W of the joint tests, then these.
@@ -141,8 +149,8 @@ SENSOR = JOINT + 8
 """Numbers in the state for each sensor."""
 
 # The twin's part.
-_SUSPECTS, _GONE, _NEXT_DUE, _BEGUN, _HEARD, _MISSED, _QUIET = range(7)
-TWIN = 7
+_SUSPECTS, _GONE, _NEXT_DUE, _BEGUN, _HEARD, _MISSED, _QUIET, _POOR, _IMPOVERISHED = range(9)
+TWIN = 9
 
 # A shown state's part: the mean square of its standardised errors, how often it was told, whether it is missed. After
 # them the inputs that hold.
@@ -160,7 +168,7 @@ def watched(
     model: StateSpaceModel,
     gate: float | None,
     marginal: bool,
-    baseline: np.ndarray | None = None,
+    baseline: np.ndarray,
     expected: np.ndarray | None = None,
 ) -> dict[str, Any]:
     """What the bank finds in a context.
@@ -169,8 +177,7 @@ def watched(
         model: The model.
         gate: Probability that a good reading passes, or None.
         marginal: Whether the filter's predictions are not Gaussian, and `Track.whitened` holds each row by itself.
-        baseline: Bias, scale and correlation of what was normal, and the highest W of each test, (rows, 3 + TESTS);
-            None for white innovations.
+        baseline: Bias, scale and correlation of what was normal, and the highest W of each test, (rows, 3 + TESTS).
         expected: Sensors that must speak, (sensors,); None for those that have spoken.
 
     Returns:
@@ -188,19 +195,29 @@ def watched(
     for k, given in enumerate(fitted):
         if given is not None:
             ranges[k] = given
-    chance = min(max(1e-6, 1.0 - gate), 0.5 * REFUSED_SHARE) if gate is not None else 0.5 * REFUSED_SHARE
     counts = np.array([len(sensor.rows) for sensor in model.sensors], np.int64)
     several = int(np.sum(counts > 1))
     return {
-        "baseline": np.ascontiguousarray(no_baseline(model) if baseline is None else baseline, float),
+        "baseline": np.ascontiguousarray(baseline, float),
         "ranges": ranges,
         "fitted": int(np.any(np.isfinite(ranges))),
         "column": column,
         "expected": np.zeros(len(counts), np.int64) if expected is None else np.ascontiguousarray(expected, np.int64),
-        "chances": np.log([REFUSED_SHARE / chance, (1.0 - REFUSED_SHARE) / (1.0 - chance)]),
+        "chances": chances_of(gate),
         "marginal": int(marginal),
         "n_tests": int(counts.sum()) * TESTS + several * JOINT,
     }
+
+
+def chances_of(gate: float | None) -> np.ndarray:
+    """log Λ of a refused and of an accepted reading, (2,), with a gate that passes a good one with that probability."""
+    chance = min(max(1e-6, 1.0 - gate), 0.5 * REFUSED_SHARE) if gate is not None else 0.5 * REFUSED_SHARE
+    return np.log([REFUSED_SHARE / chance, (1.0 - REFUSED_SHARE) / (1.0 - chance)])
+
+
+def threshold_of(model: StateSpaceModel, state: np.ndarray, s: int) -> float:
+    """h of a sensor's tests, as its rate has made it by now."""
+    return float(state[TWIN + s * SENSOR + _THRESHOLD])
 
 
 def fresh(model: StateSpaceModel) -> np.ndarray:
@@ -303,8 +320,8 @@ def _weigh(own, e, h, base, before):
     if highest >= 0.5 * h:
         for k in range(tests):
             threshold = h + base[3 + k]
-            if own[k] >= threshold or own[k] >= 0.5 * threshold and before & _BITS[k] != 0:
-                mask |= _BITS[k]
+            if own[k] >= threshold or own[k] >= 0.5 * threshold and before & BITS[k] != 0:
+                mask |= BITS[k]
     said = _add(own, AT_SPIKES, _spike_ratio(square), h, base[3 + AT_SPIKES])
     return mask | _alarm(said, SPIKY, before)
 
@@ -314,28 +331,57 @@ def _repeat(own, y, r, h, base, before):
     """Put a value to the test of repetition.
 
     Two readings of standard deviation σ, rounded to a quantum q, are equal with a probability of erf(q / 2σ) at most,
-    whatever was measured; q is the smallest step that the sensor has ever made.
+    whatever was measured; q is the smallest step that the sensor has ever made. An asset at rest repeats itself more
+    often: the share of its repetitions so far, but for those of the present run, counts if it is larger.
     """
     last = own[_VALUE]
     own[_VALUE] = y
     if not np.isfinite(last):
         return 0
     if y == last:
+        own[_RUN] += 1.0
         chance = UNKNOWN_QUANTUM
         if own[_QUANTUM] > 0.0 and r > 0.0:
-            chance = min(max(math.erf(0.5 * own[_QUANTUM] / math.sqrt(r)), 0.01), REPEATING)
-        ratio = math.log(REPEATING / chance)
+            chance = max(math.erf(0.5 * own[_QUANTUM] / math.sqrt(r)), 0.01, own[_EQUAL] / own[_COUNTED])
+        ratio = math.log(REPEATING / min(chance, REPEATING))
     else:
         step = abs(y - last)
         if own[_QUANTUM] == 0.0 or step < own[_QUANTUM]:
             own[_QUANTUM] = step
+        own[_EQUAL] += own[_RUN]
+        own[_COUNTED] += own[_RUN] + 1.0
+        own[_RUN] = 0.0
         ratio = _OTHER - h
     return _alarm(_add(own, AT_REPETITION, ratio, h, base[3 + AT_REPETITION]), STUCK, before)
 
 
 @jit
+def highest(e, refused, y, r, h, base, chances):
+    """The highest W of each test of a row, (TESTS,), over its readings: thresholds that are infinite never cut it.
+
+    `refused` (n,): 1 where the gate refused it, 0 where it did not, -1 where it had no say.
+    """
+    own = np.zeros(ROW)
+    own[_RAW] = own[_BEFORE] = own[_VALUE] = np.nan
+    found = np.zeros(TESTS)
+    for i in range(e.size):
+        if np.isfinite(y[i]):
+            _repeat(own, y[i], r, h, base, 0)
+        if refused[i] >= 0:
+            _add(own, AT_REFUSALS, chances[1 - refused[i]], h, base[3 + AT_REFUSALS])
+        if np.isfinite(e[i]):
+            _weigh(own, e[i], h, base, 0)
+        for k in range(TESTS):
+            found[k] = max(found[k], own[k])
+    return found
+
+
+@jit
 def _weigh_together(own, nis, dof, h, before):
-    """Put the NIS of a sensor with several rows to the tests of their common scale: χ² with dof under the model."""
+    """Put the NIS of a sensor with several rows to the tests of their common scale: χ² with dof under the model.
+
+    Where something else than white innovations was normal there is no such test.
+    """
     mask = 0
     for k in range(JOINT):
         c = _RATIOS[k]
@@ -402,7 +448,16 @@ def _forget(state, sensors, rows, states):
         own[_RAW] = own[_BEFORE] = np.nan
     begin = TWIN + sensors * SENSOR + rows * ROW
     state[begin : begin + states * STATE] = 0.0
-    state[_SUSPECTS] = state[_GONE] = state[_MISSED] = 0.0
+    state[_SUSPECTS] = state[_GONE] = state[_MISSED] = state[_POOR] = state[_IMPOVERISHED] = 0.0
+
+
+@inlined
+def _is_copy(i, track):
+    """Whether a reading came before: the copies that a gateway makes say nothing for or against anyone."""
+    for k in range(track.screened.shape[1]):
+        if track.screened[i, k] & DUPLICATE != 0:
+            return True
+    return False
 
 
 @jit
@@ -421,7 +476,9 @@ def _hear(i, now, y, s, context, policy, state, track):
     verdict = track.verdict[i]
     judged = verdict == USED or verdict == GATED
     together = 0
-    if judged and context.marginal == 0 and count > 1:
+    base = floats(context.baseline + 8 * first * (3 + TESTS), 3)
+    white = base[0] == 0.0 and base[1] == 1.0 and base[2] == 0.0
+    if judged and context.marginal == 0 and count > 1 and white:
         together = _weigh_together(own, track.nis[i], track.dof[i], h, int(own[_ALL]))
         own[_ALL] = together
     for k in range(count):
@@ -435,14 +492,16 @@ def _hear(i, now, y, s, context, policy, state, track):
         if width + k < y.size and np.isfinite(y[width + k]):
             r = y[width + k]
         mask = before & ~STUCK | _repeat(each, y[k], r, h, base, before)
-        if judged or verdict == FAILED:
-            ratio = chances[1] if verdict == USED else chances[0]
+        screened = track.screened[i, k] != 0
+        if judged or verdict == FAILED or screened:
+            ratio = chances[1] if verdict == USED and not screened else chances[0]
             said = _add(each, AT_REFUSALS, ratio, h, base[3 + AT_REFUSALS])
             mask = mask & ~REFUSED | _alarm(said, REFUSED, before)
-        if judged:
-            e = track.innovation[i, k] / track.innovation_std[i, k]
-            if context.marginal != 0 and np.isfinite(track.whitened[i, k]):
-                e = track.whitened[i, k]
+        if judged and not screened:
+            # A prediction that is not Gaussian says nothing where its distribution function is not known.
+            e = track.whitened[i, k]
+            if context.marginal == 0:
+                e = track.innovation[i, k] / track.innovation_std[i, k]
             if np.isfinite(e):
                 mask = mask & LOST | _weigh(each, e, h, base, before)
         if k == 0:
@@ -451,6 +510,19 @@ def _hear(i, now, y, s, context, policy, state, track):
         track.alarms[i, k] = mask
         state[_SUSPECTS] += (mask != 0) - (before != 0)
         state[_GONE] += (mask & LOST != 0) - (before & LOST != 0)
+
+
+@jit
+def _count_particles(effective, ancestors, state):
+    """Whether a cloud is impoverished, after another reading that it used."""
+    if effective < FEW_PARTICLES or ancestors < 2.0:
+        state[_POOR] = min(state[_POOR] + 1.0, float(PATIENCE))
+    else:
+        state[_POOR] = max(state[_POOR] - 1.0, 0.0)
+    if state[_POOR] == PATIENCE:
+        state[_IMPOVERISHED] = 1.0
+    elif state[_POOR] <= PATIENCE // 2:
+        state[_IMPOVERISHED] = 0.0
 
 
 @jit
@@ -514,8 +586,11 @@ def watch_rows(first, last, t, kind, channel, value, context, policy, state, tra
         if kind[i] == READING:
             if track.verdict[i] != SCREENED:
                 state[_HEARD] = 1.0
-            y = floats(value[i:].ctypes.data, value.shape[1])
-            _hear(i, now, y, channel[i], context, policy, state, track)
+            if not _is_copy(i, track):
+                y = floats(value[i:].ctypes.data, value.shape[1])
+                _hear(i, now, y, channel[i], context, policy, state, track)
+            if np.isfinite(track.effective[i]):
+                _count_particles(track.effective[i], track.ancestors[i], state)
         elif kind[i] == TRUTH:
             truth = floats(value[i:].ctypes.data, min(width, context.nx - channel[i]))
             _tell(i, channel[i], truth, context, state, track)
@@ -536,6 +611,8 @@ def watch_rows(first, last, t, kind, channel, value, context, policy, state, tra
             flags |= OUTSIDE
         if state[_MISSED] > 0.0:
             flags |= TRUTH_MISSED
+        if state[_IMPOVERISHED] != 0.0:
+            flags |= IMPOVERISHED
         track.flags[i] = flags
         track.health[i] = _health(i, now, silent, flags, state, policy, track)
 

@@ -21,7 +21,7 @@ from ..snapshots import Base
 from ..track import GATED, USED, Track
 from ..tuning import Tuning
 from .calibration import LIMITS, standardised
-from .intervals import UNKNOWN, Interval, correlation_interval
+from .intervals import Interval, correlation_interval
 from .sensitivity.responses import each
 from .sensitivity.size import MOST_STATES
 from .whiteness import ljung_box
@@ -158,11 +158,9 @@ def _rows(straight: Fold, curved: Fold) -> tuple[tuple[Curvature, ...], tuple[Wh
             apart = _apart(one.innovation[:, k], other.innovation[:, k], other.innovation_std[:, k], row.circular)
             found.append(_curvature(name, apart))
             series = [_judged(track, k) for track in (one, other)]
-            correlations = [
-                correlation_interval(e[np.isfinite(e)]) if np.isfinite(e).any() else UNKNOWN for e in series
-            ]
-            tests = [ljung_box(e).p_value for e in series]
-            whiteness.append(White(name, *correlations, *tests))
+            first, second = (correlation_interval(e[np.isfinite(e)]) for e in series)
+            p_first, p_second = (ljung_box(e).p_value for e in series)
+            whiteness.append(White(name, first, second, p_first, p_second))
     return tuple(found), tuple(whiteness)
 
 
@@ -186,8 +184,12 @@ def _in_words(exact: bool, apart: tuple[Curvature, ...], bad: list[White]) -> st
     if not bad:
         return f"{figure}; innovations of {LINEARISED} show no correlation beyond {LIMITS.correlation:g}"
     first = max(bad, key=lambda item: abs(item.linearised.value))
-    blame = abs(first.linearised.value) - abs(first.unscented.value) > LIMITS.correlation
-    why = "the linearisation is to blame" if blame else "so model or Q are off, not the linearisation"
+    if abs(first.linearised.value) - abs(first.unscented.value) > LIMITS.correlation:
+        why = "the linearisation is to blame"
+    elif worst.most <= LIMITS.bias:
+        why = "so model or Q are off, not the linearisation"
+    else:
+        why = "so neither of them fits"
     return (
         f"{figure}; innovations are not white: {first.row} {first.linearised.value:+.2f} with {LINEARISED}, "
         f"{first.unscented.value:+.2f} with {UNSCENTED}, {why}"

@@ -146,3 +146,10 @@ def of_truth(name: str, rmse: float, unit: str, size: float, start: float) -> st
     """A state whose truth was told, and is `rmse` away, `size` standard deviations."""
     where = f"{name} is {rmse:.3g} {unit} ({size:.1f} σ) from the truth {since(start)}"
     return f"{where}: the estimate is wrong and its band does not say so; look at what else is in alarm"
+
+
+def of_particles(effective: float, ancestors: float, start: float) -> str:
+    """A cloud of which a few particles carry the estimate."""
+    many = "one particle" if ancestors < 2.0 else f"{ancestors:.0f} particles"
+    what = f"the cloud is impoverished {since(start)}: {effective:.3g} particles count, and all descend from {many}"
+    return f"{what}; more particles, pf-ekf or pf-reg, or a larger Q of the states that hardly move"

@@ -26,6 +26,7 @@ from .blocks import regress_all, transform_all
 from .forecast import add_spread, predict
 from .innovation import judge_reading, observe
 from .localisation import localised, prepare
+from .ranks import account
 from .shared import (
     ADD,
     CREWS,
@@ -119,7 +120,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     """
     X = ensemble(context, state)
     a, rest = begin_analysis(context, sensor, X.shape[0], work)
-    m = observe(context, sensor, u, y, X, a, innovation, innovation_std)
+    m = observe(context, sensor, u, y, state, a, innovation, innovation_std, score)
     verdict = judge_reading(context, sensor, m, a, score)
     if verdict != USED:
         return verdict
@@ -157,4 +158,5 @@ ENKF = Estimator(
     tune=tune,
     prepare=prepare,
     blocks=block,
+    account=account,
 )

@@ -26,6 +26,7 @@ from .analysis import begin_analysis, work_size
 from .blocks import transform_all
 from .forecast import add_spread, predict
 from .innovation import judge_reading, observe
+from .ranks import account
 from .rotation import ROTATION, rotate_members
 from .shared import (
     ADD,
@@ -138,7 +139,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     X = ensemble(context, state)
     a, rest = begin_analysis(context, sensor, X.shape[0], work)
     # Z = (h(xᵢ) - ȳ) R^(-1/2) / √(N - 1),  d = R^(-1/2) (y - ȳ)
-    m = observe(context, sensor, u, y, X, a, innovation, innovation_std)
+    m = observe(context, sensor, u, y, state, a, innovation, innovation_std, score)
     verdict = judge_reading(context, sensor, m, a, score)
     if verdict != USED:
         return verdict
@@ -164,6 +165,7 @@ ETKF = Estimator(
     work_size=work_size,
     moments=moments,
     blocks=block,
+    account=account,
     points=points,
     options=(
         MEMBERS,

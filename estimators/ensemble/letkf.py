@@ -21,6 +21,7 @@ from .forecast import add_spread, predict
 from .innovation import judge_reading, observe
 from .local_transform import transform_locally
 from .localisation import localised, prepare
+from .ranks import account
 from .rotation import ROTATION, rotate
 from .shared import (
     ADD,
@@ -51,7 +52,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     """
     X = ensemble(context, state)
     a, rest = begin_analysis(context, sensor, X.shape[0], work)
-    m = observe(context, sensor, u, y, X, a, innovation, innovation_std)
+    m = observe(context, sensor, u, y, state, a, innovation, innovation_std, score)
     verdict = judge_reading(context, sensor, m, a, score)
     if verdict != USED:
         return verdict
@@ -84,6 +85,7 @@ LETKF = Estimator(
     work_size=work_size,
     moments=moments,
     blocks=block,
+    account=account,
     points=points,
     options=(MEMBERS, INFLATE, ADD, RADIUS, ROTATION),
     tune=tune,

@@ -1,7 +1,8 @@
 """What the ensemble filters share: members as a flat state, where they start, what the track shows of them.
 
-The state is the ensemble X (N, nx), member after member, and the number of times that something was drawn. The
-covariance P = Aᵀ A / (N - 1) of its anomalies A is never formed.
+The state is the ensemble X (N, nx), member after member, the number of times that something was drawn, and in which
+tenth of the members' expectations the readings lay. The covariance P = Aᵀ A / (N - 1) of its anomalies A is never
+formed.
 
 Members of a circular state keep within half a turn of their mean, which keeps within ±π; plain sums are then right.
 
@@ -35,8 +36,11 @@ from .localisation import crews
 SIZE, INFLATION, ADDITIVE, CREWS, OWN = range(5)
 """Positions in the context's options; a filter's own number stands at the last."""
 
-PROCESS, START, PERTURB, SPREAD, ROTATE = range(5)
+PROCESS, START, PERTURB, SPREAD, ROTATE, RANK = range(6)
 """Streams of randomness; see numerics/random.py."""
+
+BINS = 10
+"""Bins of the rank histogram (ranks.py)."""
 
 THREADED_FROM = 65_536
 """Numbers in an ensemble from which threads gain more than they cost."""
@@ -59,10 +63,11 @@ def tune(options: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray
 
 
 class Members(NamedTuple):
-    """The state: members X (N, nx), and how many predictions and analyses have drawn, (1,)."""
+    """The state: members X (N, nx), how many predictions and analyses have drawn, (1,), and counts of ranks (BINS,)."""
 
     X: Any
     draws: Any
+    ranks: Any
     end: int
 
 
@@ -71,7 +76,8 @@ def members_at(at, N, nx):
     """Lay the state out."""
     X, at = take_matrix(at, N, nx)
     draws, at = take_vector(at, 1)
-    return Members(X, draws, at)
+    ranks, at = take_vector(at, BINS)
+    return Members(X, draws, ranks, at)
 
 
 def state_size(options: Options, nx: int) -> int:
@@ -135,9 +141,11 @@ def settle(context, X):
 @jit
 def start(context, mean, cov, state):
     """Draw the members from N(mean, cov), cov (nx, nx) or, diagonal, (1, nx); their mean is then made exact."""
-    X, draws, _ = parts(context, state)
+    X, draws, ranks, _ = parts(context, state)
     N, n = X.shape
     draws[0] = 0.0
+    for k in range(BINS):
+        ranks[k] = 0.0
     key = key_of(context.seed, 0, START)
     z = np.empty(n)
     total = np.zeros(n)

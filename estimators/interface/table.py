@@ -7,17 +7,22 @@ from typing import Any
 import numpy as np
 
 from ..events.batch import KIND_NAMES, READING, Events, truth_of
+from ..events.maintenance import model_versions
 from ..model.state_space import StateSpaceModel
-from ..track import HEALTH_NAMES, VERDICT_NAMES, Track
+from ..track import HEALTH_NAMES, REASONS, VERDICT_NAMES, Track
 
 
-def table_of(model: StateSpaceModel, events: Events, track: Track) -> Any:
+def table_of(
+    model: StateSpaceModel, events: Events, track: Track, *, tuning_version: int = 1, model_version: int = 1
+) -> Any:
     """A pyarrow.Table of events and track.
 
     Columns: `t_ns` and `arrival_ns`; `seconds`; `event`, `channel`, and `sensor` (null unless it is a reading);
     `value_k` and, where a reading brought its own, `variance_k`; for each state `NAME_true` (NaN where it is not
     known), `NAME` and `NAME_std`; `innovation_k` and `innovation_std_k`; NIS with its windowed mean and bounds,
-    log-likelihood; verdict and health in words.
+    log-likelihood; verdict and health in words; `screened`: why the edge refused rows of the reading, null if it did
+    not; `model_version`, which counts up with each maintenance from that at the first event, and `tuning_version`, of
+    the tuning that the track was folded with.
     """
     import pyarrow as pa
 
@@ -46,6 +51,19 @@ def table_of(model: StateSpaceModel, events: Events, track: Track) -> Any:
     for name in ("nis", "nis_mean", "nis_low", "nis_high", "log_likelihood"):
         columns[name] = getattr(track, name)
     columns["verdict"] = np.array(VERDICT_NAMES)[track.verdict]
+    columns["screened"] = _reasons(track.screened)
     columns["health"] = np.array(HEALTH_NAMES)[track.health]
+    columns["model_version"] = model_versions(events, model_version)
+    columns["tuning_version"] = np.full(len(events), tuning_version, np.int64)
     plain = {k: np.ascontiguousarray(c) if isinstance(c, np.ndarray) else c for k, c in columns.items()}
     return pa.table(plain)
+
+
+def _reasons(screened: np.ndarray) -> Any:
+    """Why readings were refused, as `range, rate`; null where they were not."""
+    import pyarrow as pa
+
+    every = range(1 << len(REASONS))
+    words = [", ".join(name for k, name in enumerate(REASONS) if bits & (1 << k)) or None for bits in every]
+    bits = np.bitwise_or.reduce(screened, axis=1)
+    return pa.array(np.array(words, object)[bits], pa.string())

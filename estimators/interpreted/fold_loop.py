@@ -14,7 +14,8 @@ import numpy as np
 from ..errors import ModelError
 from ..log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from ..numerics.steps import steps_of
-from ..track import FAILED, MISSING, NONE, WHITENED, Track
+from ..screen import pass_on
+from ..track import ANCESTORS, EFFECTIVE, FAILED, MISSING, NONE, SCREENED, WHITENED, Track
 
 UNSET = int(np.iinfo(np.int64).min)
 """The clock before the first event, which sets it: the prior holds at that time."""
@@ -72,6 +73,7 @@ def run(
     A filter asks the model before it changes its state, so that it never stands in between.
     """
     tuned = nullcontext()
+    passed = np.empty(value.shape[1])
     with np.errstate(all="ignore"):  # as compiled code: a number that is not finite is an answer, not a warning
         for i in range(start, end):
             what, now, index = int(kind[i]), int(t[i]), first + i
@@ -90,10 +92,14 @@ def run(
                     if what == READING:
                         innovation, innovation_std = track.innovation[i], track.innovation_std[i]
                         sensor = int(channel[i])
-                        with context.brought(sensor, value[i, width:]) if value.shape[1] > width else tuned:
-                            verdict = code.update(
-                                context, u, sensor, value[i], index, state, work, innovation, innovation_std, score
-                            )
+                        refused = track.screened[i].any()
+                        given = passed if refused else value[i]
+                        verdict = SCREENED
+                        if not refused or pass_on(value, track.screened, i, passed):
+                            with context.brought(sensor, value[i, width:]) if value.shape[1] > width else tuned:
+                                verdict = code.update(
+                                    context, u, sensor, given, index, state, work, innovation, innovation_std, score
+                                )
                 except ModelError as error:
                     context.failed(error)
                     verdict = FAILED if what == READING else NONE
@@ -122,6 +128,8 @@ def run(
             track.dof[i] = int(score[1])
             track.log_likelihood[i] = score[2]
             track.verdict[i] = verdict
+            track.effective[i] = score[EFFECTIVE]
+            track.ancestors[i] = score[ANCESTORS]
             track.whitened[i] = score[WHITENED:]
 
 

@@ -3,6 +3,18 @@
 What a model's file needs is here: `from estimators.model import Row, Sensor, State, StateSpaceModel`.
 """
 
-from .state_space import Field, Input, Jump, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from .state_space import Field, Input, Jump, Limits, Noise, Parameter, Row, Sensor, State, StateSpaceModel, Stuck
 
-__all__ = ["Field", "Input", "Jump", "Noise", "Parameter", "Row", "Sensor", "State", "StateSpaceModel"]
+__all__ = [
+    "Field",
+    "Input",
+    "Jump",
+    "Limits",
+    "Noise",
+    "Parameter",
+    "Row",
+    "Sensor",
+    "State",
+    "StateSpaceModel",
+    "Stuck",
+]

@@ -11,14 +11,15 @@ from typing import Any, overload
 import numpy as np
 
 from ..errors import ModelError
+from .limits import check_range
 
 
 @dataclass(frozen=True)
 class State:
     """One entry of x with its prior N(mean, std²); a `circular` one is an angle in radians and wraps to ±π.
 
-    `position` says where it is, for filters that let a reading act only near its sensor; `fitted` the range in which
-    the model was fitted.
+    `position` says where it is, for filters that let a reading act only near its sensor. `fitted` is the range over
+    which the model was fitted or checked; an estimate outside is suspect.
     """
 
     name: str
@@ -28,6 +29,10 @@ class State:
     circular: bool = False
     position: tuple[float, ...] | None = None
     fitted: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a range that holds nothing."""
+        check_range(f"state {self.name}: fitted", self.fitted)
 
 
 @dataclass(frozen=True)

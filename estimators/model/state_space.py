@@ -21,6 +21,7 @@ from .correlation import Correlation, as_correlation, flaw
 from .field import CellNames, Field, State
 from .jump import Jump
 from .layout import Layout
+from .limits import Limits, Stuck, check_limits, check_range
 
 LARGE = 1024
 """States beyond which no filter forms an (nx, nx) matrix: priors are diagonal, moments are means and variances."""
@@ -31,7 +32,10 @@ TRUTH_BLOCK = 32
 SHOWN = 64
 """States that a track keeps where the model does not say which."""
 
-__all__ = ["LARGE", "Field", "Input", "Jump", "Noise", "Parameter", "Row", "Sensor", "State", "StateSpaceModel"]
+__all__ = [
+    "LARGE", "Field", "Input", "Jump", "Limits", "Noise", "Parameter", "Row", "Sensor", "State", "StateSpaceModel",
+    "Stuck",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -48,15 +52,16 @@ class Noise:
 
 @dataclass(frozen=True)
 class Input:
-    """One entry of u, a known input, held between its readings; `default` until the first.
-
-    `fitted`: the range in which the model was fitted; outside, the twin says so.
-    """
+    """One entry of u, a known input, held between its readings; `default` until the first; `fitted` as in `State`."""
 
     name: str
     unit: str
     default: float = 0.0
     fitted: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a range that holds nothing."""
+        check_range(f"input {self.name}: fitted", self.fitted)
 
 
 @dataclass(frozen=True)
@@ -92,6 +97,8 @@ class Sensor:
     `correlation` is the correlation matrix (ny, ny) of the rows' noise, where they are not independent: anything that
     NumPy takes for a matrix. R_ij = correlation_ij √(r_i r_j), so the rows' variances are tuned as ever. Of a
     covariance R, give the rows its diagonal and the sensor `correlation_of(R)`.
+
+    `limits` say what it can say at all; readings beyond are kept and never used.
     """
 
     name: str
@@ -100,6 +107,7 @@ class Sensor:
     H: Callable | None = None
     log_likelihood: Callable | None = None
     correlation: Correlation | None = None
+    limits: Limits | None = None
 
     def __post_init__(self) -> None:
         """Hold a matrix, which cannot be hashed, as its rows."""
@@ -187,6 +195,7 @@ class StateSpaceModel:
             wrong = flaw(sensor.correlation, len(rows)) if sensor.correlation is not None else None
             if wrong:
                 raise ModelError(f"model {self.name}: the correlation of sensor {sensor.name} {wrong}")
+            check_limits(f"model {self.name}: sensor {sensor.name}", sensor.limits, len(rows))
         for noise in self.noises:
             if not (noise.variance >= 0 and np.isfinite(noise.variance)):
                 raise ModelError(

@@ -19,10 +19,12 @@ from .battery_cell import (
     BATTERY_CELL,
     COMMON,
     CURRENT,
+    CURRENTS,
     HEAT_CAPACITY,
     SOC,
     TAU_1,
     TEMPERATURE,
+    TEMPERATURES,
     TO_AIR,
     V1,
     advance,
@@ -128,10 +130,10 @@ BATTERY_PACK = StateSpaceModel(
         for state in (
             State(f"soc_{k}", "1", mean=0.8, std=0.1),
             State(f"v1_{k}", "V", mean=0.0, std=0.02),
-            State(f"temperature_{k}", "°C", mean=25.0, std=3.0),
+            State(f"temperature_{k}", "°C", mean=25.0, std=3.0, fitted=TEMPERATURES),
         )
     ),
-    inputs=(Input("current", "A"), Input("air", "°C", default=25.0)),
+    inputs=(Input("current", "A", fitted=CURRENTS), Input("air", "°C", default=25.0)),
     parameters=(
         *COMMON,
         Parameter("to_neighbour", "K/W", 5.0, 0.1, 1e3),

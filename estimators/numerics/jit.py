@@ -154,6 +154,12 @@ def flags(target, n):
 
 
 @jit
+def flag_rows(target, rows, columns):
+    """The (rows, columns) int8s at an address."""
+    return carray(_to_byte(target), (rows, columns))
+
+
+@jit
 def masks(target, rows, columns):
     """The (rows, columns) int32s at an address."""
     return carray(_to_mask(target), (rows, columns))

@@ -27,7 +27,7 @@ _ROUND = 1.5 * 2.0**52
 """Adding and taking it away rounds to a whole number, which then stands in the low bits."""
 
 
-def _exp(builder: Any, x: Any) -> Any:
+def exponential(builder: Any, x: Any) -> Any:
     """e^x for a number or a vector of them, within a unit in the last place; 0 below `_LOWEST`.
 
     x = k ln 2 + r with |r| ≤ ln 2 / 2, and the Taylor polynomial of degree 13, whose remainder is under 5e-18.
@@ -69,10 +69,10 @@ def exp_minus(typing_context: Any, n: Any, x: Any, shift: Any, out: Any) -> Any:
         wide = simd_ir.broadcast(builder, shift)
 
         def whole(i: Any) -> None:
-            simd_ir.store(builder, _exp(builder, builder.fsub(simd_ir.load(builder, x, i), wide)), out, i)
+            simd_ir.store(builder, exponential(builder, builder.fsub(simd_ir.load(builder, x, i), wide)), out, i)
 
         def single(i: Any) -> None:
-            value = _exp(builder, builder.fsub(builder.load(builder.gep(x, [i])), shift))
+            value = exponential(builder, builder.fsub(builder.load(builder.gep(x, [i])), shift))
             builder.store(value, builder.gep(out, [i]))
 
         simd_ir.in_vectors(builder, n, whole, single)

@@ -27,6 +27,7 @@ from ..track import FAILED, MISSING, USED
 from .cloud import DRAW, MEMBERS, OPTIONS, RESAMPLE, RESAMPLED, cloud_of, own_covariance, sized, tune, weigh_equally
 from .describe import describe, moments, peaks, points, recoveries
 from .innovation import finite_rows
+from .lineage import account, inherit, score_cloud
 from .proposals import (
     PROPOSE,
     ahead_of,
@@ -86,6 +87,7 @@ def choose(context, key, state, work):
     children = children_of(context, key, state, work)
     ancestors_of(children, shared.ancestors)
     take_ancestors(shared.ancestors, cloud_of(state, nx, n).records)
+    inherit(context, shared.ancestors, state)
     take_ancestors(shared.ancestors, matrix(ahead_of(context, shared).densities, 0, n, 1))
     weigh_equally(state, nx, n)
     state[RESAMPLED] += 1.0
@@ -108,6 +110,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         log_sum += second
         if log_sum > -np.inf:
             keep(context, second, state, work)
+            score_cloud(state, score)
     score[2] = log_sum if log_sum > -np.inf else np.nan
     if verdict == FAILED or (verdict == USED and not log_sum > -np.inf):
         verdict = FAILED
@@ -131,6 +134,7 @@ APF = Estimator(
     points=points,
     peaks=peaks,
     recoveries=recoveries,
+    account=account,
     options=tuple(option for option in OPTIONS if option.name != "fraction"),
     tune=tune,
     prepare=phases(move_block, expect_block, propose_block),

@@ -20,9 +20,10 @@ from ..numerics.workspace import WORD, layout, size_of, start_of, take_matrix, t
 from ..tuning import Tuning
 from .resampling import SCHEME_NAMES
 
-DRAWS, SETTLED, EQUAL, ESS, RECOVERIES, RESAMPLED, _SPARE, _SPARE_TOO = range(8)
+DRAWS, SETTLED, EQUAL, ESS, RECOVERIES, RESAMPLED, ORIGINS, GENERATIONS = range(8)
 """Head of the state: predictions and updates so far; whether mean and covariance are up to date;
-whether all weights are equal; effective sample size; clouds that had to be recovered; clouds resampled."""
+whether all weights are equal; effective sample size; clouds that had to be recovered; clouds resampled; particles from
+which the present ones descend, at the last count, and readings used since (lineage.py)."""
 
 HEAD = 8
 
@@ -59,8 +60,9 @@ def tune(options: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray
 class Cloud(NamedTuple):
     """The state: the head, which states are circular (nx,), the last posterior's mean (nx,) and cov (nx, nx).
 
-    Then the log weights (N,), whose exponentials sum to 1 after a reading, to less if particles were lost since, and N
-    records (N, record): the particle x (nx,), and in some filters a covariance P (nx, nx) of its own.
+    Then the log weights (N,), whose exponentials sum to 1 after a reading, to less if particles were lost since; the
+    particles' origins (N,), see lineage.py; and N records (N, record): the particle x (nx,), and in some filters a
+    covariance P (nx, nx) of its own.
     """
 
     head: Any
@@ -68,6 +70,7 @@ class Cloud(NamedTuple):
     mean: Any
     cov: Any
     log_w: Any
+    lineage: Any
     records: Any
     end: int
 
@@ -80,8 +83,9 @@ def cloud_at(at, nx, n, record):
     mean, at = take_vector(at, nx)
     cov, at = take_matrix(at, nx, nx)
     log_w, at = take_vector(at, n)
+    lineage, at = take_vector(at, n)
     records, at = take_matrix(at, n, record)
-    return Cloud(head, circular, mean, cov, log_w, records, at)
+    return Cloud(head, circular, mean, cov, log_w, lineage, records, at)
 
 
 @layout

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled.context import circular_rows, expect, sensor_variances
+from ..compiled.context import circular_rows, expect, has_own_likelihood, sensor_variances
 from ..compiled.sensor_noise import add_covariances
 from ..numerics.jit import jit
 from ..numerics.linalg import wrap
+from ..numerics.normal_score import normal_score
+from ..track import WHITENED
+from .moments import tails_of
 
 
 @jit
@@ -78,3 +81,23 @@ def predicted(context, u, sensor, y, x, shared, innovation, innovation_std):
             nu[k] = innovation[row]
             k += 1
     return m
+
+
+@jit
+def score_rows(context, sensor, y, shared, score):
+    """Write the normal score of each finite row to score[WHITENED + row]: e = Φ⁻¹(F(y)), N(0, 1) under the model.
+
+    F = Σ wᵢ Φ((y - hᵢ) / √sᵢ) is the distribution function of the row by itself under the weights before the reading,
+    with sᵢ the variance of the reading given particle i: r, or H P Hᵀ + r where a Gaussian stands behind it. Angles
+    are counted from what the first particle expects, up to half a turn to either side. A sensor with a likelihood of
+    its own has no known distribution function, and its rows are NaN.
+    """
+    tails = tails_of(context, shared.sums)
+    own = has_own_likelihood(context, sensor)
+    k = 0
+    for row in range(sensor_variances(context, sensor).size):
+        score[WHITENED + row] = np.nan
+        if np.isfinite(y[row]):
+            if not own:
+                score[WHITENED + row] = normal_score(tails[2 * k], tails[2 * k + 1])
+            k += 1

@@ -1,7 +1,8 @@
 """Mean and covariance of a weighted cloud, from sums that any number of threads add up alike.
 
 The sums are Σw, Σw², the largest log weight, its member, and from 4 on Σ w d (m,) and Σ w d dᵀ (m, m) of deviations d
-from a reference. A block's are added in the order of its members, the blocks' in the order of the blocks.
+from a reference. A block's are added in the order of its members, the blocks' in the order of the blocks. The
+last 2 ny are the two tails of the predicted reading, Σ w Φ(z) and Σ w Φ(-z), row by row.
 """
 
 from __future__ import annotations
@@ -22,7 +23,13 @@ BLOCK = 1024
 def sums_size(nx, ny):
     """Length of the sums of states or readings."""
     k = max(nx, ny)
-    return 4 + k + k * k
+    return 4 + k + k * k + 2 * ny
+
+
+@jit
+def tails_of(context, sums):
+    """The tails of the predicted reading in the sums of a reading: two for each row."""
+    return sums[sums.size - 2 * context.width :]
 
 
 CHUNK = 64

@@ -43,7 +43,8 @@ from .cloud import (
     tune,
 )
 from .describe import describe, moments, peaks, points, recoveries
-from .innovation import finite_rows, predicted
+from .innovation import finite_rows, predicted, score_rows
+from .lineage import account, score_cloud
 from .propagate import propagate_block, smooth_block, work_size
 from .recovery import recover, start
 from .steps import NO_KEY, add_up, sweep, work_of
@@ -88,6 +89,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     add_up(context, work)
     m = predicted(context, u, sensor, y, cloud.records[0], shared, innovation, innovation_std)
     verdict = admit(context, sensor, m, shared.nu, shared.S, shared.U, score)
+    score_rows(context, sensor, y, shared, score)
     state[SETTLED] = settled
     # w_i ← w_i p(y | x_i) / Σ w p(y | x), and log p(y) = log Σ w p(y | x)
     log_sum = normalise(context, state, work)
@@ -96,6 +98,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         drawn = keep_or_resample(context, key_of(context.seed, index, RESAMPLE), log_sum, state, work)
         if drawn and numbers(context)[WIDTH] > 0.0:
             smooth(context, key_of(context.seed, index, JITTER), cloud.cov, shared.L, state, work)
+        score_cloud(state, score)
     elif verdict == USED or verdict == FAILED:
         verdict = FAILED
         recover(context, index, state)
@@ -152,6 +155,7 @@ PF = Estimator(
     points=points,
     peaks=peaks,
     recoveries=recoveries,
+    account=account,
     options=OPTIONS,
     blocks=block,
     tune=tune,
@@ -174,6 +178,7 @@ PF_REG = Estimator(
     points=points,
     peaks=peaks,
     recoveries=recoveries,
+    account=account,
     options=(*OPTIONS, BANDWIDTH, JITTERED),
     blocks=block,
     tune=tune_regularised,

@@ -22,6 +22,7 @@ from ..track import FAILED, MISSING, USED
 from .cloud import DRAW, MEMBERS, OPTIONS, RESAMPLE, cloud_of, own_covariance, sized, tune
 from .describe import describe, moments, peaks, points, recoveries
 from .innovation import finite_rows
+from .lineage import account, score_cloud
 from .proposals import (
     PROPOSE,
     expect_block,
@@ -120,6 +121,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     score[2] = log_sum if log_sum > -np.inf else np.nan
     if verdict == USED and log_sum > -np.inf:
         keep_or_resample(context, key_of(context.seed, index, RESAMPLE), log_sum, state, work)
+        score_cloud(state, score)
     elif verdict == USED or verdict == FAILED:
         verdict = FAILED
         recover(context, index, state)
@@ -142,6 +144,7 @@ PF_EKF = Estimator(
     points=points,
     peaks=peaks,
     recoveries=recoveries,
+    account=account,
     options=OPTIONS,
     tune=tune,
     prepare=phases(move_block, expect_block, propose_block),

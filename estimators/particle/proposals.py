@@ -31,11 +31,13 @@ from ..estimator import Options
 from ..gaussian.shared import admit
 from ..numerics.jit import inlined, jit
 from ..numerics.linalg import cholesky, congruence, solve_transposed, wrap
+from ..numerics.normal_score import add_tail
 from ..numerics.random import key_of
 from ..numerics.workspace import layout, size_of, take_matrix, take_vector
 from .cloud import EQUAL, MEMBERS, PROCESS, SETTLED, cloud_of, members, next_draw, own_covariance, wrap_record
-from .innovation import about, first_residual, predicted
+from .innovation import about, first_residual, predicted, score_rows
 from .mode_draws import jump, jump_key
+from .moments import tails_of
 from .recovery import recover
 from .steps import NO_KEY, add_up, block_of, blocks_of, range_of, sweep, work_at, work_of
 from .weigh import log_density
@@ -219,7 +221,7 @@ def look(context, sensor, u, y, x, P, L, H, HL, S, U, e, expected, scratch):
 def expect_block(context, u, dt, sensor, y, key, value, state, work, number):
     """joint = log w + log N(y; h(x), H P Hᵀ + R), the second kept ahead, and the sums of residuals and S - R.
 
-    The sums are about `first_residual`.
+    The sums are about `first_residual`; with them those of the two tails of each row, see `score_rows`.
     """
     nx = context.nx
     n = int(numbers(context)[MEMBERS])
@@ -237,6 +239,7 @@ def expect_block(context, u, dt, sensor, y, key, value, state, work, number):
     circular = circular_rows(context, sensor)
     reference = np.empty(r.size)
     first_residual(context, u, sensor, y, records[0, :nx], reference)
+    tails = tails_of(context, sums)
     for k in range(sums.size):
         sums[k] = 0.0
     sums[2] = -np.inf
@@ -261,8 +264,10 @@ def expect_block(context, u, dt, sensor, y, key, value, state, work, number):
         m = 0
         for row in range(r.size):
             if np.isfinite(y[row]):
-                S[m, m] -= r[row]
                 e[m] = about(e[m], reference[row], circular[row])
+                if not own:
+                    add_tail((reference[row] + e[m]) / np.sqrt(S[m, m]), w, tails[2 * m :])
+                S[m, m] -= r[row]
                 m += 1
         if correlated:
             add_covariances(context, sensor, y, -1.0, S)
@@ -318,4 +323,6 @@ def expected_reading(context, u, sensor, y, state, work, innovation, innovation_
     x = cloud.records[0, : context.nx]
     m = predicted(context, u, sensor, y, x, shared, innovation, innovation_std)
     state[SETTLED] = settled
-    return index, admit(context, sensor, m, shared.nu, shared.S, shared.U, score)
+    verdict = admit(context, sensor, m, shared.nu, shared.S, shared.U, score)
+    score_rows(context, sensor, y, shared, score)
+    return index, verdict

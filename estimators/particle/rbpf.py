@@ -47,7 +47,8 @@ from .cloud import (
 )
 from .cloud import OPTIONS as CLOUD_OPTIONS
 from .describe import DRAWN, describe, moments, recoveries
-from .innovation import finite_rows
+from .innovation import finite_rows, score_rows
+from .lineage import account, begin_lineage, score_cloud
 from .mode_draws import any_mode, jump_key, nearest_mode
 from .moments import cloud_moments
 from .rbpf_condition import adopt_block, condition_block, mixture, refer
@@ -91,6 +92,7 @@ def _begin(context, mean, cov, index, stream, state):
             mode = nearest_mode(context, mean[j] + std * normal(jump_key(key), np.uint64(i)), mean[j], std)
         _spread(context, C, True, key, i, mode, x, own_covariance(records[i], nx), column, before)
     weigh_equally(state, nx, n)
+    begin_lineage(context, state)
     state[SETTLED] = 0.0
 
 
@@ -138,6 +140,7 @@ def _recover(context, index, state):
                 C[context.mode, a] = 0.0
             mode = any_mode(context, jump_key(key), i)
         _spread(context, C, False, key, i, mode, records[i, :nx], own_covariance(records[i], nx), column, before)
+    begin_lineage(context, state)
     state[SETTLED] = 0.0
 
 
@@ -177,6 +180,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     add_up(context, work)
     m = mixture(context, sensor, y, shared, innovation, innovation_std)
     verdict = admit(context, sensor, m, shared.nu, shared.S, shared.U, score)
+    score_rows(context, sensor, y, shared, score)
     state[SETTLED] = settled
     score[2] = np.nan
     if verdict == USED:
@@ -186,6 +190,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         score[2] = log_sum
     if verdict == USED and log_sum > -np.inf:
         keep_or_resample(context, key_of(context.seed, index, RESAMPLE), log_sum, state, work)
+        score_cloud(state, score)
     elif verdict == USED or (verdict == FAILED and not score[0] == np.inf):
         verdict = FAILED
         state[SETTLED] = 0.0
@@ -239,6 +244,7 @@ RBPF = Estimator(
     points=points,
     peaks=peaks,
     recoveries=recoveries,
+    account=account,
     options=OPTIONS,
     tune=tune,
     prepare=phases(predict_block, condition_block, adopt_block),

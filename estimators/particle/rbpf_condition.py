@@ -12,8 +12,10 @@ from ..compiled.verdict import LOG_2PI
 from ..gaussian.shared import factor
 from ..numerics.jit import jit
 from ..numerics.linalg import solve_transposed, wrap
+from ..numerics.normal_score import add_tail
 from .cloud import EQUAL, MEMBERS, cloud_of, own_covariance, wrap_record
-from .innovation import finite_rows
+from .innovation import about, finite_rows
+from .moments import tails_of
 from .rbpf_work import aside_of, room_of
 from .steps import block_of, range_of, work_of
 
@@ -23,7 +25,8 @@ def condition_block(context, u, dt, sensor, y, key, value, state, work, number):
     """Condition a block's members on the reading, aside: a Kalman update of each one's linear part.
 
     x ← x + K e;  P ← P - K S Kᵀ;  joint = log w + log N(e; 0, S),  S = H P Hᵀ + R, over the finite rows. The sums get
-    the moments of the predicted reading, about the reference, under the weights before it.
+    the moments of the predicted reading, about the reference, under the weights before it, and its two tails, row by
+    row; see `score_rows`.
     """
     nx = context.nx
     n = int(numbers(context)[MEMBERS])
@@ -42,6 +45,7 @@ def condition_block(context, u, dt, sensor, y, key, value, state, work, number):
     for k in range(sums.size):
         sums[k] = 0.0
     sums[2] = -np.inf
+    tails = tails_of(context, sums)
     for i in range(first, last):
         joint[i] = -np.inf
         if not log_w[i] > -np.inf:
@@ -81,6 +85,12 @@ def condition_block(context, u, dt, sensor, y, key, value, state, work, number):
             continue
         w = 1.0 if equal else np.exp(log_w[i])
         sums[0] += w
+        k = 0
+        for row in range(r.size):
+            if np.isfinite(y[row]):
+                z = about(y[row], reference[row], angles[row]) - expected[k] if angles[row] != 0 else e[k]
+                add_tail(z / np.sqrt(S[k, k]), w, tails[2 * k :])
+                k += 1
         for a in range(m):
             sums[4 + a] += w * expected[a]
             for b in range(a + 1):

@@ -10,6 +10,7 @@ from ..compiled.noise import add_noise, belief_root
 from ..numerics.jit import floats, jit, matrix
 from ..numerics.random import key_of, normal
 from .cloud import HEAD, MEMBERS, RECOVER, RECOVERIES, SETTLED, START, cloud_of, weigh_equally, wrap_record
+from .lineage import begin_lineage
 from .mode_draws import any_mode, jump_key, nearest_mode
 from .moments import cloud_moments
 
@@ -45,6 +46,7 @@ def restart(context, mean, cov, index, stream, state):
     belief_root(cov, root)
     scatter(context, mean, root, key_of(context.seed, index, stream), cloud_of(state, nx, n).records)
     weigh_equally(state, nx, n)
+    begin_lineage(context, state)
     state[SETTLED] = 0.0
 
 
@@ -95,6 +97,7 @@ def recover(context, index, state):
     if context.mode >= 0:
         for i in range(n):
             records[i, context.mode] = any_mode(context, jump_key(key), i)
+    begin_lineage(context, state)
     state[SETTLED] = 0.0
 
 

@@ -17,10 +17,11 @@ from ..compiled.sensor_noise import has_correlated_rows, independent_rows
 from ..compiled.verdict import LOG_2PI
 from ..numerics.jit import jit
 from ..numerics.linalg import solve_unit, wrap
+from ..numerics.normal_score import add_tails
 from ..numerics.vectors import exp_minus
 from .cloud import EQUAL, MEMBERS, cloud_of
 from .innovation import about, first_residual
-from .moments import CHUNK, add_chunk
+from .moments import CHUNK, add_chunk, tails_of
 from .propagate import room_of
 from .steps import block_of, range_of, work_of
 
@@ -29,7 +30,8 @@ from .steps import block_of, range_of, work_of
 def weigh_block(context, u, dt, sensor, y, key, value, state, work, number):
     """joint = log w + log p(y | x), and the sums of the residuals' mean and covariance under the predicted weights.
 
-    A density that is NaN counts as zero. The sums are about `first_residual`.
+    And of the two tails of each row, see `score_rows`. A density that is NaN counts as zero. The sums are about
+    `first_residual`.
     """
     n = int(numbers(context)[MEMBERS])
     shared, cloud = work_of(context, work), cloud_of(state, context.nx, n)
@@ -44,6 +46,7 @@ def weigh_block(context, u, dt, sensor, y, key, value, state, work, number):
     for k in range(sums.size):
         sums[k] = 0.0
     sums[2] = -np.inf
+    tails = tails_of(context, sums)
     ny = r.size
     reference = np.empty(ny)
     first_residual(context, u, sensor, y, records[0], reference)
@@ -104,6 +107,12 @@ def weigh_block(context, u, dt, sensor, y, key, value, state, work, number):
             if density > top:
                 top = density
                 sums[3] = begin + i
+        if not own:
+            k = 0
+            for row in range(ny):
+                if np.isfinite(y[row]):
+                    add_tails(count, D[k], reference[row], 1.0 / np.sqrt(r[row]), D[m], tails[2 * k :])
+                    k += 1
         add_chunk(D, count, m, sums)
     sums[2] = top
 

@@ -18,6 +18,7 @@ from ..model.state_space import StateSpaceModel
 from ..numerics.jit import address, jit
 from ..numerics.vectors import exp_minus
 from .cloud import EQUAL, ESS, FRACTION, MEMBERS, RESAMPLED, SCHEME, SETTLED, cloud_of, weigh_equally
+from .lineage import count_origins, inherit
 from .moments import add_members, finish_moments
 from .resampling import STRATIFIED, ancestors_of, drawn_children, strata_children, take_ancestors
 from .steps import NO_KEY, add_up, block_of, block_signature, range_of, sweep, work_of
@@ -102,7 +103,7 @@ def _over_weights(phase, context, key, value, state, work):
 
 @jit
 def _settle(context, state, work):
-    """Mean, covariance and effective sample size, 1 / Σ w², of the weights of `normalise`.
+    """Mean, covariance and effective sample size, 1 / Σ w², of the weights of `normalise`; a reading has been used.
 
     Source: Kong, Liu & Wong (1994), Sequential imputations, doi:10.1080/01621459.1994.10476469.
     """
@@ -112,6 +113,7 @@ def _settle(context, state, work):
     finish_moments(cloud.circular, sums, shared.reference, cloud.mean, cloud.cov)
     state[SETTLED] = 1.0
     state[ESS] = sums[0] * sums[0] / sums[1]
+    count_origins(context, state)
 
 
 @jit
@@ -168,6 +170,7 @@ def resample(context, key, state, work):
     ancestors = work_of(context, work).ancestors
     ancestors_of(children, ancestors)
     take_ancestors(ancestors, cloud_of(state, nx, n).records)
+    inherit(context, ancestors, state)
     effective = state[ESS]
     weigh_equally(state, nx, n)
     state[ESS] = effective

@@ -12,8 +12,7 @@ import can
 
 from estimators.log import INPUT, READING, TRUTH, Events
 
-from ..simulation.simulator import Simulator
-from ..source import Channel, Report, ignore
+from ..source import Channel, Report, Source, ignore
 from .bus import open_bus
 from .databases import BusName
 from .encoder import Encoder
@@ -31,7 +30,7 @@ class Player:
     Use `run` in a process of its own, or `start` for a thread beside the listener.
 
     Args:
-        simulator: The asset; it is used up.
+        source: What the asset says, each event when it arrives; it is used up.
         databases: Database files, each with its bus (which matters to listeners only).
         channels: The twin's own channels, read backwards; true states go out too where a message has them.
         interface: python-can's name.
@@ -47,7 +46,7 @@ class Player:
 
     def __init__(
         self,
-        simulator: Simulator,
+        source: Source,
         databases: Sequence[tuple[Path, BusName]],
         channels: Iterable[Channel],
         *,
@@ -58,7 +57,7 @@ class Player:
         connect: Callable[[], Any] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._simulator = simulator
+        self._source = source
         channels = list(channels)
         self._encoder = Encoder(databases, channels)
         self._inputs = [channel.index for channel in channels if channel.kind == INPUT]
@@ -95,7 +94,7 @@ class Player:
         """Play here until the simulation ends or another thread calls `close`."""
         begun = self._clock()
         while not self._stop.is_set():
-            batch = self._simulator.read(0.0)
+            batch = self._source.read(0.0)
             if batch is None:
                 return
             for t, events in self._moments(batch):
@@ -108,9 +107,9 @@ class Player:
                 self._say(t, events)
 
     def _moments(self, batch: Events) -> list[tuple[int, list[tuple[int, int, Sequence[float]]]]]:
-        """The events of a batch by time; every input and every true state is one by itself."""
+        """The events of a batch by the time of their arrival; every input and every true state is one by itself."""
         moments: list[tuple[int, list[tuple[int, int, Sequence[float]]]]] = []
-        columns = (batch.t.tolist(), batch.kind.tolist(), batch.channel.tolist(), batch.value.tolist())
+        columns = (batch.arrival.tolist(), batch.kind.tolist(), batch.channel.tolist(), batch.value.tolist())
         for t, kind, channel, value in zip(*columns, strict=True):
             if not moments or moments[-1][0] != t:
                 moments.append((t, []))

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from estimators.compiled.model import compile_model
-from estimators.errors import NisusError, SourceError
+from estimators.errors import NisusError, SourceError, nearest
 from estimators.log import INPUT, READING, TICK, TRUTH, Events
 from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.jit import plain
 from estimators.numerics.steps import steps_of
 
-from .faults import Fault, Faults
+from ..faults.change import NEVER, Change
 from .profile import Constant, Profile
 
-BATCH = 512
-"""Events after which `read` returns."""
+BATCH = 32
+"""Events after which `read` returns: a change of the asset holds for what has not been read."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,6 @@ class Simulator:
         truth_noise: Mapping[str, float] | None = None,
         inputs: Mapping[str, Profile] | None = None,
         sensors: Mapping[str, SensorPlan] | None = None,
-        faults: Sequence[Fault] = (),
         truth_every: int | None = None,
     ) -> None:
         """Set the asset up.
@@ -74,11 +73,10 @@ class Simulator:
             truth_noise: Variances that the asset's noise adds in a second, where they differ.
             inputs: Profiles by name; the others keep their default.
             sensors: Plans by name; a sensor without one speaks at every step.
-            faults: Of sensors, applied in this order.
             truth_every: Steps between two tellings of all states of a large field; None for never.
 
         Raises:
-            SourceError: If a duration or step is not positive, or a fault does not fit the sensors.
+            SourceError: If a duration or step is not positive.
         """
         truth = truth_model or model
         if not step > 0:
@@ -95,7 +93,9 @@ class Simulator:
         for name, value in dict(initial or {}).items():
             self._x[truth.state_names.index(name)] = value
         values = dict(truth_parameters or {})
-        self._p = np.array([values.get(item.name, item.value) for item in truth.parameters], float)
+        self._own_p = np.array([values.get(item.name, item.value) for item in truth.parameters], float)
+        self._p = self._own_p.copy()
+        self._changes: list[Change] = []
         variances = dict(truth_noise or {})
         self._q = np.array([variances.get(item.name, item.variance) for item in truth.noises], float)
         profiles = dict(inputs or {})
@@ -111,7 +111,6 @@ class Simulator:
             None if sensor.correlation is None else np.linalg.cholesky(np.array(sensor.correlation))
             for sensor in model.sensors
         ]
-        self._faults = Faults(faults, model.sensors, seed)
         self._spoken = [0] * len(self._plans)
         self._circular = np.flatnonzero(truth.circular)
         self._rng = np.random.default_rng(seed)
@@ -166,6 +165,8 @@ class Simulator:
         truth = self._truth
         self._k += 1
         t = self._time(self._k)
+        if self._changes:
+            self._p = self._changed(t)
         pieces = steps_of(self._step, truth.model.max_step)
         for _ in range(pieces):
             self._jump(self._step / pieces)
@@ -189,12 +190,40 @@ class Simulator:
                 y += self._rng.normal(0.0, self._std[i], size=y.size)
             else:
                 y += self._std[i] * (root @ self._rng.standard_normal(y.size))
-            y = self._faults.spoil(i, self._k * self._step, y)
             lost = plan.drop_every is not None and self._spoken[i] % plan.drop_every == plan.drop_every - 1
             self._spoken[i] += 1
             rows.append((t, READING, i, np.full(y.size, np.nan) if lost else y))
         told = self._all if self._all_every is not None and self._k % self._all_every == 0 else self._told
         rows += [(t, TRUTH, first, self._x[first:end].copy()) for first, end in told]
+
+    def change(self, parameter: str, factor: float, start: int | None = None, length: int | None = None) -> Change:
+        """Multiply a true parameter for `length` ns, or for ever, from `start` on (ns), or with the next step.
+
+        Raises:
+            SourceError: If there is no such parameter.
+        """
+        names = [item.name for item in self._truth.model.parameters]
+        if parameter not in names:
+            raise SourceError(
+                f"simulator: {self._truth.model.name} has no parameter {parameter!r}; {nearest(parameter, names)}"
+            )
+        begin = self._time(self._k + 1) if start is None else start
+        change = Change(parameter, factor, begin, NEVER if length is None else begin + length)
+        self._changes.append(change)
+        return change
+
+    def end(self, change: Change) -> None:
+        """End a change with the next step."""
+        change.end = max(change.start, self._time(self._k + 1))
+
+    def _changed(self, t: int) -> np.ndarray:
+        """The true parameters of the step that ends at t ns."""
+        p = self._own_p.copy()
+        names = [item.name for item in self._truth.model.parameters]
+        for change in tuple(self._changes):
+            if change.start <= t < change.end:
+                p[names.index(change.parameter)] *= change.factor
+        return p
 
     def _jump(self, dt: float) -> None:
         """Draw the next mode as the model says."""

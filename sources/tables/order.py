@@ -18,8 +18,9 @@ BACKWARDS, STANDING = REMARKS = ("times run backwards", "time stands still")
 class Order:
     """Looks at the times of the rows as they are read.
 
-    A row that is older than one before it by more than the horizon is dropped as stale by the log; the first of them
-    is reported with its line. Late rows within the horizon are as recorded, and put where they belong.
+    A row that is older than one before it by more than the horizon is dropped as stale by the log, unless the guard of
+    times finds a lone wrong time or a clock that was set (estimators/events/clocks.py); the first of them is reported
+    with its line. Late rows within the horizon are as recorded, and put where they belong.
     """
 
     def __init__(self, column: str, unit: str, horizon: int | None, report: Report) -> None:
@@ -51,8 +52,8 @@ class Order:
             self._tell(
                 BACKWARDS,
                 f"{file}:{line[k]}: {self._column} is {(newest[k] - t[k]) * 1e-9:.6g} s before that of {at}, more than "
-                f"time.horizon ({self._horizon * 1e-9:g} s), and such rows are dropped as stale; sort the rows by "
-                f"{self._column}, or raise time.horizon",
+                f"time.horizon ({self._horizon * 1e-9:g} s), and such rows are dropped as stale, unless that was a "
+                f"lone wrong time or a clock that was set; sort the rows by {self._column}, or raise time.horizon",
             )
         if newest[-1] > self._newest:
             self._newest, self._newest_at = int(newest[-1]), f"{file}:{line[int(np.argmax(t))]}"

@@ -35,8 +35,8 @@ class FakeEngine:
         self.state = SimpleNamespace(
             estimator=estimator, tuning=tuning, revision=0, refolding=False, speed=1.0, paused=False, recording=None,
             counts={"readings": 0, "gated": 0, "missing": 0, "stale": 0}, t=None, health=TRACKING, since=None,
-            lost=None, nis=np.nan, nis_low=np.nan, nis_high=np.nan, latency_ms=0.4, integrity=None,
-            seekable=True, span=None, finished=False, options={},
+            lost=None, model_version=1, clock=None, nis=np.nan, nis_low=np.nan, nis_high=np.nan, latency_ms=0.4,
+            seekable=True, span=None, finished=False, options={}, faults=(), integrity=None,
         )  # fmt: skip
         self.fold = Fold(estimator, model, tuning, self.log)
         self.before = None

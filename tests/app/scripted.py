@@ -5,6 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from app.twin.dropout import DegradedAfter
+from app.twin.late import Late
 from estimators.diagnostics.health import HealthPolicy
 from estimators.log import READING, Events
 from estimators.models import MODELS
@@ -36,6 +38,9 @@ def twin(history=200_000, horizon=2.0, tick=1000.0, model=MODEL, estimator="kf")
         tuning=Tuning.of(model),
         estimator=estimator,
         recorded=False,
+        maintenance=(),
+        late=Late(False, "scripted"),
+        degraded=DegradedAfter(time.degraded_after, "scripted"),
         pairs=np.array([[0, 1]]),
         plan=SimpleNamespace(brings_variances=False),
         config=config,

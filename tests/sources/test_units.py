@@ -56,3 +56,14 @@ def test_what_does_not_convert_names_both(given, wanted, expected):
     with pytest.raises(SourceError) as caught:
         conversion(given, wanted, "speed")
     assert str(caught.value) == expected
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted", "what"),
+    [("rpm", "1/s", "a rotation"), ("1/min", "Hz", "a rotation"), ("1/s", "rad/s", "a freq")],
+)
+def test_a_rotation_is_no_frequency(given, wanted, what):
+    """An angle has no unit, so a table of units takes one for the other, off by 2π."""
+    with pytest.raises(SourceError, match=f"x: '{given}' is {what}.* they may be 2π apart; say what is meant: under"):
+        conversion(given, wanted, "x")
+    assert conversion("rpm", "deg/s", "x")[0] == pytest.approx(6.0) and conversion("kHz", "1/s", "x")[0] == 1000.0

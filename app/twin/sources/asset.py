@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from math import inf
 from typing import TYPE_CHECKING
 
 from config.loader import Loaded
 from config.source_schema import AssetSection, ProfileSection
 from config.yaml_lines import Key, dotted
-from estimators.errors import nearest
 from estimators.model.state_space import StateSpaceModel
 
+from ..faults import read_faults
 from ..model import check_names, find_model, one_each
 
 if TYPE_CHECKING:
-    from sources.simulation.faults import Fault
     from sources.simulation.profile import Profile
     from sources.simulation.simulator import Simulator
 
@@ -59,7 +57,6 @@ def make_asset(loaded: Loaded, model: StateSpaceModel, section: AssetSection, ke
         truth_noise={name: level.value for name, level in truth.noise.items()},
         inputs={name: _profile(profiles) for name, profiles in section.inputs.items()},
         sensors=plans,
-        faults=_faults(loaded, section, key, model),
         truth_every=truth.every if model.grid is not None else None,
     )
 
@@ -73,7 +70,7 @@ def check_asset(loaded: Loaded, section: AssetSection, key: Key, model: StateSpa
     check_names(loaded, (*key, "initial"), section.initial, model.state_names, "state", model)
     check_names(loaded, (*key, "inputs"), section.inputs, model.input_names, "input", model)
     check_names(loaded, (*key, "sensors"), section.sensors, model.sensor_names, "sensor", model)
-    _faults(loaded, section, key, model)
+    read_faults(loaded, section.faults, (*key, "faults"), model)
     _check_length(loaded, section, key, model)
     if section.truth.model is None:
         _check_truth(loaded, section, key, model)
@@ -118,31 +115,6 @@ def _check_same(loaded: Loaded, key: Key, truth: StateSpaceModel, model: StateSp
             raise loaded.error(
                 key, f"has {what.replace('_names', 's')} {', '.join(theirs)}; they must be {', '.join(ours)}"
             )
-
-
-def _faults(loaded: Loaded, section: AssetSection, key: Key, model: StateSpaceModel) -> list[Fault]:
-    from sources.simulation.faults import Fault
-
-    for k, item in enumerate(section.faults):
-        place = (*key, "faults", k)
-        if item.sensor not in model.sensor_names:
-            near = nearest(item.sensor, model.sensor_names)
-            raise loaded.error((*place, "sensor"), f"is {item.sensor!r}, no sensor of {model.name}; {near}")
-        rows = [row.name for row in model.sensors[model.sensor_names.index(item.sensor)].rows]
-        if item.row is not None and item.row not in rows:
-            raise loaded.error((*place, "row"), f"is {item.row!r}, no row of {item.sensor}; {nearest(item.row, rows)}")
-    return [
-        Fault(
-            item.sensor,
-            item.kind,
-            item.start,
-            inf if item.end is None else item.end,
-            item.size or 0.0,
-            1.0 if item.rate is None else item.rate,
-            item.row,
-        )
-        for item in section.faults
-    ]
 
 
 def _profile(sections: tuple[ProfileSection, ...]) -> Profile:

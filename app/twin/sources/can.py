@@ -12,6 +12,7 @@ from estimators.log import Events
 from estimators.model.state_space import StateSpaceModel
 
 from ..channels import channels
+from ..faults import read_faults
 from ..files import failure, find_databases
 from .asset import check_asset, make_asset
 from .can_log import make_decoder, open_can_log
@@ -19,6 +20,8 @@ from .kind import Kind, Opening
 
 if TYPE_CHECKING:
     from sources.can.player import Player
+    from sources.faults.change import Change
+    from sources.simulation.simulator import Simulator
     from sources.source import Report, Source
 
 
@@ -35,7 +38,8 @@ def _open(opening: Opening) -> Source:
         return bus
     # Nobody outside this process could speak on it. The listener is there first, so it hears the first frame.
     try:
-        return PlayedBus(bus, make_player(opening.loaded, opening.model, report))
+        asset, player = _make_player(opening.loaded, opening.model, report)
+        return PlayedBus(bus, player, asset)
     except NisusError:
         bus.close()
         raise
@@ -59,7 +63,21 @@ def make_player(
     Raises:
         SourceError: If the source is not a bus, it has no `asset`, or the bus cannot be opened.
     """
+    return _make_player(loaded, model, report, interface=interface, channel=channel)[1]
+
+
+def _make_player(
+    loaded: Loaded,
+    model: StateSpaceModel,
+    report: Report,
+    *,
+    interface: str | None = None,
+    channel: str | int | None = None,
+) -> tuple[Simulator, Player]:
+    """The asset, and what plays it."""
     from sources.can.player import Player
+    from sources.faults.layer import Faults
+    from sources.faults.source import with_faults
 
     section, key = loaded.config.source, ("source",)
     if not isinstance(section, CanSection):
@@ -67,8 +85,14 @@ def make_player(
     if section.asset is None:
         raise failure(loaded, key, "has no asset to play; describe one under source.asset")
     same = interface in (None, section.interface)
-    return Player(
-        make_asset(loaded, model, section.asset, (*key, "asset")),
+    place = (*key, "asset")
+    asset = make_asset(loaded, model, section.asset, place)
+    faults = Faults(
+        model, read_faults(loaded, section.asset.faults, (*place, "faults"), model), seed=section.asset.seed
+    )
+    faults.attach(asset)
+    player = Player(
+        with_faults(asset, faults),
         find_databases(loaded, section, key),
         [item for _, item in channels(loaded, section, key, model)],
         interface=interface or section.interface,
@@ -76,6 +100,7 @@ def make_player(
         bus_options=dict(section.options) if same else {},
         report=report,
     )
+    return asset, player
 
 
 class PlayedBus:
@@ -83,9 +108,10 @@ class PlayedBus:
 
     live = True
 
-    def __init__(self, bus: Source, player: Player) -> None:
+    def __init__(self, bus: Source, player: Player, asset: Simulator) -> None:
         self._bus = bus
         self._player = player
+        self._asset = asset
         player.start()
 
     def read(self, timeout: float) -> Events | None:
@@ -95,6 +121,14 @@ class PlayedBus:
     def now(self) -> int | None:
         """The bus's time, ns."""
         return self._bus.now()
+
+    def change(self, parameter: str, factor: float, start: int | None = None, length: int | None = None) -> Change:
+        """Change the asset; see `Simulator.change`. Times are those of the asset, from its start."""
+        return self._asset.change(parameter, factor, start, length)
+
+    def end(self, change: Change) -> None:
+        """End a change with the asset's next step."""
+        self._asset.end(change)
 
     def close(self) -> None:
         """Silence the asset, then leave the bus."""

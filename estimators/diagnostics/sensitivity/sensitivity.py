@@ -109,7 +109,6 @@ def sensitivity(
     seen_by: str = BANK,
     false_alarm: float = HealthPolicy().false_alarm_every,
     detection: float = 0.95,
-    baseline: np.ndarray | None = None,
     executor: Executor | str | None = "threads",
 ) -> Sensitivity:
     """Nudge every sensor row, input and parameter, fold the log again, and look at what moved.
@@ -129,7 +128,6 @@ def sensitivity(
             what it does not see, nobody can.
         false_alarm: Mean time between false alarms of all tests together, s.
         detection: Probability with which the smallest visible fault is seen.
-        baseline: What was normal when the tuning was accepted, as `Fold`; without it, white innovations.
         executor: "threads", an Executor, or None to fold one after the other. The results are the same bits.
 
     Raises:
@@ -154,7 +152,13 @@ def sensitivity(
     told = uncertainty(fisher, nudges)
     t = still.t[: still.n].copy()
     tests = tests_of(
-        model, tuning, still, track, every=false_alarm, detection=detection, bank=seen_by == BANK, baseline=baseline
+        model,
+        tuning,
+        still,
+        track,
+        every=false_alarm,
+        detection=detection,
+        bank=seen_by == BANK,
     )
     faults = each(lambda response: fault(begun, response, tests), responses, executor)
     bounds = integrity([item.error for item in faults], track.std)

@@ -29,7 +29,7 @@ from ...numerics.quantiles import normal_quantile
 from ...track import USED, Track
 from ...tuning import Tuning
 from ..evidence import _RATIOS as RATIOS
-from ..evidence import FURTHEST, watched
+from ..evidence import FURTHEST, no_baseline, watched
 
 HALVINGS = 10
 """Of the bracket of a multiple, a factor of two wide: to 0.1 %."""
@@ -104,10 +104,9 @@ def tests_of(
     every: float,
     detection: float,
     bank: bool,
-    baseline: np.ndarray | None = None,
 ) -> Witness:
     """The tests of a fold: thresholds as the bank's, log(readings between false alarms · tests) of each sensor."""
-    watch = watched(model, tuning.gate, False, baseline)
+    watch = watched(model, tuning.gate, False, no_baseline(model) if tuning.baseline is None else tuning.baseline)
     t, kind, channel = log.t[: log.n], log.kind[: log.n], log.channel[: log.n]
     used = track.verdict == USED
     h, places, columns = [], [], []

@@ -148,7 +148,7 @@ def test_the_charts_leave_a_gap_where_the_estimate_is_not_a_number(view):
     lost = lost_rows(engine.fold.track)
     assert 8 <= lost[0] and lost[-1] == RESET_AT - 2 and lost.size == RESET_AT - 1 - lost[0]
     assert [item.get("label") for item in chart.series].count("mean") == 2
-    x, high, low, *_, before, after, _, _ = chart.data
+    x, high, low, *_, before, after, _, _, _ = chart.data
     seconds = np.unique(x)
     assert np.isnan(before[x >= seconds[lost[0]]]).all() and np.isfinite(before[x < seconds[lost[0]]]).all()
     assert np.isnan(after[x <= seconds[lost[-1]]]).all() and np.isfinite(after[x > seconds[lost[-1]]]).all()

@@ -22,9 +22,9 @@ STREAM = "/rerun/stream"
 class Page:
     """All that runs behind one port."""
 
-    def __init__(self, tmp_path, review=None):
+    def __init__(self, tmp_path, review=None, behind=lambda source: source):
         self.source = Scripted()
-        self.engine = Engine(shown_twin(), lambda report: self.source)
+        self.engine = Engine(shown_twin(), lambda report: behind(self.source))
         self.viser = FakeViser()
         self.server = PageServer(self.engine, port=0, viser_port=self.viser.port, secret=SECRET, review=review)
         self.server.start()

@@ -164,7 +164,7 @@ def pull(first, t, fresh=False):
     column = np.arange(first, first + n, dtype=float)
     track = SimpleNamespace(
         mean=column[:, None], std=column[:, None], nis=column, nis_mean=column, nis_low=column, nis_high=column,
-        verdict=np.zeros(n, np.int8),
+        verdict=np.zeros(n, np.int8), screened=np.zeros((n, 1), np.int8),
     )  # fmt: skip
     readings = SimpleNamespace(
         t=np.array(t, np.int64), kind=np.zeros(n, np.int8), channel=np.zeros(n, np.int32), value=column[:, None]

@@ -14,9 +14,22 @@ import viser
 import websockets
 from viser import _messages
 
-from app.engine.commands import Pause, Record, Reset, Seek, SetEstimator, SetOption, SetTuning, Speed, UseSensor
+from app.engine.commands import (
+    ClearFault,
+    InjectFault,
+    Pause,
+    Record,
+    Reset,
+    Seek,
+    SetEstimator,
+    SetOption,
+    SetTuning,
+    Speed,
+    UseSensor,
+)
 from app.server.private_viser import HEADER, guarded_server
 from app.viser.coalescer import DRAG_INTERVAL, TYPING_PAUSE
+from app.viser.faults import WHOLE
 from app.viser.history import History
 from app.viser.rows import PATIENCE
 from app.viser.vehicle_scene import VehicleScene
@@ -25,6 +38,8 @@ from config.schema import SceneSection, ViewSection
 from estimators.log import READING, RESET, TRUTH, Events
 from estimators.models import MODELS
 from estimators.numerics.peaks import Peak
+from sources.faults.fault import Fault
+from sources.faults.layer import FaultStatus
 from tests.app.fake_engine import FakeEngine, events
 
 WINDING = MODELS["motor_winding"]
@@ -196,6 +211,28 @@ def test_every_control_submits_its_command(view, engine):
         SetEstimator("ukf"), SetTuning("gate", 0.9973), UseSensor("winding", False), Speed(np.inf), Pause(True),
         Reset(), SetOption("alpha", 0.5),
     ]  # fmt: skip
+
+
+def test_a_fault_is_put_in_and_all_are_ended(view, engine):
+    faults = view.panel.faults
+    edit(faults.kind, "bias")
+    edit(faults.target, "winding")
+    edit(faults.inject, True)
+    assert engine.commands == [] and "has no size" in view.panel._note.content
+    edit(faults.size, "2 x")
+    edit(faults.inject, True)
+    assert engine.commands == [] and "it must be a number" in view.panel._note.content
+    edit(faults.size, "2,5")
+    edit(faults.inject, True)
+    assert "must be" not in view.panel._note.content
+    edit(faults.kind, "silence")
+    edit(faults.target, WHOLE)
+    edit(faults.inject, True)
+    edit(faults.stop, True)
+    assert engine.commands == [InjectFault("bias", "winding", size=2.5), InjectFault("silence"), ClearFault()]
+    engine.state.faults = (FaultStatus(0, Fault("bias", "winding", size=2.5), None, 0, 0),)
+    view.frame()
+    assert "bias of winding, size 2.5 °C" in faults.active.content
 
 
 def test_seek_goes_where_the_slider_is_left(view, engine, clock):

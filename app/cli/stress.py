@@ -1,0 +1,148 @@
+"""`nisus stress`: mistakes made with a twin on purpose, and how soon, and how rightly, it says so."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from estimators.errors import ConfigError, NisusError
+from estimators.registry import find_estimator
+
+from ..stderr import complain
+from ..stress.matrix import matrix
+from ..stress.mistake import Mistake
+from ..stress.trial import Bench, Trial, asset_of
+from ..twin.twin import load_twin
+from .arguments import settings
+from .prepare import prepare
+from .progress import progress
+
+if TYPE_CHECKING:
+    from .arguments import Stress as Arguments
+
+WIDTH = 180
+"""Columns of the output where it is not a terminal."""
+
+
+def stress_twin(arguments: Arguments) -> int:
+    """Carry the command out."""
+    twin = load_twin(arguments.twin, log_files=arguments.log or None, overrides=settings(arguments.set))
+    if arguments.seeds < 1:
+        raise ConfigError(f"--seeds {arguments.seeds}: must be 1 or more")
+    if not arguments.duration > 0:
+        raise ConfigError(f"--duration {arguments.duration:g}: must be positive")
+    names = list(dict.fromkeys(arguments.estimators or (twin.estimator,)))
+    for name in names:
+        find_estimator(name, twin.model)
+    prepare(twin)
+    first = Bench(twin, 0, arguments.duration)
+    simulated = asset_of(twin, 0) is not None
+    mistakes = _chosen(matrix(twin.model, twin.tuning, first.events, asset=simulated), arguments.only)
+    if arguments.list:
+        print("\n".join(item.name for item in mistakes))
+        return 0
+    trials: list[Trial] = []
+    failed: list[str] = []
+    with progress(
+        f"{twin.name}, {len(mistakes)} mistakes", len(mistakes) * len(names) * arguments.seeds, "folds"
+    ) as on:
+        for seed in range(arguments.seeds):
+            bench = first if seed == 0 else Bench(twin, seed, arguments.duration)
+            for name in names:
+                for mistake in mistakes:
+                    try:
+                        trials.append(bench.run(mistake, name))
+                    except NisusError as error:
+                        failed.append(f"{mistake.name}, {name}, seed {seed}: {error}")
+                    on()
+    for text in failed:
+        complain(text)
+    if arguments.json:
+        print(json.dumps([_plain(asdict(trial)) for trial in trials]))
+    else:
+        _print(trials, mistakes, names)
+    return 0
+
+
+def _chosen(mistakes: Sequence[Mistake], only: Sequence[str]) -> list[Mistake]:
+    """Those whose name holds one of `only`; all without."""
+    found = [item for item in mistakes if not only or any(text.lower() in item.name.lower() for text in only)]
+    if not found:
+        raise ConfigError(f"--only {' '.join(only)}: no mistake has that in its name; see --list")
+    return found
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _print(trials: Sequence[Trial], mistakes: Sequence[Mistake], names: Sequence[str]) -> None:
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDTH)
+    table = Table()
+    for title in ("mistake", "filter"):
+        table.add_column(title, no_wrap=True)
+    for title in ("named after s", "first word s", "green %", "before", "recovered s"):
+        table.add_column(title, justify="right")
+    for title in ("named first", "cause right", "worst state: undamaged, gate, no gate", "in the band %"):
+        table.add_column(title, no_wrap=True)
+    wrong = 0
+    for mistake in mistakes:
+        for name in names:
+            own = [trial for trial in trials if (trial.mistake, trial.estimator) == (mistake.name, name)]
+            if own:
+                table.add_row(escape(mistake.name), name, *_cells(own, mistake))
+                wrong += _wrong_and_green(own, mistake)
+    console.print(table)
+    early = sum(trial.early for trial in trials)
+    hours = sum(trial.start for trial in trials) / 3600.0
+    console.print(f"{early} false alarms in {hours:.1f} h before the mistakes; {wrong} rows wrong and green")
+
+
+def _median(values: Sequence[float | None]) -> str:
+    """The median; never counts as later than any time."""
+    ordered = sorted(np.inf if value is None else value for value in values)
+    middle = ordered[(len(ordered) - 1) // 2]
+    return f"{middle:.1f}" if np.isfinite(middle) else "never"
+
+
+def _wrong_and_green(own: Sequence[Trial], mistake: Mistake) -> bool:
+    """Whether in the median nothing was said of what should be."""
+    return bool(mistake.causes) and _median([trial.word for trial in own]) == "never"
+
+
+def _cells(own: Sequence[Trial], mistake: Mistake) -> list[str]:
+    """The figures of one mistake and filter: medians over the seeds."""
+    said = [trial.named for trial in own if trial.named]
+    most = max(set(said), key=said.count) if said else "-"
+    right = sum(trial.cause_right and trial.subject_right for trial in own)
+    states = {
+        name: [float(np.median([getattr(trial, which)[name] for trial in own])) for which in ("calm", "error", "bare")]
+        for name in own[0].calm
+    }
+    worst = max(states, key=lambda name: states[name][1] / max(states[name][0], 1e-300), default=None)
+    error, inside = "-", "-"
+    if worst is not None:
+        error = f"{escape(worst)}: {', '.join(f'{value:.3g}' for value in states[worst])}"
+        inside = f"{100 * float(np.median([trial.coverage[worst] for trial in own])):.0f}"
+    return [
+        _median([trial.delay for trial in own]) if mistake.causes else "-",
+        _median([trial.word for trial in own]),
+        f"{100 * float(np.median([trial.green for trial in own])):.0f}",
+        f"{sum(trial.early for trial in own)}",
+        "-" if mistake.fault is None else _median([trial.recovery for trial in own]),
+        escape(most),
+        f"{right}/{len(own)}" if mistake.causes else "-",
+        error,
+        inside,
+    ]

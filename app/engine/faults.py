@@ -1,0 +1,184 @@
+"""Faults on demand: what a user asks for, found in the model and put into the running source."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf
+from typing import Any, Protocol, runtime_checkable
+
+from estimators.errors import ConfigError, SourceError, nearest
+from estimators.model.state_space import StateSpaceModel
+from sources.faults.fault import Fault
+from sources.faults.kinds import KINDS, OLDER, find_kind, numbers, problem
+from sources.faults.layer import Faults, FaultStatus
+from sources.source import Source
+
+from . import commands
+
+
+@runtime_checkable
+class Faulty(Protocol):
+    """A source that stands behind a layer of faults."""
+
+    faults: Faults
+
+
+def faults_of(source: Source) -> Faults:
+    """The faults of a running source.
+
+    Raises:
+        ConfigError: If it has none: a recording that is reviewed.
+    """
+    if not isinstance(source, Faulty):
+        raise ConfigError("a recording that is reviewed holds what came, faults included; nothing can be put into it")
+    return source.faults
+
+
+def fault_of(command: commands.InjectFault, model: StateSpaceModel) -> Fault:
+    """The fault that a command asks for. A target is a sensor, an input or (of kind model) a parameter.
+
+    Where a sensor and an input have one name it is the sensor; `input.NAME` is the input.
+
+    Raises:
+        ConfigError: If the kind or the target is not known, or a number is missing or cannot be.
+    """
+    if OLDER.get(command.kind, command.kind) not in KINDS:
+        raise ConfigError(f"InjectFault: kind is {command.kind!r}; {nearest(command.kind, list(KINDS))}")
+    fault = Fault(
+        command.kind,
+        row=command.row,
+        other=command.other,
+        end=inf if command.duration is None else command.duration,
+        size=command.size,
+        rate=command.rate,
+        every=command.every,
+        count=command.count,
+    )
+    if command.target is not None:
+        what, name = _target(command.kind, command.target, model)
+        fault = replace(fault, **{what: name})  # type: ignore[arg-type]
+    wrong = problem(fault, model)
+    if wrong:
+        raise ConfigError(f"InjectFault: {' '.join(part for part in wrong if part)}".replace(": end ", ": duration "))
+    return fault
+
+
+def _target(kind: str, target: str, model: StateSpaceModel) -> tuple[str, str]:
+    """What a target is, sensor, input or parameter, and its name."""
+    known = {
+        "sensor": model.sensor_names,
+        "input": model.input_names,
+        "parameter": tuple(item.name for item in model.parameters),
+    }
+    what, dot, name = target.partition(".")
+    if dot and what in known:
+        return what, name
+    takes = [what for what in known if what in find_kind(kind).of]
+    for what in takes:
+        if target in known[what]:
+            return what, target
+    names = [name for what in takes for name in known[what]]
+    remedy = nearest(target, names) if names else "there is none"
+    raise ConfigError(f"InjectFault: target is {target!r}, no {' or '.join(takes)} of {model.name}; {remedy}")
+
+
+def check_fault(command: commands.InjectFault | commands.ClearFault, source: Source, model: StateSpaceModel) -> None:
+    """Refuse what the source would refuse.
+
+    Raises:
+        ConfigError: With the reason.
+    """
+    layer = faults_of(source)
+    if isinstance(command, commands.ClearFault):
+        if command.number is not None and command.number not in [item.number for item in layer.status()]:
+            raise ConfigError(
+                f"ClearFault: number is {command.number}; there is no such fault, see faults of the status"
+            )
+        return
+    if fault_of(command, model).parameter is not None and not layer.can_change:
+        raise ConfigError("InjectFault: kind is model; it needs a simulated asset, and this source is none")
+
+
+def carry_out(command: commands.InjectFault | commands.ClearFault, source: Source, model: StateSpaceModel) -> str:
+    """Begin a fault, or end one or all; a line about it.
+
+    Raises:
+        NisusError: If it cannot be done.
+    """
+    check_fault(command, source, model)
+    layer = faults_of(source)
+    if isinstance(command, commands.ClearFault):
+        ended = layer.clear(command.number)
+        return "no fault to end" if not ended else f"{ended} fault(s) end"
+    fault = fault_of(command, model)
+    try:
+        number = layer.inject(fault)
+    except SourceError as error:
+        raise ConfigError(f"InjectFault: {error}") from None
+    return f"fault {number} begins: {fault_text(fault, model)}"
+
+
+def unit_of(fault: Fault, model: StateSpaceModel) -> str:
+    """Unit of the values that a fault is of; an empty text if they have several."""
+    if fault.input is not None:
+        return model.inputs[model.input_names.index(fault.input)].unit
+    if fault.sensor is None:
+        return ""
+    rows = model.sensors[model.sensor_names.index(fault.sensor)].rows
+    units = {row.unit for row in rows if fault.row in (None, row.name)}
+    return units.pop() if len(units) == 1 else ""
+
+
+def fault_text(fault: Fault, model: StateSpaceModel) -> str:
+    """A fault in a few words: bias of winding, size 2 °C."""
+    own = unit_of(fault, model)
+    kind = find_kind(fault.kind)
+    units = {item.name: item.unit.replace("row", own or "units") for item in kind.parameters}
+    parts = [f"{name} {value:g} {units[name]}".removesuffix(" 1") for name, value in numbers(fault).items()]
+    with_other = f" and {fault.other}" if fault.other is not None else ""
+    return ", ".join([f"{kind.name} of {fault.target}{with_other}", *parts])
+
+
+def status_json(items: tuple[FaultStatus, ...], model: StateSpaceModel) -> list[dict[str, Any]]:
+    """The faults that hold or will, for the API; `since` in ns, null for one that is to come."""
+    return [
+        {
+            "number": item.number,
+            "kind": find_kind(item.fault.kind).name,
+            "target": item.fault.target,
+            "text": fault_text(item.fault, model),
+            "since": item.since,
+            "touched": item.touched,
+            "lost": item.lost,
+        }
+        for item in items
+    ]
+
+
+def catalogue_json(source: Source, model: StateSpaceModel) -> dict[str, Any]:
+    """The kinds of fault with what they take, and what they may be of, for a page."""
+    layer = source.faults if isinstance(source, Faulty) else None
+    return {
+        "available": layer is not None,
+        "kinds": [
+            {
+                "name": kind.name,
+                "code": kind.code,
+                "help": kind.help,
+                "of": list(kind.of),
+                "rows": kind.rows,
+                "other": kind.other,
+                "parameters": [
+                    {"name": item.name, "unit": item.unit, "help": item.help, "default": item.default}
+                    for item in kind.parameters
+                ],
+            }
+            for kind in KINDS.values()
+            if kind.name != "model" or (layer is not None and layer.can_change)
+        ],
+        "sensors": {
+            sensor.name: [{"name": row.name, "unit": row.unit} for row in sensor.rows] for sensor in model.sensors
+        },
+        "inputs": {item.name: item.unit for item in model.inputs},
+        "parameters": {item.name: item.unit for item in model.parameters},
+    }

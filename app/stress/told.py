@@ -1,0 +1,72 @@
+"""When a fold said something, of whom: from the rows in which its alarms stood."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimators.diagnostics.episodes import Episode
+from estimators.log import READING
+from estimators.track import TRACKING, WAITING
+
+if TYPE_CHECKING:
+    from estimators.fold import Fold
+
+
+def green(fold: Fold) -> np.ndarray:
+    """Rows in which the twin says that all is well, shape (N,)."""
+    health: np.ndarray = fold.track.health[: fold.n] == TRACKING
+    return health
+
+
+def said_at(fold: Fold, episode: Episode) -> int:
+    """When an episode was first heard of, ns of the log; its start is when it began, found in hindsight."""
+    log, track, model = fold.log, fold.track, fold.model
+    kind, channel = log.kind[: fold.n], log.channel[: fold.n]
+    since = log.t[: fold.n] >= round(episode.start * 1e9)
+    alarmed, health = track.alarms[: fold.n].any(axis=1), track.health[: fold.n]
+    own = episode.subject.partition(".")[0]
+    sensors = [
+        k
+        for k, sensor in enumerate(model.sensors)
+        if own == sensor.name or episode.subject in (row.name for row in sensor.rows)
+    ]
+    flagged = track.flags[: fold.n] != 0
+    if episode.cause in ("silent", "never heard", "outside"):
+        heard = flagged
+    elif sensors:
+        heard = alarmed & (kind == READING) & (channel == sensors[0])
+    else:
+        heard = (health != TRACKING) & (health != WAITING)
+    rows = np.flatnonzero(heard & since)
+    return int(log.t[rows[0]]) if rows.size else round(episode.start * 1e9)
+
+
+def first_word(fold: Fold, start: int) -> float | None:
+    """Seconds from `start` (ns) to the first row that is not green, once a reading has come; None if all stay green."""
+    t, ok = fold.log.t[: fold.n], green(fold)
+    waiting = fold.track.health[: fold.n] == WAITING
+    rows = np.flatnonzero(~ok & ~waiting & (t >= start))
+    return int(t[rows[0]] - start) / 1e9 if rows.size else None
+
+
+def green_share(fold: Fold, start: int, end: int) -> float:
+    """Share of green rows in [start, end), ns of the log."""
+    t = fold.log.t[: fold.n]
+    during = (t >= start) & (t < end)
+    return float(green(fold)[during].mean()) if during.any() else np.nan
+
+
+def recovery(fold: Fold, end: int) -> float | None:
+    """Seconds from `end` (ns) until the twin is green for good; None if it is not at the end of the log."""
+    t, ok = fold.log.t[: fold.n], green(fold)
+    after = np.flatnonzero(t >= end)
+    if not after.size:
+        return None
+    wrong = after[~ok[after]]
+    if not wrong.size:
+        return 0.0
+    if wrong[-1] == fold.n - 1:
+        return None
+    return int(t[wrong[-1] + 1] - end) / 1e9

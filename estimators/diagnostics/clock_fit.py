@@ -1,0 +1,111 @@
+"""Offset and drift of a source's clock against the host's, from when readings were stamped and when they arrived.
+
+Each arrival - t is the offset plus a delay that is never negative, so what the clock does shows at the lower edge: the
+least of each stretch of time, and a line through those. A stretch in which all were held up lies above the line, by
+more than the others scatter, and is left out.
+
+Sources: Paxson (1998), doi:10.1145/277851.277865, for the minima of segments; Moon, Skelly & Towsley (1999),
+doi:10.1109/INFCOM.1999.749287, for why the line must lie beneath all points. The least delay of the path itself cannot
+be told from an offset, and is part of it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+STRETCH = 10**9
+"""Nanoseconds of arrival of which the least delay is kept, at first; twice as long each time that `MOST` are full."""
+
+MOST = 512
+
+FEW = 8
+"""Stretches below which no drift is told."""
+
+OUTLYING = 10.0
+"""Robust deviations above the line beyond which a stretch was held up."""
+
+
+class ClockFit(NamedTuple):
+    """What t - arrival is now.
+
+    offset: seconds by which the source's clock is ahead of the host's, less the least delay. drift_ppm: what a second
+    of the host adds to it, in microseconds; NaN while too little is known. drift_error_ppm: half of its 95 % interval.
+    """
+
+    offset: float
+    drift_ppm: float
+    drift_error_ppm: float
+
+
+class LeastDelays:
+    """The least arrival - t of each stretch, in bounded memory; the same however the events were cut into batches."""
+
+    def __init__(self) -> None:
+        self._stretch = STRETCH
+        self._at: list[int] = []
+        self._arrival: list[int] = []
+        self._delay: list[int] = []
+
+    def note(self, t: np.ndarray, arrival: np.ndarray) -> None:
+        """Readings with their own and their arrival's times, ns, each (n,)."""
+        delay = arrival - t
+        stretch = arrival // STRETCH
+        # Of each stretch in the batch the least, and of these the first.
+        order = np.lexsort((arrival, delay, stretch))
+        first = np.ones(order.size, np.bool_)
+        first[1:] = np.diff(stretch[order]) != 0
+        for i in order[first]:
+            self._one(int(arrival[i]), int(delay[i]))
+
+    def _one(self, arrival: int, delay: int) -> None:
+        at = arrival // self._stretch
+        if self._at and at < self._at[-1]:
+            # The host's clock was set back: what was before is of another.
+            self._at, self._arrival, self._delay = [], [], []
+        if self._at and self._at[-1] == at:
+            if (delay, arrival) < (self._delay[-1], self._arrival[-1]):
+                self._delay[-1], self._arrival[-1] = delay, arrival
+            return
+        self._at.append(at)
+        self._arrival.append(arrival)
+        self._delay.append(delay)
+        if len(self._at) > MOST:
+            self._stretch *= 2
+            kept = list(zip(self._arrival, self._delay, strict=True))
+            self._at, self._arrival, self._delay = [], [], []
+            for earlier in kept:
+                self._one(*earlier)
+
+    def fit(self) -> ClockFit | None:
+        """The line beneath the delays; None before the first reading."""
+        if not self._at:
+            return None
+        # Relative to the last, so that nothing is lost to rounding.
+        x = np.array([arrival - self._arrival[-1] for arrival in self._arrival], float) * 1e-9
+        y = np.array([delay - self._delay[-1] for delay in self._delay], float) * 1e-9
+        last = self._delay[-1] * 1e-9
+        if x.size < FEW:
+            return ClockFit(-(last + float(y.min())), np.nan, np.nan)
+        above = y - _robust_slope(x, y) * x
+        middle = np.median(above)
+        spread = 1.4826 * np.median(np.abs(above - middle))
+        used = above <= middle + OUTLYING * spread + 1e-9
+        slope, level = np.polyfit(x[used], y[used], 1)
+        rest = y[used] - (level + slope * x[used])
+        lever = np.sum((x[used] - x[used].mean()) ** 2)
+        error = np.sqrt(np.sum(rest**2) / (used.sum() - 2) / lever)
+        return ClockFit(-(last + level + float(rest.min())), -1e6 * float(slope), 1.96e6 * float(error))
+
+
+def _robust_slope(x: np.ndarray, y: np.ndarray) -> float:
+    """The median of the slopes between all pairs of points, which a quarter of them cannot bend.
+
+    Of the least of each few neighbours, so that a thousand pairs are enough. Source: Sen (1968),
+    doi:10.1080/01621459.1968.10480934.
+    """
+    groups = np.array_split(np.arange(x.size), min(x.size, 48))
+    least = np.array([group[np.argmin(y[group])] for group in groups])
+    i, j = np.triu_indices(least.size, 1)
+    return float(np.median((y[least[j]] - y[least[i]]) / (x[least[j]] - x[least[i]])))

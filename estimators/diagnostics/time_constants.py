@@ -1,0 +1,52 @@
+"""How long a model remembers: the time constants of its linearisation."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import ModelError
+from ..model.state_space import StateSpaceModel
+from ..numerics.jit import plain
+
+MOST = 200
+"""States beyond which the eigenvalues are not worth their time."""
+
+UNSTABLE = 1.0 - 1e-9
+"""Modulus from which on a mode does not decay: a random walk, or one that grows."""
+
+_STEP = 6e-6
+
+
+def jacobian(model: StateSpaceModel, x: np.ndarray, u: np.ndarray, p: np.ndarray, dt: float) -> np.ndarray:
+    """∂f/∂x (nx, nx) over dt, by central differences of the model's own Python.
+
+    Raises:
+        ModelError: If the model fails there.
+    """
+    f = plain(model.f)
+    F = np.empty((model.nx, model.nx))
+    try:
+        for j in range(model.nx):
+            h = _STEP * max(1.0, abs(x[j]))
+            ends = []
+            for sign in (1.0, -1.0):
+                moved, out = x.copy(), np.empty(model.nx)
+                moved[j] += sign * h
+                f(moved, u, p, dt, out)
+                ends.append(out)
+            F[:, j] = (ends[0] - ends[1]) / (2.0 * h)
+    except Exception as error:  # noqa: BLE001  a user's function raises anything
+        raise ModelError(f"{model.name}: f fails at the prior: {type(error).__name__}: {error}") from None
+    return F
+
+
+def time_constants(F: np.ndarray, dt: float) -> np.ndarray:
+    """Seconds in which each mode that decays falls to 1/e, -dt/ln|λ| for the eigenvalues λ of F (n, n), slowest first.
+
+    Modes that do not decay, such as random walks, have none.
+    """
+    if not np.all(np.isfinite(F)):
+        return np.zeros(0)
+    modulus = np.abs(np.linalg.eigvals(F))
+    decaying = modulus[(modulus < UNSTABLE) & (modulus > 0.0)]
+    return np.sort(-dt / np.log(decaying))[::-1]

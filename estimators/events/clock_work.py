@@ -1,0 +1,76 @@
+"""What the guard of times works on, and what it says: events that wait, events that pass, clocks that were set."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from .batch import Events
+
+
+class Refused(NamedTuple):
+    """A lone event whose time was far ahead: its kind, channel, time (ns) and where its clock was expected (ns)."""
+
+    kind: int
+    channel: int
+    t: int
+    expected: int
+
+
+class Moved(NamedTuple):
+    """A clock that was set: kind and channel of its first event, its time as stamped, and by how much it moved (ns)."""
+
+    kind: int
+    channel: int
+    t: int
+    by: int
+
+
+class Passed(NamedTuple):
+    """What may go to the log, in order. `settled` (N,) were held: they came in time, so no horizon applies to them."""
+
+    events: Events
+    settled: np.ndarray
+    refused: list[Refused]
+    moved: list[Moved]
+
+
+def plain_events(batch: Events) -> Events:
+    """The batch, its columns as the compiled functions read them; as it is, where it is so."""
+    types_ = (np.int64, np.int64, np.int8, np.int32)
+    columns = [np.ascontiguousarray(column, kind) for column, kind in zip(batch[:4], types_, strict=True)]
+    if all(a is b for a, b in zip(columns, batch, strict=False)):
+        return batch
+    return Events(columns[0], columns[1], columns[2], columns[3], batch.value)
+
+
+class Work:
+    """Events that were held and a batch, one after the other, and what becomes of them."""
+
+    def __init__(self, events: Events, rows: np.ndarray, raw: np.ndarray, begin: int) -> None:
+        """The rows of the state (n,), the times as stamped, and how many of the events were held."""
+        self._events = events
+        self.t, self.arrival, self.kind, self.channel = events[:4]
+        self.rows, self.raw, self.begin = rows, raw, begin
+        self.live = self.raw != self.arrival
+        self.order: list[int] = []
+        self.settled: list[bool] = []
+        self.refused: list[Refused] = []
+        self.moved: list[Moved] = []
+
+    def emit(self, at: Sequence[int], *, settled: bool = False) -> None:
+        """These pass, in this order."""
+        self.order.extend(at)
+        self.settled.extend([settled] * len(at))
+
+    def shift(self, row: int, held: list[int], step: int) -> None:
+        """The clock of a row was set: correct what is held, and what is still to come."""
+        later = np.flatnonzero(self.rows == row)
+        self.t[held] += step
+        self.t[later[later > held[-1]]] += step
+
+    def select(self, at: list[int]) -> Events:
+        """The events at these places."""
+        return self._events.select(np.array(at, np.int64))

@@ -1,0 +1,353 @@
+"""The guard before the log: readings whose time cannot be true, and clocks that have moved.
+
+One reading stamped an hour ahead would make all that follow it stale. So a lone time far from where the clock of its
+source was expected is refused, and held until what comes next tells which it was:
+
+- *ahead*: after all that was said, by more than `HORIZON` and many of its own periods, and, where arrival is known,
+  ahead of it by more than ever lately. If the next readings are back in time it was a lone one, and is refused. If
+  they stay there, nothing was said for a while (a gap) and they are let in as they are; or the clock was set.
+- *back*: before the newest of its own channel by more than the horizon, so that the log would drop it as stale. If the
+  next agree on it the clock was set back; else they go to the log, which drops and counts them, as any that is late.
+
+Where a clock was set, what it stamps from then on is moved so that its time goes on without a step: with known arrivals
+by the step of t - arrival, without by continuing its channel at its own pace.
+
+It is a pure function of the events in the order of arrival: the outcome does not depend on how they were cut into
+batches. Queries and resets, which are ours, pass. Readings are judged by sensor, inputs together, true states together:
+events do not tell their source.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numba import types
+
+from ..numerics.jit import B1, I1, I2, i64, inlined, jit_brief
+from .batch import INPUT, READING, TRUTH, Events
+from .clock_work import Moved, Passed, Refused, Work, plain_events
+
+SECOND = 10**9
+
+ENOUGH = 3
+"""Readings that must agree on another time, and steps after which the period of a channel is known."""
+
+SETTLED = 2 * SECOND
+"""Of the source's own time for which they must agree at least."""
+
+PERIODS, PERIODS_LIVE = 10, 3
+"""A reading may be so many periods ahead of the newest, without and with known arrivals."""
+
+AHEAD_OF_ARRIVAL = SECOND
+"""By which t - arrival may exceed its largest lately at least, ns; else by the horizon."""
+
+RELAX = 100
+"""t - arrival at its largest comes down by one part in so many of the time that passes, where the clock falls back."""
+
+MOST = 4096
+"""Events that are held of one channel; more that never settle are no clock."""
+
+FITS, AHEAD, BACK = range(3)
+
+# Columns of the state, one row a channel and the last for all of them together: whether it has spoken; its newest and
+# its first time; how many steps forward it made and their sum; largest t - arrival lately, the last arrival; whether
+# arrivals are known; whether events are held; its last gap.
+SEEN, LAST, FIRST, STEPS, TOTAL, OFFSET, ARRIVED, LIVE, HOLDING, GAP_FROM, GAP_TO = range(11)
+
+
+@inlined
+def _reach(state, row, horizon, live):
+    """How far ahead of the newest the next time of a channel may be, ns; -1 while its period is not known."""
+    last = state.shape[0] - 1
+    if state[row, STEPS] < ENOUGH:
+        row = last
+    if state[row, STEPS] < ENOUGH:
+        return -1
+    periods = PERIODS_LIVE if live else PERIODS
+    return max(horizon, periods * (state[row, TOTAL] // state[row, STEPS]))
+
+
+@inlined
+def _judge(state, row, t, arrival, live, horizon):
+    """Whether a time fits its channel's clock, or is far ahead or back."""
+    everything = state.shape[0] - 1
+    if state[row, SEEN] and t < state[row, LAST] - horizon:
+        return BACK
+    if not state[everything, SEEN]:
+        return FITS
+    live = live or state[row, LIVE] > 0
+    reach = _reach(state, row, horizon, live)
+    if reach < 0 or t <= state[everything, LAST] + reach:
+        return FITS
+    if live:
+        known = row if state[row, SEEN] else everything
+        if t - arrival <= state[known, OFFSET] + max(horizon, AHEAD_OF_ARRIVAL):
+            return FITS
+    return AHEAD
+
+
+@inlined
+def _note(state, row, t, arrival, live, horizon):
+    """A time is let in: what its channel, and all together, are expected to say next."""
+    everything = state.shape[0] - 1
+    for k in (row, everything):
+        if not state[k, SEEN]:
+            state[k, SEEN], state[k, FIRST], state[k, LAST] = 1, t, t
+            state[k, OFFSET], state[k, ARRIVED] = t - arrival, arrival
+        step = t - state[k, LAST]
+        if step > 0:
+            period = state[k, TOTAL] // max(1, state[k, STEPS])
+            if state[k, STEPS] < ENOUGH or step <= max(horizon, PERIODS * period):
+                state[k, STEPS] += 1
+                state[k, TOTAL] += step
+            else:
+                state[k, GAP_FROM], state[k, GAP_TO] = state[k, LAST], t
+            state[k, LAST] = t
+        passed = min(max(arrival - state[k, ARRIVED], 0), SECOND)
+        state[k, OFFSET] = max(t - arrival, state[k, OFFSET] - passed // RELAX)
+        state[k, ARRIVED] = arrival
+        if live:
+            state[k, LIVE] = 1
+
+
+@inlined
+def _row(kind, channel, sensors):
+    """The row of the state for an event; -1 for those that always pass, and that the log refuses."""
+    if kind == READING and 0 <= channel < sensors:
+        return channel
+    return sensors if kind == INPUT else sensors + 1 if kind == TRUTH else -1
+
+
+@jit_brief
+def _scan(state, t, raw, arrival, kind, channel, start, horizon):
+    """Let in what fits, from `start` to the first event that does not, or whose channel holds some: its index."""
+    sensors = state.shape[0] - 3
+    for i in range(start, t.size):
+        row = _row(kind[i], channel[i], sensors)
+        if row >= 0:
+            live = raw[i] != arrival[i]
+            if state[row, HOLDING] or _judge(state, row, t[i], arrival[i], live, horizon) != FITS:
+                return i
+            _note(state, row, t[i], arrival[i], live, horizon)
+    return t.size
+
+
+@lru_cache(maxsize=1)
+def _compiled() -> tuple[Any, Any, Any, Any]:
+    """The functions, compiled for their one signature."""
+    one = (I2, i64, i64, i64, types.boolean, i64)
+    _reach.compile((I2, i64, i64, types.boolean))
+    _judge.compile(one)
+    _note.compile(one)
+    _scan.compile((I2, I1, I1, I1, B1, types.int32[::1], i64, i64))
+    return _reach, _judge, _note, _scan
+
+
+@dataclass
+class _Run:
+    """Events of one channel that agree on another time, held until it is told whether that is true."""
+
+    verdict: int
+    now: int
+    at: list[int] = field(default_factory=list)
+    t: list[int] = field(default_factory=list)
+    offset: list[int] = field(default_factory=list)
+
+
+class ClockGuard:
+    """Stands between a source and a log; `take` each batch, and `finish` at the end."""
+
+    def __init__(self, sensors: int, horizon: int) -> None:
+        """Of a model with so many sensors; `horizon` is the log's, ns."""
+        self._sensors, self._horizon = sensors, horizon
+        self._agree = min(max(SECOND // 2, horizon // 2), SETTLED)
+        self._settled = max(SETTLED, 2 * self._agree)
+        self._everything = sensors + 2
+        self._state = np.zeros((sensors + 3, 11), np.int64)
+        self._shift = np.zeros(sensors + 2, np.int64)
+        self._steps: list[int] = []
+        self._runs: dict[int, _Run] = {}
+        self._held = Events.empty(0)
+        self._raw = np.zeros(0, np.int64)
+        self._reach, self._judge, self._note, self._scan = _compiled()
+
+    @property
+    def held(self) -> int:
+        """How many events wait for what comes next."""
+        return len(self._held)
+
+    def take(self, batch: Events) -> Passed:
+        """The next events, in the order of arrival: those that may go to the log now."""
+        if not len(batch):
+            return Passed(batch, np.zeros(0, np.bool_), [], [])
+        if not self._runs and not self._shift.any():
+            batch = plain_events(batch)
+            at = self._scan(self._state, batch.t, batch.t, *batch[1:4], 0, self._horizon)
+            if at == len(batch):
+                return Passed(batch, np.zeros(len(batch), np.bool_), [], [])
+            work = self._work(batch)
+            work.emit(range(at))
+        else:
+            work = self._work(batch)
+            at = work.begin
+        while at < len(work.t):
+            stop = self._pass(work, at)
+            work.emit(range(at, stop))
+            if stop < len(work.t):
+                self._suspect(work, stop)
+            at = stop + 1
+        return self._leave(work)
+
+    def finish(self) -> Passed:
+        """The source has ended, and nothing contradicts what is held ahead.
+
+        It is let in, but for a lone one that is farther ahead than all that was said is long: that is no gap.
+        """
+        work = self._work(Events.empty(0))
+        for row in sorted(self._runs):
+            if row in self._runs:
+                run = self._runs[row]
+                first, last = (int(self._state[self._everything, k]) for k in (FIRST, LAST))
+                if run.verdict == AHEAD and (len(run.at) > 1 or run.t[0] - last <= last - first):
+                    self._anchor(work, row)
+                else:
+                    self._dissolve(work, row)
+        return self._leave(work)
+
+    def _work(self, batch: Events) -> Work:
+        batch = plain_events(batch)
+        rows = self._rows_of(batch)
+        moved = batch._replace(t=batch.t + np.where(rows >= 0, self._shift[rows], 0))
+        events = Events.concat([self._held, moved], batch.value.shape[1]) if self._runs else moved
+        rows = np.concatenate((self._rows_of(self._held), rows))
+        return Work(events, rows, np.concatenate((self._raw, batch.t)), len(self._held))
+
+    def _rows_of(self, batch: Events) -> np.ndarray:
+        """The row of the state for each event, as `_row` has it."""
+        rows = np.full(len(batch), -1, np.int64)
+        readings = (batch.kind == READING) & (batch.channel >= 0) & (batch.channel < self._sensors)
+        rows[readings] = batch.channel[readings]
+        rows[batch.kind == INPUT] = self._sensors
+        rows[batch.kind == TRUTH] = self._sensors + 1
+        return rows
+
+    def _pass(self, work: Work, start: int) -> int:
+        columns = work.t, work.raw, work.arrival, work.kind, work.channel
+        return int(self._scan(self._state, *columns, start, self._horizon))
+
+    def _verdict(self, work: Work, i: int) -> int:
+        return int(self._judge(self._state, work.rows[i], work.t[i], work.arrival[i], work.live[i], self._horizon))
+
+    def _let_in(self, work: Work, i: int) -> None:
+        self._note(self._state, work.rows[i], work.t[i], work.arrival[i], work.live[i], self._horizon)
+
+    def _suspect(self, work: Work, i: int) -> None:
+        """Deal with an event that does not fit, or whose channel holds some."""
+        row = int(work.rows[i])
+        run = self._runs.get(row)
+        if run is not None:
+            if run.verdict == AHEAD and self._verdict(work, run.at[0]) == FITS:
+                # Time has come to where they are.
+                self._release(work, row)
+                run = None
+            elif self._verdict(work, i) == FITS or not self._agrees(work, run, i) or len(run.at) == MOST:
+                self._dissolve(work, row)
+                run = None
+        verdict = self._verdict(work, i)
+        if run is None and (verdict == FITS or (verdict == BACK and not self._can_be_set_back(work, i))):
+            if verdict == FITS:
+                self._let_in(work, i)
+            work.emit([i])
+            return
+        if run is None:
+            run = self._runs[row] = _Run(verdict, int(self._state[self._everything, LAST]))
+            self._state[row, HOLDING] = 1
+        run.at.append(i)
+        run.t.append(int(work.t[i]))
+        run.offset.append(int(work.t[i]) - int(work.arrival[i]))
+        if len(run.at) >= ENOUGH and max(run.t) - min(run.t) >= self._settled:
+            self._anchor(work, row)
+
+    def _is_live(self, work: Work, i: int) -> bool:
+        return bool(work.live[i] or self._state[work.rows[i], LIVE])
+
+    def _agrees(self, work: Work, run: _Run, i: int) -> bool:
+        """Whether an event says the same of its clock as those that are held."""
+        t = int(work.t[i])
+        if self._is_live(work, i):
+            return abs(t - int(work.arrival[i]) - run.offset[0]) <= self._agree
+        if t < run.t[-1] - self._horizon:
+            return False
+        reach = int(self._reach(self._state, work.rows[i], self._horizon, False))
+        return run.verdict == AHEAD or reach < 0 or t <= run.t[-1] + reach
+
+    def _can_be_set_back(self, work: Work, i: int) -> bool:
+        """Whether a time that went back may be a clock's, and not a block of late readings, or files in a wrong order.
+
+        With known arrivals it always may. Without, a channel cannot have measured twice at one time: what fills its
+        last gap is late, and what is before its first reading belongs there.
+        """
+        if self._is_live(work, i):
+            return True
+        state, t, horizon = self._state[work.rows[i]], int(work.t[i]), self._horizon
+        in_gap = state[GAP_TO] > state[GAP_FROM] and state[GAP_FROM] - horizon <= t <= state[GAP_TO] + horizon
+        return bool(t >= state[FIRST] - horizon and not in_gap)
+
+    def _anchor(self, work: Work, row: int) -> None:
+        """What is held was true: let it in, with the clock set right if it was one that moved."""
+        run, state = self._runs[row], self._state[row]
+        first = run.at[0]
+        now = int(self._state[self._everything, LAST])
+        step = 0
+        if self._is_live(work, first):
+            known = row if state[SEEN] else self._everything
+            step = int(self._state[known, OFFSET]) - max(run.offset)
+        elif run.verdict == BACK:
+            step = int(state[LAST] + state[TOTAL] // max(1, state[STEPS])) - run.t[0]
+        elif now > run.now:
+            # The others went on meanwhile, so this was no gap.
+            step = run.now - run.t[0]
+        if step:
+            # The sensors of one source share its clock.
+            near = [known for known in self._steps if abs(known - step) <= self._agree]
+            step = near[-1] if near else step
+            self._steps = [*self._steps[-7:], *([] if near else [step])]
+            work.moved.append(Moved(int(work.kind[first]), int(work.channel[first]), int(work.raw[first]), -step))
+            self._shift[row] += step
+            work.shift(row, run.at, step)
+        self._release(work, row)
+        for other in sorted(self._runs):
+            held = self._runs[other]
+            if held.verdict == AHEAD and self._verdict(work, held.at[0]) == FITS:
+                self._release(work, other)
+
+    def _release(self, work: Work, row: int) -> None:
+        run = self._end(row)
+        for i in run.at:
+            self._let_in(work, i)
+        work.emit(run.at, settled=True)
+
+    def _dissolve(self, work: Work, row: int) -> None:
+        """What is held was not true: refused if it is ahead; what is back goes to the log, which counts it as stale."""
+        run = self._end(row)
+        if run.verdict == BACK:
+            work.emit(run.at)
+            return
+        expected = int(self._state[self._everything, LAST])
+        work.refused += [Refused(int(work.kind[i]), int(work.channel[i]), int(work.raw[i]), expected) for i in run.at]
+
+    def _end(self, row: int) -> _Run:
+        self._state[row, HOLDING] = 0
+        return self._runs.pop(row)
+
+    def _leave(self, work: Work) -> Passed:
+        """What passes; what is still held is kept for the next batch."""
+        kept = sorted(i for run in self._runs.values() for i in run.at)
+        place = {i: k for k, i in enumerate(kept)}
+        for run in self._runs.values():
+            run.at = [place[i] for i in run.at]
+        self._held, self._raw = work.select(kept), work.raw[kept]
+        return Passed(work.select(work.order), np.array(work.settled, np.bool_), work.refused, work.moved)

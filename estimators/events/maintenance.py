@@ -1,0 +1,57 @@
+"""Maintenance: when something of the asset was changed, and which version of the model each event is of.
+
+A version of the model lasts from one maintenance to the next; the first is 1. The states that are named start again
+from the prior's variance, uncorrelated with the others, as what was known of them was of the part that is gone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .batch import MAINTENANCE, Events
+
+
+def maintained(t: int, arrival: int, states: Sequence[int], width: int) -> Events:
+    """The events of one maintenance at t (ns): one for each state (its index) that starts again."""
+    n = len(states)
+    return Events(
+        np.full(n, t, np.int64),
+        np.full(n, arrival, np.int64),
+        np.full(n, MAINTENANCE, np.int8),
+        np.array(states, np.int32),
+        np.full((n, width), np.nan),
+    )
+
+
+def model_versions(events: Events, before: int = 1) -> np.ndarray:
+    """The version of the model at each event (N,) of a log, in its order, where it begins with version `before`."""
+    rows = np.flatnonzero(events.kind == MAINTENANCE)
+    first = np.concatenate((rows[:1], rows[1:][np.diff(events.t[rows]) > 0]))
+    begins = np.zeros(len(events), np.int64)
+    begins[first] = 1
+    version: np.ndarray = before + np.cumsum(begins)
+    return version
+
+
+def versions_dropped(events: Events, count: int) -> int:
+    """How many versions of the model end with the oldest `count` events, when these are dropped.
+
+    A maintenance whose events are dropped in part is told by those that stay.
+    """
+    times = [events.t[part][events.kind[part] == MAINTENANCE] for part in (slice(0, count), slice(count, None))]
+    return int(np.setdiff1d(times[0], times[1][:1]).size)
+
+
+def without(cov: np.ndarray, prior: np.ndarray, state: int) -> np.ndarray:
+    """A covariance (nx, nx), or variances (1, nx), in which one state is as unknown as in the prior's, and apart."""
+    if cov.shape[0] == 1 < cov.shape[1]:
+        variances = cov.copy()
+        variances[0, state] = prior[0, state]
+        return variances
+    apart = cov.copy()
+    apart[state, :] = 0.0
+    apart[:, state] = 0.0
+    apart[state, state] = prior[0, state] if prior.shape[0] == 1 else prior[state, state]
+    return apart

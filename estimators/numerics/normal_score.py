@@ -1,0 +1,115 @@
+"""Normal scores e = Φ⁻¹(F(y)), by which any continuous prediction F of a number y gives e ~ N(0, 1) where it is right.
+
+Sources: Rosenblatt (1952), doi:10.1214/aoms/1177729394; Dawid (1984), doi:10.2307/2981683, for the judgement of
+sequential forecasts by it; Smith (1985), doi:10.1002/for.3980040305, for the step to normal scores.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .jit import inlined, jit
+from .simd_tails import add_tails as _add_tails
+
+FURTHEST = 8.0
+"""|e| at most: a probability of 6e-16, beyond which no prediction means what it says."""
+
+_EXACT = 1e8
+"""Degrees of freedom from which a Student t is a normal variable, to a double's digits where |e| ≤ `FURTHEST`."""
+
+# Numerator and denominator of AS 241, about the median, in the tails, and far out in them.
+_A = (
+    3.3871328727963666080e0, 1.3314166789178437745e2, 1.9715909503065514427e3, 1.3731693765509461125e4,
+    4.5921953931549871457e4, 6.7265770927008700853e4, 3.3430575583588128105e4, 2.5090809287301226727e3,
+)  # fmt: skip
+_B = (
+    1.0, 4.2313330701600911252e1, 6.8718700749205790830e2, 5.3941960214247511077e3,
+    2.1213794301586595867e4, 3.9307895800092710610e4, 2.8729085735721942674e4, 5.2264952788528545610e3,
+)  # fmt: skip
+_C = (
+    1.42343711074968357734e0, 4.63033784615654529590e0, 5.76949722146069140550e0, 3.64784832476320460504e0,
+    1.27045825245236838258e0, 2.41780725177450611770e-1, 2.27238449892691845833e-2, 7.74545014278341407640e-4,
+)  # fmt: skip
+_D = (
+    1.0, 2.05319162663775882187e0, 1.67638483018380384940e0, 6.89767334985100004550e-1,
+    1.48103976427480074590e-1, 1.51986665636164571966e-2, 5.47593808499534494600e-4, 1.05075007164441684324e-9,
+)  # fmt: skip
+_E = (
+    6.65790464350110377720e0, 5.46378491116411436990e0, 1.78482653991729133580e0, 2.96560571828504891230e-1,
+    2.65321895265761230930e-2, 1.24266094738807843860e-3, 2.71155556874348757815e-5, 2.01033439929228813265e-7,
+)  # fmt: skip
+_F = (
+    1.0, 5.99832206555887937690e-1, 1.36929880922735805310e-1, 1.48753612908506148525e-2,
+    7.86869131145613259100e-4, 1.84631831751005468180e-5, 1.42151175831644588870e-7, 2.04426310338993978564e-15,
+)  # fmt: skip
+
+
+@inlined
+def _fraction(numerator, denominator, x):
+    """A quotient of two polynomials of degree 7."""
+    above = 0.0
+    below = 0.0
+    for k in range(7, -1, -1):
+        above = above * x + numerator[k]
+        below = below * x + denominator[k]
+    return above / below
+
+
+@jit
+def tail_quantile(p):
+    """The z ≥ 0 beyond which a standard normal variable lies with a probability of p ≤ ½, to about 16 digits.
+
+    Source: Wichura (1988), Algorithm AS 241, doi:10.2307/2347330.
+    """
+    q = 0.5 - p
+    if q <= 0.425:
+        return q * _fraction(_A, _B, 0.180625 - q * q)
+    r = math.sqrt(-math.log(p))
+    return _fraction(_C, _D, r - 1.6) if r <= 5.0 else _fraction(_E, _F, r - 5.0)
+
+
+@jit
+def normal_score(lower, upper):
+    """Φ⁻¹(F) of F = lower / (lower + upper), from the smaller of the two, so that no digit of a tail is lost.
+
+    Never beyond `FURTHEST`, and NaN if both are 0 or either is NaN.
+    """
+    whole = lower + upper
+    if not whole > 0.0:
+        return np.nan
+    p = min(lower, upper) / whole
+    e = min(tail_quantile(p), FURTHEST) if p > 0.0 else FURTHEST
+    return -e if lower < upper else e
+
+
+@jit
+def student_score(t, dof):
+    """Φ⁻¹(T(t)) of Student's distribution T with `dof` degrees of freedom, in closed form.
+
+    e = (8 dof + 1) / (8 dof + 3) · √(dof log(1 + t² / dof)), with the sign of t. For |e| ≤ 3 it is 0.006 off at 9
+    degrees of freedom, 0.0002 at 49, and 0.2 at a single one; for |e| ≤ 6 it is 0.05 off at 9 and 0.002 at 49.
+
+    Source: Wallace (1959), Bounds on normal approximations to Student's and the chi-square distributions, The Annals of
+    Mathematical Statistics 30, 1121-1130.
+    """
+    e = abs(t)
+    if dof < _EXACT:
+        e = (8.0 * dof + 1.0) / (8.0 * dof + 3.0) * math.sqrt(dof * math.log1p(t * t / dof))
+    return math.copysign(min(e, FURTHEST), t) if np.isfinite(e) else np.nan
+
+
+@jit
+def add_tail(z, w, tails):
+    """tails[0] += w Φ(z), tails[1] += w Φ(-z)."""
+    beyond = 0.5 * math.erfc(abs(z) * math.sqrt(0.5))
+    within = 1.0 - beyond
+    tails[0] += w * (within if z > 0.0 else beyond)
+    tails[1] += w * (beyond if z > 0.0 else within)
+
+
+@inlined
+def add_tails(n, d, shift, scale, w, tails):
+    """tails[0] += Σ w[:n] Φ(z) and tails[1] += Σ w[:n] Φ(-z) of z = scale (d[:n] + shift), within 2e-8 of each term."""
+    _add_tails(n, d.ctypes.data, shift, scale, w.ctypes.data, tails.ctypes.data)

@@ -1,0 +1,190 @@
+"""The catalogue of faults: what each kind does, what it takes, of what it may be; and what a fault must keep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf, isfinite
+
+from estimators.errors import LARGEST, nearest
+from estimators.model.state_space import StateSpaceModel
+
+from .fault import Fault
+
+LONGEST = 1e6
+"""Seconds by which an event may be late, eleven days."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number that a kind takes; one without a default must be given. `holds` is what it must keep, `rule` in words.
+
+    In `unit`, "row" stands for the unit of the sensor's row or of the input.
+    """
+
+    name: str
+    unit: str
+    help: str
+    default: float | None
+    holds: Callable[[float], bool]
+    rule: str
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of fault; `code` stands for it in the log's stamps, so it never changes.
+
+    `of` says what it may be of: sensor, input, parameter, or twin, the whole. `rows` says that it may be of one row.
+    """
+
+    name: str
+    code: int
+    help: str
+    of: tuple[str, ...]
+    parameters: tuple[Parameter, ...] = ()
+    rows: bool = False
+    other: bool = False
+
+
+def _size(unit: str, text: str) -> Parameter:
+    return Parameter("size", unit, text, None, lambda x: abs(x) <= LARGEST, f"must lie within {LARGEST:g}")
+
+
+def _positive(unit: str, text: str) -> Parameter:
+    return Parameter("size", unit, text, None, lambda x: 0.0 < x <= LARGEST, "must be positive")
+
+
+def _seconds(name: str, text: str, default: float | None = None) -> Parameter:
+    def holds(x: float) -> bool:
+        return (0.0 < x if default is None else 0.0 <= x) and x <= LONGEST
+
+    low = "positive" if default is None else "zero or positive"
+    return Parameter(name, "s", text, default, holds, f"must be {low}, and {LONGEST:g} s at most")
+
+
+def _rate(text: str, default: float | None = 1.0) -> Parameter:
+    return Parameter("rate", "1", text, default, lambda x: 0.0 < x <= 1.0, "is a probability, above 0 and 1 at most")
+
+
+VALUE = ("sensor", "input")
+ANY = ("sensor", "input", "twin")
+
+_LIST = (
+    Kind("bias", 1, "size is added to what is said", VALUE, (_size("row", "what is added"),), rows=True),
+    Kind("drift", 2, "size is added for every second since the start", VALUE,
+         (_size("row/s", "what a second adds"),), rows=True),
+    Kind("scale", 3, "what is said is multiplied by size", VALUE, (_size("1", "the factor"),), rows=True),
+    Kind("stuck", 4, "what was said last before the start is repeated", ("sensor", "input", "twin"), rows=True),
+    Kind("spike", 5, "with probability rate a draw of that standard deviation is added", VALUE,
+         (_positive("row", "standard deviation of a spike"), _rate("probability, a reading", None)), rows=True),
+    Kind("noise", 6, "a draw of that standard deviation is added to each reading", VALUE,
+         (_positive("row", "standard deviation of the added noise"),), rows=True),
+    Kind("quantisation", 7, "what is said is rounded to multiples of size", VALUE,
+         (Parameter("size", "row", "the step", None, lambda x: 1e-9 <= x <= LARGEST, "must be 1e-9 or more"),),
+         rows=True),
+    Kind("dropout", 8, "with probability rate a reading arrives empty", ANY, (_rate("probability, a reading"),)),
+    Kind("silence", 9, "nothing arrives; an input stays as it was told last", ANY),
+    Kind("delay", 10, "what is said arrives later by size", ANY, (_seconds("size", "the delay"),)),
+    Kind("jitter", 11, "what is said arrives later by a draw of an exponential distribution", ANY,
+         (_seconds("size", "mean of the delays"),)),
+    Kind("bursts", 12, "what is said is kept back, and arrives together every so many seconds", ANY,
+         (_seconds("every", "seconds between two arrivals"),)),
+    Kind("reorder", 13, "with probability rate a reading arrives after the next one of its kind", ANY,
+         (_rate("probability, a reading"),)),
+    Kind("duplicate", 14, "with probability rate a reading is said again", ANY,
+         (_rate("probability, a reading"),
+          _seconds("every", "seconds between repetitions, by stamp and arrival; 0 repeats the stamp", 0.0),
+          Parameter("count", "1", "repetitions of a reading", 1.0,
+                    lambda x: 1.0 <= x <= 1000.0 and x == round(x), "must be a whole number from 1 to 1000"))),
+    Kind("clock_jump", 15, "the clock that stamps what is said is ahead by size", ANY,
+         (Parameter("size", "s", "how far ahead; negative is behind", None, lambda x: abs(x) <= 1e9,
+                    "must lie within 1e9 s"),)),
+    Kind("clock_drift", 16, "the clock that stamps what is said gains size seconds a second", ANY,
+         (Parameter("size", "s/s", "what it gains; negative loses", None, lambda x: abs(x) < 1.0,
+                    "must lie between -1 and 1"),)),
+    Kind("swap", 17, "the readings of sensor come as those of other, and the other way round", ("sensor",),
+         other=True),
+    Kind("model", 18, "a true parameter of the simulated asset is multiplied by size", ("parameter",),
+         (_size("1", "the factor"),)),
+)  # fmt: skip
+
+KINDS = {kind.name: kind for kind in _LIST}
+"""By name."""
+
+OLDER = {"outliers": "spike"}
+"""Names by which a kind was known."""
+
+
+def find_kind(name: str) -> Kind:
+    """The kind of that name, today's or an older one."""
+    return KINDS[OLDER.get(name, name)]
+
+
+def problem(fault: Fault, model: StateSpaceModel) -> tuple[str, str] | None:
+    """What is wrong with a fault: its field (or an empty text, for the fault itself) and a text; None if nothing is."""
+    if OLDER.get(fault.kind, fault.kind) not in KINDS:
+        return "kind", f"is {fault.kind!r}; {nearest(fault.kind, list(KINDS))}"
+    kind = find_kind(fault.kind)
+    return _of_target(fault, kind, model) or _of_numbers(fault, kind)
+
+
+def _of_target(fault: Fault, kind: Kind, model: StateSpaceModel) -> tuple[str, str] | None:
+    known = {
+        "sensor": list(model.sensor_names),
+        "input": list(model.input_names),
+        "parameter": [item.name for item in model.parameters],
+    }
+    given = [what for what in known if getattr(fault, what) is not None]
+    if len(given) > 1:
+        return given[1], f"is given beside {given[0]}; a fault is of one of them"
+    what = given[0] if given else "twin"
+    if what not in kind.of:
+        if given:
+            return what, f"means nothing to a fault of kind {fault.kind}; leave it out"
+        return "", f"is of kind {fault.kind} and has no {' or '.join(kind.of)}; add it"
+    for field, names, word in ((what, known.get(what, []), what), ("other", known["sensor"], "sensor")):
+        name = getattr(fault, field, None)
+        if name is not None and name not in names:
+            return field, f"is {name!r}, no {word} of {model.name}; {nearest(name, names)}"
+    if (fault.other is not None) != kind.other:
+        if kind.other:
+            return "", f"is of kind {fault.kind} and has no other; add it"
+        return "other", f"means nothing to a fault of kind {fault.kind}; leave it out"
+    rows = {sensor.name: [row.name for row in sensor.rows] for sensor in model.sensors}
+    if kind.other:
+        ours, theirs = len(rows[str(fault.sensor)]), len(rows[str(fault.other)])
+        if fault.other == fault.sensor or ours != theirs:
+            return "other", f"is {fault.other!r}; it must be another sensor than {fault.sensor}, with {ours} row(s)"
+    if fault.row is not None:
+        if not kind.rows or fault.sensor is None:
+            return "row", f"means nothing to a fault of kind {fault.kind}; leave it out"
+        if fault.row not in rows[fault.sensor]:
+            near = nearest(fault.row, rows[fault.sensor])
+            return "row", f"is {fault.row!r}, no row of {fault.sensor}; {near}"
+    return None
+
+
+def _of_numbers(fault: Fault, kind: Kind) -> tuple[str, str] | None:
+    if not (isfinite(fault.start) and 0.0 <= fault.start <= LARGEST):
+        return "start", f"is {fault.start:g} s; it must be zero or positive"
+    if not fault.start < fault.end or not (fault.end <= LARGEST or fault.end == inf):
+        return "end", f"is {fault.end} s; it must be above start ({fault.start} s)"
+    takes = {item.name: item for item in kind.parameters}
+    for name in ("size", "rate", "every", "count"):
+        value = getattr(fault, name)
+        if name not in takes:
+            if value is not None:
+                return name, f"means nothing to a fault of kind {fault.kind}; leave it out"
+        elif value is None:
+            if takes[name].default is None:
+                return "", f"is of kind {fault.kind} and has no {name}; add it"
+        elif not (isfinite(value) and takes[name].holds(value)):
+            return name, f"is {value:g}; it {takes[name].rule}"
+    return None
+
+
+def numbers(fault: Fault) -> dict[str, float]:
+    """The numbers of a fault by name, defaults filled in."""
+    given = {item.name: getattr(fault, item.name) for item in find_kind(fault.kind).parameters}
+    defaults = {item.name: item.default for item in find_kind(fault.kind).parameters}
+    return {name: float(value if value is not None else defaults[name] or 0.0) for name, value in given.items()}

@@ -1,0 +1,295 @@
+"""The faults of one source: scheduled and injected, changed from any thread while another reads."""
+
+from __future__ import annotations
+
+import heapq
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import inf
+
+import numpy as np
+
+from estimators.errors import SourceError
+from estimators.log import INPUT, Events
+from estimators.model.state_space import StateSpaceModel
+
+from .active import Active
+from .change import NEVER, Change, Changeable
+from .fault import Fault
+from .item import Item, events_of, items_of
+from .kinds import find_kind, problem
+from .times import ns
+
+
+@dataclass
+class _Entry:
+    """A fault with its number, and its window in ns once it is known."""
+
+    number: int
+    fault: Fault
+    scheduled: bool
+    base: int | None
+    end: int = NEVER
+    change: Change | None = None
+
+    def window(self, base: int) -> tuple[int, int]:
+        last = NEVER if self.fault.end == inf else base + ns(self.fault.end)
+        return base + ns(self.fault.start), min(self.end, last)
+
+
+@dataclass(frozen=True)
+class FaultStatus:
+    """A fault that holds or will: its number, since when (ns; None: not yet), events that it touched and swallowed."""
+
+    number: int
+    fault: Fault
+    since: int | None
+    touched: int
+    lost: int
+
+
+class Faults:
+    """Makes of a source's events what they become under faults, which act one after the other in order of number.
+
+    The same events, seed and faults give the same bits, in whatever batches the events come. What arrives later is kept
+    back until an event that arrived after it has come, or `release` is told that its time has come; nothing is lost
+    but what a silence swallows, which is counted.
+
+    Raises:
+        SourceError: If a scheduled fault does not fit the model, with its number and remedy.
+    """
+
+    def __init__(self, model: StateSpaceModel, scheduled: Sequence[Fault] = (), *, seed: int = 0) -> None:
+        self._model, self._seed = model, seed
+        self._lock = threading.Lock()
+        self._asset: Changeable | None = None
+        self._entries: list[_Entry] = []
+        for number, fault in enumerate(scheduled):
+            self._check(fault, f"fault {number + 1}")
+            self._entries.append(_Entry(number, fault, True, None))
+        self._next = len(scheduled)
+        self._begin()
+
+    def _check(self, fault: Fault, name: str) -> None:
+        wrong = problem(fault, self._model)
+        if wrong:
+            raise SourceError(f"{name}: {' '.join(part for part in wrong if part)}")
+
+    def _begin(self) -> None:
+        """Nothing has come yet."""
+        self._active: list[tuple[_Entry, Active]] = []
+        self._waiting: list[tuple[int, int, Item]] = []
+        self._sent = 0
+        self._origin: int | None = None
+        self._newest: int | None = None
+        self._clock: int | None = None
+        self._told = np.full(len(self._model.inputs), np.nan)
+
+    # From any thread
+
+    def inject(self, fault: Fault) -> int:
+        """Begin a fault with the next event; its start and end count from there. Gives its number.
+
+        Raises:
+            SourceError: If it does not fit the model, or the source is no asset whose parameters could change.
+        """
+        self._check(fault, "fault")
+        if find_kind(fault.kind).name == "model":
+            # With the asset's next step, which is not known before.
+            fault = replace(fault, start=0.0, end=fault.end - fault.start)
+        with self._lock:
+            entry = _Entry(self._next, fault, False, None if self._newest is None else self._newest + 1)
+            if find_kind(fault.kind).name == "model":
+                self._change(entry)
+            self._next += 1
+            self._entries.append(entry)
+            if self._origin is not None:
+                self._activate(entry)
+            return entry.number
+
+    def clear(self, number: int | None = None) -> int:
+        """End the fault of that number, or all, with the next event; how many there were.
+
+        Raises:
+            SourceError: If there is none of that number.
+        """
+        with self._lock:
+            found = [
+                item
+                for item in self._entries
+                if number in (None, item.number)
+                and not self._over(item)
+                # A model that is to change back with its asset's next step.
+                and (item.change is None or item.end == NEVER)
+            ]
+            if number is not None and not found:
+                raise SourceError(f"there is no fault {number} that could end")
+            for entry in found:
+                self._end(entry)
+            return len(found)
+
+    def status(self) -> tuple[FaultStatus, ...]:
+        """The faults that hold or will."""
+        with self._lock:
+            running = {entry.number: active for entry, active in self._active}
+            found = []
+            for entry in self._entries:
+                active = running.get(entry.number)
+                if self._over(entry):
+                    continue
+                since, touched, lost = (active.since, active.touched, active.lost) if active else (None, 0, 0)
+                found.append(FaultStatus(entry.number, entry.fault, since, touched, lost))
+            return tuple(found)
+
+    @property
+    def lost(self) -> int:
+        """Events that faults swallowed, since the source began."""
+        with self._lock:
+            return sum(active.lost for _, active in self._active)
+
+    @property
+    def can_change(self) -> bool:
+        """Whether the source is an asset whose true parameters can be changed."""
+        return self._asset is not None
+
+    def attach(self, source: object) -> None:
+        """The source was opened: changes of the model that are to come are told to it.
+
+        Raises:
+            SourceError: If there are some, and it is no simulated asset.
+        """
+        with self._lock:
+            self._asset = source if isinstance(source, Changeable) else None
+            for entry in self._entries:
+                if find_kind(entry.fault.kind).name == "model":
+                    self._change(entry)
+
+    # On the thread that reads
+
+    def restart(self) -> None:
+        """The source began again: so does everything, with the faults where they were."""
+        with self._lock:
+            self._begin()
+
+    def pass_on(self, batch: Events) -> Events:
+        """What comes in place of a batch."""
+        with self._lock:
+            if not len(batch):
+                return batch
+            if self._origin is None:
+                self._origin = int(batch.t[0])
+                for entry in self._entries:
+                    self._activate(entry)
+            width = batch.value.shape[1]
+            if self._active or self._waiting:
+                out: list[Item] = []
+                for item in items_of(batch):
+                    self._clock = item.arrival if self._clock is None else max(self._clock, item.arrival)
+                    out += self._due(self._clock - 1)
+                    out += self._send(self._through([item]))
+                passed = events_of(out, width)
+            else:
+                self._clock = max(int(batch.arrival.max()), self._clock if self._clock is not None else -NEVER)
+                passed = batch
+            self._newest = max(int(batch.t.max()), self._newest if self._newest is not None else -NEVER)
+            self._note_inputs(passed)
+            return passed
+
+    def release(self, now: int) -> Events:
+        """What has arrived by `now`, ns; only when no event that arrived before is still to come."""
+        with self._lock:
+            return events_of(self._due(now), self._model.width)
+
+    def finish(self) -> Events:
+        """What is still kept back, when the source has ended."""
+        with self._lock:
+            kept: list[Item] = []
+            for k, (_, active) in enumerate(self._active):
+                kept += self._through(active.flush(), k + 1)
+            return events_of(self._send(kept) + self._due(NEVER), self._model.width)
+
+    # With the lock held
+
+    def _through(self, items: list[Item], first: int = 0) -> list[Item]:
+        for _, active in self._active[first:]:
+            items = active.process(items)
+        return items
+
+    def _send(self, items: list[Item]) -> list[Item]:
+        """Those that have arrived; the others wait."""
+        out = []
+        for item in items:
+            if self._clock is not None and item.arrival > self._clock:
+                heapq.heappush(self._waiting, (item.arrival, self._sent, item))
+                self._sent += 1
+            else:
+                out.append(item)
+        return out
+
+    def _due(self, until: int) -> list[Item]:
+        out = []
+        while self._waiting and self._waiting[0][0] <= until:
+            out.append(heapq.heappop(self._waiting)[2])
+        return out
+
+    def _note_inputs(self, events: Events) -> None:
+        rows = events.value[events.kind == INPUT][:, : self._told.size]
+        for k in range(self._told.size if len(rows) else 0):
+            known = rows[~np.isnan(rows[:, k]), k]
+            if known.size:
+                self._told[k] = known[-1]
+
+    def _activate(self, entry: _Entry) -> None:
+        assert self._origin is not None
+        if entry.base is None:
+            entry.base = self._origin
+        start, end = entry.window(entry.base)
+        active = Active(
+            entry.fault,
+            self._model,
+            (self._seed, entry.number),
+            start,
+            end,
+            scheduled=entry.scheduled,
+            inputs=self._told,
+        )
+        self._active.append((entry, active))
+
+    def _over(self, entry: _Entry) -> bool:
+        """Whether it has ended, or ends with the next event."""
+        if entry.base is None or self._newest is None:
+            return False
+        return entry.window(entry.base)[1] <= self._newest + 1
+
+    def _end(self, entry: _Entry) -> None:
+        entry.end = self._newest + 1 if self._newest is not None else -NEVER
+        begun = any(item is entry and active.begun for item, active in self._active)
+        if entry.change is not None and self._asset is not None:
+            self._asset.end(entry.change)
+            if not self._asset.live:
+                entry.end = entry.change.end
+        if not begun:
+            self._entries.remove(entry)
+            self._active = [(item, active) for item, active in self._active if item is not entry]
+        for item, active in self._active:
+            if item is entry:
+                active.end = entry.end
+
+    def _change(self, entry: _Entry) -> None:
+        """Tell the asset of a change of its model, and learn from when on it holds."""
+        fault = entry.fault
+        if self._asset is None:
+            raise SourceError("a fault of kind model needs a simulated asset; this source has none")
+        start = None
+        if entry.scheduled:
+            start = ns(fault.start)
+        elif entry.change is not None and not self._asset.live:
+            start = entry.change.start
+        length = None if fault.end == inf else ns(fault.end - fault.start)
+        change = self._asset.change(str(fault.parameter), float(fault.size or 0.0), start, length)
+        if entry.end != NEVER and entry.change is not None:
+            change.end = entry.change.end
+        entry.change = change
+        if not (self._asset.live or entry.scheduled):
+            entry.base = change.start

@@ -1,0 +1,183 @@
+"""The matrix of mistakes and its runner: figures against rows counted by hand, and mistakes whose outcome is known."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from app.cli.main import main
+from app.stress.matrix import matrix
+from app.stress.mistake import Mistake
+from app.stress.told import first_word, green_share, recovery, said_at
+from app.stress.trial import Bench, without_truth
+from app.twin.twin import load_twin
+from estimators.diagnostics.episodes import Episode
+from estimators.log import READING, TICK, TRUTH, Log
+from estimators.models import MODELS
+from estimators.track import DEGRADED, SUSPECT, TRACKING, WAITING
+from estimators.tuning import Tuning
+from sources.faults.kinds import problem
+from tests.support import SECOND, log_of
+
+MODEL = MODELS["motor_drive"]
+
+
+def folded(health, alarms=None, channel=None):
+    """A fold of a reading a second, whose health and alarms are written down here."""
+    n = len(health)
+    log = log_of(4, *((float(k), READING, [0.0], 0 if channel is None else channel[k]) for k in range(n)))
+    track = SimpleNamespace(
+        health=np.array(health, np.int8),
+        alarms=np.zeros((n, 3), np.int32) if alarms is None else np.array(alarms, np.int32).reshape(n, -1),
+        flags=np.zeros(n, np.int64),
+    )
+    return SimpleNamespace(log=log, track=track, n=n, model=MODEL)
+
+
+W, T, S, D = WAITING, TRACKING, SUSPECT, DEGRADED
+
+
+def test_words_shares_and_recovery_count_rows():
+    fold = folded([W, W, T, T, S, S, T, D, T, T])
+    assert first_word(fold, 0) == 4.0 and first_word(fold, 5 * SECOND) == 0.0 and first_word(fold, 8 * SECOND) is None
+    assert green_share(fold, 2 * SECOND, 8 * SECOND) == 3 / 6
+    assert recovery(fold, 6 * SECOND) == 2.0 and recovery(fold, 8 * SECOND) == 0.0
+    assert recovery(folded([T, T, S, S]), SECOND) is None
+
+
+def episode(subject, cause, start=0.0):
+    return Episode(start, None, subject, cause, 0.0, 0.0, 0.0, "", "")
+
+
+def test_an_episode_is_heard_of_in_the_first_row_that_alarms_after_it_began():
+    channel = [0, 1, 2] * 3
+    alarms = [[0, 0, 0]] * 4 + [[8, 0, 0], [4, 0, 0], [0, 0, 0], [8, 0, 0], [0, 0, 0]]
+    fold = folded([T] * 4 + [S] * 5, alarms, channel)
+    first, second, third = MODEL.sensor_names
+    assert said_at(fold, episode(second, "shifted")) == 4 * SECOND
+    assert said_at(fold, episode(third, "shifted", 2.0)) == 5 * SECOND
+    assert said_at(fold, episode(second, "shifted", 4.5)) == 7 * SECOND
+    assert said_at(fold, episode("twin", "diverged")) == 4 * SECOND
+
+
+def test_the_matrix_can_be_made():
+    """Each mistake of it is a fault that the source takes, or an entry of the tuning that can be set."""
+    tuning = Tuning.of(MODEL)
+    events = log_of(
+        MODEL.width, *((float(k), 1, [0.0, 10.0 + k, 100.0, 40.0, 20.0][: len(MODEL.inputs)]) for k in range(5))
+    )
+    found = matrix(MODEL, tuning, events.events, asset=True)
+    names = [item.name for item in found]
+    assert len(set(names)) == len(names) and len(found) > 60
+    for item in found:
+        assert (item.fault is None) != (not item.belief)
+        for key, factor in item.belief.items():
+            tuning.set(key, factor * tuning.get(key))
+        for fault in item.fault(10.0, 20.0) if item.fault is not None else ():
+            assert problem(fault, MODEL) is None and (fault.start, fault.end) == (10.0, 20.0)
+    for wanted in ("R x10", "Q /100", "yoke +5 σ", "tooth stuck", "all stuck", "winding silent", "winding spikes 1 %"):
+        assert wanted in names
+    # Twenty-five percent of an input that never changes, half of what another varies by; one that is zero has no size.
+    assert "speed +25 rad/s" in names and "i_q +2 A" in names and not any(name.startswith("i_d +") for name in names)
+    assert not any(item.of_asset for item in matrix(MODEL, tuning, events.events, asset=False))
+
+
+def test_subject_and_cause():
+    mistake = Mistake("", frozenset({"shifted"}), frozenset({"yoke"}))
+    assert mistake.right_cause(episode("tooth", "shifted")) and not mistake.right_subject(episode("tooth", "shifted"))
+    assert mistake.right_subject(episode("yoke.top", "wide")) and not mistake.right_cause(episode("yoke", "wide"))
+
+
+def test_a_log_without_truth_keeps_its_rows():
+    events = log_of(2, (0, TICK, []), (1, TRUTH, [5.0, 6.0]), (1, READING, [1.0]), (2, TRUTH, [7.0], 1)).events
+    log = Log(2)
+    log.extend(without_truth(events))
+    assert log.n == len(events) and not np.any(log.kind[: log.n] == TRUTH)
+    np.testing.assert_array_equal(log.t[: log.n], events.t)
+    np.testing.assert_array_equal(log.kind[: log.n] == READING, events.kind == READING)
+    np.testing.assert_array_equal(log.value[: log.n][events.kind == READING], events.value[events.kind == READING])
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return Bench(load_twin("motor_winding"), 0, 240.0)
+
+
+def chosen(bench, name):
+    twin = bench.twin
+    return next(item for item in matrix(twin.model, twin.tuning, bench.events, asset=True) if item.name == name)
+
+
+def test_what_comes_late_within_the_horizon_changes_nothing(bench):
+    trial = bench.run(chosen(bench, "all 0.5 s late"), "kf")
+    # The twin ships without a gate, so the fold without one is the undisturbed one.
+    assert trial.bare == trial.calm and trial.stale == 0
+    assert (trial.word, trial.delay, trial.named, trial.green, trial.recovery) == (None, None, None, 1.0, 0.0)
+
+
+def test_the_error_of_a_bias_is_what_a_linear_filter_makes_of_it(bench):
+    """A Kalman filter without a gate is linear: its error under a bias b is that without it plus b times one response,
+    so the mean square is a quadratic in b. Those at 0, 2 and 5 give that at 20, to rounding.
+    """
+    trials = {size: bench.run(chosen(bench, f"winding +{size} σ"), "kf") for size in (2, 5, 20)}
+    assert {(trial.start, trial.end) for trial in trials.values()} == {(80.0, 160.0)}
+    sizes = np.array([0.0, 2.0, 5.0])
+    square = (
+        np.array([trials[2].calm["temperature"], trials[2].bare["temperature"], trials[5].bare["temperature"]]) ** 2
+    )
+    expected = np.sqrt(np.polyval(np.polyfit(sizes, square, 2), 20.0))
+    assert trials[20].bare["temperature"] == pytest.approx(expected, rel=1e-9)
+    assert trials[20].bare["temperature"] > 10 * trials[20].calm["temperature"]
+    # With a gate it is refused for a while.
+    assert trials[20].error["temperature"] < 0.9 * trials[20].bare["temperature"]
+    assert trials[20].coverage["temperature"] < 0.2
+
+
+def test_what_must_be_seen_is_seen_and_named(bench):
+    for name, named in (("R x100", "winding wide"), ("winding stuck", "winding stuck"), ("all silent", "twin stale")):
+        trial = bench.run(chosen(bench, name), "kf")
+        assert trial.named == named and trial.cause_right and trial.subject_right
+        assert 0.0 <= trial.word <= trial.delay < 40.0 and trial.green < 0.6 and trial.early == 0
+
+
+def test_a_change_of_the_asset_is_made_in_the_asset():
+    twin = load_twin("motor_can")
+    bench = Bench(twin, 1, 30.0)
+    mistake = chosen(bench, "winding_tooth of the asset +30 %")
+    damaged = bench._damaged(mistake, 10.0, 20.0)
+    for events in (bench.events, damaged):
+        assert events.t.max() <= 30 * SECOND
+    assert len(damaged) == len(bench.events)
+    same = np.all((damaged.value == bench.events.value) | np.isnan(damaged.value), axis=1)
+    assert np.all(same[damaged.t < 10 * SECOND]) and not np.any(
+        same[(damaged.kind == TRUTH) & (damaged.t > 10 * SECOND)]
+    )
+    assert not np.array_equal(Bench(twin, 2, 30.0).events.value, bench.events.value, equal_nan=True)
+
+
+def test_the_command_prints_a_table_or_json(capsys):
+    given = ["stress", "motor_winding", "--only", "winding stuck", "R x100", "--seeds", "2", "--duration", "120"]
+    assert main(given) == 0
+    out = capsys.readouterr().out
+    assert "winding stuck" in out and "2/2" in out and "0 rows wrong and green" in out
+    assert main([*given, "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [(row["mistake"], row["seed"]) for row in rows] == [
+        ("R x100", 0), ("winding stuck", 0), ("R x100", 1), ("winding stuck", 1),
+    ]  # fmt: skip
+    assert main(["stress", "motor_winding", "--list", "--duration", "60"]) == 0
+    assert "Q /100" in capsys.readouterr().out.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (["--only", "earthquake"], "--only earthquake: no mistake has that in its name; see --list"),
+        (["--seeds", "0"], "--seeds 0: must be 1 or more"),
+        (["--duration", "-3"], "--duration -3: must be positive"),
+    ],
+)
+def test_what_cannot_be_asked_for_is_one_line(given, says, capsys):
+    assert main(["stress", "motor_winding", *given]) == 2
+    assert says in capsys.readouterr().err

@@ -1,0 +1,158 @@
+"""Limits and ranges of validity as a twin's YAML says them: what they come to, what is refused, what is told of it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from app.cli.arguments import Fold as Arguments
+from app.cli.fold import fold_twin
+from app.engine.counts import RowCounts
+from app.engine.refusals import refusals
+from app.recording.format import base_from_json, base_to_json
+from app.twin.twin import load_twin
+from estimators.errors import ConfigError
+from estimators.fold import Fold
+from estimators.log import Log
+from estimators.model.limits import Limits, Stuck
+from estimators.tuning import Tuning
+
+TWIN = """\
+model: motor_winding
+estimator: kf
+sensors:
+  winding:
+    std: 0.5
+    {limits}
+{more}
+source:
+  type: table
+  files: log.csv
+  time: {{column: t, unit: s}}
+  sensors:
+    winding: {{columns: T, where: {{ok: 1}}}}
+"""
+
+
+def write(folder: Path, limits: str, more: str = "") -> str:
+    path = folder / "twin.yaml"
+    path.write_text(TWIN.format(limits=limits, more=more))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("limits", "expected"),
+    [
+        ("range: [-40, 180]", Limits(range=((-40.0, 180.0),))),
+        ("range: [[-40, null]]", Limits(range=((-40.0, np.inf),))),
+        ("saturation: [null, 250]", Limits(saturation=((-np.inf, 250.0),))),
+        ("rate: 5", Limits(rate=(5.0,))),
+        ("stuck: {readings: 20, quantum: 0.1}", Limits(stuck=Stuck(readings=20, quantum=(0.1,)))),
+        ("stuck: {quantum: 0.5, std: 0.2}", Limits(stuck=Stuck(quantum=(0.5,), std=(0.2,)))),
+        ("duplicates: {within: 0.05}", Limits(duplicates=0.05)),
+        ("use: true", None),
+    ],
+)
+def test_limits_reach_the_sensor(tmp_path, limits, expected) -> None:
+    assert load_twin(write(tmp_path, limits)).model.sensors[0].limits == expected
+
+
+def test_a_range_of_validity_takes_the_place_of_the_models(tmp_path) -> None:
+    model = load_twin(write(tmp_path, "use: true", "valid: {temperature: {min: 0, max: 150}}")).model
+    assert [state.fitted for state in model.states if state.name == "temperature"] == [(0.0, 150.0)]
+
+
+@pytest.mark.parametrize(
+    ("limits", "more", "said"),
+    [
+        ("range: [5, 1]", "", r"twin.yaml:6: sensors.winding.range is \[5, 1\]; the first must be below the second"),
+        ("range: [5]", "", r"twin.yaml:6: sensors.winding.range is \[5\]; give the least and the greatest value"),
+        ("range: [[1, 2], [1, 2]]", "", "twin.yaml:6: sensors.winding.range has 2 entries; give one, or 1"),
+        ("rate: -1", "", "twin.yaml:6: sensors.winding.rate is -1; it must be positive"),
+        ("stuck: {quantum: 0}", "", "twin.yaml:6: sensors.winding.stuck.quantum is 0; it must be positive"),
+        ("stuck: {readings: 1}", "", "twin.yaml:6: sensors.winding.stuck.readings is 1; it must be 2 or more"),
+        ("stuck: {readings: 3, seconds: 1}", "", "sensors.winding.stuck gives both readings and seconds; keep one"),
+        ("stuck: {}", "", "twin.yaml:6: sensors.winding.stuck gives neither readings, seconds nor quantum"),
+        ("duplicates: {within: -1}", "", "sensors.winding.duplicates.within is -1; it must be zero or positive"),
+        (
+            "use: true",
+            "valid: {temprature: {min: 0}}",
+            "valid.temprature is no state or input of motor_winding; .*temperature",
+        ),
+        (
+            "use: true",
+            "valid: {rate: {min: 1, max: 1}}",
+            "valid.rate is a mapping; its min must be below its max",
+        ),
+    ],
+)
+def test_what_means_nothing_is_refused_with_its_place(tmp_path, limits, more, said) -> None:
+    with pytest.raises(ConfigError, match=said):
+        load_twin(write(tmp_path, limits, more))
+
+
+def test_a_quantum_says_nothing_of_a_sensor_without_noise(tmp_path) -> None:
+    path = write(tmp_path, "stuck: {quantum: 0.1}")
+    Path(path).write_text(Path(path).read_text().replace("std: 0.5", "std: 0"))
+    with pytest.raises(ConfigError, match="gives a quantum alone, which says nothing of a sensor without noise"):
+        load_twin(path)
+
+
+def log_with_faults(folder: Path) -> None:
+    """A log of 60 s: 10 of them not valid, three out of range, of which one is written twice, and a jump."""
+    rng = np.random.default_rng(1)
+    values = 30 + rng.normal(0, 0.5, 60)
+    values[[20, 21, 22]] = 500.0, -300.0, 500.0
+    values[40] = 60.0
+    rows = [f"{t},{y:.6f},{int(not 5 <= t < 15)}" for t, y in enumerate(values)]
+    rows.insert(21, rows[20])
+    (folder / "log.csv").write_text("\n".join(["t,T,ok", *rows]) + "\n")
+
+
+def test_what_was_refused_is_counted_told_and_kept(tmp_path, capsys) -> None:
+    log_with_faults(tmp_path)
+    path, out = write(tmp_path, "range: [-40, 180]\n    rate: 5"), tmp_path / "out.parquet"
+    assert fold_twin(Arguments(path, json=True)) == 0
+    told = json.loads(capsys.readouterr().out)
+    # The spikes are both out of range and too fast.
+    expected = {"range": 3, "rate": 4, "duplicate": 1, "condition": 10}
+    assert told["screened"] == {"winding": expected}
+    assert fold_twin(Arguments(path, out=out)) == 0
+    text = capsys.readouterr().out
+    assert "not used of winding" in text and "range 3, rate 4, duplicate 1, condition 10" in text
+    table = pq.read_table(out).to_pandas()
+    reasons = table["screened"].value_counts().to_dict()
+    assert reasons == {"range, rate": 3, "rate": 1, "duplicate": 1}
+    spikes = table[table["screened"] == "range, rate"]
+    assert sorted(spikes["value_0"]) == [-300.0, 500.0, 500.0] and set(spikes["verdict"]) == {"screened"}
+
+
+def test_counts_and_lines_name_sensor_value_and_rule(tmp_path) -> None:
+    twin = load_twin(write(tmp_path, "range: [-40, 180]\n    rate: 5"))
+    log = Log.of(twin.model)
+    log.add("winding", [0, 1, 1, 2, 3], [30, 30, 30, 500, 60])
+    fold = Fold("kf", twin.model, Tuning.of(twin.model), log)
+    fold.advance()
+    lines = dict(refusals(twin.model, log, fold.track, 0))
+    assert lines["duplicate winding"].startswith("winding: 30 °C came again; it counts once: look for what")
+    assert lines["range winding"].startswith("winding: 500 °C is outside -40 to 180 °C; not used: look at the sensor")
+    assert lines["rate winding"].startswith("winding: 60 °C is further from the last good reading than 5 °C/s allows;")
+    assert len(lines) == 3
+    counts = RowCounts(twin.model)
+    found = counts.count(fold.track, log.channel)
+    assert (found["screened"], found["used"]) == (3, 2)
+    assert (found["duplicate winding"], found["range winding"], found["rate winding"]) == (1, 1, 2)
+
+
+def test_a_base_keeps_what_the_screen_remembers(tmp_path) -> None:
+    twin = load_twin(write(tmp_path, "rate: 5"))
+    log = Log.of(twin.model)
+    log.add("winding", np.arange(100.0), np.full(100, 30.0))
+    fold = Fold("kf", twin.model, Tuning.of(twin.model), log)
+    fold.advance()
+    base = fold.base_at(100)[1]
+    again = base_from_json(base_to_json(base))
+    assert again is not None and base.edge is not None and again.edge is not None
+    assert again.edge.tobytes() == base.edge.tobytes() and base.edge.any()

@@ -1,0 +1,98 @@
+"""What of a twin's time comes from its YAML, and what from its model."""
+
+import json
+
+import pytest
+
+from app.cli.arguments import Fold
+from app.cli.fold import fold_twin
+from app.twin.twin import load_twin
+from estimators.errors import ConfigError
+
+TWIN = """
+model: motor_winding
+time: {%s}
+source: {type: simulator, seed: 1, step: 2.0, duration: 600, sensors: {winding: {every: %d}}}
+%s
+"""
+
+
+def made(tmp_path, time="horizon: 2", every=1, more=""):
+    path = tmp_path / "motor.yaml"
+    path.write_text(TWIN % (time, every, more))
+    return path
+
+
+def test_the_yaml_wins(tmp_path):
+    twin = load_twin(made(tmp_path, "degraded_after: 4.5"))
+    assert twin.policy.degraded_after == 4.5 and twin.degraded.reason == "time.degraded_after"
+
+
+@pytest.mark.parametrize(("every", "seconds"), [(1, 6.0), (2, 12.0), (4, 15.0)])
+def test_three_periods_of_the_slowest_sensor_and_no_more_than_stale(tmp_path, every, seconds):
+    """The winding's rate is a random walk: nothing of it decays."""
+    twin = load_twin(made(tmp_path, every=every))
+    assert twin.policy.degraded_after == seconds
+
+
+def test_a_model_that_decays_gives_its_slowest_time_constant():
+    """gripper_contact forgets within 0.95 s, so the least holds; the bench's magnet takes minutes, so stale_after."""
+    assert load_twin("gripper_contact").degraded.seconds == 3.0
+    slow = load_twin("motor_bench", overrides={"time.stale_after": "10000"}).degraded
+    assert slow.seconds == pytest.approx(399.0, abs=0.5) and "399" in slow.reason
+
+
+def test_large_ensembles_do_not_go_back():
+    """400 MB a snapshot: they are 4096 events apart, and each event takes seconds."""
+    large = load_twin("thermal_field_large")
+    assert large.late.inflate and "4096 events x 50," in large.late.reason
+    small = load_twin("motor_winding")
+    assert not small.late.inflate and "64 events" in small.late.reason
+    exact = load_twin("thermal_field_large", overrides={"time.late": "exact"})
+    assert not exact.late.inflate
+
+
+def test_a_filter_of_one_gain_cannot_inflate(tmp_path):
+    with pytest.raises(ConfigError, match="motor.yaml:3: estimator kf-steady: readings bring their own variance"):
+        load_twin(made(tmp_path, "late: inflate", more="estimator: kf-steady"))
+
+
+def test_maintenance_of_the_yaml_is_in_the_fold(tmp_path, capsys):
+    more = "maintenance:\n- {at: 100, what: new fan, states: [rate]}\n"
+    out = tmp_path / "track.parquet"
+    assert fold_twin(Fold(str(made(tmp_path, more=more)), out=out, json=True)) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["degraded_after"]["seconds"] == 6.0 and told["late"]["inflate"] is False
+    assert told["wrong_time"] == told["stale"] == told["inflated"] == 0
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(out).to_pandas()
+    rows = table[table.event == "maintenance"]
+    assert rows.seconds.tolist() == [100.0]
+    assert table.model_version.tolist() == [1 + (k >= rows.index[0]) for k in table.index]
+    assert table.tuning_version.nunique() == 1
+
+
+@pytest.mark.parametrize(
+    ("states", "text"), [("[ratte]", "did you mean rate"), ("[rate, rate]", "names a state twice"), ("[]", "states")]
+)
+def test_maintenance_of_states_that_are_not_there_is_refused_with_its_line(tmp_path, states, text):
+    more = f"maintenance:\n- {{at: 100, what: new fan, states: {states}}}\n"
+    with pytest.raises(ConfigError, match=f"motor.yaml:[67].*{text}"):
+        load_twin(made(tmp_path, more=more))
+
+
+@pytest.mark.parametrize("how", ["exact", "inflate"])
+def test_late_rows_of_a_table_are_used_either_way(tmp_path, how, capsys):
+    lines = [f"{k}.0,{40 + 0.01 * k:.2f}" for k in range(300)]
+    lines[100], lines[101] = lines[101], lines[100]
+    (tmp_path / "log.csv").write_text("\n".join(["t,y", *lines]))
+    (tmp_path / "twin.yaml").write_text(
+        f"model: motor_winding\nestimator: kf\ntime: {{late: {how}}}\n"
+        "source: {type: table, files: log.csv, time: {column: t}, sensors: {winding: {columns: y}}}\n"
+    )
+    out = tmp_path / "track.parquet"
+    assert fold_twin(Fold(str(tmp_path / "twin.yaml"), out=out, json=True)) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["readings"] == 300 and told["stale"] == 0
+    assert told["inflated"] == (1 if how == "inflate" else 0)

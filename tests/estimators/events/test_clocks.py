@@ -1,0 +1,233 @@
+"""The guard of times: lone wrong stamps go, clocks that were set go on, gaps and late readings stay as they are.
+
+The truth of each stream is made first and then spoiled, so what must come out is known without the guard.
+"""
+
+import numpy as np
+import pytest
+
+from estimators.events.clocks import ClockGuard
+from estimators.log import INPUT, READING, TICK, TRUTH, Events, Log
+from tests.support import SECOND
+
+HORIZON = 2 * SECOND
+HOUR = 3600.0
+
+
+def events(t, arrival=None, kind=READING, channel=0):
+    """Events whose value is their number, so that each can be found again."""
+    t = np.round(np.asarray(t, float) * SECOND).astype(np.int64)
+    arrival = t.copy() if arrival is None else np.round(np.asarray(arrival, float) * SECOND).astype(np.int64)
+    n = t.size
+    value = np.arange(n, dtype=float).reshape(n, 1)
+    return Events(t, arrival, np.full(n, kind, np.int8), np.broadcast_to(np.int32(channel), n).copy(), value)
+
+
+class Outcome:
+    """A stream through guard and log, cut before the events at `cuts`."""
+
+    def __init__(self, stream, cuts=(), horizon=HORIZON, sensors=2):
+        guard, self.log = ClockGuard(sensors, horizon), Log(1)
+        self.stale, self.refused, self.moved = 0, [], []
+        edges = [0, *sorted(cuts), len(stream)]
+        passed = [guard.take(stream.select(slice(a, b))) for a, b in zip(edges, edges[1:], strict=False)]
+        for part in (*passed, guard.finish()):
+            self.stale += self.log.extend(part.events, horizon, part.settled)[1]
+            self.refused += part.refused
+            self.moved += part.moved
+        assert guard.held == 0
+        assert self.log.n + self.stale + len(self.refused) == len(stream)
+
+    @property
+    def numbers(self):
+        return self.log.value[: self.log.n, 0]
+
+    @property
+    def seconds(self):
+        return self.log.t[: self.log.n] / SECOND
+
+    def told(self):
+        log = self.log
+        return self.stale, self.refused, self.moved, *(column[: log.n].tolist() for column in log._columns()[:4])
+
+
+T = np.arange(2000.0)
+DELAY = 0.01
+
+
+@pytest.mark.parametrize("arrivals", [False, True])
+@pytest.mark.parametrize("ahead", [HOUR, 60.0, 365 * 86400.0])
+def test_one_reading_stamped_ahead_costs_itself_only(arrivals, ahead):
+    t = T.copy()
+    t[200] += ahead
+    made = Outcome(events(t, T + DELAY if arrivals else None))
+    assert made.numbers.tolist() == [*range(200), *range(201, 2000)]
+    assert made.stale == 0 and not made.moved
+    (refused,) = made.refused
+    assert refused.t == round(t[200] * SECOND) and refused.expected == 199 * SECOND
+
+
+@pytest.mark.parametrize("ahead", [HOUR, -HOUR, 30.0, -30.0])
+def test_a_clock_that_was_set_is_named_and_goes_on(ahead):
+    """With arrivals the step is known to the delay, which here is the same for all: no time is off at all."""
+    t = T + np.where(T >= 200, ahead, 0.0)
+    made = Outcome(events(t, T + DELAY))
+    np.testing.assert_array_equal(made.seconds, T)
+    assert made.numbers.tolist() == list(range(2000)) and not made.refused and not made.stale
+    (moved,) = made.moved
+    assert moved.by == round(ahead * SECOND) and moved.t == round(t[200] * SECOND)
+
+
+def test_a_clock_that_is_set_there_and_back_is_followed_both_times():
+    t = T + np.where((T >= 200) & (T < 900), HOUR, 0.0)
+    made = Outcome(events(t, T + DELAY))
+    np.testing.assert_array_equal(made.seconds, T)
+    assert [move.by for move in made.moved] == [round(HOUR * SECOND), -round(HOUR * SECOND)]
+
+
+def test_a_step_is_known_within_the_jitter_of_the_delay():
+    """The least delay of those that settled it, against the least of the ones before: off by the jitter at most."""
+    jitter = np.random.default_rng(4).uniform(0.0, 0.3, T.size)
+    made = Outcome(events(T + np.where(T >= 200, HOUR, 0.0), T + jitter))
+    assert not made.refused and not made.stale and len(made.moved) == 1
+    assert np.abs(made.seconds - T).max() <= 0.3
+
+
+def test_a_table_whose_clock_is_set_back_goes_on_at_its_own_pace():
+    made = Outcome(events(T - np.where(T >= 1000, 300.0, 0.0)))
+    np.testing.assert_array_equal(made.seconds, T)
+    assert [move.by for move in made.moved] == [-300 * SECOND]
+
+
+def test_sensors_of_one_clock_keep_their_times_to_each_other():
+    """Two sensors at 1 and 4 Hz: alone each would go on at its own pace, apart by up to a period of the slower."""
+    t = np.concatenate((T, np.sort(np.random.default_rng(9).uniform(0.0, 500.0, T.size))))
+    sensor = np.repeat([0, 1], T.size)
+    order = np.argsort(t, kind="stable")
+    order = order[t[order] < 490.0]
+    t, sensor = t[order], sensor[order]
+    made = Outcome(events(t - np.where(t >= 400.0, 300.0, 0.0), channel=sensor))
+    assert not made.refused and not made.stale and len(made.moved) == 2
+    true = np.round(t * SECOND).astype(np.int64)[made.numbers.astype(int)]
+    late = made.log.t[: made.log.n] - true
+    assert np.all(late[:100] == 0) and np.ptp(late[true > 400 * SECOND]) == 0
+
+
+@pytest.mark.parametrize("arrivals", [False, True])
+def test_a_night_without_data_is_as_it_was(arrivals):
+    t = T + np.where(T >= 700, 36000.0, 0.0) + np.where(T >= 1500, 90.0, 0.0)
+    made = Outcome(events(t, t + DELAY if arrivals else None))
+    np.testing.assert_array_equal(made.seconds, t)
+    assert not made.refused and not made.moved and not made.stale
+
+
+def test_inputs_that_change_seldom_are_no_jumps():
+    """They come at once, as the readings do: their own pace says nothing."""
+    at = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 500.0, 1500.0])
+    readings, inputs = events(T), events(at, kind=INPUT)
+    stream = Events.concat([readings, inputs], 1)
+    stream = stream.select(np.argsort(stream.t, kind="stable"))
+    made = Outcome(stream)
+    np.testing.assert_array_equal(made.log.t[: made.log.n], stream.t)
+
+
+def test_a_wrong_row_of_a_table_is_refused_whole():
+    t = np.repeat(T, 3)
+    t[300:303] += HOUR
+    stream = events(t)._replace(kind=np.tile(np.array([INPUT, READING, TRUTH], np.int8), T.size))
+    made = Outcome(stream)
+    assert len(made.refused) == 3 and made.stale == 0 and made.log.n == 5997
+
+
+def without_guard(stream):
+    """How many the log has and has dropped as stale, event by event."""
+    log = Log(1)
+    stale = sum(log.extend(stream.select(slice(k, k + 1)), HORIZON)[1] for k in range(len(stream)))
+    return log.n, stale
+
+
+def test_late_readings_are_as_before():
+    """A block that fills a gap, without arrivals: stale beyond the horizon, and no clock that went back."""
+    stream = events(np.concatenate((T[:100], T[160:220], T[100:160], T[220:])))
+    made = Outcome(stream)
+    assert (made.log.n, made.stale) == without_guard(stream) and made.stale == 60
+    assert not made.refused and not made.moved
+
+
+@pytest.mark.parametrize("until", [359.5, 360.0, 363.5])
+def test_a_block_that_was_held_up_on_its_way_is_late_not_another_clock(until):
+    """It arrives in one go, so t - arrival is another for each reading; those after newer ones are stale."""
+    arrival = np.where((T >= 300) & (T < 360), until + (T - 300) * 1e-3, T) + DELAY
+    order = np.argsort(arrival, kind="stable")
+    stream = events(T[order], arrival[order])
+    made = Outcome(stream)
+    assert (made.log.n, made.stale) == without_guard(stream)
+    assert not made.moved and not made.refused
+
+
+def test_files_in_a_wrong_order_are_stale_as_before():
+    made = Outcome(events(np.concatenate((T[1000:], T[:1000]))))
+    assert made.stale == 1000 and not made.moved
+
+
+def test_the_host_clock_that_is_set_is_no_matter():
+    """Its times go on evenly, whatever arrival says."""
+    for step in (HOUR, -HOUR):
+        made = Outcome(events(T, T + np.where(T >= 300, step, 0.0) + DELAY))
+        np.testing.assert_array_equal(made.seconds, T)
+        assert not made.moved and not made.refused
+
+
+def test_a_lone_last_reading_is_refused_only_where_no_gap_is_so_long():
+    assert len(Outcome(events([*T, 1e6])).refused) == 1
+    assert Outcome(events([*T, 1e6, 1e6 + 1])).log.n == 2002
+    assert Outcome(events([*T, 3500.0])).log.n == 2001
+
+
+def test_queries_and_resets_pass_whatever_their_time():
+    stream = Events.concat([events(T), events([1e7], kind=TICK), events(T[-1] + 1 + T)], 1)
+    made = Outcome(stream)
+    assert made.log.n == 4001
+
+
+def spoiled(seed):
+    """Two sensors, inputs and truth with lone jumps, steps there and back, gaps and late ones, with arrivals or not."""
+    rng = np.random.default_rng(seed)
+    n = 400
+    t = np.cumsum(rng.exponential(0.2, n)) + np.where(np.arange(n) > rng.integers(n), rng.choice([0.0, 500.0]), 0.0)
+    arrival = t + rng.exponential(0.05, n)
+    stamped = t.copy()
+    for _ in range(rng.integers(4)):
+        begin, length = rng.integers(n), rng.integers(1, 150)
+        stamped[begin : begin + length] += rng.choice([-1, 1]) * rng.choice([5.0, 60.0, 3600.0])
+    late = rng.random(n) < 0.05
+    stamped[late] -= rng.uniform(0.0, 6.0, late.sum())
+    stream = events(stamped, arrival if rng.random() < 0.6 else None)
+    kind = rng.choice(np.array([READING, READING, INPUT, TRUTH, TICK], np.int8), n)
+    channel = np.where(kind == READING, rng.integers(0, 2, n), 0).astype(np.int32)
+    return stream._replace(kind=kind, channel=channel)
+
+
+@pytest.mark.parametrize("seed", range(150))
+def test_cuts_change_nothing_and_everything_is_counted(seed):
+    stream = spoiled(seed)
+    cuts = np.random.default_rng(seed).integers(0, 400, seed % 40)
+    assert Outcome(stream, cuts).told() == Outcome(stream).told()
+
+
+@pytest.mark.parametrize("seed", range(1000, 1030))
+def test_event_by_event_is_the_same_too(seed):
+    stream = spoiled(seed)
+    assert Outcome(stream, range(1, len(stream))).told() == Outcome(stream).told()
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_what_is_in_time_passes_untouched(seed):
+    """Readings late by less than the horizon, in the order of arrival: all of them, and at once."""
+    rng = np.random.default_rng(seed)
+    t = np.cumsum(rng.exponential(0.1, 500))
+    arrival = t + rng.uniform(0.0, rng.uniform(0.0, 1.5), 500)
+    order = np.argsort(arrival, kind="stable")
+    stream = events(t[order], arrival[order], channel=rng.integers(0, 2, 500))
+    passed = ClockGuard(2, HORIZON).take(stream)
+    assert passed.events is stream and not passed.settled.any()

@@ -1,0 +1,161 @@
+"""Maintenance: the states that are named are as unknown as at the start, whatever the filter, the pieces, the order."""
+
+import numpy as np
+import pytest
+
+from estimators.compiled.model import compile_model
+from estimators.events.maintenance import maintained, model_versions
+from estimators.fold import Fold, fold
+from estimators.log import INPUT, MAINTENANCE, READING, TICK, Events, Log
+from estimators.models import MODELS
+from estimators.registry import ESTIMATORS
+from estimators.tuning import Tuning
+from estimators.versions import last_maintenance, model_version_at
+from tests.support import SECOND, assert_same
+
+MODEL = MODELS["motor_winding"]
+INTERPRETED = next(name for name, entry in ESTIMATORS.items() if entry.interpreted)
+PAIR = np.array([[0, 1]])
+HALF = SECOND // 2
+
+
+def stream(n=300, at=(100, 200), states=(1,), seed=0):
+    """Readings of the winding at every second, and maintenance half a second after those numbered `at`."""
+    y = 40.0 + np.cumsum(np.random.default_rng(seed).normal(size=n))
+    t = np.arange(1, n + 1) * SECOND
+    readings = Events(t, t, np.full(n, READING, np.int8), np.zeros(n, np.int32), y.reshape(n, 1))
+    changes = [maintained((k + 1) * SECOND + HALF, 0, states, MODEL.width) for k in at]
+    return Events.concat([readings, *changes], MODEL.width)
+
+
+def log_of(events):
+    log = Log.of(MODEL)
+    log.extend(events)
+    return log
+
+
+def test_the_kalman_filter_is_the_textbooks_with_the_covariance_edited():
+    """The recursion written out, with F and Q of the model measured at its own functions."""
+    log = log_of(stream(states=(1,)))
+    tuning = Tuning.of(MODEL)
+    track = fold("kf", MODEL, tuning, log, pairs=PAIR)
+    made = compile_model(MODEL)
+    n, u = MODEL.nx, np.array([item.default for item in MODEL.inputs])
+    H = np.zeros((1, n))
+    H[0, 0] = 1.0
+    x, P, clock = MODEL.prior_mean.copy(), np.diag(MODEL.prior_std**2), None
+    for k in range(log.n):
+        dt = 0.0 if clock is None else (log.t[k] - clock) * 1e-9
+        steps = max(1, int(np.ceil(dt / MODEL.max_step))) if dt else 0
+        for _ in range(steps):
+            zero, F = np.empty(n), np.empty((n, n))
+            made.f(np.zeros(n), u, tuning.p, dt / steps, zero)
+            for j in range(n):
+                column = np.empty(n)
+                made.f(np.eye(n)[j], u, tuning.p, dt / steps, column)
+                F[:, j] = column - zero
+            Q = np.zeros((n, n))
+            made.Q(x, u, tuning.p, tuning.q, dt / steps, Q)
+            x, P = F @ x + zero, F @ P @ F.T + Q
+        clock = log.t[k]
+        if log.kind[k] == MAINTENANCE:
+            j = log.channel[k]
+            P[j, :] = P[:, j] = 0.0
+            P[j, j] = MODEL.prior_std[j] ** 2
+        else:
+            S = H @ P @ H.T + tuning.r[0]
+            K = P @ H.T / S
+            x = x + K[:, 0] * (log.value[k, 0] - x[0])
+            P = P - K @ H @ P
+        # Both are rounded at each of some hundreds of steps.
+        np.testing.assert_allclose(track.mean[k], x, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(track.std[k], np.sqrt(np.diag(P)), rtol=1e-8)
+        np.testing.assert_allclose(track.cross[k], P[0, 1], rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("estimator", ["kf", "ekf", "iekf", "ukf", "ckf", "sr-kf", "sr-ekf", "sr-ukf"])
+def test_mean_stays_and_the_variance_is_the_priors(estimator):
+    log = log_of(Events.concat([stream(), query()], MODEL.width))
+    track = fold(estimator, MODEL, Tuning.of(MODEL), log, pairs=PAIR)
+    rows = np.flatnonzero(log.events.kind == MAINTENANCE)
+    assert rows.size == 2
+    for row in rows:
+        np.testing.assert_allclose(track.std[row, 1], MODEL.prior_std[1], rtol=1e-9)
+        assert abs(track.cross[row, 0]) < 1e-9
+    # A query at that time, which comes before it, tells what it was before.
+    before = rows[0] - 1
+    assert log.kind[before] == TICK
+    np.testing.assert_allclose(track.mean[rows[0]], track.mean[before], rtol=1e-9)
+    np.testing.assert_allclose(track.std[rows[0], 0], track.std[before, 0], rtol=1e-9)
+    assert track.std[before, 1] < 0.9 * track.std[rows[0], 1]
+
+
+def query():
+    return Events.one(101 * SECOND + HALF, 0, TICK, 0, [], MODEL.width)
+
+
+@pytest.mark.parametrize(("estimator", "count"), [("pf", 4000), ("enkf", 1000), ("etkf", 1000)])
+def test_members_are_drawn_from_the_same(estimator, count):
+    tuning = Tuning.of(MODEL).with_options({"particles" if estimator == "pf" else "members": count})
+    log = log_of(stream(150, at=(100,)))
+    track = fold(estimator, MODEL, tuning, log, pairs=PAIR)
+    (row,) = np.flatnonzero(log.events.kind == MAINTENANCE)
+    # The deviation of a sample's standard deviation is 1/sqrt(2 n) of it; four of them.
+    np.testing.assert_allclose(track.std[row, 1], MODEL.prior_std[1], rtol=4 / np.sqrt(2 * count))
+
+
+@pytest.mark.parametrize("estimator", ["kf", "pf", "enkf", INTERPRETED])
+def test_pieces_and_late_readings_change_nothing(estimator):
+    events = stream(states=(0, 1))
+    tuning = Tuning.of(MODEL)
+    whole = fold(estimator, MODEL, tuning, log_of(events), pairs=PAIR)
+    rng = np.random.default_rng(5)
+    log = Log.of(MODEL)
+    growing = Fold(estimator, MODEL, tuning, log, pairs=PAIR)
+    # Each comes up to 70 s late.
+    order = np.argsort(events.t + rng.uniform(0, 70 * SECOND, len(events)), kind="stable")
+    for piece in np.array_split(order, 60):
+        index, _ = log.extend(events.select(piece))
+        growing.rewind(index)
+        while growing.n < log.n:
+            growing.advance(int(rng.integers(1, 9)))
+    assert_same(growing.track, whole)
+
+
+def test_versions_count_times_not_states():
+    log = log_of(stream(states=(0, 1)))
+    versions = model_versions(log.events)
+    t = log.t[: log.n]
+    expected = 1 + (t >= 101 * SECOND + HALF) + (t >= 201 * SECOND + HALF)
+    np.testing.assert_array_equal(versions, expected)
+    assert [model_version_at(log, s * SECOND) for s in (0, 101, 102, 250)] == [1, 1, 2, 3]
+    assert last_maintenance(log, 101 * SECOND) is None
+    assert last_maintenance(log, 150 * SECOND) == 101 * SECOND + HALF
+
+
+@pytest.mark.parametrize("count", [50, 100, 101, 102, 103, 104, 150, 203, 204, 205, 303])
+def test_versions_go_on_after_the_oldest_events_are_dropped(count):
+    """Also where a maintenance of two states is cut in half."""
+    log = log_of(stream(states=(0, 1)))
+    t, versions = log.t[: log.n].copy(), model_versions(log.events)
+    log.drop_front(count)
+    after = model_versions(log.events, log.version)
+    # The half that stays begins the version that its first half had begun.
+    np.testing.assert_array_equal(after, versions[count:])
+    assert model_version_at(log, int(t[-1])) == 3
+
+
+def test_a_base_knows_its_version():
+    log = log_of(stream(3000, at=(100, 200)))
+    made = Fold("kf", MODEL, Tuning.of(MODEL), log)
+    made.advance()
+    at, base = made.base_at(2048)
+    assert at == 2048 and base.version == 3 and made.base_at(10)[1].version == 1
+
+
+def test_before_anything_was_said_it_starts_at_the_prior():
+    log = log_of(Events.concat([maintained(0, 0, [0], MODEL.width), stream(10, at=())], MODEL.width))
+    track = fold("kf", MODEL, Tuning.of(MODEL), log)
+    np.testing.assert_allclose(track.mean[0], MODEL.prior_mean)
+    np.testing.assert_allclose(track.std[0], MODEL.prior_std)
+    assert INPUT not in log.events.kind
