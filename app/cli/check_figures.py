@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,10 +11,8 @@ from estimators.diagnostics.sensitivity import Sensitivity, View, bounds_of
 from estimators.track import HEALTH_NAMES
 
 from .check_list import blamed, checklist, stamps
+from .checked import Checked
 from .fold_report import calibration_dict, number
-
-if TYPE_CHECKING:
-    from .check import Checked
 
 
 def figures(checked: Checked) -> dict[str, Any]:

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from config.source_schema import CanLogSection, CanSection, MergedSection
 from estimators.diagnostics.calibration import LIMITS
-from estimators.diagnostics.dimension import BUSY, spread_error
-from estimators.diagnostics.posterior import OFTEN
+from estimators.diagnostics.checklist.dimension import BUSY, spread_error
+from estimators.diagnostics.checklist.posterior import OFTEN
 from estimators.diagnostics.sensitivity import Sensitivity
 from estimators.diagnostics.sensitivity.words import subject_text
 from estimators.log import MAINTENANCE
 from estimators.track import HEALTH_NAMES
 
+from .checked import Checked
 from .scores import scores_file
-
-if TYPE_CHECKING:
-    from .check import Checked
 
 YES, PARTLY, NO, NONE = "yes", "partly", "no", "not told"
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,10 +14,8 @@ from estimators.diagnostics.sensitivity.words import range_text, size_text, subj
 from estimators.track import HEALTH_NAMES
 
 from .check_list import blamed, checklist
+from .checked import Checked
 from .fold_report import calibration_lines
-
-if TYPE_CHECKING:
-    from .check import Checked
 
 MOST = 12
 """Rows of a table on the page; JSON has all."""

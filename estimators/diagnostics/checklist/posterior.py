@@ -11,16 +11,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..fold import Fold
-from ..log import READING, Log
-from ..model.state_space import StateSpaceModel
-from ..numerics.peaks import Peak
-from ..registry import find_entry, unfit
-from ..snapshots import Base
-from ..track import GATED, USED, Track
-from ..tuning import Tuning
-from .calibration import standardised
-from .whiteness import jarque_bera
+from ...fold import Fold
+from ...log import READING, Log
+from ...model.state_space import StateSpaceModel
+from ...numerics.peaks import Peak
+from ...registry import find_entry, unfit
+from ...snapshots import Base
+from ...track import GATED, USED, Track
+from ...tuning import Tuning
+from ..calibration import standardised
+from ..whiteness import jarque_bera
 
 LOOKS = 150
 """Times at which the cloud is looked at; finding its peaks takes milliseconds."""

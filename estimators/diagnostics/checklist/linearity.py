@@ -13,18 +13,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..fold import Fold
-from ..log import READING, Log
-from ..model.state_space import StateSpaceModel
-from ..registry import find_entry, unfit
-from ..snapshots import Base
-from ..track import GATED, USED, Track
-from ..tuning import Tuning
-from .calibration import LIMITS, standardised
-from .intervals import Interval, correlation_interval
-from .sensitivity.responses import each
-from .sensitivity.size import MOST_STATES
-from .whiteness import ljung_box
+from ...fold import Fold
+from ...log import READING, Log
+from ...model.state_space import StateSpaceModel
+from ...registry import find_entry, unfit
+from ...snapshots import Base
+from ...track import GATED, USED, Track
+from ...tuning import Tuning
+from ..calibration import LIMITS, standardised
+from ..intervals import Interval, correlation_interval
+from ..sensitivity.responses import each
+from ..sensitivity.size import MOST_STATES
+from ..whiteness import ljung_box
 
 QUANTILE = 0.95
 """Of the differences along the track; a few at the start, where the spread is the prior's, need not matter."""

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..model.state_space import LARGE, StateSpaceModel
+from ...model.state_space import LARGE, StateSpaceModel
 
 CLOSE = 0.1
 """Share by which the standard deviations of an ensemble may be off by chance."""

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..log import READING, Log
-from ..model.state_space import StateSpaceModel
+from ...log import READING, Log
+from ...model.state_space import StateSpaceModel
 
 QUANTILES = (0.5, 0.99, 1.0)
 """Of lateness."""

@@ -12,15 +12,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..fold import Fold
-from ..log import READING, Log
-from ..model.state_space import StateSpaceModel
-from ..snapshots import Base
-from ..track import HELD_OUT
-from ..tuning import Tuning
-from .calibration import BANDS, calibrations
-from .score import Fit, Score, score
-from .sensitivity.responses import each
+from ...fold import Fold
+from ...log import READING, Log
+from ...model.state_space import StateSpaceModel
+from ...registry import find_estimator
+from ...snapshots import Base
+from ...track import HELD_OUT
+from ...tuning import Tuning
+from ..calibration import BANDS, calibrations
+from ..score import Fit, Score, score
+from ..sensitivity.responses import each
 
 MARGIN = 0.05
 """Share by which an error must exceed that of the open loop before the filter is said to make it worse."""
@@ -114,8 +115,7 @@ def held_out(
         fold.finish()
         return fold
 
-    filtered = Fold(estimator, model, tuning, log, base=base)
-    if filtered.estimator.family in ALONE:
+    if find_estimator(estimator, model).family in ALONE:
         executor = None
     filtered, floor, *folds = each(run, [tuning, nobody, *without], executor)
     open_rows = _score(floor).held_out
