@@ -26,6 +26,8 @@ from .fields import (
 from .limits_schema import DuplicatesSection, Positives, Ranges, StuckSection, Validity
 from .source_schema import SourceSection
 
+GateProbability = Annotated[float, Field(strict=True, gt=0, lt=1)]
+
 
 class PriorSection(Section):
     """What is believed of one state before the first reading."""
@@ -92,6 +94,25 @@ class EstimatorSection(Section):
     options: dict[str, Option] = {}
     """The filter's own options by name, for example {alpha: 0.5} of the UKF; a choice by its word, {resampling:
     stratified}, or its number. Default: the catalogue's."""
+
+
+class GateSection(Section):
+    """What becomes of readings far from their prediction."""
+
+    probability: GateProbability
+    """Probability with which a good reading passes, for example 0.9973."""
+    kind: Literal["hard", "soft"] = "hard"
+    """hard: a reading outside is refused. soft: it counts, with its noise inflated until it lies on the gate, so that
+    the further off it is the less it moves the estimate; kf-steady and `adapt: R` take no soft one."""
+    reopen: Positive | Literal["never"] = 30.0
+    """A sensor that stays refused is judged by what the other sensors say: it is isolated, or the twin was wrong and
+    lets it in. Where nothing tells, the asset is believed so many seconds after the first refused reading. never: a
+    sensor that is refused stays refused. Default: 30."""
+
+    @property
+    def seconds(self) -> float | None:
+        """`reopen` in seconds; None for never."""
+        return None if self.reopen == "never" else float(self.reopen)
 
 
 class TimeSection(Section):
@@ -178,6 +199,10 @@ def _estimator(value: Any) -> Any:
     return {"name": value} if isinstance(value, str) else value
 
 
+def _gate(value: Any) -> Any:
+    return value if value is None or isinstance(value, (dict, GateSection)) else {"probability": value}
+
+
 class TwinSection(Section):
     """A twin: a model of an asset, the source of its readings, and the estimator that joins them."""
 
@@ -209,9 +234,11 @@ class TwinSection(Section):
     filters: dict[str, dict[str, Option]] = {}
     """Options of other filters, by name, for when one is chosen on the page or compared, for example
     {letkf: {radius: 4}}. Default: the catalogue's."""
-    gate: Annotated[float, Field(strict=True, gt=0, lt=1)] | None = None
-    """Probability with which a good reading passes the gate, for example 0.9973; readings outside are not used.
-    Default: null, no gate."""
+    gate: Annotated[
+        GateSection | None, BeforeValidator(_gate, json_schema_input_type=GateProbability | GateSection | None)
+    ] = None
+    """Probability with which a good reading passes the gate, for example 0.9973; readings outside are not used. Or
+    {probability, kind, reopen}. Default: null, no gate."""
     commissioned: dict[str, NormalSection] = {}
     """What was normal when this tuning was accepted, by sensor row: alarms are about what has changed since. Default:
     innovations that are white and as large as the filter says."""

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from .compiled.context import context_of
+from .compiled.jacobians import scratch_size, sensor_jacobian
 from .compiled.model import CompiledModel, compile_model
 from .diagnostics.account import spread_ratio
 from .diagnostics.evidence import fresh, no_baseline, watched
@@ -25,20 +26,23 @@ from .errors import EstimatorError, ModelError
 from .estimator import Code, Estimator
 from .events.checks import admitted
 from .events.maintenance import versions_dropped, without
-from .fold_checks import check_base, check_pairs, check_prior, check_tuning, check_variances
+from .fold_checks import check_base, check_pairs, check_prior, check_soft, check_tuning, check_variances
 from .fold_kernel import compiled
+from .gate import doubt
+from .gate.reopening import Decision, decide
+from .gate.stories import widening
 from .interpreted import fold_loop
 from .interpreted.black_box_filters import driven
 from .interpreted.fold_loop import LONGEST, UNSET
 from .interpreted.view import View
 from .log import BEFORE, INPUT, MAINTENANCE, READING, TICK, TRUTH, Log
 from .model.mode_as_number import indicator
-from .model.state_space import StateSpaceModel
+from .model.state_space import LARGE, StateSpaceModel
 from .numerics.peaks import Peak
 from .numerics.quantiles import chi_square_quantile
 from .registry import find_estimator
-from .screen import fresh_screen, screen_of
-from .snapshots import Base, Snapshot, Snapshots
+from .screen import fresh_screen, limits_of
+from .snapshots import Base, Snapshot, Snapshots, Story
 from .track import WHITENED, Track
 from .tuning import Tuning
 
@@ -90,6 +94,8 @@ class Fold:
         self._own_prior = None if prior is None else check_prior(prior, model, self.estimator)
         self.policy = policy or HealthPolicy()
         self.options = self.estimator.complete_for(model, tuning.options)
+        if tuning.gate is not None and tuning.gate_kind == "soft":
+            check_soft(self.estimator, self.options)
         self.n = 0
         self._checked = -1
         self._check_log()
@@ -108,7 +114,12 @@ class Fold:
         self._work = _scratch(self.estimator.work_size(self.options, model.nx, model.width) + 1)
         self._score = np.empty(WHITENED + model.ny)
         self._evidence = fresh(model)
-        self._screen, self._edge = screen_of(model), fresh_screen(model)
+        self._edge = fresh_screen(model)
+        reopens = tuning.reopen is not None and model.nx <= LARGE
+        self._rule = doubt.rule_of(tuning.gate, tuning.gate_kind, reopens)
+        self._doubt = doubt.fresh(len(model.sensors))
+        self.decisions: list[Decision] = []
+        """What was decided of sensors that stayed refused, see gate/reopening.py."""
         self._clock = np.array([UNSET])
         self._u = np.array([item.default for item in model.inputs], float)
         mean, cov = self._held["prior_mean"], self._held["prior_cov"]
@@ -117,7 +128,7 @@ class Fold:
         if base is not None:
             check_base(base, model)
             mean, cov, self._clock[0], self._u[:] = base.mean, base.cov, base.clock, base.u
-        self._run, judge, begin, self._screen_rows = compiled()
+        self._run, judge, begin, _ = compiled()
         if model.black_box or self.estimator.interpreted:
             self._context = View(self._compiled, self._context, tuning, self.options, self.pairs, self._held)
             self._run = partial(fold_loop.run_and_judge, judge, self._seen)
@@ -129,6 +140,8 @@ class Fold:
             self._state[:] = left
             if base is not None and base.evidence is not None and base.evidence.size == self._evidence.size:
                 self._evidence[:] = base.evidence
+            if base is not None and base.doubt is not None and base.doubt.shape == self._doubt.shape:
+                self._doubt[:] = base.doubt
         if base is not None and base.edge is not None and base.edge.size == self._edge.size:
             self._edge[:] = base.edge
         self._snapshots = Snapshots(self._state.nbytes)
@@ -140,19 +153,20 @@ class Fold:
     def _see(self, expected: np.ndarray | None) -> np.void:
         """The context of this model and tuning; the arrays that it points to are kept in `self._held`."""
         model, tuning = self.model, self.tuning
-        gate = np.full(model.width + 1, np.inf)
+        self.gate_limits = np.full(model.width + 1, np.inf)
         if tuning.gate is not None:
-            gate[1:] = chi_square_quantile(tuning.gate, np.arange(1, model.width + 1))
+            self.gate_limits[1:] = chi_square_quantile(tuning.gate, np.arange(1, model.width + 1))
         held = {
             "p": np.ascontiguousarray(tuning.p, float),
             "q": np.ascontiguousarray(tuning.q, float),
             # Its own: what a reading brings stands here while it is folded, and other folds have the same tuning.
             "r": np.array(tuning.r, float),
             "used": tuning.used.astype(np.int8),
-            "gate": gate,
+            "gate": np.tile(self.gate_limits, (len(model.sensors), 1)),
             "options": np.ascontiguousarray(self.estimator.tune(self.options, model, tuning), float),
             "pairs": self.pairs,
             "prepared": self.estimator.prepare(model, self.options),
+            **limits_of(model),
             **watched(model, tuning.gate, self.marginal, self.baseline, expected),
         }
         values: dict[str, Any] = {**self._compiled.static, **held}
@@ -330,32 +344,117 @@ class Fold:
             if self.pictures is not None:
                 stop = self.pictures.next(log, self.n, stop)
             stop = self._maintenance(stop)
+            begun_at, changed = self.n, False
             try:
-                self._screen_events(self.n, stop)
                 if log.kind[self.n] == MAINTENANCE:
                     self._maintain(self.n)
+                    self.n = stop
                 else:
-                    self._run_events(self.n, stop)
+                    asking = self._run_events(self.n, stop)
+                    stop = stop if asking < 0 else asking + 1
+                    self.n = stop
+                    if asking >= 0:
+                        changed = self._decide(asking)
             except BaseException:
                 # Python was stopped between two events: back to where the state is known.
                 self._held["r"][:] = self.tuning.r
-                self._restore(self.n)
+                self._held["gate"][:] = self.gate_limits
+                self._restore(begun_at)
                 raise
-            self.n = stop
-            if stop == boundary:
-                self._remember()
+            if stop == boundary or changed:
+                self._remember(pinned=changed)
         return end - begun
 
-    def _screen_events(self, start: int, stop: int) -> None:
-        """Which rows of the readings the filter shall not see."""
-        log, screened = self.log, self._rows.screened
-        self._screen_rows(start, stop, log.t, log.kind, log.channel, log.value, self._screen, self._edge, screened)
+    def _decide(self, row: int) -> bool:
+        """Decide on the sensor whose reading asks for it; whether the state is another now."""
+        assert self.tuning.reopen is not None
+        decision, changed = decide(self, row, self._doubt, self.tuning.reopen)
+        if decision is not None:
+            self.decisions.append(decision)
+        return changed
 
-    def _run_events(self, start: int, stop: int) -> None:
-        log = self.log
+    def second_story(self, start: int, stop: int, sensor: int) -> Story:
+        """Fold the events from `start` to `stop` apart, as if the twin had been wrong before the first of them.
+
+        Args:
+            start: A refused reading of the sensor.
+            stop: The row after the last, folded already.
+            sensor: Its gate is off, and the covariance is widened before its reading.
+        """
+        at = self._snapshots.last(self.log.first + start)
+        snapshot = self._snapshots[at]
+        clock, u, state = np.array([snapshot.clock]), snapshot.u.copy(), snapshot.state.copy()
+        edge = snapshot.edge.copy()
+        self._run_apart(at - self.log.first, start, clock, u, state, edge)
+        mean, cov = self.estimator.moments(self.options, state, self.model.nx)
+        prior = self._held["prior_cov"]
+        diagonals = [matrix[0] if len(matrix) == 1 else np.diag(matrix) for matrix in (cov, prior)]
+        H = self._slope(sensor, mean, u)
+        added = widening(diagonals[0], diagonals[1], H, self._rows.innovation[start, : len(H)])
+        cov = cov + (added if len(cov) == 1 else np.diag(added))
+        self._begin(self._code, self._context, np.ascontiguousarray(mean), cov, state)
+        self._held["gate"][sensor] = np.inf
+        track = self._run_apart(start, stop, clock, u, state, edge)
+        self._held["gate"][sensor] = self.gate_limits
+        return Story(track, int(clock[0]), u, state, np.sqrt(added))
+
+    def go_on_with(self, story: Story) -> None:
+        """Take the state of the second story for one's own."""
+        self._clock[0], self._u[:], self._state[:] = story.clock, story.u, story.state
+        self._asked = -1
+
+    def _slope(self, sensor: int, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """dh/dx (ny, nx) of a sensor; nothing depends on a mode."""
+        if isinstance(self._context, View):
+            H = self._context.H(sensor, x, u)
+        else:
+            H = np.empty((len(self.model.sensors[sensor].rows), self.model.nx))
+            scratch = np.empty(scratch_size(self.model.nx, self.model.width))
+            sensor_jacobian(self._context, sensor, np.ascontiguousarray(x), u, H, scratch)
+        if self.model.mode >= 0:
+            H[:, self.model.mode] = 0.0
+        return H
+
+    def _run_apart(
+        self, start: int, stop: int, clock: np.ndarray, u: np.ndarray, state: np.ndarray, edge: np.ndarray
+    ) -> Track:
+        """Fold events into a track of their own; clock, u, state and screen move on."""
+        log, model = self.log, self.model
+        track = Track.allocate(stop - start, len(model.shown), len(self.pairs), model.ny, model.width)
         self._run(
             self._code,
             self._context,
+            self._rule._replace(most=0),
+            log.first + start,
+            0,
+            stop - start,
+            log.t[start:stop],
+            log.kind[start:stop],
+            log.channel[start:stop],
+            log.value[start:stop],
+            log.width,
+            clock,
+            u,
+            state,
+            doubt.fresh(len(model.sensors)),
+            edge,
+            np.empty_like(state),
+            self._work,
+            self._score,
+            track,
+            self.policy,
+            self._bounds,
+            self._evidence.copy(),
+        )
+        return track
+
+    def _run_events(self, start: int, stop: int) -> int:
+        """Fold events in place; the row of a reading that asks for a decision, after which the loop stopped, or -1."""
+        log = self.log
+        asking = self._run(
+            self._code,
+            self._context,
+            self._rule,
             log.first,
             start,
             stop,
@@ -367,6 +466,8 @@ class Fold:
             self._clock,
             self._u,
             self._state,
+            self._doubt,
+            self._edge,
             self._spare,
             self._work,
             self._score,
@@ -375,7 +476,8 @@ class Fold:
             self._bounds,
             self._evidence,
         )
-        self._asked = stop - 1
+        self._asked = stop - 1 if asking < 0 else -1
+        return int(asking)
 
     def _maintenance(self, stop: int) -> int:
         """Where to stop, at `stop` at the latest, so that an event of maintenance is dealt with by itself."""
@@ -415,10 +517,10 @@ class Fold:
         mean, cov = self.estimator.moments(self.options, state, self.model.nx)
         self.pictures.take(self.log, self.n, mean, cov[0] if cov.shape[0] == 1 else np.diag(cov))
 
-    def _remember(self) -> None:
-        gathered = self._evidence.copy(), self._edge.copy()
+    def _remember(self, pinned: bool = False) -> None:
+        gathered = self._evidence.copy(), self._edge.copy(), self._doubt.copy()
         snapshot = Snapshot(int(self._clock[0]), self._u.copy(), self._state.copy(), *gathered)
-        self._snapshots.keep(self.log.first + self.n, self.log.first, snapshot)
+        self._snapshots.keep(self.log.first + self.n, self.log.first, snapshot, pinned)
 
     def rewind(self, index: int) -> None:
         """Go back so that the event at `index` (and all after it) will be folded again."""
@@ -428,7 +530,10 @@ class Fold:
     def _restore(self, index: int) -> None:
         at = self._snapshots.last(self.log.first + index)
         self._snapshots.forget_after(at)
-        self._clock[0], self._u[:], self._state[:], self._evidence[:], self._edge[:] = self._snapshots[at]
+        snapshot = self._snapshots[at]
+        self._clock[0], self._u[:], self._state[:] = snapshot.clock, snapshot.u, snapshot.state
+        self._evidence[:], self._edge[:], self._doubt[:] = snapshot.evidence, snapshot.edge, snapshot.doubt
+        self.decisions = [decision for decision in self.decisions if decision.row < at]
         self.n = at - self.log.first
         self._asked = -1
         if self.pictures is not None:
@@ -437,11 +542,22 @@ class Fold:
     def base_at(self, index: int) -> tuple[int, Base]:
         """The last snapshot at or before the event `index`: its index, and the base of a fold that starts there."""
         at = self._snapshots.last(self.log.first + index)
-        clock, u, state, evidence, edge = self._snapshots[at]
+        clock, u, state, evidence, edge, doubts = self._snapshots[at]
         mean, cov = self.estimator.moments(self.options, state, self.model.nx)
         version = self.log.version + versions_dropped(self.log.events, at - self.log.first)
-        name, gathered = self.estimator.name, (evidence.copy(), edge.copy())
-        base = Base(mean, cov, clock, u.copy(), name, state.copy(), at, *gathered, version)
+        base = Base(
+            mean,
+            cov,
+            clock,
+            u.copy(),
+            self.estimator.name,
+            state.copy(),
+            at,
+            evidence=evidence.copy(),
+            edge=edge.copy(),
+            version=version,
+            doubt=doubts.copy(),
+        )
         return at - self.log.first, base
 
     def follow(self, log: Log, changed_from: int | None) -> None:
@@ -477,6 +593,7 @@ class Fold:
         if self.pictures is not None:
             self.pictures.drop_front(self.log.first + count)
         self._snapshots.forget_before(self.log.first + count)
+        self.decisions = [decision for decision in self.decisions if decision.row >= self.log.first + count]
 
 
 def fold(

@@ -126,6 +126,21 @@ def _check_sizes(what: str, mean: np.ndarray, cov: np.ndarray, model: StateSpace
         raise EstimatorError(f"{what}: cov has shape {cov.shape}; for {model.name} it must be {wanted[0]}")
 
 
+def check_soft(entry: Estimator, options: Options) -> None:
+    """Refuse a soft gate, which inflates R, where a filter holds on to one R.
+
+    Raises:
+        EstimatorError: With what to do.
+    """
+    if entry.fixed_r:
+        raise EstimatorError(f"estimator {entry.name}: a soft gate inflates R, but its gain is for one R; use kf")
+    if options.get("adapt") == ADAPT_R:
+        raise EstimatorError(
+            f"estimator {entry.name}: a soft gate inflates R, but adapt learns one R of each sensor; set adapt to off "
+            "or Q, or gate.kind to hard"
+        )
+
+
 def check_variances(entry: Estimator, options: Options) -> None:
     """Refuse readings that bring their own variance where a filter holds on to one R.
 

@@ -9,15 +9,18 @@ import numpy as np
 from numba import types
 
 from .compiled.context import context_type, prior, sensor_rows
+from .compiled.verdict import limit_of
 from .diagnostics.evidence import watch_rows
 from .diagnostics.health import assess, bounds_type, policy_type
 from .estimator import call_describe, call_predict, call_start, call_update, code_type
+from .gate.doubt import forget, note, rule_type
+from .gate.soften import soften
 from .interpreted.fold_loop import LONGEST, UNSET
 from .log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, inlined, jit
 from .numerics.steps import steps_of
-from .screen import any_refused, pass_on, screen_rows, screen_signature
-from .track import ANCESTORS, EFFECTIVE, MISSING, NONE, SCREENED, WHITENED, track_type
+from .screen import pass_on, screen_reading, screen_signature
+from .track import ANCESTORS, EFFECTIVE, GATED, MISSING, NONE, SCREENED, USED, WHITENED, track_type
 
 
 @jit
@@ -54,8 +57,14 @@ def exchange(r, own, kept):
 
 
 @jit
-def run(code, context, first, start, end, t, kind, channel, value, width, clock, u, state, spare, work, score, track):
+def run(
+    code, context, rule, first, start, end, t, kind, channel, value, width,
+    clock, u, state, doubt, edge, spare, work, score, track,
+):  # fmt: skip
     """Fold events `start` to `end`: clock (1,), u (nu,) and state move on in place, one track row is filled an event.
+
+    Stops behind the first reading that asks for a decision on its sensor (gate/doubt.py), and returns its row; -1 if
+    none does.
 
     A tick, a truth or a mark is a query: it is answered from a copy of the state, so it never changes the estimate.
     Variances that a reading brings (columns of `value` from `width` on) take the place of the tuned R while it is
@@ -83,6 +92,7 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
         what = kind[i]
         index = first + i
         for j in range(innovation.shape[1]):
+            screened[i, j] = 0
             innovation[i, j] = np.nan
             innovation_std[i, j] = np.nan
             score[WHITENED + j] = np.nan
@@ -92,6 +102,7 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
         score[EFFECTIVE] = np.nan
         score[ANCESTORS] = np.nan
         verdict = NONE
+        asked = False
         if what == READING or what == INPUT:
             advance_to(code, context, u, clock[0], t[i], index, state, work)
             clock[0] = t[i]
@@ -104,15 +115,33 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
                     row, rows = sensor_rows(context, channel[i])
                     r = floats(context.r, context.n_rows)[row : row + rows]
                     exchange(r, value[i, width:], kept)
-                refused = any_refused(screened, i)
+                given = floats(value[i:].ctypes.data, value.shape[1])
                 verdict = SCREENED
-                if not refused or pass_on(value, screened, i, passed):
+                left = True
+                if screen_reading(i, t[i], channel[i], given, context, edge, screened):
+                    left = pass_on(value, screened, i, passed)
+                    given = passed
+                if left:
                     verdict = call_update(
                         code.update,
                         context,
                         u,
                         channel[i],
-                        passed if refused else value[i],
+                        given,
+                        index,
+                        state,
+                        work,
+                        innovation[i],
+                        innovation_std[i],
+                        score,
+                    )
+                if verdict == GATED and rule.soft != 0:
+                    verdict = soften(
+                        code,
+                        context,
+                        u,
+                        channel[i],
+                        given,
                         index,
                         state,
                         work,
@@ -123,10 +152,14 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
                 if variances:
                     for k in range(rows):
                         r[k] = kept[k]
+                if verdict == GATED or verdict == USED:
+                    beyond = score[0] > limit_of(context, channel[i], int(score[1]))
+                    asked = note(doubt[channel[i]], rule.most, beyond, index, float(t[i]))
             call_describe(code.describe, context, state, mean[i], std[i], cross[i])
         elif what == RESET:
             prior_mean, prior_cov = prior(context)
             call_start(code.start, context, prior_mean, prior_cov, state)
+            forget(doubt)
             clock[0] = t[i]
             call_describe(code.describe, context, state, mean[i], std[i], cross[i])
         else:
@@ -146,6 +179,9 @@ def run(code, context, first, start, end, t, kind, channel, value, width, clock,
         track.ancestors[i] = score[ANCESTORS]
         for j in range(whitened.shape[1]):
             whitened[i, j] = score[WHITENED + j]
+        if asked:
+            return i
+    return -1
 
 
 @jit
@@ -163,20 +199,24 @@ def judge(start, end, t, kind, channel, value, context, policy, bounds, evidence
 
 @jit
 def run_and_judge(
-    code, context, first, start, end, t, kind, channel, value, width, clock, u, state, spare, work, score, track,
-    policy, bounds, evidence,
+    code, context, rule, first, start, end, t, kind, channel, value, width,
+    clock, u, state, doubt, edge, spare, work, score, track, policy, bounds, evidence,
 ):  # fmt: skip
     """Both in one call: of a few events, the handing over takes longer than the work."""
-    run(code, context, first, start, end, t, kind, channel, value, width, clock, u, state, spare, work, score, track)
-    judge(start, end, t, kind, channel, value, context, policy, bounds, evidence, track)
+    asking = run(
+        code, context, rule, first, start, end, t, kind, channel, value, width,
+        clock, u, state, doubt, edge, spare, work, score, track,
+    )  # fmt: skip
+    judge(start, end if asking < 0 else asking + 1, t, kind, channel, value, context, policy, bounds, evidence, track)
+    return asking
 
 
 I4 = types.int32[::1]
 _log = (I1, B1, I4, F2)
 begin_signature = types.void(code_type, context_type, F1, F2, F1)
 judge_signature = types.void(i64, i64, *_log, context_type, policy_type, bounds_type, F1, track_type)
-run_signature = types.void(
-    code_type, context_type, i64, i64, i64, *_log, i64, I1, F1, F1, F1, F1, F1, track_type,
+run_signature = i64(
+    code_type, context_type, rule_type, i64, i64, i64, *_log, i64, I1, F1, F1, F2, F1, F1, F1, F1, track_type,
     policy_type, bounds_type, F1,
 )  # fmt: skip
 
@@ -184,7 +224,7 @@ run_signature = types.void(
 @lru_cache(maxsize=1)
 def compiled() -> tuple[Any, ...]:
     """The entry points, compiled for their one signature (or loaded from the cache)."""
-    functions = (run_and_judge, judge, begin, screen_rows)
+    functions = (run_and_judge, judge, begin, screen_reading)
     signatures = (run_signature, judge_signature, begin_signature, screen_signature)
     for function, signature in zip(functions, signatures, strict=True):
         function.compile(signature.args)

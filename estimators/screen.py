@@ -12,15 +12,14 @@ more in a row with pᵐ at most. At n readings a day, a run of m ≥ ln n / -ln 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
 
-from .log import READING
+from .compiled.context import circular_rows, context_type, sensor_rows
 from .model.limits import NOISES, Stuck
 from .model.state_space import StateSpaceModel
-from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, i64, inlined, ints, jit
+from .numerics.jit import F1, floats, i64, inlined, ints, jit
 from .numerics.linalg import wrap
 from .track import DUPLICATE, RANGE, RATE, REASONS, REPEATED, SATURATED
 
@@ -38,85 +37,52 @@ ROW = 6
 """Numbers in the state for each row."""
 
 
-class Screen(NamedTuple):
-    """The limits of all sensors as columns.
+_LOW, _HIGH, _CLIP_LOW, _CLIP_HIGH, _RATE, _SLACK, _HALF, _REPETITIONS, _LASTING, _SURPRISE = range(10)
+COLUMNS = 10
+"""Columns of the limits: lowest and highest value; where the converter clips; rate, units a second, and slack, units;
+half the quantum; repetitions and seconds of a run that is stuck, infinite where only surprise counts: -ln p, 0 where
+there is no such rule."""
 
-    row_start, row_count, limited (sensors,) int64: whether a sensor has limits of its values; duplicates (sensors,)
-    int64, ns. Of the rows: low, high; clip_low, clip_high; rate, units a second, and slack, units; half the quantum;
-    repetitions and lasting (s) of a run that is stuck, infinite where only surprise counts: -ln p, 0 where there is no
-    such rule; circular int64.
+
+def limits_of(model: StateSpaceModel) -> dict[str, np.ndarray]:
+    """What the screen finds in a context.
+
+    Returns:
+        `limits` (rows, COLUMNS); `limited` (sensors,), whether a sensor has limits of its values; `duplicates`
+        (sensors,), ns within which equal readings are one.
     """
-
-    row_start: Any
-    row_count: Any
-    limited: Any
-    duplicates: Any
-    low: Any
-    high: Any
-    clip_low: Any
-    clip_high: Any
-    rate: Any
-    slack: Any
-    half: Any
-    repetitions: Any
-    lasting: Any
-    surprise: Any
-    circular: Any
-
-
-screen_type = types.NamedTuple((I1, I1, I1, I1, *[F1] * 10, I1), Screen)
-
-
-def screen_of(model: StateSpaceModel) -> Screen:
-    """The limits of a model's sensors."""
-    count = len(model.sensors)
-    rows = len(model.row_names)
-    screen = Screen(
-        row_start=np.array(model.row_start[:count], np.int64),
-        row_count=np.array([len(sensor.rows) for sensor in model.sensors], np.int64),
-        limited=np.zeros(count, np.int64),
-        duplicates=np.zeros(count, np.int64),
-        low=np.full(rows, -np.inf),
-        high=np.full(rows, np.inf),
-        clip_low=np.full(rows, -np.inf),
-        clip_high=np.full(rows, np.inf),
-        rate=np.full(rows, np.inf),
-        slack=np.zeros(rows),
-        half=np.zeros(rows),
-        repetitions=np.full(rows, np.inf),
-        lasting=np.full(rows, np.inf),
-        surprise=np.zeros(rows),
-        circular=np.array([row.circular for sensor in model.sensors for row in sensor.rows], np.int64),
-    )
+    count, rows = len(model.sensors), len(model.row_names)
+    limits = np.tile([-np.inf, np.inf, -np.inf, np.inf, np.inf, 0.0, 0.0, np.inf, np.inf, 0.0], (rows, 1))
+    limited, duplicates = np.zeros(count, np.int64), np.zeros(count, np.int64)
     for k, sensor in enumerate(model.sensors):
-        limits = sensor.limits
-        if limits is None:
+        given = sensor.limits
+        if given is None:
             continue
-        own = slice(screen.row_start[k], screen.row_start[k] + screen.row_count[k])
+        own = limits[model.row_start[k] : model.row_start[k] + len(sensor.rows)]
         std = np.sqrt([row.variance for row in sensor.rows])
-        screen.duplicates[k] = round(limits.duplicates * 1e9)
-        screen.limited[k] = bool(limits.range or limits.saturation or limits.rate or limits.stuck)
-        if limits.range:
-            screen.low[own], screen.high[own] = np.array(limits.range).T
-        if limits.saturation:
-            screen.clip_low[own], screen.clip_high[own] = np.array(limits.saturation).T
-        if limits.rate:
-            screen.rate[own], screen.slack[own] = limits.rate, NOISES * std
-        if limits.stuck is not None:
-            _be_stuck(screen, own, limits.stuck, std)
-    return screen
+        duplicates[k] = round(given.duplicates * 1e9)
+        limited[k] = bool(given.range or given.saturation or given.rate or given.stuck)
+        if given.range:
+            own[:, [_LOW, _HIGH]] = given.range
+        if given.saturation:
+            own[:, [_CLIP_LOW, _CLIP_HIGH]] = given.saturation
+        if given.rate:
+            own[:, _RATE], own[:, _SLACK] = given.rate, NOISES * std
+        if given.stuck is not None:
+            _be_stuck(own, given.stuck, std)
+    return {"limits": limits, "limited": limited, "duplicates": duplicates}
 
 
-def _be_stuck(screen: Screen, own: slice, stuck: Stuck, std: np.ndarray) -> None:
+def _be_stuck(own: np.ndarray, stuck: Stuck, std: np.ndarray) -> None:
     quantum = np.broadcast_to(np.array(stuck.quantum or (0.0,)), std.shape)
-    screen.half[own] = 0.5 * quantum
+    own[:, _HALF] = 0.5 * quantum
     if stuck.readings is not None:
-        screen.repetitions[own] = stuck.readings - 1
+        own[:, _REPETITIONS] = stuck.readings - 1
     if stuck.seconds is not None:
-        screen.lasting[own] = stuck.seconds
+        own[:, _LASTING] = stuck.seconds
     if stuck.readings is None and stuck.seconds is None:
         sigma = np.broadcast_to(np.array(stuck.std or std), std.shape)
-        screen.surprise[own] = [surprise(q, s) for q, s in zip(quantum, sigma, strict=True)]
+        own[:, _SURPRISE] = [surprise(q, s) for q, s in zip(quantum, sigma, strict=True)]
 
 
 def surprise(quantum: float, std: float) -> float:
@@ -142,47 +108,47 @@ def _same(a, b):
     return a == b or np.isnan(a) and np.isnan(b)
 
 
-@jit
-def _is_duplicate(now, y, s, screen, begin, state, times):
+@inlined
+def _is_duplicate(now, y, s, first, count, within, begin, state, times):
     """Whether a reading says what the one before said, at the same time or too soon after it to be another."""
     own = s * SENSOR
-    if state[own + _COUNT] == 0.0 or now - times[own + _ORIGINAL] > screen.duplicates[s]:
+    if state[own + _COUNT] == 0.0 or now - times[own + _ORIGINAL] > within:
         return False
-    for k in range(screen.row_count[s]):
-        if not _same(y[k], state[begin + (screen.row_start[s] + k) * ROW + _VALUE]):
+    for k in range(count):
+        if not _same(y[k], state[begin + (first + k) * ROW + _VALUE]):
             return False
     return True
 
 
 @jit
-def _repeats(now, y, row, at, a_day, screen, state, times):
+def _repeats(now, y, at, a_day, limit, state, times):
     """Whether a row has said the same for too long."""
-    if not np.isfinite(state[at + _RUN]) or abs(y - state[at + _RUN]) > screen.half[row]:
+    if not np.isfinite(state[at + _RUN]) or abs(y - state[at + _RUN]) > limit[_HALF]:
         state[at + _RUN], state[at + _RUN_LENGTH] = y, 0.0
         times[at + _RUN_BEGAN] = now
         return False
     state[at + _RUN_LENGTH] += 1.0
     length = state[at + _RUN_LENGTH]
-    if length >= screen.repetitions[row] or (now - times[at + _RUN_BEGAN]) * 1e-9 >= screen.lasting[row]:
+    if length >= limit[_REPETITIONS] or (now - times[at + _RUN_BEGAN]) * 1e-9 >= limit[_LASTING]:
         return True
-    return screen.surprise[row] > 0.0 and length * screen.surprise[row] >= math.log(max(a_day, math.e))
+    return limit[_SURPRISE] > 0.0 and length * limit[_SURPRISE] >= math.log(max(a_day, math.e))
 
 
 @jit
-def _reasons(now, y, row, at, a_day, screen, state, times):
+def _reasons(now, y, circular, at, a_day, limit, state, times):
     """Bits of the limits that a row of a reading breaks."""
     bits = 0
-    if y < screen.low[row] or y > screen.high[row]:
+    if y < limit[_LOW] or y > limit[_HIGH]:
         bits |= RANGE
-    if y <= screen.clip_low[row] or y >= screen.clip_high[row]:
+    if y <= limit[_CLIP_LOW] or y >= limit[_CLIP_HIGH]:
         bits |= SATURATED
-    if np.isfinite(screen.rate[row]) and np.isfinite(state[at + _KEPT]):
+    if np.isfinite(limit[_RATE]) and np.isfinite(state[at + _KEPT]):
         change = y - state[at + _KEPT]
-        if screen.circular[row] != 0:
+        if circular != 0:
             change = wrap(change)
-        if abs(change) > screen.rate[row] * (now - times[at + _KEPT_AT]) * 1e-9 + screen.slack[row]:
+        if abs(change) > limit[_RATE] * (now - times[at + _KEPT_AT]) * 1e-9 + limit[_SLACK]:
             bits |= RATE
-    if _repeats(now, y, row, at, a_day, screen, state, times):
+    if _repeats(now, y, at, a_day, limit, state, times):
         bits |= REPEATED
     if bits == 0:
         state[at + _KEPT] = y
@@ -191,44 +157,47 @@ def _reasons(now, y, row, at, a_day, screen, state, times):
 
 
 @jit
-def screen_rows(first, last, t, kind, channel, value, screen, state, screened):
-    """Fill `screened` (N, ny) for events `first` to `last`: bits of the limits that each row of a reading breaks.
+def screen_reading(i, now, s, y, context, state, screened):
+    """Fill row i of `screened` (N, ny): bits of the limits that each row of reading y of sensor s breaks.
 
-    `state` moves on with them, so the outcome does not depend on how a fold was cut into pieces.
+    `state` moves on with it, so the outcome does not depend on how a fold was cut into pieces.
+
+    Returns:
+        Whether any row is refused.
     """
     times = ints(state.ctypes.data, state.size)
-    state = borrowed(state)
-    value = borrowed_rows(value)
-    begin = screen.row_count.size * SENSOR
-    for i in range(first, last):
-        for k in range(screened.shape[1]):
-            screened[i, k] = 0
-        if kind[i] != READING:
-            continue
-        s, now = channel[i], t[i]
-        own, y = s * SENSOR, value[i]
-        if _is_duplicate(now, y, s, screen, begin, state, times):
-            for k in range(screen.row_count[s]):
-                if not np.isnan(y[k]):
-                    screened[i, k] = DUPLICATE
-            continue
-        if state[own + _COUNT] == 0.0:
-            times[own + _FIRST] = now
-        times[own + _ORIGINAL] = now
-        elapsed = (now - times[own + _FIRST]) * 1e-9
-        a_day = DAY * state[own + _COUNT] / elapsed if elapsed > 0.0 else np.inf
-        state[own + _COUNT] += 1.0
-        for k in range(screen.row_count[s]):
-            row = screen.row_start[s] + k
-            at = begin + row * ROW
-            state[at + _VALUE] = y[k]
-            if screen.limited[s] != 0 and not np.isnan(y[k]):
-                screened[i, k] = _reasons(now, y[k], row, at, a_day, screen, state, times)
+    begin = context.n_sensors * SENSOR
+    first, count = sensor_rows(context, s)
+    own = s * SENSOR
+    within = ints(context.duplicates, context.n_sensors)[s]
+    if _is_duplicate(now, y, s, first, count, within, begin, state, times):
+        told = False
+        for k in range(count):
+            if not np.isnan(y[k]):
+                screened[i, k] = DUPLICATE
+                told = True
+        return told
+    if state[own + _COUNT] == 0.0:
+        times[own + _FIRST] = now
+    times[own + _ORIGINAL] = now
+    elapsed = (now - times[own + _FIRST]) * 1e-9
+    a_day = DAY * state[own + _COUNT] / elapsed if elapsed > 0.0 else np.inf
+    state[own + _COUNT] += 1.0
+    limited = ints(context.limited, context.n_sensors)[s] != 0
+    refused = False
+    for k in range(count):
+        at = begin + (first + k) * ROW
+        state[at + _VALUE] = y[k]
+        if limited and not np.isnan(y[k]):
+            limit = floats(context.limits + 8 * (first + k) * COLUMNS, COLUMNS)
+            bits = _reasons(now, y[k], circular_rows(context, s)[k], at, a_day, limit, state, times)
+            screened[i, k] = bits
+            refused |= bits != 0
+    return refused
 
 
 B2 = types.int8[:, ::1]
-I4 = types.int32[::1]
-screen_signature = types.void(i64, i64, I1, B1, I4, F2, screen_type, F1, B2)
+screen_signature = types.boolean(i64, i64, i64, F1, context_type, F1, B2)
 
 
 def reasons_by_sensor(sensors: int, channel: np.ndarray, screened: np.ndarray) -> np.ndarray:
@@ -237,15 +206,6 @@ def reasons_by_sensor(sensors: int, channel: np.ndarray, screened: np.ndarray) -
     bits = np.bitwise_or.reduce(screened[rows], axis=1)
     counts = [np.bincount(channel[rows[bits & (1 << k) != 0]], minlength=sensors) for k in range(len(REASONS))]
     return np.stack(counts, axis=1)
-
-
-@inlined
-def any_refused(screened, i):
-    """Whether a row of reading i is refused."""
-    for k in range(screened.shape[1]):
-        if screened[i, k] != 0:
-            return True
-    return False
 
 
 @jit

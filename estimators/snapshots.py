@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .track import Track
+
 EVERY = 64
 """Events between snapshots of the last `RECENT` events, where late readings fall."""
 
@@ -17,6 +19,9 @@ SPARSE_EVERY = 1024
 MEMORY = 256 * 2**20
 """Bytes that the snapshots of a fold may take, half for the recent ones; large states are kept at wider steps."""
 
+PINNED = 64
+"""Snapshots behind a decision that changed the state: the events before it do not lead to it by themselves."""
+
 
 class Base(NamedTuple):
     """Where a fold starts whose log has lost its oldest events: clock, inputs, and what the dropped events left.
@@ -24,8 +29,8 @@ class Base(NamedTuple):
     mean (nx,) and cov (nx, nx), or the variances (1, nx) of a large state, stand for it in any filter. `state` is all
     that the filter `estimator` had (modes, members, particles, what an adaptation learned), for that filter alone.
     `first` is the absolute index of the first event that is folded from here. `evidence` is what had been gathered
-    against the filter, for the same filter; `edge` what the screen remembers of the sensors, for any. `version` is the
-    model's there (events/maintenance.py).
+    against the filter, `doubt` what is remembered of sensors that were refused, for the same filter; `edge` what the
+    screen remembers of the sensors, for any. `version` is the model's there (events/maintenance.py).
     """
 
     mean: np.ndarray
@@ -38,16 +43,31 @@ class Base(NamedTuple):
     evidence: np.ndarray | None = None
     edge: np.ndarray | None = None
     version: int = 1
+    doubt: np.ndarray | None = None
 
 
 class Snapshot(NamedTuple):
-    """Clock (ns), inputs (nu,), state of a filter, evidence against it and state of the screen, before an event."""
+    """What a fold goes on from before an event.
+
+    Clock (ns), inputs (nu,), state of the filter, evidence against it, state of the screen, doubts of the sensors.
+    """
 
     clock: int
     u: np.ndarray
     state: np.ndarray
     evidence: np.ndarray
     edge: np.ndarray
+    doubt: np.ndarray
+
+
+class Story(NamedTuple):
+    """Events folded apart: their track, where that ended, and by how much each state was widened before (nx,)."""
+
+    track: Track
+    clock: int
+    u: np.ndarray
+    state: np.ndarray
+    widened: np.ndarray
 
 
 class Snapshots:
@@ -61,6 +81,7 @@ class Snapshots:
             self._every *= 2
         self._sparse = max(SPARSE_EVERY, self._every)
         self._kept: dict[int, Snapshot] = {}
+        self._pinned: list[int] = []
 
     @property
     def every(self) -> int:
@@ -81,13 +102,15 @@ class Snapshots:
         stride = self._sparse if end - at > RECENT else self._every
         return at + stride - at % stride
 
-    def keep(self, at: int, first: int, snapshot: Snapshot) -> None:
+    def keep(self, at: int, first: int, snapshot: Snapshot, pinned: bool = False) -> None:
         """Keep one; drop what is neither recent nor kept for ever. `first`: absolute index of the log's first event."""
         self._kept[at] = snapshot
+        if pinned:
+            self._pinned = [key for key in (*self._pinned, at) if key in self._kept][-min(PINNED, self._most) :]
         old = at - RECENT
-        if old % self._sparse and old in self._kept and old != first:
+        if old % self._sparse and old in self._kept and old != first and old not in self._pinned:
             del self._kept[old]
-        for_ever = [key for key in self._kept if key <= old]
+        for_ever = [key for key in self._kept if key <= old and key not in self._pinned]
         if len(for_ever) > self._most + 1:
             self._sparse *= 2
             for key in for_ever:

@@ -25,6 +25,9 @@ WAITING, TRACKING, SUSPECT, DEGRADED, DIVERGED, STALE = range(6)
 """Health: no reading has come; consistent; consistent no more; a sensor is lost or readings are late; the estimate is
 lost; nothing arrives."""
 
+LOG_LIKELIHOOD = 2
+"""Where in what a filter scores its log-likelihood is."""
+
 EFFECTIVE, ANCESTORS, WHITENED = range(3, 6)
 """Where in what a filter scores, after NIS, degrees of freedom and log-likelihood, the particles that count stand and
 those from which they descend, and where the whitened rows of the reading begin."""

@@ -14,6 +14,15 @@ from .model.state_space import StateSpaceModel
 
 _versions = count(1)
 
+GATE_KINDS = ("hard", "soft")
+"""What becomes of a reading beyond the gate: it is refused; it counts with its noise inflated."""
+
+REOPEN = 30.0
+"""Seconds after which the asset is believed, if a tuning does not say otherwise."""
+
+GATE_KEYS = {"gate": "gate", "gate.kind": "gate_kind", "gate.reopen": "reopen"}
+"""Keys of the gate, and the fields that they turn."""
+
 TOGETHER = 16
 """Rows of a sensor from which on they share one entry, `R.<sensor>`, in what a panel shows."""
 
@@ -34,9 +43,11 @@ class Tuning:
 
     q (nw,) is the variance that each process noise adds in one second; r (rows,) the variance of each sensor row;
     p (np,) the model's parameters; `used` (sensors,) is False where a sensor is held out: predicted and scored, never
-    used. `gate` is the probability that a good reading passes, or None. `options` are the estimator's own. `baseline`
-    (rows, ...) is what was normal of the innovations when it was accepted (diagnostics/evidence.py), or None for white
-    ones.
+    used. `gate` is the probability that a good reading passes, or None; a reading beyond it is refused, or, where
+    `gate_kind` is "soft", counts with its noise inflated (gate/soften.py). A sensor that stays refused is judged
+    (gate/reopening.py); if nothing tells whether it or the twin is wrong, the asset is believed after `reopen` seconds,
+    None for never. `options` are the estimator's own. `baseline` (rows, ...) is what was normal of the innovations when
+    it was accepted (diagnostics/evidence.py), or None for white ones.
     """
 
     model: StateSpaceModel
@@ -45,6 +56,8 @@ class Tuning:
     p: np.ndarray
     used: np.ndarray
     gate: float | None = None
+    gate_kind: str = "hard"
+    reopen: float | None = REOPEN
     options: Mapping[str, float] = field(default_factory=dict)
     seed: int = 0
     baseline: np.ndarray | None = None
@@ -89,16 +102,17 @@ class Tuning:
         """Every key that `set` takes."""
         rows = [f"R.{name}" for name in self.model.row_names]
         used = [f"use.{name}" for name in self.model.sensor_names]
-        return [*dict.fromkeys([item.key for item in self.items()] + rows), *used, "gate"]
+        return [*dict.fromkeys([item.key for item in self.items()] + rows), *used, *GATE_KEYS]
 
-    def get(self, key: str) -> float | bool | None:
+    def get(self, key: str) -> float | bool | str | None:
         """The value under a key."""
-        if key == "gate":
-            return self.gate
+        if key in GATE_KEYS:
+            value: float | str | None = getattr(self, GATE_KEYS[key])
+            return value
         group, index = self._locate(key)
         return bool(self.used[index]) if group == "used" else _mean(getattr(self, group)[index])
 
-    def set(self, key: str, value: float | bool | None) -> Tuning:
+    def set(self, key: str, value: float | bool | str | None) -> Tuning:
         """A new tuning with one entry changed; `R.<sensor>` is that of all rows of the sensor.
 
         Raises:
@@ -109,6 +123,15 @@ class Tuning:
                 raise ConfigError(f"gate is {value}; it must lie between 0 and 1, or be null for no gate")
             gate = None if value is None else float(value)
             return replace(self, gate=gate, version=next(_versions))
+        if key == "gate.kind":
+            if value not in GATE_KINDS:
+                raise ConfigError(f"gate.kind is {value!r}; it must be hard or soft")
+            return replace(self, gate_kind=str(value), version=next(_versions))
+        if key == "gate.reopen":
+            if value is not None and not 0.0 < float(value) <= LARGEST:
+                raise ConfigError(f"gate.reopen is {value}; it must be a positive number of seconds, or null for never")
+            reopen = None if value is None else float(value)
+            return replace(self, reopen=reopen, version=next(_versions))
         group, index = self._locate(key)
         if group == "used":
             changed: np.ndarray = self.used.copy()

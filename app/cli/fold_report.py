@@ -13,6 +13,8 @@ from estimators.diagnostics.failure_cause import failures
 from estimators.diagnostics.intervals import Interval
 from estimators.diagnostics.score import Score
 from estimators.fold import Fold
+from estimators.gate.reopening import Decision
+from estimators.gate.stories import softened
 from estimators.model.state_space import StateSpaceModel
 from estimators.screen import reasons_by_sensor
 from estimators.track import FAILED, HEALTH_NAMES, REASONS, USED
@@ -20,6 +22,9 @@ from estimators.tuning import TOGETHER
 
 from ..intake import WRONG_TIME
 from ..twin.twin import Twin
+
+DECISIONS = 10
+"""On sensors that stayed refused, that are printed at most: the last ones; --json has all."""
 
 
 def calibration_of(twin: Twin, fold: Fold) -> list[Calibration]:
@@ -32,6 +37,16 @@ def calibration_of(twin: Twin, fold: Fold) -> list[Calibration]:
 def number(value: float) -> float | None:
     """As JSON has it: null where there is none."""
     return float(value) if np.isfinite(value) else None
+
+
+def _softened(fold: Fold) -> int:
+    """How many readings lay beyond a soft gate and counted with their noise inflated."""
+    return int(np.sum(softened(fold.track, fold.gate_limits)))
+
+
+def _decision(decision: Decision) -> dict[str, Any]:
+    """A decision on a sensor that stayed refused; times in seconds of the log, evidence null where none was weighed."""
+    return {**decision._asdict(), "evidence": number(decision.evidence)}
 
 
 def _decimals(number: float) -> str:
@@ -81,6 +96,8 @@ def as_dict(
         "degraded_after": twin.degraded._asdict(),
         "conditioned": sum(count for key, count in counts.items() if key.startswith("condition ")),
         "gated": result.gated,
+        "softened": _softened(fold),
+        "gate": [_decision(decision) for decision in fold.decisions],
         "refused": number(result.refused),
         "missing": result.missing,
         "failed": int(np.sum(fold.track.verdict == FAILED)),
@@ -170,6 +187,7 @@ def as_text(
     rows += [
         ("log-likelihood", f"{result.log_likelihood:.2f}" + refusals),
         ("gated", f"{result.gated}" + (f"   {100 * result.refused:.2g} % of the readings" if result.gated else "")),
+        *([("softened", f"{_softened(fold)}")] if fold.tuning.gate_kind == "soft" else []),
         ("missing", f"{result.missing}"),
     ]
     failed = int(np.sum(track.verdict == FAILED))
@@ -203,6 +221,7 @@ def as_text(
         ("final variances", variances),
         ("late readings", f"{'used when they come, R inflated' if twin.late.inflate else 'exact'}: {twin.late.reason}"),
         ("degraded after", f"{twin.degraded.seconds:g} s without a reading: {twin.degraded.reason}"),
+        *((f"at {decision.time:.1f} s", decision.text) for decision in fold.decisions[-DECISIONS:]),
         ("health at the end", HEALTH_NAMES[int(track.health[-1])]),
         ("time per event", f"{1e6 * seconds:.2f} µs"),
     ]

@@ -6,6 +6,7 @@ import numpy as np
 
 from estimators.diagnostics.failure_cause import failures
 from estimators.fold import Fold
+from estimators.gate.stories import AGREES
 from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
 
 from .counts import UNSETTLED, complaints, estimated_rows, last_run
@@ -25,6 +26,7 @@ class Alerts:
         self._recoveries = 0
         self._lost: tuple[int, int] | None = None
         self._failures = 0
+        self._decided = -np.inf
         self._said: set[str] = set()
         self._tries, self._fresh = 0, False
 
@@ -36,6 +38,7 @@ class Alerts:
     def again(self) -> None:
         """Another fold begins, whose recoveries and failures are counted from none."""
         self._recoveries = self._failures = 0
+        self._decided = -np.inf
         self._lost = None
         self._said.clear()
         # Nobody has looked at its rows yet.
@@ -50,6 +53,7 @@ class Alerts:
             self._notices.report(key, text, counted=False)
         self._look_at_failures(fold)
         self._look_for_cause(fold, before)
+        self._look_at_decisions(fold)
         count, known = fold.recoveries(), self._recoveries
         self._recoveries = count
         if count > known:
@@ -89,6 +93,14 @@ class Alerts:
                 break
             end = start
         return log.first + end, int(log.t[end])
+
+    def _look_at_decisions(self, fold: Fold) -> None:
+        """Tell what was decided of sensors that stayed refused; nothing twice, though a late reading decides again."""
+        new = [decision for decision in fold.decisions if decision.time > self._decided]
+        for decision in new:
+            level = "info" if decision.outcome == AGREES else "warn"
+            self._notices.report(f"{decision.outcome} {decision.sensor}", decision.text, level=level)
+            self._decided = decision.time
 
     def _look_at_failures(self, fold: Fold) -> None:
         """Say what a black box failed with; the same words once, as readings that failed are counted anyway."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from estimators.registry import ESTIMATORS
+from estimators.tuning import GATE_KEYS
 
 if TYPE_CHECKING:
     from estimators.tuning import Tuning
@@ -39,8 +40,7 @@ def turned(twin: Twin, estimator: str, tuning: Tuning) -> dict[str, Any]:
     found |= {f"R.{first.model.row_names[k]}": float(first.r[k]) for k in rows}
     names = first.model.sensor_names
     found |= {f"use.{names[k]}": bool(first.used[k]) for k in np.flatnonzero(first.used != tuning.used)}
-    if tuning.gate != first.gate:
-        found["gate"] = first.gate
+    found |= {key: first.get(key) for key in GATE_KEYS if tuning.get(key) != first.get(key)}
     return found
 
 

@@ -17,6 +17,7 @@ import pyarrow as pa
 import rerun as rr
 
 from estimators.errors import SourceError
+from estimators.gate.doubt import REMEMBERED
 from estimators.model.state_space import StateSpaceModel
 from estimators.snapshots import Base
 from estimators.tuning import Tuning
@@ -42,6 +43,8 @@ def tuning_to_json(tuning: Tuning, estimator: str) -> str:
             "p": tuning.p.tolist(),
             "used": tuning.used.tolist(),
             "gate": tuning.gate,
+            "gate_kind": tuning.gate_kind,
+            "reopen": tuning.reopen,
             "options": dict(tuning.options),
             "seed": tuning.seed,
         }
@@ -58,6 +61,9 @@ def tuning_from_json(text: str, model: StateSpaceModel) -> tuple[Tuning, str]:
         p=np.array(values["p"], float),
         used=np.array(values["used"], bool),
         gate=values["gate"],
+        # Of older recordings the gate was hard, and never opened again.
+        gate_kind=values.get("gate_kind", "hard"),
+        reopen=values.get("reopen"),
         options=values["options"],
         seed=values["seed"],
     )
@@ -70,16 +76,16 @@ def base_to_json(base: Base | None) -> str:
         return "null"
     moments = {"mean": base.mean.tolist(), "cov": base.cov.tolist(), "clock": base.clock, "u": base.u.tolist()}
     moments |= {"first": base.first, "version": base.version}
-    arrays = {"state": base.state, "edge": base.edge, "evidence": base.evidence}
-    held = {key: _encoded(array) for key, array in arrays.items() if array is not None}
+    arrays = {"state": base.state, "edge": base.edge, "evidence": base.evidence, "doubt": base.doubt}
+    held = {key: _packed(array) for key, array in arrays.items() if array is not None}
     return json.dumps({**moments, "estimator": base.estimator, **held})
 
 
-def _encoded(array: np.ndarray) -> str:
-    return base64.b64encode(np.ascontiguousarray(array, "<f8").tobytes()).decode()
+def _packed(numbers: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(numbers, "<f8").tobytes()).decode()
 
 
-def _decoded(text: str | None) -> np.ndarray | None:
+def _unpacked(text: str | None) -> np.ndarray | None:
     return None if text is None else np.frombuffer(base64.b64decode(text), "<f8").astype(float)
 
 
@@ -88,17 +94,19 @@ def base_from_json(text: str) -> Base | None:
     values = json.loads(text)
     if values is None:
         return None
+    doubt = _unpacked(values.get("doubt"))
     return Base(
         np.array(values["mean"]),
         np.array(values["cov"]),
         int(values["clock"]),
         np.array(values["u"], float),
         values.get("estimator", ""),
-        _decoded(values.get("state")),
+        _unpacked(values.get("state")),
         int(values.get("first", 0)),
-        evidence=_decoded(values.get("evidence")),
-        edge=_decoded(values.get("edge")),
+        evidence=_unpacked(values.get("evidence")),
+        edge=_unpacked(values.get("edge")),
         version=int(values.get("version", 1)),
+        doubt=None if doubt is None else doubt.reshape(-1, REMEMBERED),
     )
 
 

@@ -198,8 +198,10 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
     with _placed(loaded, ("estimator",)):
         entry = find_estimator(first.name, model)
     _check_options(loaded, ("estimator", "options"), first.name, first.options, model)
-    tuning = Tuning.of(model).with_options(_options(config, first.name)).set("gate", config.gate)
-    tuning = replace(tuning, baseline=baseline(loaded, model))
+    tuning = replace(Tuning.of(model), baseline=baseline(loaded, model)).with_options(_options(config, first.name))
+    if config.gate is not None:
+        tuning = tuning.set("gate", config.gate.probability).set("gate.kind", config.gate.kind)
+        tuning = tuning.set("gate.reopen", config.gate.seconds)
     for name, section in config.sensors.items():
         if not section.use:
             tuning = tuning.set(f"use.{name}", False)

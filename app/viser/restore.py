@@ -71,6 +71,10 @@ def _text(twin: Twin, key: str, value: Any) -> str:
         return ESTIMATORS[value].title
     if key == "gate":
         return "off" if value is None else f"{100 * value:.6g} %"
+    if key == "gate.kind":
+        return str(value)
+    if key == "gate.reopen":
+        return "never" if value is None else f"{value:.6g} s"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if key.startswith("options."):

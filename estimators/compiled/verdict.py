@@ -11,6 +11,13 @@ LOG_2PI = float(np.log(2.0 * np.pi))
 
 
 @inlined
+def limit_of(context, sensor, m):
+    """The NIS up to which a reading of m finite rows passes the gate."""
+    width = context.width + 1
+    return floats(context.gate, context.n_sensors * width)[sensor * width + m]
+
+
+@inlined
 def verdict_of(context, sensor, m, nis, log_det, score):
     """NIS, log-likelihood and verdict of a reading with m finite rows, from its NIS and log det S.
 
@@ -23,7 +30,7 @@ def verdict_of(context, sensor, m, nis, log_det, score):
     score[2] = -0.5 * (nis + log_det + m * LOG_2PI)
     if flags(context.used, context.n_sensors)[sensor] == 0:
         return HELD_OUT
-    limit = floats(context.gate, context.width + 1)[m]
+    limit = limit_of(context, sensor, m)
     if nis <= limit:
         # A reading that far off would leave an estimate that is no number.
         return USED if nis < np.inf else FAILED

@@ -11,11 +11,26 @@ from typing import Any
 
 import numpy as np
 
+from ..compiled.verdict import limit_of
 from ..errors import ModelError
+from ..gate.doubt import Rule, forget, note
+from ..gate.soften import inflation
 from ..log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from ..numerics.steps import steps_of
-from ..screen import pass_on
-from ..track import ANCESTORS, EFFECTIVE, FAILED, MISSING, NONE, SCREENED, WHITENED, Track
+from ..screen import pass_on, screen_reading
+from ..track import (
+    ANCESTORS,
+    EFFECTIVE,
+    FAILED,
+    GATED,
+    LOG_LIKELIHOOD,
+    MISSING,
+    NONE,
+    SCREENED,
+    USED,
+    WHITENED,
+    Track,
+)
 
 UNSET = int(np.iinfo(np.int64).min)
 """The clock before the first event, which sets it: the prior holds at that time."""
@@ -50,6 +65,7 @@ def _advance_to(
 def run(
     code: Any,
     context: Any,
+    rule: Rule,
     first: int,
     start: int,
     end: int,
@@ -61,11 +77,13 @@ def run(
     clock: np.ndarray,
     u: np.ndarray,
     state: np.ndarray,
+    doubt: np.ndarray,
+    edge: np.ndarray,
     spare: np.ndarray,
     work: np.ndarray,
     score: np.ndarray,
     track: Track,
-) -> None:
+) -> int:
     """Fold events `start` to `end` as the kernel does; see `fold.run`.
 
     Where a model's own Python fails, the view counts it and the fold goes on: a reading has failed, an estimate that
@@ -77,29 +95,50 @@ def run(
     with np.errstate(all="ignore"):  # as compiled code: a number that is not finite is an answer, not a warning
         for i in range(start, end):
             what, now, index = int(kind[i]), int(t[i]), first + i
+            track.screened[i] = 0
             track.innovation[i] = np.nan
             track.innovation_std[i] = np.nan
             score[:] = np.nan
             score[1] = 0.0
             verdict = NONE
+            asked = False
             told = state
             known = True
             if what in (READING, INPUT):
+                if what == READING:
+                    sensor = int(channel[i])
+                    refused = screen_reading(i, now, sensor, value[i], context.context, edge, track.screened)
+                    given = passed if refused else value[i]
                 try:
                     known = False
                     _advance_to(code, context, u, clock, now, index, state, work)
                     known = True
                     if what == READING:
                         innovation, innovation_std = track.innovation[i], track.innovation_std[i]
-                        sensor = int(channel[i])
-                        refused = track.screened[i].any()
-                        given = passed if refused else value[i]
-                        verdict = SCREENED
-                        if not refused or pass_on(value, track.screened, i, passed):
+                        if refused and not pass_on(value, track.screened, i, passed):
+                            verdict = SCREENED
+                        else:
                             with context.brought(sensor, value[i, width:]) if value.shape[1] > width else tuned:
                                 verdict = code.update(
                                     context, u, sensor, given, index, state, work, innovation, innovation_std, score
                                 )
+                                if verdict == GATED and rule.soft:
+                                    verdict = _soften(
+                                        code,
+                                        context,
+                                        u,
+                                        sensor,
+                                        given,
+                                        index,
+                                        state,
+                                        work,
+                                        innovation,
+                                        innovation_std,
+                                        score,
+                                    )
+                        if verdict in (GATED, USED):
+                            beyond = score[0] > limit_of(context.context, sensor, int(score[1]))
+                            asked = note(doubt[sensor], rule.most, beyond, index, float(now))
                 except ModelError as error:
                     context.failed(error)
                     verdict = FAILED if what == READING else NONE
@@ -108,6 +147,7 @@ def run(
                     np.copyto(u, given, where=np.isfinite(given))
             elif what == RESET:
                 code.start(context, *context.prior(), state)
+                forget(doubt)
                 clock[0] = now
             else:
                 if clock[0] == UNSET:
@@ -131,9 +171,39 @@ def run(
             track.effective[i] = score[EFFECTIVE]
             track.ancestors[i] = score[ANCESTORS]
             track.whitened[i] = score[WHITENED:]
+            if asked:
+                return i
+    return -1
 
 
-def run_and_judge(judge: Any, seen: np.void, *given: Any) -> None:
+def _soften(
+    code: Any,
+    context: Any,
+    u: np.ndarray,
+    sensor: int,
+    y: np.ndarray,
+    index: int,
+    state: np.ndarray,
+    work: np.ndarray,
+    innovation: np.ndarray,
+    innovation_std: np.ndarray,
+    score: np.ndarray,
+) -> int:
+    """As gate/soften.py does."""
+    w = inflation(context.context, sensor, y, innovation, score[0], int(score[1]))
+    if not w < np.inf:
+        return GATED
+    nu, std, scored = innovation.copy(), innovation_std.copy(), score.copy()
+    with context.brought(sensor, w * context.variances(sensor)):
+        verdict = int(code.update(context, u, sensor, y, index, state, work, innovation, innovation_std, score))
+    innovation[:], innovation_std[:] = nu, std
+    if verdict == USED:
+        scored[LOG_LIKELIHOOD] = score[LOG_LIKELIHOOD]
+    score[:] = scored
+    return verdict
+
+
+def run_and_judge(judge: Any, seen: np.void, *given: Any) -> int:
     """Fold events, and judge their rows as those of a compiled filter are.
 
     Args:
@@ -142,6 +212,7 @@ def run_and_judge(judge: Any, seen: np.void, *given: Any) -> None:
         given: As the kernel's.
     """
     *folded, policy, bounds, evidence = given
-    _, _, _, start, end, t, kind, channel, value, *_, track = folded
-    run(*folded)
-    judge(start, end, t, kind, channel, value, seen, policy, bounds, evidence, track)
+    _, _, _, _, start, end, t, kind, channel, value, *_, track = folded
+    asking = run(*folded)
+    judge(start, end if asking < 0 else asking + 1, t, kind, channel, value, seen, policy, bounds, evidence, track)
+    return asking

@@ -75,6 +75,10 @@ class View:
         """R (ny, ny): the covariance of a sensor's rows."""
         return self._R[sensor]
 
+    def variances(self, sensor: int) -> np.ndarray:
+        """r (ny,): the variances of a sensor's rows."""
+        return self._r[sensor]
+
     @contextmanager
     def brought(self, sensor: int, own: np.ndarray) -> Iterator[None]:
         """While it lasts, R has the variances that a reading brought, own (ny or more,); NaN leaves the tuned one."""

@@ -11,12 +11,10 @@ from hypothesis import strategies as st
 from estimators.diagnostics.evidence import OUTSIDE, REFUSED, STUCK
 from estimators.errors import ModelError
 from estimators.fold import Fold, fold
-from estimators.fold_kernel import compiled
 from estimators.log import READING, Events, Log
 from estimators.model.limits import NOISES, Limits, Stuck
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
-from estimators.screen import fresh_screen, screen_of
 from estimators.track import DUPLICATE, MISSING, RANGE, RATE, REPEATED, SATURATED, SCREENED, SUSPECT, USED
 from estimators.tuning import Tuning
 from tests.support import SECOND, assert_same
@@ -150,14 +148,12 @@ def test_the_kernel_finds_what_the_rules_say_however_it_is_cut(a, b, rows, data)
     log = Log.of(walk)
     log.extend(events(rows, walk.width))
     ordered = [(int(t) // BEAT, int(s), tuple(y[: s + 1])) for t, s, y in zip(log.t, log.channel, log.value[: log.n])]
-    *_, screen_rows = compiled()
-    state, screened = fresh_screen(walk), np.full((log.n, walk.ny), 99, np.int8)
+    growing = Fold("kf", walk, Tuning.of(walk), log)
     cuts = sorted(data.draw(st.lists(st.integers(0, log.n), max_size=3)))
     for start, stop in zip([0, *cuts], [*cuts, log.n]):
-        columns = (log.t, log.kind, log.channel, log.value)
-        screen_rows(start, stop, *columns, screen_of(walk), state, screened)
+        growing.advance(stop - start)
     expected = plain_screen([a, b], ordered)
-    for i, (row, told) in enumerate(zip(expected, screened.tolist())):
+    for i, (row, told) in enumerate(zip(expected, growing.track.screened.tolist(), strict=True)):
         assert told == row + [0] * (walk.ny - len(row)), (i, ordered[: i + 1])
 
 
@@ -292,10 +288,7 @@ def test_a_quantum_alone_speaks_less_than_once_a_day_and_soon_when_stuck() -> No
     y = np.round(rng.normal(0, sigma, n) / quantum) * quantum
     y[-60:] = y[-60]
     log.add("a", t * 1e-9, y)
-    *_, screen_rows = compiled()
-    screened = np.zeros((n, walk.ny), np.int8)
-    screen_rows(0, n, log.t, log.kind, log.channel, log.value, screen_of(walk), fresh_screen(walk), screened)
-    found = np.flatnonzero(screened[:, 0])
+    found = np.flatnonzero(fold("kf", walk, Tuning.of(walk), log).screened[:, 0])
     begins = found[np.diff(found, prepend=-9) > 1]
     p = math.erf(quantum / (2 * math.sqrt(2) * sigma))
     # A Poisson count of mean `days` at most passes its mean by five standard deviations once in 10⁵.

@@ -1,0 +1,83 @@
+"""The soft gate: a reading beyond it is not refused, its noise is inflated until it lies on it.
+
+    R ← w R,   w = 1 + (1/g - 1/NIS) νᵀ R⁻¹ ν,   NIS = νᵀ S⁻¹ ν > g
+
+With one row, or where ν is an eigenvector of S R⁻¹, NIS(w) is g exactly: 1/NIS is linear in w. With more rows 1/NIS is
+concave in w, and its slope nowhere less than 1 / νᵀ R⁻¹ ν, so NIS(w) is at most g. The further off a reading is, the
+less it moves the estimate: by about g/√NIS of what it asks for.
+
+Sources: Huber (1964), doi:10.1214/aoms/1177703732, for weights that fall with the distance; Chang (2014),
+doi:10.1007/s00190-013-0690-8, for a factor of R from the NIS.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..compiled.context import sensor_rows
+from ..compiled.sensor_noise import independent_rows
+from ..compiled.verdict import limit_of
+from ..estimator import call_update
+from ..numerics.jit import floats, jit
+from ..numerics.linalg import solve_unit
+from ..track import GATED, LOG_LIKELIHOOD, USED
+
+MARGIN = 1e-9
+"""By which a softened NIS stays below the gate, relative: rounding must not leave it above."""
+
+
+@jit
+def inflation(context, sensor, y, innovation, nis, m):
+    """The factor w of R with which a reading's NIS is at most the gate's.
+
+    Args:
+        context: The context; its R is what the reading was judged by.
+        sensor: Index of the sensor.
+        y: The reading (ny,), of which m rows are finite.
+        innovation: ν (ny,).
+        nis: Its NIS, beyond the gate.
+        m: Finite rows.
+    """
+    first, rows = sensor_rows(context, sensor)
+    r = floats(context.r, context.n_rows)[first : first + rows]
+    L, d, e = np.zeros((rows, rows)), np.empty(rows), np.empty(rows)
+    independent_rows(context, sensor, y, r, L, d)
+    k = 0
+    for i in range(rows):
+        if np.isfinite(y[i]):
+            e[k] = innovation[i]
+            k += 1
+    solve_unit(L, m, e)
+    square = 0.0
+    for i in range(m):
+        square += e[i] * e[i] / d[i]
+    limit = limit_of(context, sensor, m) * (1.0 - MARGIN)
+    return 1.0 + (1.0 / limit - 1.0 / nis) * square
+
+
+@jit
+def soften(code, context, u, sensor, y, index, state, work, innovation, innovation_std, score):
+    """Update on a reading beyond the gate with its noise inflated: the verdict.
+
+    What the track shows of the reading, innovation, deviation, NIS and whitened rows, stays that of the noise which was
+    tuned; the log-likelihood is that of the inflated noise. Refused as before where R cannot be inflated, as a row
+    without noise, or a density of the sensor's own that does not go by it.
+    """
+    first, rows = sensor_rows(context, sensor)
+    r = floats(context.r, context.n_rows)[first : first + rows]
+    w = inflation(context, sensor, y, innovation, score[0], int(score[1]))
+    if not w < np.inf:
+        return GATED
+    tuned, nu, std, scored = r.copy(), innovation.copy(), innovation_std.copy(), score.copy()
+    for k in range(rows):
+        r[k] *= w
+    verdict = call_update(code.update, context, u, sensor, y, index, state, work, innovation, innovation_std, score)
+    for k in range(rows):
+        r[k] = tuned[k]
+    for k in range(nu.size):
+        innovation[k] = nu[k]
+        innovation_std[k] = std[k]
+    for k in range(score.size):
+        if k != LOG_LIKELIHOOD or verdict != USED:
+            score[k] = scored[k]
+    return verdict

@@ -1,0 +1,199 @@
+"""Two stories about a sensor that stays refused, and the bits that are the same in whatever pieces they are told."""
+
+import numpy as np
+import pytest
+
+from estimators.fold import Fold
+from estimators.gate.doubt import CHANCE, FEWEST, rule_of
+from estimators.gate.stories import SHARE, Evidence, cost, decided, widening
+from estimators.log import READING, RESET, Events, Log
+from estimators.track import GATED, USED
+from tests.support import SECOND, as_log, assert_same
+
+from .two_sensors import JUMP, MODEL, TUNING, series
+
+FILTERS = ["kf", "sr-kf", "pf", "enkf", "filterpy-kf"]
+
+
+def folded(name, events, tuning=TUNING, **rest):
+    growing = Fold(name, MODEL, tuning, as_log(events), **rest)
+    growing.advance()
+    return growing
+
+
+def outcomes(growing):
+    return [decision.outcome for decision in growing.decisions]
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_sensor_that_jumps_is_isolated(name):
+    """The other sensor contradicts it with its first reading, half a second later."""
+    growing = folded(name, series(1, a=5.0))
+    isolated = growing.decisions[1]
+    assert outcomes(growing)[:2] == ["doubted", "isolated"] and set(outcomes(growing)[2:]) <= {"isolated"}
+    assert isolated.sensor == "a" and JUMP < isolated.time < JUMP + 1.0
+    assert isolated.witnesses == 1 and isolated.evidence < -np.log(1000.0)
+    assert abs(growing.track.mean[-1, 0]) < 1.0
+    after = (growing.log.channel[: growing.n] == 0) & (growing.log.t[: growing.n] >= JUMP * SECOND)
+    assert not np.any(growing.track.verdict[after] == USED)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_an_asset_that_jumps_is_followed(name):
+    growing = folded(name, series(1, a=5.0, b=5.0))
+    assert outcomes(growing) == ["doubted", "reopened"]
+    reopened = growing.decisions[1]
+    assert JUMP < reopened.time < JUMP + 1.0 and reopened.evidence > np.log(1000.0)
+    late = growing.log.t[: growing.n] > (JUMP + 1.0) * SECOND
+    assert not np.any(growing.track.verdict[late] == GATED)
+    # The level's own walk: 0.01 m in a root second, over 60 s.
+    assert abs(growing.track.mean[-1, 0] - 5.0) < 4 * 0.01 * np.sqrt(60.0) + 0.1
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_where_nothing_tells_the_asset_is_believed_after_a_time(name):
+    growing = folded(name, series(1, a=5.0, with_b=False))
+    assert outcomes(growing) == ["doubted", "believed"]
+    believed = growing.decisions[1]
+    assert JUMP + 30.0 <= believed.time <= JUMP + 30.0 + 0.15 and believed.witnesses == 0
+    assert "nothing told for 30 s" in believed.text
+    at = believed.row - growing.log.first
+    assert growing.track.verdict[at] == GATED and np.all(growing.track.verdict[at + 1 :] != GATED)
+    sooner = folded(name, series(1, a=5.0, with_b=False), TUNING.set("gate.reopen", 5.0))
+    assert sooner.decisions[1].time == pytest.approx(JUMP + 5.0, abs=0.15)
+    never = folded(name, series(1, a=5.0, with_b=False), TUNING.set("gate.reopen", None))
+    assert not never.decisions and np.sum(never.track.verdict == GATED) == 400
+
+
+def test_a_sensor_gone_wild_is_isolated_by_its_own_readings():
+    """Noise a hundred times what it was: whatever is believed, the next reading contradicts it."""
+    growing = folded("kf", series(2, noise_a=10.0, with_b=False))
+    assert "isolated" in outcomes(growing) and "believed" not in outcomes(growing)
+    assert "contradict one another" in next(d.text for d in growing.decisions if d.outcome == "isolated")
+    assert abs(growing.track.mean[-1, 0]) < 1.0
+
+
+def test_a_sensor_that_agrees_again_is_said_to():
+    growing = folded("kf", series(1, a=5.0, until=30.0))
+    assert outcomes(growing) == ["doubted", "isolated", "agrees"]
+    # Ten readings in a row that pass, at 10 Hz.
+    assert growing.decisions[-1].time == pytest.approx(30.9, abs=0.15)
+
+
+def test_questions_after_an_isolation_are_ever_further_apart():
+    growing = folded("kf", series(1, a=5.0, seconds=300.0))
+    times = [decision.time for decision in growing.decisions if decision.outcome == "isolated"]
+    assert len(times) == 4 and np.allclose(np.diff(times), [30.0, 60.0, 120.0], atol=0.3)
+
+
+def test_a_twin_begun_elsewhere_believes_its_first_readings():
+    """Nothing confirmed the start, so a sensor that was refused from its first reading is believed at once."""
+    prior = np.array([300.0]), np.array([[0.01]])
+    growing = folded("kf", series(1, with_b=False), prior=prior)
+    first = growing.decisions[0]
+    assert outcomes(growing) == ["believed"] and first.refused == 3 and first.time < 0.5
+    assert "from its first" in first.text
+    assert abs(growing.track.mean[-1, 0]) < 1.0
+
+
+def test_undamaged_readings_raise_no_doubt():
+    for seed in range(5):
+        assert not folded("kf", series(seed, seconds=200.0)).decisions
+
+
+STORIES = [dict(a=5.0), dict(a=5.0, b=5.0), dict(a=5.0, with_b=False), dict(a=1.0, b=0.6, noise_a=0.5)]
+
+
+@pytest.mark.parametrize("kind", ["hard", "soft"])
+@pytest.mark.parametrize("story", range(len(STORIES)))
+@pytest.mark.parametrize("name", ["kf", "pf", "enkf", "filterpy-kf"])
+def test_pieces_and_order_of_arrival_do_not_matter(name, story, kind):
+    events = series(story, **STORIES[story])
+    reset = Events.one(int(25.05 * SECOND), 0, RESET, 0, np.nan, MODEL.width)
+    if story == 0:
+        events = as_log(Events.concat([events, reset], MODEL.width)).events
+    tuning = TUNING.set("gate.kind", kind)
+    whole = folded(name, events, tuning)
+    assert whole.decisions
+    rng = np.random.default_rng(story)
+    order = np.argsort(np.arange(len(events)) + rng.exponential(20.0, len(events)))
+    order = np.concatenate(([0], order[order != 0]))
+    log = Log(MODEL.width, capacity=1)
+    growing = Fold(name, MODEL, tuning, log)
+    rewound = 0
+    for part in np.array_split(order, 150):
+        changed, _ = log.extend(events.select(part))
+        rewound += changed < growing.n and bool(growing.decisions)
+        growing.rewind(changed)
+        growing.advance(int(rng.integers(1, 6)) if rng.random() < 0.3 else None)
+    growing.advance()
+    assert rewound > 10
+    assert_same(growing.track, whole.track)
+    assert [tuple(d) for d in growing.decisions] == [tuple(d) for d in whole.decisions]
+
+
+def test_a_fold_from_a_base_decides_as_the_whole_one():
+    """That a sensor had agreed before is part of the base: else it would be believed at its first refusals."""
+    events = series(1, a=5.0, with_b=False)
+    whole = folded("kf", events)
+    at, base = whole.base_at(200)
+    assert at == 192
+    tail = as_log(events.select(slice(at, None)))
+    tail.first = at
+    rest = Fold("kf", MODEL, TUNING, tail, base=base)
+    rest.advance()
+    assert np.array_equal(rest.track.mean, whole.track.mean[at:])
+    assert [d.outcome for d in rest.decisions] == ["doubted", "believed"]
+
+
+def test_most_refusals_in_a_row_that_chance_explains():
+    for gate in (0.5, 0.95, 0.999):
+        most = rule_of(gate, "hard", True).most
+        assert (1.0 - gate) ** most <= CHANCE < (1.0 - gate) ** (most - 1)
+    assert rule_of(0.999999, "hard", True).most == FEWEST
+    assert rule_of(0.95, "hard", False).most == 0 and rule_of(None, "soft", True) == (0, 0)
+
+
+def test_cost_of_a_reading_is_the_least_that_inflated_noise_makes_of_it():
+    """Beyond the gate c minimises, over factors w ≥ 1 with NIS/w ≤ g, NIS/w + m log w: found here by search."""
+    limit = 13.0
+    for m in (1, 3):
+        for nis in (20.0, 500.0):
+            w = np.linspace(nis / limit, 50.0 * nis, 400_000)
+            least = np.min(nis / w + m * np.log(w))
+            at_gate = limit + m * np.log(nis / limit)
+            assert cost(np.array([nis]), np.array([m]), np.array([limit]))[0] == pytest.approx(at_gate, rel=1e-12)
+            assert least <= at_gate
+    assert cost(np.array([5.0]), np.array([2]), np.array([limit]))[0] == 5.0
+
+
+def test_widened_states_reach_what_was_refused():
+    """S = α H Σ Hᵀ alone explains ν to one deviation in every row; what hardly moves a reading stays as it was."""
+    prior = np.array([4.0, 1.0, 100.0])
+    H = np.array([[1.0, 0.01, 0.0], [0.0, 0.0, 2.0]])
+    assert H[0, 1] ** 2 * prior[1] < SHARE * 4.0
+    nu = np.array([10.0, np.nan])
+    added = widening(np.full(3, 1e-3), prior, H, nu)
+    assert added == pytest.approx([100.0, 0.0, 2500.0])
+    assert np.all(nu[:1] ** 2 <= (np.square(H) @ added)[:1] * (1 + 1e-12))
+    assert widening(np.full(3, 1e-3), np.zeros(3), H[:1], np.array([1.0])) == pytest.approx([1.0, 0.0, 0.0])
+    assert not widening(np.zeros(3), np.zeros(3), H, nu).any()
+
+
+def test_what_follows_from_the_evidence():
+    assert decided(Evidence(8.0, 3, 0.0), False, False) == "reopened"
+    assert decided(Evidence(8.0, 3, -16.0), True, True) == "isolated"
+    assert decided(Evidence(6.0, 3, 0.0), False, False) == "doubted"
+    assert decided(Evidence(-6.0, 3, 0.0), False, True) == "believed"
+    assert decided(Evidence(-6.0, 3, 0.0), True, False) == "believed"
+
+
+def test_a_story_that_begins_after_another_starts_from_what_that_one_left():
+    """Widening leaves the mean, so the first innovation of the second story is that of the first."""
+    growing = folded("kf", series(1, a=5.0, with_b=False), TUNING.set("gate.reopen", 1.0))
+    believed = next(d.row for d in growing.decisions if d.outcome == "believed")
+    start = believed + 1
+    while growing.log.kind[start] != READING:
+        start += 1
+    story = growing.second_story(start, start + 1, 0)
+    assert story.track.innovation[0, 0] == pytest.approx(growing.track.innovation[start, 0], abs=1e-12)
