@@ -105,7 +105,7 @@ def _posterior(checked: Checked) -> Line:
     # Of many rows a few look so by chance.
     heavy = heavy if len(heavy) > OFTEN * len(checked.tails) else []
     if found.reason:
-        said = [f"no cloud was looked at: {found.reason}"]
+        said = [f"no cloud tells of peaks: {found.reason}"]
     else:
         several = f"{100 * found.several:.2g} % of {found.looks} looks at the cloud of {found.estimator} over "
         several += f"{found.over:.4g} s show more than one peak (at most {found.most})"
@@ -125,6 +125,8 @@ def _posterior(checked: Checked) -> Line:
         remedy = (
             f"{checked.twin.estimator} has one peak: use pf, pf_ekf or rbpf" if one else "particles carry the peaks"
         )
+    elif heavy and checked.linearity.passes is not None and not checked.linearity.white:
+        remedy = "innovations are correlated too: these are errors of the model, and a gate would refuse good readings"
     elif heavy and checked.twin.tuning.gate is None:
         remedy = "heavy tails need a gate, not particles: set gate: 0.99999"
     elif heavy:
