@@ -31,7 +31,7 @@ def check_twin(arguments: Arguments) -> int:
     if arguments.html is not None:
         arguments.html.write_text(as_html(f"nisus check {twin.name}", parts), encoding="utf-8")
     if arguments.json:
-        print(json.dumps(figures(checked)))
+        print(json.dumps(figures(checked), allow_nan=False))
     else:
         print("\n".join(as_text(parts)))
     return 0

@@ -156,8 +156,8 @@ def _timing(checked: Checked) -> dict[str, Any]:
     return {
         "stamps": stamps(checked),
         "horizon": section.horizon,
-        "degraded_after": policy.degraded_after,
-        "stale_after": policy.stale_after,
+        "degraded_after": number(policy.degraded_after),
+        "stale_after": number(policy.stale_after),
         "stale": checked.counts["stale"],
         "sensors": {item.sensor: _plain(item) for item in checked.arrivals},
     }
@@ -182,6 +182,6 @@ def _health(checked: Checked) -> dict[str, Any]:
     share = np.bincount(track.health, minlength=len(HEALTH_NAMES)) / max(1, len(track))
     return {
         "share": {name: float(value) for name, value in zip(HEALTH_NAMES, share, strict=True)},
-        "false_alarm_every": checked.twin.policy.false_alarm_every,
+        "false_alarm_every": number(checked.twin.policy.false_alarm_every),
         "episodes": [_plain(episode) for episode in checked.episodes],
     }

@@ -121,3 +121,20 @@ def test_text_is_the_same_page(capsys):
     out = capsys.readouterr().out
     assert "Checklist" in out and "integrity bound" in out and "There is one sensor" in out
     assert max(map(len, out.splitlines())) <= 160
+
+
+@pytest.mark.parametrize(
+    "name, seconds", [("agv_corridor", 10), ("gripper_contact", 1), ("lorenz96", 1), ("thermal_field", 11)]
+)
+def test_what_does_not_apply_is_said_and_nothing_fails(name, seconds, capsys):
+    assert main(["check", name, "--duration", str(seconds), "--json"]) == 0
+    # Numbers that are none are null: JSON has no NaN.
+    found = json.loads(capsys.readouterr().out, parse_constant=lambda word: pytest.fail(word))
+    assert set(found) == REQUIRED | MORE
+    if name == "thermal_field":
+        assert found["integrity"]["reason"] == found["observability"]["reason"] != ""
+        assert found["checklist"]["linearity"]["answer"] == "not told"
+        assert found["smallest_visible"] == []
+        assert "temperature, all cells" in found["open_loop"]["states"]
+    else:
+        assert found["integrity"]["reason"] == "" and found["smallest_visible"]

@@ -60,8 +60,8 @@ def test_api_and_panel_show_it_beside_two_sigma(engine):
     for entry in after["integrity"].values():
         assert set(entry) == {"bound", "two_sigma", "unit", "fault"} and entry["bound"] > entry["two_sigma"] > 0.0
     text = status_html(engine.status(), 0)
-    for name in MODEL.state_names:
-        assert name in text
+    for name, entry in after["integrity"].items():
+        assert f"{name}</span> ±{entry['two_sigma']:.3g} / {entry['bound']:.3g} {entry['unit']}" in text
     assert "integrity bound under one unseen fault" in text
 
 
@@ -94,6 +94,20 @@ def test_a_window_starts_at_a_snapshot_and_is_a_copy():
     assert taken.base.first + len(taken.events) == 3000
     taken.events.value[:] = 0.0
     assert log.value[2999, 0] != 0.0
+
+
+def test_a_part_of_the_log_goes_on_from_what_stood_before_it():
+    log = Log(MODEL.width)
+    log.extend(readings(*series(3000)))
+    tuning = twin().tuning
+    fold = Fold("kf", MODEL, tuning, log)
+    fold.advance()
+    watch = IntegrityWatch(MODEL, lambda: window(fold, 0, most=200), EVERY)
+    watch.look()
+    whole = bounds_of(MODEL, sensitivity("kf", MODEL, tuning, log, most=200, false_alarm=EVERY))
+    assert watch.of(0).bounds.keys() == whole.keys()
+    for state, bound in whole.items():
+        np.testing.assert_allclose(watch.of(0).bounds[state][1:4], bound[1:4], rtol=1e-9)
 
 
 def test_nothing_is_computed_twice_nor_while_a_refold_is_waited_for():
