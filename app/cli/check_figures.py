@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from estimators.diagnostics.calibration import BANDS
+from estimators.diagnostics.episodes import episode_json
 from estimators.diagnostics.sensitivity import Sensitivity, View, bounds_of
 from estimators.track import HEALTH_NAMES
 
@@ -183,5 +184,5 @@ def _health(checked: Checked) -> dict[str, Any]:
     return {
         "share": {name: float(value) for name, value in zip(HEALTH_NAMES, share, strict=True)},
         "false_alarm_every": number(checked.twin.policy.false_alarm_every),
-        "episodes": [_plain(episode) for episode in checked.episodes],
+        "episodes": [episode_json(episode) for episode in checked.episodes],
     }

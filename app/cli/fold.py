@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyarrow.parquet as pq
 
+from estimators.diagnostics.episodes import Episode, episodes
 from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError, SourceError
@@ -26,6 +27,7 @@ from ..engine.stall import interruptible
 from ..intake import Intake
 from ..twin.twin import Twin, load_twin
 from .arguments import settings
+from .fold_episodes import episode_lines
 from .fold_report import as_dict, as_text, calibration_of
 from .prepare import prepare
 from .remarks import remarking
@@ -95,7 +97,16 @@ def fold_twin(arguments: Arguments) -> int:
     prepare(twin)
     log, counts = read_log(twin, arguments.duration)
     period = twin.picture if arguments.out is not None and arguments.out.suffix == ".rrd" else None
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log, pairs=twin.pairs, policy=twin.policy, picture=period)
+    fold = Fold(
+        twin.estimator,
+        twin.model,
+        twin.tuning,
+        log,
+        pairs=twin.pairs,
+        policy=twin.policy,
+        picture=period,
+        expected=twin.expected,
+    )
     begun = time.perf_counter()
 
     def work() -> None:
@@ -108,19 +119,23 @@ def fold_twin(arguments: Arguments) -> int:
     result = score(fold.track, log.events, twin.model, pictures, gate=twin.tuning.gate)
     found = calibration_of(twin, fold)
     if arguments.out is not None:
-        _write(arguments.out, twin, log, fold.track, pictures)
+        _write(arguments.out, twin, log, fold.track, pictures, episodes(fold))
     if arguments.json:
         print(json.dumps(as_dict(twin, result, found, seconds, counts, fold)))
     else:
-        print("\n".join(as_text(twin, result, found, seconds, counts, fold)))
+        print("\n".join([*as_text(twin, result, found, seconds, counts, fold), *episode_lines(episodes(fold))]))
     return 0
 
 
-def _write(path: Path, twin: Twin, log: Log, track: Track, pictures: Sequence[Picture]) -> None:
+def _write(
+    path: Path, twin: Twin, log: Log, track: Track, pictures: Sequence[Picture], found: Sequence[Episode]
+) -> None:
     if path.suffix == ".rrd":
         from ..recording.writer import write_recording
 
-        write_recording(path, twin, log, track, pictures)
+        write_recording(path, twin, log, track, pictures, found)
         return
-    table = table_of(twin.model, log.events, track, tuning_version=twin.tuning.version, model_version=log.version)
+    table = table_of(
+        twin.model, log.events, track, found, tuning_version=twin.tuning.version, model_version=log.version
+    )
     pq.write_table(table, path)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from estimators.diagnostics.calibration import BANDS, Calibration, calibrations, truth_calibration
+from estimators.diagnostics.episodes import episode_json, episodes
 from estimators.diagnostics.failure_cause import failures
 from estimators.diagnostics.intervals import Interval
 from estimators.diagnostics.score import Score
@@ -67,7 +68,8 @@ def as_dict(
     the share of the track's rows in each state of health.
     `log_likelihood` has the price of the readings that were refused, which `log_likelihood_used` leaves out; `refused`
     is their share. `calibration` has an entry for each sensor row, used or held out, and each state whose truth is
-    told: see estimators/diagnostics/calibration.py.
+    told: see estimators/diagnostics/calibration.py. `episodes` have start and end in seconds of the log (end null while
+    one lasts): see estimators/diagnostics/episodes.py.
     """
     return {
         "twin": twin.name,
@@ -111,6 +113,7 @@ def as_dict(
             )
         },
         "calibration": [calibration_dict(entry) for entry in found],
+        "episodes": [episode_json(episode) for episode in episodes(fold)],
         "seconds_per_event": seconds,
     }
 

@@ -1,15 +1,16 @@
-"""Alerts from new rows: readings that could not be used, clouds that were lost, changes of health."""
+"""Alerts from new rows: readings that could not be used, clouds and estimates that were lost. See also chronicle.py."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
 from estimators.diagnostics.failure_cause import failures
 from estimators.fold import Fold
 from estimators.gate.stories import AGREES
-from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
 
-from .counts import UNSETTLED, complaints, estimated_rows, last_run
+from .counts import UNSETTLED, complaints, estimated_rows
 from .notices import Notices
 from .refusals import refusals
 
@@ -20,9 +21,9 @@ TRIES = 3
 class Alerts:
     """Reports the rows of a fold as they come."""
 
-    def __init__(self, notices: Notices) -> None:
-        self._notices = notices
-        self._health = TRACKING
+    def __init__(self, notices: Notices, in_alarm: Callable[[], frozenset[str]] = frozenset) -> None:
+        """`in_alarm`: sensors of which it is said already that something is wrong."""
+        self._notices, self._in_alarm = notices, in_alarm
         self._recoveries = 0
         self._lost: tuple[int, int] | None = None
         self._failures = 0
@@ -47,16 +48,18 @@ class Alerts:
     def look(self, fold: Fold, before: int) -> None:
         """Report the rows from `before` on."""
         track, log = fold.track, fold.log
+        known = {f"gated {name}" for name in self._in_alarm()}
         for key, text in complaints(fold.model, log.channel, track, before):
-            self._notices.report(key, text, counted=False)
+            if key not in known:
+                self._notices.report(key, text, counted=False)
         for key, text in refusals(fold.model, log, track, before):
             self._notices.report(key, text, counted=False)
         self._look_at_failures(fold)
         self._look_for_cause(fold, before)
         self._look_at_decisions(fold)
-        count, known = fold.recoveries(), self._recoveries
+        count, told = fold.recoveries(), self._recoveries
         self._recoveries = count
-        if count > known:
+        if count > told:
             name = fold.estimator.name
             text = f"{name}: no particle explained a reading; the cloud was widened, {count} time(s) so far"
             self._notices.report("recovered", text, counted=False)
@@ -65,12 +68,6 @@ class Alerts:
         if self._lost is not None and not was_lost:
             text = "the estimate is not a number; Reset, or another filter, may help"
             self._notices.say(text, level="error", t=self._lost[1])
-        if len(track) and track.health[-1] != self._health:
-            self._health = int(track.health[-1])
-            more = "; Reset starts again from the prior" if self._health == DIVERGED and self._lost is None else ""
-            level = "info" if self._health == TRACKING else "warn"
-            since = int(log.t[last_run(track.health)])
-            self._notices.say(f"health: {HEALTH_NAMES[self._health]}{more}", level=level, t=since)
 
     def _look_for_numbers(self, fold: Fold, before: int) -> tuple[int, int] | None:
         """The first of the last rows without a number: its absolute index, and its time; None if the last has one."""

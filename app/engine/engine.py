@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from estimators.diagnostics.health import HealthPolicy
+from estimators.diagnostics.sensor_states import sensor_states
 from estimators.errors import EstimatorError, NisusError
 from estimators.fold import Fold
 from estimators.late import inflated
@@ -24,12 +25,14 @@ from estimators.log import TICK, Events, Log
 from estimators.numerics.peaks import peaks_of
 from estimators.registry import find_estimator
 from estimators.snapshots import SPARSE_EVERY, Base
+from estimators.track import TRACKING, WAITING
 from estimators.versions import model_version_at
 
 from ..intake import Intake
 from ..stderr import complain
 from . import commands
 from .alerts import Alerts
+from .chronicle import Chronicle
 from .counts import Latency, RowCounts, last_run
 from .execute import Remembered, execute
 from .faults import Faulty
@@ -46,6 +49,7 @@ from .silence import Silence
 from .stall import Stall
 
 if TYPE_CHECKING:
+    from estimators.diagnostics.episodes import Episode
     from estimators.diagnostics.field_pictures import Picture
     from estimators.events.clocks import Passed
     from estimators.tuning import Tuning
@@ -108,7 +112,8 @@ class Engine:
         self._idle_ticks = IdleTicks(section.tick)
         self._latency = Latency()
         self._clock = HostClock(self.notices, section.horizon)
-        self._alerts = Alerts(self.notices)
+        self._chronicle = Chronicle(self)
+        self._alerts = Alerts(self.notices, lambda: self._chronicle.account.in_alarm)
         self._silence = Silence(self.notices, section.stale_after)
         self._stall = Stall(self._say_stalled)
         self._integrity = IntegrityWatch(self.model, self._window, self._policy.false_alarm_every)
@@ -131,7 +136,15 @@ class Engine:
     def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
         period = self.twin.picture if self.model.grid is not None else None
         return Fold(
-            estimator, self.model, tuning, log, pairs=self.pairs, policy=self._policy, base=base, picture=period
+            estimator,
+            self.model,
+            tuning,
+            log,
+            pairs=self.pairs,
+            policy=self._policy,
+            base=base,
+            picture=period,
+            expected=self.twin.expected,
         )
 
     @contextmanager
@@ -152,6 +165,7 @@ class Engine:
         self._stall.start()
         self._refolder.start()
         self._thread.start()
+        self._chronicle.start()
         self._feeder.start()
         self._integrity.start()
 
@@ -163,6 +177,7 @@ class Engine:
         self._refolder.stop()
         if self._thread.is_alive():
             self._thread.join(timeout=5.0 if self._stall.text is None else 0.1)
+        self._chronicle.stop()
         self._stall.stop()
 
     def submit(self, command: commands.Command) -> None:
@@ -250,6 +265,10 @@ class Engine:
         with self._reading():
             return self._fold.tuning, self._fold.estimator.name
 
+    def episodes(self) -> list[Episode]:
+        """What was and is wrong, in the order of its start; at most a second behind the rows."""
+        return list(self._chronicle.account.episodes)
+
     def previous(self) -> Pull | None:
         """The whole previous revision, for comparison; its arrays never change."""
         return self._previous
@@ -276,6 +295,11 @@ class Engine:
             log, fold = self._log, self._fold
             track = fold.track
             last = fold.n - 1
+            now = log.t[last] * 1e-9 if last >= 0 else 0.0
+            states = sensor_states(self.model, fold.tuning.used, fold.evidence, now, self._policy)
+            health = int(track.health[last]) if last >= 0 else self._silence.health
+            account = self._chronicle.account
+            leading = account.leading(dict(zip(self.model.sensor_names, states, strict=True)))
             status = Status(
                 estimator=self.estimator,
                 tuning=self.tuning,
@@ -283,8 +307,11 @@ class Engine:
                 revision=self._revision,
                 refolding=self._requests.waiting,
                 t=int(log.t[last]) if last >= 0 else None,
-                health=int(track.health[last]) if last >= 0 else self._silence.health,
+                health=health,
                 since=int(log.t[last_run(track.health)]) if last >= 0 else None,
+                cause=leading.text if leading is not None and health not in (WAITING, TRACKING) else "",
+                sensors=account.of_sensors(self.model.sensor_names, states),
+                episodes_open=len(account.lasting),
                 lost=self._alerts.lost,
                 model_version=model_version_at(log, int(log.t[last])) if last >= 0 else log.version,
                 clock=self._clock.estimate,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from estimators.diagnostics.episodes import Episode
 from estimators.diagnostics.health import HealthPolicy
 from estimators.log import Events
 from estimators.model.state_space import StateSpaceModel
@@ -70,6 +71,9 @@ class Running(Protocol):
 
     def pull(self, cursor: Cursor, limit: int | None = None) -> Pull:
         """Copies of the rows since the cursor, at most `limit`, and the notices since."""
+
+    def episodes(self) -> list[Episode]:
+        """What was and is wrong, in the order of its start."""
 
     def previous(self) -> Pull | None:
         """The whole previous revision, for comparison."""

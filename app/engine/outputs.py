@@ -69,7 +69,9 @@ class Status:
     """The state of the running twin, for panels and the API.
 
     `t` is the time of the last event (ns), `since` the time when the present health began, `lost` the time from which
-    the estimate has not been a number (None if it is one). `model_version` counts up with each maintenance. `clock` is
+    the estimate has not been a number (None if it is one). `cause` is the text of the leading episode while health is
+    not tracking; `sensors` gives each sensor's state (diagnostics/sensor_states.py) and the text of its own episode.
+    `model_version` counts up with each maintenance. `clock` is
     that of a live source against this machine's, None while it is not known. `counts` are those of the rows of this
     revision, and of other things that happened to the twin. `account` is what the filter says of itself (see
     `Fold.account`). `latency_ms` is the 99th percentile from a reading's arrival to its row. `faults` are those that
@@ -85,6 +87,9 @@ class Status:
     t: int | None
     health: int
     since: int | None
+    cause: str
+    sensors: dict[str, tuple[str, str]]
+    episodes_open: int
     lost: int | None
     model_version: int
     clock: ClockFit | None

@@ -58,6 +58,9 @@ if (settings.viser) {
 
 const spell = (seconds) => (seconds < 120 ? `${Math.floor(seconds)} s` : `${Math.floor(seconds / 60)} min`);
 
+// Beside the colours, for whoever cannot tell them.
+const SIGNS = { waiting: "○", tracking: "●", suspect: "◐", degraded: "▲", diverged: "✖", stale: "◌" };
+
 function show(status) {
   document.title = `${status.twin} · Nisus`;
   $("twin").textContent = status.twin;
@@ -65,14 +68,17 @@ function show(status) {
   const recorded = status.began_as === "recorded" ? (turned ? " · recorded, turned" : " · as recorded") : "";
   $("title").textContent = status.title + recorded;
   const lost = status.lost !== null;
-  const lasting = lost || (status.health !== "tracking" && status.since !== null);
+  const lasting = lost || (!["tracking", "waiting"].includes(status.health) && status.since !== null);
   const condition = lost ? "not a number" : status.health;
   const since = lost ? status.lost : status.since;
-  $("health").textContent = lasting ? `${condition} for ${spell((status.t - since) / 1e9)}` : condition;
+  const sign = SIGNS[status.health] ?? "●";
+  $("health").textContent = `${sign} ${lasting ? `${condition} for ${spell((status.t - since) / 1e9)}` : condition}`;
   $("health").title = lost
     ? "The estimate is not a number: reset it, or choose another filter"
     : "Health of the estimate";
   $("health").dataset.health = status.health;
+  if ($("cause").textContent !== status.cause) $("cause").textContent = $("cause").title = status.cause;
+  $("cause").hidden = lost || !status.cause;
   $("estimator").textContent = status.estimator.toUpperCase();
   $("revision").textContent = status.refolding ? `${status.revision} …` : status.revision;
   compare(status.revision);

@@ -90,7 +90,7 @@ def _unpacked(text: str | None) -> np.ndarray | None:
 
 
 def base_from_json(text: str) -> Base | None:
-    """The base that `base_to_json` wrote; older recordings hold moments only, and no index."""
+    """The base that `base_to_json` wrote; older recordings hold moments only, and no index or evidence."""
     values = json.loads(text)
     if values is None:
         return None

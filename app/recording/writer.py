@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from estimators.diagnostics.health import FAR
 from estimators.errors import NisusError, SourceError
 
+from ..engine.notices import Notice
 from ..engine.outputs import Cursor, Pull
 from ..rerun.rows import RerunRows
 from .disk import Disk
@@ -27,6 +28,7 @@ from .format import RecordingFile
 from .split import NEVER, Split, part_path
 
 if TYPE_CHECKING:
+    from estimators.diagnostics.episodes import Episode
     from estimators.diagnostics.field_pictures import Picture
     from estimators.log import Log
     from estimators.track import Track
@@ -269,7 +271,14 @@ class _Part:
         self._engine.release(self._charts)
 
 
-def write_recording(path: Path, twin: Twin, log: Log, track: Track, pictures: Sequence[Picture] = ()) -> None:
+def write_recording(
+    path: Path,
+    twin: Twin,
+    log: Log,
+    track: Track,
+    pictures: Sequence[Picture] = (),
+    episodes: Sequence[Episode] = (),
+) -> None:
     """Write a finished fold as a recording, in the same form as a running twin's, with the pictures of a large field.
 
     Args:
@@ -278,10 +287,15 @@ def write_recording(path: Path, twin: Twin, log: Log, track: Track, pictures: Se
         log: The events.
         track: Their rows.
         pictures: Of a large field.
+        episodes: What was wrong; a line each among the recording's events.
 
     Raises:
         SourceError: If the file cannot be written.
     """
+    lines = [
+        Notice(k, round(episode.start * 1e9), "error" if episode.cause == "diverged" else "warn", episode.text)
+        for k, episode in enumerate(episodes)
+    ]
     try:
         path.unlink(missing_ok=True)
         file = RecordingFile(path, name=twin.name, text=twin.text, twin_path=twin.path, base=None)
@@ -290,7 +304,8 @@ def write_recording(path: Path, twin: Twin, log: Log, track: Track, pictures: Se
         for start in range(0, log.n, ROWS):
             rows = slice(start, min(log.n, start + ROWS))
             here = [picture for picture in pictures if start < picture.before <= rows.stop]
-            pull = Pull(0, start == 0, start, log.events.select(rows), track.select(rows), pictures=here)
+            said = lines if start == 0 else []
+            pull = Pull(0, start == 0, start, log.events.select(rows), track.select(rows), said, here)
             file.write(pull)
             drawing(pull)
             file.flush()

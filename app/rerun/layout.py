@@ -27,6 +27,9 @@ from .style import (
     with_unit,
 )
 
+LANES = 6
+"""Sensors at most whose states are drawn, in a tab behind the twin's health."""
+
 AT_ONCE = 3
 """Charts of states that are shown at the same time; more come in tabs, which cost nothing while they are hidden."""
 
@@ -82,6 +85,8 @@ def blueprint(
         axis_y=rrb.ScalarAxis(range=(-0.08 * nis_limit(model), nis_limit(model)), zoom_lock=True),
     )
     health = rrb.StateTimelineView(origin=f"{root}/health", name="health", time_view=axis)
+    sensors = rrb.StateTimelineView(origin=f"{root}/sensor", name="sensors", time_view=axis)
+    healths = [health, sensors] if len(model.sensors) <= LANES else [health]
     columns = rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["LogLevel", "Body"])
     events = rrb.TextLogView(origin=EVENTS, name="events", columns=columns)
     ellipses = [
@@ -104,7 +109,7 @@ def blueprint(
         above = [*charts, rrb.Horizontal(*_tabs(innovations), nis)]
         shares = [1.25 * min(len(states), AT_ONCE) / len(charts)] * len(charts) + [1.1, 0.8, 1.5]
     return rrb.Blueprint(
-        rrb.Vertical(*above, health, bottom, row_shares=shares),
+        rrb.Vertical(*above, *_tabs(healths), bottom, row_shares=shares),
         rrb.TopPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),

@@ -6,6 +6,7 @@ import numpy as np
 import rerun as rr
 
 from estimators.diagnostics.field_pictures import Picture
+from estimators.diagnostics.sensor_states import STATES, states_along
 from estimators.log import READING, Events, truth_of
 from estimators.track import FAILED, GATED, HEALTH_NAMES, Track
 
@@ -15,10 +16,10 @@ from ..engine.interface import Running
 from ..engine.notices import Notice
 from ..engine.outputs import Pull
 from .field import FieldDrawing
-from .layout import blueprint, styles
+from .layout import LANES, blueprint, styles
 from .pairs import PairDrawing
 from .sink import Sink
-from .style import EVENTS, HEALTH_COLORS, pair_name
+from .style import EVENTS, HEALTH_COLORS, SENSOR_COLORS, pair_name
 from .thin import last_of_each_time
 
 PIXELS = 1200
@@ -74,6 +75,15 @@ class RerunRows:
                 values=list(HEALTH_NAMES), labels=list(HEALTH_NAMES), colors=np.array(HEALTH_COLORS, np.uint32)
             ),
         )
+        self._sensors = list(self.model.sensor_names) if len(self.model.sensors) <= LANES else []
+        self._states_of = dict.fromkeys(self._sensors, -1)
+        for name in self._sensors:
+            self.sink.static(
+                f"/sensor/{name}",
+                rr.StateConfiguration(
+                    values=list(STATES), labels=list(STATES), colors=np.array(SENSOR_COLORS, np.uint32)
+                ),
+            )
         if self._layout:
             layout = blueprint(self.model, self.pairs, window=self.sink.window, root=root, truth=self._tells_field)
             self.sink.stream.send_blueprint(layout)
@@ -146,6 +156,7 @@ class RerunRows:
             self._states(line_t, line_track, width)
             self._window_nis(line_t, line_track, width)
             self._health_changes(line_t, line_track, past)
+            self._sensor_changes(events.select(lines), line_track, past)
             for ellipse in self._ellipses:
                 ellipse.draw(self.sink, line_t, line_track, events.select(lines), past)
         if dots.any():
@@ -210,6 +221,18 @@ class RerunRows:
         if changes.size:
             names = [HEALTH_NAMES[health[k]] for k in changes]
             self.sink.columns("/health", t[changes], rr.StateChange.columns(state=names))
+
+    def _sensor_changes(self, events: Events, track: Track, past: bool) -> None:
+        for s, name in enumerate(self._sensors):
+            rows, states = states_along(events, track, s)
+            if not rows.size:
+                continue
+            changes = np.flatnonzero(np.append(-1 if past else self._states_of[name], states[:-1]) != states)
+            if not past:
+                self._states_of[name] = int(states[-1])
+            if changes.size:
+                words = [STATES[states[k]] for k in changes]
+                self.sink.columns(f"/sensor/{name}", events.t[rows[changes]], rr.StateChange.columns(state=words))
 
     def _readings(self, events: Events, track: Track, width: int) -> None:
         channel, t = events.channel, events.t

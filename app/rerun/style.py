@@ -21,6 +21,8 @@ GAP = 0.05
 """Between the picture of a field and its scale, and the width of the scale, of the picture's width."""
 
 HEALTH_COLORS = (0x60A5FAFF, 0x16A34AFF, 0xFACC15FF, 0xF59E0BFF, 0xDC2626FF, 0x9CA3AFFF)
+SENSOR_COLORS = (0x60A5FAFF, 0x16A34AFF, 0xFACC15FF, 0xF59E0BFF, 0x9CA3AFFF, 0x64748BFF)
+"""Of the states of a sensor, in the order of `STATES`."""
 
 
 def with_unit(name: str, unit: str) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 
 from starlette.responses import JSONResponse
 
+from estimators.diagnostics.episodes import anchor, episode_json
 from estimators.errors import ConfigError, printable
 from estimators.track import HEALTH_NAMES
 
@@ -61,6 +62,9 @@ def status_json(engine: Running) -> dict[str, Any]:
         "t": status.t,
         "health": HEALTH_NAMES[status.health],
         "since": status.since,
+        "cause": status.cause,
+        "sensors": {name: {"state": state, "text": text} for name, (state, text) in status.sensors.items()},
+        "episodes_open": status.episodes_open,
         "lost": status.lost,
         "nis": _plain(status.nis),
         "nis_low": _plain(status.nis_low),
@@ -82,6 +86,11 @@ def status_json(engine: Running) -> dict[str, Any]:
         "faults": faults.status_json(status.faults, engine.model),
         **_integrity(status),
     }
+
+
+def episodes_json(engine: Running) -> list[dict[str, Any]]:
+    """What was and is wrong, in the order of its start: times in seconds of the log, `help` in ALARMS.md."""
+    return [episode_json(episode) | {"help": f"ALARMS.md#{anchor(episode.cause)}"} for episode in engine.episodes()]
 
 
 def faults_json(engine: Running) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from estimators.errors import NisusError
 
 from ..engine.interface import Running
 from ..rerun.feed import RerunFeed
-from .api import Json, command_from_json, faults_json, one_line, status_json
+from .api import Json, command_from_json, episodes_json, faults_json, one_line, status_json
 from .bounds import BODY, TooLarge, bounded_body, bounds
 from .gate import Gate, session_token
 from .port import listen
@@ -129,6 +129,7 @@ class PageServer:
         routes: list[Any] = [
             Route("/", self._page),
             Route("/api/status", self._status),
+            Route("/api/episodes", self._episodes),
             Route("/api/recordings", self._list_recordings),
             Route("/api/faults", self._faults),
             Route("/api/command", self._command, methods=["POST"]),
@@ -156,6 +157,9 @@ class PageServer:
     async def _status(self, request: Request) -> Response:
         status = status_json(self._engine)
         return Json({**status, "recordings": sorted(self._recordings())})
+
+    async def _episodes(self, request: Request) -> Response:
+        return Json(episodes_json(self._engine))
 
     async def _list_recordings(self, request: Request) -> Response:
         found = {name: path for name, path in self._recordings().items() if path.is_file()}

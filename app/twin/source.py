@@ -40,6 +40,8 @@ class Plan:
     """Whether some sensor's readings tell their own noise."""
     scheduled: tuple[Fault, ...] = ()
     """The faults that the YAML puts into the source."""
+    fed: tuple[int, ...] = ()
+    """The sensors that the source feeds."""
 
     def faults(self) -> Faults:
         """A new layer of faults, with those of the YAML."""
@@ -118,7 +120,9 @@ def plan_source(loaded: Loaded, model: StateSpaceModel, log_files: Sequence[Path
     kind.check(loaded, model, section, KEY)
     scheduled = _scheduled(loaded, model)
     own = any(item.accuracy is not None for item in found)
-    return Plan(loaded, model, tuple(log_files) if log_files is not None else None, own, scheduled)
+    fed_sensors = {item.index for item in found if item.kind == READING} if fed else range(len(model.sensors))
+    files = tuple(log_files) if log_files is not None else None
+    return Plan(loaded, model, files, own, scheduled, tuple(sorted(fed_sensors)))
 
 
 def _scheduled(loaded: Loaded, model: StateSpaceModel) -> tuple[Fault, ...]:

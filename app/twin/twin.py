@@ -110,6 +110,11 @@ class Twin:
         return degraded_after(self.config, self.model)
 
     @property
+    def expected(self) -> np.ndarray:
+        """Whether each sensor must speak, (sensors,): those that the source feeds."""
+        return np.isin(np.arange(len(self.model.sensors)), self.plan.fed)
+
+    @property
     def tells_field(self) -> bool:
         """Whether the source tells the truth of a whole large field."""
         grid, source = self.model.grid, self.config.source

@@ -36,7 +36,7 @@ from .faults import FaultRows
 from .options import OptionRows
 from .restore import BeganRows
 from .rows import ChoiceRow, Held, NumberRow
-from .status import events_html, note_html, status_html
+from .status import episodes_html, events_html, note_html, sensors_html, status_html
 from .time_units import SECONDS, Unit
 
 SPEEDS = {"0.1×": 0.1, "0.25×": 0.25, "0.5×": 0.5, "1×": 1.0, "2×": 2.0, "5×": 5.0, "10×": 10.0, "max": np.inf}
@@ -69,12 +69,14 @@ class Panel:
         with tabs.add_tab("Sensors"):
             gui.add_html('<div style="font-size:0.8em;padding:0 0.9em 0.6em">Off: held out. Predicted and scored, '
                          "never used.</div>")  # fmt: skip
+            self._sensors_text = gui.add_html("")
             self.sensors = {name: self._sensor(gui, name, status) for name in engine.model.sensor_names}
             self.faults = FaultRows(gui, engine.model, engine.submit, self.complain)
         with tabs.add_tab("Play"):
             self._build_play(gui, status)
             self.scene_folder = gui.add_folder("Scene")
         with tabs.add_tab("Events"):
+            self._episodes_list = gui.add_html("")
             self._events_list = gui.add_html("")
 
     def _build_estimator(self, gui: viser.GuiApi, status: Status) -> None:
@@ -182,6 +184,8 @@ class Panel:
         style = "padding:0 0.9em 0.5em;font-size:0.8em;overflow-wrap:anywhere"
         self._show(self._record_state, "record", f'<div style="{style}">{html.escape(text)}</div>')
         self._show(self.status, "status", status_html(status, origin, unit))
+        self._show(self._sensors_text, "sensors", sensors_html(status.sensors))
+        self._show(self._episodes_list, "episodes", episodes_html(self._engine.episodes(), origin, unit))
         if self._events_changed or unit != self._unit:
             self._events_changed, self._unit = False, unit
             self._show(self._events_list, "events", events_html(list(self._events), origin, unit))

@@ -1,22 +1,30 @@
-"""The panel's texts: the status line, the list of events, the note about an edit."""
+"""The panel's texts: the status line, the lights of the sensors, episodes and events, the note about an edit."""
 
 from __future__ import annotations
 
 import html
-import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
 
+from estimators.diagnostics.episodes import Episode, anchor
 from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
 
 from ..engine.host_clock import clock_text
 from ..engine.notices import Notice
 from ..engine.outputs import Status
+from .integrity import integrity_html
 from .time_units import SECONDS, Unit
 
-COLORS = {"tracking": "#16a34a", "degraded": "#d97706", "diverged": "#dc2626", "stale": "#6b7280"}
-LEVELS = {"info": "#6b7280", "warn": "#d97706", "error": "#dc2626"}
-SHOWN = 8
-"""States whose integrity is shown."""
+LIGHTS = {
+    "waiting": ("○", "#2563eb"), "tracking": ("●", "#15803d"), "suspect": ("◐", "#a16207"),
+    "degraded": ("▲", "#c2410c"), "diverged": ("✖", "#dc2626"), "stale": ("◌", "#6b7280"), "held out": ("–", "#6b7280"),
+}  # fmt: skip
+"""Sign and colour of each state of the twin and its sensors; the sign is there for whoever cannot tell the colours."""
 
+FEW = 8
+"""Sensors that have a light of their own beside the status; more are counted."""
+
+LEVELS = {"info": "#6b7280", "warn": "#d97706", "error": "#dc2626"}
 COUNTED = ("readings", "gated", "missing", "stale")
 SELDOM = ("held out", "screened", "failed", "recovered", "wrong time", "clock moved")
 
@@ -35,6 +43,9 @@ def status_html(status: Status, origin: int | None, unit: Unit = SECONDS) -> str
         )
     elif status.health == DIVERGED:
         remedy = "The readings contradict the estimate. <b>Reset</b> starts again from the prior."
+    elif status.cause:
+        more = f" ({status.episodes_open - 1} more under Events)" if status.episodes_open > 1 else ""
+        remedy = html.escape(status.cause) + more
     at = "" if status.t is None or origin is None else unit.text((status.t - origin) * 1e-9)
     state = "ended" if status.finished else "paused" if status.paused else ""
     fold = "⟳ refolding" if status.refolding else f"revision {status.revision}"
@@ -56,32 +67,55 @@ def status_html(status: Status, origin: int | None, unit: Unit = SECONDS) -> str
         '<div style="padding:0.2em 1.4em 0.6em 0.9em;font-size:0.8em;line-height:1.6;'
         'font-variant-numeric:tabular-nums">'
         '<div style="display:flex;justify-content:space-between;gap:0.5em">'
-        f'<b style="color:{COLORS.get(health, "#6b7280")}">● {health}{since}</b>'
-        f"<span>{state}</span><span>{fold}</span><span>{at}</span></div><div>{cells}</div><div>{remedy}</div>"
+        f"<b>{_light(health, f'{health}{since}')}</b>"
+        f"<span>{state}</span><span>{fold}</span><span>{at}</span></div><div>{cells}</div>"
+        f'<div>{_lights(status.sensors)}</div><div style="overflow-wrap:anywhere">{remedy}</div>'
         f"{integrity_html(status)}</div>"
     )
 
 
-def integrity_html(status: Status) -> str:
-    """How wrong each state can be by one fault that nobody notices, beside ± 2 σ; nothing until it is known."""
-    found = status.integrity
-    if found is None:
+def _light(state: str, text: str) -> str:
+    sign, color = LIGHTS[state]
+    return f'<span style="color:{color};white-space:nowrap">{sign} {html.escape(text)}</span>'
+
+
+def _lights(sensors: Mapping[str, tuple[str, str]]) -> str:
+    """A light for each sensor, with its name and state; of many sensors, how many are in each state."""
+    if len(sensors) <= FEW:
+        lights = [_light(state, f"{name.replace('_', ' ')} {state}") for name, (state, _) in sensors.items()]
+    else:
+        counted = Counter(state for state, _ in sensors.values())
+        lights = [_light(state, f"{count} sensors {state}") for state, count in counted.most_common()]
+    return " ".join(f'<span style="margin-right:0.9em">{light}</span>' for light in lights)
+
+
+def sensors_html(sensors: Mapping[str, tuple[str, str]]) -> str:
+    """What is wrong with each sensor that is not in order, and what to do."""
+    lines = [
+        f'<div style="margin-bottom:0.35em">{_light(state, f"{name} {state}")}<div>{html.escape(text)}</div></div>'
+        for name, (state, text) in sensors.items()
+        if state not in ("tracking", "held out")
+    ]
+    text = "".join(lines) or '<span style="opacity:0.65">Nothing is wrong with any sensor.</span>'
+    return f'<div style="padding:0.2em 0.9em 0.6em;font-size:0.8em;line-height:1.5;overflow-wrap:anywhere">{text}</div>'
+
+
+def episodes_html(episodes: Sequence[Episode], origin: int | None, unit: Unit = SECONDS) -> str:
+    """The episodes that last, the earliest first, each with its remedy."""
+    lasting = [episode for episode in episodes if episode.end is None]
+    if not lasting:
         return ""
-    muted = '<span style="opacity:0.65">'
-    if found.reason:
-        return f"<div>{muted}integrity not watched: {html.escape(found.reason)}</span></div>"
-    cells = "".join(
-        f'<span style="margin-right:0.9em;white-space:nowrap" title="{html.escape(item.fault, quote=True)}">{muted}'
-        f"{html.escape(name)}</span> ±{_size(item.two_sigma)} / {_size(item.bound)} {html.escape(item.unit)}</span>"
-        for name, item in list(found.bounds.items())[:SHOWN]
-    )
-    age = found.age(status.t)
-    old = "" if age is None else f", {age:.0f} s ago"
-    return f"<div>{muted}± 2 σ / integrity bound under one unseen fault{old}:</span> {cells}</div>"
-
-
-def _size(value: float) -> str:
-    return f"{value:.3g}" if math.isfinite(value) else "∞"
+    lines = []
+    for episode in lasting:
+        at = "" if origin is None else f"since {unit.text(episode.start - origin * 1e-9)}"
+        lines.append(
+            f'<div style="border-left:3px solid {LEVELS["warn"]};padding-left:0.5em;margin-bottom:0.35em">'
+            f"<b>{html.escape(episode.subject)}: {html.escape(episode.cause)}</b> "
+            f'<span style="opacity:0.65">{at} · ALARMS.md#{anchor(episode.cause)}</span>'
+            f"<div>{html.escape(episode.text)}</div></div>"
+        )
+    style = "padding:0.2em 0.9em 0.6em;font-size:0.8em;line-height:1.5;overflow-wrap:anywhere"
+    return f'<div style="{style}"><div style="opacity:0.65">Now</div>{"".join(lines)}</div>'
 
 
 def events_html(notices: list[Notice], origin: int | None, unit: Unit = SECONDS) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from ..log import READING
 from ..model.state_space import StateSpaceModel
 from ..track import FAILED, GATED, USED
-from .episodes import Folded, standardised
+from .episodes import Folded, course_of, standardised
 from .evidence import BITS, CAUSES, chances_of, highest, no_baseline, threshold_of
 
 MARGIN = 1.5
@@ -54,7 +54,7 @@ def commission(fold: Folded, evidence: np.ndarray) -> dict[str, Normal]:
         verdict = track.verdict[rows]
         h = threshold_of(model, evidence, s)
         for k in range(len(sensor.rows)):
-            e = standardised(fold, rows, k)
+            e = standardised(course_of(fold), rows, k)
             known = np.isfinite(e)
             if known.sum() < FEWEST:
                 continue

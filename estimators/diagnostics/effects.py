@@ -16,8 +16,15 @@ from ..numerics.quantiles import normal_quantile
 
 SIDE = float(normal_quantile(0.975))
 
+FURTHEST = 6.0
+"""|e| beyond which it counts as this."""
+
 SPIKE = 4.0
 """|e| from which an innovation is a spike where the others are in order."""
+
+
+KINDS = ("shifted", "narrow", "wide", "correlated", "alternating", "spiky")
+"""The ways in which innovations can differ."""
 
 
 class Effect(NamedTuple):
@@ -39,8 +46,10 @@ def effects(e: np.ndarray) -> list[Effect]:
     """All ways in which a run e (n,), finite, differs from white noise, the likeliest first.
 
     The mean is taken out before the scale, both before the correlation, and spikes are told from scale by what the
-    innovations without them have.
+    innovations without them have. They stand alone: several in a row on one side are a shift. What is further off than
+    `FURTHEST` says no more than that.
     """
+    e = np.clip(e, -FURTHEST, FURTHEST)
     n = e.size
     if n < 2:
         size = float(e[0]) if n else 0.0
@@ -54,7 +63,7 @@ def effects(e: np.ndarray) -> list[Effect]:
     # With correlated noise a mean is known less well than with white.
     wide = np.sqrt(floor * (1.0 + max(bounded, 0.0)) / (1.0 - max(bounded, 0.0)) / n)
     found = [Effect("shifted", mean, mean - SIDE * wide, mean + SIDE * wide, 0.5 * n * mean**2)]
-    spikes = np.abs(rest) > SPIKE
+    spikes = _alone(rest)
     calm = rest[~spikes]
     share = float(np.mean(spikes))
     if spikes.any() and calm.size > 1:
@@ -83,13 +92,21 @@ def effects(e: np.ndarray) -> list[Effect]:
     return sorted(found, key=lambda effect: -effect.ratio)
 
 
+def _alone(e: np.ndarray) -> np.ndarray:
+    """Which of e (n,) are spikes without a neighbour that is one on the same side."""
+    side = np.where(np.abs(e) > SPIKE, np.sign(e), 0.0)
+    beside = np.concatenate(([0.0], side, [0.0]))
+    alone: np.ndarray = (side != 0.0) & (beside[:-2] != side) & (beside[2:] != side)
+    return alone
+
+
 def onset(e: np.ndarray, cause: str) -> int:
     """The index of e (n,), up to which nothing was wrong, most likely, if `cause` is what is wrong at the end.
 
     The start that maximises the generalised likelihood ratio of what follows it; the estimate of the time of change of
     Basseville & Nikiforov (1993), 2.6.
     """
-    back = e[::-1]
+    back = np.clip(e[::-1], -FURTHEST, FURTHEST)
     n = np.arange(1, e.size + 1)
     if cause == "shifted":
         gain = 0.5 * np.cumsum(back) ** 2 / n

@@ -1,7 +1,8 @@
 """Episodes: what was wrong from when to when, with whom, by how much, and what can be done about it.
 
-A pure function of log and track. The alarms of one sensor that follow each other are one episode; what its innovations
-show since its onset names the cause (effects.py). ALARMS.md says for each cause what it means and what to do.
+A pure function of events and track. The alarms of one sensor that follow each other are one episode; what its
+innovations show since its onset names the cause (effects.py). ALARMS.md says for each cause what it means and what to
+do.
 """
 
 from __future__ import annotations
@@ -11,11 +12,11 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ..log import INPUT, READING, TRUTH, Log, truth_of
+from ..log import INPUT, READING, TRUTH, Events, Log, truth_of
 from ..model.state_space import Input, State, StateSpaceModel
 from ..track import DIVERGED, GATED, HEALTH_NAMES, STALE, USED, Track
 from ..tuning import Tuning
-from .effects import Effect, effects, onset
+from .effects import KINDS, Effect, effects, onset
 from .evidence import AGREEING, DISAGREEING, IMPOVERISHED, MISSED, OUTSIDE, REFUSED, SENSORS, STUCK
 from .words import of_particles, of_sensor, of_silence, of_truth, of_twin, since
 
@@ -30,11 +31,18 @@ MOST = 0.5
 """Share of refused readings from which an episode is one of refusals."""
 
 
+CAUSES = (
+    "shifted", "narrow", "wide", "correlated", "alternating", "spiky", "refused", "stuck", "disagreeing", "agreeing",
+    "silent", "never heard", "missed", "outside", "impoverished", "stale", "diverged",
+)  # fmt: skip
+"""Of episodes; each has its heading in ALARMS.md."""
+
+
 class Episode(NamedTuple):
     """Something that was wrong.
 
     `start` and `end` in seconds of the log; `end` None while it lasts. `subject`: a sensor, one of its rows, a state,
-    an input, or "twin". `cause`: a key of ALARMS.md. `size` in `unit` with its 95 % interval, `low` to `high` (NaN
+    an input, or "twin". `cause`: one of `CAUSES`. `size` in `unit` with its 95 % interval, `low` to `high` (NaN
     where there is none). `text`: one sentence with the remedy.
     """
 
@@ -49,40 +57,90 @@ class Episode(NamedTuple):
     text: str
 
 
-class Folded(Protocol):
-    """What episodes are read from: a Fold, or whatever has its log and track.
+def episode_json(episode: Episode) -> dict[str, float | str | None]:
+    """An episode for JSON: its fields by name; null for what is not a number, which JSON does not have."""
+    return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in episode._asdict().items()}
 
-    `marginal`: whether `Track.whitened` holds each row by itself, as for predictions that are not Gaussian. `baseline`:
-    what was normal, see evidence.py.
+
+def anchor(cause: str) -> str:
+    """Of its heading in ALARMS.md, as GitHub makes it."""
+    return cause.replace(" ", "-")
+
+
+class Course(NamedTuple):
+    """What episodes are made of: events, their rows, and with what they were folded.
+
+    `marginal`: whether the predictions are not Gaussian. `heard` (sensors,): when each sensor spoke last before these
+    events, ns, 0 where it did not; None if they are the first.
     """
+
+    model: StateSpaceModel
+    tuning: Tuning
+    marginal: bool
+    events: Events
+    track: Track
+    heard: np.ndarray | None = None
+
+
+class Folded(Protocol):
+    """A fold, as far as episodes need it; see `Course`."""
 
     @property
     def model(self) -> StateSpaceModel: ...  # noqa: D102
     @property
     def tuning(self) -> Tuning: ...  # noqa: D102
     @property
-    def log(self) -> Log: ...  # noqa: D102
+    def marginal(self) -> bool: ...  # noqa: D102
     @property
-    def track(self) -> Track: ...  # noqa: D102
+    def log(self) -> Log: ...  # noqa: D102
     @property
     def n(self) -> int: ...  # noqa: D102
     @property
-    def marginal(self) -> bool: ...  # noqa: D102
-    @property
-    def baseline(self) -> np.ndarray: ...  # noqa: D102
+    def track(self) -> Track: ...  # noqa: D102
+
+
+class Found(NamedTuple):
+    """An episode, and where it was found.
+
+    `key`: what is tested, and on whom; of one key there is one episode at a time. `begin`: the first row in alarm,
+    among those that are tested; `at`: its time, ns.
+    """
+
+    key: tuple[str, str]
+    begin: int
+    at: int
+    episode: Episode
+
+
+def course_of(fold: Folded) -> Course:
+    """What a fold has come to so far: views, which change with it."""
+    return Course(fold.model, fold.tuning, fold.marginal, fold.log.events.select(slice(0, fold.n)), fold.track)
 
 
 def episodes(fold: Folded) -> list[Episode]:
     """All episodes of a fold, in the order of their start."""
+    return [item.episode for item in found_in(course_of(fold))]
+
+
+def found_in(course: Course) -> list[Found]:
+    """All episodes of a stretch of events, in the order of their start."""
     found = [
-        *_of_sensors(fold),
-        *_of_silence(fold),
-        *_of_truth(fold),
-        *_of_ranges(fold),
-        *_of_particles(fold),
-        *_of_twin(fold),
+        *_of_sensors(course),
+        *_of_silence(course),
+        *_of_truth(course),
+        *_of_ranges(course),
+        *_of_particles(course),
+        *_of_twin(course),
     ]
-    return sorted(found, key=lambda episode: (episode.start, episode.subject))
+    plain = [item._replace(episode=_plain(item.episode)) for item in found]
+    return sorted(plain, key=lambda item: (item.episode.start, item.episode.subject))
+
+
+def _plain(episode: Episode) -> Episode:
+    """With numbers of Python, whatever they came from."""
+    end = None if episode.end is None else float(episode.end)
+    start, size, low, high = (float(x) for x in (episode.start, episode.size, episode.low, episode.high))
+    return episode._replace(start=start, end=end, size=size, low=low, high=high)
 
 
 def _runs(on: np.ndarray, joined: int = 0) -> Iterator[tuple[int, int, bool]]:
@@ -96,41 +154,47 @@ def _runs(on: np.ndarray, joined: int = 0) -> Iterator[tuple[int, int, bool]]:
         yield int(begin), int(end), bool(on.size - end <= joined)
 
 
-def standardised(fold: Folded, rows: np.ndarray, k: int) -> np.ndarray:
+def standardised(course: Course, rows: np.ndarray, k: int) -> np.ndarray:
     """e of row k of the readings at `rows`, as the bank sees it; NaN where there is none."""
-    track = fold.track
+    track = course.track
     e = track.innovation[rows, k] / track.innovation_std[rows, k]
-    if fold.marginal:
+    if course.marginal:
         e = track.whitened[rows, k]
     verdict = track.verdict[rows]
     return np.where((verdict == USED) | (verdict == GATED), e, np.nan)
 
 
-def unusual(fold: Folded, s: int, k: int, e: np.ndarray) -> np.ndarray:
+def unusual(course: Course, s: int, k: int, e: np.ndarray) -> np.ndarray:
     """Finite e (n,) of row k of sensor s as it would be drawn from N(0, 1) if it were as it was when accepted."""
-    bias, scale, phi = fold.baseline[fold.model.row_start[s] + k, :3]
+    if course.tuning.baseline is None:
+        return e
+    bias, scale, phi = course.tuning.baseline[course.model.row_start[s] + k, :3]
     e = (e - bias) / scale
     return np.append(e[:1], (e[1:] - phi * e[:-1]) / np.sqrt(1.0 - phi**2)) if phi else e
 
 
-def _of_sensors(fold: Folded) -> Iterator[Episode]:
-    log, track, model = fold.log, fold.track, fold.model
-    kind, channel = log.kind[: fold.n], log.channel[: fold.n]
+def _of_sensors(course: Course) -> Iterator[Found]:
+    events, track, model = course.events, course.track, course.model
+    if not track.alarms.any():
+        return
     for s, sensor in enumerate(model.sensors):
-        rows = np.flatnonzero((kind == READING) & (channel == s))
+        rows = np.flatnonzero((events.kind == READING) & (events.channel == s))
         masks = track.alarms[rows, : len(sensor.rows)]
         for begin, end, lasts in _runs(masks.any(axis=1), JOINED):
-            yield _of_sensor(fold, s, rows, masks, begin, end, lasts)
+            episode = _of_sensor(course, s, rows, masks, begin, end, lasts)
+            yield Found(("sensor", sensor.name), begin, int(events.t[rows[begin]]), episode)
 
 
-def _of_sensor(fold: Folded, s: int, rows: np.ndarray, masks: np.ndarray, begin: int, end: int, lasts: bool) -> Episode:
+def _of_sensor(
+    course: Course, s: int, rows: np.ndarray, masks: np.ndarray, begin: int, end: int, lasts: bool
+) -> Episode:
     """The episode of the readings `begin` to `end` of a sensor, whose events are `rows`."""
-    log, track, model = fold.log, fold.track, fold.model
+    events, track, model = course.events, course.track, course.model
     said = np.bitwise_or.reduce(masks[begin:end])
-    k, begun, ranked = _most_telling(fold, s, rows, np.flatnonzero(said), begin, end)
+    k, begun, over, ranked = _most_telling(course, s, rows, np.flatnonzero(said), begin, end, lasts)
     effect = ranked[0]
     cause, size, low, high = effect.cause, effect.size, effect.low, effect.high
-    values, verdict = log.value[rows], track.verdict[rows]
+    values, verdict = events.value[rows], track.verdict[rows]
     stuck = np.flatnonzero(said & STUCK)
     refused = np.flatnonzero(said & REFUSED)
     # A gate that refuses some readings has a reason that shows in the others.
@@ -139,52 +203,60 @@ def _of_sensor(fold: Folded, s: int, rows: np.ndarray, masks: np.ndarray, begin:
     if stuck.size:
         k, cause = int(stuck[0]), "stuck"
         begun = _same_since(values[:, k], begin)
+        others = np.flatnonzero(values[begun:end, k] != values[begun, k])
+        over = end if lasts or not others.size else begun + int(others[0])
         size, low, high = float(values[begun, k]), np.nan, np.nan
     elif refused.size:
         k, cause = int(refused[0]), "refused"
         used = np.flatnonzero(verdict[:begin] == USED)
         begun = int(used[-1]) + 1 if used.size else 0
-        size, low, high = float(np.mean(verdict[begun:end] == GATED)), np.nan, np.nan
+        over = end if lasts else begun + int(np.flatnonzero(verdict[begun:end] == GATED)[-1]) + 1
+        size, low, high = float(np.mean(verdict[begun:over] == GATED)), np.nan, np.nan
     elif said[0] & (DISAGREEING | AGREEING) and not np.any(said & ~(DISAGREEING | AGREEING)):
         cause = "disagreeing" if said[0] & DISAGREEING else "agreeing"
-    nu = track.innovation[rows[begun:end], k]
+    nu = track.innovation[rows[begun:over], k]
     about = float(np.nanmean(nu)) if np.isfinite(nu).any() else np.nan
     row = model.sensors[s].rows[k]
     unit = {"shifted": "σ", "narrow": "×", "wide": "×", "disagreeing": "×", "agreeing": "×", "stuck": row.unit}
     subject = model.row_names[model.row_start[s] + k]
-    start = log.t[rows[begun]] * 1e-9
+    start = events.t[rows[begun]] * 1e-9
     correlation = next((item.size for item in ranked if item.cause in ("correlated", "alternating")), 0.0)
     return Episode(
         start=start,
-        end=None if lasts else log.t[rows[end - 1]] * 1e-9,
+        end=None if lasts else events.t[rows[max(over - 1, begun)]] * 1e-9,
         subject=subject,
         cause=cause,
         size=size,
         low=low,
         high=high,
         unit=unit.get(cause, ""),
-        text=of_sensor(model, fold.tuning, s, k, cause, size, about, correlation, start),
+        text=of_sensor(model, course.tuning, s, k, cause, size, about, correlation, start),
     )
 
 
 def _most_telling(
-    fold: Folded, s: int, rows: np.ndarray, said: np.ndarray, begin: int, end: int
-) -> tuple[int, int, list[Effect]]:
-    """The row that shows most of what is wrong, the reading since when, and what it shows, the likeliest first."""
+    course: Course, s: int, rows: np.ndarray, said: np.ndarray, begin: int, end: int, lasts: bool
+) -> tuple[int, int, int, list[Effect]]:
+    """The row that shows most of what is wrong, the readings from when to when, and what it shows, the likeliest first.
+
+    A test falls more slowly than its cause goes: an episode that is over ended where that is most likely.
+    """
     first = max(0, begin - LOOKED_AT)
-    best: tuple[int, int, list[Effect]] = (int(said[0]) if said.size else 0, begin, [_UNKNOWN])
+    best: tuple[int, int, int, list[Effect]] = (int(said[0]) if said.size else 0, begin, end, [_UNKNOWN])
     for k in said:
-        e = standardised(fold, rows[first:end], int(k))
+        e = standardised(course, rows[first:end], int(k))
         known = np.flatnonzero(np.isfinite(e))
         if known.size < 2:
             continue
-        e = unusual(fold, s, int(k), e[known])
+        e = unusual(course, s, int(k), e[known])
         alarm = min(int(np.searchsorted(known, begin - first)), e.size - 1)
-        guess = effects(e[max(0, alarm - JOINED) :][:LOOKED_AT])[0]
-        begun = onset(e[: alarm + 1], guess.cause)
-        ranked = effects(e[begun:][:LOOKED_AT])
-        if ranked[0].ratio > best[2][0].ratio:
-            best = int(k), first + int(known[begun]), ranked
+        for cause in KINDS:
+            begun = onset(e[: alarm + 1], cause)
+            run = e[begun : begun + LOOKED_AT]
+            over = max(begun + run.size - onset(run[::-1], cause), min(alarm + 1, begun + run.size))
+            ranked = effects(e[begun:over])
+            if ranked[0].cause == cause and ranked[0].ratio > best[3][0].ratio:
+                best = int(k), first + int(known[begun]), first + int(known[over - 1]) + 1, ranked
     return best
 
 
@@ -197,20 +269,22 @@ def _same_since(values: np.ndarray, at: int) -> int:
     return int(others[-1]) + 1 if others.size else 0
 
 
-def _of_silence(fold: Folded) -> Iterator[Episode]:
-    log, model = fold.log, fold.model
-    t, flags = log.t[: fold.n], fold.track.flags
+def _of_silence(course: Course) -> Iterator[Found]:
+    events, model, flags = course.events, course.model, course.track.flags
+    t = events.t
     if not flags.any():
         return
     for s, sensor in enumerate(model.sensors[:SENSORS]):
-        heard = np.flatnonzero((log.kind[: fold.n] == READING) & (log.channel[: fold.n] == s))
+        heard = np.flatnonzero((events.kind == READING) & (events.channel == s))
+        known = 0 if course.heard is None else int(course.heard[s])
         for begin, end, lasts in _runs(flags >> s & 1 != 0):
             before = heard[heard < begin]
-            cause = "silent" if before.size else "never heard"
-            start = t[before[-1]] * 1e-9 if before.size else t[0] * 1e-9
-            yield Episode(
+            last = int(t[before[-1]]) if before.size else known
+            cause = "silent" if last else "never heard"
+            start = (last or int(t[0])) * 1e-9
+            episode = Episode(
                 start=start,
-                end=None if lasts else t[min(end, fold.n - 1)] * 1e-9,
+                end=None if lasts else t[min(end, t.size - 1)] * 1e-9,
                 subject=sensor.name,
                 cause=cause,
                 size=(t[end - 1] - t[begin]) * 1e-9 + (t[begin] * 1e-9 - start),
@@ -219,18 +293,18 @@ def _of_silence(fold: Folded) -> Iterator[Episode]:
                 unit="s",
                 text=of_silence(model, s, cause, start),
             )
+            yield Found(("silence", sensor.name), begin, int(t[begin]), episode)
 
 
-def _of_truth(fold: Folded) -> Iterator[Episode]:
-    log, model, track = fold.log, fold.model, fold.track
-    kind = log.kind[: fold.n]
-    told = np.flatnonzero(kind == TRUTH)
+def _of_truth(course: Course) -> Iterator[Found]:
+    events, model, track = course.events, course.model, course.track
+    told = np.flatnonzero(events.kind == TRUTH)
     missed = told[track.alarms[told].any(axis=1)]
     if not missed.size:
         return
     for column, (j, state) in enumerate(zip(model.shown, model.shown_states, strict=True)):
-        rows, values = truth_of(log.events.select(slice(0, fold.n)), int(j))
-        place = int(j) - log.channel[rows]
+        rows, values = truth_of(events, int(j))
+        place = int(j) - events.channel[rows]
         within = place < track.alarms.shape[1]
         rows, values, place = rows[within], values[within], place[within]
         if not rows.size:
@@ -241,12 +315,13 @@ def _of_truth(fold: Folded) -> Iterator[Episode]:
             error = track.mean[own, column] - values[begin:end]
             if state.circular:
                 error = (error + np.pi) % (2.0 * np.pi) - np.pi
-            off = np.abs(error) / track.std[own, column]
-            start = log.t[rows[begin]] * 1e-9
+            sure = track.std[own, column] > 0.0
+            off = np.abs(error[sure]) / track.std[own[sure], column]
+            start = events.t[rows[begin]] * 1e-9
             size = float(np.sqrt(np.mean(off**2)))
-            yield Episode(
+            episode = Episode(
                 start=start,
-                end=None if lasts else log.t[rows[end - 1]] * 1e-9,
+                end=None if lasts else events.t[rows[end - 1]] * 1e-9,
                 subject=state.name,
                 cause="missed",
                 size=size,
@@ -255,23 +330,24 @@ def _of_truth(fold: Folded) -> Iterator[Episode]:
                 unit="σ",
                 text=of_truth(state.name, float(np.sqrt(np.mean(error**2))), state.unit, size, start),
             )
+            yield Found(("truth", state.name), begin, int(events.t[rows[begin]]), episode)
 
 
-def _of_ranges(fold: Folded) -> Iterator[Episode]:
-    log, model, track = fold.log, fold.model, fold.track
-    t = log.t[: fold.n]
+def _of_ranges(course: Course) -> Iterator[Found]:
+    events, model, track = course.events, course.model, course.track
+    t = events.t
     if not np.any(track.flags & OUTSIDE):
         return
     for column, state in enumerate(model.shown_states):
         yield from _outside(state, track.mean[:, column], t)
-    events = np.flatnonzero(log.kind[: fold.n] == INPUT)
+    rows = np.flatnonzero(events.kind == INPUT)
     for j, given in enumerate(model.inputs):
-        value = log.value[events, j]
+        value = events.value[rows, j]
         known = np.isfinite(value)
-        yield from _outside(given, value[known], t[events[known]])
+        yield from _outside(given, value[known], t[rows[known]])
 
 
-def _outside(item: State | Input, value: np.ndarray, t: np.ndarray) -> Iterator[Episode]:
+def _outside(item: State | Input, value: np.ndarray, t: np.ndarray) -> Iterator[Found]:
     if item.fitted is None:
         return
     low, high = item.fitted
@@ -279,7 +355,7 @@ def _outside(item: State | Input, value: np.ndarray, t: np.ndarray) -> Iterator[
         start = t[begin] * 1e-9
         least, most = float(np.nanmin(value[begin:end])), float(np.nanmax(value[begin:end]))
         size = most if most > high else least
-        yield Episode(
+        episode = Episode(
             start=start,
             end=None if lasts else t[min(end, t.size - 1)] * 1e-9,
             subject=item.name,
@@ -291,19 +367,20 @@ def _outside(item: State | Input, value: np.ndarray, t: np.ndarray) -> Iterator[
             text=f"{item.name} is {size:.4g} {item.unit}, outside {low:g} to {high:g} where the model was fitted, "
             f"{since(start)}: bands hold only inside; use a model fitted there",
         )
+        yield Found(("range", item.name), begin, int(t[begin]), episode)
 
 
-def _of_particles(fold: Folded) -> Iterator[Episode]:
-    t, track = fold.log.t[: fold.n], fold.track
+def _of_particles(course: Course) -> Iterator[Found]:
+    t, track = course.events.t, course.track
     for begin, end, lasts in _runs(track.flags & IMPOVERISHED != 0):
         effective = track.effective[begin:end]
         effective = effective[np.isfinite(effective)]
         if not effective.size:
             continue
         start, size = t[begin] * 1e-9, float(np.median(effective))
-        yield Episode(
+        episode = Episode(
             start=start,
-            end=None if lasts else t[min(end, fold.n - 1)] * 1e-9,
+            end=None if lasts else t[min(end, t.size - 1)] * 1e-9,
             subject="twin",
             cause="impoverished",
             size=size,
@@ -312,18 +389,19 @@ def _of_particles(fold: Folded) -> Iterator[Episode]:
             unit="",
             text=of_particles(size, float(np.nanmin(track.ancestors[begin:end])), start),
         )
+        yield Found(("particles", "twin"), begin, int(t[begin]), episode)
 
 
-def _of_twin(fold: Folded) -> Iterator[Episode]:
-    t, health = fold.log.t[: fold.n], fold.track.health
+def _of_twin(course: Course) -> Iterator[Found]:
+    t, track = course.events.t, course.track
     for code in (STALE, DIVERGED):
-        for begin, end, lasts in _runs(health == code):
+        for begin, end, lasts in _runs(track.health == code):
             start = t[begin] * 1e-9
             if code == STALE:
-                start -= float(fold.track.age[begin])
-            yield Episode(
+                start -= float(track.age[begin])
+            episode = Episode(
                 start=start,
-                end=None if lasts else t[min(end, fold.n - 1)] * 1e-9,
+                end=None if lasts else t[min(end, t.size - 1)] * 1e-9,
                 subject="twin",
                 cause=HEALTH_NAMES[code],
                 size=(t[end - 1] - t[begin]) * 1e-9,
@@ -332,3 +410,4 @@ def _of_twin(fold: Folded) -> Iterator[Episode]:
                 unit="s",
                 text=of_twin(code == STALE, start),
             )
+            yield Found(("twin", HEALTH_NAMES[code]), begin, int(t[begin]), episode)

@@ -3,7 +3,7 @@
 Under the model the standardised innovations e of a row are N(0, 1) and white. Each way of being wrong is another
 density of e given the one before, and the cumulated log-likelihood ratio tests it:
 
-    W ← min(max(W, 0) + log Λ, cap);  alarm when W ≥ h,  over when W < h/2
+    W ← min(max(W, 0) + log Λ, cap);  alarm when W ≥ h,  over when W < ¾ h
 
 With h = log(readings between false alarms × tests) the mean time between false alarms of the whole bank is at least
 what was asked for, whatever is wrong and however long it lasts. The test that speaks names the cause.
@@ -76,8 +76,8 @@ SHIFTS = (0.2, 0.5, 1.5, -0.2, -0.5, -1.5)
 CORRELATIONS = (0.25, 0.6, -0.25, -0.6)
 """Lag-1 correlations of e that are tested, at unit variance."""
 
-SPIKE_SHARE, SPIKE = 0.03, 5.0
-"""Spikes: this share of e has so many standard deviations."""
+SPIKE_SHARES, SPIKE = (0.03, 0.003), 5.0
+"""Spikes: these shares of e have so many standard deviations."""
 
 REFUSED_SHARE = 0.3
 """Share of refused readings that is tested against what the gate refuses by chance."""
@@ -91,8 +91,11 @@ REPEATING = 0.999
 UNKNOWN_QUANTUM = 0.5
 """Probability of a repeated value that is granted to a sensor which has never changed: its quantum is not known yet."""
 
-SPARE = 8.0
+SPARE = 3.0
 """By which W may pass its threshold, so that it falls again when the cause has gone."""
+
+LASTING = 0.75
+"""Share of the threshold above which an alarm lasts."""
 
 MISSES, MISSES_NO_MORE = 4.5, 3.0
 """Root mean square of (estimate - truth) / σ, over about `TOLD` tellings, from which a truth is missed, and no more."""
@@ -107,12 +110,13 @@ PATIENCE = 60
 as lie between two counts of ancestors: of a sound cloud a count may be 1 by chance, hardly three in a row."""
 
 _QUADRATIC = len(SCALES) + len(SHIFTS) + len(CORRELATIONS)
-TESTS = _QUADRATIC + 3
+TESTS = _QUADRATIC + len(SPIKE_SHARES) + 2
 """Tests of a row: the quadratic ones, spikes, refusals, repetition."""
 
 _OTHER = math.log((1.0 - REPEATING) / (1.0 - UNKNOWN_QUANTUM))
 
-AT_SPIKES, AT_REFUSALS, AT_REPETITION = range(_QUADRATIC, TESTS)
+AT_SPIKES = _QUADRATIC
+AT_REFUSALS, AT_REPETITION = range(TESTS - 2, TESTS)
 
 JOINT = len(SCALES)
 """Tests of all rows of a sensor together, by its NIS: that of their scale."""
@@ -131,11 +135,23 @@ def _ratios() -> np.ndarray:
 _RATIOS = _ratios()
 _SPIKE_STEPS = 64.0
 _SQUARES = np.arange(FURTHEST**2 * _SPIKE_STEPS + 2.0) / _SPIKE_STEPS
-_SPIKE_RATIO = np.log1p(SPIKE_SHARE * (np.exp(0.5 * _SQUARES * (1.0 - 1.0 / SPIKE**2)) / SPIKE - 1.0))
-"""log Λ of spikes at so many e² a step, between which it is nearly straight (to 1e-5)."""
+_SPIKE_RATIO = np.log1p(
+    np.array(SPIKE_SHARES)[:, None] * (np.exp(0.5 * _SQUARES * (1.0 - 1.0 / SPIKE**2)) / SPIKE - 1.0)
+)
+"""log Λ of spikes, for each share, at so many e² a step, between which it is nearly straight (to 1e-5)."""
 
 BITS = np.array(
-    [*[NARROW] * 3, *[WIDE] * 3, *[HIGH] * 3, *[LOW] * 3, *[CORRELATED] * 2, *[ALTERNATING] * 2, SPIKY, REFUSED, STUCK]
+    [
+        *[NARROW] * 3,
+        *[WIDE] * 3,
+        *[HIGH] * 3,
+        *[LOW] * 3,
+        *[CORRELATED] * 2,
+        *[ALTERNATING] * 2,
+        *[SPIKY] * 2,
+        REFUSED,
+        STUCK,
+    ]
 )
 
 # A row's part of the state: its tests' W, then these.
@@ -247,6 +263,12 @@ def causes_now(model: StateSpaceModel, state: np.ndarray) -> tuple[np.ndarray, n
     return each[:, _MASK].astype(int), own[:, _ALL].astype(int), own[:, _SILENT] > 0.0
 
 
+def heard_last(model: StateSpaceModel, state: np.ndarray) -> np.ndarray:
+    """When each sensor spoke last, s (sensors,); NaN for one that has not."""
+    own = state[TWIN : TWIN + len(model.sensors) * SENSOR].reshape(-1, SENSOR)
+    return np.where(own[:, _COUNT] > 0.0, own[:, _LAST], np.nan)
+
+
 @inlined
 def _sensor(state, s):
     """The part of sensor s."""
@@ -269,7 +291,7 @@ def _add(W, k, ratio, h, peak):
     W[k] = min(max(W[k], 0.0) + min(ratio, 0.5 * h), threshold + SPARE)
     if W[k] >= threshold:
         return 2
-    return 1 if W[k] >= 0.5 * threshold else 0
+    return 1 if W[k] >= LASTING * threshold else 0
 
 
 @inlined
@@ -279,11 +301,12 @@ def _alarm(said, bit, before):
 
 
 @inlined
-def _spike_ratio(square):
+def _spike_ratio(share, square):
     """log Λ of spikes against none, from e²."""
     at = square * _SPIKE_STEPS
     k = int(at)
-    return _SPIKE_RATIO[k] + (at - k) * (_SPIKE_RATIO[k + 1] - _SPIKE_RATIO[k])
+    low, high = _SPIKE_RATIO[share, k], _SPIKE_RATIO[share, k + 1]
+    return low + (at - k) * (high - low)
 
 
 @jit
@@ -315,15 +338,17 @@ def _weigh(own, e, h, base, before):
         )
         W = min(max(own[k], 0.0) + min(ratio, 0.5 * h), h + base[3 + k] + SPARE)
         own[k] = W
-        highest = max(highest, W - 0.5 * base[3 + k])
+        highest = max(highest, W - LASTING * base[3 + k])
     mask = 0
-    if highest >= 0.5 * h:
+    if highest >= LASTING * h:
         for k in range(tests):
             threshold = h + base[3 + k]
-            if own[k] >= threshold or own[k] >= 0.5 * threshold and before & BITS[k] != 0:
+            if own[k] >= threshold or own[k] >= LASTING * threshold and before & BITS[k] != 0:
                 mask |= BITS[k]
-    said = _add(own, AT_SPIKES, _spike_ratio(square), h, base[3 + AT_SPIKES])
-    return mask | _alarm(said, SPIKY, before)
+    for k in range(len(SPIKE_SHARES)):
+        said = _add(own, AT_SPIKES + k, _spike_ratio(k, square), h, base[3 + AT_SPIKES + k])
+        mask |= _alarm(said, SPIKY, before)
+    return mask
 
 
 @jit

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from ..diagnostics.episodes import Course, Episode, found_in
 from ..diagnostics.nees import Nees, nees
 from ..diagnostics.score import Score, score
 from ..errors import EstimatorError
 from ..events.batch import READING, Events
 from ..model.state_space import StateSpaceModel
+from ..registry import find_estimator
 from ..track import Track
 from ..tuning import Tuning
 from .table import table_of
@@ -93,7 +95,13 @@ class Estimates:
 
     def table(self) -> Any:
         """A pyarrow.Table, one row an event; `.to_pandas()` makes a frame of it. See tabular.py for its columns."""
-        return table_of(self.model, self.events, self.track)
+        return table_of(self.model, self.events, self.track, self.episodes())
+
+    def episodes(self) -> list[Episode]:
+        """What was wrong from when to when, with whom, by how much, and what to do: see ALARMS.md."""
+        marginal = find_estimator(self.estimator, self.model).family in ("particle", "ensemble")
+        course = Course(self.model, self.tuning, marginal, self.events, self.track)
+        return [found.episode for found in found_in(course)]
 
     def score(self) -> Score:
         """NIS and its bounds, errors against the truth, predictions of sensors held out."""

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from ..diagnostics.episodes import Episode, episode_json
+from ..diagnostics.evidence import CAUSES, IMPOVERISHED, OUTSIDE, SENSORS, TRUTH_MISSED
 from ..events.batch import KIND_NAMES, READING, Events, truth_of
 from ..events.maintenance import model_versions
 from ..model.state_space import StateSpaceModel
@@ -13,7 +17,13 @@ from ..track import HEALTH_NAMES, REASONS, VERDICT_NAMES, Track
 
 
 def table_of(
-    model: StateSpaceModel, events: Events, track: Track, *, tuning_version: int = 1, model_version: int = 1
+    model: StateSpaceModel,
+    events: Events,
+    track: Track,
+    episodes: Sequence[Episode] = (),
+    *,
+    tuning_version: int = 1,
+    model_version: int = 1,
 ) -> Any:
     """A pyarrow.Table of events and track.
 
@@ -22,7 +32,9 @@ def table_of(
     known), `NAME` and `NAME_std`; `innovation_k` and `innovation_std_k`; NIS with its windowed mean and bounds,
     log-likelihood; verdict and health in words; `screened`: why the edge refused rows of the reading, null if it did
     not; `model_version`, which counts up with each maintenance from that at the first event, and `tuning_version`, of
-    the tuning that the track was folded with.
+    the tuning that the track was folded with; `alarms`, the causes that are in alarm after a reading or a
+    truth, and `flags`, what else is wrong, both joined by commas, null where there is none. The schema's metadata have
+    `episodes`, as JSON.
     """
     import pyarrow as pa
 
@@ -55,8 +67,25 @@ def table_of(
     columns["health"] = np.array(HEALTH_NAMES)[track.health]
     columns["model_version"] = model_versions(events, model_version)
     columns["tuning_version"] = np.full(len(events), tuning_version, np.int64)
+    columns["alarms"] = pa.array(
+        _words(np.bitwise_or.reduce(track.alarms, axis=1, dtype=np.int64), _CAUSES), pa.string()
+    )
+    bits = {1 << k: f"{name} silent" for k, name in enumerate(model.sensor_names[:SENSORS])} | _FLAGS
+    columns["flags"] = pa.array(_words(track.flags, bits), pa.string())
     plain = {k: np.ascontiguousarray(c) if isinstance(c, np.ndarray) else c for k, c in columns.items()}
-    return pa.table(plain)
+    metadata = {"episodes": json.dumps([episode_json(episode) for episode in episodes])}
+    return pa.table(plain).replace_schema_metadata(metadata)
+
+
+_CAUSES = {1 << k: cause for k, cause in enumerate(CAUSES)}
+_FLAGS = {IMPOVERISHED: "impoverished", OUTSIDE: "outside the fitted range", TRUTH_MISSED: "truth missed"}
+
+
+def _words(masks: np.ndarray, bits: dict[int, str]) -> np.ndarray:
+    """What the bits of each mask say; None where there are none."""
+    kinds, which = np.unique(masks, return_inverse=True)
+    said = [", ".join(word for bit, word in bits.items() if int(mask) & bit) or None for mask in kinds]
+    return np.array(said, object)[which.reshape(-1)]
 
 
 def _reasons(screened: np.ndarray) -> Any:

@@ -8,6 +8,7 @@ import numpy as np
 
 from app.engine.commands import Pause, Record, Restore, SetEstimator, SetOption, SetTuning, Speed, UseSensor
 from config.schema import ViewSection
+from estimators.diagnostics.episodes import episodes
 from estimators.fold import Fold
 from estimators.log import Events, Log
 from estimators.registry import ESTIMATORS
@@ -35,6 +36,7 @@ class FakeEngine:
         self.state = SimpleNamespace(
             estimator=estimator, tuning=tuning, revision=0, refolding=False, speed=1.0, paused=False, recording=None,
             counts={"readings": 0, "gated": 0, "missing": 0, "stale": 0}, t=None, health=TRACKING, since=None,
+            cause="", sensors={name: ("tracking", "") for name in model.sensor_names}, episodes_open=0,
             lost=None, model_version=1, clock=None, nis=np.nan, nis_low=np.nan, nis_high=np.nan, latency_ms=0.4,
             seekable=True, span=None, finished=False, options={}, faults=(), integrity=None,
         )  # fmt: skip
@@ -96,6 +98,9 @@ class FakeEngine:
         pull.notices = self.notices[cursor.told :]
         cursor.n, cursor.revision, cursor.told = self.log.n, self.state.revision, len(self.notices)
         return pull
+
+    def episodes(self):
+        return episodes(self.fold)
 
     def previous(self):
         return self.before

@@ -12,7 +12,9 @@ import pytest
 from app.cli.arguments import Fold
 from app.cli.compare_fold import fold_row
 from app.cli.fold import fold_twin, read_log
+from app.cli.fold_episodes import episode_lines
 from app.twin.twin import load_twin
+from estimators.diagnostics.episodes import Episode
 from estimators.track import HEALTH_NAMES
 
 DRIVE = """\
@@ -42,6 +44,46 @@ def test_true_states_have_columns_of_their_own(tmp_path: Path) -> None:
     # The events as they were read are in the table too.
     log, _ = read_log(load_twin(str(tmp_path / "drive.yaml")), None)
     np.testing.assert_array_equal(table["value_1"].to_numpy(), log.events.value[:, 1])
+
+
+def stuck_drive(tmp_path: Path) -> Path:
+    """200 readings, one a second, of which the last 100 are equal."""
+    y = 40.0 + np.random.default_rng(5).normal(0, 2, 200)
+    y[100:] = 41.5
+    (tmp_path / "drive.csv").write_text("t,y\n" + "".join(f"{k},{value}\n" for k, value in enumerate(y)))
+    path = tmp_path / "drive.yaml"
+    path.write_text(DRIVE.replace("  truth: {temperature: {columns: temperature}, rate: {columns: rate}}\n", ""))
+    return path
+
+
+def test_episodes_are_printed_told_to_scripts_and_kept(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    twin, out = str(stuck_drive(tmp_path)), tmp_path / "track.parquet"
+    assert fold_twin(Fold(twin, out=out)) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "1 episode(s); ALARMS.md says what each cause means" in lines
+    assert lines[-1].startswith("  stuck, at the end: winding is stuck at 41.5 °C since 100.0 s")
+    assert fold_twin(Fold(twin, json=True)) == 0
+    (episode,) = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)["episodes"]
+    assert {key: episode[key] for key in ("start", "end", "subject", "cause", "size", "low", "high", "unit")} == {
+        "start": 100.0, "end": None, "subject": "winding", "cause": "stuck", "size": 41.5, "low": None, "high": None,
+        "unit": "°C",
+    }  # fmt: skip
+    table = pq.read_table(out)
+    assert json.loads(table.schema.metadata[b"episodes"]) == [episode]
+    alarms, health = table["alarms"].to_pylist(), table["health"].to_pylist()
+    assert alarms[:100] == [None] * 100 and "stuck" in alarms[-1].split(", ")
+    # A sensor that tells nothing more degrades the twin, from the reading on with which it is known.
+    known = next(k for k, causes in enumerate(alarms) if causes and "stuck" in causes)
+    assert 100 < known < 130 and set(health[known:]) == {"degraded"}
+    assert table["flags"].to_pylist() == [None] * 200
+
+
+def test_of_many_episodes_the_first_are_printed() -> None:
+    one = Episode(1.0, 2.5, "winding", "narrow", 2.0, 1.9, 2.1, "×", "bands of winding are too narrow")
+    lines = list(episode_lines([one] * 25))
+    assert lines[1] == "  narrow, for 1.5 s: bands of winding are too narrow"
+    assert len(lines) == 12 and lines[-1] == "  and 15 more; --json has them all"
+    assert len(list(episode_lines([]))) == 1
 
 
 BOX = """\

@@ -20,6 +20,7 @@ from app.rerun.sink import CALENDAR
 from app.rerun.style import pair_name
 from app.rerun.thin import last_of_each_time, thin
 from estimators.log import READING, TRUTH, Events
+from estimators.track import HEALTH_NAMES
 from tests.app.scripted import Replayed, readings, twin, wait_for
 
 WINDOW = 10.0
@@ -137,7 +138,14 @@ def test_bytes_hold_the_rows_of_the_track(fed):
     np.testing.assert_allclose(points, block[at] / axis_scales(fed.engine.model, np.array([0, 1])), rtol=1e-6)
     _, values = fed.column("/nis/window")
     assert np.all((values[:, 1] < values[:, 2])[1:])
-    assert fed.column("/health", "StateChange:state")[1].ravel().tolist() == ["tracking"]
+    health = pull.track.health
+    changes = np.flatnonzero(np.append(-1, health[:-1]) != health)
+    times, states = fed.column("/health", "StateChange:state")
+    assert states.ravel().tolist() == [HEALTH_NAMES[code] for code in health[changes]]
+    np.testing.assert_array_equal(times, pull.events.t[changes])
+    words = ["suspect" if mask.any() else "tracking" for mask in pull.track.alarms[reading]]
+    changes = [word for word, before in zip(words, [None, *words], strict=False) if word != before]
+    assert fed.column(f"/sensor/{sensor}", "StateChange:state")[1].ravel().tolist() == changes
 
 
 @pytest.mark.parametrize("wide", [100.0, 4.0, 0.04])

@@ -1,0 +1,272 @@
+"""The chronicle: episodes of the running twin, as they begin and end, outside the engine's thread.
+
+It pulls rows with a cursor, as a view does, and looks for episodes among the last of them (tail.py). What began before
+those is carried on: its size and words stay as they were when it was seen whole. A late reading takes rows back, and
+another revision begins a new chronicle; what lasts through that is not said again.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from estimators.diagnostics.episodes import JOINED, Course, Episode, Found, found_in
+from estimators.registry import find_estimator
+from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING, WAITING
+
+from .counts import estimated_rows, last_run
+from .interface import Running
+from .tail import ROWS, Tail
+
+PERIOD = 0.4
+"""Seconds between two looks, when they are cheap."""
+
+SHARE = 0.05
+"""Part of a core that looking may take: dearer looks come less often."""
+
+SLOWEST = 3.0
+"""Seconds between two looks at most."""
+
+PULLED = 8192
+"""Rows pulled at once, so that the engine's lock is not held for long."""
+
+KEPT = 1000
+"""Episodes that are over and kept; older ones stand in the recording."""
+
+SAID = 5
+"""Episodes of one look that are said one by one."""
+
+JOINS = {"sensor": JOINED, "truth": JOINED, "range": JOINED}
+"""Rows without an alarm that an episode bridges, by what is tested."""
+
+RANKS = {
+    "diverged": 0, "stale": 1, "never heard": 2, "silent": 2, "stuck": 2, "refused": 2, "missed": 3, "shifted": 3,
+}  # fmt: skip
+"""How bad causes are, the worst first; the others come last."""
+
+UNRANKED = 4
+
+OF_SENSORS = ("sensor", "silence")
+"""What is tested of sensors; the second part of such a key is the sensor's name."""
+
+LOST = ("stuck", "refused")
+"""Causes that take the place of any other."""
+
+
+class Entry(NamedTuple):
+    """An episode, what it is of, and when its first alarm was, ns."""
+
+    key: tuple[str, str]
+    at: int
+    episode: Episode
+
+
+class Account(NamedTuple):
+    """What the chronicle says, all of one moment: episodes in the order of their start, and those that last."""
+
+    episodes: tuple[Episode, ...] = ()
+    lasting: tuple[Entry, ...] = ()
+
+    def leading(self, states: Mapping[str, str]) -> Episode | None:
+        """The worst of those that last, the earliest of them; `states` of the sensors tell which of them is lost."""
+
+        def badness(entry: Entry) -> tuple[int, float]:
+            kind, name = entry.key
+            lost = kind in OF_SENSORS and states.get(name) in ("degraded", "stale")
+            return min(_badness(entry.episode)[0], RANKS["silent"] if lost else UNRANKED), entry.episode.start
+
+        first = min(self.lasting, key=badness, default=None)
+        return None if first is None else first.episode
+
+    @property
+    def in_alarm(self) -> frozenset[str]:
+        """Sensors of which something is known to be wrong, so that each refused reading need not be said."""
+        return frozenset(entry.key[1] for entry in self.lasting if entry.key[0] == "sensor")
+
+    def of_sensors(self, names: Sequence[str], states: Sequence[str]) -> dict[str, tuple[str, str]]:
+        """State of each sensor, with the text of the worst that lasts of it."""
+        found = {name: (state, "") for name, state in zip(names, states, strict=True)}
+        for entry in sorted(self.lasting, key=lambda entry: _badness(entry.episode), reverse=True):
+            kind, name = entry.key
+            if kind in OF_SENSORS and found[name][0] not in ("waiting", "tracking"):
+                found[name] = (found[name][0], entry.episode.text)
+        return found
+
+
+def _badness(episode: Episode) -> tuple[int, float]:
+    return RANKS.get(episode.cause, UNRANKED), episode.start
+
+
+class Chronicle:
+    """Keeps the episodes of one engine; `account` may be read by any thread, and never changes."""
+
+    def __init__(self, engine: Running, rows: int = ROWS) -> None:
+        """`rows`: that are looked at, see `Tail`."""
+        self._engine = engine
+        self._cursor = engine.cursor()
+        self._tail = Tail(engine.model, rows)
+        self._begin()
+        self._health = WAITING
+        self.account = Account()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="chronicle", daemon=True)
+
+    def _begin(self) -> None:
+        self._tail.begin(0)
+        self._over: list[Entry] = []
+        self._carried: dict[tuple[str, str], Entry] = {}
+        self._entries: list[Entry] = []
+
+    def start(self) -> None:
+        """Begin to look."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Look once more, and end."""
+        self._stopping.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=2.0)
+        self._engine.release(self._cursor)
+
+    def _run(self) -> None:
+        wait = PERIOD
+        while True:
+            stopping = self._stopping.wait(wait)
+            begun = time.monotonic()
+            try:
+                self.look()
+            except Exception as error:  # noqa: BLE001  what is said of the twin must not stop it
+                self._engine.notices.report("chronicle", f"{type(error).__name__}: {error}", level="error")
+            if stopping:
+                return
+            wait = float(np.clip((time.monotonic() - begun) / SHARE, PERIOD, SLOWEST))
+
+    def look(self) -> None:
+        """Take the rows that are new, and say what has begun and what is over."""
+        before, again = self._entries, False
+        while True:
+            log = self._cursor.log
+            pull = self._engine.pull(self._cursor, PULLED)
+            if not pull.fresh and pull.first < self._tail.first:
+                # A late reading belongs before the rows that are kept: all of them again.
+                self._cursor.revision = -1
+                continue
+            if pull.fresh:
+                # Another revision: what lasts is known. Another log: another life, of which nothing was said.
+                again = log == self._cursor.log
+                before = before if again else []
+                self._begin()
+                self._tail.begin(pull.first)
+            self._tail.put(pull)
+            if self._tail.full:
+                self._find()
+                self._cut()
+            if len(pull.events) < PULLED:
+                break
+        if self._tail.n:
+            self._find()
+            self._say(before, again)
+
+    def _find(self) -> None:
+        """Bring the entries up to the rows that are there."""
+        tail = self._tail
+        tuning, estimator = self._engine.folded_with()
+        marginal = find_estimator(estimator, tuning.model).family in ("particle", "ensemble")
+        course = Course(self._engine.model, tuning, marginal, tail.events, tail.track, tail.heard)
+        left = dict(self._carried)
+        entries = []
+        for item in found_in(course):
+            known = left.get(item.key)
+            if known is not None and item.begin <= JOINS.get(item.key[0], 0):
+                del left[item.key]
+                entries.append(_continued(known, item, int(tail.events.t[-1])))
+            else:
+                entries.append(Entry(item.key, item.at, item.episode))
+        # What is not in alarm any more ended where the rows begin.
+        end = float(tail.events.t[0] * 1e-9)
+        ended = [e._replace(episode=e.episode._replace(end=e.episode.end or end)) for e in left.values()]
+        self._entries = sorted([*self._over, *ended, *entries], key=lambda e: (e.episode.start, e.episode.subject))
+        lasting = tuple(e for e in self._entries if e.episode.end is None)
+        self.account = Account(tuple(e.episode for e in self._entries), lasting)
+
+    def _cut(self) -> None:
+        """Cut the older rows off, and keep what was found there."""
+        self._tail.cut()
+        first = int(self._tail.events.t[0])
+        begun = [entry for entry in self._entries if entry.at < first]
+        over = [e for e in begun if e.episode.end is not None and e.episode.end * 1e9 < first]
+        self._over = over[-KEPT:]
+        self._carried = {e.key: e for e in begun if e.episode.end is None or e.episode.end * 1e9 >= first}
+
+    def _say(self, before: list[Entry], again: bool) -> None:
+        """Say what is new against the entries before; `again`: those of another revision, or of rows taken back."""
+        begun, over = _changes(before, self._entries, again)
+        notices, track, t = self._engine.notices, self._tail.track, self._tail.events.t
+        states = {name: state for name, (state, _) in self._engine.status().sensors.items()}
+        leading = self.account.leading(states)
+        health = int(track.health[-1])
+        if health != self._health:
+            self._health = health
+            text = f"health: {HEALTH_NAMES[health]}"
+            if (
+                health not in (WAITING, TRACKING)
+                and leading is not None
+                and estimated_rows(track.select(slice(-1, None)))[0]
+            ):
+                new = [entry for entry in begun if entry.episode is leading]
+                text += f": {leading.text}" if new else f": {leading.subject} {leading.cause}"
+                begun = [entry for entry in begun if entry.episode is not leading]
+            level = {WAITING: "info", TRACKING: "info", DIVERGED: "error"}.get(health, "warn")
+            notices.say(text, level=level, t=int(t[last_run(track.health)]))
+        for entry in begun[:SAID]:
+            episode = entry.episode
+            lasted = "" if episode.end is None else f"; over after {_duration(episode)}"
+            level = "error" if episode.cause == "diverged" else "warn"
+            notices.say(f"{episode.text}{lasted}", level=level, t=round(episode.start * 1e9))
+        if len(begun) > SAID:
+            notices.say(f"and {len(begun) - SAID} more episode(s) of this kind", level="warn")
+        for entry in over[:SAID]:
+            episode = entry.episode
+            what = "heard at last" if episode.cause == "never heard" else f"no longer {episode.cause}"
+            assert episode.end is not None
+            notices.say(f"{episode.subject}: {what}, after {_duration(episode)}", t=round(episode.end * 1e9))
+
+
+def _continued(known: Entry, item: Found, now: int) -> Entry:
+    """An episode that began before the rows that are kept."""
+    old, new = known.episode, item.episode
+    if new.cause in LOST and old.cause not in LOST:
+        old = new._replace(start=old.start)
+    size = (new.end or now * 1e-9) - old.start if old.unit == "s" else old.size
+    return Entry(known.key, known.at, old._replace(end=new.end, size=size))
+
+
+def _changes(before: list[Entry], now: list[Entry], again: bool) -> tuple[list[Entry], list[Entry]]:
+    """The entries that have begun and those that are over; `again`: where rows changed, only what lasts is news."""
+    if again:
+        known = {entry.key for entry in before if entry.episode.end is None}
+        return [entry for entry in now if entry.episode.end is None and entry.key not in known], []
+    same = {(entry.key, entry.at): entry for entry in before}
+    begun, over = [], []
+    for entry in now:
+        old = same.get((entry.key, entry.at)) or next((item for item in before if _meet(item, entry)), None)
+        if old is None:
+            begun.append(entry)
+        elif old.episode.end is None and entry.episode.end is not None:
+            over.append(entry)
+    return begun, over
+
+
+def _meet(one: Entry, other: Entry) -> bool:
+    """Whether two entries are one episode, of which a late reading has moved an end."""
+    a, b = one.episode, other.episode
+    return one.key == other.key and a.start <= (b.end or np.inf) and b.start <= (a.end or np.inf)
+
+
+def _duration(episode: Episode) -> str:
+    assert episode.end is not None
+    return f"{episode.end - episode.start:.3g} s"

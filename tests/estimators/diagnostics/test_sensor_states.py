@@ -1,0 +1,99 @@
+"""The state of each sensor: now, from what the bank has gathered, and along the track, row by row."""
+
+import numpy as np
+
+from estimators.diagnostics.episodes import episodes
+from estimators.diagnostics.health import HealthPolicy
+from estimators.diagnostics.sensor_states import STATES, sensor_states, states_along
+from estimators.fold import Fold
+from estimators.interface.table import table_of
+from estimators.log import READING, TICK, Events, Log
+from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.tuning import Tuning
+from tests.support import SECOND
+
+POLICY = HealthPolicy(stale_after=60.0)
+
+
+def f(x, u, p, dt, out):
+    out[0] = x[0]
+
+
+def h(x, u, p, out):
+    out[0] = x[0]
+
+
+MODEL = StateSpaceModel(
+    name="level",
+    title="a level seen by three gauges",
+    states=(State("level", "m", 0.0, 1.0),),
+    noises=(Noise("level", "m2/s", 1e-6),),
+    sensors=tuple(Sensor(name, (Row("level", "m", 1.0),), h=h) for name in ("one", "two", "three")),
+    f=f,
+    linear=True,
+)
+
+
+def log_until(end: int, silent_from: int) -> Log:
+    """Ticks at each second; gauge one reads noise, two repeats itself from 100 s on, three falls silent."""
+    rng = np.random.default_rng(11)
+    rows = []
+    for k in range(end):
+        rows.append((k + 0.1, READING, 0, rng.normal()))
+        rows.append((k + 0.2, READING, 1, rng.normal() if k < 100 else 0.25))
+        if k < silent_from:
+            rows.append((k + 0.3, READING, 2, rng.normal()))
+        rows.append((k + 0.4, TICK, 0, np.nan))
+    t = np.array([round(row[0] * SECOND) for row in rows], np.int64)
+    kinds, channels = (np.array([row[k] for row in rows]) for k in (1, 2))
+    values = np.array([row[3] for row in rows], float).reshape(-1, 1)
+    log = Log.of(MODEL)
+    log.extend(Events(t, t.copy(), kinds.astype(np.int8), channels.astype(np.int32), values))
+    return log
+
+
+def folded(end: int, silent_from: int) -> Fold:
+    fold = Fold("kf", MODEL, Tuning.of(MODEL), log_until(end, silent_from), policy=POLICY)
+    fold.advance()
+    return fold
+
+
+def states(fold: Fold, used=(True, True, True)) -> list[str]:
+    return sensor_states(MODEL, np.array(used), fold.evidence, int(fold.log.t[fold.n - 1]) * 1e-9, POLICY)
+
+
+def test_each_sensor_has_a_state_of_its_own():
+    assert states(folded(0, 0)) == ["waiting"] * 3
+    assert states(folded(90, 200)) == ["tracking"] * 3
+    assert states(folded(90, 0)) == ["tracking", "tracking", "waiting"]
+    # Two has repeated itself 50 times; three is silent for 20 s, then for more than the 60 s of the policy.
+    assert states(folded(150, 130)) == ["tracking", "degraded", "degraded"]
+    assert states(folded(230, 130)) == ["tracking", "degraded", "stale"]
+    assert states(folded(230, 130), (False, True, True)) == ["held out", "degraded", "stale"]
+
+
+def test_along_the_track_it_changes_where_the_episodes_begin():
+    fold = folded(180, 130)
+    track, events = fold.track, fold.log.events
+    of = {episode.subject: episode for episode in episodes(fold)}
+    for s, name, after in ((1, "two", 100), (2, "three", 130)):
+        rows, codes = states_along(events, track, s)
+        words = [STATES[code] for code in codes]
+        change = words.index("degraded")
+        assert set(words[:change]) == {"tracking"} and set(words[change:]) == {"degraded"}
+        # Told after the cause: some repetitions, or six periods.
+        assert after < events.t[rows[change]] / SECOND < after + 30
+        assert of[name].cause in ("stuck", "silent") and of[name].start < events.t[rows[change]] / SECOND
+    rows, codes = states_along(events, track, 0)
+    assert {STATES[code] for code in codes} == {"tracking"} and rows.size == 180
+
+
+def test_the_table_has_alarms_and_flags_in_words():
+    fold = folded(180, 130)
+    table = table_of(MODEL, fold.log.events, fold.track)
+    flags, alarms = table["flags"].to_pylist(), table["alarms"].to_pylist()
+    assert [flag == "three silent" for flag in flags] == [bool(mask & 4) for mask in fold.track.flags]
+    assert set(flags) == {None, "three silent"}
+    assert [bool(words) for words in alarms] == [bool(mask) for mask in fold.track.alarms.any(axis=1)]
+    stuck = [k for k, words in enumerate(alarms) if words and "stuck" in words.split(", ")]
+    assert set(fold.log.channel[stuck]) == {1} and fold.log.t[stuck[0]] > 100 * SECOND

@@ -1,0 +1,71 @@
+"""ALARMS.md: every cause that the code can name, and every state, has its heading, with what to look at and to do."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from estimators.diagnostics.episodes import CAUSES, anchor
+from estimators.diagnostics.sensor_states import STATES
+from estimators.track import HEALTH_NAMES
+
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / "ALARMS.md").read_text()
+
+
+def sections():
+    """The text under each heading of the second level, by the anchor that GitHub makes of it."""
+    parts = re.split(r"^## (.+)$", TEXT, flags=re.MULTILINE)
+    return {title.lower().replace(" ", "-"): body for title, body in zip(parts[1::2], parts[2::2], strict=True)}
+
+
+def causes_in(path):
+    """Literals that the code gives as a cause: `cause = ...`, `cause=...`, and the first argument of an `Effect`."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        values = []
+        if isinstance(node, ast.keyword) and node.arg == "cause":
+            values = [node.value]
+        elif isinstance(node, ast.Assign):
+            for target in node.targets:
+                if isinstance(target, ast.Name) and target.id == "cause":
+                    values = [node.value]
+                elif isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
+                    pairs = zip(target.elts, node.value.elts, strict=True)
+                    values += [value for name, value in pairs if isinstance(name, ast.Name) and name.id == "cause"]
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Effect":
+            values = node.args[:1]
+        for value in values:
+            branches = [value.body, value.orelse] if isinstance(value, ast.IfExp) else [value]
+            found |= {branch.value for branch in branches if isinstance(branch, ast.Constant)}
+    return found
+
+
+def test_the_causes_are_those_that_the_code_gives():
+    folder = ROOT / "estimators/diagnostics"
+    given = causes_in(folder / "episodes.py") | causes_in(folder / "effects.py")
+    # Those of the twin as a whole are names of its health.
+    assert given | {"stale", "diverged"} == set(CAUSES)
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+def test_each_cause_says_what_it_is_and_what_to_do(cause):
+    body = sections()[anchor(cause)]
+    for part in ("Usual cause:", "Look at:", "Response:", "Clears:"):
+        assert part in body, part
+    assert body.strip().startswith("*")
+
+
+@pytest.mark.parametrize("state", sorted({*HEALTH_NAMES, *STATES}))
+def test_each_state_has_its_heading(state):
+    body = sections()[anchor(state)]
+    assert "Response:" in body or "Clears:" in body
+
+
+def test_nothing_is_explained_that_is_never_said():
+    assert set(sections()) == {anchor(name) for name in (*CAUSES, *HEALTH_NAMES, *STATES)}
+
+
+def test_the_readme_leads_there():
+    assert "ALARMS.md" in (ROOT / "README.md").read_text()
