@@ -119,13 +119,15 @@ def as_dict(
                 HEALTH_NAMES, np.bincount(fold.track.health, minlength=len(HEALTH_NAMES)) / len(fold.track), strict=True
             )
         },
-        "calibration": [_calibration(entry) for entry in found],
+        "calibration": [calibration_dict(entry) for entry in found],
         "episodes": [as_json(item) for item in told],
         "seconds_per_event": seconds,
     }
 
 
-def _calibration(entry: Calibration) -> dict[str, Any]:
+def calibration_dict(entry: Calibration) -> dict[str, Any]:
+    """One calibration, for JSON."""
+
     def figure(found: Interval) -> dict[str, float | None]:
         return {name: number(value) for name, value in zip(Interval._fields, found, strict=True)}
 

@@ -39,6 +39,7 @@ from .faults import Faulty
 from .feeder import Feeder, Finished, Restarted
 from .host_clock import HostClock
 from .idle_ticks import IdleTicks
+from .integrity import IntegrityWatch, Window, window
 from .interface import Records
 from .notices import Notices
 from .outputs import Belief, Cursor, Pull, Status
@@ -115,6 +116,7 @@ class Engine:
         self._alerts = Alerts(self.notices, lambda: self._chronicle.account.in_alarm)
         self._silence = Silence(self.notices, section.stale_after)
         self._stall = Stall(self._say_stalled)
+        self._integrity = IntegrityWatch(self.model, self._window, self._policy.false_alarm_every)
         self._status: tuple[float, Status] | None = None
         self.recorder: Records | None = None
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
@@ -165,10 +167,12 @@ class Engine:
         self._thread.start()
         self._chronicle.start()
         self._feeder.start()
+        self._integrity.start()
 
     def stop(self) -> None:
         """Stop reading and folding."""
         self._stopping.set()
+        self._integrity.stop()
         self._feeder.stop()
         self._refolder.stop()
         if self._thread.is_alive():
@@ -328,10 +332,16 @@ class Engine:
                 recording=self.recorder.path if self.recorder is not None else None,
                 latency_ms=self._latency.percentile(99.0),
                 latency_p50_ms=self._latency.percentile(50.0),
+                integrity=self._integrity.of(self._revision),
                 faults=layer.status() if layer is not None else (),
             )
         self._status = (time.monotonic(), status)
         return status
+
+    def _window(self) -> Window | None:
+        """What the integrity bounds are computed from; nothing while a refold is waited for."""
+        with self._reading():
+            return None if self._requests.waiting else window(self._fold, self._revision)
 
     # The engine's own thread
 

@@ -12,6 +12,7 @@ from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
 from ..engine.host_clock import clock_text
 from ..engine.notices import Notice
 from ..engine.outputs import Status
+from .integrity import integrity_html
 from .time_units import SECONDS, Unit
 
 LIGHTS = {
@@ -68,7 +69,8 @@ def status_html(status: Status, origin: int | None, unit: Unit = SECONDS) -> str
         '<div style="display:flex;justify-content:space-between;gap:0.5em">'
         f"<b>{_light(health, f'{health}{since}')}</b>"
         f"<span>{state}</span><span>{fold}</span><span>{at}</span></div><div>{cells}</div>"
-        f'<div>{_lights(status.sensors)}</div><div style="overflow-wrap:anywhere">{remedy}</div></div>'
+        f'<div>{_lights(status.sensors)}</div><div style="overflow-wrap:anywhere">{remedy}</div>'
+        f"{integrity_html(status)}</div>"
     )
 
 
