@@ -32,6 +32,7 @@ from ..intake import Intake
 from ..stderr import complain
 from . import commands
 from .alerts import Alerts
+from .blame import Blame
 from .chronicle import Chronicle
 from .counts import Latency, RowCounts, last_run
 from .execute import Remembered, execute
@@ -117,6 +118,7 @@ class Engine:
         self._silence = Silence(self.notices, section.stale_after)
         self._stall = Stall(self._say_stalled)
         self._integrity = IntegrityWatch(self.model, self._window, self._policy.false_alarm_every)
+        self._blame = Blame(self.model, lambda: self._chronicle.account.episodes, self._window, self.notices)
         self._status: tuple[float, Status] | None = None
         self.recorder: Records | None = None
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
@@ -168,11 +170,13 @@ class Engine:
         self._chronicle.start()
         self._feeder.start()
         self._integrity.start()
+        self._blame.start()
 
     def stop(self) -> None:
         """Stop reading and folding."""
         self._stopping.set()
         self._integrity.stop()
+        self._blame.stop()
         self._feeder.stop()
         self._refolder.stop()
         if self._thread.is_alive():
@@ -267,7 +271,7 @@ class Engine:
 
     def episodes(self) -> list[Episode]:
         """What was and is wrong, in the order of its start; at most a second behind the rows."""
-        return list(self._chronicle.account.episodes)
+        return [self._blame.told(episode) for episode in self._chronicle.account.episodes]
 
     def previous(self) -> Pull | None:
         """The whole previous revision, for comparison; its arrays never change."""

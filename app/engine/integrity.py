@@ -119,7 +119,7 @@ class IntegrityWatch:
             return
         try:
             found = self._compute(taken)
-        except _Stopped:
+        except Stopped:
             return
         except Exception as error:  # noqa: BLE001  a user's model may raise anything; the twin goes on
             self._latest = Integrity(taken.revision, t, f"{type(error).__name__}: {error}")
@@ -137,7 +137,7 @@ class IntegrityWatch:
             log,
             base=taken.base,
             false_alarm=self._false_alarm,
-            executor=_Unhurried(self._stopping),
+            executor=Unhurried(self._stopping),
         )
 
     def _run(self) -> None:
@@ -156,11 +156,11 @@ def reason_against(model: StateSpaceModel, estimator: str) -> str:
     return ""
 
 
-class _Stopped(Exception):  # noqa: N818  no error: the twin ends
+class Stopped(Exception):  # noqa: N818  no error: the twin ends
     """The twin has ended."""
 
 
-class _Unhurried(Executor):
+class Unhurried(Executor):
     """Works on one item after another, and rests after each as long as it took."""
 
     def __init__(self, stopping: threading.Event) -> None:
@@ -170,12 +170,12 @@ class _Unhurried(Executor):
         """As the built-in `map`.
 
         Raises:
-            _Stopped: If the twin has ended meanwhile.
+            Stopped: If the twin has ended meanwhile.
         """
         took = 0.0
         for items in zip(*iterables, strict=False):
             if self._stopping.wait(took):
-                raise _Stopped
+                raise Stopped
             begun = time.thread_time()
             yield fn(*items)
             took = time.thread_time() - begun
