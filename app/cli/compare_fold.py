@@ -137,7 +137,7 @@ def timed(
     log = Log.of(twin.model, capacity=max(1, len(events)))
     log.extend(events)
     tuning = replace(twin.tuning.with_options(twin.options_of(estimator)), seed=seed)
-    fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=twin.policy)
+    fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=twin.policy, expected=twin.expected)
     took: list[float] = []
     while not took or (sum(took) < enough and fold.n == log.n):
         fold.rewind(0)
