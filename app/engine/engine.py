@@ -313,7 +313,9 @@ class Engine:
                 t=int(log.t[last]) if last >= 0 else None,
                 health=health,
                 since=int(log.t[last_run(track.health)]) if last >= 0 else None,
-                cause=leading.text if leading is not None and health not in (WAITING, TRACKING) else "",
+                cause=self._blame.told(leading).text
+                if leading is not None and health not in (WAITING, TRACKING)
+                else "",
                 sensors=account.of_sensors(self.model.sensor_names, states),
                 episodes_open=len(account.lasting),
                 lost=self._alerts.lost,

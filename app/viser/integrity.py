@@ -19,7 +19,8 @@ def integrity_html(status: Status) -> str:
     muted = '<span style="opacity:0.65">'
     if found.reason:
         return f"<div>{muted}integrity not watched: {html.escape(found.reason)}</span></div>"
-    cells = "".join(
+    # A space between two, where the line may break.
+    cells = " ".join(
         f'<span style="margin-right:0.9em;white-space:nowrap" title="{html.escape(item.fault, quote=True)}">{muted}'
         f"{html.escape(name)}</span> ±{_size(item.two_sigma)} / {_size(item.bound)} {html.escape(item.unit)}</span>"
         for name, item in list(found.bounds.items())[:SHOWN]
