@@ -282,16 +282,18 @@ def _of_silence(course: Course) -> Iterator[Found]:
             last = int(t[before[-1]]) if before.size else known
             cause = "silent" if last else "never heard"
             start = (last or int(t[0])) * 1e-9
+            over = None if lasts else float(t[min(end, t.size - 1)] * 1e-9)
+            size = t[end - 1] * 1e-9 - start if over is None else over - start
             episode = Episode(
                 start=start,
-                end=None if lasts else t[min(end, t.size - 1)] * 1e-9,
+                end=over,
                 subject=sensor.name,
                 cause=cause,
-                size=(t[end - 1] - t[begin]) * 1e-9 + (t[begin] * 1e-9 - start),
+                size=size,
                 low=np.nan,
                 high=np.nan,
                 unit="s",
-                text=of_silence(model, s, cause, start),
+                text=of_silence(model, s, cause, start, None if lasts else size),
             )
             yield Found(("silence", sensor.name), begin, int(t[begin]), episode)
 
