@@ -79,6 +79,9 @@ CORRELATIONS = (0.25, 0.6, -0.25, -0.6)
 SPIKE_SHARES, SPIKE = (0.03, 0.003), 5.0
 """Spikes: these shares of e have so many standard deviations."""
 
+CALM, FAR_OUT = 500, 3.5
+"""Readings without an |e| beyond this after which spikes are forgotten: rare ones say little of what comes long after."""
+
 REFUSED_SHARE = 0.3
 """Share of refused readings that is tested against what the gate refuses by chance."""
 
@@ -155,8 +158,8 @@ BITS = np.array(
 )
 
 # A row's part of the state: its tests' W, then these.
-_MASK, _RAW, _BEFORE, _VALUE, _QUANTUM, _RUN, _EQUAL, _COUNTED = range(TESTS, TESTS + 8)
-ROW = TESTS + 8
+_MASK, _RAW, _BEFORE, _VALUE, _QUANTUM, _RUN, _EQUAL, _COUNTED, _CALM = range(TESTS, TESTS + 9)
+ROW = TESTS + 9
 """Numbers in the state for each row."""
 
 # A sensor's part: W of the joint tests, then these.
@@ -345,7 +348,10 @@ def _weigh(own, e, h, base, before):
             threshold = h + base[3 + k]
             if own[k] >= threshold or own[k] >= LASTING * threshold and before & BITS[k] != 0:
                 mask |= BITS[k]
+    own[_CALM] = 0.0 if abs(white) > FAR_OUT else own[_CALM] + 1.0
     for k in range(len(SPIKE_SHARES)):
+        if own[_CALM] >= CALM:
+            own[AT_SPIKES + k] = 0.0
         said = _add(own, AT_SPIKES + k, _spike_ratio(k, square), h, base[3 + AT_SPIKES + k])
         mask |= _alarm(said, SPIKY, before)
     return mask

@@ -97,8 +97,8 @@ def test_each_is_said_once_when_it_begins_and_when_it_is_over(engine, asset):
     (first,) = [line for line in engine.notices.since(0) if "too narrow" in line.text]
     assert first.text.startswith("health: suspect: bands of winding") and first.level == "warn"
     narrow = engine.episodes()[0]
-    # The first alarm is some readings after the onset.
-    assert 0 <= first.t * 1e-9 - narrow.start < 20
+    # The test of variance 2.5 gains 0.74 nats from a reading of variance 4, of which it needs 14.4.
+    assert 0 <= first.t * 1e-9 - narrow.start < 3 * 14.4 / 0.74
     assert sum(text.startswith("winding: no longer") for text in said(engine)) == 1
     assert lasted and engine.status().episodes_open == 0 and engine.status().cause == ""
     assert engine.status().sensors == {"winding": ("tracking", "")}
@@ -116,7 +116,7 @@ def test_what_began_before_the_rows_that_are_kept_is_carried_on(engine, asset):
     (expected,), (found,) = whole(engine), chronicle.account.episodes
     assert (found.end, found.subject) == (expected.end, expected.subject)
     # Its onset was sought in what came before it was carried on, and stays what it was.
-    assert starts == {found.start} and abs(found.start - expected.start) < 30
+    assert starts == {found.start} and abs(found.start - expected.start) < 64
     assert chronicle._tail.n <= 128
 
 
