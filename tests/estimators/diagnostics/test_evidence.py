@@ -1,4 +1,4 @@
-"""The bank of tests against its words: an oracle in plain Python, from densities, on streams in which all goes wrong."""
+"""The bank of tests against its words: an oracle in plain Python, from densities, on streams where all goes wrong."""
 
 import math
 from dataclasses import replace
@@ -80,22 +80,25 @@ def log_normal(x, mean, variance):
     return -0.5 * ((x - mean) ** 2 / variance + math.log(2.0 * math.pi * variance))
 
 
+def white(e):
+    return log_normal(e, 0.0, 1.0)
+
+
+def mixed(e, share):
+    return math.log(share * math.exp(log_normal(e, 0.0, 25.0)) + (1.0 - share) * math.exp(white(e)))
+
+
 def bank_of_a_row():
-    """(name, cause, log Λ of e and the e before) of every test of innovations, from the densities."""
-    under = lambda e: log_normal(e, 0.0, 1.0)  # noqa: E731
+    """(cause, log Λ of e and the e before) of every test of innovations, from the densities."""
     for v in (1.5, 2.5, 6.0, 0.6, 0.3, 0.05):
-        yield ("narrow" if v > 1 else "wide"), lambda e, _, v=v: log_normal(e, 0.0, v) - under(e)
+        yield ("narrow" if v > 1 else "wide"), lambda e, _, v=v: log_normal(e, 0.0, v) - white(e)
     for m in (0.2, 0.5, 1.5, -0.2, -0.5, -1.5):
-        yield ("high" if m > 0 else "low"), lambda e, _, m=m: log_normal(e, m, 1.0) - under(e)
+        yield ("high" if m > 0 else "low"), lambda e, _, m=m: log_normal(e, m, 1.0) - white(e)
     for phi in (0.25, 0.6, -0.25, -0.6):
-        name = "correlated" if phi > 0 else "alternating"
-        yield name, lambda e, last, phi=phi: log_normal(e, phi * last, 1.0 - phi**2) - under(e)
+        cause = "correlated" if phi > 0 else "alternating"
+        yield cause, lambda e, last, phi=phi: log_normal(e, phi * last, 1.0 - phi**2) - white(e)
     for share in (0.03, 0.003):
-        far = lambda e: log_normal(e, 0.0, 25.0)  # noqa: E731
-        yield (
-            "spiky",
-            lambda e, _, s=share: math.log(s * math.exp(far(e)) + (1.0 - s) * math.exp(under(e))) - under(e),
-        )
+        yield "spiky", lambda e, _, share=share: mixed(e, share) - white(e)
 
 
 OF_INNOVATIONS = tuple(bank_of_a_row())
