@@ -79,6 +79,9 @@ CORRELATIONS = (0.25, 0.6, -0.25, -0.6)
 SPIKE_SHARES, SPIKE = (0.03, 0.003), 5.0
 """Spikes: these shares of e have so many standard deviations."""
 
+RARE = 1
+"""The share that counts only while no other test of the row but the one before it is in alarm."""
+
 REFUSED_SHARE = 0.3
 """Share of refused readings that is tested against what the gate refuses by chance."""
 
@@ -346,6 +349,11 @@ def _weigh(own, e, h, base, before):
             if own[k] >= threshold or own[k] >= LASTING * threshold and before & BITS[k] != 0:
                 mask |= BITS[k]
     for k in range(len(SPIKE_SHARES)):
+        # What is far off while something else is wrong is no rare spike, and would be held for one for thousands of
+        # readings after that.
+        if k == RARE and mask & ~SPIKY != 0:
+            own[AT_SPIKES + k] = 0.0
+            continue
         said = _add(own, AT_SPIKES + k, _spike_ratio(k, square), h, base[3 + AT_SPIKES + k])
         mask |= _alarm(said, SPIKY, before)
     return mask

@@ -9,6 +9,7 @@ from app.cli.arguments import Commission
 from app.cli.commission import commission_twin, lines, write
 from app.twin.twin import load_twin
 from estimators.diagnostics.commission import Normal, baseline_of
+from estimators.diagnostics.evidence import CAUSES
 from estimators.errors import ConfigError
 
 TWIN = """\
@@ -105,12 +106,18 @@ def test_a_file_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("section", "said"),
     [
-        ("  tooth: {bias: 0, scale: 1, correlation: 0}\n", "drive.yaml:10: commissioned.tooth is no sensor row of motor_winding; it has winding"),
-        ("  winding:\n    reached:\n      broken: 2\n", "drive.yaml:12: commissioned.winding.reached.broken is no cause; choose from narrow, wide, high, low, correlated, alternating, spiky, refused, stuck, disagreeing, agreeing, missed"),
+        (
+            "  tooth: {bias: 0, scale: 1, correlation: 0}\n",
+            "drive.yaml:10: commissioned.tooth is no sensor row of motor_winding; it has winding",
+        ),
+        (
+            "  winding:\n    reached:\n      broken: 2\n",
+            "drive.yaml:12: commissioned.winding.reached.broken is no cause; choose from " + ", ".join(CAUSES),
+        ),
         ("  winding: {scale: 0}\n", "drive.yaml:10: commissioned.winding.scale"),
         ("  winding: {correlation: 1}\n", "drive.yaml:10: commissioned.winding.correlation"),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_section_is_one_line(tmp_path: Path, section: str, said: str) -> None:
     path = drive(tmp_path, TWIN + "commissioned:\n" + section)
     with pytest.raises(ConfigError) as problem:

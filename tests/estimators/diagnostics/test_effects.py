@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from estimators.diagnostics.effects import KINDS, effects, onset
+from estimators.diagnostics.effects import KINDS, common_scale, effects, onset
 
 RUNS = 400
 
@@ -75,6 +75,18 @@ def test_the_share_of_spikes_is_counted():
         inside += found.low <= 0.03 / 1.03 <= found.high
     # The normal interval of a small share is known to be short: 93 % at 15 of 500 (Brown, Cai & DasGupta 2001).
     assert 0.88 * RUNS <= inside <= 0.99 * RUNS
+
+
+def test_the_scale_of_rows_together_covers_the_truth():
+    """NIS of three rows, of which one is missing at times, all with 1.2 times the noise."""
+    rng = np.random.default_rng(10)
+    inside = 0
+    for _ in range(RUNS):
+        dof = rng.integers(2, 4, 100)
+        found = common_scale(1.2 * np.sqrt(rng.chisquare(dof) / dof), dof)
+        assert found.cause == "narrow"
+        inside += found.low <= 1.2 <= found.high
+    assert 0.9 * RUNS <= inside <= 0.99 * RUNS
 
 
 @pytest.mark.parametrize("cause", KINDS)

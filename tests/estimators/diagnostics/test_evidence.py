@@ -142,6 +142,10 @@ class RowOracle:
             if self.before is None and cause in ("correlated", "alternating"):
                 continue
             last = 0.0 if self.before is None else self.before
+            # The last one, rare spikes, stands alone.
+            if k == len(self.tests) - 1 and said - {"spiky"}:
+                test.W = 0.0
+                continue
             said |= test.put(ratio(white, last), h, self.base[3 + k], self.said)
         self.raw, self.before = raw, white
         return said
@@ -415,13 +419,13 @@ def test_pieces_and_late_arrivals_change_nothing(seed, pieces, late):
 
 
 def walk(wrong, *, gate=None, silent=(0.0, 0.0)):
-    """States of the twin, without repeats, over 25 minutes of sensor `one`, four readings a second, off by wrong(t).
+    """States of the twin, without repeats, over five minutes of sensor `one`, four readings a second, off by wrong(t).
 
-    So long because a test of rare spikes falls slowly. Between the times of `silent` there are only ticks.
+    Between the times of `silent` there are only ticks.
     """
     rng = np.random.default_rng(5)
     x, batch = 0.0, [Events.one(0, 0, TICK, 0, (), MODEL.width)]
-    for k in range(1, 6000):
+    for k in range(1, 1200):
         x += -0.05 * x + rng.normal(0.0, 0.1)
         t, y = k * SECOND // 4, x + 0.5 * rng.normal() + wrong(k / 4)
         kind = TICK if silent[0] < k / 4 < silent[1] else READING
