@@ -1,4 +1,4 @@
-"""Episodes of one fault each, put into readings that were in order: who, what, since when, until when, and the words."""
+"""Episodes of one fault each, put into readings that were in order: who, what, from when to when, in words."""
 
 import json
 
