@@ -21,8 +21,9 @@ from .prepare import prepare
 if TYPE_CHECKING:
     from .arguments import Commission as Arguments
 
-SECTION = re.compile(r"^commissioned:.*\n(?:[ \t#].*\n|\n(?=[ \t]))*", re.MULTILINE)
-"""The section in a YAML: its key, and the lines under it."""
+SECTION = re.compile(r"^commissioned:.*(?:\n|\Z)(?:(?:[ \t]*(?:#.*)?\r?\n)*[ \t]+[^\s#].*(?:\n|\Z))*", re.MULTILINE)
+"""The section in a YAML: its key and the lines under it, to the last that is indented; a comment after that belongs to
+what follows."""
 
 
 def commission_twin(arguments: Arguments) -> int:
@@ -67,8 +68,11 @@ def write(path: Path, section: str) -> None:
         ConfigError: If the file cannot be written.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        with path.open(encoding="utf-8", newline="") as file:
+            text = file.read()
+        end = "\r\n" if "\r\n" in text else "\n"
+        section = section.replace("\n", end)
         kept, found = SECTION.subn(lambda _: section, text, count=1)
-        path.write_text(kept if found else text.rstrip("\n") + "\n\n" + section, encoding="utf-8")
+        path.write_text(kept if found else text.rstrip("\r\n") + 2 * end + section, encoding="utf-8", newline="")
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written ({error.strerror})") from None

@@ -92,6 +92,17 @@ def effects(e: np.ndarray) -> list[Effect]:
     return sorted(found, key=lambda effect: -effect.ratio)
 
 
+def common_scale(e: np.ndarray, dof: np.ndarray) -> Effect:
+    """The scale of all rows of a sensor together, from e = √(NIS / dof) (n,) and the degrees of freedom (n,)."""
+    whole = float(np.sum(dof))
+    variance = max(float(np.sum(dof * e**2)) / whole, 1e-12)
+    deviation = float(np.sqrt(variance))
+    half = SIDE / np.sqrt(2.0 * whole) * deviation
+    gain = 0.5 * whole * (variance - 1.0 - float(np.log(variance)))
+    cause = "narrow" if variance > 1.0 else "wide"
+    return Effect(cause, deviation, max(0.0, deviation - half), deviation + half, gain)
+
+
 def _alone(e: np.ndarray) -> np.ndarray:
     """Which of e (n,) are spikes without a neighbour that is one on the same side."""
     side = np.where(np.abs(e) > SPIKE, np.sign(e), 0.0)

@@ -16,7 +16,7 @@ from ..log import INPUT, READING, TRUTH, Events, Log, truth_of
 from ..model.state_space import Input, State, StateSpaceModel
 from ..track import DIVERGED, GATED, HEALTH_NAMES, STALE, USED, Track
 from ..tuning import Tuning
-from .effects import KINDS, Effect, effects, onset
+from .effects import KINDS, Effect, common_scale, effects, onset
 from .evidence import AGREEING, DISAGREEING, IMPOVERISHED, MISSED, OUTSIDE, REFUSED, SENSORS, STUCK
 from .words import of_particles, of_sensor, of_silence, of_truth, of_twin, since
 
@@ -198,8 +198,11 @@ def _of_sensor(
     stuck = np.flatnonzero(said & STUCK)
     refused = np.flatnonzero(said & REFUSED)
     # A gate that refuses some readings has a reason that shows in the others.
-    if refused.size and np.mean(verdict[begin:end] == GATED) < MOST:
-        refused = refused[:0]
+    if refused.size:
+        # Other tests fall more slowly: those readings are in order already.
+        until = int(np.flatnonzero((masks[begin:end] & REFUSED).any(axis=1))[-1]) + 1
+        if np.mean(verdict[begin : begin + until] == GATED) < MOST:
+            refused = refused[:0]
     if stuck.size:
         k, cause = int(stuck[0]), "stuck"
         begun = _same_since(values[:, k], begin)
@@ -213,12 +216,14 @@ def _of_sensor(
         over = end if lasts else begun + int(np.flatnonzero(verdict[begun:end] == GATED)[-1]) + 1
         size, low, high = float(np.mean(verdict[begun:over] == GATED)), np.nan, np.nan
     elif said[0] & (DISAGREEING | AGREEING) and not np.any(said & ~(DISAGREEING | AGREEING)):
-        cause = "disagreeing" if said[0] & DISAGREEING else "agreeing"
+        k, cause = 0, "disagreeing" if said[0] & DISAGREEING else "agreeing"
+        begun, over, (_, size, low, high, _) = _together(course, rows, begin, end, cause)
     nu = track.innovation[rows[begun:over], k]
     about = float(np.nanmean(nu)) if np.isfinite(nu).any() else np.nan
     row = model.sensors[s].rows[k]
     unit = {"shifted": "σ", "narrow": "×", "wide": "×", "disagreeing": "×", "agreeing": "×", "stuck": row.unit}
-    subject = model.row_names[model.row_start[s] + k]
+    of_all = cause in ("disagreeing", "agreeing")
+    subject = model.sensors[s].name if of_all else model.row_names[model.row_start[s] + k]
     start = events.t[rows[begun]] * 1e-9
     correlation = next((item.size for item in ranked if item.cause in ("correlated", "alternating")), 0.0)
     return Episode(
@@ -258,6 +263,24 @@ def _most_telling(
             if ranked[0].cause == cause and ranked[0].ratio > best[3][0].ratio:
                 best = int(k), first + int(known[begun]), first + int(known[over - 1]) + 1, ranked
     return best
+
+
+def _together(course: Course, rows: np.ndarray, begin: int, end: int, cause: str) -> tuple[int, int, Effect]:
+    """From when to when all rows of a sensor together are off more, or less, than their noise, and how much.
+
+    The mean of a NIS is its degrees of freedom: the root of their ratio takes the place of e.
+    """
+    first = max(0, begin - LOOKED_AT)
+    nis, dof = course.track.nis[rows[first:end]], course.track.dof[rows[first:end]]
+    known = np.flatnonzero(np.isfinite(nis) & (dof > 0))
+    e = np.sqrt(nis[known] / dof[known])
+    alarm = min(int(np.searchsorted(known, begin - first)), e.size - 1)
+    way = "narrow" if cause == "disagreeing" else "wide"
+    begun = onset(e[: alarm + 1], way)
+    run = e[begun : begun + LOOKED_AT]
+    over = max(begun + run.size - onset(run[::-1], way), min(alarm + 1, begun + run.size))
+    found = common_scale(e[begun:over], dof[known][begun:over])
+    return first + int(known[begun]), first + int(known[over - 1]) + 1, found
 
 
 _UNKNOWN = Effect("narrow", np.nan, np.nan, np.nan, -np.inf)

@@ -80,7 +80,11 @@ SPIKE_SHARES, SPIKE = (0.03, 0.003), 5.0
 """Spikes: these shares of e have so many standard deviations."""
 
 CALM, FAR_OUT = 500, 3.5
-"""Readings without an |e| beyond this after which spikes are forgotten: rare ones say little of what comes long after."""
+"""Readings without an |e| beyond this after which spikes are forgotten: they say little of what comes long after."""
+
+RARE = 1
+"""The share that counts only while no other test of the row but the one before it is in alarm."""
+
 
 REFUSED_SHARE = 0.3
 """Share of refused readings that is tested against what the gate refuses by chance."""
@@ -352,6 +356,10 @@ def _weigh(own, e, h, base, before):
     for k in range(len(SPIKE_SHARES)):
         if own[_CALM] >= CALM:
             own[AT_SPIKES + k] = 0.0
+        # What is far off while something else is wrong is no rare spike.
+        if k == RARE and mask & ~SPIKY != 0:
+            own[AT_SPIKES + k] = 0.0
+            continue
         said = _add(own, AT_SPIKES + k, _spike_ratio(k, square), h, base[3 + AT_SPIKES + k])
         mask |= _alarm(said, SPIKY, before)
     return mask
@@ -475,7 +483,7 @@ def _forget(state, sensors, rows, states):
     for k in range(rows):
         own = _row(state, sensors, k)
         own[:TESTS] = 0.0
-        own[_MASK] = 0.0
+        own[_MASK] = own[_CALM] = 0.0
         own[_RAW] = own[_BEFORE] = np.nan
     begin = TWIN + sensors * SENSOR + rows * ROW
     state[begin : begin + states * STATE] = 0.0

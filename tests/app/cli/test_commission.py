@@ -1,0 +1,125 @@
+"""`nisus commission`: what is normal, as lines of a YAML that are written, replaced and read again."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.cli.arguments import Commission
+from app.cli.commission import commission_twin, lines, write
+from app.twin.twin import load_twin
+from estimators.diagnostics.commission import Normal, baseline_of
+from estimators.diagnostics.evidence import CAUSES
+from estimators.errors import ConfigError
+
+TWIN = """\
+# A drive.
+model: motor_winding
+
+source:
+  type: table
+  files: drive.csv
+  time: {column: t, unit: s}
+  sensors: {winding: {columns: y}}
+"""
+SECTION = """\
+commissioned:                    # of another day
+  winding: {bias: 0.5, scale: 2, correlation: 0.1,
+
+    # a comment inside
+    reached: {narrow: 4}}
+"""
+REST = """\
+# What is drawn; this comment belongs to what follows.
+view:
+  window: 60
+"""
+
+
+def drive(folder: Path, text: str = TWIN) -> str:
+    """A recording of 300 readings, noisier than the model believes, and its twin."""
+    y = 40.0 + np.random.default_rng(1).normal(0.0, 4.0, 300)
+    (folder / "drive.csv").write_text("t,y\n" + "".join(f"{k},{value:.3f}\n" for k, value in enumerate(y)))
+    path = folder / "drive.yaml"
+    path.write_bytes(text.encode())
+    return str(path)
+
+
+def test_what_is_printed_is_what_is_read_again(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    path = drive(tmp_path)
+    assert load_twin(path).tuning.baseline is None
+    assert commission_twin(Commission(path)) == 0
+    printed = capsys.readouterr().out
+    assert Path(path).read_text() == TWIN
+    Path(path).write_text(TWIN + printed)
+    baseline = load_twin(path).tuning.baseline
+    assert baseline is not None and baseline[0, 1] > 1.5
+    # Against white innovations, not against what was normal before: the same again.
+    assert commission_twin(Commission(path)) == 0
+    assert capsys.readouterr().out == printed
+
+
+def test_every_figure_comes_back(tmp_path: Path) -> None:
+    normals = {"winding": Normal(-0.25, 1.75, -0.125, {"narrow": 12.5, "high": 3.0, "stuck": 100.0})}
+    twin = load_twin(drive(tmp_path, TWIN + lines(normals)))
+    np.testing.assert_array_equal(twin.tuning.baseline, baseline_of(twin.model, normals))
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"], ids=["unix", "windows"])
+@pytest.mark.parametrize(
+    "text",
+    [TWIN, TWIN + SECTION, TWIN + SECTION + REST, SECTION + TWIN, TWIN + SECTION.rstrip("\n"), TWIN + "\n" + SECTION],
+    ids=["none", "last", "amidst", "first", "unended", "apart"],
+)
+def test_the_rest_of_the_file_stays(tmp_path: Path, text: str, end: str) -> None:
+    """Byte for byte, with line ends as they are; and written again it is the same."""
+    path = Path(drive(tmp_path, text.replace("\n", end)))
+    assert commission_twin(Commission(str(path), write=True)) == 0
+    written = path.read_bytes()
+    first = written.index(b"commissioned:")
+    # Two lines of its own: the key, and a row with what was reached.
+    own = b"".join(written[first:].splitlines(keepends=True)[:3])
+    assert own.endswith(b"}}" + end.encode())
+    before, section, after = text.partition(SECTION.rstrip("\n"))
+    expected = (before if section else before + "\n", after.removeprefix("\n"))
+    assert (written[:first], written[first + len(own) :]) == tuple(
+        part.replace("\n", end).encode() for part in expected
+    )
+    load_twin(str(path))
+    assert commission_twin(Commission(str(path), write=True)) == 0
+    assert path.read_bytes() == written
+
+
+def test_too_little_is_one_line(tmp_path: Path) -> None:
+    path = drive(tmp_path)
+    with pytest.raises(ConfigError) as problem:
+        commission_twin(Commission(path, duration=20.0, write=True))
+    assert str(problem.value) == "no sensor row has 50 readings that were judged; commission on a longer recording"
+    assert Path(path).read_text() == TWIN
+
+
+def test_a_file_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"absent\.yaml: cannot be written \(No such file or directory\)$"):
+        write(tmp_path / "absent.yaml", "commissioned: {}\n")
+
+
+@pytest.mark.parametrize(
+    ("section", "said"),
+    [
+        (
+            "  tooth: {bias: 0, scale: 1, correlation: 0}\n",
+            "drive.yaml:10: commissioned.tooth is no sensor row of motor_winding; it has winding",
+        ),
+        (
+            "  winding:\n    reached:\n      broken: 2\n",
+            "drive.yaml:12: commissioned.winding.reached.broken is no cause; choose from " + ", ".join(CAUSES),
+        ),
+        ("  winding: {scale: 0}\n", "drive.yaml:10: commissioned.winding.scale"),
+        ("  winding: {correlation: 1}\n", "drive.yaml:10: commissioned.winding.correlation"),
+    ],
+)
+def test_a_wrong_section_is_one_line(tmp_path: Path, section: str, said: str) -> None:
+    path = drive(tmp_path, TWIN + "commissioned:\n" + section)
+    with pytest.raises(ConfigError) as problem:
+        load_twin(path)
+    assert said in str(problem.value) and "\n" not in str(problem.value)

@@ -1,0 +1,128 @@
+"""What was normal when a tuning was accepted: a wrong model is silent on more of the same, and speaks of a change."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from estimators.diagnostics.commission import FEWEST, MARGIN, baseline_of, commission
+from estimators.diagnostics.evidence import BITS, CAUSES, NARROW, no_baseline
+from estimators.fold import Fold
+from estimators.log import READING, Events
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.tuning import Tuning
+from tests.support import SECOND, as_log
+
+
+def still(x, u, p, dt, out):
+    out[:] = x
+
+
+def level(x, u, p, out):
+    out[0] = x[0]
+
+
+def pair(x, u, p, out):
+    out[0] = x[0]
+    out[1] = x[0]
+
+
+MODEL = StateSpaceModel(
+    name="level",
+    title="a level that walks at random, as the model believes",
+    states=(State("level", "m", mean=0.0, std=1.0),),
+    noises=(Noise("level", "m²/s", 0.01),),
+    sensors=(
+        Sensor("gauge", (Row("gauge", "m", 0.04),), h=level),
+        Sensor("floats", (Row("left", "m", 0.09), Row("right", "m", 0.09)), h=pair),
+    ),
+    f=still,
+    linear=True,
+)
+
+
+def asset(seed, n=3000, *, change=None):
+    """An asset that the model does not describe: it swings, the gauge is 0.1 m off and half as noisy as believed.
+
+    `change` (n,): what is added to the gauge besides.
+    """
+    rng = np.random.default_rng(seed)
+    k = np.arange(n)
+    phase = rng.uniform(0.0, 2.0 * np.pi)
+    x = 0.5 * np.sin(k / 12.0 + phase) + np.cumsum(rng.normal(0.0, 0.03, n))
+    gauge = x + 0.1 + rng.normal(0.0, 0.1, n) + (0.0 if change is None else change)
+    floats = x[:, None] + rng.normal(0.0, 0.4, (n, 2))
+    value = np.full((2 * n, MODEL.width), np.nan)
+    value[::2, 0], value[1::2] = gauge, floats
+    t = np.repeat((k + 1) * SECOND, 2)
+    channel = np.tile([0, 1], n).astype(np.int32)
+    return as_log(Events(t, t.copy(), np.full(2 * n, READING, np.int8), channel, value))
+
+
+def folded(log, baseline=None):
+    fold = Fold("kf", MODEL, replace(Tuning.of(MODEL), baseline=baseline), log)
+    fold.advance()
+    return fold
+
+
+@pytest.fixture(scope="module")
+def normals():
+    fold = folded(asset(0))
+    assert fold.track.alarms.any(axis=1).mean() > 0.5
+    return commission(fold, fold.evidence)
+
+
+def test_the_normal_is_that_of_the_innovations(normals):
+    """Bias, scale and correlation by numpy, of e cut at 6 σ, to the three digits that are kept."""
+    track = folded(asset(0)).track
+    assert list(normals) == ["gauge", "floats.left", "floats.right"]
+    for name, first, k in (("gauge", 0, 0), ("floats.left", 1, 0), ("floats.right", 1, 1)):
+        e = np.clip(track.innovation[first::2, k] / track.innovation_std[first::2, k], -6.0, 6.0)
+        lag = np.corrcoef(e[1:], e[:-1])[0, 1]
+        normal = normals[name]
+        assert (normal.bias, normal.scale) == pytest.approx((e.mean(), e.std()), abs=5.1e-4)
+        # That of corrcoef takes the means and deviations of either end apart: 1/n more or less.
+        assert normal.correlation == pytest.approx(lag, abs=2e-3)
+        assert set(normal.reached) <= set(CAUSES) and all(peak > 1.0 for peak in normal.reached.values())
+
+
+@pytest.mark.parametrize("seed", range(1, 7))
+def test_more_of_the_same_is_silent(normals, seed):
+    baseline = baseline_of(MODEL, normals)
+    assert not folded(asset(seed), baseline).track.alarms.any()
+    assert folded(asset(seed)).track.alarms.any()
+
+
+@pytest.mark.parametrize(
+    ("change", "cause", "within"),
+    [
+        (lambda rng, n: np.full(n, 0.5), "high", 60),
+        (lambda rng, n: np.full(n, -0.5), "low", 60),
+        (lambda rng, n: rng.normal(0.0, 0.5, n), "narrow", 60),
+    ],
+    ids=["above", "below", "noisy"],
+)
+def test_a_change_is_heard(normals, change, cause, within):
+    """Against what was normal, in the gauge, soon after it began at reading 1500, and not before."""
+    rng = np.random.default_rng(9)
+    added = np.append(np.zeros(1500), change(rng, 1500))
+    track = folded(asset(1, change=added), baseline_of(MODEL, normals)).track
+    gauge = track.alarms[::2, 0]
+    assert not gauge[:1500].any()
+    assert np.bitwise_or.reduce(gauge[1500 : 1500 + within]) >> CAUSES.index(cause) & 1
+
+
+def test_the_baseline_is_what_was_normal(normals):
+    """Margin times what was reached, for every test of that cause; white innovations for a row without a normal."""
+    part = {"gauge": normals["gauge"]}
+    baseline = baseline_of(MODEL, part)
+    np.testing.assert_array_equal(baseline[1:], no_baseline(MODEL)[1:])
+    assert tuple(baseline[0, :3]) == part["gauge"][:3]
+    assert np.all(baseline[0, 3:][BITS == NARROW] == MARGIN * part["gauge"].reached.get("narrow", 0.0))
+
+
+def test_too_few_readings_have_no_normal():
+    fold = folded(asset(0, n=FEWEST))
+    assert len(commission(fold, fold.evidence)) == 3
+    fold = folded(asset(0, n=FEWEST - 1))
+    assert commission(fold, fold.evidence) == {}

@@ -1,0 +1,324 @@
+"""Episodes of one fault each, put into readings that were in order: who, what, from when to when, in words."""
+
+import json
+
+import numpy as np
+import pytest
+
+from estimators.diagnostics.episodes import CAUSES, JOINED, Episode, course_of, episode_json, episodes, found_in
+from estimators.diagnostics.evidence import IMPOVERISHED, LOW, NARROW
+from estimators.diagnostics.health import HealthPolicy
+from estimators.fold import Fold
+from estimators.log import INPUT, READING, TICK, TRUTH, Events
+from estimators.model.state_space import Input, Noise, Row, Sensor, State, StateSpaceModel
+from estimators.tuning import Tuning
+from tests.support import SECOND, as_log
+
+ROWS = 8
+
+
+def walk(x, u, p, dt, out):
+    out[0] = x[0] + dt * u[0]
+
+
+def one(x, u, p, out):
+    out[0] = x[0]
+
+
+def many(x, u, p, out):
+    out[:] = x[0]
+
+
+MODEL = StateSpaceModel(
+    name="level",
+    title="a level, a gauge and a chain of floats",
+    states=(State("level", "m", mean=0.0, std=1.0, fitted=(-20.0, 20.0)),),
+    inputs=(Input("feed", "m/s", fitted=(-1.0, 1.0)),),
+    noises=(Noise("level", "m²/s", 0.0025),),
+    sensors=(
+        Sensor("gauge", (Row("gauge", "m", 0.04),), h=one),
+        Sensor("chain", tuple(Row(f"c{k}", "m", 1.0) for k in range(ROWS)), h=many),
+    ),
+    f=walk,
+    linear=True,
+)
+POLICY = HealthPolicy(degraded_after=10.0, stale_after=40.0)
+N, BEGIN, END = 1200, 400, 600
+
+
+def noise(rng, n, phi):
+    """AR(1) of unit variance."""
+    z = rng.standard_normal(n)
+    for k in range(1, n):
+        z[k] = phi * z[k - 1] + np.sqrt(1.0 - phi**2) * z[k]
+    return z
+
+
+def folded(*, gauge=None, chain=None, skip=None, gate=None, truth=0.0, feed=0.0, expected=None, seed=0):
+    """A reading of each sensor a second, exact until something is said of the seconds from BEGIN to END.
+
+    `gauge` and `chain`: what these readings are instead, of the level (n,) and the noise in σ (n, rows); `skip`:
+    sensors that say nothing; `truth`: how far off what is told is; `feed`: the input.
+    """
+    rng = np.random.default_rng(seed)
+    level = np.cumsum(0.05 * rng.standard_normal(N))
+    z, others = rng.standard_normal((N, 1)), rng.standard_normal((N, ROWS))
+    within = slice(BEGIN, END)
+    y = [level[:, None] + 0.2 * z, level[:, None] + others]
+    for s, (change, noises) in enumerate(((gauge, z), (chain, others))):
+        if change is not None:
+            y[s][within] = change(level[within, None], noises[within], rng)
+    batch = []
+    for k in range(N):
+        t, off = (k + 1) * SECOND, BEGIN <= k < END
+        batch.append(Events.one(t, t, INPUT, 0, feed if off else 0.0, MODEL.width))
+        batch.append(Events.one(t, t, TICK, 0, (), MODEL.width))
+        for s in range(2):
+            if not (off and skip is not None and s in skip):
+                batch.append(Events.one(t, t, READING, s, y[s][k], MODEL.width))
+        batch.append(Events.one(t, t, TRUTH, 0, level[k] + (truth if off else 0.0), MODEL.width))
+    tuning = Tuning.of(MODEL).set("gate", gate).set("gate.reopen", None)
+    fold = Fold("kf", MODEL, tuning, as_log(Events.concat(batch, MODEL.width)), policy=POLICY, expected=expected)
+    fold.advance()
+    return fold
+
+
+def spiked(x, z, rng):
+    z = z.copy()
+    z[::15] = 6.0 * rng.choice([-1.0, 1.0], z[::15].shape)
+    return x + 0.2 * z
+
+
+SENSORS = {
+    "shifted": (
+        {"gauge": lambda x, z, rng: x + 0.4 + 0.2 * z},
+        ("gauge", "σ", 0.4, 2.0),
+        "reads 0.",
+        "above the prediction since",
+        "the sensor, an input or a parameter; hold gauge out to see",
+    ),
+    "narrow": (
+        {"gauge": lambda x, z, rng: x + 0.6 * z},
+        ("gauge", "×", 1.8, 3.2),
+        "bands of gauge are too narrow since",
+        "times as far as predicted; R.gauge too small, or it got noisier",
+    ),
+    "wide": (
+        {"gauge": lambda x, z, rng: x + 0.04 * z},
+        ("gauge", "×", 0.1, 0.6),
+        "bands of gauge are too wide since",
+        "times as far as predicted; R.gauge too large",
+    ),
+    "correlated": (
+        {"gauge": lambda x, z, rng: x + 0.2 * noise(rng, len(x), 0.7)[:, None]},
+        ("gauge", "", 0.2, 0.8),
+        "innovations of gauge are correlated (+0.",
+        "Q.level too small, or a missing state",
+    ),
+    "alternating": (
+        {"gauge": lambda x, z, rng: x + 0.2 * noise(rng, len(x), -0.7)[:, None]},
+        ("gauge", "", -0.9, -0.4),
+        "innovations of gauge change sign (-0.",
+        "Q.level too large, so that the estimate follows the noise",
+    ),
+    "spiky": (
+        {"gauge": spiked},
+        ("gauge", "", 0.04, 0.09),
+        "gauge spikes since",
+        "% of its readings are outliers; set a gate, look at its wiring",
+    ),
+    "refused": (
+        {"gauge": lambda x, z, rng: x + 5.0 + 0.2 * z, "gate": 0.9999},
+        ("gauge", "", 0.99, 1.0),
+        "gauge is refused by the gate since",
+        "(100 % of its readings): the sensor is wrong, or the twin is; Reset, or hold gauge out",
+    ),
+    "stuck": (
+        {"gauge": lambda x, z, rng: np.full_like(x, 0.125)},
+        ("gauge", "m", 0.125, 0.125),
+        "gauge is stuck at 0.125 m since",
+        "other sensors see the same states; hold it out until it is mended",
+    ),
+    "disagreeing": (
+        {"chain": lambda x, z, rng: x + 1.16 * z},
+        ("chain", "×", 1.12, 1.2),
+        "rows of chain contradict each other since",
+        "R.chain too small, or one of them is wrong",
+    ),
+    "agreeing": (
+        {"chain": lambda x, z, rng: x + 0.8 * z},
+        ("chain", "×", 0.77, 0.83),
+        "rows of chain are closer to the prediction than their noise since",
+        "R.chain too large",
+    ),
+}
+FAR = 45
+"""Seconds by which a weak fault's begin and end are known: see test_effects.py, twice the correlated one's."""
+
+
+@pytest.mark.parametrize("cause", SENSORS)
+def test_one_fault_of_a_sensor_is_one_episode(cause):
+    fault, (subject, unit, least, most), *words = SENSORS[cause]
+    fold = folded(**fault)
+    # What a wrong sensor does to the estimate, the others contradict: that is an episode of theirs.
+    found = [each for each in episodes(fold) if each.subject.startswith(subject)]
+    assert [each.cause for each in found] == [cause]
+    (each,) = found
+    assert each.unit == unit
+    assert least <= each.size <= most and not each.low > each.size and not each.high < each.size
+    assert abs(each.start - BEGIN - 1) <= FAR and each.end is not None and abs(each.end - END) <= FAR
+    for part in words:
+        assert part in each.text
+    assert "\n" not in each.text and each.text[-1] != "."
+
+
+@pytest.mark.parametrize("cause", ["refused", "stuck"])
+def test_what_is_certain_has_its_readings_exactly(cause):
+    (each,) = (item for item in episodes(folded(**SENSORS[cause][0])) if item.cause == cause)
+    # Until the last reading that was refused, or equal.
+    assert (each.start, each.end) == (BEGIN + 1.0, float(END))
+
+
+def test_in_order_there_is_none():
+    assert [episodes(folded(seed=seed)) for seed in range(4)] == [[]] * 4
+
+
+def only(found, cause):
+    assert [each.cause for each in found].count(cause) == 1
+    return next(each for each in found if each.cause == cause)
+
+
+def test_silence():
+    """Since the last reading; and it ends with the next."""
+    found = episodes(folded(skip=(0,)))
+    each = only(found, "silent")
+    assert len(found) == 1
+    assert (each.subject, each.start, each.end, each.unit) == ("gauge", BEGIN, END + 1.0, "s")
+    assert each.size == END + 1 - BEGIN
+    said = f"gauge is silent since {BEGIN}.0 s: other sensors see the same states; check its wiring and its bus"
+    assert each.text == said
+
+
+def test_a_sensor_that_should_speak_and_never_does():
+    events = folded().log.events
+    kept = events.select(np.flatnonzero((events.kind != READING) | (events.channel == 1)))
+    fold = Fold("kf", MODEL, Tuning.of(MODEL), as_log(kept), policy=POLICY, expected=np.array([1, 1]))
+    fold.advance()
+    (each,) = episodes(fold)
+    assert (each.subject, each.cause, each.start, each.end) == ("gauge", "never heard", 1.0, None)
+    said = "gauge was never heard: other sensors see the same states; check its channel map and its bus"
+    assert each.text == said
+
+
+def test_a_twin_without_readings_is_stale():
+    found = episodes(folded(skip=(0, 1)))
+    assert {each.cause for each in found} >= {"silent", "stale"}
+    each = only(found, "stale")
+    assert (each.subject, each.start, each.unit) == ("twin", BEGIN, "s")
+    assert each.end == END + 1.0
+    said = f"no reading was used since {BEGIN}.0 s: the estimate is the model's alone; check the source"
+    assert each.text == said
+
+
+def test_a_truth_that_is_missed():
+    fold = folded(truth=2.0)
+    (each,) = episodes(fold)
+    assert (each.subject, each.cause, each.unit) == ("level", "missed", "σ")
+    std = float(np.median(fold.track.std[:, 0]))
+    # From the first telling on, as one of 20 σ is enough; over when a memory of ten has brought 20² below 3².
+    assert each.start == BEGIN + 1.0 and END <= each.end <= END + 10.0 * np.log((2.0 / std) ** 2 / 3.0**2) + 5.0
+    assert each.low <= each.size <= each.high <= 3.0 / std
+    assert each.text.startswith("level is ") and each.text.endswith(
+        "the estimate is wrong and its band does not say so; look at what else is in alarm"
+    )
+
+
+def test_an_input_outside_its_range():
+    fold = folded(feed=-1.5, skip=(0, 1))
+    found = {(each.subject, each.cause): each for each in episodes(fold)}
+    each = found["feed", "outside"]
+    assert (each.start, each.end, each.size, each.low, each.high) == (BEGIN + 1.0, END + 1.0, -1.5, -1.5, -1.5)
+    assert each.unit == "m/s"
+    assert each.text == (
+        f"feed is -1.5 m/s, outside -1 to 1 where the model was fitted, since {BEGIN + 1}.0 s: bands hold only inside; "
+        "use a model fitted there"
+    )
+    # The level sinks 1.5 m a second from about 0: beyond -20 after some 13 s.
+    level = found["level", "outside"]
+    assert BEGIN + 10 <= level.start <= BEGIN + 17 and level.unit == "m" and level.size < -250.0
+
+
+def test_a_gate_that_refuses_all_is_divergence():
+    fault = {"gauge": lambda x, z, rng: x + 9.0, "chain": lambda x, z, rng: x + 9.0 + 0.1 * z, "gate": 0.9999}
+    each = only(episodes(folded(**fault)), "diverged")
+    assert each.subject == "twin" and BEGIN < each.start < BEGIN + 50 and each.end is not None
+    assert each.text.startswith("the estimate is lost since")
+
+
+def test_an_impoverished_cloud():
+    course = course_of(folded())
+    track = course.track.copy()
+    track.flags[1000:2000] |= IMPOVERISHED
+    track.effective[1000:2000], track.ancestors[1000:2000] = np.linspace(1.0, 3.0, 1000), 1.0
+    (found,) = found_in(course._replace(track=track))
+    each = found.episode
+    t = course.events.t * 1e-9
+    assert (each.subject, each.cause, each.start, each.end) == ("twin", "impoverished", t[1000], t[2000])
+    assert (each.low, each.size, each.high) == pytest.approx((1.05, 2.0, 2.95))
+    assert "2 particles count, and all descend from one particle" in each.text
+
+
+# Runs of alarms
+
+
+def alarmed(*readings):
+    """Alarms of the gauge at those of its readings, in a fold that is in order."""
+    course = course_of(folded())
+    track = course.track.copy()
+    rows = np.flatnonzero((course.events.kind == READING) & (course.events.channel == 0))
+    track.alarms[rows[list(readings)], 0] = NARROW
+    return found_in(course._replace(track=track))
+
+
+def test_alarms_that_follow_each_other_are_one_episode():
+    """With 30 quiet readings between them they do; with 31 they do not."""
+    assert len(alarmed(100)) == 1
+    assert len(alarmed(100, 101 + JOINED)) == 1
+    assert len(alarmed(100, 102 + JOINED)) == 2
+
+
+def test_an_episode_lasts_while_it_may_go_on():
+    ended, lasting = alarmed(N - 2 - JOINED), alarmed(N - 1 - JOINED)
+    assert ended[0].episode.end is not None and lasting[0].episode.end is None
+
+
+def test_episodes_come_in_the_order_of_their_start():
+    found = alarmed(900, 200, 500)
+    starts = [item.episode.start for item in found]
+    assert len(found) == 3 and starts == sorted(starts)
+    assert [item.begin for item in found] == [200, 500, 900]
+    assert {item.key for item in found} == {("sensor", "gauge")}
+
+
+def test_episodes_of_several_bits_are_one():
+    course = course_of(folded())
+    track = course.track.copy()
+    rows = np.flatnonzero((course.events.kind == READING) & (course.events.channel == 1))
+    track.alarms[rows[100:120], 0], track.alarms[rows[110:130], 3] = NARROW, LOW
+    assert len(found_in(course._replace(track=track))) == 1
+
+
+# For scripts
+
+
+def test_json_has_every_field_and_no_nan():
+    text = json.dumps([episode_json(each) for each in episodes(folded(skip=(0, 1)))], allow_nan=False)
+    for each in json.loads(text):
+        assert tuple(each) == Episode._fields
+        assert each["cause"] in CAUSES and each["low"] is None and isinstance(each["size"], float)
+
+
+def test_numbers_are_those_of_python():
+    for cause in ("shifted", "stuck"):
+        for each in episodes(folded(**SENSORS[cause][0])):
+            assert {type(value) for value in each} <= {float, str, type(None)}

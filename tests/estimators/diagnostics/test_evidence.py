@@ -1,0 +1,456 @@
+"""The bank of tests against its words: an oracle in plain Python, from densities, on streams where all goes wrong."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimators.diagnostics.evidence import CAUSES, OUTSIDE, TRUTH_MISSED, no_baseline
+from estimators.diagnostics.health import HealthPolicy
+from estimators.fold import Fold, fold
+from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events, Log
+from estimators.model.limits import Limits
+from estimators.model.state_space import Input, Noise, Row, Sensor, State, StateSpaceModel
+from estimators.track import (
+    DEGRADED,
+    DIVERGED,
+    DUPLICATE,
+    FAILED,
+    GATED,
+    HELD_OUT,
+    MISSING,
+    SCREENED,
+    STALE,
+    SUSPECT,
+    TRACKING,
+    USED,
+    WAITING,
+)
+from estimators.tuning import Tuning
+from tests.support import SECOND, as_log, assert_same
+
+
+def f(x, u, p, dt, out):
+    out[0] = x[0] + dt * (u[0] - 0.2 * x[0])
+    out[1] = x[1] + dt * (0.5 * x[0] - 0.3 * x[1])
+
+
+def one(x, u, p, out):
+    out[0] = x[0]
+
+
+def two(x, u, p, out):
+    out[0] = x[1]
+    out[1] = x[0] + x[1]
+
+
+def other(x, u, p, out):
+    out[0] = x[1] - x[0]
+
+
+MODEL = StateSpaceModel(
+    name="tanks",
+    title="two tanks",
+    states=(State("a", "m", mean=0.0, std=1.0, fitted=(-3.0, 3.0)), State("b", "m", mean=0.0, std=1.0)),
+    inputs=(Input("feed", "m/s", fitted=(-1.0, 1.0)),),
+    noises=(Noise("a", "m²/s", 0.04), Noise("b", "m²/s", 0.04)),
+    sensors=(
+        Sensor("one", (Row("one", "m", 0.25),), h=one, limits=Limits(range=((-9.0, 9.0),))),
+        Sensor("two", (Row("low", "m", 0.09), Row("high", "m", 0.36)), h=two, limits=Limits(range=((-9.0, 9.0),) * 2)),
+        Sensor("other", (Row("other", "m", 0.25),), h=other),
+    ),
+    f=f,
+    linear=True,
+)
+ROWS = ((0,), (1, 2), (3,))
+R = (0.25, 0.09, 0.36, 0.25)
+POLICY = HealthPolicy(
+    window=20, degraded_after=3.0, stale_after=12.0, diverged_nis=30.0, diverged_gated=0.9, false_alarm_every=600.0
+)
+"""Of the window little is asked, so that what the tests say is seen."""
+
+
+# The oracle
+
+
+def log_normal(x, mean, variance):
+    return -0.5 * ((x - mean) ** 2 / variance + math.log(2.0 * math.pi * variance))
+
+
+def white(e):
+    return log_normal(e, 0.0, 1.0)
+
+
+def mixed(e, share):
+    return math.log(share * math.exp(log_normal(e, 0.0, 25.0)) + (1.0 - share) * math.exp(white(e)))
+
+
+def bank_of_a_row():
+    """(cause, log Λ of e and the e before) of every test of innovations, from the densities."""
+    for v in (1.5, 2.5, 6.0, 0.6, 0.3, 0.05):
+        yield ("narrow" if v > 1 else "wide"), lambda e, _, v=v: log_normal(e, 0.0, v) - white(e)
+    for m in (0.2, 0.5, 1.5, -0.2, -0.5, -1.5):
+        yield ("high" if m > 0 else "low"), lambda e, _, m=m: log_normal(e, m, 1.0) - white(e)
+    for phi in (0.25, 0.6, -0.25, -0.6):
+        cause = "correlated" if phi > 0 else "alternating"
+        yield cause, lambda e, last, phi=phi: log_normal(e, phi * last, 1.0 - phi**2) - white(e)
+    for share in (0.03, 0.003):
+        yield "spiky", lambda e, _, share=share: mixed(e, share) - white(e)
+
+
+OF_INNOVATIONS = tuple(bank_of_a_row())
+PER_ROW = len(OF_INNOVATIONS) + 2
+N_TESTS = 4 * PER_ROW + 6
+
+
+class Cusum:
+    """W ← min(max(W, 0) + log Λ, threshold + 3); one reading is worth half of h at most."""
+
+    def __init__(self, cause):
+        self.cause, self.W = cause, 0.0
+
+    def put(self, ratio, h, peak, before):
+        threshold = h + peak
+        self.W = min(max(self.W, 0.0) + min(ratio, 0.5 * h), threshold + 3.0)
+        self.on = self.W >= threshold or self.W >= 0.75 * threshold and self.cause in before
+        return {self.cause} if self.on else set()
+
+
+class RowOracle:
+    def __init__(self, base):
+        self.base = base
+        self.value, self.quantum, self.run, self.equal, self.counted = None, None, 0, 0, 0
+        self.forget()
+
+    def forget(self):
+        self.tests = [Cusum(cause) for cause, _ in OF_INNOVATIONS]
+        self.refusals, self.repetition = Cusum("refused"), Cusum("stuck")
+        self.raw = self.before = None
+        self.calm = 0
+        self.said = set()
+
+    def innovation(self, e, h):
+        bias, scale, phi = self.base[:3]
+        raw = min(max((e - bias) / scale, -6.0), 6.0)
+        white = raw
+        if phi and self.raw is not None:
+            white = min(max((raw - phi * self.raw) / math.sqrt(1.0 - phi**2), -6.0), 6.0)
+        self.calm = 0 if abs(white) > 3.5 else self.calm + 1
+        said = set()
+        for k, (test, (cause, ratio)) in enumerate(zip(self.tests, OF_INNOVATIONS, strict=True)):
+            if self.before is None and cause in ("correlated", "alternating"):
+                continue
+            last = 0.0 if self.before is None else self.before
+            if cause == "spiky" and self.calm >= 500:
+                test.W = 0.0
+            # The last one, rare spikes, stands alone.
+            if k == len(self.tests) - 1 and said - {"spiky"}:
+                test.W = 0.0
+                continue
+            said |= test.put(ratio(white, last), h, self.base[3 + k], self.said)
+        self.raw, self.before = raw, white
+        return said
+
+    def repeat(self, y, r, h):
+        last, self.value = self.value, y
+        if last is None:
+            return set()
+        if y == last:
+            self.run += 1
+            chance = 0.5
+            if self.quantum is not None:
+                share = self.equal / self.counted
+                chance = min(max(math.erf(0.5 * self.quantum / math.sqrt(r)), 0.01, share), 0.999)
+            ratio = math.log(0.999 / chance)
+        else:
+            step = abs(y - last)
+            self.quantum = step if self.quantum is None else min(step, self.quantum)
+            self.equal, self.counted, self.run = self.equal + self.run, self.counted + self.run + 1, 0
+            # Another value ends it for certain: more than W can hold.
+            ratio = math.log(0.001 / 0.5) - h
+        return self.repetition.put(ratio, h, self.base[-1], self.said)
+
+
+class SensorOracle:
+    def __init__(self):
+        self.times, self.silent, self.due, self.h, self.longest = [], False, math.inf, 0.0, 0.0
+        self.forget()
+
+    def forget(self):
+        self.together = [Cusum(cause) for cause in ["disagreeing"] * 3 + ["agreeing"] * 3]
+        self.said = set()
+
+    def speaks(self, now):
+        if self.times:
+            self.longest = max(self.longest, now - self.times[-1])
+        self.times.append(now)
+        n = len(self.times)
+        period = (now - self.times[0]) / (n - 1) if n > 1 else 0.0
+        if n <= 16 or math.log2(n).is_integer():
+            readings = POLICY.false_alarm_every / max(period, 1e-3)
+            self.h = math.log(max(readings, 8.0) * N_TESTS)
+        self.due = now + max(POLICY.silent_periods * period, 2.0 * self.longest) if n > 2 else math.inf
+        self.silent = False
+
+    def scale(self, nis, dof):
+        said = set()
+        for test, v in zip(self.together, (1.5, 2.5, 6.0, 0.6, 0.3, 0.05), strict=True):
+            ratio = 0.5 * (1.0 - 1.0 / v) * min(nis, 36.0 * dof) - 0.5 * dof * math.log(v)
+            said |= test.put(ratio, self.h, 0.0, self.said)
+        self.said = said
+        return said
+
+
+def by_definition(events, track, gate, baseline, expected):
+    """alarms, flags and health of each row, from what the filter left in the track."""
+    sensors, rows = [SensorOracle() for _ in ROWS], [RowOracle(base) for base in baseline]
+    chance = 0.15 if gate is None else min(max(1e-6, 1.0 - gate), 0.15)
+    refusal, acceptance = math.log(0.3 / chance), math.log(0.7 / (1.0 - chance))
+    squares, missed, feed, heard = [[], []], [False, False], 0.0, False
+    begun = events.t[0] * 1e-9
+    for s, needed in enumerate(expected):
+        if needed:
+            sensors[s].due = begun + POLICY.stale_after
+    for i in range(len(events)):
+        now, kind, s = events.t[i] * 1e-9, events.kind[i], int(events.channel[i])
+        alarms = np.zeros(track.alarms.shape[1], int)
+        if kind == READING:
+            verdict = track.verdict[i]
+            heard |= verdict != SCREENED
+            if not np.any(track.screened[i] & DUPLICATE):
+                sensor = sensors[s]
+                sensor.speaks(now)
+                judged = verdict in (USED, GATED)
+                plain = tuple(baseline[ROWS[s][0], :3]) == (0.0, 1.0, 0.0)
+                if judged and len(ROWS[s]) > 1 and plain:
+                    sensor.scale(track.nis[i], track.dof[i])
+                elif judged:
+                    sensor.said = set()
+                together = sensor.said if judged else set()
+                for k, index in enumerate(ROWS[s]):
+                    row, y = rows[index], events.value[i, k]
+                    if not np.isfinite(y):
+                        continue
+                    said = (row.said - {"stuck"}) | row.repeat(y, R[index], sensor.h)
+                    screened = track.screened[i, k] != 0
+                    if judged or verdict == FAILED or screened:
+                        ratio = acceptance if verdict == USED and not screened else refusal
+                        said = (said - {"refused"}) | row.refusals.put(ratio, sensor.h, row.base[-2], row.said)
+                    if judged and not screened:
+                        e = track.innovation[i, k] / track.innovation_std[i, k]
+                        said = (said & {"refused", "stuck"}) | row.innovation(e, sensor.h)
+                    if k == 0:
+                        said = said - {"disagreeing", "agreeing"} | (together if judged else sensor.said)
+                    row.said = said
+                    alarms[k] = sum(1 << CAUSES.index(cause) for cause in said)
+        elif kind == TRUTH:
+            for k, truth in enumerate(events.value[i, : 2 - s]):
+                if np.isfinite(truth):
+                    j = s + k
+                    z = (track.mean[i, j] - truth) / track.std[i, j]
+                    squares[j].append(min(z * z, 1e4))
+                    # The mean of the first ten, then with a memory of ten.
+                    n = len(squares[j])
+                    mean = squares[j][0]
+                    for m, square in enumerate(squares[j][1:], 2):
+                        mean += (square - mean) / min(m, 10)
+                    missed[j] = (n >= 10 and mean > 4.5**2) or (missed[j] and mean > 3.0**2)
+                    alarms[k] = missed[j] << CAUSES.index("missed")
+        elif kind == INPUT and np.isfinite(events.value[i, 0]):
+            feed = events.value[i, 0]
+        elif kind == RESET:
+            for each in (*sensors, *rows):
+                each.forget()
+            squares, missed = [[], []], [False, False]
+        for sensor in sensors:
+            sensor.silent |= now > sensor.due
+        silent = sum(1 << s for s, sensor in enumerate(sensors) if sensor.silent)
+        flags = silent
+        if not -3.0 <= track.mean[i, 0] <= 3.0 or not -1.0 <= feed <= 1.0:
+            flags |= OUTSIDE
+        if any(missed):
+            flags |= TRUTH_MISSED
+        said = set().union(*(row.said for row in rows))
+        if not heard:
+            health = STALE if now - begun > POLICY.stale_after else WAITING
+        elif track.age[i] > POLICY.stale_after:
+            health = STALE
+        elif track.consistency[i] == DIVERGED:
+            health = DIVERGED
+        elif track.age[i] > POLICY.degraded_after or silent or said & {"refused", "stuck"}:
+            health = DEGRADED
+        else:
+            health = SUSPECT if said or flags else TRACKING
+        yield alarms, flags, health
+
+
+# Streams
+
+
+def stream(rng, n):
+    """Readings of three sensors, drawn from the model, through spells in which one thing after the other is wrong."""
+    spells = ("fine", "loud", "quiet", "high", "stuck", "spikes", "wild", "drift", "silent", "coarse", "feed", "lie")
+    t, x, batch, spell, left, offset, target = 0, np.zeros(2), [], "fine", 60, 0.0, 0
+    held = {}
+
+    def put(kind, channel, value):
+        batch.append(Events.one(t, t, kind, channel, value, MODEL.width))
+
+    put(TICK, 0, ())
+    while len(batch) < n:
+        dt = rng.choice([0.1, 0.2, 0.3])
+        t += round(dt * SECOND)
+        x = x + dt * np.array([-0.2 * x[0], 0.5 * x[0] - 0.3 * x[1]]) + rng.normal(0.0, np.sqrt(0.04 * dt), 2)
+        left -= 1
+        if left < 0:
+            spell, left, target = str(rng.choice(spells)), int(rng.integers(20, 120)), int(rng.integers(3))
+            offset, held = 0.0, {}
+            if spell == "feed":
+                put(INPUT, 0, rng.choice([-2.0, 2.0]))
+            elif rng.random() < 0.3:
+                put(INPUT, 0, 0.0)
+            if rng.random() < 0.15:
+                put(RESET, 0, ())
+                x = rng.normal(0.0, 1.0, 2)
+        if spell == "silent" and rng.random() < 0.1:
+            t += round(rng.choice([0.5, 2.0, 15.0]) * SECOND)
+            put(TICK, 0, ())
+        for s in range(3):
+            if rng.random() < 0.2 or spell == "silent" and s == target:
+                continue
+            exact = (x[:1], np.array([x[1], x[0] + x[1]]), x[1:] - x[:1])[s]
+            noise = rng.normal(0.0, np.sqrt([R[k] for k in ROWS[s]]))
+            if s == target:
+                offset += 0.02 if spell == "drift" else 0.0
+                noise *= {"loud": 2.5, "quiet": 0.1}.get(spell, 1.0)
+                offset = {"high": 1.0}.get(spell, offset)
+                if spell == "spikes" and rng.random() < 0.1:
+                    noise *= 8.0
+            y = exact + noise + (offset if s == target else 0.0)
+            if spell == "coarse" and s == target:
+                y = np.round(y * 2.0) / 2.0
+            if spell == "wild" and s == target:
+                y[rng.random(y.size) < 0.5] = 20.0
+            if spell == "stuck" and s == target:
+                y = held.setdefault(s, y)
+            y = np.where(rng.random(y.size) < 0.05, np.nan, y)
+            put(READING, s, y)
+            if rng.random() < 0.01:
+                put(READING, s, y)
+        if rng.random() < 0.2:
+            lie = 3.0 if spell == "lie" else 0.0
+            put(TRUTH, 0, np.where(rng.random(2) < 0.2, np.nan, x + lie))
+    return Events.concat(batch, MODEL.width)
+
+
+def setting(rng, seed):
+    """A tuning and sensors that must speak: gates, a sensor held out, what was normal before."""
+    tuning = Tuning.of(MODEL).set("gate", [None, 0.999, 0.9999][seed % 3]).set("gate.reopen", None)
+    if seed % 4 == 1:
+        tuning = tuning.set("use.other", False)
+    baseline = no_baseline(MODEL)
+    if seed % 2:
+        baseline[seed % 4, :3] = 0.3, 1.4, 0.35
+        baseline[seed % 4, 3:] = rng.uniform(0.0, 4.0, baseline.shape[1] - 3)
+    return replace(tuning, baseline=baseline), np.array([1, 0, 1])
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_bank_is_its_definition(seed):
+    rng = np.random.default_rng(seed)
+    events = as_log(stream(rng, 4000)).events
+    tuning, expected = setting(rng, seed)
+    track = Fold("kf", MODEL, tuning, as_log(events), policy=POLICY, expected=expected)
+    track.advance()
+    found = track.track
+    said = by_definition(events, found, tuning.gate, tuning.baseline, expected)
+    alarms, flags, health = (np.array(column) for column in zip(*said, strict=True))
+    np.testing.assert_array_equal(found.flags, flags)
+    different = np.flatnonzero((found.alarms != alarms).any(axis=1))
+    assert not different.size, (different[:5], found.alarms[different[0]], alarms[different[0]])
+    np.testing.assert_array_equal(found.health, health)
+
+
+def test_all_that_can_be_said_is_said_in_those_streams():
+    """Else the test above would say nothing of it."""
+    bits, flags, healths, verdicts = 0, 0, set(), set()
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        events = stream(rng, 4000)
+        tuning, expected = setting(rng, seed)
+        growing = Fold("kf", MODEL, tuning, as_log(events), policy=POLICY, expected=expected)
+        growing.advance()
+        bits |= int(np.bitwise_or.reduce(growing.track.alarms, axis=None))
+        flags |= int(np.bitwise_or.reduce(growing.track.flags))
+        healths |= set(growing.track.health)
+        verdicts |= set(growing.track.verdict)
+    assert bits == (1 << len(CAUSES)) - 1
+    assert flags == OUTSIDE | TRUTH_MISSED | 0b111
+    assert healths == {WAITING, TRACKING, SUSPECT, DEGRADED, DIVERGED, STALE}
+    assert verdicts >= {USED, GATED, HELD_OUT, MISSING, SCREENED}
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10**6), st.lists(st.integers(1, 90), min_size=1, max_size=20), st.integers(0, 60))
+def test_pieces_and_late_arrivals_change_nothing(seed, pieces, late):
+    """The bank goes back with the fold: what came late is judged as if it had come in time."""
+    rng = np.random.default_rng(seed)
+    events = stream(rng, 600)
+    tuning, expected = setting(rng, seed)
+    whole = Fold("kf", MODEL, tuning, as_log(events), policy=POLICY, expected=expected)
+    whole.advance()
+    # Readings of one sensor and time keep their order, as the log does: only whole times move.
+    order = np.argsort(events.t + rng.integers(0, late + 1, events.t.max() // SECOND + 1)[events.t // SECOND] * SECOND,
+                       kind="stable")  # fmt: skip
+    log = Log(MODEL.width)
+    growing = Fold("kf", MODEL, tuning, log, policy=POLICY, expected=expected)
+    at, turn = 0, 0
+    while at < len(events):
+        end = at + pieces[turn % len(pieces)]
+        start, _ = log.extend(events.select(order[at:end]))
+        if start < growing.n:
+            growing.rewind(start)
+        growing.advance(int(rng.integers(1, 100)))
+        at, turn = end, turn + 1
+    growing.advance()
+    assert_same(growing.track, whole.track)
+
+
+# The state machine
+
+
+def walk(wrong, *, gate=None, silent=(0.0, 0.0)):
+    """States of the twin, without repeats, over five minutes of sensor `one`, four readings a second, off by wrong(t).
+
+    Between the times of `silent` there are only ticks.
+    """
+    rng = np.random.default_rng(5)
+    x, batch = 0.0, [Events.one(0, 0, TICK, 0, (), MODEL.width)]
+    for k in range(1, 1200):
+        x += -0.05 * x + rng.normal(0.0, 0.1)
+        t, y = k * SECOND // 4, x + 0.5 * rng.normal() + wrong(k / 4)
+        kind = TICK if silent[0] < k / 4 < silent[1] else READING
+        batch.append(Events.one(t, t, kind, 0, y if kind == READING else (), MODEL.width))
+    tuning = Tuning.of(MODEL).set("gate", gate).set("gate.reopen", None)
+    health = fold("kf", MODEL, tuning, as_log(Events.concat(batch, MODEL.width)), policy=POLICY).health
+    return [int(code) for code in health[np.flatnonzero(np.diff(health, prepend=-1))]]
+
+
+@pytest.mark.parametrize(
+    ("case", "states"),
+    [
+        ({"wrong": lambda t: 0.0}, [WAITING, TRACKING]),
+        ({"wrong": lambda t: 2.0 * (-1) ** round(4 * t) * (40 < t < 60)}, [WAITING, TRACKING, SUSPECT, TRACKING]),
+        ({"wrong": lambda t: 4.0 * (40 < t < 43), "gate": 0.9999}, [WAITING, TRACKING, DEGRADED, SUSPECT, TRACKING]),
+        ({"wrong": lambda t: 0.0, "silent": (40, 50)}, [WAITING, TRACKING, DEGRADED, TRACKING]),
+        ({"wrong": lambda t: 0.0, "silent": (40, 70)}, [WAITING, TRACKING, DEGRADED, STALE, TRACKING]),
+        ({"wrong": lambda t: 0.0, "silent": (0, 60)}, [WAITING, STALE, TRACKING]),
+    ],
+    ids=["in order", "contrary", "refused", "silent", "stale", "late"],
+)
+def test_health_takes_each_step_once(case, states):
+    """No flicker: one state follows the other, and when the cause has gone it is the first again."""
+    assert walk(**case) == states
