@@ -53,14 +53,16 @@ class Told(NamedTuple):
 VALUES = st.one_of(
     st.integers(-20, 20).map(float), st.sampled_from([np.nan, 1e6, -1e6, 3.0, 3.0]), st.floats(-60, 60, width=32)
 )
-GAPS = st.one_of(st.integers(0, 4), st.sampled_from([0, 1, 1, 40, 4000, 4 * 86400]))
+GAPS = st.one_of(st.integers(0, 4), st.integers(0, 4), st.sampled_from([0, 1, 1, 40, 4000, 4 * 86400]))
 KINDS = st.sampled_from([READING] * 12 + [TRUTH, TICK, RESET, MAINTENANCE, MARK])
 
 
-def told(delays: st.SearchStrategy[int], wrong: st.SearchStrategy[int]) -> st.SearchStrategy[list[Told]]:
+def told(
+    delays: st.SearchStrategy[int], wrong: st.SearchStrategy[int], least: int = 1
+) -> st.SearchStrategy[list[Told]]:
     """Streams of events."""
     one = st.builds(Told, GAPS, KINDS, st.integers(0, 1), st.tuples(VALUES, VALUES), delays, st.integers(0, 2), wrong)
-    return st.lists(one, min_size=1, max_size=60)
+    return st.lists(one, min_size=least, max_size=60)
 
 
 def stream(items: list[Told]) -> Events:
@@ -157,12 +159,12 @@ def assert_same_numbers(a: Fold, b: Fold) -> None:
         np.testing.assert_array_equal(left, right)
 
 
-WRONG = st.one_of(st.just(0), st.sampled_from([0, 0, 14400, -14400, 240, -240, 20, -20]))
+WRONG = st.sampled_from([0] * 12 + [14400, -14400, 240, -240, 20, -20])
 
 
 @pytest.mark.parametrize("estimator", FILTERS)
 @ONCE
-@given(told(st.integers(0, 4 * HORIZON), WRONG), CUTS, CUTS, st.sampled_from(sorted(GATES)))
+@given(told(st.integers(0, 2) | st.integers(0, 4 * HORIZON), WRONG, 20), CUTS, CUTS, st.sampled_from(sorted(GATES)))
 def test_whatever_clocks_say_nothing_is_lost_uncounted(estimator, items, cuts, others, gate):
     """Each event is in the log, or was too late, or was refused for its time; with any cuts the same ones."""
     events = stream(items)

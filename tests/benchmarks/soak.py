@@ -33,6 +33,9 @@ STEP = 0.003
 AT_ONCE = 512
 """Events of the asset that are passed on together."""
 
+TRANSIT = 1_000_000
+"""ns from the measurement to its arrival."""
+
 EVERY = 8.0
 """Seconds of the asset between two mixes."""
 
@@ -102,7 +105,8 @@ class Soaked:
         batch = Events.concat(parts, self._width)
         self.made += len(batch)
         self.seconds = float(batch.t.max()) * 1e-9
-        return batch
+        # As from a bus: when it arrived is known.
+        return batch._replace(arrival=batch.arrival + TRANSIT)
 
     def now(self) -> int | None:
         """It tells none, so that the engine does not ask for the estimate by itself."""
