@@ -21,6 +21,10 @@ from .item import Item, events_of, items_of
 from .kinds import find_kind, problem
 from .times import ns
 
+LINGERS = ns(60.0)
+"""Of the source's time by which a fault must have ended to be gone. What was measured while it lasted and comes later
+still, it does not touch."""
+
 
 @dataclass
 class _Entry:
@@ -80,6 +84,7 @@ class Faults:
         """Nothing has come yet."""
         self._active: list[tuple[_Entry, Active]] = []
         self._waiting: list[tuple[int, int, Item]] = []
+        self._lost = 0
         self._sent = 0
         self._origin: int | None = None
         self._newest: int | None = None
@@ -146,7 +151,7 @@ class Faults:
     def lost(self) -> int:
         """Events that faults swallowed, since the source began."""
         with self._lock:
-            return sum(active.lost for _, active in self._active)
+            return self._lost + sum(active.lost for _, active in self._active)
 
     @property
     def can_change(self) -> bool:
@@ -188,6 +193,7 @@ class Faults:
                     self._clock = item.arrival if self._clock is None else max(self._clock, item.arrival)
                     out += self._due(self._clock - 1)
                     out += self._send(self._through([item]))
+                    out += self._send(self._leave(item.at))
                 passed = events_of(out, width)
             else:
                 self._clock = max(int(batch.arrival.max()), self._clock if self._clock is not None else -NEVER)
@@ -215,6 +221,17 @@ class Faults:
         for _, active in self._active[first:]:
             items = active.process(items)
         return items
+
+    def _leave(self, at: int) -> list[Item]:
+        """Let faults go that have ended long before: what they still keep back. Each would cost every later event."""
+        gone = [k for k, (_, active) in enumerate(self._active) if active.ended and at > active.end + LINGERS]
+        kept: list[Item] = []
+        for k in gone:
+            kept += self._through(self._active[k][1].flush(), k + 1)
+            self._lost += self._active[k][1].lost
+        if gone:
+            self._active = [item for k, item in enumerate(self._active) if k not in gone]
+        return kept
 
     def _send(self, items: list[Item]) -> list[Item]:
         """Those that have arrived; the others wait."""

@@ -11,7 +11,7 @@ from estimators.models import MODELS
 from estimators.numerics.jit import plain
 from sources.faults.fault import Fault
 from sources.faults.kinds import KINDS
-from sources.faults.layer import Faults
+from sources.faults.layer import LINGERS, Faults
 from sources.faults.source import FaultySource, PacedFaultySource, with_faults
 from sources.memory import MemorySource
 from sources.pacer import Pacer
@@ -158,6 +158,27 @@ def test_an_injected_fault_holds_for_the_next_event_until_it_is_cleared():
     assert layer.clear() == 0
     with pytest.raises(SourceError, match="there is no fault 7"):
         layer.clear(7)
+
+
+def test_faults_that_ended_long_ago_cost_nothing_and_what_they_lost_stays_counted():
+    events = stream(100)
+    layer = Faults(
+        MODEL, [Fault("silence", FIRST, start=10, end=20), Fault("reorder", FIRST, start=12, end=20, rate=1.0)]
+    )
+    source = FaultySource(MemorySource(events, batch=4), layer)
+    out = read_all(source)
+    assert events.t[-1] - events.t[0] > 20 * SECOND + LINGERS
+    assert not layer._active and layer.lost == 10
+    assert len(out) == len(events) - layer.lost + 4
+
+
+def test_what_is_kept_back_by_a_fault_that_leaves_comes():
+    layer = Faults(MODEL, [Fault("reorder", FIRST, end=5, rate=1.0)])
+    source = FaultySource(bus := Live(), layer)
+    for seconds, channel in ((1.0, 0), (10.0, 1), (100.0, 1)):
+        bus.put(one(seconds, channel=channel))
+    out = Events.concat([source.read(0.0) for _ in range(3)], MODEL.width)
+    assert sorted(out.t[out.kind == READING].tolist()) == [SECOND, 10 * SECOND, 100 * SECOND] and not layer._active
 
 
 def test_one_that_was_cleared_before_it_began_leaves_no_trace():
