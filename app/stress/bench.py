@@ -105,7 +105,10 @@ class Bench:
         self.events = plain_log(twin, seed, duration)
         self.origin = int(self.events.t[0])
         self.length = float(self.events.t.max() - self.events.t[0]) * 1e-9
+        # Folds of the log as it is, and of the mistake that is looked at, by filter and gate.
         self._calm: dict[tuple[str, float | None], Folded] = {}
+        self._wrong: dict[tuple[str, float | None], Folded] = {}
+        self._present = ""
 
     def window(self, mistake: Mistake) -> tuple[float, float]:
         """When a mistake lasts, seconds after the log's first event."""
@@ -118,13 +121,14 @@ class Bench:
         return self.origin + round(start * 1e9), self.origin + round(end * 1e9)
 
     def found_after(self, mistake: Mistake, estimator: str) -> float:
-        """Share of the time that a mistake lasts after which the twin as it ships is no longer green; or infinity.
+        """Share of the time that a mistake lasts after which the twin says so, as it ships; or infinity.
 
         Raises:
             NisusError: As `fold`.
         """
         start, end = self.span(mistake)
-        word = first_word(self.fold(mistake, estimator, self.twin.tuning.gate).fold, start)
+        gate = self.twin.tuning.gate
+        word = first_word(self.fold(mistake, estimator, gate).fold, start, self.fold(None, estimator, gate).fold)
         share = np.inf if word is None else word * 1e9 / (end - start)
         return share if share < 1.0 else np.inf
 
@@ -134,18 +138,13 @@ class Bench:
         Raises:
             NisusError: If the filter does not apply, or the mistake cannot be made.
         """
-        key = (estimator, gate)
-        if mistake is None and key in self._calm:
-            return self._calm[key]
-        events = self.events if mistake is None else self._damaged(mistake)
-        folded = self._fold(estimator, self._tuning(estimator, mistake).set("gate", gate), events)
-        if mistake is None:
-            self._calm[key] = folded
-        return folded
-
-    def open(self, mistake: Mistake | None, estimator: str) -> Fold:
-        """The fold that refuses nothing, of a log with a mistake or without; see `fold`."""
-        return self.fold(mistake, estimator, None).fold
+        if mistake is not None and mistake.name != self._present:
+            self._present, self._wrong = mistake.name, {}
+        made, key = self._calm if mistake is None else self._wrong, (estimator, gate)
+        if key not in made:
+            events = self.events if mistake is None else self._damaged(mistake)
+            made[key] = self._fold(estimator, self._tuning(estimator, mistake).set("gate", gate), events)
+        return made[key]
 
     def _damaged(self, mistake: Mistake) -> Events:
         """The log as it becomes; a change of the asset needs a run of its own."""

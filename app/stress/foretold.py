@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimators.diagnostics.evidence import OUTSIDE
 from estimators.diagnostics.sensitivity.responses import SMOOTH, stand_in
 from estimators.diagnostics.sensitivity.visibility import tests_of
 from estimators.fold import Fold
@@ -88,16 +89,29 @@ class Oracle:
 
 
 def shift_of(bench: Bench, mistake: Mistake, estimator: str) -> Foretold | None:
-    """By the shift of the means; None where it cannot be told so: no filter without chance, or other times."""
-    model = bench.twin.model
-    name, _ = stand_in(estimator, model)
+    """By the shift of the means; None where it cannot be told so: no filter without chance, or other times.
+
+    Where the twin has a gate, what this refuses goes on to be told of, so that it is looked at with and without.
+    """
+    name, _ = stand_in(estimator, bench.twin.model)
     if name != estimator and name not in SMOOTH:
         return None
-    clean, wrong = bench.open(None, name), bench.open(mistake, name)
+    seen = []
+    for gate in dict.fromkeys((None, bench.twin.tuning.gate)):
+        found = _seen(bench, bench.fold(None, name, gate).fold, bench.fold(mistake, name, gate).fold, mistake)
+        if found is None:
+            return None
+        seen.append(found)
+    likely, possible, _ = np.array(seen).max(axis=0)
+    return Foretold(VISIBLE if likely else CHANCE if possible else INVISIBLE, seen[0][2])
+
+
+def _seen(bench: Bench, clean: Fold, wrong: Fold, mistake: Mistake) -> tuple[bool, bool, float] | None:
+    """Whether the bank sees a mistake surely, or at all, and the multiple of it that it would see surely."""
     own, other = _readings(clean), _readings(wrong)
     if own.size != other.size or np.any(clean.log.t[own] != wrong.log.t[other]):
         return None
-    start, end = bench.span(mistake)
+    model, (start, end) = bench.twin.model, bench.span(mistake)
     during = (clean.log.t[own] >= start) & (clean.log.t[own] < end)
     moved = np.where(during[:, None], wrong.track.innovation[other] - clean.track.innovation[own], 0.0)
     for s, sensor in enumerate(model.sensors):
@@ -117,9 +131,12 @@ def shift_of(bench: Bench, mistake: Mistake, estimator: str) -> Foretold | None:
         detection=DETECTION,
         bank=True,
     )
+    flagged, before = wrong.track.flags[other] & OUTSIDE != 0, clean.track.flags[own] & OUTSIDE != 0
+    # A range is not left by chance: states and inputs are what they are.
+    outside = bool(np.any(flagged & ~before & during))
     likely, possible = tests.sees(standardised)
-    multiple = tests.multiple(standardised, standardised)
-    return Foretold(VISIBLE if likely else CHANCE if possible else INVISIBLE, multiple)
+    multiple = np.nan if outside else tests.multiple(standardised, standardised)
+    return likely or outside, possible or outside, multiple
 
 
 def _readings(fold: Fold) -> np.ndarray:

@@ -10,7 +10,7 @@ from estimators.diagnostics.score import Score, score
 from .bench import Bench, Folded
 from .foretold import VISIBLE, Foretold
 from .mistake import Mistake
-from .told import first_word, green_share, recovery, said_at
+from .told import first_word, green_share, heard_in, recovery, said_at
 
 GATE = 0.9973
 """Of the fold with the defence, where the twin ships without a gate."""
@@ -35,11 +35,11 @@ class Trial:
     `foretold`: visible, invisible or by chance, before it was made; `visible_from`: the multiple of its size from which
     on it would be visible, NaN where that is not known. `outcome`: one of `OUTCOMES`. `delay`: seconds from its start
     to the first episode with its cause and one of its subjects; `word`: to the first row that is not green; None is
-    never. `named`: the first episode after the start, subject and cause. `early`: episodes that were heard of before it
-    began. `green`: share of green rows while it lasted. `error` and `bare`: RMSE by state over the truth meanwhile,
-    with a gate and without; `calm`: of the same filter over the same time, without the mistake; `coverage`: share of
-    the truth in the 95 % band, by state. `recovery`: seconds from its end until green for good; None is never, or that
-    it does not end.
+    never. `named`: the first episode after the start, subject and cause. What is heard of without the mistake, too,
+    does not count. `early`: episodes that were heard of before it began. `green`: share of green rows while it lasted.
+    `error` and `bare`: RMSE by state over the truth meanwhile, with a gate and without; `calm`: of the same filter over
+    the same time, without the mistake; `coverage`: share of the truth in the 95 % band, by state. `recovery`: seconds
+    from its end until green for good; None is never, or that it does not end.
     """
 
     mistake: str
@@ -77,15 +77,17 @@ def make(bench: Bench, mistake: Mistake, estimator: str, foretold: Foretold) -> 
     shipped = ships.fold
     start, end = bench.window(mistake)
     begun, ended = bench.span(mistake)
-    told = sorted(((said_at(shipped, item), item) for item in episodes(shipped)), key=lambda pair: pair[0])
+    undisturbed = bench.fold(None, estimator, gate)
+    told = heard_in(shipped, undisturbed.fold)
     since = [(at, item) for at, item in told if at >= begun]
     after = [(at, item) for at, item in since if at < ended]
     fits = [at for at, item in after if mistake.right_cause(item) and mistake.right_subject(item)]
-    first = after[0][1] if after else None
-    word = first_word(shipped, begun)
+    # That the estimate is lost is no cause, and is said sooner than one can be told.
+    first = next((item for _, item in after if item.cause != "diverged"), after[0][1] if after else None)
+    word = first_word(shipped, begun, undisturbed.fold)
     heard = word is not None and word < (ended - begun) / 1e9
     scores = {name: _score(item, begun, ended) for name, item in (("gated", gated), ("bare", bare))}
-    calm = _score(bench.fold(None, estimator, gate), begun, ended)
+    calm = _score(undisturbed, begun, ended)
     return Trial(
         mistake=mistake.name,
         estimator=estimator,
@@ -100,7 +102,7 @@ def make(bench: Bench, mistake: Mistake, estimator: str, foretold: Foretold) -> 
         named=f"{first.subject} {first.cause}" if first is not None else None,
         cause_right=first is not None and mistake.right_cause(first),
         subject_right=first is not None and mistake.right_subject(first),
-        early=len(told) - len(since),
+        early=sum(said_at(undisturbed.fold, item) < begun for item in episodes(undisturbed.fold)),
         green=green_share(shipped, begun, ended),
         error={name: fit.rmse for name, fit in scores["gated"].states.items()},
         bare={name: fit.rmse for name, fit in scores["bare"].states.items()},
