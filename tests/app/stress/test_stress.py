@@ -148,7 +148,7 @@ def test_a_change_of_the_asset_is_made_in_the_asset():
     twin = load_twin("motor_can")
     bench = Bench(twin, 1, 30.0)
     mistake = chosen(bench, "winding_tooth of the asset +30 %")
-    damaged = bench._damaged(mistake, 10.0, 20.0)
+    damaged = bench._damaged(mistake)
     for events in (bench.events, damaged):
         assert events.t.max() <= 30 * SECOND
     assert len(damaged) == len(bench.events)
