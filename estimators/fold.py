@@ -518,9 +518,11 @@ class Fold:
         self.pictures.take(self.log, self.n, mean, cov[0] if cov.shape[0] == 1 else np.diag(cov))
 
     def _remember(self, pinned: bool = False) -> None:
+        self._snapshots.keep(self.log.first + self.n, self.log.first, self._snapshot(), pinned)
+
+    def _snapshot(self) -> Snapshot:
         gathered = self._evidence.copy(), self._edge.copy(), self._doubt.copy()
-        snapshot = Snapshot(int(self._clock[0]), self._u.copy(), self._state.copy(), *gathered)
-        self._snapshots.keep(self.log.first + self.n, self.log.first, snapshot, pinned)
+        return Snapshot(int(self._clock[0]), self._u.copy(), self._state.copy(), *gathered)
 
     def rewind(self, index: int) -> None:
         """Go back so that the event at `index` (and all after it) will be folded again."""
@@ -542,10 +544,16 @@ class Fold:
     def base_at(self, index: int) -> tuple[int, Base]:
         """The last snapshot at or before the event `index`: its index, and the base of a fold that starts there."""
         at = self._snapshots.last(self.log.first + index)
-        clock, u, state, evidence, edge, doubts = self._snapshots[at]
+        return at - self.log.first, self._base(at, self._snapshots[at])
+
+    def base_here(self) -> Base:
+        """The base of a fold that goes on with the next event."""
+        return self._base(self.log.first + self.n, self._snapshot())
+
+    def _base(self, at: int, snapshot: Snapshot) -> Base:
+        clock, u, state, evidence, edge, doubts = snapshot
         mean, cov = self.estimator.moments(self.options, state, self.model.nx)
-        version = self.log.version + versions_dropped(self.log.events, at - self.log.first)
-        base = Base(
+        return Base(
             mean,
             cov,
             clock,
@@ -555,10 +563,9 @@ class Fold:
             at,
             evidence=evidence.copy(),
             edge=edge.copy(),
-            version=version,
+            version=self.log.version + versions_dropped(self.log.events, at - self.log.first),
             doubt=doubts.copy(),
         )
-        return at - self.log.first, base
 
     def follow(self, log: Log, changed_from: int | None) -> None:
         """Go on with the log of which the present one is an earlier copy.

@@ -65,6 +65,31 @@ class Fold:
 
 
 @dataclass(frozen=True)
+class Check:
+    """Say what could be wrong with a twin unnoticed: a checklist with measured figures, on one page.
+
+    Linearity, size, shape of the posterior, observability, the smallest visible fault of every sensor, input and
+    parameter, how wrong each state can be by one that nobody sees, timing, health, and every sensor held out in turn
+    beside the model without any reading.
+    """
+
+    twin: Twin
+    """Name of a twin that ships, or path of a YAML file."""
+    estimator: str | None = None
+    """Estimator to use instead of the twin's own; `nisus filters` lists all of them."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable, as for `run`."""
+    log: tuple[Path, ...] = ()
+    """Recordings to read instead of the twin's own."""
+    duration: float | None = None
+    """Take only this many seconds of the source."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print one JSON object."""
+    html: Path | None = None
+    """Also write the page to this HTML file, which needs no other."""
+
+
+@dataclass(frozen=True)
 class Compare:
     """Fold every filter that applies over the same log, in parallel, and print what each estimate was worth.
 
@@ -235,7 +260,7 @@ class New:
     """Its unit: s, ms, us, ns, min or h."""
 
 
-Command = Run | Fold | Compare | Stress | Commission | Filters | Review | Bus | Twins | Schema | Log | New
+Command = Run | Fold | Check | Compare | Stress | Commission | Filters | Review | Bus | Twins | Schema | Log | New
 COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in get_args(Command)}
 
 

@@ -96,7 +96,7 @@ def fold_row(twin: Twin, estimator: str, logs: Sequence[Events], budget: float =
     try:
         for k in range(folds):
             events = within(logs[k % len(logs)], span)
-            fold, seconds = _timed(twin, estimator, events, k, share if k == 0 else np.inf, ENOUGH if k == 0 else 0.0)
+            fold, seconds = timed(twin, estimator, events, k, share if k == 0 else np.inf, ENOUGH if k == 0 else 0.0)
             if fold.n < len(events):
                 span = tidy((events.t[fold.n - 1] - events.t[0]) * 1e-9)
                 events = within(events, span)
@@ -109,7 +109,7 @@ def fold_row(twin: Twin, estimator: str, logs: Sequence[Events], budget: float =
 
 def refold(twin: Twin, estimator: str, events: Events, seed: int = 0) -> Outcome:
     """Fold one filter over all the events."""
-    fold, seconds = _timed(twin, estimator, events, seed, np.inf, enough=0.0)
+    fold, seconds = timed(twin, estimator, events, seed, np.inf, enough=0.0)
     return outcome_of(fold, events, seconds)
 
 
@@ -126,7 +126,7 @@ def tidy(seconds: float) -> float:
     return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= seconds))
 
 
-def _timed(
+def timed(
     twin: Twin, estimator: str, events: Events, seed: int, budget: float, enough: float = ENOUGH
 ) -> tuple[Fold, float]:
     """Fold the events, or what the budget (s) allows; a short fold again and again, as other work disturbs it.
@@ -137,7 +137,7 @@ def _timed(
     log = Log.of(twin.model, capacity=max(1, len(events)))
     log.extend(events)
     tuning = replace(twin.tuning.with_options(twin.options_of(estimator)), seed=seed)
-    fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=twin.policy)
+    fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=twin.policy, expected=twin.expected)
     took: list[float] = []
     while not took or (sum(took) < enough and fold.n == log.n):
         fold.rewind(0)

@@ -27,7 +27,7 @@ from ..engine.stall import interruptible
 from ..intake import Intake
 from ..twin.twin import Twin, load_twin
 from .arguments import settings
-from .fold_episodes import episode_lines
+from .fold_episodes import blamed, episode_lines
 from .fold_report import as_dict, as_text, calibration_of
 from .prepare import prepare
 from .remarks import remarking
@@ -118,12 +118,13 @@ def fold_twin(arguments: Arguments) -> int:
     pictures = fold.pictures.taken if fold.pictures is not None else []
     result = score(fold.track, log.events, twin.model, pictures, gate=twin.tuning.gate)
     found = calibration_of(twin, fold)
+    told = blamed(fold, episodes(fold))
     if arguments.out is not None:
-        _write(arguments.out, twin, log, fold.track, pictures, episodes(fold))
+        _write(arguments.out, twin, log, fold.track, pictures, [item.episode for item in told])
     if arguments.json:
-        print(json.dumps(as_dict(twin, result, found, seconds, counts, fold)))
+        print(json.dumps(as_dict(twin, result, found, seconds, counts, fold, told)))
     else:
-        print("\n".join([*as_text(twin, result, found, seconds, counts, fold), *episode_lines(episodes(fold))]))
+        print("\n".join([*as_text(twin, result, found, seconds, counts, fold), *episode_lines(told)]))
     return 0
 
 

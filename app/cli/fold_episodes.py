@@ -1,22 +1,79 @@
-"""Episodes as `nisus fold` prints them: the first ones, in their order, and how many more there are."""
+"""Episodes as `nisus fold` prints them: the first ones, in their order, with who is to blame, and how many more."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
-from estimators.diagnostics.episodes import Episode
+from estimators.diagnostics.episodes import Episode, episode_json
+from estimators.diagnostics.sensitivity.suspects import ALIKE, TELLING, Suspect, in_words, suspects
+from estimators.errors import NisusError
+from estimators.fold import Fold
 
 SHOWN = 10
 
+ASKED = 3
+"""Episodes whose cause is looked for, the first ones: each takes a refold for every sensor, input and parameter."""
 
-def episode_lines(episodes: Sequence[Episode]) -> Iterator[str]:
+
+class Told(NamedTuple):
+    """An episode, and the faults that explain it best."""
+
+    episode: Episode
+    suspects: tuple[Suspect, ...]
+
+
+def blamed(fold: Fold, episodes: Sequence[Episode]) -> list[Told]:
+    """The episodes, the first of those in which readings are shifted with whoever may be to blame."""
+    told: list[Told] = []
+    asked = 0
+    for episode in episodes:
+        found: tuple[Suspect, ...] = ()
+        if episode.cause in ("shifted", "refused") and asked < ASKED:
+            asked += 1
+            found = _suspects(fold, episode)
+        told.append(Told(episode, found))
+    return told
+
+
+def _suspects(fold: Fold, episode: Episode) -> tuple[Suspect, ...]:
+    try:
+        found = suspects(fold.estimator.name, fold.model, fold.tuning, fold.log, episode.start)
+    except NisusError:
+        return ()
+    if not found or found[0].gain < TELLING:
+        return ()
+    return tuple(suspect for suspect in found if found[0].gain - suspect.gain < ALIKE)
+
+
+def as_json(told: Told) -> dict[str, Any]:
+    """An episode for JSON, with its suspects."""
+    return {
+        **episode_json(told.episode),
+        "suspects": [
+            {
+                "kind": suspect.nudge.kind,
+                "name": suspect.nudge.name,
+                "size": suspect.size,
+                "deviation": suspect.deviation,
+                "unit": suspect.nudge.unit,
+                "log_likelihood": suspect.gain,
+            }
+            for suspect in told.suspects
+        ],
+    }
+
+
+def episode_lines(told: Sequence[Told]) -> Iterator[str]:
     """A heading and a line each; a word where there are none."""
-    if not episodes:
+    if not told:
         yield "no episodes: nothing that the tests could see was wrong"
         return
-    yield f"{len(episodes)} episode(s); ALARMS.md says what each cause means"
-    for episode in episodes[:SHOWN]:
+    yield f"{len(told)} episode(s); ALARMS.md says what each cause means"
+    for episode, found in told[:SHOWN]:
         lasted = "at the end" if episode.end is None else f"for {episode.end - episode.start:.3g} s"
         yield f"  {episode.cause}, {lasted}: {episode.text}"
-    if len(episodes) > SHOWN:
-        yield f"  and {len(episodes) - SHOWN} more; --json has them all"
+        if found:
+            yield f"    most likely off: {in_words(found)}"
+    if len(told) > SHOWN:
+        yield f"  and {len(told) - SHOWN} more; --json has them all"

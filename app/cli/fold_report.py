@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from estimators.diagnostics.calibration import BANDS, Calibration, calibrations, truth_calibration
-from estimators.diagnostics.episodes import episode_json, episodes
 from estimators.diagnostics.failure_cause import failures
 from estimators.diagnostics.intervals import Interval
 from estimators.diagnostics.score import Score
@@ -23,6 +22,7 @@ from estimators.tuning import TOGETHER
 
 from ..intake import WRONG_TIME
 from ..twin.twin import Twin
+from .fold_episodes import Told, as_json
 
 DECISIONS = 10
 """On sensors that stayed refused, that are printed at most: the last ones; --json has all."""
@@ -56,7 +56,13 @@ def _decimals(number: float) -> str:
 
 
 def as_dict(
-    twin: Twin, result: Score, found: Sequence[Calibration], seconds: float, counts: Counter[str], fold: Fold
+    twin: Twin,
+    result: Score,
+    found: Sequence[Calibration],
+    seconds: float,
+    counts: Counter[str],
+    fold: Fold,
+    told: Sequence[Told],
 ) -> dict[str, Any]:
     """What a script needs of a fold.
 
@@ -69,7 +75,8 @@ def as_dict(
     `log_likelihood` has the price of the readings that were refused, which `log_likelihood_used` leaves out; `refused`
     is their share. `calibration` has an entry for each sensor row, used or held out, and each state whose truth is
     told: see estimators/diagnostics/calibration.py. `episodes` have start and end in seconds of the log (end null while
-    one lasts): see estimators/diagnostics/episodes.py.
+    one lasts), and `suspects`, the faults that explain them best: see estimators/diagnostics/episodes.py and
+    sensitivity/suspects.py.
     """
     return {
         "twin": twin.name,
@@ -112,13 +119,15 @@ def as_dict(
                 HEALTH_NAMES, np.bincount(fold.track.health, minlength=len(HEALTH_NAMES)) / len(fold.track), strict=True
             )
         },
-        "calibration": [_calibration(entry) for entry in found],
-        "episodes": [episode_json(episode) for episode in episodes(fold)],
+        "calibration": [calibration_dict(entry) for entry in found],
+        "episodes": [as_json(item) for item in told],
         "seconds_per_event": seconds,
     }
 
 
-def _calibration(entry: Calibration) -> dict[str, Any]:
+def calibration_dict(entry: Calibration) -> dict[str, Any]:
+    """One calibration, for JSON."""
+
     def figure(found: Interval) -> dict[str, float | None]:
         return {name: number(value) for name, value in zip(Interval._fields, found, strict=True)}
 

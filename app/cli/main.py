@@ -17,6 +17,7 @@ from ..stderr import complain
 from .arguments import (
     COMMANDS,
     Bus,
+    Check,
     Command,
     Commission,
     Compare,
@@ -41,6 +42,10 @@ def carry_out(command: Command) -> int:
         from .fold import fold_twin
 
         return fold_twin(command)
+    if isinstance(command, Check):
+        from .check import check_twin
+
+        return check_twin(command)
     if isinstance(command, Compare):
         from .compare import compare_twin
 

@@ -32,6 +32,7 @@ from ..intake import Intake
 from ..stderr import complain
 from . import commands
 from .alerts import Alerts
+from .blame import Blame
 from .chronicle import Chronicle
 from .counts import Latency, RowCounts, last_run
 from .execute import Remembered, execute
@@ -39,6 +40,7 @@ from .faults import Faulty
 from .feeder import Feeder, Finished, Restarted
 from .host_clock import HostClock
 from .idle_ticks import IdleTicks
+from .integrity import IntegrityWatch, Window, window
 from .interface import Records
 from .notices import Notices
 from .outputs import Belief, Cursor, Pull, Status
@@ -115,6 +117,8 @@ class Engine:
         self._alerts = Alerts(self.notices, lambda: self._chronicle.account.in_alarm)
         self._silence = Silence(self.notices, section.stale_after)
         self._stall = Stall(self._say_stalled)
+        self._integrity = IntegrityWatch(self.model, self._window, self._policy.false_alarm_every)
+        self._blame = Blame(self.model, lambda: self._chronicle.account.episodes, self._window, self.notices)
         self._status: tuple[float, Status] | None = None
         self.recorder: Records | None = None
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
@@ -165,10 +169,14 @@ class Engine:
         self._thread.start()
         self._chronicle.start()
         self._feeder.start()
+        self._integrity.start()
+        self._blame.start()
 
     def stop(self) -> None:
         """Stop reading and folding."""
         self._stopping.set()
+        self._integrity.stop()
+        self._blame.stop()
         self._feeder.stop()
         self._refolder.stop()
         if self._thread.is_alive():
@@ -263,7 +271,7 @@ class Engine:
 
     def episodes(self) -> list[Episode]:
         """What was and is wrong, in the order of its start; at most a second behind the rows."""
-        return list(self._chronicle.account.episodes)
+        return [self._blame.told(episode) for episode in self._chronicle.account.episodes]
 
     def previous(self) -> Pull | None:
         """The whole previous revision, for comparison; its arrays never change."""
@@ -305,7 +313,9 @@ class Engine:
                 t=int(log.t[last]) if last >= 0 else None,
                 health=health,
                 since=int(log.t[last_run(track.health)]) if last >= 0 else None,
-                cause=leading.text if leading is not None and health not in (WAITING, TRACKING) else "",
+                cause=self._blame.told(leading).text
+                if leading is not None and health not in (WAITING, TRACKING)
+                else "",
                 sensors=account.of_sensors(self.model.sensor_names, states),
                 episodes_open=len(account.lasting),
                 lost=self._alerts.lost,
@@ -328,10 +338,16 @@ class Engine:
                 recording=self.recorder.path if self.recorder is not None else None,
                 latency_ms=self._latency.percentile(99.0),
                 latency_p50_ms=self._latency.percentile(50.0),
+                integrity=self._integrity.of(self._revision),
                 faults=layer.status() if layer is not None else (),
             )
         self._status = (time.monotonic(), status)
         return status
+
+    def _window(self) -> Window | None:
+        """What the integrity bounds are computed from; nothing while a refold is waited for."""
+        with self._reading():
+            return None if self._requests.waiting else window(self._fold, self._revision)
 
     # The engine's own thread
 

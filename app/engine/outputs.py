@@ -15,6 +15,7 @@ from estimators.track import Track
 from estimators.tuning import Tuning
 from sources.faults.layer import FaultStatus
 
+from .integrity import Integrity
 from .notices import Notice
 
 
@@ -74,7 +75,8 @@ class Status:
     that of a live source against this machine's, None while it is not known. `counts` are those of the rows of this
     revision, and of other things that happened to the twin. `account` is what the filter says of itself (see
     `Fold.account`). `latency_ms` is the 99th percentile from a reading's arrival to its row. `faults` are those that
-    were put into the source, and hold or will.
+    were put into the source, and hold or will. `integrity` bounds what could be wrong with each state unnoticed; None
+    until it is known.
     """
 
     estimator: str
@@ -105,3 +107,4 @@ class Status:
     latency_ms: float | None
     latency_p50_ms: float | None
     faults: tuple[FaultStatus, ...] = ()
+    integrity: Integrity | None = None

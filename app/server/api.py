@@ -22,6 +22,7 @@ from ..engine.changes import began_as, turned
 from ..engine.execute import Refolding, retuned
 from ..engine.interface import Running
 from ..engine.maintenance import check_maintenance
+from ..engine.outputs import Status
 from ..engine.playback import PLAYBACK, check_playback
 
 LONGEST_NAME = 255
@@ -83,6 +84,7 @@ def status_json(engine: Running) -> dict[str, Any]:
         "recording": str(status.recording) if status.recording is not None else None,
         "latency_ms": _plain(status.latency_ms),
         "faults": faults.status_json(status.faults, engine.model),
+        **_integrity(status),
     }
 
 
@@ -94,6 +96,18 @@ def episodes_json(engine: Running) -> list[dict[str, Any]]:
 def faults_json(engine: Running) -> dict[str, Any]:
     """The faults that can be put into the source."""
     return faults.catalogue_json(engine.source, engine.model)
+
+
+def _integrity(status: Status) -> dict[str, Any]:
+    """By state the bound of its error under one unseen fault, beside 2 σ; how old that is, s; why there is none."""
+    found = status.integrity
+    if found is None:
+        return {"integrity": {}, "integrity_age": None, "integrity_note": "not computed yet"}
+    bounds = {
+        name: {"bound": _plain(item.bound), "two_sigma": _plain(item.two_sigma), "unit": item.unit, "fault": item.fault}
+        for name, item in found.bounds.items()
+    }
+    return {"integrity": bounds, "integrity_age": found.age(status.t), "integrity_note": found.reason}
 
 
 def _plain(value: Any) -> Any:

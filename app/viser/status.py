@@ -12,6 +12,7 @@ from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING
 from ..engine.host_clock import clock_text
 from ..engine.notices import Notice
 from ..engine.outputs import Status
+from .integrity import integrity_html
 from .time_units import SECONDS, Unit
 
 LIGHTS = {
@@ -52,13 +53,14 @@ def status_html(status: Status, origin: int | None, unit: Unit = SECONDS) -> str
     counts = dict(status.counts)
     known = [(name, counts.pop(name, 0)) for name in COUNTED]
     known += [(name, counts[name]) for name in SELDOM if counts.get(name)]
-    cells = "".join(
+    # A space between two, where the line may break.
+    cells = " ".join(
         f'<span style="margin-right:0.9em;white-space:nowrap"><span style="opacity:0.65">{html.escape(name)}</span> '
         f"{count:,}</span>"
         for name, count in known
     )
     if latency is not None:
-        cells += f'<span style="white-space:nowrap"><span style="opacity:0.65">latency</span> {latency:.1f} ms</span>'
+        cells += f' <span style="white-space:nowrap"><span style="opacity:0.65">latency</span> {latency:.1f} ms</span>'
     if status.clock is not None:
         text = html.escape(clock_text(status.clock))
         cells += f' <span style="white-space:nowrap"><span style="opacity:0.65">clock</span> {text}</span>'
@@ -68,7 +70,8 @@ def status_html(status: Status, origin: int | None, unit: Unit = SECONDS) -> str
         '<div style="display:flex;justify-content:space-between;gap:0.5em">'
         f"<b>{_light(health, f'{health}{since}')}</b>"
         f"<span>{state}</span><span>{fold}</span><span>{at}</span></div><div>{cells}</div>"
-        f'<div>{_lights(status.sensors)}</div><div style="overflow-wrap:anywhere">{remedy}</div></div>'
+        f'<div>{_lights(status.sensors)}</div><div style="overflow-wrap:anywhere">{remedy}</div>'
+        f"{integrity_html(status)}</div>"
     )
 
 

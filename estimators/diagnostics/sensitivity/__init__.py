@@ -1,8 +1,9 @@
 """What could be wrong without anyone noticing: sensitivities, smallest visible faults, integrity, observability."""
 
+from .bounds import Bound, bounds_of
 from .gramian import Gramian, View, gramian
 from .nudges import Nudge
 from .responses import Response
 from .sensitivity import Sensitivity, sensitivity
 
-__all__ = ["Gramian", "Nudge", "Response", "Sensitivity", "View", "gramian", "sensitivity"]
+__all__ = ["Bound", "Gramian", "Nudge", "Response", "Sensitivity", "View", "bounds_of", "gramian", "sensitivity"]

@@ -12,7 +12,7 @@ import pytest
 from app.cli.arguments import Fold
 from app.cli.compare_fold import fold_row
 from app.cli.fold import fold_twin, read_log
-from app.cli.fold_episodes import episode_lines
+from app.cli.fold_episodes import Told, episode_lines
 from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import Episode
 from estimators.track import HEALTH_NAMES
@@ -69,6 +69,7 @@ def test_episodes_are_printed_told_to_scripts_and_kept(tmp_path: Path, capsys: p
         "unit": "°C",
     }  # fmt: skip
     table = pq.read_table(out)
+    assert episode.pop("suspects") == []  # a sensor that is stuck is no riddle
     assert json.loads(table.schema.metadata[b"episodes"]) == [episode]
     alarms, health = table["alarms"].to_pylist(), table["health"].to_pylist()
     assert alarms[:100] == [None] * 100 and "stuck" in alarms[-1].split(", ")
@@ -80,7 +81,7 @@ def test_episodes_are_printed_told_to_scripts_and_kept(tmp_path: Path, capsys: p
 
 def test_of_many_episodes_the_first_are_printed() -> None:
     one = Episode(1.0, 2.5, "winding", "narrow", 2.0, 1.9, 2.1, "×", "bands of winding are too narrow")
-    lines = list(episode_lines([one] * 25))
+    lines = list(episode_lines([Told(one, ())] * 25))
     assert lines[1] == "  narrow, for 1.5 s: bands of winding are too narrow"
     assert len(lines) == 12 and lines[-1] == "  and 15 more; --json has them all"
     assert len(list(episode_lines([]))) == 1

@@ -324,7 +324,7 @@ def test_chart_holds_band_mean_readings_truth_and_previous(view, engine):
     before = engine.fold.track.mean.copy()
     engine.submit(SetTuning("Q.temperature", 10.0))
     view.frame()
-    x, high, low, reading, _, _, previous, truth, mean, _, _ = view.charts._charts[0].data
+    x, high, low, reading, _, _, previous, truth, mean, _, _, _ = view.charts._charts[0].data
     track, readings = engine.fold.track, engine.log.events
     used = readings.kind == READING
     # One bucket of the 60 s window holds the reading and the truth of one second: x doubles, values stay.
@@ -345,7 +345,7 @@ def test_a_reset_at_the_time_of_the_last_reading_ends_the_line(window, view, eng
     engine.put(events(WINDING, RESET, 0, [engine.state.t * 1e-9], np.zeros((1, 0))))
     view.frame()
     for j, state in enumerate(WINDING.states):
-        _, high, low, *_, mean, _, _ = view.charts._charts[j].data
+        _, high, low, *_, mean, _, _, _ = view.charts._charts[j].data
         ends = mean[-1], high[-1], low[-1]
         assert ends == pytest.approx((state.mean, state.mean + 2 * state.std, state.mean - 2 * state.std))
 

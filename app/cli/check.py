@@ -1,0 +1,37 @@
+"""`nisus check`: what could be wrong with a twin unnoticed, and what its estimate is worth, on one page."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+from ..twin.twin import load_twin
+from .arguments import settings
+from .check_figures import figures
+from .check_html import as_html
+from .check_tables import sections
+from .check_text import as_text
+from .checked import Checked, check
+from .fold import read_log
+from .prepare import attend, prepare
+
+if TYPE_CHECKING:
+    from .arguments import Check as Arguments
+
+
+def check_twin(arguments: Arguments) -> int:
+    """Carry the command out."""
+    twin = load_twin(
+        arguments.twin, log_files=arguments.log or None, overrides=settings(arguments.set, arguments.estimator)
+    )
+    prepare(twin)
+    log, counts = read_log(twin, arguments.duration)
+    checked: Checked = attend(twin.model, lambda: check(twin, log, counts), "checking")
+    parts = sections(checked)
+    if arguments.html is not None:
+        arguments.html.write_text(as_html(f"nisus check {twin.name}", parts), encoding="utf-8")
+    if arguments.json:
+        print(json.dumps(figures(checked), allow_nan=False))
+    else:
+        print("\n".join(as_text(parts)))
+    return 0

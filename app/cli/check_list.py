@@ -1,0 +1,271 @@
+"""The checklist of a twin: eight questions, each with an answer, the figures behind it and what to do."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from config.source_schema import CanLogSection, CanSection, MergedSection
+from estimators.diagnostics.calibration import LIMITS
+from estimators.diagnostics.checklist.dimension import BUSY, spread_error
+from estimators.diagnostics.checklist.posterior import OFTEN
+from estimators.diagnostics.sensitivity import Sensitivity
+from estimators.diagnostics.sensitivity.words import subject_text
+from estimators.log import MAINTENANCE
+from estimators.track import HEALTH_NAMES
+
+from .checked import Checked
+from .scores import scores_file
+
+YES, PARTLY, NO, NONE = "yes", "partly", "no", "not told"
+
+BLAME = 0.9
+"""Correlation of two estimates from which on one takes the blame for the other."""
+
+ILL = 1e8
+"""Conditioning from which on the information of the worst direction is rounding."""
+
+LEFT = 0.9
+"""Share of the prior deviation; a direction that keeps more is not observed."""
+
+LINEARISES = ("ekf", "iekf", "sr_ekf", "filterpy_ekf", "pf_ekf")
+
+
+class Line(NamedTuple):
+    """One question of the checklist: `answer` is yes, partly, no, or "not told"."""
+
+    key: str
+    question: str
+    answer: str
+    figures: str
+    remedy: str
+
+
+def checklist(checked: Checked) -> list[Line]:
+    """The lines, in the order of the article."""
+    return [
+        _linearity(checked),
+        _dimension(checked),
+        _posterior(checked),
+        _observability(checked),
+        _timing(checked),
+        _health(checked),
+        _tuning(checked),
+        _change(checked),
+    ]
+
+
+def _linearity(checked: Checked) -> Line:
+    found, name = checked.linearity, checked.twin.estimator
+    question = "Does a linearised model pass innovation whiteness over what the log covers?"
+    if found.passes is None:
+        return Line("linearity", question, NONE, found.reason, "")
+    remedy = ""
+    if not found.passes:
+        better = (
+            "ukf or ckf see the curvature" if name in LINEARISES else f"{name}, which runs here, does not linearise"
+        )
+        remedy = better
+    elif not found.white:
+        remedy = "correlation above zero: more Q, or a state is missing; below: less Q"
+    answer = NO if not found.passes else YES if found.white else PARTLY
+    return Line("linearity", question, answer, found.text, remedy)
+
+
+def _dimension(checked: Checked) -> Line:
+    found, fold = checked.dimension, checked.fold
+    entry = fold.estimator
+    question = "Is n small enough for O(n³) at this rate, or is an ensemble required?"
+    figures = (
+        f"{found.nx:,} states, {found.rate:.3g} readings a second; a covariance step is {found.flops:.3g} operations "
+        f"on {found.memory / 1e6:.3g} MB; {entry.name} takes {1e6 * found.seconds:.3g} µs a reading, "
+        f"{100 * found.share:.2g} % of one processor"
+    )
+    if np.isfinite(found.largest) and found.largest > found.nx:
+        figures += f", by n³ all of it at {found.largest:,.0f} states"
+    members = fold.options.get("members", fold.options.get("particles", 0.0))
+    if members:
+        figures += f"; {members:,.0f} members: each σ is off by {100 * spread_error(members):.2g} % by chance"
+    else:
+        figures += f"; an ensemble would need {found.members} members for σ within 10 %"
+    remedy = ""
+    if found.share > BUSY:
+        remedy = f"more than {100 * BUSY:.0f} % of a processor: fewer readings, fewer members, or another filter"
+    elif entry.family == "ensemble":
+        remedy = "an ensemble is what runs"
+    answer = YES if found.passes and entry.family != "ensemble" else PARTLY if found.passes else NO
+    return Line("dimension", question, answer, figures, remedy)
+
+
+def _posterior(checked: Checked) -> Line:
+    found = checked.peaks
+    question = "Is the posterior multimodal, or is the noise heavy-tailed?"
+    heavy = [tail for tail in checked.tails if tail.heavy]
+    # Of many rows a few look so by chance.
+    heavy = heavy if len(heavy) > OFTEN * len(checked.tails) else []
+    if found.reason:
+        said = [f"no cloud tells of peaks: {found.reason}"]
+    else:
+        several = f"{100 * found.several:.2g} % of {found.looks} looks at the cloud of {found.estimator} over "
+        several += f"{found.over:.4g} s show more than one peak (at most {found.most})"
+        said = [several]
+        if found.recoveries:
+            said.append(f"the cloud was lost {found.recoveries} time(s), so its shape says little")
+    worst = max(checked.tails, key=lambda tail: tail.kurtosis, default=None)
+    if worst is not None:
+        said.append(
+            f"innovations: {sum(tail.heavy for tail in checked.tails)} of {len(checked.tails)} rows are heavy-tailed, "
+            f"the worst {worst.row} with excess kurtosis {worst.kurtosis:.2g} and {100 * worst.far:.2g} % beyond 4 σ"
+        )
+    peaked = not found.reason and not found.recoveries and found.several > OFTEN
+    remedy = ""
+    if peaked:
+        one = checked.fold.estimator.peaks is None
+        remedy = (
+            f"{checked.twin.estimator} has one peak: use pf, pf_ekf or rbpf" if one else "particles carry the peaks"
+        )
+    elif heavy and checked.linearity.passes is not None and not checked.linearity.white:
+        remedy = "innovations are correlated too: these are errors of the model, and a gate would refuse good readings"
+    elif heavy and checked.twin.tuning.gate is None:
+        remedy = "heavy tails need a gate, not particles: set gate: 0.99999"
+    elif heavy:
+        remedy = "heavy tails: the gate takes the worst of them"
+    answer = YES if peaked else PARTLY if heavy else NONE if found.reason and worst is None else NO
+    return Line("posterior", question, answer, "; ".join(said), remedy)
+
+
+def blamed(found: Sensitivity) -> list[tuple[str, str, float]]:
+    """Who takes the blame for whom: pairs that look alike in the readings.
+
+    Their estimates from this log would be correlated beyond 0.9, if these two were unknown and all others known.
+    """
+    names = [subject_text(nudge) for nudge in found.nudges]
+    root = np.sqrt(np.diag(found.fisher))
+    with np.errstate(all="ignore"):
+        c = -found.fisher / np.outer(root, root)
+    pairs = [
+        (names[i], names[j], float(c[i, j]))
+        for i in range(len(names))
+        for j in range(i + 1, len(names))
+        if abs(c[i, j]) > BLAME
+    ]
+    return sorted(pairs, key=lambda pair: -abs(pair[2]))
+
+
+def _observability(checked: Checked) -> Line:
+    found, told = checked.gramian, checked.sensitivity
+    question = "Is the Gramian well conditioned for every state and parameter that is estimated?"
+    whole = found.whole
+    if whole is None:
+        return Line("observability", question, NONE, found.reason, "")
+    figures = (
+        f"rank {whole.rank} of {checked.twin.model.nx}, conditioning {whole.conditioning:.3g}; the weakest direction "
+        f"is {whole.text}"
+    )
+    if found.windows:
+        ranks = [window.rank for window in found.windows]
+        figures += f"; in {len(ranks)} windows alone rank {min(ranks)} to {max(ranks)}"
+    pairs = blamed(told)
+    if pairs:
+        first, second, value = pairs[0]
+        figures += f"; {len(pairs)} pair(s) look alike in the readings, first {first} and {second} ({value:+.3f})"
+    if whole.beyond:
+        return Line("observability", question, NONE, f"{figures}; {found.note}", "")
+    free = checked.twin.model.prior_std > 0.0
+    left = whole.deviation[free]
+    unseen = bool(left.size and left.max() > LEFT)
+    full = whole.rank >= int(free.sum()) and whole.conditioning < ILL
+    remedy = ""
+    if unseen or not full:
+        remedy = "what is not observed keeps its prior and drifts: add a sensor, or trust it no further than its band"
+    elif pairs:
+        remedy = "do not estimate both of a pair from this log; measure one, or excite the asset otherwise"
+    return Line("observability", question, NO if unseen else YES if full and not pairs else PARTLY, figures, remedy)
+
+
+def stamps(checked: Checked) -> str:
+    """Where the times of the readings come from, in words."""
+    source = checked.twin.config.source
+    kinds = {type(part) for part in source.parts} if isinstance(source, MergedSection) else {type(source)}
+    if kinds & {CanSection, CanLogSection}:
+        return "frames are stamped where they are received, not at the sensor"
+    return "every reading has the time at which it was measured"
+
+
+def _timing(checked: Checked) -> Line:
+    question = "Are there source timestamps, a buffer for the worst latency, and a policy for stale data?"
+    section, policy = checked.twin.config.time, checked.twin.policy
+    spoke = [item for item in checked.arrivals if item.n]
+    late = [item for item in spoke if np.isfinite(item.lateness[-1])]
+    silent = [item.sensor for item in checked.arrivals if not item.n]
+    stale = checked.counts["stale"]
+    said = [stamps(checked)]
+    worst = max(spoke, key=lambda item: np.nan_to_num(item.gap), default=None)
+    if worst is not None and np.isfinite(worst.gap):
+        said.append(f"longest gap {worst.gap:.3g} s ({worst.sensor})")
+    if late:
+        most = max(item.lateness[-1] for item in late)
+        said.append(f"worst lateness {most:.3g} s for a horizon of {section.horizon:g} s")
+    else:
+        said.append(f"when readings arrived is not known; the horizon is {section.horizon:g} s")
+    said.append(f"{stale} stale; degraded after {policy.degraded_after:g} s, stale after {policy.stale_after:g} s")
+    if silent:
+        said.append(f"never heard: {', '.join(silent)}")
+    remedy = ""
+    if stale:
+        remedy = f"{stale} reading(s) came later than the horizon: raise time.horizon"
+    elif silent:
+        remedy = "check the channel map of what is never heard"
+    elif worst is not None and worst.gap > policy.degraded_after:
+        remedy = f"{worst.sensor} is silent for longer than {policy.degraded_after:g} s: degraded meanwhile"
+    whole = bool(late) and "measured" in said[0] and not silent
+    return Line("timing", question, NO if stale else YES if whole else PARTLY, "; ".join(said), remedy)
+
+
+def _health(checked: Checked) -> Line:
+    question = "Are NIS, whiteness and refusals monitored, with alerts and a documented response?"
+    track = checked.fold.track
+    share = np.bincount(track.health, minlength=len(HEALTH_NAMES)) / max(1, len(track))
+    parts = ", ".join(f"{name} {100 * value:.3g} %" for name, value in zip(HEALTH_NAMES, share, strict=True) if value)
+    found = checked.episodes
+    wrong = [entry for entry in checked.calibration if entry.words]
+    figures = (
+        f"a false alarm every {checked.twin.policy.false_alarm_every:g} s at most; health {parts}; {len(found)} "
+        f"episode(s); calibration off in {len(wrong)} of {len(checked.calibration)} rows and states"
+    )
+    remedy = found[0].text if found else wrong[0].words[0] if wrong else ""
+    return Line("health", question, YES, figures, remedy)
+
+
+def _tuning(checked: Checked) -> Line:
+    question = "Are Q and R fitted on recorded data, versioned, and covered by regression tests?"
+    twin = checked.twin
+    kept = scores_file(twin.path)
+    scores = kept.exists()
+    off = [
+        entry.subject
+        for entry in checked.calibration
+        if entry.role == "used" and entry.scale.beyond(1.0 / (1.0 + LIMITS.width), 1.0 + LIMITS.width)
+    ]
+    normal = "what was normal is kept with them" if twin.tuning.baseline is not None else "what was normal is not kept"
+    figures = (
+        f"Q and R stand in {twin.path.name}, which says no more of a fit than its comments; {normal}; scores of every "
+        f"filter {'are kept in ' + kept.name if scores else 'are not kept'}; bands off by more than a quarter: "
+        f"{', '.join(off[:4]) if off else 'none'}{f' and {len(off) - 4} more' if len(off) > 4 else ''}"
+    )
+    remedy = []
+    if twin.tuning.baseline is None:
+        remedy.append(f"nisus commission {twin.path.stem} keeps what is normal, so that a change is told")
+    if not scores:
+        remedy.append(f"nisus compare {twin.path.stem} --write keeps the scores")
+    return Line("tuning", question, PARTLY if scores or not remedy else NO, figures, "; ".join(remedy))
+
+
+def _change(checked: Checked) -> Line:
+    question = "Is the model version tied to maintenance events?"
+    log = checked.log
+    done = int(np.sum(log.kind[: log.n] == MAINTENANCE))
+    figures = f"each maintenance counts the version of {checked.twin.model.name} up; {done} in this log"
+    remedy = "tell the twin of maintenance, so that the covariance of what was changed is opened again"
+    return Line("change", question, YES if done else PARTLY, figures, "" if done else remedy)

@@ -1,0 +1,206 @@
+"""What a check found, as sections of tables: printed as text, or as HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from estimators.diagnostics.calibration import BANDS
+from estimators.diagnostics.sensitivity import bounds_of
+from estimators.diagnostics.sensitivity.information import directions
+from estimators.diagnostics.sensitivity.words import range_text, size_text, subject_text
+from estimators.track import HEALTH_NAMES
+
+from .check_list import blamed, checklist
+from .checked import Checked
+from .fold_report import calibration_lines
+
+MOST = 12
+"""Rows of a table on the page; JSON has all."""
+
+WORSE = "worse than no filter"
+
+
+class Bar(NamedTuple):
+    """Two lengths to compare, in `unit`: 2 σ and the integrity bound, or an RMS and the open loop's."""
+
+    name: str
+    unit: str
+    first: float
+    second: float
+
+
+class Part(NamedTuple):
+    """One section: a title, what is said before the table, its head and rows; `bars` are what HTML draws of it."""
+
+    title: str
+    said: tuple[str, ...]
+    head: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
+    bars: tuple[Bar, ...] = ()
+    legend: tuple[str, str] = ("", "")
+
+
+def sections(checked: Checked) -> list[Part]:
+    """The page, from top to bottom."""
+    return [
+        _title(checked),
+        _checklist(checked),
+        _integrity(checked),
+        _visible(checked),
+        _observability(checked),
+        _held_out(checked),
+        _open_loop(checked),
+        _timing(checked),
+        _health(checked),
+    ]
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}" if np.isfinite(value) else "-"
+
+
+def _cut(rows: Sequence[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
+    """At most `MOST` rows, and one that says how many more there are."""
+    if len(rows) <= MOST + 1:
+        return tuple(rows)
+    return (*rows[:MOST], (f"... and {len(rows) - MOST} more", *[""] * (len(rows[0]) - 1)))
+
+
+def _title(checked: Checked) -> Part:
+    twin, log = checked.twin, checked.log
+    seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9
+    part = "the first" if checked.span is not None else "all"
+    said = f"{twin.estimator} over {part} {seconds:.4g} s of its log, {log.n:,} events, {checked.dimension.nx:,} states"
+    return Part(f"{twin.name}: {twin.title}", (said,))
+
+
+def _checklist(checked: Checked) -> Part:
+    rows = [(line.question, line.answer, line.figures, line.remedy) for line in checklist(checked)]
+    return Part("Checklist", (), ("question", "answer", "figures", "remedy"), tuple(rows))
+
+
+def _integrity(checked: Checked) -> Part:
+    found = checked.sensitivity
+    title = "How wrong a state can be by one fault that nobody notices"
+    if found.reason:
+        return Part(title, (f"Not computed: {found.reason}.",))
+    bounds = bounds_of(checked.twin.model, found)
+    rows = [
+        (name, item.unit, _number(item.two_sigma), _number(item.bound), item.fault or "none")
+        for name, item in bounds.items()
+    ]
+    bars = [Bar(name, item.unit, item.two_sigma, item.bound) for name, item in bounds.items()]
+    said = (f"{found.note}.",) if found.note else ()
+    head = ("state", "unit", "± 2 σ", "integrity bound", "by")
+    return Part(title, said, head, _cut(rows), tuple(bars[:MOST]), ("± 2 σ", "integrity bound"))
+
+
+def _visible(checked: Checked) -> Part:
+    found = checked.sensitivity
+    title = "How large a fault must be to be noticed"
+    if found.reason:
+        return Part(title, (f"Not computed: {found.reason}.",))
+    seconds = float(found.t[-1] - found.t[0]) * 1e-9
+    rows = []
+    for nudge, size, (low, high) in zip(found.nudges, found.smallest_visible, found.unseen, strict=True):
+        seen = size_text(nudge, size) if np.isfinite(size) else "cannot be seen within its range"
+        rows.append((subject_text(nudge), seen, range_text(nudge, low, high)))
+    said = f"A constant fault, there for all of {seconds:.4g} s, seen with 95 %."
+    return Part(title, (said,), ("fault", "smallest visible", "passes unseen"), _cut(rows))
+
+
+def _observability(checked: Checked) -> Part:
+    found = checked.gramian
+    title = "What the readings can tell"
+    if found.whole is None:
+        return Part(title, (f"Not computed: {found.reason}.",))
+    begin = float(found.whole.begin)
+    rows = [
+        (
+            f"{(view.begin - begin) * 1e-9:.4g} to {(view.end - begin) * 1e-9:.4g} s",
+            f"{view.rank} of {checked.twin.model.nx}",
+            _number(view.conditioning),
+            view.text,
+        )
+        for view in (found.whole, *found.windows)
+    ]
+    said = [f"{found.note}."] if found.note else []
+    pairs = blamed(checked.sensitivity)
+    for one, other, value in pairs[:MOST]:
+        said.append(f"{one} and {other} take the blame for each other: correlation {value:+.3f}.")
+    if len(pairs) > MOST:
+        said.append(f"So do {len(pairs) - MOST} more pairs.")
+    told = checked.sensitivity
+    untold = [item for item in directions(told.fisher, told.nudges) if not item.deviation < 1.0] if told.nudges else []
+    if untold:
+        said.append(f"With all unknown together {len(untold)} combination(s) cannot be told, first {untold[0].text}.")
+    return Part(title, tuple(said), ("part of the log", "rank", "conditioning", "weakest direction"), _cut(rows))
+
+
+def _held_out(checked: Checked) -> Part:
+    title = "Each sensor held out, and predicted by the others"
+    found = checked.held_out.rows
+    rows, bars = [], []
+    for row in found:
+        shares = (f"{100 * share:.3g}" for share in row.coverage)
+        verdict = WORSE if row.worse else ""
+        figures = (row.row, row.unit, _number(row.rms), f"{row.bias:+.3g}")
+        rows.append((*figures, *shares, _number(row.open_loop), verdict))
+        bars.append(Bar(row.row, row.unit, row.rms, row.open_loop))
+    said = [f"{row.row} is predicted {WORSE}: RMS {_number(row.rms)} {row.unit} by the other sensors, "
+            f"{_number(row.open_loop)} by the model alone." for row in found if row.worse]  # fmt: skip
+    if len({row.sensor for row in found}) == 1:
+        said.append("There is one sensor: held out, it leaves the open loop.")
+    bands = tuple(f"in {100 * band:.0f} %" for band in BANDS)
+    head = ("sensor row", "unit", "RMS", "bias", *bands, "open loop", "")
+    legend = ("RMS by the other sensors", "RMS without any reading")
+    return Part(title, tuple(said[:MOST]), head, _cut(rows), tuple(bars[:MOST]), legend)
+
+
+def _open_loop(checked: Checked) -> Part:
+    title = "The estimate against no filter at all, where the truth is known"
+    found = checked.held_out.states
+    if not found:
+        return Part(title, ("The log tells no truth: see the sensors held out.",))
+    said = tuple(
+        f"The filter makes {item.state} {WORSE}: RMS {_number(item.filter)} {item.unit} with its readings, "
+        f"{_number(item.open_loop)} without any."
+        for item in found
+        if item.worse
+    )
+    rows = [(item.state, item.unit, _number(item.filter), _number(item.open_loop), WORSE if item.worse else "")
+            for item in found]  # fmt: skip
+    bars = tuple(Bar(item.state, item.unit, item.filter, item.open_loop) for item in found[:MOST])
+    head = ("state", "unit", "RMS of the filter", "RMS of the open loop", "")
+    return Part(title, said, head, _cut(rows), bars, ("filter", "open loop"))
+
+
+def _timing(checked: Checked) -> Part:
+    rows = [
+        (
+            item.sensor,
+            f"{item.n:,}",
+            _number(item.rate),
+            _number(item.gap),
+            f"{100 * item.missing:.2g}" if np.isfinite(item.missing) else "-",
+            " / ".join(_number(value) for value in item.lateness),
+        )
+        for item in checked.arrivals
+    ]
+    head = ("sensor", "readings", "a second", "longest gap, s", "missing, %", "lateness, s: half, 99 %, worst")
+    return Part("When readings come", (), head, _cut(rows))
+
+
+def _health(checked: Checked) -> Part:
+    track = checked.fold.track
+    share = np.bincount(track.health, minlength=len(HEALTH_NAMES)) / max(1, len(track))
+    parts = [f"{name} {100 * value:.3g} %" for name, value in zip(HEALTH_NAMES, share, strict=True) if value]
+    said = [", ".join(parts) + "."]
+    said += [episode.text for episode in checked.episodes[:MOST]]
+    if len(checked.episodes) > MOST:
+        said.append(f"... and {len(checked.episodes) - MOST} more episodes.")
+    said += calibration_lines(checked.calibration, checked.twin.model)[: 2 * MOST]
+    return Part("Health and calibration", tuple(said))

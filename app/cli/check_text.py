@@ -1,0 +1,41 @@
+"""A check as plain text."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+
+from .check_tables import Part
+
+WIDTH = 118
+
+
+def as_text(parts: Sequence[Part]) -> list[str]:
+    """Lines of the page; a table whose rows do not fit is a paragraph for each row."""
+    lines: list[str] = []
+    for part in parts:
+        lines += ["", part.title] if lines else [part.title]
+        for said in part.said:
+            lines += textwrap.wrap(said, WIDTH, initial_indent="  ", subsequent_indent="    ")
+        lines += _table(part)
+    return lines
+
+
+def _table(part: Part) -> list[str]:
+    widths = [max(len(cell) for cell in column) for column in zip(part.head, *part.rows, strict=True)]
+    if sum(widths) + 2 * len(widths) > WIDTH + 40:
+        return _paragraphs(part)
+    rows = (part.head, *part.rows) if part.rows else ()
+    return [
+        ("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))).rstrip() for row in rows
+    ]
+
+
+def _paragraphs(part: Part) -> list[str]:
+    lines = []
+    for row in part.rows:
+        first, second, *others = row
+        lines.append(f"  {first} {second}".rstrip())
+        for other in filter(None, others):
+            lines += textwrap.wrap(other, WIDTH, initial_indent="      ", subsequent_indent="      ")
+    return lines

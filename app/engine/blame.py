@@ -1,0 +1,127 @@
+"""Who is most likely off, while the twin runs: for each open episode, in a thread that is never in the engine's way.
+
+A shift may be the fault of a sensor, an input or a parameter. Which of them explains best what was seen takes a refold
+for each (estimators/diagnostics/sensitivity/suspects.py); it is asked soon after an episode has begun, and again
+whenever twice as much has been seen of it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections.abc import Callable, Sequence
+
+from estimators.diagnostics.episodes import Episode
+from estimators.diagnostics.sensitivity.suspects import in_words, suspects
+from estimators.errors import NisusError
+from estimators.log import Log
+from estimators.model.state_space import StateSpaceModel
+
+from .integrity import LOWEST, Stopped, Unhurried, Window, reason_against
+from .notices import Notices
+
+EVERY = 1.0
+"""Seconds between two looks at the open episodes."""
+
+RIDDLES = ("shifted", "refused")
+"""Causes that leave open who is to blame."""
+
+SOON = 3.0
+"""Seconds of an episode from which on it can be asked."""
+
+
+class Blame:
+    """Whoever may be to blame for each open episode, by its subject."""
+
+    def __init__(
+        self,
+        model: StateSpaceModel,
+        episodes: Callable[[], Sequence[Episode]],
+        take: Callable[[], Window | None],
+        notices: Notices,
+        *,
+        every: float = EVERY,
+    ) -> None:
+        """Prepare.
+
+        Args:
+            model: Of the twin.
+            episodes: Gives those known now.
+            take: Gives a copy of the last events, or None if now is not the time.
+            notices: Where a finding is said, once.
+            every: Seconds between two looks.
+        """
+        self._model, self._episodes, self._take, self._notices, self._every = model, episodes, take, notices, every
+        self._words: dict[str, str] = {}
+        self._seen: dict[str, float] = {}
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="blame", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End after the fold that is under way."""
+        self._stopping.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=1.0)
+
+    def of(self, episode: Episode) -> str:
+        """Who is most likely off, in words; nothing if it is not known."""
+        return self._words.get(episode.subject, "") if _riddle(episode) else ""
+
+    def told(self, episode: Episode) -> Episode:
+        """The episode, with who is most likely off in its text."""
+        words = self.of(episode)
+        return episode._replace(text=f"{episode.text}; most likely off: {words}") if words else episode
+
+    def look(self) -> None:
+        """Ask for the open episode of which most is new."""
+        riddles = [episode for episode in self._episodes() if _riddle(episode)]
+        subjects = {episode.subject for episode in riddles}
+        self._words = {subject: words for subject, words in self._words.items() if subject in subjects}
+        self._seen = {subject: seen for subject, seen in self._seen.items() if subject in subjects}
+        taken = self._take() if riddles else None
+        if taken is None or reason_against(self._model, taken.estimator):
+            return
+        now, begun = taken.events.t[-1] * 1e-9, taken.base.clock * 1e-9
+        for episode in riddles:
+            lasted = now - episode.start
+            if lasted < max(SOON, 2.0 * self._seen.get(episode.subject, 0.0)) or episode.start < begun:
+                continue
+            self._seen[episode.subject] = lasted
+            self._ask(episode, taken)
+
+    def _ask(self, episode: Episode, taken: Window) -> None:
+        log = Log.of(self._model, capacity=len(taken.events))
+        log.first, log.floor = taken.base.first, taken.base.clock
+        log.extend(taken.events)
+        executor = Unhurried(self._stopping)
+        try:
+            found = suspects(
+                taken.estimator, self._model, taken.tuning, log, episode.start, base=taken.base, executor=executor
+            )
+        except (NisusError, Stopped):
+            return
+        words, before = in_words(found), self.of(episode)
+        if words:
+            self._words[episode.subject] = words
+            if not before:
+                self._notices.say(
+                    f"{episode.subject}: most likely off: {words}", level="warn", t=int(taken.events.t[-1])
+                )
+
+    def _run(self) -> None:
+        if sys.platform == "linux":
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOWEST)
+        while not self._stopping.wait(self._every):
+            try:
+                self.look()
+            except Exception as error:  # noqa: BLE001  a user's model may raise anything; the twin goes on
+                self._notices.report("blame", f"{type(error).__name__}: {error}", level="error", counted=False)
+
+
+def _riddle(episode: Episode) -> bool:
+    return episode.end is None and episode.cause in RIDDLES

@@ -1,0 +1,173 @@
+"""Each sensor held out in turn, and predicted by the others; and no reading at all, which is the floor.
+
+A filter earns its place where it predicts a sensor that it does not see, or a state whose truth is known, better than
+the model alone does from its prior and inputs: the open loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from typing import NamedTuple
+
+import numpy as np
+
+from ...fold import Fold
+from ...log import READING, Log
+from ...model.state_space import StateSpaceModel
+from ...registry import find_estimator
+from ...snapshots import Base
+from ...track import HELD_OUT
+from ...tuning import Tuning
+from ..calibration import BANDS, calibrations
+from ..score import Fit, Score, score
+from ..sensitivity.responses import each
+
+MARGIN = 0.05
+"""Share by which an error must exceed that of the open loop before the filter is said to make it worse."""
+
+ALONE = ("particle", "ensemble")
+"""Families whose folds run one after the other: each of them runs on all processors."""
+
+
+class Prediction(NamedTuple):
+    """A sensor row that is predicted without its sensor, at `n` readings.
+
+    rms and bias (prediction less reading) in `unit`; coverage (3,) the shares of the readings inside the bands `BANDS`
+    of the prediction, intervals (3, 2) their 95 % intervals. `open_loop` is the RMS of the model without any reading.
+    """
+
+    row: str
+    sensor: str
+    unit: str
+    n: int
+    rms: float
+    bias: float
+    coverage: np.ndarray
+    intervals: np.ndarray
+    open_loop: float
+
+    @property
+    def worse(self) -> bool:
+        """Whether the other sensors make the prediction worse than none does."""
+        return worse(self.rms, self.open_loop)
+
+
+class Against(NamedTuple):
+    """A state whose truth is known: RMS error of the filter and of the open loop, in `unit`."""
+
+    state: str
+    unit: str
+    filter: float
+    open_loop: float
+
+    @property
+    def worse(self) -> bool:
+        """Whether the filter makes the state worse than no filter."""
+        return worse(self.filter, self.open_loop)
+
+
+class HeldOut(NamedTuple):
+    """All rows of sensors that speak, and all states whose truth is known."""
+
+    rows: tuple[Prediction, ...]
+    states: tuple[Against, ...]
+
+
+def worse(rms: float, floor: float) -> bool:
+    """Whether an error is larger than that of the open loop by more than the margin; an error of no size is not."""
+    return bool(rms > (1.0 + MARGIN) * floor)
+
+
+def held_out(
+    estimator: str,
+    model: StateSpaceModel,
+    tuning: Tuning,
+    log: Log,
+    *,
+    base: Base | None = None,
+    executor: Executor | str | None = "threads",
+) -> HeldOut:
+    """Fold the log without each sensor that speaks, without all, and as it is.
+
+    Args:
+        estimator: Of the twin.
+        model: Whose sensors.
+        tuning: As the twin's; a sensor that it holds out stays so throughout.
+        log: The events; it must not grow meanwhile (give a copy).
+        base: Where the log starts, if older events were dropped.
+        executor: As `sensitivity`.
+
+    Raises:
+        EstimatorError: As `Fold`.
+        ModelError: As `Fold`.
+    """
+    kind, channel = log.kind[: log.n], log.channel[: log.n]
+    speak = [int(s) for s in np.unique(channel[kind == READING])]
+    nobody = tuning
+    for name in model.sensor_names:
+        nobody = nobody.set(f"use.{name}", False)
+    without = [tuning.set(f"use.{model.sensor_names[s]}", False) for s in speak]
+
+    def run(other: Tuning) -> Fold:
+        fold = Fold(estimator, model, other, log, base=base)
+        fold.advance()
+        fold.finish()
+        return fold
+
+    if find_estimator(estimator, model).family in ALONE:
+        executor = None
+    filtered, floor, *folds = each(run, [tuning, nobody, *without], executor)
+    open_rows = _score(floor).held_out
+    rows: list[Prediction] = []
+    for s, fold in zip(speak, folds, strict=True):
+        rows += _predictions(fold, s, open_rows)
+    return HeldOut(tuple(rows), tuple(_states(filtered, floor)))
+
+
+def _score(fold: Fold) -> Score:
+    pictures = fold.pictures.taken if fold.pictures is not None else ()
+    return score(fold.track, fold.log.events, fold.model, pictures, gate=fold.tuning.gate)
+
+
+def _predictions(fold: Fold, s: int, floor: dict[str, Fit]) -> list[Prediction]:
+    """Of the rows of sensor s, which this fold holds out."""
+    model, log = fold.model, fold.log
+    own = np.flatnonzero(
+        (log.kind[: log.n] == READING) & (log.channel[: log.n] == s) & (fold.track.verdict == HELD_OUT)
+    )
+    events, track = log.events.select(own), fold.track.select(own)
+    fits = score(track, events, model).held_out
+    found = calibrations(model, events, track, marginal=fold.marginal)
+    units = [row.unit for row in model.sensors[s].rows]
+    first = model.row_start[s]
+    by_name = dict(zip(model.row_names[first : first + len(units)], units, strict=True))
+    return [
+        Prediction(
+            row=entry.subject,
+            sensor=model.sensor_names[s],
+            unit=by_name[entry.subject],
+            n=entry.n,
+            rms=fits[entry.subject].rmse,
+            bias=fits[entry.subject].bias,
+            coverage=np.array([share.value for share in entry.coverage]),
+            intervals=np.array([(share.low, share.high) for share in entry.coverage]).reshape(len(BANDS), 2),
+            open_loop=floor[entry.subject].rmse if entry.subject in floor else np.nan,
+        )
+        for entry in found
+        if entry.subject in fits
+    ]
+
+
+def _states(filtered: Fold, floor: Fold) -> Sequence[Against]:
+    model = filtered.model
+    one, other = _score(filtered), _score(floor)
+    units = {state.name: state.unit for state in model.shown_states}
+    found = [
+        Against(name, units[name], fit.rmse, other.states[name].rmse)
+        for name, fit in one.states.items()
+        if name in other.states
+    ]
+    if one.field is not None and other.field is not None and model.grid is not None:
+        found.insert(0, Against(f"{model.grid.name}, all cells", model.grid.unit, one.field.rmse, other.field.rmse))
+    return found

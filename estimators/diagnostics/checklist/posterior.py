@@ -1,0 +1,183 @@
+"""The shape of the posterior: several peaks, or one peak and noise with heavy tails?
+
+Peaks are those that two clouds of particles, which draw differently, share along the log. Tails are those of the
+innovations of the filter in use, each in units of its own standard deviation: a scale that is wrong makes no tails.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ...fold import Fold
+from ...log import READING, Log
+from ...model.state_space import StateSpaceModel
+from ...numerics.peaks import Peak
+from ...registry import find_entry, unfit
+from ...snapshots import Base
+from ...track import GATED, USED, Track
+from ...tuning import Tuning
+from ..calibration import standardised
+from ..whiteness import jarque_bera
+
+LOOKS = 150
+"""Times at which the cloud is looked at; finding its peaks takes milliseconds."""
+
+MOST_STATES = 12
+"""Of a cloud: beyond, particles that explain a reading become too rare for its shape to say anything."""
+
+MOST_EVENTS = 4000
+
+DISTINCT = 0.2
+"""Share of a cloud's members that must differ after a reading; of fewer, clusters are of chance."""
+
+COLLAPSED = 0.5
+"""Share of the looks at a collapsed cloud, from which on its shape says nothing."""
+
+WEIGHT = 0.001
+"""Share of the other cloud that a peak must have there, too."""
+
+NEAR = 3.0
+"""Standard deviations in each state, within which a point belongs to a peak."""
+
+DIP = 0.5
+"""Share of the points at either end, of which there must be fewer in the middle between two peaks."""
+
+OFTEN = 0.05
+"""Share of the looks with more than one peak, from which on the posterior has several."""
+
+HEAVY = 1.0
+"""Excess kurtosis that matters: that of Student's t with ten degrees of freedom."""
+
+FAR = 4.0
+"""Standard deviations beyond which a normal innovation lies once in 16,000 readings."""
+
+LEAST = 50
+"""Readings of which a kurtosis is taken at least."""
+
+
+class Peaks(NamedTuple):
+    """Of a cloud, at `looks` times: share of them with more than one peak, and the most there were.
+
+    `collapsed` is the share of the times at which so few members differed that peaks would be of chance; they do not
+    count. `reason` says why nothing can be told. `recoveries` counts how often the cloud lost the asset: then its shape
+    says little. `over`: seconds of the log.
+    """
+
+    estimator: str
+    reason: str
+    looks: int
+    several: float
+    most: int
+    recoveries: int
+    over: float
+    collapsed: float = 0.0
+
+
+class Tail(NamedTuple):
+    """Excess kurtosis of a row's n innovations, their share beyond 4 σ, p-value of Jarque-Bera."""
+
+    row: str
+    n: int
+    kurtosis: float
+    far: float
+    p_value: float
+
+    @property
+    def heavy(self) -> bool:
+        """Whether the tails are heavier than a normal distribution's by more than matters."""
+        return self.n >= LEAST and self.kurtosis > HEAVY
+
+
+def peaks(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, *, base: Base | None = None) -> Peaks:
+    """Fold the first part of a log with particles twice, and look at the clouds on the way.
+
+    Args:
+        estimator: A particle filter.
+        model: Of at most 12 states.
+        tuning: With the options of that filter.
+        log: The events; it must not grow meanwhile (give a copy).
+        base: Where the log starts, if older events were dropped.
+
+    Raises:
+        EstimatorError: As `Fold`.
+        ModelError: As `Fold`.
+    """
+    reason = unfit(find_entry(estimator), model) or ""
+    if not reason and model.nx > MOST_STATES:
+        reason = f"{model.nx:,} states are too many for particles, whose number grows exponentially with them"
+    if reason:
+        return Peaks(estimator, reason, 0, np.nan, 0, 0, 0.0)
+    end = min(log.n, MOST_EVENTS)
+    # After a reading, where a cloud that has lost its variety shows it: later, noise moves copies apart.
+    stops = np.flatnonzero(log.kind[:end] == READING) + 1
+    stops = stops[np.unique(np.linspace(0, stops.size - 1, min(stops.size, LOOKS)).round().astype(int))]
+    folds = [Fold(estimator, model, replace(tuning, seed=tuning.seed + k), log, base=base) for k in range(2)]
+    counts = []
+    for stop in stops:
+        for fold in folds:
+            fold.advance(int(stop) - fold.n)
+        points, other = (fold.points() for fold in folds)
+        varied = len(np.unique(points, axis=0)) >= DISTINCT * len(points)
+        counts.append(_confirmed(folds[0].peaks(), other, model.circular) if varied else 0)
+    over = float(log.t[end - 1] - log.t[0]) * 1e-9
+    found = np.array(counts, int)
+    collapsed = float(np.mean(found == 0)) if found.size else 0.0
+    if collapsed > COLLAPSED:
+        reason = (
+            f"{100 * collapsed:.3g} % of the time fewer than {100 * DISTINCT:.0f} % of the particles of {estimator} "
+            "differ, as the readings are too sharp for so few"
+        )
+    found = found[found > 0]
+    several = float(np.mean(found > 1)) if found.size else np.nan
+    most = int(found.max(initial=0))
+    return Peaks(estimator, reason, found.size, several, most, folds[0].recoveries(), over, collapsed)
+
+
+def _confirmed(found: list[Peak], points: np.ndarray, circular: np.ndarray) -> int:
+    """How many peaks of a cloud are apart in another one too, whose points (n, nx) are given; at least one.
+
+    What chance has split has points of the other cloud in the middle as at both ends.
+    """
+    kept: list[Peak] = []
+    for peak in found:
+        if all(_apart(peak, one, points, circular) for one in kept):
+            kept.append(peak)
+    return max(1, len(kept))
+
+
+def _apart(one: Peak, other: Peak, points: np.ndarray, circular: np.ndarray) -> bool:
+    spread = np.sqrt(np.maximum(np.diag(one.cov), np.diag(other.cov)))
+    middle = one.mean + 0.5 * _less(other.mean, one.mean, circular)
+
+    def share(centre: np.ndarray) -> float:
+        return float(np.mean(np.all(np.abs(_less(points, centre, circular)) <= NEAR * spread, axis=1)))
+
+    ends = min(share(one.mean), share(other.mean))
+    return ends >= WEIGHT and share(middle) < DIP * ends
+
+
+def _less(one: np.ndarray, other: np.ndarray, circular: np.ndarray) -> np.ndarray:
+    """The difference, of angles by the shorter way."""
+    return np.where(circular, (one - other + np.pi) % (2.0 * np.pi) - np.pi, one - other)
+
+
+def tails(model: StateSpaceModel, log: Log, track: Track, *, marginal: bool) -> tuple[Tail, ...]:
+    """Of every sensor row with readings that were used or refused; `marginal` as in calibration.py."""
+    judged = (log.kind[: len(track)] == READING) & ((track.verdict == USED) | (track.verdict == GATED))
+    found = []
+    for s, sensor in enumerate(model.sensors):
+        own = track.select(np.flatnonzero(judged & (log.channel[: len(track)] == s)))
+        for k in range(len(sensor.rows)):
+            e = standardised(own, k, marginal)
+            e = e[np.isfinite(e)]
+            z = e - np.mean(e) if e.size else e
+            variance = float(np.mean(z**2)) if z.size else 0.0
+            if variance > 0.0:
+                kurtosis = float(np.mean(z**4)) / variance**2 - 3.0
+                far = float(np.mean(np.abs(z) > FAR * np.sqrt(variance)))
+                name = model.row_names[model.row_start[s] + k]
+                found.append(Tail(name, int(e.size), kurtosis, far, jarque_bera(e).p_value))
+    return tuple(found)

@@ -1,0 +1,112 @@
+"""Who is to blame: which single fault explains best what the innovations have shown since an episode began.
+
+A fault of size θ moves the whitened innovations by θ Δν, as a refold with that nudge shows. Against what was seen,
+
+    θ̂ = Σ Δνᵀν / Σ ΔνᵀΔν,   log Λ = ½ (Σ Δνᵀν)² / Σ ΔνᵀΔν
+
+is its most likely size and how much likelier than no fault it makes what was seen. A size says by how much a sensor, or
+what the filter is told or believes, is off. Faults that nothing in the data
+tells apart have the same log Λ, and are named together.
+
+Source: Willsky & Jones (1976), doi:10.1109/TAC.1976.1101146, the generalised likelihood ratio of additive faults.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ...fold import Fold
+from ...log import Log
+from ...model.state_space import StateSpaceModel
+from ...snapshots import Base
+from ...tuning import Tuning
+from .nudges import Given, Nudge, nudges_of
+from .responses import Start, each, refold, respond, stand_in
+from .size import reason_against
+
+MOST = 4000
+"""Events since the beginning of an episode that are folded again."""
+
+ALIKE = 3.0
+"""Nats within which one fault explains as much as another: twenty times as likely is another matter."""
+
+TELLING = 5.0
+"""Nats below which nothing is explained."""
+
+
+class Suspect(NamedTuple):
+    """A fault that may be the cause: its most likely size with its standard deviation, and log Λ against no fault."""
+
+    nudge: Nudge
+    size: float
+    deviation: float
+    gain: float
+
+
+def suspects(
+    estimator: str,
+    model: StateSpaceModel,
+    tuning: Tuning,
+    log: Log,
+    since: float,
+    *,
+    base: Base | None = None,
+    executor: Executor | str | None = "threads",
+) -> list[Suspect]:
+    """The faults that may explain what has happened since a time, the likeliest first.
+
+    Args:
+        estimator: That ran.
+        model: The model.
+        tuning: That ran.
+        log: What was folded; nothing is changed.
+        since: Beginning of the episode, s.
+        base: Where the log's fold starts, if not at the prior.
+        executor: See `sensitivity`.
+
+    Returns:
+        Every sensor row, input and parameter by log Λ; none where nudges do not apply (see `sensitivity`).
+    """
+    first = int(np.searchsorted(log.t[: log.n], round(since * 1e9)))
+    cut = log.copy()
+    cut.n = min(log.n, first + MOST)
+    if first >= cut.n or reason_against(model, cut):
+        return []
+    begun = _start(estimator, model, tuning, cut, base, first)
+    seen = np.nan_to_num(begun.track.whitened)
+    found = []
+    for response in each(lambda nudge: respond(begun, nudge), nudges_of(model, tuning, begun.given.log), executor):
+        moved = np.nan_to_num(response.whitened)
+        power = float(np.sum(moved**2))
+        if power > 0.0:
+            nudge = response.nudge
+            size = float(np.clip(np.sum(moved * seen) / power, nudge.low, nudge.high))
+            gain = float(size * np.sum(moved * seen) - 0.5 * size**2 * power)
+            found.append(Suspect(nudge, size, power**-0.5, gain))
+    return sorted(found, key=lambda suspect: -suspect.gain)
+
+
+def _start(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, base: Base | None, first: int) -> Start:
+    """The fold from exactly the event `first` on, with the gate open: what it refuses tells most of all."""
+    name, note = stand_in(estimator, model)
+    own = tuning.with_options({}) if name != estimator else tuning
+    fold = Fold(name, model, own, log, base=base)
+    fold.advance(first)
+    here = fold.base_here()
+    still = log.copy()
+    still.drop_front(first)
+    given = Given(replace(own, gate=None), still, here)
+    return Start(name, given, refold(name, given), first, note)
+
+
+def in_words(found: Sequence[Suspect], most: int = 3) -> str:
+    """The likeliest, and those that explain as much; nothing if no single fault explains anything."""
+    if not found or found[0].gain < TELLING:
+        return ""
+    alike = [suspect for suspect in found if found[0].gain - suspect.gain < ALIKE][:most]
+    return " or ".join(suspect.nudge.in_words(suspect.size) for suspect in alike)

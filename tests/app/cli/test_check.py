@@ -1,0 +1,140 @@
+"""`nisus check`: its figures, its page as text and as HTML."""
+
+import json
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from app.cli.check_html import as_html
+from app.cli.check_tables import Bar, Part
+from app.cli.main import main
+
+REQUIRED = {"checklist", "observability", "smallest_visible", "integrity", "held_out", "open_loop"}
+MORE = {"twin", "estimator", "span", "timing", "calibration", "posterior", "linearity", "dimension", "health"}
+
+QUESTIONS = ["linearity", "dimension", "posterior", "observability", "timing", "health", "tuning", "change"]
+
+
+class Page(HTMLParser):
+    """What a browser would make of it: every tag must be closed, and nothing may be fetched."""
+
+    VOID = ("meta", "br", "hr", "img", "link", "input")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: set[str] = set()
+        self.attributes: list[tuple[str, str, str | None]] = []
+        self.text: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        self.attributes += [(tag, name, value) for name, value in attrs]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.add(tag)
+        self.attributes += [(tag, name, value) for name, value in attrs]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def parsed(text: str) -> Page:
+    page = Page()
+    page.feed(text)
+    page.close()
+    assert page.open == []
+    return page
+
+
+@pytest.fixture(scope="module")
+def checked(tmp_path_factory):
+    """JSON, HTML of the smallest twin."""
+    html = tmp_path_factory.mktemp("check") / "check.html"
+    with pytest.MonkeyPatch.context() as patch:
+        printed: list[str] = []
+        patch.setattr("builtins.print", lambda *words, **_: printed.append(" ".join(map(str, words))))
+        assert main(["check", "motor_winding", "--json", "--html", str(html)]) == 0
+    return json.loads(printed[-1]), html.read_text(encoding="utf-8")
+
+
+def test_keys_are_those_that_scripts_read(checked):
+    found, _ = checked
+    assert set(found) == REQUIRED | MORE
+    assert list(found["checklist"]) == QUESTIONS
+    for key, line in found["checklist"].items():
+        assert set(line) == {"key", "question", "answer", "figures", "remedy"} and line["key"] == key
+        assert line["answer"] in ("yes", "partly", "no", "not told") and line["figures"]
+
+
+def test_figures_agree_with_each_other(checked):
+    found, _ = checked
+    (fault,) = found["smallest_visible"]
+    assert (fault["kind"], fault["name"], fault["unit"]) == ("sensor", "winding", "°C")
+    states = found["integrity"]["states"]
+    assert set(states) == {"temperature", "rate"}
+    for state in states.values():
+        assert state["bound"] == pytest.approx(state["bias"] + state["two_sigma"], rel=1e-9)
+    held = found["held_out"]["winding"]
+    # The only sensor: without it nothing is left but the model.
+    assert held["rms"] == held["open_loop"] == found["open_loop"]["sensors"]["winding"]["rms"]
+    assert set(held["coverage"]) == {"50", "90", "95"}
+    # The YAML says what to expect of the filter: 1.04 °C.
+    truth = found["open_loop"]["states"]["temperature"]
+    assert truth["filter"] == pytest.approx(1.04, abs=0.005)
+    assert truth["rms"] > 10.0 and truth["worse"] is False
+    assert found["linearity"]["exact"] and found["linearity"]["passes"]
+    assert found["observability"]["whole"]["rank"] == 2
+    # One in 15 readings is lost, the last of them among these.
+    assert found["timing"]["sensors"]["winding"]["n"] == 112
+    assert sum(found["health"]["share"].values()) == pytest.approx(1.0)
+
+
+def test_html_is_one_file_without_scripts(checked):
+    _, html = checked
+    page = parsed(html)
+    assert not page.tags & {"script", "link", "iframe", "img", "object", "embed", "form", "input"}
+    for tag, name, value in page.attributes:
+        assert name not in ("src", "href", "srcset", "action", "onload", "onclick"), (tag, name, value)
+    assert "url(" not in html and "@import" not in html
+    assert "svg" in page.tags and "table" in page.tags
+    assert "Checklist" in page.text
+
+
+def test_html_escapes_what_users_name():
+    part = Part(
+        'a <b> & "c"', ("<script>alert(1)</script>",), ("<i>",), (("<u>", "yes"),), (Bar("<s>", "°C", 1.0, np.nan),)
+    )
+    page = parsed(as_html("<title>", [Part("head", ()), part]))
+    assert not page.tags & {"script", "b", "i", "u", "s"}
+    assert "<script>alert(1)</script>" in page.text and "<u>" in page.text and "no number" in page.text
+
+
+def test_text_is_the_same_page(capsys):
+    assert main(["check", "motor_winding", "--duration", "20"]) == 0
+    out = capsys.readouterr().out
+    assert "Checklist" in out and "integrity bound" in out and "There is one sensor" in out
+    assert max(map(len, out.splitlines())) <= 160
+
+
+@pytest.mark.parametrize(
+    "name, seconds", [("agv_corridor", 10), ("gripper_contact", 1), ("lorenz96", 1), ("thermal_field", 11)]
+)
+def test_what_does_not_apply_is_said_and_nothing_fails(name, seconds, capsys):
+    assert main(["check", name, "--duration", str(seconds), "--json"]) == 0
+    # Numbers that are none are null: JSON has no NaN.
+    found = json.loads(capsys.readouterr().out, parse_constant=lambda word: pytest.fail(word))
+    assert set(found) == REQUIRED | MORE
+    if name == "thermal_field":
+        assert found["integrity"]["reason"] == found["observability"]["reason"] != ""
+        assert found["checklist"]["linearity"]["answer"] == "not told"
+        assert found["smallest_visible"] == []
+        assert "temperature, all cells" in found["open_loop"]["states"]
+    else:
+        assert found["integrity"]["reason"] == "" and found["smallest_visible"]

@@ -1,0 +1,91 @@
+"""Peaks of clouds whose shape is known, and tails of innovations drawn from known distributions."""
+
+import numpy as np
+import pytest
+
+from estimators.diagnostics.checklist.posterior import FAR, peaks, tails
+from estimators.fold import fold
+from estimators.log import Log
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.tuning import Tuning
+
+
+def still(x, u, p, dt, out):
+    out[0] = x[0]
+
+
+def level(x, u, p, out):
+    out[0] = x[0]
+
+
+def square(x, u, p, out):
+    out[0] = x[0] * x[0]
+
+
+def model(h, variance: float = 1.0) -> StateSpaceModel:
+    return StateSpaceModel(
+        name="one",
+        title="one state",
+        states=(State("x", "m", mean=0.0, std=3.0),),
+        noises=(Noise("x", "m²/s", 0.001),),
+        sensors=(Sensor("y", (Row("y", "m", variance),), h=h),),
+        f=still,
+    )
+
+
+def log_of(one: StateSpaceModel, values) -> Log:
+    log = Log.of(one)
+    log.add("y", np.arange(1.0, len(values) + 1.0), values)
+    return log
+
+
+def test_a_square_leaves_both_roots_and_a_level_one():
+    rng = np.random.default_rng(2)
+    noise = rng.normal(size=40)
+    both = peaks("pf", model(square), Tuning.of(model(square)), log_of(model(square), 16.0 + noise))
+    # After the first reading, which narrows the prior, few particles may differ.
+    assert both.reason == "" and both.looks in (39, 40)
+    # Each root has half the cloud: none dies out over 40 readings, of which resampling takes a few.
+    assert both.several > 0.9 and both.most == 2
+    one = peaks("pf", model(level), Tuning.of(model(level)), log_of(model(level), 4.0 + noise))
+    assert (one.several, one.most) == (0.0, 1)
+
+
+def test_a_cloud_that_collapses_tells_nothing():
+    sharp = model(level, 1e-10)
+    found = peaks("pf", sharp, Tuning.of(sharp), log_of(sharp, np.full(30, 1.0)))
+    assert found.collapsed > 0.5
+    assert "particles of pf differ" in found.reason
+
+
+def test_too_many_states_for_particles():
+    many = StateSpaceModel(
+        name="many",
+        title="many",
+        states=tuple(State(f"x{k}", "m", 0.0, 1.0) for k in range(13)),
+        noises=(Noise("x0", "m²/s", 1.0),),
+        sensors=(Sensor("y", (Row("y", "m", 1.0),), h=level),),
+        f=still,
+    )
+    found = peaks("pf", many, Tuning.of(many), log_of(many, [0.0]))
+    assert found.reason.startswith("13 states are too many")
+
+
+@pytest.mark.parametrize("heavy", [False, True])
+def test_tails_of_a_normal_and_of_a_student(heavy):
+    n = 4000
+    rng = np.random.default_rng(4)
+    # Student's t with five degrees of freedom has an excess kurtosis of 6; a state that hardly moves leaves the noise.
+    noise = rng.standard_t(5, size=n) * np.sqrt(3.0 / 5.0) if heavy else rng.normal(size=n)
+    one = model(level)
+    tuning = Tuning.of(one).set("Q.x", 1e-9)
+    log = log_of(one, noise)
+    (tail,) = tails(one, log, fold("ekf", one, tuning, log), marginal=False)
+    assert tail.n == n and tail.row == "y"
+    assert tail.heavy is heavy
+    if heavy:
+        assert tail.far > 10 * 6.3e-5 and tail.p_value < 1e-9
+    else:
+        # Four standard errors, √(24 / n); one beyond 4 σ is expected in 16,000.
+        assert abs(tail.kurtosis) < 4.0 * np.sqrt(24.0 / n)
+        assert tail.far * n <= 3 and FAR == 4.0

@@ -1,0 +1,78 @@
+"""Who is to blame: single faults of a simulated motor, whose names and sizes are known."""
+
+import numpy as np
+import pytest
+
+from estimators.diagnostics.sensitivity.suspects import in_words, suspects
+from estimators.log import INPUT, READING, Log
+from estimators.models import MODELS
+from estimators.tuning import Tuning
+from sources.simulation.profile import Constant, Steps
+from sources.simulation.simulator import Simulator
+from tests.support import read_all
+
+MODEL = MODELS["motor_drive"]
+SINCE = 60.0
+
+
+@pytest.fixture(scope="module")
+def log():
+    """Two minutes of the motor, drawn from the model that the filter believes, under a load that changes."""
+    inputs = {
+        "i_q": Steps((0.0, 20.0, 70.0, 90.0), (60.0, 200.0, 120.0, 240.0)),
+        "speed": Steps((0.0, 30.0, 80.0), (150.0, 350.0, 200.0)),
+        "coolant": Constant(40.0),
+        "ambient": Constant(22.0),
+    }
+    found = Log.of(MODEL)
+    found.extend(read_all(Simulator(MODEL, seed=4, step=0.1, duration=120.0, inputs=inputs)))
+    return found
+
+
+def blamed(log):
+    return suspects("ekf", MODEL, Tuning.of(MODEL), log, SINCE)
+
+
+def test_nobody_is_blamed_for_what_is_as_it_should_be(log):
+    """Twice log Λ of one fault is χ² with one degree of freedom; the largest of k independent ones stays below this."""
+    found = blamed(log)
+    assert found[0].gain < 0.5 * (2.0 * np.log(len(found)) + 9.0)
+
+
+@pytest.mark.parametrize("sensor", MODEL.sensor_names)
+def test_the_sensor_that_is_off_by_so_much(log, sensor):
+    s, size = MODEL.sensor_names.index(sensor), 1.5
+    wrong = log.copy()
+    late = (wrong.t[: wrong.n] >= SINCE * 1e9) & (wrong.kind[: wrong.n] == READING)
+    wrong.value[: wrong.n][late & (wrong.channel[: wrong.n] == s), 0] += size
+    first = blamed(wrong)[0]
+    assert (first.nudge.kind, first.nudge.name) == ("sensor", sensor)
+    assert abs(first.size - size) < 4.0 * first.deviation
+    assert in_words(blamed(wrong)).startswith(f"sensor {sensor} +")
+
+
+def test_an_input_that_is_off(log):
+    wrong = log.copy()
+    k = MODEL.input_names.index("coolant")
+    given = wrong.kind[: wrong.n] == INPUT
+    # What holds since before is told anew where the fault begins.
+    late = given & (wrong.t[: wrong.n] >= SINCE * 1e9)
+    at = int(np.searchsorted(wrong.t[: wrong.n], round(SINCE * 1e9)))
+    value = np.full((1, MODEL.width), np.nan)
+    value[0, k] = 40.0 + 15.0
+    wrong.value[: wrong.n][late, k] = 55.0
+    wrong.extend(
+        wrong.events.select(slice(at, at + 1))._replace(
+            kind=np.array([INPUT], np.int8), channel=np.array([0], np.int32), value=value
+        )
+    )
+    found = blamed(wrong)
+    coolant = next(suspect for suspect in found if suspect.nudge.name == "coolant")
+    assert found[0].gain - coolant.gain < 3.0 and abs(coolant.size - 15.0) < 4.0 * coolant.deviation
+
+
+def test_what_lasts_is_cut_and_what_is_before_is_left_alone(log):
+    before = [column.copy() for column in log.events]
+    blamed(log)
+    for column, kept in zip(log.events, before, strict=True):
+        np.testing.assert_array_equal(column, kept)
