@@ -16,9 +16,11 @@ from estimators.errors import ConfigError, NisusError
 from estimators.registry import find_estimator
 
 from ..stderr import complain
+from ..stress.bench import Bench, asset_of
+from ..stress.foretold import CHANCE, INVISIBLE, Oracle
 from ..stress.matrix import matrix
 from ..stress.mistake import Mistake
-from ..stress.trial import Bench, Trial, asset_of
+from ..stress.trial import FALSE, MISNAMED, MISSED, NAMED, UNSEEN, Trial, make
 from ..twin.twin import load_twin
 from .arguments import settings
 from .prepare import prepare
@@ -27,7 +29,7 @@ from .progress import progress
 if TYPE_CHECKING:
     from .arguments import Stress as Arguments
 
-WIDTH = 180
+WIDTH = 220
 """Columns of the output where it is not a terminal."""
 
 
@@ -48,6 +50,7 @@ def stress_twin(arguments: Arguments) -> int:
     if arguments.list:
         print("\n".join(item.name for item in mistakes))
         return 0
+    oracle = Oracle(twin, arguments.duration)
     trials: list[Trial] = []
     failed: list[str] = []
     with progress(
@@ -58,7 +61,8 @@ def stress_twin(arguments: Arguments) -> int:
             for name in names:
                 for mistake in mistakes:
                     try:
-                        trials.append(bench.run(mistake, name))
+                        foretold = oracle.foretell(bench, mistake, name)
+                        trials.append(make(bench, mistake, name, foretold))
                     except NisusError as error:
                         failed.append(f"{mistake.name}, {name}, seed {seed}: {error}")
                     on()
@@ -90,23 +94,51 @@ def _print(trials: Sequence[Trial], mistakes: Sequence[Mistake], names: Sequence
     if not console.is_terminal:
         console = Console(width=WIDTH)
     table = Table()
-    for title in ("mistake", "filter"):
+    for title in ("mistake", "filter", "visible from"):
         table.add_column(title, no_wrap=True)
-    for title in ("named after s", "first word s", "green %", "before", "recovered s"):
-        table.add_column(title, justify="right")
-    for title in ("named first", "cause right", "worst state: undamaged, gate, no gate", "in the band %"):
+    table.add_column("outcome", no_wrap=True)
+    for title in ("named after s", "first word s", "green %", "recovered s"):
+        table.add_column(title, justify="right", min_width=6)
+    for title in ("named first", "right", "worst state: undamaged, gate, no gate", "in the band %"):
         table.add_column(title, no_wrap=True)
-    wrong = 0
+    wrong = []
     for mistake in mistakes:
         for name in names:
             own = [trial for trial in trials if (trial.mistake, trial.estimator) == (mistake.name, name)]
             if own:
                 table.add_row(escape(mistake.name), name, *_cells(own, mistake))
-                wrong += _wrong_and_green(own, mistake)
+                if 2 * sum(trial.outcome == MISSED for trial in own) >= len(own):
+                    wrong.append(f"{mistake.name} ({name})")
     console.print(table)
     early = sum(trial.early for trial in trials)
     hours = sum(trial.start for trial in trials) / 3600.0
-    console.print(f"{early} false alarms in {hours:.1f} h before the mistakes; {wrong} rows wrong and green")
+    console.print(f"{early} false alarms in {hours:.1f} h before the mistakes")
+    console.print("\n".join(_summary(trials, mistakes)), markup=False, highlight=False)
+    console.print(f"{len(wrong)} rows wrong and green{': ' if wrong else ''}{', '.join(wrong)}", markup=False)
+
+
+def _summary(trials: Sequence[Trial], mistakes: Sequence[Mistake]) -> list[str]:
+    """What was foretold against what was found, and how rightly that was named."""
+    made = {mistake.name: mistake for mistake in mistakes}
+    real = [trial for trial in trials if made[trial.mistake].causes]
+    found = [trial for trial in real if trial.outcome in (NAMED, MISNAMED)]
+    hidden = [trial for trial in real if trial.foretold == INVISIBLE]
+    chance = [trial for trial in real if trial.foretold == CHANCE]
+    visible = len(real) - len(hidden) - len(chance)
+    sensors = [trial for trial in found if made[trial.mistake].subjects]
+    calm = [trial for trial in trials if not made[trial.mistake].causes]
+    return [
+        f"visible: {visible}, {sum(trial.outcome == MISSED for trial in real)} MISSED; "
+        f"invisible: {len(hidden)}, {sum(trial.outcome != UNSEEN for trial in hidden)} found all the same; "
+        f"by chance: {len(chance)}, {sum(trial.outcome != UNSEEN for trial in chance)} found",
+        f"of {len(found)} found the cause is right in {_share([trial.cause_right for trial in found])}, "
+        f"of {len(sensors)} of one sensor the sensor in {_share([trial.subject_right for trial in sensors])}",
+        f"of {len(calm)} that the log undoes {sum(trial.outcome == FALSE for trial in calm)} were heard of",
+    ]
+
+
+def _share(right: Sequence[bool]) -> str:
+    return f"{100.0 * float(np.mean(right)):.0f} %" if right else "-"
 
 
 def _median(values: Sequence[float | None]) -> str:
@@ -116,9 +148,24 @@ def _median(values: Sequence[float | None]) -> str:
     return f"{middle:.1f}" if np.isfinite(middle) else "never"
 
 
-def _wrong_and_green(own: Sequence[Trial], mistake: Mistake) -> bool:
-    """Whether in the median nothing was said of what should be."""
-    return bool(mistake.causes) and _median([trial.word for trial in own]) == "never"
+def _visible_from(own: Sequence[Trial], mistake: Mistake) -> str:
+    """What was foretold: the size that would be visible beside the mistake's own, or a word."""
+    words = [trial.foretold for trial in own]
+    word = max(sorted(set(words)), key=words.count)
+    multiple = float(np.median([trial.visible_from for trial in own]))
+    if np.isnan(multiple):
+        return word
+    if not np.isfinite(multiple):
+        return "never"
+    if np.isnan(mistake.size):
+        return f"× {multiple:.2g}"
+    return f"{multiple * mistake.size:.2g} of {mistake.size:.2g} {mistake.unit}"
+
+
+def _often(words: Sequence[str]) -> str:
+    """Different words, each with how often it came, the most frequent first."""
+    counts = sorted({(-words.count(word), word) for word in words})
+    return counts[0][1] if len(counts) == 1 else ", ".join(f"{-n} {word}" for n, word in counts)
 
 
 def _cells(own: Sequence[Trial], mistake: Mistake) -> list[str]:
@@ -136,10 +183,11 @@ def _cells(own: Sequence[Trial], mistake: Mistake) -> list[str]:
         error = f"{escape(worst)}: {', '.join(f'{value:.3g}' for value in states[worst])}"
         inside = f"{100 * float(np.median([trial.coverage[worst] for trial in own])):.0f}"
     return [
+        _visible_from(own, mistake),
+        _often([trial.outcome for trial in own]),
         _median([trial.delay for trial in own]) if mistake.causes else "-",
         _median([trial.word for trial in own]),
         f"{100 * float(np.median([trial.green for trial in own])):.0f}",
-        f"{sum(trial.early for trial in own)}",
         "-" if mistake.fault is None else _median([trial.recovery for trial in own]),
         escape(most),
         f"{right}/{len(own)}" if mistake.causes else "-",

@@ -76,15 +76,16 @@ def _of_sensors(model: StateSpaceModel, tuning: Tuning) -> Iterator[Mistake]:
             label = name if row is None else f"{name}.{row}"
             for size in (2.0, 5.0, 20.0):
                 fault = _fault("bias", sensor=name, row=row, size=size * std)
-                yield Mistake(f"{label} +{size:g} σ", SHIFT, own, fault=fault)
+                plain = Mistake(f"{label} +{size:g} σ", SHIFT, own, fault=fault, shifts=True)
+                yield replace(plain, size=size * std, unit=sensor.rows[0].unit)
             drift = _fault("drift", sensor=name, row=row, size=0.1 * std)
-            yield Mistake(f"{label} drifts 1 σ in 10 s", SHIFT | {"correlated"}, own, fault=drift)
+            yield Mistake(f"{label} drifts 1 σ in 10 s", SHIFT | {"correlated"}, own, fault=drift, shifts=True)
             noisy = _fault("noise", sensor=name, row=row, size=3.0 * std)
             yield Mistake(f"{label} noise x3", frozenset({"narrow", "refused"}), own, fault=noisy)
             spikes = _fault("spike", sensor=name, row=row, size=10.0 * std, rate=0.01)
             yield Mistake(f"{label} spikes 1 %", frozenset({"spiky"}), own, fault=spikes)
             scaled = _fault("scale", sensor=name, row=row, size=1.1)
-            yield Mistake(f"{label} x1.1", MODEL, own, fault=scaled)
+            yield Mistake(f"{label} x1.1", MODEL, own, fault=scaled, shifts=True)
         yield Mistake(f"{name} stuck", frozenset({"stuck"}), own, fault=_fault("stuck", sensor=name))
         lost = _fault("silence", sensor=name)
         if len(model.sensors) > 1:
@@ -96,7 +97,7 @@ def _of_sensors(model: StateSpaceModel, tuning: Tuning) -> Iterator[Mistake]:
     if pair is not None:
         first, second = pair
         swapped = _fault("swap", sensor=first, other=second)
-        yield Mistake(f"{first} and {second} swapped", MODEL, frozenset(pair), fault=swapped)
+        yield Mistake(f"{first} and {second} swapped", MODEL, frozenset(pair), fault=swapped, shifts=True)
 
 
 def _silent(model: StateSpaceModel) -> Callable[[float, float], list[Fault]]:
@@ -123,11 +124,13 @@ def _of_inputs(model: StateSpaceModel, events: Events) -> Iterator[Mistake]:
         size = float(0.5 * np.ptp(values)) or float(0.25 * np.abs(values).mean())
         if size:
             biased = _fault("bias", input=item.name, size=size)
-            yield Mistake(f"{item.name} +{size:.3g} {item.unit}", INPUT_WRONG, fault=biased)
+            name = f"{item.name} +{size:.3g} {item.unit}"
+            yield Mistake(name, INPUT_WRONG, fault=biased, size=size, unit=item.unit, shifts=True)
             scaled = _fault("scale", input=item.name, size=1.3)
-            yield Mistake(f"{item.name} x1.3", INPUT_WRONG, fault=scaled)
+            yield Mistake(f"{item.name} x1.3", INPUT_WRONG, fault=scaled, shifts=True)
         if np.ptp(values):
-            yield Mistake(f"{item.name} lost", INPUT_WRONG, fault=_fault("silence", input=item.name))
+            lost = _fault("silence", input=item.name)
+            yield Mistake(f"{item.name} lost", INPUT_WRONG, fault=lost, shifts=True)
 
 
 def _of_time(model: StateSpaceModel) -> Iterator[Mistake]:
@@ -154,7 +157,7 @@ def _of_model(model: StateSpaceModel, tuning: Tuning, asset: bool) -> Iterator[M
             continue  # out of the range in which it makes sense
         if not value:
             continue
-        believed = Mistake(f"{item.name} believed +30 %", MODEL | LARGE_BANDS, belief={key: 1.3})
+        believed = Mistake(f"{item.name} believed +30 %", MODEL | LARGE_BANDS, belief={key: 1.3}, shifts=True)
         yield believed
         if asset:
             changed = _fault("model", parameter=item.name, size=1.3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from math import nan
 from typing import TYPE_CHECKING
 
 from estimators.diagnostics.episodes import Episode
@@ -23,6 +24,10 @@ class Mistake:
     a window (start, end) in seconds of the log. An episode has the right cause if its key is among `causes`, and the
     right subject if its subject, or the sensor whose row that is, is among `subjects`. A mistake without causes is none
     that should be heard of.
+
+    `size` in `unit`: of a mistake that adds a constant to a sensor or an input, for those who compare. `shifts`:
+    whether it moves the means of the innovations alone, by as much in every log; else it changes their noise, or what
+    comes when.
     """
 
     name: str
@@ -31,6 +36,9 @@ class Mistake:
     belief: Mapping[str, float] = field(default_factory=dict)
     fault: Callable[[float, float], list[Fault]] | None = None
     of_asset: bool = False
+    size: float = nan
+    unit: str = ""
+    shifts: bool = False
 
     def right_cause(self, episode: Episode) -> bool:
         """Whether the cause that an episode names is one of this mistake's."""

@@ -6,12 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimators.diagnostics.episodes import Episode
+from estimators.diagnostics.episodes import Episode, episodes
 from estimators.log import READING
 from estimators.track import TRACKING, WAITING
 
 if TYPE_CHECKING:
     from estimators.fold import Fold
+
+SAME = 1_000_000_000
+"""ns between two episodes of one subject and cause that are the same, with a mistake and without."""
 
 
 def green(fold: Fold) -> np.ndarray:
@@ -43,12 +46,35 @@ def said_at(fold: Fold, episode: Episode) -> int:
     return int(log.t[rows[0]]) if rows.size else round(episode.start * 1e9)
 
 
-def first_word(fold: Fold, start: int) -> float | None:
-    """Seconds from `start` (ns) to the first row that is not green, once a reading has come; None if all stay green."""
+def first_word(fold: Fold, start: int, calm: Fold | None = None) -> float | None:
+    """Seconds from `start` (ns) to the first row that is not green, once a reading has come; None if all stay green.
+
+    Where `calm`, the fold without the mistake, was not green either at that time, nothing is said of the mistake.
+    """
     t, ok = fold.log.t[: fold.n], green(fold)
     waiting = fold.track.health[: fold.n] == WAITING
-    rows = np.flatnonzero(~ok & ~waiting & (t >= start))
+    said = ~ok & ~waiting & (t >= start)
+    if calm is not None:
+        before = np.searchsorted(calm.log.t[: calm.n], t, side="right") - 1
+        said &= green(calm)[np.maximum(before, 0)]
+    rows = np.flatnonzero(said)
     return int(t[rows[0]] - start) / 1e9 if rows.size else None
+
+
+def heard_in(fold: Fold, calm: Fold) -> list[tuple[int, Episode]]:
+    """Episodes and when each was first heard of, ns of the log; not those that were heard of without the mistake."""
+    known = [(said_at(calm, item), item) for item in episodes(calm)]
+    return sorted(
+        (
+            (at, item)
+            for at, item in ((said_at(fold, item), item) for item in episodes(fold))
+            if not any(
+                (item.subject, item.cause) == (other.subject, other.cause) and abs(at - when) < SAME
+                for when, other in known
+            )
+        ),
+        key=lambda pair: pair[0],
+    )
 
 
 def green_share(fold: Fold, start: int, end: int) -> float:

@@ -27,6 +27,9 @@ LOOKED_AT = 4000
 """Readings of an episode, and before it, of which the size is made."""
 
 
+WANDERING = 0.5
+"""Lag-1 correlation from which innovations that are too large are those of a mean that moves: noise does not wander."""
+
 MOST = 0.5
 """Share of refused readings from which an episode is one of refusals."""
 
@@ -244,10 +247,12 @@ def _most_telling(
 ) -> tuple[int, int, int, list[Effect]]:
     """The row that shows most of what is wrong, the readings from when to when, and what it shows, the likeliest first.
 
-    A test falls more slowly than its cause goes: an episode that is over ended where that is most likely.
+    A test falls more slowly than its cause goes: an episode that is over ended where that is most likely. What moves
+    one way and then back has no mean over the whole: where innovations wander, the part that is shifted tells more.
     """
     first = max(0, begin - LOOKED_AT)
     best: tuple[int, int, int, list[Effect]] = (int(said[0]) if said.size else 0, begin, end, [_UNKNOWN])
+    shifted = best
     for k in said:
         e = standardised(course, rows[first:end], int(k))
         known = np.flatnonzero(np.isfinite(e))
@@ -260,8 +265,19 @@ def _most_telling(
             run = e[begun : begun + LOOKED_AT]
             over = max(begun + run.size - onset(run[::-1], cause), min(alarm + 1, begun + run.size))
             ranked = effects(e[begun:over])
-            if ranked[0].cause == cause and ranked[0].ratio > best[3][0].ratio:
-                best = int(k), first + int(known[begun]), first + int(known[over - 1]) + 1, ranked
+            if ranked[0].cause != cause:
+                continue
+            found = int(k), first + int(known[begun]), first + int(known[over - 1]) + 1, ranked
+            if ranked[0].ratio > best[3][0].ratio:
+                best = found
+            if cause == "shifted" and ranked[0].ratio > shifted[3][0].ratio:
+                shifted = found
+    ranked = best[3]
+    wanders = any(item.cause == "correlated" and item.size >= WANDERING for item in ranked)
+    if ranked[0].cause == "narrow" and wanders:
+        if np.isfinite(shifted[3][0].ratio):
+            return shifted
+        return (*best[:3], sorted(ranked, key=lambda item: item.cause != "correlated"))
     return best
 
 

@@ -69,30 +69,40 @@ class Witness(NamedTuple):
         least = self.best(whitened)
         if not self.bank or not np.isfinite(least):
             return least
+        rows = self._of_rows(standardised)
+        low = high = least
+        while not self._bank_sees(rows, high, self.z):
+            low, high = high, 2.0 * high
+            if high > WIDEST * least:
+                return np.inf
+        for _ in range(HALVINGS if high > low else 0):
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if self._bank_sees(rows, middle, self.z) else (middle, high)
+        return high
+
+    def sees(self, standardised: np.ndarray) -> tuple[bool, bool]:
+        """Whether the bank sees a change, Δν over σ (N, ny), with the probability asked for, and with its complement.
+
+        What it does not even see with the complement is invisible; between them chance decides.
+        """
+        rows = self._of_rows(standardised)
+        return self._bank_sees(rows, 1.0, self.z), self._bank_sees(rows, 1.0, -self.z)
+
+    def _of_rows(self, standardised: np.ndarray) -> list[np.ndarray]:
+        """Shifts of each sensor row as the bank sees them, the correlation that was normal taken out."""
         rows = []
         for row, (place, k) in enumerate(zip(self.places, self.columns, strict=True)):
             m = np.nan_to_num(standardised[place, k]) / self.baseline[row, 1]
             phi = self.baseline[row, 2]
             before = np.concatenate([np.zeros(1), m[:-1]])
             rows.append((m - phi * before) / np.sqrt(1.0 - phi * phi))
+        return rows
+
+    def _bank_sees(self, rows: list[np.ndarray], size: float, z: float) -> bool:
         peaks = self.baseline[:, 3 : 3 + len(RATIOS)]
-
-        def seen(size: float) -> bool:
-            return any(
-                bool(passes(size * m, RATIOS, h, peak, self.z))
-                for m, h, peak in zip(rows, self.h, peaks, strict=True)
-                if m.size
-            )
-
-        low = high = least
-        while not seen(high):
-            low, high = high, 2.0 * high
-            if high > WIDEST * least:
-                return np.inf
-        for _ in range(HALVINGS if high > low else 0):
-            middle = 0.5 * (low + high)
-            low, high = (low, middle) if seen(middle) else (middle, high)
-        return high
+        return any(
+            bool(passes(size * m, RATIOS, h, peak, z)) for m, h, peak in zip(rows, self.h, peaks, strict=True) if m.size
+        )
 
 
 def tests_of(
@@ -156,7 +166,7 @@ def passes(shifts, ratios, h, peaks, z):
             # What one e does to its own step and to the next may add up.
             slope = abs(2.0 * a * m + b * old + d) + abs(b * m + 2.0 * c * old)
             variance += slope * slope + 2.0 * (a * a + c * c) + b * b
-            if total >= limit and total - z * np.sqrt(variance) >= limit:
+            if total - z * np.sqrt(variance) >= limit:
                 return True
             old = m
     return False
