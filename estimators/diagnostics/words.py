@@ -129,8 +129,10 @@ def of_silence(model: StateSpaceModel, s: int, cause: str, start: float, lasted:
     """A sensor that says nothing since `start`, or said nothing for `lasted` seconds."""
     name = model.sensors[s].name
     if lasted is not None:
-        first = "was heard for the first time after" if cause == "never heard" else f"was silent {since(start)} for"
-        return f"{name} {first} {lasted:.3g} s: {_lost(model, s)}; look at its wiring and its bus if that is too long"
+        what = f"was silent for {lasted:.3g} s {since(start)}"
+        if cause == "never heard":
+            what = f"was heard for the first time after {lasted:.3g} s"
+        return f"{name} {what}: {_lost(model, s)}; look at its wiring and its bus if that is too long"
     if cause == "never heard":
         return f"{name} was never heard: {_lost(model, s)}; check its channel map and its bus"
     return f"{name} is silent {since(start)}: {_lost(model, s)}; check its wiring and its bus"

@@ -195,8 +195,8 @@ def test_silence():
     assert len(found) == 1
     assert (each.subject, each.start, each.end, each.unit) == ("gauge", BEGIN, END + 1.0, "s")
     assert each.size == END + 1 - BEGIN
-    said = f"gauge is silent since {BEGIN}.0 s: other sensors see the same states; check its wiring and its bus"
-    assert each.text == said
+    said = f"gauge was silent for {END + 1 - BEGIN} s since {BEGIN}.0 s: other sensors see the same states; "
+    assert each.text == said + "look at its wiring and its bus if that is too long"
 
 
 def test_a_sensor_that_should_speak_and_never_does():
