@@ -35,7 +35,7 @@ from .interpreted import fold_loop
 from .interpreted.black_box_filters import driven
 from .interpreted.fold_loop import LONGEST, UNSET
 from .interpreted.view import View
-from .log import BEFORE, INPUT, MAINTENANCE, READING, TICK, TRUTH, Log
+from .log import BEFORE, INPUT, MAINTENANCE, MARK, READING, TICK, TRUTH, Log
 from .model.mode_as_number import indicator
 from .model.state_space import LARGE, StateSpaceModel
 from .numerics.peaks import Peak
@@ -509,7 +509,7 @@ class Fold:
         """Of what stands before event `n`; after a query, of what it was answered with."""
         assert self.pictures is not None
         last = self.n - 1
-        query = self.log.kind[last] in (TRUTH, TICK)
+        query = self.log.kind[last] in (TRUTH, TICK, MARK)
         if query and self._asked != last:
             evidence = self._evidence.copy()
             self._run_events(last, self.n)

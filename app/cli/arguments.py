@@ -136,6 +136,8 @@ class Commission:
     """Recordings to read instead of the twin's own."""
     duration: float | None = None
     """Take only this many seconds of the source."""
+    force: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Take the data for normal although sensors are refused or stuck in them, or the twin is lost."""
     write: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Put the section `commissioned` into the twin's YAML, in place of the one that is there."""
 

@@ -8,9 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from estimators.diagnostics.commission import Normal, commission
 from estimators.errors import ConfigError
 from estimators.fold import Fold
+from estimators.log import READING
+from estimators.track import DIVERGED, FAILED, GATED, SCREENED, STALE
 
 from ..engine.stall import interruptible
 from ..twin.twin import load_twin
@@ -20,6 +24,12 @@ from .prepare import prepare
 
 if TYPE_CHECKING:
     from .arguments import Commission as Arguments
+
+MOST = 0.1
+"""Share of readings refused, of rows lost, or of one value in a row, beyond which data are not in order."""
+
+LONGEST = 50
+"""Equal readings in a row that are never too many."""
 
 SECTION = re.compile(r"^commissioned:.*(?:\n|\Z)(?:(?:[ \t]*(?:#.*)?\r?\n)*[ \t]+[^\s#].*(?:\n|\Z))*", re.MULTILINE)
 """The section in a YAML: its key and the lines under it, to the last that is indented; a comment after that belongs to
@@ -36,6 +46,11 @@ def commission_twin(arguments: Arguments) -> int:
     # What is normal is told from white innovations, not from what was normal before.
     fold = Fold(twin.estimator, twin.model, replace(twin.tuning, baseline=None), log, policy=twin.policy)
     interruptible(fold, fold.advance)
+    broken = against(fold)
+    if broken and not arguments.force:
+        raise ConfigError(
+            f"{twin.name}: {broken}; commission on data on which everything was in order, or --force it to be normal"
+        )
     text = lines(commission(fold, fold.evidence))
     if not arguments.write:
         print(text, end="")
@@ -43,6 +58,28 @@ def commission_twin(arguments: Arguments) -> int:
     write(twin.path, text)
     print(f"{twin.path}: commissioned on {log.n} events of {twin.name}, {twin.estimator}")
     return 0
+
+
+def against(fold: Fold) -> str:
+    """Why a fold cannot be what is normal, in one line; nothing if it can."""
+    model, log, track = fold.model, fold.log, fold.track
+    lost = float(np.mean((track.health == DIVERGED) | (track.health == STALE)))
+    if lost > MOST:
+        return f"the twin is diverged or stale for {100 * lost:.0f} % of its rows"
+    for s, sensor in enumerate(model.sensors):
+        rows = np.flatnonzero((log.kind[: fold.n] == READING) & (log.channel[: fold.n] == s))
+        if not rows.size:
+            continue
+        refused = float(np.mean(np.isin(track.verdict[rows], (GATED, FAILED, SCREENED))))
+        if refused > MOST:
+            return f"{100 * refused:.0f} % of the readings of {sensor.name} are refused"
+        for k, row in enumerate(sensor.rows):
+            value = log.value[rows, k]
+            changes = np.flatnonzero(np.diff(value, prepend=np.nan, append=np.nan) != 0.0)
+            longest = int(np.max(np.diff(changes))) if changes.size > 1 else 0
+            if longest > max(LONGEST, MOST * rows.size):
+                return f"{row.name} of {sensor.name} says the same {longest} times in a row"
+    return ""
 
 
 def lines(normals: Mapping[str, Normal]) -> str:

@@ -27,7 +27,7 @@ from ..engine.stall import interruptible
 from ..intake import Intake
 from ..twin.twin import Twin, load_twin
 from .arguments import settings
-from .fold_episodes import blamed, episode_lines
+from .fold_episodes import blamed, dropped, episode_lines
 from .fold_report import as_dict, as_text, calibration_of
 from .prepare import prepare
 from .remarks import remarking
@@ -118,7 +118,7 @@ def fold_twin(arguments: Arguments) -> int:
     pictures = fold.pictures.taken if fold.pictures is not None else []
     result = score(fold.track, log.events, twin.model, pictures, gate=twin.tuning.gate)
     found = calibration_of(twin, fold)
-    told = blamed(fold, episodes(fold))
+    told = blamed(fold, [*dropped(counts, fold), *episodes(fold)])
     if arguments.out is not None:
         _write(arguments.out, twin, log, fold.track, pictures, [item.episode for item in told])
     if arguments.json:

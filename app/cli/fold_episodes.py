@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from estimators.diagnostics.episodes import Episode, episode_json
 from estimators.diagnostics.sensitivity.suspects import ALIKE, TELLING, Suspect, in_words, suspects
 from estimators.errors import NisusError
 from estimators.fold import Fold
+from estimators.log import READING
+
+from ..intake import WRONG_TIME
 
 SHOWN = 10
 
@@ -21,6 +27,25 @@ class Told(NamedTuple):
 
     episode: Episode
     suspects: tuple[Suspect, ...]
+
+
+MANY = 0.05
+"""Share of readings that never came into the log from which nothing that it says is to be trusted."""
+
+
+def dropped(counts: Mapping[str, int], fold: Fold) -> list[Episode]:
+    """An episode of what was dropped before the log, if that was much."""
+    lost = counts.get("stale", 0) + counts.get(WRONG_TIME, 0)
+    kept = int(np.sum(fold.log.kind[: fold.n] == READING))
+    share = lost / max(1, lost + kept)
+    if share < MANY:
+        return []
+    t = fold.log.t[: fold.n] * 1e-9
+    text = (
+        f"{100 * share:.0f} % of the readings were dropped, {lost} of {lost + kept}: too late, or with a time that cannot "
+        "be true; check the times of the source, or lengthen time.horizon"
+    )
+    return [Episode(float(t[0]), None, "twin", "dropped", share, math.nan, math.nan, "", text)]
 
 
 def blamed(fold: Fold, episodes: Sequence[Episode]) -> list[Told]:

@@ -313,9 +313,7 @@ class Engine:
                 t=int(log.t[last]) if last >= 0 else None,
                 health=health,
                 since=int(log.t[last_run(track.health)]) if last >= 0 else None,
-                cause=self._blame.told(leading).text
-                if leading is not None and health not in (WAITING, TRACKING)
-                else "",
+                cause=self._cause(leading, health) if last >= 0 else self._silence.cause,
                 sensors=account.of_sensors(self.model.sensor_names, states),
                 episodes_open=len(account.lasting),
                 lost=self._alerts.lost,
@@ -343,6 +341,10 @@ class Engine:
             )
         self._status = (time.monotonic(), status)
         return status
+
+    def _cause(self, leading: Episode | None, health: int) -> str:
+        """Why the twin is not to be trusted now."""
+        return self._blame.told(leading).text if leading is not None and health not in (WAITING, TRACKING) else ""
 
     def _window(self) -> Window | None:
         """What the integrity bounds are computed from; nothing while a refold is waited for."""

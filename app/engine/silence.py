@@ -24,6 +24,13 @@ class Silence:
         """Of a twin that has heard nothing."""
         return STALE if self._told else WAITING
 
+    @property
+    def cause(self) -> str:
+        """Why the twin is stale that has heard nothing; nothing while it waits."""
+        if not self._told:
+            return ""
+        return f"nothing has come since the twin started, {self._clock() - self._since:.0f} s ago; check the source"
+
     def look(self, *, live: bool) -> None:
         """Nothing has come yet. A recording may be held; of a bus that is silent so long people are told, once."""
         if live and not self._told and self._clock() - self._since > self._after:

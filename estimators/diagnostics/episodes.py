@@ -14,7 +14,7 @@ import numpy as np
 
 from ..log import INPUT, READING, TRUTH, Events, Log, truth_of
 from ..model.state_space import Input, State, StateSpaceModel
-from ..track import DIVERGED, GATED, HEALTH_NAMES, STALE, USED, Track
+from ..track import DIVERGED, GATED, HEALTH_NAMES, REASONS, SCREENED, STALE, USED, Track
 from ..tuning import Tuning
 from .effects import KINDS, Effect, common_scale, effects, onset
 from .evidence import AGREEING, DISAGREEING, IMPOVERISHED, MISSED, OUTSIDE, REFUSED, SENSORS, STUCK
@@ -35,8 +35,8 @@ MOST = 0.5
 
 
 CAUSES = (
-    "shifted", "narrow", "wide", "correlated", "alternating", "spiky", "refused", "stuck", "disagreeing", "agreeing",
-    "silent", "never heard", "missed", "outside", "impoverished", "stale", "diverged",
+    "shifted", "narrow", "wide", "correlated", "alternating", "spiky", "refused", "screened", "stuck", "disagreeing",
+    "agreeing", "silent", "never heard", "missed", "outside", "impoverished", "stale", "diverged", "dropped",
 )  # fmt: skip
 """Of episodes; each has its heading in ALARMS.md."""
 
@@ -197,16 +197,27 @@ def _of_sensor(
     k, begun, over, ranked = _most_telling(course, s, rows, np.flatnonzero(said), begin, end, lasts)
     effect = ranked[0]
     cause, size, low, high = effect.cause, effect.size, effect.low, effect.high
+    reasons = ""
     values, verdict = events.value[rows], track.verdict[rows]
     stuck = np.flatnonzero(said & STUCK)
     refused = np.flatnonzero(said & REFUSED)
     # A gate that refuses some readings has a reason that shows in the others.
-    if refused.size:
+    edge = verdict[begin:end] == SCREENED
+    if refused.size and np.mean(edge) >= MOST:
+        refused = refused[:0]
+        cause, k = "screened", int(np.argmax((track.screened[rows[begin:end]] != 0).sum(axis=0)))
+        begun = begin - int(np.argmax(verdict[:begin][::-1] != SCREENED)) if np.any(verdict[:begin] != SCREENED) else 0
+        over = end if lasts else begin + int(np.flatnonzero(edge)[-1]) + 1
+        size, low, high = float(np.mean(verdict[begun:over] == SCREENED)), np.nan, np.nan
+    elif refused.size:
         # Other tests fall more slowly: those readings are in order already.
         until = int(np.flatnonzero((masks[begin:end] & REFUSED).any(axis=1))[-1]) + 1
         if np.mean(verdict[begin : begin + until] == GATED) < MOST:
             refused = refused[:0]
-    if stuck.size:
+    if cause == "screened":
+        bits = int(np.bitwise_or.reduce(track.screened[rows[begun:over], k]))
+        reasons = " and ".join(reason for place, reason in enumerate(REASONS) if bits >> place & 1)
+    elif stuck.size:
         k, cause = int(stuck[0]), "stuck"
         begun = _same_since(values[:, k], begin)
         others = np.flatnonzero(values[begun:end, k] != values[begun, k])
@@ -238,7 +249,7 @@ def _of_sensor(
         low=low,
         high=high,
         unit=unit.get(cause, ""),
-        text=of_sensor(model, course.tuning, s, k, cause, size, about, correlation, start),
+        text=of_sensor(model, course.tuning, s, k, cause, size, about, correlation, start, reasons),
     )
 
 

@@ -3,7 +3,7 @@
 Under the model the standardised innovations e of a row are N(0, 1) and white. Each way of being wrong is another
 density of e given the one before, and the cumulated log-likelihood ratio tests it:
 
-    W ← min(max(W, 0) + log Λ, cap);  alarm when W ≥ h,  over when W < ¾ h
+    W ← min(max(W, 0) + log Λ, cap);  alarm when W ≥ h,  over when W < 0.85 h
 
 With h = log(readings between false alarms × tests) the mean time between false alarms of the whole bank is at least
 what was asked for, whatever is wrong and however long it lasts. The test that speaks names the cause.
@@ -98,10 +98,10 @@ REPEATING = 0.999
 UNKNOWN_QUANTUM = 0.5
 """Probability of a repeated value that is granted to a sensor which has never changed: its quantum is not known yet."""
 
-SPARE = 3.0
+SPARE = 1.0
 """By which W may pass its threshold, so that it falls again when the cause has gone."""
 
-LASTING = 0.75
+LASTING = 0.85
 """Share of the threshold above which an alarm lasts."""
 
 MISSES, MISSES_NO_MORE = 4.5, 3.0

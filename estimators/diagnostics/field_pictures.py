@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..log import TRUTH, Log
+from ..log import MARK, TRUTH, Log
 from ..model.field import Field
 from ..numerics.quantiles import normal_quantile
 
@@ -65,13 +65,16 @@ class Pictures:
             return False
         if self.period is not None and log.t[n] // self.period != log.t[n - 1] // self.period:
             return True
-        return bool(log.kind[n - 1] == TRUTH) and self._most_of(self._told(log, n))
+        last = n - 1
+        while last > 0 and log.kind[last] == MARK:  # the stamp of a fault tells nothing, and comes after what is told
+            last -= 1
+        return bool(log.kind[last] == TRUTH) and self._most_of(self._told(log, n))
 
     def next(self, log: Log, n: int, end: int) -> int:
         """The first event after `n` before which one is due; `end` if there is none."""
         t, kind = log.t[n:end], log.kind[n:end]
         new = t[1:] != t[:-1]
-        likely = new & (kind[:-1] == TRUTH)
+        likely = new & ((kind[:-1] == TRUTH) | (kind[:-1] == MARK))
         if self.period is not None:
             likely |= new & (t[1:] // self.period != t[:-1] // self.period)
         for k in np.flatnonzero(likely):

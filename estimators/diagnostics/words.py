@@ -69,6 +69,7 @@ def of_sensor(
     about: float,
     correlation: float,
     start: float,
+    reasons: str = "",
 ) -> str:
     """An episode of row k of sensor s.
 
@@ -82,6 +83,7 @@ def of_sensor(
         about: Mean of the innovations, in the row's unit.
         correlation: Their lag-1 correlation.
         start: When it began, s.
+        reasons: Limits that the readings break, of one that is screened.
     """
     sensor = model.sensors[s]
     row = sensor.rows[k]
@@ -111,6 +113,9 @@ def of_sensor(
     if cause == "refused":
         what = f"{name} is refused by the gate {when} ({100 * size:.0f} % of its readings)"
         return f"{what}: the sensor is wrong, or the twin is; Reset, or hold {sensor.name} out"
+    if cause == "screened":
+        what = f"{name} breaks its limits ({reasons}) {when}: {100 * size:.0f} % of its readings are not used"
+        return f"{what}; {_lost(model, s)}; look at the sensor, or at sensors.{sensor.name} in the YAML"
     if cause == "stuck":
         return f"{name} is stuck at {size:.6g} {unit} {when}: {_lost(model, s)}; hold it out until it is mended"
     if cause == "disagreeing":

@@ -40,7 +40,7 @@ def stubborn(name):
     made = twin()
     made.estimator = name
     options = {option.name: OPTIONS[option.name] for option in ESTIMATORS[name].options if option.name in OPTIONS}
-    tuning = made.tuning.set("gate", 0.9973).set("Q.temperature", 1e-4).set("Q.rate", 1e-8)
+    tuning = made.tuning.set("gate", 0.9973).set("gate.reopen", None).set("Q.temperature", 1e-4).set("Q.rate", 1e-8)
     made.tuning = tuning.with_options(options)
     return made
 

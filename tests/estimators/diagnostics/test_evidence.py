@@ -107,15 +107,15 @@ N_TESTS = 4 * PER_ROW + 6
 
 
 class Cusum:
-    """W ← min(max(W, 0) + log Λ, threshold + 3); one reading is worth half of h at most."""
+    """W ← min(max(W, 0) + log Λ, threshold + 1); one reading is worth half of h at most."""
 
     def __init__(self, cause):
         self.cause, self.W = cause, 0.0
 
     def put(self, ratio, h, peak, before):
         threshold = h + peak
-        self.W = min(max(self.W, 0.0) + min(ratio, 0.5 * h), threshold + 3.0)
-        self.on = self.W >= threshold or self.W >= 0.75 * threshold and self.cause in before
+        self.W = min(max(self.W, 0.0) + min(ratio, 0.5 * h), threshold + 1.0)
+        self.on = self.W >= threshold or self.W >= 0.85 * threshold and self.cause in before
         return {self.cause} if self.on else set()
 
 

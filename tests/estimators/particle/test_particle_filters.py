@@ -360,7 +360,7 @@ def test_snapshots_of_large_states_keep_to_their_memory(monkeypatch):
     small = Fold("pf", model, tuning, log)
     small.advance()
     assert len(plain._snapshots._kept) > 20
-    assert sum(state.nbytes for _, _, state, _ in small._snapshots._kept.values()) <= 12 * plain._state.nbytes
+    assert sum(kept.state.nbytes for kept in small._snapshots._kept.values()) <= 12 * plain._state.nbytes
     small.rewind(2000)
     assert small.n <= 2000
     small.advance()
