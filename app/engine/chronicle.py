@@ -44,7 +44,8 @@ JOINS = {"sensor": JOINED, "truth": JOINED, "range": JOINED}
 """Rows without an alarm that an episode bridges, by what is tested."""
 
 RANKS = {
-    "diverged": 0, "stale": 1, "never heard": 2, "silent": 2, "stuck": 2, "refused": 2, "screened": 2, "missed": 3, "shifted": 3,
+    "diverged": 0, "stale": 1, "never heard": 2, "silent": 2, "stuck": 2, "refused": 2, "screened": 2, "missed": 3,
+    "shifted": 3,
 }  # fmt: skip
 """How bad causes are, the worst first; the others come last."""
 

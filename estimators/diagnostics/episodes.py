@@ -20,7 +20,7 @@ from .effects import KINDS, Effect, common_scale, effects, onset
 from .evidence import AGREEING, DISAGREEING, IMPOVERISHED, MISSED, OUTSIDE, REFUSED, SENSORS, STUCK
 from .words import of_particles, of_sensor, of_silence, of_truth, of_twin, since
 
-JOINED = 30
+JOINED = 100
 """Readings without an alarm after which another is another episode."""
 
 LOOKED_AT = 4000

@@ -114,7 +114,8 @@ def test_what_began_before_the_rows_that_are_kept_is_carried_on(engine, asset):
         if chronicle._tail.first > 337:
             starts.add(chronicle.account.episodes[0].start)
     (expected,), (found,) = whole(engine), chronicle.account.episodes
-    assert (found.end, found.subject) == (expected.end, expected.subject)
+    # Where it ended is sought in the rows that are kept, which do not reach back to its beginning.
+    assert found.subject == expected.subject and expected.end <= found.end < expected.end + 128
     # Its onset was sought in what came before it was carried on, and stays what it was.
     assert starts == {found.start} and abs(found.start - expected.start) < 64
     assert chronicle._tail.n <= 128
@@ -128,13 +129,13 @@ def test_another_revision_begins_anew_and_says_nothing_twice(asset):
         t, y = asset
         source.put(readings(t[:400], y[:400]))
         wait_for(lambda: any(episode.end is None for episode in engine.episodes()))
-        lines = sum("too narrow" in text for text in said(engine))
+        wait_for(lambda: any("too narrow" in text for text in said(engine)))
         # As narrow as before, or nearly.
         engine.submit(commands.SetTuning("R.winding", 3.0))
         wait_for(lambda: engine.status().revision == 1)
         wait_for(lambda: engine.episodes() and not same_as(engine, Tuning.of(MODEL)))
         same(engine.episodes(), whole(engine))
-        assert sum("too narrow" in text for text in said(engine)) == lines == 1
+        assert sum("too narrow" in text for text in said(engine)) == 1
         # Wide bands explain the readings: what was open has gone, and is not carried on.
         engine.submit(commands.SetTuning("R.winding", 100.0))
         wait_for(lambda: engine.status().revision == 2)
