@@ -42,7 +42,7 @@ def dropped(counts: Mapping[str, int], fold: Fold) -> list[Episode]:
         return []
     t = fold.log.t[: fold.n] * 1e-9
     text = (
-        f"{100 * share:.0f} % of the readings were dropped, {lost} of {lost + kept}: too late, or with a time that "
+        f"{100 * share:.3g} % of the readings were dropped, {lost} of {lost + kept}: too late, or with a time that "
         "cannot be true; check the times of the source, or lengthen time.horizon"
     )
     return [Episode(float(t[0]), None, "twin", "dropped", share, math.nan, math.nan, "", text)]

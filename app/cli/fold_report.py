@@ -22,7 +22,7 @@ from estimators.tuning import TOGETHER
 
 from ..intake import WRONG_TIME
 from ..twin.twin import Twin
-from .fold_episodes import Told, as_json
+from .fold_episodes import Told, as_json, dropped
 
 DECISIONS = 10
 """On sensors that stayed refused, that are printed at most: the last ones; --json has all."""
@@ -232,7 +232,10 @@ def as_text(
         ("late readings", f"{'used when they come, R inflated' if twin.late.inflate else 'exact'}: {twin.late.reason}"),
         ("degraded after", f"{twin.degraded.seconds:g} s without a reading: {twin.degraded.reason}"),
         *((f"at {decision.time:.1f} s", decision.text) for decision in fold.decisions[-DECISIONS:]),
-        ("health at the end", HEALTH_NAMES[int(track.health[-1])]),
+        (
+            "health at the end",
+            f"{HEALTH_NAMES[int(track.health[-1])]}{' in what was not dropped' if dropped(counts, fold) else ''}",
+        ),
         ("time per event", f"{1e6 * seconds:.2f} µs"),
     ]
     width = max(len(name) for name, _ in rows)
