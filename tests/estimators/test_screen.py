@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from estimators.diagnostics.episodes import episodes
 from estimators.diagnostics.evidence import OUTSIDE, REFUSED, STUCK
 from estimators.errors import ModelError
 from estimators.fold import Fold, fold
@@ -351,3 +352,17 @@ def test_a_battery_outside_the_range_of_its_fit_says_so(celsius) -> None:
 def test_limits_that_mean_nothing_are_refused(make, said) -> None:
     with pytest.raises(ModelError, match=said):
         make()
+
+
+def test_a_sensor_whose_readings_all_break_their_limits_is_an_episode_of_its_own() -> None:
+    """Named with the limit and the share, from the first reading that broke it; not as one of a wrong R."""
+    walk = model(Limits(range=((-30.0, 30.0),)))
+    y = np.random.default_rng(5).normal(0.0, 0.25, 600)
+    y[400:] += 100.0
+    log = Log.of(walk)
+    log.add("a", np.arange(600.0), y)
+    found = Fold("kf", walk, Tuning.of(walk), log)
+    found.advance()
+    each = next(episode for episode in episodes(found) if episode.cause == "screened")
+    assert (each.start, each.end, each.size) == (400.0, None, 1.0)
+    assert "(range)" in each.text and "100 % of its readings are not used" in each.text

@@ -12,10 +12,14 @@ import pytest
 from app.cli.arguments import Fold
 from app.cli.compare_fold import fold_row
 from app.cli.fold import fold_twin, read_log
-from app.cli.fold_episodes import Told, episode_lines
+from app.cli.fold_episodes import Told, dropped, episode_lines
 from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import Episode
+from estimators.fold import Fold as FoldOf
+from estimators.log import Log
+from estimators.models import MODELS
 from estimators.track import HEALTH_NAMES
+from estimators.tuning import Tuning
 
 DRIVE = """\
 model: motor_winding
@@ -237,3 +241,15 @@ def test_the_json_says_what_a_script_needs(tmp_path: Path, capsys: pytest.Captur
     assert fit["coverage"] == inside.mean()
     winding = told["calibration"][0]
     assert winding["role"] == "held out" and winding["coverage"]["95"]["value"] == inside.mean()
+
+
+def test_what_was_dropped_is_said_if_it_was_much() -> None:
+    model = MODELS["motor_winding"]
+    log = Log.of(model)
+    log.add("winding", np.arange(10.0), np.full(10, 35.0))
+    folded = FoldOf("kf", model, Tuning.of(model), log)
+    folded.advance()
+    assert dropped({}, folded) == [] and dropped({"stale": 0, "wrong time": 0}, folded) == []
+    (episode,) = dropped({"stale": 80, "wrong time": 10}, folded)
+    assert (episode.cause, episode.subject, episode.size, episode.end) == ("dropped", "twin", 0.9, None)
+    assert episode.text.startswith("90 % of the readings were dropped, 90 of 100:")
