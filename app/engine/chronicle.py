@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -150,13 +151,14 @@ class Chronicle:
         """Take the rows that are new, and say what has begun and what is over."""
         before, again = self._entries, False
         while True:
-            log = self._cursor.log
+            log, passage = self._cursor.log, self._engine.notices.passage
             pull = self._engine.pull(self._cursor, PULLED)
             if not pull.fresh and pull.first < self._tail.first:
                 # A late reading belongs before the rows that are kept: all of them again.
                 self._cursor.revision = -1
                 continue
             if pull.fresh:
+                passage = self._engine.notices.passage
                 # Another revision: what lasts is known. Another log: another life, of which nothing was said.
                 again = log == self._cursor.log
                 before = before if again else []
@@ -170,7 +172,7 @@ class Chronicle:
                 break
         if self._tail.n:
             self._find()
-            self._say(before, again)
+            self._say(before, again, passage)
 
     def _find(self) -> None:
         """Bring the entries up to the rows that are there."""
@@ -203,10 +205,14 @@ class Chronicle:
         self._over = over[-KEPT:]
         self._carried = {e.key: e for e in begun if e.episode.end is None or e.episode.end * 1e9 >= first}
 
-    def _say(self, before: list[Entry], again: bool) -> None:
-        """Say what is new against the entries before; `again`: those of another revision, or of rows taken back."""
+    def _say(self, before: list[Entry], again: bool, passage: int) -> None:
+        """Say what is new against the entries before; `again`: those of another revision, or of rows taken back.
+
+        A source that has begun again meanwhile, in another passage, has not lived what these rows tell.
+        """
         begun, over = _changes(before, self._entries, again)
-        notices, track, t = self._engine.notices, self._tail.track, self._tail.events.t
+        say = partial(self._engine.notices.say, passage=passage)
+        track, t = self._tail.track, self._tail.events.t
         states = {name: state for name, (state, _) in self._engine.status().sensors.items()}
         leading = self.account.leading(states)
         health = int(track.health[-1])
@@ -222,19 +228,19 @@ class Chronicle:
                 text += f": {leading.text}" if new else f": {leading.subject} {leading.cause}"
                 begun = [entry for entry in begun if entry.episode is not leading]
             level = {WAITING: "info", TRACKING: "info", DIVERGED: "error"}.get(health, "warn")
-            notices.say(text, level=level, t=int(t[last_run(track.health)]))
+            say(text, level=level, t=int(t[last_run(track.health)]))
         for entry in begun[:SAID]:
             episode = entry.episode
             lasted = "" if episode.end is None else f"; over after {_duration(episode)}"
             level = "error" if episode.cause == "diverged" else "warn"
-            notices.say(f"{episode.text}{lasted}", level=level, t=round(episode.start * 1e9))
+            say(f"{episode.text}{lasted}", level=level, t=round(episode.start * 1e9))
         if len(begun) > SAID:
-            notices.say(f"and {len(begun) - SAID} more episode(s) of this kind", level="warn")
+            say(f"and {len(begun) - SAID} more episode(s) of this kind", level="warn")
         for entry in over[:SAID]:
             episode = entry.episode
             what = "heard at last" if episode.cause == "never heard" else f"no longer {episode.cause}"
             assert episode.end is not None
-            notices.say(f"{episode.subject}: {what}, after {_duration(episode)}", t=round(episode.end * 1e9))
+            say(f"{episode.subject}: {what}, after {_duration(episode)}", t=round(episode.end * 1e9))
 
 
 def _continued(known: Entry, item: Found, now: int) -> Entry:

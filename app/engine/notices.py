@@ -60,10 +60,11 @@ class Notices:
             self._last[key] = (self._clock(), self._counts[key])
             self._add(level, text if more < 1 else f"{text} ({more} more before)")
 
-    def say(self, text: str, level: str = "info", t: int | None = None) -> None:
-        """Add a line, of what happened now or at `t`."""
+    def say(self, text: str, level: str = "info", t: int | None = None, *, passage: int | None = None) -> None:
+        """Add a line, of what happened now or at `t`; nothing if that was of another `passage` than the present one."""
         with self._lock:
-            self._add(level, text, t)
+            if passage is None or passage == self.passage:
+                self._add(level, text, t)
 
     def begin_again(self) -> None:
         """The source has begun again: lines from here on belong to another pass over it."""

@@ -152,9 +152,9 @@ def _check(command: commands.Command, engine: Running) -> None:
     elif isinstance(command, commands.Reset) and not engine.span()[1]:
         raise ConfigError("Reset: nothing to reset; no reading has come yet")
     elif isinstance(command, commands.Maintenance):
+        check_maintenance(command.what, command.states, engine.model)
         if not engine.span()[1]:
             raise ConfigError("Maintenance: no reading has come yet; what is believed is what was at first")
-        check_maintenance(command.what, command.states, engine.model)
     elif isinstance(command, commands.Record) and engine.recorder is None:
         raise ConfigError("Record: this session cannot record")
     elif isinstance(command, commands.InjectFault | commands.ClearFault):

@@ -120,10 +120,10 @@ def test_the_private_viser_server_is_not_crowded_out_either(monkeypatch, capfd):
 
 
 def test_a_body_of_more_than_64_kb_is_refused(page):  # noqa: F811
-    padded = b'{"command": "Reset"' + b" " * BODY + b"}"
+    padded = b'{"command": "Restore"' + b" " * BODY + b"}"
     answer = page.client.post("/api/command", padded)
     assert answer.status == 413 and "64 kB" in answer.text and answer.text.count("\n") == 1
-    fits = b'{"command": "Reset"' + b" " * (BODY - 20) + b"}"
+    fits = b'{"command": "Restore"' + b" " * (BODY - 22) + b"}"
     assert len(fits) == BODY and page.client.post("/api/command", fits).status == 202
 
 
