@@ -200,15 +200,15 @@ class Engine:
         with self._reading():
             self._cursors = [item for item in self._cursors if item is not cursor]
 
-    def pull(self, cursor: Cursor, limit: int | None = None) -> Pull:
-        """Copies of the rows since the cursor, at most `limit`, and the notices since."""
+    def pull(self, cursor: Cursor, limit: int | None = None, *, align: int = 1) -> Pull:
+        """Copies of the rows since the cursor, at most `limit`, and the notices since; from a multiple of `align` on."""
         with self._reading():
             log, fold = self._log, self._fold
             fresh = cursor.log != self._logs or (cursor.revision != self._revision and not cursor.follows_log)
             cursor.log, cursor.revision = self._logs, self._revision
             if fresh:
                 cursor.next, cursor.picture = 0, -1
-            start = max(cursor.next, log.first)
+            start = max(cursor.next // align * align, log.first)
             end = log.first + fold.n
             if limit is not None:
                 end = min(end, start + limit)
@@ -221,6 +221,8 @@ class Engine:
                 Events(*(column.copy() for column in readings)),
                 fold.track.select(rows).copy(),
                 pictures=_since(fold, cursor.picture, max(start, end)),
+                oldest=log.first,
+                changed=max(cursor.next, log.first),
             )
             cursor.next = max(start, end)
             if pull.pictures:
@@ -229,6 +231,21 @@ class Engine:
         if lines:
             cursor.notice = lines[-1].number + 1
         return replace(pull, notices=lines)
+
+    def rows(self, start: int, stop: int) -> Pull:
+        """Copies of the rows with these absolute indices, as far as they are there; no cursor moves."""
+        with self._reading():
+            log, fold = self._log, self._fold
+            start = min(max(start, log.first), log.first + fold.n)
+            rows = slice(start - log.first, max(start, min(stop, log.first + fold.n)) - log.first)
+            readings = log.events.select(rows)
+            events = Events(*(column.copy() for column in readings))
+            return Pull(self._revision, False, start, events, fold.track.select(rows).copy(), oldest=log.first)
+
+    def index_at(self, t: int) -> int:
+        """Absolute index of the first folded event at or after a time, ns; the number of events if there is none."""
+        with self._reading():
+            return self._log.first + int(np.searchsorted(self._log.t[: self._fold.n], t))
 
     @property
     def source(self) -> Source:

@@ -69,8 +69,14 @@ class Running(Protocol):
     def release(self, cursor: Cursor) -> None:
         """Forget a cursor."""
 
-    def pull(self, cursor: Cursor, limit: int | None = None) -> Pull:
-        """Copies of the rows since the cursor, at most `limit`, and the notices since."""
+    def pull(self, cursor: Cursor, limit: int | None = None, *, align: int = 1) -> Pull:
+        """Copies of the rows since the cursor, at most `limit`, and the notices since; from a multiple of `align` on."""
+
+    def rows(self, start: int, stop: int) -> Pull:
+        """Copies of the rows with these absolute indices, as far as they are there."""
+
+    def index_at(self, t: int) -> int:
+        """Absolute index of the first folded event at or after a time, ns."""
 
     def episodes(self) -> list[Episode]:
         """What was and is wrong, in the order of its start."""

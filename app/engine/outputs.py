@@ -42,6 +42,8 @@ class Pull:
     `fresh`: these rows start afresh (another revision or log, or the first pull): forget what was drawn. `first` is the
     absolute index of the first row; if it is below what was pulled before, a late reading rewrote the rows from there.
     `pictures` are those of a large field since the cursor; one with an index that was seen before takes its place.
+    `oldest` is the absolute index of the first row that is still there, `changed` that of the first of these that is new
+    or another; those before it were asked for to be aligned.
     """
 
     revision: int
@@ -51,6 +53,8 @@ class Pull:
     track: Track
     notices: list[Notice] = field(default_factory=list)
     pictures: list[Picture] = field(default_factory=list)
+    oldest: int = 0
+    changed: int = 0
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,12 @@ from estimators.errors import NisusError
 
 from ..engine.interface import Running
 from ..rerun.feed import RerunFeed
+from ..series.series import Series
 from .api import Json, command_from_json, episodes_json, faults_json, one_line, status_json
 from .bounds import BODY, TooLarge, bounded_body, bounds
 from .gate import Gate, session_token
+from .model_json import model_json
+from .page_stream import PageStream
 from .port import listen
 from .viewer_assets import FILES, viewer_assets, viewer_version
 from .viser_proxy import ViserProxy
@@ -83,6 +86,7 @@ class PageServer:
         """
         self._engine = engine
         self._review = review
+        self._series = Series(engine)
         self._boot = uuid.uuid4().hex
         self._socket = listen(port)
         self.port: int = self._socket.getsockname()[1]
@@ -129,12 +133,14 @@ class PageServer:
         routes: list[Any] = [
             Route("/", self._page),
             Route("/api/status", self._status),
+            Route("/api/model", self._model),
             Route("/api/episodes", self._episodes),
             Route("/api/recordings", self._list_recordings),
             Route("/api/faults", self._faults),
             Route("/api/command", self._command, methods=["POST"]),
             Route(f"/viewer/{viewer_version()}/{{name}}", self._viewer_file),
             Route("/rec/{name}", self._recording),
+            WebSocketRoute("/api/stream", self._page_stream),
             WebSocketRoute("/rerun/stream", self._stream),
             Mount("/page", StaticFiles(directory=PAGE)),
         ]
@@ -155,8 +161,16 @@ class PageServer:
         return Response(text.replace("{{settings}}", quoted), media_type="text/html")
 
     async def _status(self, request: Request) -> Response:
-        status = status_json(self._engine)
-        return Json({**status, "recordings": sorted(self._recordings())})
+        return Json(self._state())
+
+    def _state(self) -> dict[str, Any]:
+        return {**status_json(self._engine), "recordings": sorted(self._recordings())}
+
+    async def _model(self, request: Request) -> Response:
+        return Json(await asyncio.to_thread(model_json, self._engine))
+
+    async def _page_stream(self, browser: WebSocket) -> None:
+        await PageStream(browser, self._engine, self._series, self._state, self._boot).run()
 
     async def _episodes(self, request: Request) -> Response:
         return Json(episodes_json(self._engine))

@@ -1,6 +1,6 @@
 // Rerun's web viewer in a canvas of this page. It has no connection of its own: what it shows is handed to it.
 
-import { FOLLOWING, closeRecordings, readState, setTimeCursor } from "./wire.js";
+import { FOLLOWING, closeRecordings, readState, setTimeCursor } from "./rerun_wire.js";
 
 const CHANNEL = "nisus";
 const PATIENCE = 30000; // ms until bytes must have been taken in

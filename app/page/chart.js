@@ -1,0 +1,143 @@
+// One chart: a canvas of uPlot's with a line above it that says what it is and what it reads at the cursor.
+
+import { element, setText } from "./dom.js";
+
+const GAP = 52; // px for the labels of the value axis
+export const CURSOR = "time";
+
+const styles = getComputedStyle(document.documentElement);
+export const colour = (name) => styles.getPropertyValue(`--${name}`).trim();
+
+export const line = (name, options = {}) => ({
+  stroke: () => colour(name), width: 1.5, points: { show: false }, spanGaps: false, ...options,
+});
+
+export const edge = (options = {}) => ({ stroke: null, width: 0, points: { show: false }, ...options });
+
+export const dots = (name, size = 4, ring = false) => ({
+  stroke: () => colour(name),
+  paths: () => null,
+  points: { show: true, size, width: ring ? 1.5 : 0, stroke: () => colour(name), fill: () => (ring ? "transparent" : colour(name)) },
+});
+
+export class Chart {
+  // what: {title, unit, note, weight, series, bands, range(self, low, high), scale, draw: [hook], values: [label of a tick]}
+  constructor(what, { select, home, wheel }) {
+    this.what = what;
+    this.reading = element("output", { class: "reading" });
+    this.head = element(
+      "header", {},
+      element("b", {}, what.title), element("span", { class: "unit" }, what.unit ?? ""),
+      what.note ? element("span", { class: "note" }, what.note) : null,
+      element("span", { class: "space" }), this.reading,
+    );
+    this.canvas = element("div", { class: "plot" });
+    this.node = element("article", { class: "chart", style: `--weight:${what.weight}`, "aria-label": `Chart of ${what.title}` }, this.head, this.canvas);
+    this.data = [[], ...what.series.map(() => [])];
+    this.actions = { select, home, wheel };
+    this.visible = true;
+  }
+
+  // Once it is in the page, and has a size.
+  begin(last) {
+    const { what } = this;
+    this.plot = new uPlot(
+      {
+        width: Math.max(50, this.canvas.clientWidth),
+        height: Math.max(40, this.canvas.clientHeight),
+        legend: { show: false },
+        padding: [6, 10, last ? 0 : 4, 0],
+        cursor: {
+          sync: { key: CURSOR, scales: ["x", null] },
+          drag: { x: true, y: false, setScale: false },
+          points: { show: false },
+          y: false,
+          bind: { dblclick: () => () => (this.actions.home(), null) },
+        },
+        scales: {
+          x: { time: false, range: () => this.span },
+          y: { ...what.scale, range: (self, low, high) => what.range(this, low, high) },
+        },
+        axes: [
+          { show: true, ...axis(), size: last ? 22 : 0, values: last ? what.ticks : () => [], ticks: { show: last, stroke: () => colour("rule"), size: 4 } },
+          { ...axis(), size: GAP, space: 26, ...(what.axis ?? {}) },
+        ],
+        series: [{}, ...what.series],
+        bands: what.bands ?? [],
+        hooks: {
+          setSelect: [(self) => this.selected(self)],
+          drawAxes: what.under ? [(self) => what.under(self, this)] : [],
+          draw: what.over ? [(self) => what.over(self, this)] : [],
+          setCursor: [(self) => this.pointed(self)],
+        },
+      },
+      this.data,
+      this.canvas,
+    );
+    this.plot.over.addEventListener("wheel", (event) => this.actions.wheel(event, this.plot), { passive: false });
+    this.sized = new ResizeObserver(() => {
+      const { clientWidth: width, clientHeight: height } = this.canvas;
+      if (width > 0 && height > 0 && (width !== this.plot.width || height !== this.plot.height)) this.plot.setSize({ width, height });
+    });
+    this.sized.observe(this.canvas);
+    this.seen = new IntersectionObserver(([entry]) => {
+      this.visible = entry.isIntersecting;
+      if (this.visible && this.waiting) this.draw();
+    });
+    this.seen.observe(this.node);
+  }
+
+  // span: seconds at both ends of the axis; origin-based times in data[0].
+  show(data, span) {
+    this.data = data;
+    this.span = span;
+    if (this.visible) this.draw();
+    else this.waiting = true;
+  }
+
+  draw() {
+    this.waiting = false;
+    this.plot.batch(() => {
+      this.plot.setData(this.data, false);
+      this.plot.setScale("x", { min: this.span[0], max: this.span[1] });
+    });
+    this.pointed(this.plot);
+  }
+
+  selected(self) {
+    const { left, width } = self.select;
+    if (width < 4) return;
+    const ends = [self.posToVal(left, "x"), self.posToVal(left + width, "x")];
+    self.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
+    this.actions.select(...ends);
+  }
+
+  // What the line above says: at the cursor, else of the newest row.
+  pointed(self) {
+    const { left, idx } = self.cursor;
+    const at = left >= 0 && idx !== null && idx !== undefined ? idx : this.data[0].length - 1;
+    setText(this.reading, at < 0 ? "" : this.what.says((series) => this.at(series, at)));
+  }
+
+  // The value of a series there, or the last one before it.
+  at(series, index) {
+    const values = this.data[series];
+    for (let k = index; k >= Math.max(0, index - 64); k--) if (typeof values?.[k] === "number") return values[k];
+    return NaN;
+  }
+
+  end() {
+    this.sized?.disconnect();
+    this.seen?.disconnect();
+    this.plot?.destroy();
+    this.node.remove();
+  }
+}
+
+const axis = () => ({
+  stroke: () => colour("faint"),
+  font: "11px system-ui, sans-serif",
+  grid: { stroke: () => colour("grid"), width: 1 },
+  ticks: { show: false },
+  gap: 4,
+});

@@ -1,0 +1,48 @@
+// Numbers, units and times as text.
+
+const EXPONENTS = { 2: "²", 3: "³", "-1": "⁻¹" };
+
+// A value with its deviation: as many digits as the deviation justifies.
+export function withDeviation(value, deviation, unit) {
+  if (!Number.isFinite(value)) return "–";
+  if (!Number.isFinite(deviation) || deviation <= 0) return `${compact(value)}${spaced(unit)}`;
+  const digits = Math.min(8, Math.max(0, 1 - Math.floor(Math.log10(deviation))));
+  return `${value.toFixed(digits)} ± ${deviation.toFixed(digits)}${spaced(unit)}`;
+}
+
+// Four digits, no exponent where it can be helped.
+export function compact(value, digits = 4) {
+  if (!Number.isFinite(value)) return "–";
+  if (value === 0) return "0";
+  const size = Math.abs(value);
+  if (size >= 1e6 || size < 1e-4) return value.toExponential(Math.max(0, digits - 2)).replace("e+", "e");
+  return String(Number(value.toPrecision(digits)));
+}
+
+export const spaced = (unit) => (unit && unit !== "1" ? ` ${unit}` : "");
+
+export const bracketed = (unit) => (unit && unit !== "1" ? `[${unit}]` : "");
+
+// Seconds of the log as a clock: 0:07.3, 12:31, 3:05:00.
+export function clock(seconds, fraction = 0) {
+  if (!Number.isFinite(seconds)) return "–";
+  const sign = seconds < 0 ? "-" : "";
+  const scale = 10 ** fraction;
+  const all = Math.round(Math.abs(seconds) * scale) / scale;
+  const hours = Math.floor(all / 3600);
+  const minutes = Math.floor((all % 3600) / 60);
+  const rest = (all % 60).toFixed(fraction).padStart(fraction ? 3 + fraction : 2, "0");
+  return hours ? `${sign}${hours}:${String(minutes).padStart(2, "0")}:${rest}` : `${sign}${minutes}:${rest}`;
+}
+
+// A length of time: 3.2 s, 4 min, 2.5 h.
+export function span(seconds) {
+  if (seconds < 10) return `${Number(seconds.toPrecision(2))} s`;
+  if (seconds < 120) return `${Math.round(seconds)} s`;
+  if (seconds < 7200) return `${Math.round(seconds / 60)} min`;
+  return `${Number((seconds / 3600).toPrecision(2))} h`;
+}
+
+export const words = (name) => name.replaceAll("_", " ");
+
+export const exponent = (n) => EXPONENTS[n] ?? `^${n}`;

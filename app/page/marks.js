@@ -1,0 +1,19 @@
+// Episodes as shades behind the curves of a chart, where something was wrong.
+
+import { colour } from "./chart.js";
+
+export function marks(plot, episodes) {
+  const { ctx, bbox } = plot;
+  const [low, high] = [plot.scales.x.min, plot.scales.x.max];
+  ctx.save();
+  ctx.fillStyle = colour("episode");
+  for (const episode of episodes) {
+    const start = Math.max(episode.from ?? episode.start, low);
+    const end = Math.min(episode.to ?? episode.end ?? high, high);
+    if (end <= start && !(episode.start >= low && episode.start <= high)) continue;
+    const left = plot.valToPos(start, "x", true);
+    const right = Math.max(left + 2, plot.valToPos(end, "x", true));
+    ctx.fillRect(left, bbox.top, right - left, bbox.height);
+  }
+  ctx.restore();
+}

@@ -1,0 +1,191 @@
+"""What one group of charts shows: some columns of one run between two times, as no more points than can be seen.
+
+A lane remembers what it has sent and gives only groups that are new or have changed since.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from estimators.errors import ConfigError
+
+from .columns import DOTS, LOWER, UPPER, Column
+from .pyramid import FACTOR, Groups
+from .run import Run
+
+SLACK = 1.3
+"""By how much the number of groups may leave its bounds before their size changes: else charts would flicker."""
+
+MOST_POINTS, MOST_COLUMNS = 4000, 400
+FOREVER = 2**62
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a browser asks of a lane.
+
+    `run` is "live", "previous" or the number of a revision that is kept. Times are seconds since the first event;
+    `since` None is the first, `until` None the newest, and with `span` the last seconds are followed. `points` is how
+    many groups there are at most.
+    """
+
+    columns: tuple[str, ...]
+    run: str = "live"
+    since: float | None = None
+    until: float | None = None
+    span: float | None = None
+    points: int = 600
+
+
+def wanted_from_json(body: Any, columns: dict[str, Column]) -> Wanted:
+    """What a browser asks, checked.
+
+    Raises:
+        ConfigError: If it is not that.
+    """
+    if not isinstance(body, dict):
+        raise ConfigError(f"lane: {body!r} is no object")
+    names = body.get("columns")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or len(names) > MOST_COLUMNS:
+        raise ConfigError(f"lane: columns must be a list of at most {MOST_COLUMNS} names")
+    unknown = next((name for name in names if name not in columns), None)
+    if unknown is not None:
+        raise ConfigError(f"lane: there is no column {unknown!r}; /api/model lists them")
+    numbers = {}
+    for key in ("since", "until", "span"):
+        value = body.get(key)
+        if value is not None and (isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9):
+            raise ConfigError(f"lane: {key} is {value!r}; it must be a number of seconds, or null")
+        numbers[key] = value
+    points = body.get("points", 600)
+    if not isinstance(points, int) or isinstance(points, bool) or not 2 <= points <= MOST_POINTS:
+        raise ConfigError(f"lane: points is {points!r}; it must be a whole number from 2 to {MOST_POINTS}")
+    run = body.get("run", "live")
+    if not isinstance(run, str):
+        raise ConfigError(f"lane: run is {run!r}; it must be live, previous, or a number as text")
+    return Wanted(tuple(names), run, points=points, **numbers)
+
+
+class Lane:
+    """Gives frames of one view; see `Wanted`."""
+
+    def __init__(self, name: str, wanted: Wanted, columns: dict[str, Column]) -> None:
+        self.name, self.wanted = name, wanted
+        self._kinds = np.array([columns[column].kind for column in wanted.columns])
+        self._size = 0
+        self._sent = (0, 0)
+        """Numbers of the groups that the browser has: from the first to before the second."""
+        self._told: object = None
+        """Which run, and which generation of it, they are of."""
+        self._dirty = FOREVER
+        """First row that has changed since the last frame."""
+        self._offsets = np.full(len(wanted.columns), np.nan)
+
+    def changed(self, row: int) -> None:
+        """Rows from that one on are new or others."""
+        self._dirty = min(self._dirty, row)
+
+    def frame(self, run: Run, origin: int, newest: int) -> bytes | None:
+        """What has changed since the last frame, or None.
+
+        Args:
+            run: Whose rows; its levels are up to date.
+            origin: Time of the first event, ns, from which seconds count.
+            newest: Time of the last one.
+        """
+        wanted = self.wanted
+        until = newest if wanted.until is None else min(newest, _instant(origin, wanted.until))
+        since = _instant(origin, wanted.since) if wanted.since is not None else origin
+        if wanted.span is not None:
+            since = max(since, until - round(wanted.span * 1e9))
+        # One row more to either side, so that lines leave the chart at its edges.
+        start, stop = run.span(since, until + 1)
+        start, stop = max(0, start - 1), stop + 1
+        size = self._sized(stop - start)
+        told = (run, run.generation, size)
+        first, last = start // size, -(-min(stop, run.end) // size)
+        have_first, have_last = self._sent
+        fresh = told != self._told or first < have_first or first > have_last
+        at = first if fresh else min(have_last, self._dirty // size)
+        at = max(first, min(at, last))
+        if not fresh and (at >= last or self._dirty >= run.end):
+            return None
+        groups = run.groups(size, at, last, list(wanted.columns))
+        self._told, self._dirty = told, FOREVER
+        # The last group may grow.
+        self._sent = (first, groups.start + len(groups))
+        return self._packed(groups, origin, fresh, first, run.revision)
+
+    def _sized(self, rows: int) -> int:
+        """How many rows a group has: as few as the points allow, and as before if that nearly does."""
+        points = self.wanted.points
+        kept = self._size
+        if kept and rows <= SLACK * points * kept and (kept == 1 or rows * SLACK > points * kept / FACTOR):
+            return kept
+        size = 1
+        while rows > points * size:
+            size *= FACTOR
+        self._size = size
+        return size
+
+    def _packed(self, groups: Groups, origin: int, fresh: bool, first: int, revision: int) -> bytes:
+        times, values = drawn(groups, self._kinds)
+        seconds = (times - origin) * 1e-9
+        # Single precision around a value of each column: positions on the earth need more than it holds.
+        unknown = np.isnan(self._offsets)
+        self._offsets[unknown] = [_some(column) for column in values.T[unknown]]
+        told = fresh or bool((unknown & ~np.isnan(self._offsets)).any())
+        offsets = np.nan_to_num(self._offsets)
+        header = json.dumps(
+            {
+                "lane": self.name,
+                "revision": revision,
+                "run": self.wanted.run,
+                "fresh": fresh,
+                "first": first,
+                "start": groups.start,
+                "each": 1 if groups.size == 1 else 2,
+                "size": groups.size,
+                "points": int(seconds.size),
+                "columns": list(self.wanted.columns) if fresh else None,
+                "offsets": offsets.tolist() if told else None,
+            },
+            separators=(",", ":"),
+        ).encode()
+        header += b" " * (-(len(header) + 4) % 8)
+        block = (values - offsets).astype(np.float32).T
+        parts = (struct.pack("<I", len(header)), header, seconds.astype("<f8").tobytes(), block.tobytes())
+        return b"".join(parts)
+
+
+def drawn(groups: Groups, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The points of groups: times (k,) and values (k, columns), one a group of one row, else two.
+
+    The two are a line's extremes in the order in which they lead on to the next; the edge of a band is twice its outer
+    extreme; a dot that is alone in its group is drawn once.
+    """
+    if groups.size == 1:
+        return groups.first, groups.high
+    times = np.stack((groups.first, groups.last), axis=1).ravel()
+    first = np.where(groups.rising, groups.low, groups.high)
+    second = np.where(groups.rising, groups.high, groups.low)
+    upper, lower, dots = (kinds == kind for kind in (UPPER, LOWER, DOTS))
+    first[:, upper] = second[:, upper] = groups.high[:, upper]
+    first[:, lower] = second[:, lower] = groups.low[:, lower]
+    second[:, dots] = np.where(groups.low[:, dots] == groups.high[:, dots], np.nan, second[:, dots])
+    return times, np.stack((first, second), axis=1).reshape(-1, first.shape[1])
+
+
+def _some(column: np.ndarray) -> float:
+    finite = column[np.isfinite(column)]
+    return float(finite[0]) if finite.size else np.nan
+
+
+def _instant(origin: int, seconds: float) -> int:
+    return origin + math.floor(seconds * 1e9)

@@ -1,0 +1,171 @@
+"""Levels of detail: rows in groups of 16, 64, 256, ..., of each of which only the extremes are kept.
+
+A group is a run of absolute row indices, so a chart does not shimmer while its window slides, a peak of one row stays
+visible however many are drawn, and only the newest groups change when rows arrive.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+FIRST = 16
+"""Rows in a group of the finest level; finer ones are made from the rows themselves."""
+
+FACTOR = 4
+"""Groups of one level that are one of the next."""
+
+
+class Groups(NamedTuple):
+    """Groups that follow each other, of `size` rows each; the first has number `start`.
+
+    first, last (k,): times of their first and last rows, ns. low, high (k, columns): their extremes, NaN of none.
+    rising (k, columns): whether the last row of a group is not below its first.
+    """
+
+    size: int
+    start: int
+    first: np.ndarray
+    last: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    rising: np.ndarray
+
+    def __len__(self) -> int:
+        """Number of groups (not of fields)."""
+        return int(self.first.size)
+
+    def since(self, number: int) -> Groups:
+        """Those from a number on."""
+        return self.part(number, self.start + len(self))
+
+    def part(self, start: int, stop: int) -> Groups:
+        """Those with numbers from `start` to before `stop`, as far as they are there."""
+        start = max(start, self.start)
+        rows = slice(start - self.start, max(start, stop) - self.start)
+        return Groups(self.size, start, *(column[rows] for column in self[2:]))
+
+    def followed(self, more: Groups) -> Groups:
+        """These up to where the others begin, and then the others."""
+        before = self.part(self.start, more.start)
+        columns = (np.concatenate(pair) for pair in zip(before[2:], more[2:], strict=True))
+        return Groups(self.size, before.start if len(before) else more.start, *columns)
+
+
+def no_groups(size: int, columns: int) -> Groups:
+    """None yet."""
+    times, values = np.zeros(0, np.int64), np.zeros((0, columns))
+    return Groups(size, 0, times, times, values, values, np.zeros((0, columns), bool))
+
+
+def grouped(size: int, first: int, t: np.ndarray, values: np.ndarray) -> Groups:
+    """Rows in groups.
+
+    Args:
+        size: Rows in a group.
+        first: Absolute index of the first row.
+        t: Their times, shape (n,), ascending.
+        values: Shape (n, columns).
+    """
+    if not t.size:
+        return no_groups(size, values.shape[1])
+    start = first // size
+    ends = np.arange(start + 1, (first + t.size - 1) // size + 1) * size - first
+    starts, lasts = np.concatenate(([0], ends)), np.concatenate((ends, [t.size])) - 1
+    low, high = np.fmin.reduceat(values, starts, axis=0), np.fmax.reduceat(values, starts, axis=0)
+    return Groups(size, start, t[starts], t[lasts], low, high, values[lasts] >= values[starts])
+
+
+def coarser(groups: Groups) -> Groups:
+    """Groups of `FACTOR` of these."""
+    start = groups.start // FACTOR
+    ends = np.arange(start + 1, (groups.start + len(groups) - 1) // FACTOR + 1) * FACTOR - groups.start
+    starts, lasts = np.concatenate(([0], ends)), np.concatenate((ends, [len(groups)])) - 1
+    low, high = np.fmin.reduceat(groups.low, starts, axis=0), np.fmax.reduceat(groups.high, starts, axis=0)
+    middle = groups.low + groups.high
+    # Where several become one, it rises if their middles do.
+    rising = np.where((lasts > starts)[:, None], middle[lasts] >= middle[starts], groups.rising[starts])
+    return Groups(groups.size * FACTOR, start, groups.first[starts], groups.last[lasts], low, high, rising)
+
+
+class Pyramid:
+    """The levels of some columns, kept up to date from the rows that changed."""
+
+    def __init__(self, columns: int) -> None:
+        self._columns = columns
+        self._levels = [_Level(FIRST, columns)]
+
+    def update(self, first: int, t: np.ndarray, values: np.ndarray) -> None:
+        """Take rows that are new or rewritten; all known ones after them are void.
+
+        Args:
+            first: Absolute index of the first row, a multiple of `FIRST`, or the oldest row that is still there.
+            t: Their times, shape (n,), ascending.
+            values: Shape (n, columns).
+        """
+        fresh = grouped(FIRST, first, t, values)
+        for k in range(len(self._levels) + 1):
+            if k == len(self._levels):
+                if len(self._levels[-1].groups) < 2 * FACTOR:
+                    break
+                self._levels.append(_Level(FIRST * FACTOR**k, self._columns))
+                fresh = coarser(self._levels[k - 1].groups)
+            self._levels[k].put(fresh)
+            if not len(fresh):
+                break
+            fresh = coarser(self._levels[k].groups.since(fresh.start // FACTOR * FACTOR))
+
+    def forget(self, oldest: int) -> None:
+        """Drop the groups whose rows are all older than that index."""
+        for level in self._levels:
+            level.drop(oldest // level.groups.size)
+
+    def level(self, size: int) -> Groups:
+        """The groups of that size; those of the coarsest level where there are none so large."""
+        for level in self._levels:
+            if level.groups.size == size:
+                return level.groups
+        groups = self._levels[-1].groups
+        while groups.size < size and len(groups):
+            groups = coarser(groups)
+        return groups
+
+
+class _Level:
+    """The groups of one size, in columns that grow by doubling."""
+
+    def __init__(self, size: int, columns: int) -> None:
+        self._start, self._n, self._size = 0, 0, size
+        self._room: list[np.ndarray] = [
+            np.zeros(64, np.int64), np.zeros(64, np.int64), np.zeros((64, columns)), np.zeros((64, columns)),
+            np.zeros((64, columns), bool),
+        ]  # fmt: skip
+
+    @property
+    def groups(self) -> Groups:
+        """Views of what is there."""
+        first, last, low, high, rising = (column[: self._n] for column in self._room)
+        return Groups(self._size, self._start, first, last, low, high, rising)
+
+    def put(self, fresh: Groups) -> None:
+        """Put groups in place of those from their number on."""
+        at = fresh.start - self._start
+        if not 0 <= at <= self._n:
+            self._start, at = fresh.start, 0
+        needed = at + len(fresh)
+        for column, new in zip(self._room, fresh[2:], strict=True):
+            if needed > len(column):
+                self._room = [np.resize(old, (2 * needed, *old.shape[1:])) for old in self._room]
+                break
+        for column, new in zip(self._room, fresh[2:], strict=True):
+            column[at:needed] = new
+        self._n = needed
+
+    def drop(self, number: int) -> None:
+        """Drop the groups before a number, once they are half of what is there."""
+        gone = min(number - self._start, self._n)
+        if gone * 2 > self._n > 0:
+            for column in self._room:
+                column[: self._n - gone] = column[gone : self._n].copy()
+            self._start, self._n = self._start + gone, self._n - gone

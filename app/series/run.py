@@ -1,0 +1,144 @@
+"""One fold's worth of rows: what is running now, or a revision that was kept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Protocol
+
+import numpy as np
+
+from ..engine.interface import Running
+from ..engine.outputs import Cursor, Pull
+from .columns import Column
+from .pyramid import FIRST, Groups, Pyramid, grouped
+
+ROWS = 16_384
+"""Rows pulled at once, so that a long history does not hold the engine's lock for long."""
+
+
+class Run(Protocol):
+    """Rows of a fold by absolute index, and their levels of detail."""
+
+    revision: int
+    generation: int
+    end: int
+
+    def sync(self, columns: Iterable[str]) -> None:
+        """Bring the levels up to date, of these columns at least."""
+
+    def span(self, since: int, until: int) -> tuple[int, int]:
+        """Absolute indices of the rows between two times, ns: the first, and the one after the last."""
+
+    def groups(self, size: int, start: int, stop: int, columns: list[str]) -> Groups:
+        """Groups of `size` rows with numbers from `start` to before `stop`."""
+
+
+class _Levels:
+    """The columns that somebody asked for, and their pyramid."""
+
+    def __init__(self, columns: dict[str, Column]) -> None:
+        self.known = columns
+        self.asked: list[str] = []
+        self.pyramid = Pyramid(0)
+
+    def ask(self, names: Iterable[str]) -> bool:
+        """Ask for columns; whether that were new ones, so that all rows are to be taken again."""
+        new = [name for name in names if name in self.known and name not in self.asked]
+        if new:
+            self.asked = sorted({*self.asked, *new})
+        return bool(new)
+
+    def clear(self) -> None:
+        self.pyramid = Pyramid(len(self.asked))
+
+    def take(self, pull: Pull) -> None:
+        self.pyramid.update(pull.first, pull.events.t, self.values(pull, self.asked))
+
+    def values(self, pull: Pull, names: list[str]) -> np.ndarray:
+        out = np.empty((len(pull.events), len(names)))
+        for k, name in enumerate(names):
+            out[:, k] = self.known[name].values(pull.events, pull.track)
+        return out
+
+    def part(self, size: int, start: int, stop: int, names: list[str]) -> Groups:
+        groups = self.pyramid.level(size).part(start, stop)
+        picked = [self.asked.index(name) for name in names]
+        return groups._replace(low=groups.low[:, picked], high=groups.high[:, picked], rising=groups.rising[:, picked])
+
+
+class LiveRun:
+    """What is running now. Not for several threads at once."""
+
+    def __init__(self, engine: Running, columns: dict[str, Column]) -> None:
+        self._engine, self._levels = engine, _Levels(columns)
+        self._cursor: Cursor = engine.cursor()
+        self.revision = -1
+        self.generation = 0
+        """Counts up when all rows are to be looked at again: of another revision or log, or for another column."""
+        self.changed = 0
+        """First row that changed in the last `sync`; `end` if none did."""
+        self.end = 0
+
+    def close(self) -> None:
+        """Give the cursor back."""
+        self._engine.release(self._cursor)
+
+    def sync(self, columns: Iterable[str]) -> None:
+        """See `Run`."""
+        if self._levels.ask(columns):
+            self._engine.release(self._cursor)
+            self._cursor = self._engine.cursor()
+        self.changed = self.end
+        while True:
+            pull = self._engine.pull(self._cursor, ROWS, align=FIRST)
+            if pull.fresh:
+                self._levels.clear()
+                self.generation += 1
+                self.revision, self.changed = pull.revision, 0
+            if len(pull.events):
+                self._levels.take(pull)
+                self.changed = min(self.changed, pull.changed)
+            self.end = pull.first + len(pull.events)
+            if len(pull.events) < ROWS:
+                self._levels.pyramid.forget(pull.oldest)
+                return
+
+    def span(self, since: int, until: int) -> tuple[int, int]:
+        """See `Run`."""
+        return self._engine.index_at(since), min(self.end, self._engine.index_at(until))
+
+    def groups(self, size: int, start: int, stop: int, columns: list[str]) -> Groups:
+        """See `Run`."""
+        if size >= FIRST:
+            return self._levels.part(size, start, stop, columns)
+        pull = self._engine.rows(start * size, min(stop * size, self.end))
+        return grouped(size, pull.first, pull.events.t, self._levels.values(pull, columns))
+
+
+class KeptRun:
+    """A revision that was kept whole: the previous one, or one that was pinned. Its arrays never change."""
+
+    def __init__(self, pull: Pull, columns: dict[str, Column]) -> None:
+        self._pull, self._levels = pull, _Levels(columns)
+        self.revision, self.generation = pull.revision, 0
+        self.end = pull.first + len(pull.events)
+
+    def sync(self, columns: Iterable[str]) -> None:
+        """See `Run`."""
+        if self._levels.ask(columns):
+            self._levels.clear()
+            self._levels.take(self._pull)
+
+    def span(self, since: int, until: int) -> tuple[int, int]:
+        """See `Run`."""
+        start, stop = np.searchsorted(self._pull.events.t, (since, until))
+        return self._pull.first + int(start), self._pull.first + int(stop)
+
+    def groups(self, size: int, start: int, stop: int, columns: list[str]) -> Groups:
+        """See `Run`."""
+        if size >= FIRST:
+            return self._levels.part(size, start, stop, columns)
+        first = self._pull.first
+        rows = slice(max(0, start * size - first), max(0, stop * size - first))
+        part = Pull(self.revision, False, first + rows.start, self._pull.events.select(rows), self._pull.track.select(rows))
+        return grouped(size, part.first, part.events.t, self._levels.values(part, columns))

@@ -1,0 +1,95 @@
+"""The series of a running twin, for every browser that looks: one set of levels for all, and none while nobody does."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable
+
+from ..engine.interface import Running
+from .columns import columns_of
+from .lane import Lane
+from .run import KeptRun, LiveRun
+
+PREVIOUS = "previous"
+
+
+class Series:
+    """Frames for the lanes of all browsers. Any thread may ask."""
+
+    def __init__(self, engine: Running) -> None:
+        self._engine = engine
+        self.columns = columns_of(engine.model)
+        self._lock = threading.Lock()
+        self._live: LiveRun | None = None
+        self._kept: dict[str, KeptRun] = {}
+        self._lanes: set[Lane] = set()
+        self._origin: int | None = None
+
+    def origin(self) -> int | None:
+        """The time from which charts count seconds, ns: the start of a recording, else the first event that was seen.
+
+        None while nothing has come.
+        """
+        span = self._engine.status().span
+        first, newest = self._engine.span() if span is None else span
+        if newest and (self._origin is None or span is not None or newest < self._origin):
+            self._origin = first
+        return self._origin
+
+    def open(self, lane: Lane) -> None:
+        """A browser looks at this lane from now on."""
+        with self._lock:
+            self._lanes.add(lane)
+
+    def close(self, lane: Lane) -> None:
+        """Nobody looks at it any more."""
+        with self._lock:
+            self._lanes.discard(lane)
+            if not self._lanes:
+                self._kept.clear()
+                if self._live is not None:
+                    self._live.close()
+                    self._live = None
+
+    def frames(self, lanes: Iterable[Lane]) -> list[bytes]:
+        """What has changed in these lanes since they were asked last."""
+        with self._lock:
+            origin, newest = self.origin(), self._engine.span()[1]
+            if origin is None or not newest:
+                return []
+            asked = [lane for lane in lanes if lane in self._lanes]
+            self._sync({column for lane in asked if lane.wanted.run == "live" for column in lane.wanted.columns})
+            frames = [frame for lane in asked if (frame := self._frame(lane, origin, newest)) is not None]
+            return frames
+
+    def _sync(self, columns: set[str]) -> None:
+        if self._live is None:
+            self._live = LiveRun(self._engine, self.columns)
+        self._live.sync(columns)
+        for lane in self._lanes:
+            if lane.wanted.run == "live":
+                lane.changed(self._live.changed)
+
+    def _frame(self, lane: Lane, origin: int, newest: int) -> bytes | None:
+        name = lane.wanted.run
+        if name == "live":
+            assert self._live is not None
+            return lane.frame(self._live, origin, newest)
+        run = self._find(name)
+        if run is None:
+            return None
+        run.sync(lane.wanted.columns)
+        return lane.frame(run, origin, newest)
+
+    def _find(self, name: str) -> KeptRun | None:
+        """The previous revision, or a kept one; None if there is none."""
+        if name == PREVIOUS:
+            pull = self._engine.previous()
+            kept = self._kept.get(PREVIOUS)
+            if pull is None:
+                self._kept.pop(PREVIOUS, None)
+                return None
+            if kept is None or kept.revision != pull.revision:
+                kept = self._kept[PREVIOUS] = KeptRun(pull, self.columns)
+            return kept
+        return self._kept.get(name)
