@@ -12,7 +12,7 @@ export const line = (name, options = {}) => ({
   stroke: () => colour(name), width: 1.5, points: { show: false }, spanGaps: false, ...options,
 });
 
-export const edge = (options = {}) => ({ stroke: null, width: 0, points: { show: false }, ...options });
+export const edge = (options = {}) => ({ stroke: () => "transparent", width: 0, points: { show: false }, ...options });
 
 export const dots = (name, size = 4, ring = false) => ({
   stroke: () => colour(name),

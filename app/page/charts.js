@@ -1,6 +1,6 @@
 // The stack of charts: one time axis, one cursor. States that nobody measures first, then the others, NIS, innovations.
 
-import { Chart, CURSOR, colour, dots, edge, line } from "./chart.js";
+import { Chart, colour, dots, edge, line } from "./chart.js";
 import { bracketed, clock, compact, spaced, withDeviation, words } from "./format.js";
 import { Lane } from "./lane.js";
 import { marks } from "./marks.js";
@@ -11,6 +11,7 @@ const DENSITY = 1.6; // px to a group of rows
 
 // The columns of a state's chart from the live lane, in the order of its series.
 const OF_STATE = ["upper", "lower", "truth", "mean"];
+const MOST_GROWTH = 4; // halvings of the window while there is less than that to show
 const OF_ROW = ["reading", "held", "refused", "screened"];
 
 export class Charts {
@@ -81,8 +82,7 @@ export class Charts {
     if (!x.length) return;
     const end = x[x.length - 1];
     if (this.view.following) {
-      const span = this.view.span ?? Math.max(1, end - x[0]);
-      this.range = [end - span, end + 0.005 * span];
+      this.range = followed(x[0], end, this.view.span);
     }
     const ended = this.range;
     for (const chart of this.charts) chart.show(chart.what.data(), ended);
@@ -112,7 +112,14 @@ export class Charts {
   }
 }
 
-export { CURSOR };
+// What is followed: the last seconds; while there are fewer, a part of the window that they fill from the left.
+function followed(start, end, span) {
+  if (span === null) return [start, Math.max(end, start + 1)];
+  if (end - start >= span) return [end - span, end + 0.004 * span];
+  let length = span;
+  for (let k = 0; k < MOST_GROWTH && end - start < length / 2; k++) length /= 2;
+  return [start, start + length];
+}
 
 function stateChart(charts, state) {
   const range = new Range();
@@ -125,31 +132,30 @@ function stateChart(charts, state) {
     unit: bracketed(state.unit),
     note: state.rows.length ? null : "not measured",
     weight: state.rows.length ? 1 : 1.5,
-    // upper, lower, truth, mean, readings …, bounds of integrity, previous mean
+    // upper, lower, previous mean, readings …, truth, mean: what matters most lies on top
     series: [
-      edge(), edge(), line("truth", { width: 1.5, dash: [5, 3], spanGaps: true }), line("estimate", { width: 1.75 }),
-      ...rows.map((name) => marksOf[name.split(":")[0]]()),
-      line("previous", { width: 1 }),
+      edge(), edge(), line("previous", { width: 1 }), ...rows.map((name) => marksOf[name.split(":")[0]]()),
+      line("truth", { width: 1.5, dash: [5, 3], spanGaps: true }), line("estimate", { width: 1.75 }),
     ],
     bands: [{ series: [1, 2], fill: () => colour("band") }],
     ticks: ticks,
-    under: (plot) => marks(plot, charts.episodes, charts.model),
+    under: (plot) => marks(plot, charts.episodes),
     over: (plot) => integrityLines(plot, charts, state),
     data: () => {
-      const columns = [live.x, ...own.map((name) => live.column(name)), ...rows.map((name) => live.column(name))];
-      return joined(columns, [previous.x, previous.column(`mean:${state.name}`)]);
+      const [upper, lower, truth, mean] = own.map((name) => live.column(name));
+      const table = [live.x, upper, lower, ...rows.map((name) => live.column(name)), truth, mean];
+      return joined(table, [previous.x, previous.column(`mean:${state.name}`)], 3);
     },
     range: (chart) => {
       if (state.probability) return [-0.03, 1.03];
       const [x, upper, lower, ...lines] = chart.data;
       const [from, to] = within(x, charts.range);
-      const [lowest, highest] = extent(lines.slice(0, -1), from, to);
+      const [lowest, highest] = extent(lines.slice(1), from, to); // what was before does not rule the axis
       const [under, over] = bandExtent(lower, upper, from, to);
       return range.fit(Math.min(lowest, under), Math.max(highest, over));
     },
     says: (value) => {
-      const [upper, mean] = [value(1), value(4)];
-      const truth = value(3);
+      const [upper, truth, mean] = [value(1), value(4 + rows.length), value(5 + rows.length)];
       const bound = charts.integrity?.[state.name]?.bound;
       const unseen = Number.isFinite(bound) ? `  (${compact(bound, 2)} unseen)` : "";
       const off = Number.isFinite(truth) ? `  truth ${compact(truth, 4)}` : "";
@@ -158,36 +164,40 @@ function stateChart(charts, state) {
   };
 }
 
+// Drawn by its logarithm: from a stuck sensor's 0.02 to an outlier's 200 everything can be read.
 function nisChart(charts) {
   const { live } = charts;
-  const names = ["nis_high", "nis_low", "nis_mean", "nis"];
-  const logarithmic = (value) => (typeof value === "number" ? Math.max(value, 1e-12) : value);
+  const names = ["nis_high", "nis_low", "nis", "nis_mean"];
+  const log = (value) => (typeof value === "number" ? Math.log10(Math.max(value, 1e-9)) : value);
   return {
     title: "NIS",
     unit: "",
     note: "mean of the last readings, in its 95 % bounds",
     weight: 1,
-    series: [line("bound", { width: 1, dash: [4, 4] }), line("bound", { width: 1, dash: [4, 4] }), line("estimate"), dots("quiet", 2.5)],
+    series: [line("bound", { width: 1 }), line("bound", { width: 1 }), dots("quiet", 2.5), line("estimate", { width: 1.75 })],
     bands: [{ series: [1, 2], fill: () => colour("bounds") }],
-    scale: { distr: 3 },
-    axis: { filter: (self, splits) => splits.map((v) => (String(v).match(/^[0.]*1[0.]*$|^10*$/) ? v : null)) },
+    axis: {
+      splits: (self, axis, low, high) => [0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100, 300, 1000].map(Math.log10).filter((v) => low <= v && v <= high),
+      values: (self, splits) => splits.map((v) => compact(10 ** v, 1)),
+    },
     ticks,
-    under: (plot) => marks(plot, charts.episodes, charts.model),
+    under: (plot) => marks(plot, charts.episodes),
     data: () => {
       const [low, high] = nisRange(live);
-      const clamp = (v) => (typeof v === "number" ? Math.min(high, Math.max(low, v)) : v);
-      return [live.x, ...names.map((name) => live.column(name).map(name === "nis" ? clamp : logarithmic))];
+      const clamped = (value) => (typeof value === "number" ? Math.min(high - 0.03, Math.max(low + 0.03, log(value))) : value);
+      return [live.x, ...names.map((name) => live.column(name).map(name === "nis" ? clamped : log))];
     },
     range: () => nisRange(live),
-    says: (value) => `${compact(value(3), 3)}  bounds ${compact(value(2), 3)} – ${compact(value(1), 3)}`,
+    says: (value) => `${compact(10 ** value(4), 3)}  bounds ${compact(10 ** value(2), 3)} – ${compact(10 ** value(1), 3)}`,
   };
 }
 
-// A decade about the bounds, and more where the mean itself leaves it.
+// Decades about the bounds, and more where the mean itself leaves them.
 function nisRange(live) {
-  const middle = Math.sqrt(live.last("nis_low") * live.last("nis_high")) || 1;
+  const middle = Math.log10(Math.sqrt(live.last("nis_low") * live.last("nis_high"))) || 0;
   const [low, high] = extent([live.column("nis_mean")], 0, live.x.length - 1);
-  return [Math.min(middle / 10, low / 1.5), Math.max(middle * 10, high * 1.5)];
+  const known = Number.isFinite(low) && low > 0;
+  return [known ? Math.min(middle - 1, Math.log10(low) - 0.15) : middle - 1, known ? Math.max(middle + 1, Math.log10(high) + 0.15) : middle + 1];
 }
 
 function innovationChart(charts, row) {
@@ -202,7 +212,7 @@ function innovationChart(charts, row) {
     series: [line("bound", { width: 1, spanGaps: true }), line("bound", { width: 1, spanGaps: true }), dots("reading", 3)],
     bands: [{ series: [1, 2], fill: () => colour("bounds") }],
     ticks,
-    under: (plot) => marks(plot, charts.episodes, charts.model),
+    under: (plot) => marks(plot, charts.episodes),
     data: () => [live.x, ...names.map((name) => live.column(name))],
     range: (chart) => {
       const [x, upper, lower, values] = chart.data;
@@ -227,7 +237,8 @@ function integrityLines(plot, charts, state) {
   const found = charts.integrity?.[state.name];
   if (!found || !Number.isFinite(found.bound)) return;
   const { ctx, bbox } = plot;
-  const [x, , , , mean] = plot.data;
+  const x = plot.data[0];
+  const mean = plot.data[plot.data.length - 1];
   ctx.save();
   ctx.beginPath();
   ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
@@ -250,8 +261,19 @@ function integrityLines(plot, charts, state) {
   ctx.restore();
 }
 
-// Two tables of other times as one; where one has no row the other's line goes on.
-function joined(table, other) {
-  if (!other[0].length) return [...table, new Array(table[0].length).fill(null)];
-  return uPlot.join([table, other], [table.map(() => 2).slice(1), [2]].map((modes) => [0, ...modes]));
+// Two tables of other times as one, in which the other's columns stand from place `at` on. Where a table has no row it says undefined, over which its lines go on; rows of one
+// time stay apart, as those of several sensors are.
+function joined(table, other, at) {
+  const [a, b] = [table[0], other[0]];
+  if (!b.length) return table.toSpliced(at, 0, ...other.slice(1).map(() => new Array(a.length)));
+  const x = [];
+  const from = []; // index in the first table, or -1 - index in the second
+  for (let i = 0, j = 0; i < a.length || j < b.length; ) {
+    const first = j >= b.length || (i < a.length && a[i] <= b[j]);
+    x.push(first ? a[i] : b[j]);
+    from.push(first ? i++ : -1 - j++);
+  }
+  const mine = table.map((values) => from.map((k) => (k >= 0 ? values[k] : undefined)));
+  mine[0] = x;
+  return mine.toSpliced(at, 0, ...other.slice(1).map((values) => from.map((k) => (k < 0 ? values[-1 - k] : undefined))));
 }

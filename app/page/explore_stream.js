@@ -1,4 +1,4 @@
-// The stream of frames from the server, for as long as somebody can see them.
+// The stream of frames for Rerun, for as long as somebody can see them.
 
 const SLOWEST = 8000; // ms between two attempts to connect
 const SHARE = 0.5; // part of the time that drawing may take; the panel beside it needs the rest
@@ -6,7 +6,7 @@ const SLOW = 1000; // ms from which on a picture is dear, as where no graphics c
 const SLOW_SHARE = 0.2; // then the twin itself may need the processor
 const LONGEST_REST = 8000; // ms
 
-export class Stream {
+export class ExploreStream {
   // told(message): JSON messages; changed(state): "live", "waiting", "hidden", "ended", "failed"
   constructor({ viewer, told, changed }) {
     this.viewer = viewer;
@@ -14,13 +14,25 @@ export class Stream {
     this.changed = changed;
     this.layout = true;
     this.delay = 250;
+    this.asleep = false;
     document.addEventListener("visibilitychange", () => (document.hidden ? this.close("hidden") : this.open()));
     if (!document.hidden) this.open();
   }
 
+  wake() {
+    this.asleep = false;
+    this.open();
+  }
+
+  // Nobody sees it: nothing is computed, sent or drawn.
+  sleep() {
+    this.asleep = true;
+    this.close("hidden");
+  }
+
   open() {
     clearTimeout(this.timer);
-    if (this.socket || document.hidden) return;
+    if (this.socket || this.asleep || document.hidden) return;
     const socket = new WebSocket(`ws://${location.host}/rerun/stream?layout=${this.layout ? 1 : 0}`);
     socket.binaryType = "arraybuffer";
     this.socket = socket;

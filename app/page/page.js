@@ -1,168 +1,122 @@
-// The page: two panes, a header, and what the user chose of their looks.
+// The page: trust on top, tuning to the left, charts in the middle, scene and lists to the right, time below.
 
-import { Stream } from "./stream.js";
-import { Viewer } from "./viewer.js";
+import { Charts } from "./charts.js";
+import { $, element, setAttribute } from "./dom.js";
+import { Episodes } from "./episodes.js";
+import { Explore } from "./explore.js";
+import { Faults } from "./faults.js";
+import { clock } from "./format.js";
+import { keys } from "./keys.js";
+import { Link } from "./link.js";
+import { Runs } from "./runs.js";
+import { Stage } from "./stage.js";
+import { Tabs } from "./tabs.js";
+import { Transport } from "./transport.js";
+import { Trust } from "./trust.js";
+import { Tune } from "./tune.js";
+import { View } from "./view.js";
 
 const settings = JSON.parse(document.body.dataset.settings);
-const $ = (id) => document.getElementById(id);
-const dark = matchMedia("(prefers-color-scheme: dark)");
-const chosen = localStorage.getItem("nisus.theme");
-const theme = chosen ?? (dark.matches ? "dark" : "light");
+const theme = document.documentElement.dataset.theme;
 
-document.documentElement.dataset.theme = theme;
 $("theme").addEventListener("click", () => {
   localStorage.setItem("nisus.theme", theme === "dark" ? "light" : "dark");
-  // Rerun's viewer takes its theme when it starts.
+  // Rerun's and Viser's pages take their theme when they start.
   location.reload();
 });
 
-// The panes
+const answer = await fetch("/api/model");
+if (!answer.ok) throw new Error(await answer.text());
+const model = await answer.json();
+window.nisus = { model, drawn: 0, revision: null };
 
-const sideways = () => innerWidth > 800;
-const left = $("left");
-const setShare = (share) => {
-  const percent = Math.min(85, Math.max(15, share));
-  left.style.setProperty("--left", `${percent}%`);
-  $("divider").setAttribute("aria-valuenow", String(Math.round(percent)));
-  localStorage.setItem("nisus.left", String(percent));
-};
-const getShare = () => Number(localStorage.getItem("nisus.left")) || 50;
-setShare(getShare());
+const link = new Link(settings.boot);
+window.nisus.link = link;
 
-$("divider").addEventListener("pointerdown", (event) => {
-  event.preventDefault();
-  $("divider").setPointerCapture(event.pointerId);
-  document.body.classList.add("dragging");
+// Times of episodes and events as the charts count them.
+link.addEventListener("status", () => {
+  const origin = link.status.origin;
+  if (origin !== link.origin) {
+    link.origin = origin;
+    place(link.episodes);
+  }
 });
-$("divider").addEventListener("pointermove", (event) => {
-  if (!document.body.classList.contains("dragging")) return;
-  const box = document.querySelector("main").getBoundingClientRect();
-  setShare(100 * (sideways() ? (event.clientX - box.left) / box.width : (event.clientY - box.top) / box.height));
+function place(episodes) {
+  const origin = Number(link.status.origin ?? 0) / 1e9;
+  for (const episode of episodes) {
+    episode.from = episode.start - origin;
+    episode.to = episode.end === null ? null : episode.end - origin;
+  }
+}
+link.addEventListener("episodes", (event) => place(event.detail));
+link.addEventListener("notices", (event) => {
+  const origin = link.status.origin;
+  for (const notice of event.detail) notice.from = origin && notice.t ? (notice.t - Number(origin)) / 1e9 : null;
 });
-for (const end of ["pointerup", "pointercancel"])
-  $("divider").addEventListener(end, () => document.body.classList.remove("dragging"));
-$("divider").addEventListener("keydown", (event) => {
-  const step = { ArrowLeft: -2, ArrowUp: -2, ArrowRight: 2, ArrowDown: 2 }[event.key];
-  if (step) setShare(getShare() + step);
+
+const view = new View(model.window);
+const charts = new Charts($("charts"), model, link, view);
+window.nisus.charts = charts;
+window.nisus.view = view;
+
+const side = new Tabs($("side-tabs"), "nisus.side");
+new Trust(model, link, (tab) => side.show(tab));
+const tune = new Tune(model, link);
+new Faults($("faults"), model, link);
+new Episodes($("episodes"), link, view, charts);
+new Runs($("runs"), link);
+const transport = new Transport(model, link, view, charts);
+const explore = new Explore(settings.viewer, theme);
+const stage = new Stage(settings.viser, theme);
+
+const middle = new Tabs($("middle-tabs"), null, (name) => {
+  if (name === "explore") explore.show();
+  else explore.hide();
 });
-$("divider").addEventListener("dblclick", () => setShare(50));
+side.show(side.chosen ?? "scene");
+// The scene once the charts stand: its three.js keeps the page busy while it starts.
+const staged = (name) => stage.visible(name === "scene");
+link.addEventListener("frames", () => setTimeout(() => ((side.shown = staged), staged(side.chosen)), 300), { once: true });
 
-if (settings.viser) {
-  const socket = `ws://${location.host}/viser/`;
-  $("viser").src = `/viser/?websocket=${encodeURIComponent(socket)}${theme === "dark" ? "&darkMode" : ""}`;
-} else {
-  left.hidden = $("divider").hidden = true;
+async function record() {
+  if (link.status.recording) await link.ask("Record", { path: null });
+  else {
+    const stamp = new Date().toISOString().replace(/[-:]/g, "").replace("T", "-").slice(0, 15);
+    await link.ask("Record", { path: `${model.twin}-${stamp}.rrd` });
+  }
 }
+$("record").addEventListener("click", record);
 
-// The header
-
-const spell = (seconds) => (seconds < 120 ? `${Math.floor(seconds)} s` : `${Math.floor(seconds / 60)} min`);
-
-// Beside the colours, for whoever cannot tell them.
-const SIGNS = { waiting: "○", tracking: "●", suspect: "◐", degraded: "▲", diverged: "✖", stale: "◌" };
-
-function show(status) {
-  document.title = `${status.twin} · Nisus`;
-  $("twin").textContent = status.twin;
-  const turned = Object.keys(status.turned).length > 0;
-  const recorded = status.began_as === "recorded" ? (turned ? " · recorded, turned" : " · as recorded") : "";
-  $("title").textContent = status.title + recorded;
-  const lost = status.lost !== null;
-  const lasting = lost || (!["tracking", "waiting"].includes(status.health) && status.since !== null);
-  const condition = lost ? "not a number" : status.health;
-  const since = lost ? status.lost : status.since;
-  const sign = SIGNS[status.health] ?? "●";
-  $("health").textContent = `${sign} ${lasting ? `${condition} for ${spell((status.t - since) / 1e9)}` : condition}`;
-  $("health").title = lost
-    ? "The estimate is not a number: reset it, or choose another filter"
-    : "Health of the estimate";
-  $("health").dataset.health = status.health;
-  if ($("cause").textContent !== status.cause) $("cause").textContent = $("cause").title = status.cause;
-  $("cause").hidden = lost || !status.cause;
-  $("estimator").textContent = status.estimator.toUpperCase();
-  $("revision").textContent = status.refolding ? `${status.revision} …` : status.revision;
-  compare(status.revision);
-  const number = (value) => (typeof value === "number" ? value.toPrecision(3) : "–");
-  const bounded = typeof status.nis === "number";
-  $("nis").textContent = bounded ? `${number(status.nis)} (${number(status.nis_low)} – ${number(status.nis_high)})` : "–";
-  $("latency").textContent = typeof status.latency_ms === "number" ? `${status.latency_ms.toFixed(1)} ms` : "–";
-  $("recording").hidden = status.recording === null;
-  $("recording").title = status.recording ?? "";
-  const playing = status.finished ? "ended" : status.paused ? "paused" : null;
-  $("playing").hidden = playing === null;
-  $("playing").textContent = playing ?? "";
-}
-
-// The newest revision that was heard of, and the one that the right pane's viewer has drawn.
-const revisions = { newest: null, drawn: null };
-
-function compare(revision) {
-  revisions.newest = Math.max(revision, revisions.newest ?? 0);
-  const late = revisions.drawn !== null && revisions.drawn !== revisions.newest;
-  const text = late ? `revision ${revisions.drawn} still; drawing ${revisions.newest} …` : "";
-  if ($("behind").textContent === text) return;
-  $("behind").textContent = text;
-  $("behind").hidden = !late;
-}
-
-function offer(names) {
-  const wanted = names.join("\n");
-  if ($("recordings").dataset.names === wanted) return;
-  $("recordings").dataset.names = wanted;
+link.addEventListener("status", (event) => {
+  const names = event.detail.recordings ?? [];
+  const key = names.join("\n");
+  if ($("recordings").dataset.names === key) return;
+  $("recordings").dataset.names = key;
   $("recordings").replaceChildren(
-    ...names.slice(-3).map((name) => {
-      const link = document.createElement("a");
-      link.href = `/rec/${encodeURIComponent(name)}`;
-      link.textContent = name;
-      link.title = "Download this recording";
-      link.download = name;
-      return link;
-    }),
+    ...names.slice(-3).map((name) => element("a", { href: `/rec/${encodeURIComponent(name)}`, download: name, title: "Download this recording" }, name)),
   );
-}
+});
 
-const CONNECTION = {
-  live: "live",
-  waiting: "connection lost, trying again",
-  hidden: "hidden",
-  failed: "charts stopped",
-  ended: "this session has ended; open the address that Nisus printed last",
+const drawer = () => {
+  const open = document.body.classList.toggle("tuning");
+  setAttribute($("drawer"), "aria-expanded", String(open));
 };
+$("drawer").addEventListener("click", drawer);
 
-function connection(state) {
-  $("connection").dataset.state = state === "live" ? "live" : ["waiting", "failed", "ended"].includes(state) ? "lost" : "idle";
-  $("connection").textContent = CONNECTION[state];
-}
+keys([
+  ["space", "pause or go on", () => transport.pause()],
+  [".", "one event further, while paused", () => link.ask("Step")],
+  ["ArrowLeft", "a tenth of the charts back", () => view.pan(-0.1 * (charts.range[1] - charts.range[0]), charts.range)],
+  ["ArrowRight", "a tenth of the charts on", () => view.pan(0.1 * (charts.range[1] - charts.range[0]), charts.range)],
+  ["f", "follow the newest row", () => view.follow()],
+  ["0", "charts as wide as the twin says", () => view.follow(view.configured)],
+  ["r", "record, or end the recording", record],
+  ["u", "undo the last edit", () => tune.undo()],
+  ["U", "redo", () => tune.redo()],
+  ["e", "episodes", () => side.show("episodes")],
+  ["s", "scene", () => side.show("scene")],
+  ["x", "explore in Rerun, and back", () => middle.show(middle.chosen === "explore" ? "charts" : "explore")],
+  ["t", "tune, where the page is narrow", drawer],
+]);
 
-function note(text) {
-  $("notice").textContent = text;
-  $("notice").hidden = false;
-}
-
-// The right pane
-
-try {
-  const viewer = await Viewer.open($("rerun"), $("before"), settings.viewer, theme);
-  window.nisus = { viewer, revision: null, drawn: 0, status: null };
-  new Stream({
-    viewer,
-    changed: connection,
-    told: (message) => {
-      if (message.boot && message.boot !== settings.boot) location.reload(); // another server, perhaps another twin
-      if (message.status) show((window.nisus.status = message.status));
-      if (message.recordings) offer(message.recordings);
-      if (message.recording) compare((window.nisus.revision = message.revision));
-      if (message.drawn) {
-        // Unless it lost patience with the viewer, that shows the recording announced last.
-        if (!viewer.announced) revisions.drawn = window.nisus.revision;
-        compare(window.nisus.revision);
-        window.nisus.drawn += 1;
-        $("notice").hidden = true;
-      }
-      if (message.failed) note(`The charts stopped: ${message.failed}. Reload the page.`);
-    },
-  });
-} catch (error) {
-  connection("failed");
-  note(`The charts could not be loaded: ${error.message}`);
-}
+$("clock").title = `Time since the first reading; ${clock(0)}`;

@@ -1,0 +1,115 @@
+// Faults on demand and maintenance: put something wrong into what the source says, and see how soon the twin tells.
+
+import { element, setText } from "./dom.js";
+import { words } from "./format.js";
+import { section } from "./tune.js";
+
+export class Faults {
+  constructor(node, model, link) {
+    Object.assign(this, { node, model, link });
+    this.begin();
+  }
+
+  async begin() {
+    const answer = await fetch("/api/faults");
+    if (!answer.ok) return;
+    this.catalogue = await answer.json();
+    this.node.append(this.faultSection(), this.maintenanceSection());
+    this.link.addEventListener("status", (event) => this.show(event.detail));
+    this.show(this.link.status);
+  }
+
+  faultSection() {
+    const { kinds, available } = this.catalogue;
+    const hint = "Put something wrong into what the source says, and see how soon the twin tells";
+    if (!available) return section("Faults on demand", hint, false, element("p", { class: "about" }, "A recording that is reviewed holds what came, faults included."));
+    this.kind = element("select", { "aria-label": "Fault", onchange: () => this.offer() }, ...kinds.map((kind) => element("option", { value: kind.name, title: kind.help }, words(kind.name))));
+    this.target = element("select", { "aria-label": "Of what", onchange: () => this.offerRows() });
+    this.row = element("select", { "aria-label": "Row" });
+    this.other = element("select", { "aria-label": "Swapped with" });
+    this.help = element("p", { class: "about" });
+    this.numbers = element("div", { class: "numbers" });
+    this.note = element("p", { class: "error", role: "alert", hidden: true });
+    this.list = element("ul", { class: "held" });
+    const inject = element("button", { type: "button", id: "inject", class: "go", onclick: () => this.inject() }, "Inject");
+    const made = section("Faults on demand", hint, false, element("div", { class: "pair" }, this.kind, this.target),
+      element("div", { class: "pair" }, this.row, this.other), this.help, this.numbers, inject, this.note, this.list);
+    this.offer();
+    return made;
+  }
+
+  offer() {
+    const kind = this.catalogue.kinds.find((item) => item.name === this.kind.value);
+    const known = { sensor: Object.keys(this.catalogue.sensors), input: Object.keys(this.catalogue.inputs), parameter: Object.keys(this.catalogue.parameters), all: [""] };
+    const option = (what) => (name) => element("option", { value: name && what !== "sensor" ? `${what}.${name}` : name }, name ? `${words(name)}${what === "sensor" ? "" : ` (${what})`}` : "the whole source");
+    const targets = ["sensor", "input", "parameter"].filter((what) => kind.of.includes(what)).flatMap((what) => known[what].map(option(what)));
+    if (!kind.of.some((what) => what in known) || kind.of.some((what) => !["sensor", "input", "parameter"].includes(what))) targets.push(option("all")(""));
+    this.target.replaceChildren(...targets);
+    setText(this.help, kind.help);
+    this.fields = new Map();
+    const rows = kind.parameters.map((number) => {
+      const field = element("input", { type: "text", inputmode: "decimal", "aria-label": words(number.name), placeholder: number.default ?? "" });
+      this.fields.set(number.name, field);
+      return element("label", { title: number.help }, element("span", {}, words(number.name)), field, element("span", { class: "unit" }, number.unit ?? ""));
+    });
+    const duration = element("input", { type: "text", inputmode: "decimal", "aria-label": "duration", placeholder: "until stopped" });
+    this.fields.set("duration", duration);
+    this.numbers.replaceChildren(...rows, element("label", {}, element("span", {}, "duration"), duration, element("span", { class: "unit" }, "s")));
+    this.offerRows();
+  }
+
+  offerRows() {
+    const kind = this.catalogue.kinds.find((item) => item.name === this.kind.value);
+    const rows = (kind.rows && this.catalogue.sensors[this.target.value]) || [];
+    this.row.replaceChildren(element("option", { value: "" }, "all rows"), ...rows.map((row) => element("option", { value: row.name }, words(row.name))));
+    this.row.hidden = rows.length < 2;
+    const others = kind.other ? Object.keys(this.catalogue.sensors).filter((name) => name !== this.target.value) : [];
+    this.other.replaceChildren(...others.map((name) => element("option", { value: name }, words(name))));
+    this.other.hidden = !others.length;
+  }
+
+  async inject() {
+    const fields = { kind: this.kind.value };
+    if (this.target.value) fields.target = this.target.value;
+    if (!this.row.hidden && this.row.value) fields.row = this.row.value;
+    if (!this.other.hidden) fields.other = this.other.value;
+    for (const [name, field] of this.fields) {
+      const text = field.value.trim().replace(",", ".");
+      if (text !== "") fields[name] = Number.isFinite(Number(text)) ? Number(text) : text;
+    }
+    this.complain(await this.link.ask("InjectFault", fields));
+  }
+
+  complain(reason) {
+    setText(this.note, reason ?? "");
+    this.note.hidden = !reason;
+  }
+
+  show(status) {
+    const held = status.faults ?? [];
+    const key = JSON.stringify(held);
+    if (key === this.shown) return;
+    this.shown = key;
+    this.list.replaceChildren(
+      ...held.map((fault) =>
+        element("li", {}, element("span", {}, fault.text ?? words(fault.kind)), element("button", { type: "button", onclick: () => this.link.ask("ClearFault", { number: fault.number }) }, "stop")),
+      ),
+    );
+  }
+
+  maintenanceSection() {
+    const what = element("input", { type: "text", placeholder: "what was changed", "aria-label": "What was changed", maxlength: 200 });
+    const which = element("select", { "aria-label": "States that it concerns" }, element("option", { value: "" }, "all states"), ...this.model.states.map((state) => element("option", { value: state.name }, words(state.name))));
+    const note = element("p", { class: "error", role: "alert", hidden: true });
+    const done = async () => {
+      const states = which.value ? [which.value] : this.model.states.map((state) => state.name);
+      const reason = await this.link.ask("Maintenance", { what: what.value.trim(), states });
+      setText(note, reason ?? "");
+      note.hidden = !reason;
+      if (!reason) what.value = "";
+    };
+    const reset = element("button", { type: "button", id: "reset", title: "Back to the prior at the present time", onclick: () => this.link.ask("Reset") }, "Reset the estimate");
+    return section("Maintenance", "Something of the asset was changed: states start again, a new version of the model begins", false,
+      element("div", { class: "pair" }, what, which), element("div", { class: "pair" }, element("button", { type: "button", class: "go", onclick: done }, "Done"), reset), note);
+  }
+}

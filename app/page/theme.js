@@ -1,0 +1,3 @@
+// Before anything is drawn: light or dark, as chosen here or as the system has it.
+document.documentElement.dataset.theme =
+  localStorage.getItem("nisus.theme") ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");

@@ -1,0 +1,145 @@
+// The bar of time: pause, step, speed, where we are, health and events on a track; click to look there.
+
+import { $, element, setAttribute, setText } from "./dom.js";
+import { clock } from "./format.js";
+import { Lane } from "./lane.js";
+import { SIGNS } from "./trust.js";
+
+const HEALTH = ["waiting", "tracking", "suspect", "degraded", "diverged", "stale"];
+const SPEEDS = [["0.1×", 0.1], ["0.25×", 0.25], ["0.5×", 0.5], ["1×", 1], ["2×", 2], ["5×", 5], ["10×", 10], ["max", "inf"]];
+const WINDOWS = [10, 30, 60, 120, 300, 900, 3600];
+const POINTS = 400;
+
+export class Transport {
+  constructor(model, link, view, charts) {
+    Object.assign(this, { model, link, view, charts });
+    this.lane = new Lane();
+    this.episodes = [];
+    this.canvas = $("timeline");
+    const spans = [...new Set([...WINDOWS, model.window])].sort((a, b) => a - b);
+    $("window").replaceChildren(...spans.map((s) => element("option", { value: s }, s < 60 ? `${s} s` : s < 3600 ? `${s / 60} min` : `${s / 3600} h`)), element("option", { value: "all" }, "all"));
+    $("window").value = String(model.window);
+    $("window").addEventListener("change", () => view.follow($("window").value === "all" ? null : Number($("window").value)));
+    $("speed").replaceChildren(...SPEEDS.map(([text, value]) => element("option", { value }, text)));
+    $("speed").addEventListener("change", () => link.ask("Speed", { factor: $("speed").value === "inf" ? "inf" : Number($("speed").value) }));
+    $("pause").addEventListener("click", () => this.pause());
+    $("step").addEventListener("click", () => link.ask("Step"));
+    $("follow").addEventListener("click", () => view.hold(charts.range));
+    this.canvas.addEventListener("pointerdown", (event) => this.press(event));
+    this.canvas.addEventListener("pointermove", (event) => this.hover(event));
+    this.canvas.addEventListener("keydown", (event) => this.keyed(event));
+    link.look("overview", { columns: ["health"], points: POINTS }, (...frame) => this.lane.take(...frame));
+    link.addEventListener("frames", () => this.draw());
+    link.addEventListener("episodes", (event) => (this.episodes = event.detail));
+    link.addEventListener("status", (event) => this.show(event.detail));
+    view.addEventListener("change", () => this.draw());
+    new ResizeObserver(() => this.draw()).observe(this.canvas);
+  }
+
+  // Ends of the track in seconds: of the whole recording where that is known.
+  get ends() {
+    const { x } = this.lane;
+    const [first, last] = x.length ? [x[0], x[x.length - 1]] : [0, 1];
+    const length = this.status?.length;
+    return [Math.min(0, first), Math.max(last, typeof length === "number" ? length : last, first + 1)];
+  }
+
+  // A replay is paused; of a live source only the charts are held.
+  pause() {
+    if (this.status?.seekable) this.link.ask("Pause", { paused: !this.status.paused });
+    else this.view.hold(this.charts.range);
+  }
+
+  show(status) {
+    this.status = status;
+    const held = status.seekable ? status.paused : !this.view.following;
+    setText($("pause"), held ? "▶" : "❚❚");
+    setAttribute($("pause"), "title", status.seekable ? (held ? "Go on (space)" : "Pause the replay (space)") : "Hold the charts; the twin runs on (space)");
+    $("pause").disabled = status.finished && status.seekable;
+    $("step").hidden = $("speed").hidden = !status.seekable;
+    $("step").disabled = !status.paused;
+    if (status.seekable && document.activeElement !== $("speed")) $("speed").value = String(status.speed ?? 1);
+    setText($("state"), status.finished ? "ended" : status.paused ? "paused" : "");
+    const now = status.origin && status.t !== null ? this.now : NaN;
+    setText($("now"), clock(now, 1));
+  }
+
+  get now() {
+    const { x } = this.lane;
+    return x.length ? x[x.length - 1] : NaN;
+  }
+
+  draw() {
+    $("follow").hidden = this.view.following;
+    setText($("follow"), "follow ▸");
+    const { canvas } = this;
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    const ratio = devicePixelRatio;
+    if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
+      canvas.width = Math.round(width * ratio);
+      canvas.height = Math.round(height * ratio);
+    }
+    const ctx = canvas.getContext("2d");
+    ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
+    ctx.clearRect(0, 0, width, height);
+    const style = getComputedStyle(document.documentElement);
+    const tone = (name) => style.getPropertyValue(`--${name}`).trim();
+    const [start, end] = this.ends;
+    const place = (seconds) => ((seconds - start) / (end - start)) * width;
+    ctx.fillStyle = tone("rule");
+    ctx.fillRect(0, 14, width, 10);
+    const { x } = this.lane;
+    const health = this.lane.column("health");
+    for (let k = 0; k < x.length; ) {
+      let next = k + 1;
+      while (next < x.length && health[next] === health[k]) next += 1;
+      ctx.fillStyle = tone(`health-${HEALTH[health[k]] ?? "waiting"}`);
+      const until = next < x.length ? place(x[next]) : place(x[x.length - 1]);
+      ctx.fillRect(place(x[k]), 14, Math.max(1, until - place(x[k])), 10);
+      k = next;
+    }
+    ctx.font = "11px system-ui, sans-serif";
+    ctx.textAlign = "center";
+    ctx.fillStyle = tone("ink");
+    for (const episode of this.episodes) ctx.fillText("▾", Math.min(width - 5, Math.max(5, place(episode.from))), 12);
+    // What the charts show.
+    const [since, until] = this.charts.range;
+    ctx.strokeStyle = tone("ink");
+    ctx.lineWidth = 1.5;
+    const left = Math.max(0, place(since));
+    ctx.strokeRect(left + 0.75, 11.75, Math.max(3, Math.min(width, place(until)) - left - 1.5), 14.5);
+    ctx.fillStyle = tone("faint");
+    ctx.textAlign = "left";
+    ctx.fillText(clock(start), 0, 38);
+    ctx.textAlign = "right";
+    ctx.fillText(clock(end), width, 38);
+  }
+
+  time(event) {
+    const box = this.canvas.getBoundingClientRect();
+    const [start, end] = this.ends;
+    return start + (Math.min(1, Math.max(0, (event.clientX - box.left) / box.width))) * (end - start);
+  }
+
+  // The past is looked at; the future of a recording is sought.
+  press(event) {
+    const time = this.time(event);
+    if (time <= this.now && !event.shiftKey) this.view.goTo(time, this.charts.range);
+    else if (this.status?.seekable) {
+      this.link.ask("Seek", { seconds: time });
+      this.view.follow();
+    }
+  }
+
+  hover(event) {
+    const time = this.time(event);
+    const near = this.episodes.filter((episode) => episode.from <= time && time <= (episode.to ?? Infinity));
+    const future = time > this.now ? (this.status?.seekable ? ": click to play on from here" : "") : "";
+    setAttribute(this.canvas, "title", [clock(time, 1) + future, ...near.map((episode) => `${SIGNS.suspect} ${episode.text}`)].join("\n"));
+  }
+
+  keyed(event) {
+    const step = { ArrowLeft: -0.1, ArrowRight: 0.1 }[event.key];
+    if (step) this.view.pan(step * (this.charts.range[1] - this.charts.range[0]), this.charts.range);
+  }
+}

@@ -1,0 +1,229 @@
+// The Tune panel: filter and options, noises, parameters, gate, sensors. Undo and redo.
+
+import { $, element, setAttribute, setText } from "./dom.js";
+import { Knob } from "./knob.js";
+import { words } from "./format.js";
+
+const GROUPS = { Q: "Process noise Q", R: "Sensor noise R", p: "Parameters" };
+const HINTS = {
+  Q: "Variance that is added in one second: how much the model is distrusted",
+  R: "Variance of the readings: how much the sensors are distrusted",
+  p: "Numbers of the model",
+};
+const GATES = [["off", null], ["95 %", 0.95], ["99 %", 0.99], ["99.73 %", 0.9973], ["99.99 %", 0.9999]];
+const MANY = 8; // entries from which on a group is closed at first
+const KEPT = 100; // edits that can be undone
+
+export class Tune {
+  constructor(model, link) {
+    Object.assign(this, { model, link });
+    this.knobs = new Map();
+    this.undone = [];
+    this.done = [];
+    this.sections = element("div", { class: "sections" });
+    $("tune").replaceChildren(this.head(), this.sections);
+    this.sections.append(this.filterSection());
+    for (const [prefix, title] of Object.entries(GROUPS)) {
+      const items = model.tuning.filter((item) => item.key.startsWith(`${prefix}.`));
+      if (items.length) this.sections.append(this.group(prefix, title, items));
+    }
+    this.sections.append(this.gateSection(), this.sensorSection());
+    link.addEventListener("status", (event) => this.sync(event.detail));
+  }
+
+  head() {
+    const button = (id, text, title, click) => element("button", { type: "button", id, title, "aria-label": title, onclick: click, disabled: true }, text);
+    this.undoButton = button("undo", "↶", "Undo the last edit (U)", () => this.undo());
+    this.redoButton = button("redo", "↷", "Redo (Shift-U)", () => this.redo());
+    this.restoreButton = button("restore", "Restore", "Filter and tuning as the session began with", () => this.link.ask("Restore"));
+    this.notice = element("p", { class: "error", role: "alert", hidden: true });
+    return element("header", { class: "panel-head" }, element("h2", {}, "Tune"), element("span", { class: "space" }), this.undoButton, this.redoButton, this.restoreButton, this.notice);
+  }
+
+  filterSection() {
+    const applies = this.model.estimators.filter((entry) => !entry.reason);
+    const refused = this.model.estimators.filter((entry) => entry.reason);
+    const option = (entry) => element("option", { value: entry.name, disabled: Boolean(entry.reason), title: entry.reason ?? entry.assumes }, entry.title);
+    this.estimator = element(
+      "select", { id: "estimator", "aria-label": "Estimator", onchange: () => this.choose(this.estimator.value) },
+      element("optgroup", { label: "Estimators" }, ...applies.map(option)),
+      refused.length ? element("optgroup", { label: "Do not apply here" }, ...refused.map(option)) : null,
+    );
+    $("estimator-place").replaceChildren(this.estimator);
+    this.about = element("p", { class: "about" });
+    this.options = element("div", { class: "options" });
+    const reasons = refused.length
+      ? element("details", { class: "refused" }, element("summary", {}, `${refused.length} do not apply here: why`),
+          element("dl", {}, ...refused.flatMap((entry) => [element("dt", {}, entry.title), element("dd", {}, entry.reason)])))
+      : null;
+    return section("Filter", "Assumptions, options and why others do not apply", false, this.about, this.options, reasons);
+  }
+
+  group(prefix, title, items) {
+    const all = prefix === "p" || items.length < 2 ? null : this.together(prefix, title);
+    const knobs = items.map((item) => {
+      const knob = new Knob(
+        {
+          key: item.key, label: item.key.slice(2), unit: item.unit, low: item.low, high: item.high, configured: item.configured,
+          logarithmic: prefix !== "p",
+        },
+        (value) => this.turn(item.key, value),
+      );
+      this.knobs.set(item.key, knob);
+      return knob.node;
+    });
+    return section(title, HINTS[prefix], items.length <= MANY, all, ...knobs);
+  }
+
+  // One line that scales all of a group.
+  together(prefix, title) {
+    const scale = (factor) => async () => {
+      for (const [key, knob] of this.knobs) if (key.startsWith(`${prefix}.`)) knob.set(Number((knob.value * factor).toPrecision(6)));
+    };
+    const button = (text, factor) => element("button", { type: "button", title: `All of ${title} ${text}`, onclick: scale(factor) }, text);
+    return element("div", { class: "together" }, element("span", {}, "all"), button("÷10", 0.1), button("÷2", 0.5), button("×2", 2), button("×10", 10));
+  }
+
+  gateSection() {
+    const choose = () => this.turn("gate", this.gate.value === "off" ? null : Number(this.gate.value));
+    this.gate = element("select", { "aria-label": "Gate", title: "Probability with which a good reading passes", onchange: choose });
+    this.kind = element(
+      "select", { "aria-label": "Kind of gate", title: "What becomes of a reading beyond it", onchange: () => this.turn("gate.kind", this.kind.value) },
+      element("option", { value: "hard" }, "refuse"), element("option", { value: "soft" }, "soften"),
+    );
+    return section("Gate", "Readings that a good sensor would hardly give", true, element("div", { class: "pair" }, this.gate, this.kind));
+  }
+
+  sensorSection() {
+    this.sensors = new Map();
+    const rows = this.model.sensors.map((name) => {
+      const box = element("input", { type: "checkbox", onchange: () => this.use(name, box.checked) });
+      const row = element("label", { class: "sensor", title: "Off: held out. Predicted and scored, never used" }, box, element("span", {}, words(name)), element("em", {}));
+      this.sensors.set(name, [box, row.lastChild]);
+      return row;
+    });
+    return section("Sensors in use", "Off: held out. Predicted and scored, never used", this.model.sensors.length <= MANY, ...rows);
+  }
+
+  sync(status) {
+    this.status = status;
+    if (document.activeElement !== this.estimator) this.estimator.value = status.estimator;
+    const entry = this.model.estimators.find((item) => item.name === status.estimator);
+    if (this.entry !== entry) this.build(entry);
+    for (const [name, knob] of this.optionKnobs) {
+      if (knob instanceof Knob) knob.sync(status.options[name]);
+      else if (document.activeElement !== knob) knob.value = String(Math.round(status.options[name]));
+    }
+    for (const [key, value] of Object.entries(status.tuning)) this.knobs.get(key)?.sync(value);
+    this.syncGate(status);
+    for (const [name, [box, note]] of this.sensors) {
+      const used = status.used[name];
+      if (document.activeElement !== box || box.checked === used) box.checked = used;
+      setText(note, status.sensors[name]?.state === "tracking" ? "" : (status.sensors[name]?.state ?? ""));
+    }
+    const turned = Object.keys(status.turned).length;
+    this.restoreButton.disabled = !turned;
+    setText(this.restoreButton, turned ? `Restore ${turned}` : "Restore");
+    setAttribute(this.restoreButton, "title", turned ? `Turned since the start: ${Object.keys(status.turned).join(", ")}` : "Nothing was turned");
+  }
+
+  syncGate(status) {
+    const gate = status.gate ?? null;
+    const known = [...GATES];
+    if (!known.some(([, value]) => value === gate)) known.push([`${100 * gate} %`, gate]);
+    const wanted = JSON.stringify(known);
+    if (this.gates !== wanted) {
+      this.gates = wanted;
+      this.gate.replaceChildren(...known.map(([text, value]) => element("option", { value: value === null ? "off" : value }, text)));
+    }
+    if (document.activeElement !== this.gate) this.gate.value = gate === null ? "off" : String(gate);
+    if (document.activeElement !== this.kind) this.kind.value = status.gate_kind ?? "hard";
+    this.kind.disabled = gate === null;
+  }
+
+  build(entry) {
+    this.entry = entry;
+    this.optionKnobs = new Map();
+    setText(this.about, entry.assumes);
+    setAttribute(this.about, "title", `Fails when ${entry.fails_when}. ${entry.source}`);
+    const rows = entry.options.map((option) => {
+      if (option.choices.length) {
+        const select = element("select", { "aria-label": option.name, title: option.meaning, onchange: () => this.option(option.name, Number(select.value)) },
+          ...option.choices.map((text, k) => element("option", { value: k }, text)));
+        this.optionKnobs.set(option.name, select);
+        return element("div", { class: "knob plain" }, element("label", { title: option.meaning }, words(option.name)), select);
+      }
+      const knob = new Knob(
+        {
+          key: `option.${option.name}`, label: option.name, unit: option.unit, low: option.low, high: option.high ?? Infinity,
+          configured: option.configured, logarithmic: option.whole && option.configured > 20, whole: option.whole, help: option.meaning,
+        },
+        (value) => this.option(option.name, option.whole ? Math.round(value) : value),
+      );
+      this.optionKnobs.set(option.name, knob);
+      return knob.node;
+    });
+    this.options.replaceChildren(...rows);
+  }
+
+  // Edits. Each is kept with what undoes it.
+
+  choose(name) {
+    return this.edit(`estimator ${name}`, "SetEstimator", { name }, { name: this.status.estimator });
+  }
+
+  turn(key, value) {
+    const before = { gate: this.status.gate ?? null, "gate.kind": this.status.gate_kind }[key] ?? this.status.tuning[key] ?? null;
+    return this.edit(key, "SetTuning", { key, value }, { key, value: before });
+  }
+
+  option(name, value) {
+    return this.edit(`option ${name}`, "SetOption", { name, value }, { name, value: this.status.options[name] });
+  }
+
+  use(name, used) {
+    return this.edit(`use ${name}`, "UseSensor", { name, used }, { name, used: !used });
+  }
+
+  async edit(what, command, fields, before) {
+    const reason = await this.link.ask(command, fields);
+    setText(this.notice, reason ?? "");
+    this.notice.hidden = !reason;
+    if (!reason) {
+      const last = this.done.at(-1);
+      // The values of one drag are one edit.
+      if (last?.what === what && performance.now() - last.when < 1500) Object.assign(last, { fields, when: performance.now() });
+      else this.done.push({ what, command, fields, before, when: performance.now() });
+      this.done.splice(0, Math.max(0, this.done.length - KEPT));
+      this.undone.length = 0;
+      this.enable();
+    }
+    return reason;
+  }
+
+  async undo() {
+    const last = this.done.pop();
+    if (!last) return;
+    await this.link.ask(last.command, last.before);
+    this.undone.push(last);
+    this.enable();
+  }
+
+  async redo() {
+    const next = this.undone.pop();
+    if (!next) return;
+    await this.link.ask(next.command, next.fields);
+    this.done.push({ ...next, when: 0 });
+    this.enable();
+  }
+
+  enable() {
+    this.undoButton.disabled = !this.done.length;
+    this.redoButton.disabled = !this.undone.length;
+    setAttribute(this.undoButton, "title", this.done.length ? `Undo ${this.done.at(-1).what} (U)` : "Nothing to undo");
+  }
+}
+
+export function section(title, hint, open, ...children) {
+  return element("details", { class: "section", open }, element("summary", { title: hint }, title), ...children);
+}
