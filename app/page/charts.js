@@ -184,7 +184,8 @@ function nisChart(charts) {
     under: (plot) => marks(plot, charts.episodes),
     data: () => {
       const [low, high] = nisRange(live);
-      const clamped = (value) => (typeof value === "number" ? Math.min(high - 0.03, Math.max(low + 0.03, log(value))) : value);
+      // Readings that fit are of no interest; one that does not fit at all stands at the top.
+      const clamped = (value) => (typeof value !== "number" || log(value) < low ? null : Math.min(high - 0.03, log(value)));
       return [live.x, ...names.map((name) => live.column(name).map(name === "nis" ? clamped : log))];
     },
     range: () => nisRange(live),

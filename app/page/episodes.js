@@ -11,7 +11,10 @@ export class Episodes {
     this.notices = [];
     link.addEventListener("episodes", (event) => this.show(event.detail));
     link.addEventListener("notices", (event) => {
-      this.notices = [...event.detail.reverse(), ...this.notices].slice(0, MOST);
+      // After a break all are told again.
+      const known = this.notices[0]?.number ?? -1;
+      const fresh = event.detail.filter((notice) => notice.number > known).reverse();
+      this.notices = [...fresh, ...this.notices].slice(0, MOST);
       this.show(this.link.episodes);
     });
     this.show([]);

@@ -7,13 +7,15 @@ export function marks(plot, episodes) {
   const [low, high] = [plot.scales.x.min, plot.scales.x.max];
   ctx.save();
   ctx.fillStyle = colour("episode");
+  ctx.beginPath();
   for (const episode of episodes) {
     const start = Math.max(episode.from ?? episode.start, low);
     const end = Math.min(episode.to ?? episode.end ?? high, high);
     if (end <= start && !(episode.start >= low && episode.start <= high)) continue;
     const left = plot.valToPos(start, "x", true);
     const right = Math.max(left + 2, plot.valToPos(end, "x", true));
-    ctx.fillRect(left, bbox.top, right - left, bbox.height);
+    ctx.rect(left, bbox.top, right - left, bbox.height);
   }
+  ctx.fill(); // once, so that several at one time are no darker
   ctx.restore();
 }

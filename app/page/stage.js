@@ -30,6 +30,6 @@ export class Stage {
 }
 
 const PANELS = `
-  [data-dock-region], [data-dock-region-handle], [data-floating-window], .mantine-Notifications-root { display: none !important; }
+  [data-dock-region], [data-dock-region-handle], [data-floating-window], .mantine-Paper-root, .mantine-Notifications-root { display: none !important; }
   [data-dock-root] > div { inset: 0 !important; width: 100% !important; }
 `;

@@ -130,7 +130,7 @@ export class Tune {
   syncGate(status) {
     const gate = status.gate ?? null;
     const known = [...GATES];
-    if (!known.some(([, value]) => value === gate)) known.push([`${100 * gate} %`, gate]);
+    if (!known.some(([, value]) => value === gate)) known.push([`${Number((100 * gate).toPrecision(8))} %`, gate]);
     const wanted = JSON.stringify(known);
     if (this.gates !== wanted) {
       this.gates = wanted;

@@ -60,7 +60,9 @@ def wanted_from_json(body: Any, columns: dict[str, Column]) -> Wanted:
     numbers = {}
     for key in ("since", "until", "span"):
         value = body.get(key)
-        if value is not None and (isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9):
+        if value is not None and (
+            isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9
+        ):
             raise ConfigError(f"lane: {key} is {value!r}; it must be a number of seconds, or null")
         numbers[key] = value
     points = body.get("points", 600)
@@ -119,7 +121,7 @@ class Lane:
         groups = run.groups(size, at, last, list(wanted.columns))
         self._told, self._dirty = told, FOREVER
         # The last group may grow.
-        self._sent = (first, groups.start + len(groups))
+        self._sent = (first, groups.start + groups.count)
         return self._packed(groups, origin, fresh, first, run.revision)
 
     def _sized(self, rows: int) -> int:

@@ -140,5 +140,7 @@ class KeptRun:
             return self._levels.part(size, start, stop, columns)
         first = self._pull.first
         rows = slice(max(0, start * size - first), max(0, stop * size - first))
-        part = Pull(self.revision, False, first + rows.start, self._pull.events.select(rows), self._pull.track.select(rows))
+        part = Pull(
+            self.revision, False, first + rows.start, self._pull.events.select(rows), self._pull.track.select(rows)
+        )
         return grouped(size, part.first, part.events.t, self._levels.values(part, columns))

@@ -58,7 +58,11 @@ class PageStream:
         finally:
             for task in tasks:
                 task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            for outcome in await asyncio.gather(*tasks, return_exceptions=True):
+                if isinstance(outcome, Exception) and not isinstance(outcome, WebSocketDisconnect):
+                    self._engine.notices.report(
+                        "page error", f"page error: {type(outcome).__name__}: {outcome}", "error"
+                    )
             for lane in self._lanes.values():
                 self._series.close(lane)
             with contextlib.suppress(RuntimeError):
