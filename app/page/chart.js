@@ -36,17 +36,18 @@ export class Chart {
     this.data = [[], ...what.series.map(() => [])];
     this.actions = { select, home, wheel };
     this.visible = true;
+    this.last = false;
   }
 
   // Once it is in the page, and has a size.
-  begin(last) {
+  begin() {
     const { what } = this;
     this.plot = new uPlot(
       {
         width: Math.max(50, this.canvas.clientWidth),
         height: Math.max(40, this.canvas.clientHeight),
         legend: { show: false },
-        padding: [6, 10, last ? 0 : 4, 0],
+        padding: [6, 10, null, 0],
         cursor: {
           sync: { key: CURSOR, scales: ["x", null] },
           drag: { x: true, y: false, setScale: false },
@@ -59,8 +60,8 @@ export class Chart {
           y: { ...what.scale, range: (self, low, high) => what.range(this, low, high) },
         },
         axes: [
-          { show: true, ...axis(), size: last ? 22 : 0, values: last ? what.ticks : () => [], ticks: { show: last, stroke: () => colour("rule"), size: 4 } },
-          { ...axis(), size: GAP, space: 26, ...(what.axis ?? {}) },
+          { ...axis(), size: () => (this.last ? 22 : 4), values: (...given) => (this.last ? what.ticks(...given) : given[1].map(() => null)) },
+          { ...axis(), size: GAP, space: 20, ...(what.axis ?? {}) },
         ],
         series: [{}, ...what.series],
         bands: what.bands ?? [],
@@ -85,6 +86,13 @@ export class Chart {
       if (this.visible && this.waiting) this.draw();
     });
     this.seen.observe(this.node);
+  }
+
+  // Whether it is the lowest, below which time stands.
+  bottom(last) {
+    if (this.last === last) return;
+    this.last = last;
+    this.plot?.redraw(false, true);
   }
 
   // span: seconds at both ends of the axis; origin-based times in data[0].

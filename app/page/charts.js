@@ -1,12 +1,15 @@
 // The stack of charts: one time axis, one cursor. States that nobody measures first, then the others, NIS, innovations.
 
 import { Chart, colour, dots, edge, line } from "./chart.js";
+import { $ } from "./dom.js";
 import { bracketed, clock, compact, spaced, withDeviation, words } from "./format.js";
 import { Lane } from "./lane.js";
+import { Layout } from "./layout.js";
 import { marks } from "./marks.js";
 import { Range, bandExtent, extent, within } from "./ranges.js";
 
 const MOST = 24; // charts of states or rows
+const FEW = 6; // states of which those that nobody measures have more room
 const DENSITY = 1.6; // px to a group of rows
 
 // The columns of a state's chart from the live lane, in the order of its series.
@@ -35,10 +38,11 @@ export class Charts {
     ];
     this.charts = this.parts.map((part) => new Chart(part, actions));
     node.replaceChildren(...this.charts.map((chart) => chart.node));
-    this.charts.forEach((chart, k) => {
+    for (const chart of this.charts) {
       chart.span = this.range;
-      chart.begin(k === this.charts.length - 1);
-    });
+      chart.begin();
+    }
+    this.layout = new Layout(this.charts, node, $("layout"), model.twin);
     view.addEventListener("change", () => this.ask());
     link.addEventListener("frames", () => this.draw());
     link.addEventListener("episodes", (event) => (this.episodes = event.detail));
@@ -128,10 +132,11 @@ function stateChart(charts, state) {
   const own = OF_STATE.map((kind) => `${kind}:${state.name}`);
   const marksOf = { reading: () => dots("reading", 4), held: () => dots("reading", 5, true), refused: () => dots("refused", 6), screened: () => dots("refused", 7, true) };
   return {
+    key: `state:${state.name}`,
     title: state.label,
     unit: bracketed(state.unit),
     note: state.rows.length ? null : "not measured",
-    weight: state.rows.length ? 1 : 1.5,
+    weight: state.rows.length || charts.model.states.length > FEW ? 1 : 1.5,
     // upper, lower, previous mean, readings …, truth, mean: what matters most lies on top
     series: [
       edge(), edge(), line("previous", { width: 1 }), ...rows.map((name) => marksOf[name.split(":")[0]]()),
@@ -142,9 +147,15 @@ function stateChart(charts, state) {
     under: (plot) => marks(plot, charts.episodes),
     over: (plot) => integrityLines(plot, charts, state),
     data: () => {
-      const [upper, lower, truth, mean] = own.map((name) => live.column(name));
-      const table = [live.x, upper, lower, ...rows.map((name) => live.column(name)), truth, mean];
-      return joined(table, [previous.x, previous.column(`mean:${state.name}`)], 3);
+      let [upper, lower, truth, mean] = own.map((name) => live.column(name));
+      let dotted = rows.map((name) => live.column(name));
+      let before = previous.column(`mean:${state.name}`);
+      if (state.circular) {
+        [upper, lower] = [upper, lower].map((side) => side.map((value, k) => (value === null ? null : turned(mean[k]) + value - mean[k])));
+        [truth, mean, before] = [truth, mean, before].map(unbroken);
+        dotted = dotted.map((values) => values.map(turned));
+      }
+      return joined([live.x, upper, lower, ...dotted, truth, mean], [previous.x, before], 3);
     },
     range: (chart) => {
       if (state.probability) return [-0.03, 1.03];
@@ -170,6 +181,7 @@ function nisChart(charts) {
   const names = ["nis_high", "nis_low", "nis", "nis_mean"];
   const log = (value) => (typeof value === "number" ? Math.log10(Math.max(value, 1e-9)) : value);
   return {
+    key: "nis",
     title: "NIS",
     unit: "",
     note: "mean of the last readings, in its 95 % bounds",
@@ -206,6 +218,7 @@ function innovationChart(charts, row) {
   const { live } = charts;
   const names = ["innovation_upper", "innovation_lower", "innovation"].map((kind) => `${kind}:${row.name}`);
   return {
+    key: `innovation:${row.name}`,
     title: words(row.name),
     unit: bracketed(row.unit),
     note: "innovation, reading − prediction",
@@ -260,6 +273,14 @@ function integrityLines(plot, charts, state) {
     ctx.stroke();
   }
   ctx.restore();
+}
+
+// An angle between -π and π, and a curve of such, which leaves the chart at one edge and comes back at the other.
+const turned = (value) => (typeof value === "number" ? value - 2 * Math.PI * Math.round(value / (2 * Math.PI)) : value);
+
+function unbroken(values) {
+  const angles = values.map(turned);
+  return angles.map((value, k) => (k && Math.abs(value - angles[k - 1]) > Math.PI ? null : value));
 }
 
 // Two tables of other times as one, in which the other's columns stand from place `at` on. Where a table has no row it says undefined, over which its lines go on; rows of one
