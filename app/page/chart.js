@@ -2,7 +2,7 @@
 
 import { element, setText } from "./dom.js";
 
-const GAP = 52; // px for the labels of the value axis
+export const GAP = 52; // px for the labels of the value axis
 export const CURSOR = "time";
 
 const styles = getComputedStyle(document.documentElement);
@@ -36,7 +36,6 @@ export class Chart {
     this.data = [[], ...what.series.map(() => [])];
     this.actions = { select, home, wheel };
     this.visible = true;
-    this.last = false;
   }
 
   // Once it is in the page, and has a size.
@@ -60,7 +59,7 @@ export class Chart {
           y: { ...what.scale, range: (self, low, high) => what.range(this, low, high) },
         },
         axes: [
-          { ...axis(), size: () => (this.last ? 22 : 4), values: (...given) => (this.last ? what.ticks(...given) : given[1].map(() => null)) },
+          { ...axis(), size: 3, values: (self, splits) => splits.map(() => null) }, // time stands below all charts
           { ...axis(), size: GAP, space: 20, ...(what.axis ?? {}) },
         ],
         series: [{}, ...what.series],
@@ -86,13 +85,6 @@ export class Chart {
       if (this.visible && this.waiting) this.draw();
     });
     this.seen.observe(this.node);
-  }
-
-  // Whether it is the lowest, below which time stands.
-  bottom(last) {
-    if (this.last === last) return;
-    this.last = last;
-    this.plot?.redraw(false, true);
   }
 
   // span: seconds at both ends of the axis; origin-based times in data[0].
@@ -142,7 +134,7 @@ export class Chart {
   }
 }
 
-const axis = () => ({
+export const axis = () => ({
   stroke: () => colour("faint"),
   font: "11px system-ui, sans-serif",
   grid: { stroke: () => colour("grid"), width: 1 },

@@ -6,6 +6,7 @@ import { bracketed, clock, compact, spaced, withDeviation, words } from "./forma
 import { Lane } from "./lane.js";
 import { Layout } from "./layout.js";
 import { marks } from "./marks.js";
+import { TimeAxis } from "./time_axis.js";
 import { Range, bandExtent, extent, within } from "./ranges.js";
 
 const MOST = 24; // charts of states or rows
@@ -42,6 +43,7 @@ export class Charts {
       chart.span = this.range;
       chart.begin();
     }
+    this.axis = new TimeAxis($("axis"));
     this.layout = new Layout(this.charts, node, $("layout"), model.twin);
     view.addEventListener("change", () => this.ask());
     link.addEventListener("frames", () => this.draw());
@@ -88,8 +90,8 @@ export class Charts {
     if (this.view.following) {
       this.range = followed(x[0], end, this.view.span);
     }
-    const ended = this.range;
-    for (const chart of this.charts) chart.show(chart.what.data(), ended);
+    for (const chart of this.charts) if (!chart.node.hidden) chart.show(chart.what.data(), this.range);
+    this.axis.show(this.range);
     window.nisus.drawn = (window.nisus.drawn ?? 0) + 1;
     window.nisus.revision = this.live.revision;
     this.node.dataset.revision = this.live.revision;
@@ -143,7 +145,6 @@ function stateChart(charts, state) {
       line("truth", { width: 1.5, dash: [5, 3], spanGaps: true }), line("estimate", { width: 1.75 }),
     ],
     bands: [{ series: [1, 2], fill: () => colour("band") }],
-    ticks: ticks,
     under: (plot) => marks(plot, charts.episodes),
     over: (plot) => integrityLines(plot, charts, state),
     data: () => {
@@ -192,7 +193,6 @@ function nisChart(charts) {
       splits: (self, axis, low, high) => [0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100, 300, 1000].map(Math.log10).filter((v) => low <= v && v <= high),
       values: (self, splits) => splits.map((v) => compact(10 ** v, 1)),
     },
-    ticks,
     under: (plot) => marks(plot, charts.episodes),
     data: () => {
       const [low, high] = nisRange(live);
@@ -225,7 +225,6 @@ function innovationChart(charts, row) {
     weight: 0.62,
     series: [line("bound", { width: 1, spanGaps: true }), line("bound", { width: 1, spanGaps: true }), dots("reading", 3)],
     bands: [{ series: [1, 2], fill: () => colour("bounds") }],
-    ticks,
     under: (plot) => marks(plot, charts.episodes),
     data: () => [live.x, ...names.map((name) => live.column(name))],
     range: (chart) => {
@@ -238,12 +237,6 @@ function innovationChart(charts, row) {
     },
     says: (value) => `${compact(value(3), 3)}${spaced(row.unit)}  ± ${compact(value(1), 3)} expected`,
   };
-}
-
-function ticks(self, splits) {
-  const step = splits.length > 1 ? splits[1] - splits[0] : 1;
-  const fraction = step >= 1 ? 0 : Math.min(3, Math.ceil(-Math.log10(step)));
-  return splits.map((value) => clock(value, fraction));
 }
 
 // How wrong the state could be by one fault that nobody sees, to either side of the estimate.

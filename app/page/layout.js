@@ -53,16 +53,12 @@ export class Layout {
 
   apply() {
     const hidden = new Set(this.kept.hidden ?? []);
-    let last = null;
     this.order.forEach((chart, k) => {
       chart.node.style.order = k;
       chart.node.hidden = hidden.has(chart.what.key);
       const height = this.kept.heights?.[chart.what.key];
       chart.node.style.flex = height ? `0 0 ${height}px` : "";
-      if (!chart.node.hidden) last = chart;
     });
-    // Time stands below the last one.
-    for (const chart of this.charts) chart.bottom(chart === last);
   }
 
   keep() {
