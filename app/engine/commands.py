@@ -50,6 +50,36 @@ class Restore:
 
 
 @dataclass(frozen=True)
+class Load:
+    """Back to the estimator and the tuning of the run of that number."""
+
+    number: int
+
+
+@dataclass(frozen=True)
+class Pin:
+    """Keep the track of a run, the running one or the last before it, to compare with; four at most."""
+
+    number: int
+
+
+@dataclass(frozen=True)
+class Unpin:
+    """Keep it no longer."""
+
+    number: int
+
+
+@dataclass(frozen=True)
+class Note:
+    """Give a run a name, and write a note on it; empty ones take them away."""
+
+    number: int
+    name: str = ""
+    note: str = ""
+
+
+@dataclass(frozen=True)
 class Reset:
     """Forget the estimate: back to the model's prior at the present time."""
 
@@ -125,7 +155,7 @@ class ClearFault:
 
 
 Command = (
-    SetEstimator | SetTuning | SetOption | UseSensor | Restore | Reset | Maintenance | Pause | Speed | Step | Seek
-    | Record | InjectFault | ClearFault
+    SetEstimator | SetTuning | SetOption | UseSensor | Restore | Load | Pin | Unpin | Note | Reset | Maintenance | Pause
+    | Speed | Step | Seek | Record | InjectFault | ClearFault
 )  # fmt: skip
 """Any of them."""

@@ -46,6 +46,7 @@ from .notices import Notices
 from .outputs import Belief, Cursor, Pull, Status
 from .playback import playback_status
 from .refolder import Refolded, Refolder, Requests
+from .revisions import Revisions
 from .silence import Silence
 from .stall import Stall
 
@@ -106,7 +107,7 @@ class Engine:
         self._feeder = Feeder(lambda: open_source(self.notices.report), self._inbox, self.notices.report)
         self._refolder = Refolder(self._inbox.put)
         self._requests = Requests()
-        self._previous: Pull | None = None
+        self.revisions = Revisions(self.estimator, self.tuning)
         self._revision = 0
         self._stopping = threading.Event()
         self._finished = False
@@ -291,8 +292,8 @@ class Engine:
         return [self._blame.told(episode) for episode in self._chronicle.account.episodes]
 
     def previous(self) -> Pull | None:
-        """The whole previous revision, for comparison; its arrays never change."""
-        return self._previous
+        """The whole previous revision, for comparison, before a drag if one goes on; its arrays never change."""
+        return self.revisions.previous()
 
     def belief(self) -> Belief:
         """The estimate now."""
@@ -490,10 +491,10 @@ class Engine:
         """The source began again: so does the log. The fold is a new revision of it; a refold is asked for again."""
         wanted = (self.estimator, self.tuning) if self._requests.waiting else None
         with self._lock, self._stall.watched(self._fold):
-            self._previous = None
             self.estimator, self.tuning = self._fold.estimator.name, self._fold.tuning
             self._clear(self._first_base)
             self._revision += 1
+            self.revisions.restarted(self._revision)
             self.notices.revision = self._revision
             self._finished = False
             self._requests.forget()
@@ -548,7 +549,9 @@ class Engine:
                 self._refuse(done.ticket, str(error))
                 return True
             events = Events(*(column[: old.n].copy() for column in log.events))
-            self._previous = Pull(self._revision, False, log.first, events, old.track)
+            pictures = _since(old, -1, log.first + old.n)
+            left = Pull(self._revision, False, log.first, events, old.track, pictures=pictures, oldest=log.first)
+            self.revisions.left(left, fold.estimator.name, fold.tuning)
             self._fold, self._row_counts = fold, row_counts
             self._revision += 1
             self.notices.revision = self._revision

@@ -26,7 +26,10 @@ if TYPE_CHECKING:
     from ..twin.twin import Twin
 
 
-Refolding = commands.SetEstimator | commands.SetTuning | commands.SetOption | commands.UseSensor | commands.Restore
+Refolding = (
+    commands.SetEstimator | commands.SetTuning | commands.SetOption | commands.UseSensor | commands.Restore
+    | commands.Load
+)  # fmt: skip
 """Commands that fold the history again."""
 
 
@@ -38,6 +41,9 @@ def retuned(command: Refolding, engine: Running) -> tuple[str, Tuning]:
     """
     if isinstance(command, commands.Restore):
         return engine.twin.estimator, engine.twin.tuning
+    if isinstance(command, commands.Load):
+        run = engine.revisions.find(command.number)
+        return run.estimator, run.tuning
     estimator, tuning = engine.estimator, engine.tuning
     if isinstance(command, commands.SetEstimator):
         entry = find_estimator(command.name, engine.model)
@@ -70,6 +76,12 @@ def execute(command: commands.Command, engine: Running) -> None:
     """
     if isinstance(command, Refolding):
         engine.retune(*retuned(command, engine))
+    elif isinstance(command, commands.Pin):
+        engine.revisions.pin(command.number)
+    elif isinstance(command, commands.Unpin):
+        engine.revisions.unpin(command.number)
+    elif isinstance(command, commands.Note):
+        engine.revisions.describe(command.number, command.name, command.note)
     elif isinstance(command, commands.Reset):
         engine.insert(_reset_now(engine))
         engine.notices.say("estimate reset to the prior")

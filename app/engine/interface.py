@@ -19,6 +19,7 @@ from sources.source import Source
 from .commands import Command
 from .notices import Notices
 from .outputs import Belief, Cursor, Pull, Status
+from .revisions import Revisions
 
 if TYPE_CHECKING:
     from ..twin.twin import Twin
@@ -48,6 +49,7 @@ class Running(Protocol):
     tuning: Tuning
     notices: Notices
     recorder: Records | None
+    revisions: Revisions
 
     @property
     def source(self) -> Source:

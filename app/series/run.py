@@ -119,7 +119,7 @@ class KeptRun:
     """A revision that was kept whole: the previous one, or one that was pinned. Its arrays never change."""
 
     def __init__(self, pull: Pull, columns: dict[str, Column]) -> None:
-        self._pull, self._levels = pull, _Levels(columns)
+        self.of, self._levels = pull, _Levels(columns)
         self.revision, self.generation = pull.revision, 0
         self.end = pull.first + len(pull.events)
 
@@ -127,20 +127,18 @@ class KeptRun:
         """See `Run`."""
         if self._levels.ask(columns):
             self._levels.clear()
-            self._levels.take(self._pull)
+            self._levels.take(self.of)
 
     def span(self, since: int, until: int) -> tuple[int, int]:
         """See `Run`."""
-        start, stop = np.searchsorted(self._pull.events.t, (since, until))
-        return self._pull.first + int(start), self._pull.first + int(stop)
+        start, stop = np.searchsorted(self.of.events.t, (since, until))
+        return self.of.first + int(start), self.of.first + int(stop)
 
     def groups(self, size: int, start: int, stop: int, columns: list[str]) -> Groups:
         """See `Run`."""
         if size >= FIRST:
             return self._levels.part(size, start, stop, columns)
-        first = self._pull.first
+        first = self.of.first
         rows = slice(max(0, start * size - first), max(0, stop * size - first))
-        part = Pull(
-            self.revision, False, first + rows.start, self._pull.events.select(rows), self._pull.track.select(rows)
-        )
+        part = Pull(self.revision, False, first + rows.start, self.of.events.select(rows), self.of.track.select(rows))
         return grouped(size, part.first, part.events.t, self._levels.values(part, columns))

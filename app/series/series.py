@@ -6,11 +6,16 @@ import threading
 from collections.abc import Iterable
 
 from ..engine.interface import Running
+from ..engine.outputs import Pull
 from .columns import columns_of
+from .difference import DifferenceRun
 from .lane import Lane
-from .run import KeptRun, LiveRun
+from .run import KeptRun, LiveRun, Run
 
 PREVIOUS = "previous"
+
+LESS = "difference:"
+"""Before the name of a revision: its means less those of what runs."""
 
 
 class Series:
@@ -21,7 +26,7 @@ class Series:
         self.columns = columns_of(engine.model)
         self._lock = threading.Lock()
         self._live: LiveRun | None = None
-        self._kept: dict[str, KeptRun] = {}
+        self._kept: dict[str, KeptRun | DifferenceRun] = {}
         self._lanes: set[Lane] = set()
         self._origin: int | None = None
 
@@ -58,6 +63,8 @@ class Series:
             if origin is None or not newest:
                 return []
             asked = [lane for lane in lanes if lane in self._lanes]
+            looked_at = {lane.wanted.run for lane in self._lanes}
+            self._kept = {name: run for name, run in self._kept.items() if name in looked_at}
             self._sync({column for lane in asked if lane.wanted.run == "live" for column in lane.wanted.columns})
             frames = [frame for lane in asked if (frame := self._frame(lane, origin, newest)) is not None]
             return frames
@@ -81,15 +88,23 @@ class Series:
         run.sync(lane.wanted.columns)
         return lane.frame(run, origin, newest)
 
-    def _find(self, name: str) -> KeptRun | None:
-        """The previous revision, or a kept one; None if there is none."""
+    def _find(self, name: str) -> Run | None:
+        """The previous revision, a pinned one, or one less what runs; None if there is none of that name."""
+        pull = self._pulled(name.removeprefix(LESS))
+        kept = self._kept.get(name)
+        if pull is None:
+            self._kept.pop(name, None)
+            return None
+        if kept is None or kept.of is not pull:
+            if name.startswith(LESS):
+                kept = DifferenceRun(pull, self.columns, self._engine)
+            else:
+                kept = KeptRun(pull, self.columns)
+            self._kept[name] = kept
+        return kept
+
+    def _pulled(self, name: str) -> Pull | None:
         if name == PREVIOUS:
-            pull = self._engine.previous()
-            kept = self._kept.get(PREVIOUS)
-            if pull is None:
-                self._kept.pop(PREVIOUS, None)
-                return None
-            if kept is None or kept.revision != pull.revision:
-                kept = self._kept[PREVIOUS] = KeptRun(pull, self.columns)
-            return kept
-        return self._kept.get(name)
+            return self._engine.previous()
+        pinned = {str(run.number): run.track for run in self._engine.revisions.runs if run.pinned}
+        return pinned.get(name)

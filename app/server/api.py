@@ -24,6 +24,7 @@ from ..engine.interface import Running
 from ..engine.maintenance import check_maintenance
 from ..engine.outputs import Status
 from ..engine.playback import PLAYBACK, check_playback
+from ..engine.revisions import Revisions
 
 LONGEST_NAME = 255
 """Bytes of a file's name, on nearly all file systems."""
@@ -89,7 +90,22 @@ def status_json(engine: Running) -> dict[str, Any]:
         "recording": str(status.recording) if status.recording is not None else None,
         "latency_ms": _plain(status.latency_ms),
         "faults": faults.status_json(status.faults, engine.model),
+        "runs": _runs(engine.revisions),
         **_integrity(status),
+    }
+
+
+def _runs(revisions: Revisions) -> dict[str, Any]:
+    """When to ask /api/runs again (`version`), the run before the running one, and the pinned ones."""
+    runs = revisions.runs
+    return {
+        "version": revisions.version,
+        "last": runs[-2].number if len(runs) > 1 else None,
+        "pinned": [
+            {"number": run.number, "place": run.place, "name": run.name, "running": run is runs[-1]}
+            for run in runs
+            if run.pinned
+        ],
     }
 
 
@@ -154,6 +170,12 @@ def command_from_json(body: Any, engine: Running) -> commands.Command:
 def _check(command: commands.Command, engine: Running) -> None:
     if isinstance(command, Refolding):
         retuned(command, engine)
+    elif isinstance(command, commands.Pin):
+        engine.revisions.free_place(command.number)
+    elif isinstance(command, commands.Unpin):
+        engine.revisions.find(command.number)
+    elif isinstance(command, commands.Note):
+        engine.revisions.check_words(command.number, command.name, command.note)
     elif isinstance(command, commands.Reset) and not engine.span()[1]:
         raise ConfigError("Reset: nothing to reset; no reading has come yet")
     elif isinstance(command, commands.Maintenance):

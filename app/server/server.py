@@ -34,6 +34,7 @@ from .gate import Gate, session_token
 from .model_json import model_json
 from .page_stream import PageStream
 from .port import listen
+from .runs_api import RunsApi
 from .viewer_assets import FILES, viewer_assets, viewer_version
 from .viser_proxy import ViserProxy
 
@@ -87,6 +88,7 @@ class PageServer:
         self._engine = engine
         self._review = review
         self._series = Series(engine)
+        self._runs = RunsApi(engine)
         self._boot = uuid.uuid4().hex
         self._socket = listen(port)
         self.port: int = self._socket.getsockname()[1]
@@ -113,12 +115,14 @@ class PageServer:
         """Serve; the Rerun viewer's files are prepared meanwhile, if this machine has not got them yet."""
         threading.Thread(target=self._prepare, name="viewer assets", daemon=True).start()
         self._thread.start()
+        self._runs.start()
         while not self._server.started and self._thread.is_alive():
             time.sleep(0.005)
 
     def stop(self) -> None:
         """Close all connections, and the port."""
         self._server.should_exit = True
+        self._runs.stop()
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
         self._socket.close()
@@ -135,6 +139,7 @@ class PageServer:
             Route("/api/status", self._status),
             Route("/api/model", self._model),
             Route("/api/episodes", self._episodes),
+            *self._runs.routes(),
             Route("/api/recordings", self._list_recordings),
             Route("/api/faults", self._faults),
             Route("/api/command", self._command, methods=["POST"]),

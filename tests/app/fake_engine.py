@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from app.engine.commands import Pause, Record, Restore, SetEstimator, SetOption, SetTuning, Speed, UseSensor
+from app.engine.revisions import Revisions
 from config.schema import ViewSection
 from estimators.diagnostics.episodes import episodes
 from estimators.fold import Fold
@@ -42,6 +43,7 @@ class FakeEngine:
         )  # fmt: skip
         self.fold = Fold(estimator, model, tuning, self.log)
         self.before = None
+        self.revisions = Revisions(estimator, tuning)
         self.notices = []
 
     def put(self, readings):

@@ -1,0 +1,93 @@
+"""How large the innovations are against what the filter says, and what the noise of the sensors would have to be.
+
+A refused reading counts as one at the gate: as it is, one spike would speak for all; without it, the gate would hide
+what it refuses. So squares are min(e², g), and their mean is divided by what it is in a consistent filter,
+
+    E min(χ²_m, g) = m Pr(χ²_{m+2} ≤ g) + g Pr(χ²_m > g).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtr, chdtrc
+
+from ..log import READING, Events
+from ..numerics.quantiles import chi_square_quantile
+from ..track import GATED, USED, Track
+from ..tuning import Tuning
+
+FEWEST = 50
+"""Readings of a row from which on its noise is estimated."""
+
+
+class SensorNoise(NamedTuple):
+    """Variance of the noise of one sensor row as its innovations have it, in the square of the row's unit.
+
+    `variance` is not positive where the innovations are smaller than the process noise and the model alone explain;
+    `std` is its standard deviation, were the innovations white and normal, `n` how many there are.
+    """
+
+    variance: float
+    std: float
+    n: int
+
+
+def mean_nis(track: Track, gate: float | None) -> float:
+    """Mean NIS a degree of freedom of the readings used and refused, 1 if the filter is consistent; NaN without any.
+
+    Args:
+        track: What was concluded.
+        gate: That of the tuning; None where nothing is refused.
+    """
+    judged = (track.verdict == USED) | (track.verdict == GATED)
+    nis, dof = track.nis[judged], np.asarray(track.dof[judged], float)
+    g = _quantile(gate, dof)
+    expected = _expected(g, dof).sum()
+    return float(np.minimum(nis, g).sum() / expected) if expected > 0.0 else np.nan
+
+
+def sensor_noise(track: Track, events: Events, tuning: Tuning) -> dict[str, SensorNoise]:
+    """Noise of the sensor rows with enough readings, as their innovations ν have it.
+
+    R̂ = mean ν² - (S - R), the innovations' covariance less what of it the filter lays to its own prediction, H P⁻ Hᵀ.
+    All that the innovations have too much or too little is laid to R, so it means something only where Q is right: with
+    a Q too small it is too large. P⁻ follows from R; taken again and again the estimate comes to rest.
+
+    Args:
+        track: What was concluded, under `tuning`.
+        events: Of what.
+        tuning: Its R held as it is: nothing brought variances, and the filter adapted none.
+
+    Source: Mohamed & Schwarz (1999), doi:10.1007/s001900050236, the R of the innovation-based filter; after Mehra
+    (1970), doi:10.1109/TAC.1970.1099422.
+    """
+    model, found = tuning.model, dict[str, SensorNoise]()
+    judged = (events.kind == READING) & ((track.verdict == USED) | (track.verdict == GATED))
+    for s, sensor in enumerate(model.sensors):
+        rows = np.flatnonzero(judged & (events.channel == s))
+        g = _quantile(tuning.gate, np.asarray(track.dof[rows], float))
+        for k in range(len(sensor.rows)):
+            nu, S = track.innovation[rows, k], track.innovation_std[rows, k] ** 2
+            known = np.isfinite(nu) & np.isfinite(S) & (S > 0.0)
+            n = int(known.sum())
+            if n < FEWEST:
+                continue
+            nu, S, most = nu[known], S[known], g[known]
+            R = float(tuning.r[model.row_start[s] + k])
+            square = np.minimum(nu**2, most * S) / _expected(most, np.ones(n))
+            std = float(np.sqrt(2.0 * np.mean(S**2) / n))
+            found[model.row_names[model.row_start[s] + k]] = SensorNoise(float(np.mean(square - S)) + R, std, n)
+    return found
+
+
+def _quantile(gate: float | None, dof: np.ndarray) -> np.ndarray:
+    return np.full(dof.size, np.inf) if gate is None else chi_square_quantile(gate, dof)
+
+
+def _expected(g: np.ndarray, dof: np.ndarray) -> np.ndarray:
+    """E min(χ²_m, g) of each; m where there is no gate."""
+    finite = np.isfinite(g)
+    limit = np.where(finite, g, 1.0)
+    return np.where(finite, dof * chdtr(dof + 2.0, limit) + limit * chdtrc(dof, limit), dof)
