@@ -6,6 +6,7 @@ import { bracketed, clock, compact, spaced, withDeviation, words } from "./forma
 import { Lane } from "./lane.js";
 import { Layout } from "./layout.js";
 import { marks } from "./marks.js";
+import { Pins } from "./pins.js";
 import { TimeAxis } from "./time_axis.js";
 import { Range, bandExtent, extent, within } from "./ranges.js";
 
@@ -44,6 +45,7 @@ export class Charts {
       chart.begin();
     }
     this.axis = new TimeAxis($("axis"));
+    this.pins = new Pins(this, model, link, actions);
     this.layout = new Layout(this.charts, node, $("layout"), model.twin);
     view.addEventListener("change", () => this.ask());
     link.addEventListener("frames", () => this.draw());
@@ -73,6 +75,7 @@ export class Charts {
     this.link.look("charts", { ...place, columns: this.columns }, (...frame) => this.live.take(...frame));
     const before = this.model.states.map((state) => `mean:${state.name}`);
     this.link.look("previous", { ...place, run: "previous", columns: before }, (...frame) => this.previous.take(...frame));
+    this.pins.ask(place);
     if (!this.view.following) {
       this.range = [this.view.since, this.view.until];
       this.draw(); // what is there already, until the points for it come
@@ -91,6 +94,7 @@ export class Charts {
       this.range = followed(x[0], end, this.view.span);
     }
     for (const chart of this.charts) if (!chart.node.hidden) chart.show(chart.what.data(), this.range);
+    this.pins.show(this.range);
     this.axis.show(this.range);
     window.nisus.drawn = (window.nisus.drawn ?? 0) + 1;
     window.nisus.revision = this.live.revision;
@@ -145,7 +149,10 @@ function stateChart(charts, state) {
       line("truth", { width: 1.5, dash: [5, 3], spanGaps: true }), line("estimate", { width: 1.75 }),
     ],
     bands: [{ series: [1, 2], fill: () => colour("band") }],
-    under: (plot) => marks(plot, charts.episodes),
+    under: (plot) => {
+      marks(plot, charts.episodes);
+      charts.pins.draw(plot, state);
+    },
     over: (plot) => integrityLines(plot, charts, state),
     data: () => {
       let [upper, lower, truth, mean] = own.map((name) => live.column(name));
@@ -164,7 +171,7 @@ function stateChart(charts, state) {
       const [from, to] = within(x, charts.range);
       const [lowest, highest] = extent(lines.slice(1), from, to); // what was before does not rule the axis
       const [under, over] = bandExtent(lower, upper, from, to);
-      return range.fit(Math.min(lowest, under), Math.max(highest, over));
+      return range.fit(...charts.pins.widened(Math.min(lowest, under), Math.max(highest, over), state.name));
     },
     says: (value) => {
       const [upper, truth, mean] = [value(1), value(4 + rows.length), value(5 + rows.length)];

@@ -34,17 +34,28 @@ export class Knob {
     this.back = element("button", { type: "button", class: "back", title: `Back to the configured ${compact(what.configured)}`, "aria-label": `${label}: as configured`, onclick: () => this.set(what.configured) }, "↺");
     const step = (factor, text) =>
       element("button", { type: "button", title: `${text} ${label}`, "aria-label": `${label} ${text}`, onclick: () => this.set(this.value * factor) }, text);
+    this.said = element("button", { type: "button", class: "data-says", hidden: true, onclick: () => this.take() }, "◆");
     this.error = element("p", { class: "error", role: "alert", hidden: true });
     this.below = element("div", { class: "below" });
     this.node = element(
       "div", { class: `knob${this.slides ? "" : " plain"}`, dataset: { key: what.key ?? what.label } },
       element("label", { title: what.help ? `${label}: ${what.help}` : label }, label),
-      this.slider ? element("span", { class: "track", style: `--tick:${100 * this.place(what.configured)}%` }, this.slider) : null,
+      this.slider ? element("span", { class: "track", style: `--tick:${100 * this.place(what.configured)}%` }, this.slider, this.said) : null,
       element("span", { class: "field" }, this.field, element("span", { class: "unit" }, what.unit && what.unit !== "1" ? what.unit : "")),
       this.logarithmic ? element("span", { class: "steps" }, step(0.1, "÷10"), step(10, "×10")) : null,
       this.back, this.error, this.below,
     );
     this.show(what.configured);
+  }
+
+  // What the data say the value is: a mark on the slider that takes it. saying: {value, text, take}, or null.
+  say(saying) {
+    this.take = saying?.take ?? (() => this.set(saying.value));
+    this.said.hidden = !saying?.value;
+    if (this.said.hidden) return;
+    this.said.style.setProperty("--place", this.place(saying.value));
+    setAttribute(this.said, "title", `Data: ${saying.text}. Take ${compact(saying.value, 3)}`);
+    setAttribute(this.said, "aria-label", `${words(this.what.label)}: take ${compact(saying.value, 3)}, as the data say`);
   }
 
   // Where on the slider a value is, from 0 to 1, and back.

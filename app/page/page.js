@@ -65,7 +65,7 @@ new Trust(model, link, (tab) => side.show(tab));
 const tune = new Tune(model, link);
 new Faults($("faults"), model, link);
 new Episodes($("episodes"), link, view, charts);
-new Runs($("runs"), link);
+const runs = new Runs($("runs"), link);
 const transport = new Transport(model, link, view, charts);
 const explore = new Explore(settings.viewer, theme);
 const stage = new Stage(settings.viser, theme);
@@ -120,6 +120,7 @@ keys([
   ["r", "record, or end the recording", record],
   ["u", "undo the last edit", () => tune.undo()],
   ["U", "redo", () => tune.redo()],
+  ["b", "between what runs and the run before it", () => runs.swap()],
   ["e", "episodes", () => side.show("episodes")],
   ["y", "two states against each other", () => side.show("xy")],
   ["s", "scene", () => side.show("scene")],

@@ -1,5 +1,6 @@
 // The Tune panel: filter and options, noises, parameters, gate, sensors. Undo and redo.
 
+import { Around } from "./around.js";
 import { $, element, setAttribute, setText } from "./dom.js";
 import { Knob } from "./knob.js";
 import { words } from "./format.js";
@@ -28,6 +29,7 @@ export class Tune {
       if (items.length) this.sections.append(this.group(prefix, title, items));
     }
     this.sections.append(this.gateSection(), this.sensorSection());
+    this.around = new Around(model, link, this);
     link.addEventListener("status", (event) => this.sync(event.detail));
   }
 
@@ -77,11 +79,15 @@ export class Tune {
 
   // One line that scales all of a group.
   together(prefix, title) {
-    const scale = (factor) => async () => {
-      for (const [key, knob] of this.knobs) if (key.startsWith(`${prefix}.`)) knob.set(Number((knob.value * factor).toPrecision(6)));
-    };
-    const button = (text, factor) => element("button", { type: "button", title: `All of ${title} ${text}`, onclick: scale(factor) }, text);
-    return element("div", { class: "together" }, element("span", {}, "all"), button("÷10", 0.1), button("÷2", 0.5), button("×2", 2), button("×10", 10));
+    const button = (text, factor) => element("button", { type: "button", title: `All of ${title} ${text}`, onclick: () => this.scale(prefix, factor) }, text);
+    const data = prefix === "Q"
+      ? element("button", { type: "button", id: "scale-Q", disabled: true, onclick: () => this.scale("Q", Number(data.dataset.level)) }, "data –")
+      : null;
+    return element("div", { class: "together" }, element("span", {}, "all"), button("÷10", 0.1), button("÷2", 0.5), button("×2", 2), button("×10", 10), data);
+  }
+
+  scale(prefix, factor) {
+    for (const [key, knob] of this.knobs) if (key.startsWith(`${prefix}.`)) knob.set(Number((knob.value * factor).toPrecision(6)));
   }
 
   gateSection() {
@@ -173,6 +179,7 @@ export class Tune {
   }
 
   turn(key, value) {
+    this.around.show(key);
     const before = { gate: this.status.gate ?? null, "gate.kind": this.status.gate_kind }[key] ?? this.status.tuning[key] ?? null;
     return this.edit(key, "SetTuning", { key, value }, { key, value: before });
   }

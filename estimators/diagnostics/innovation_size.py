@@ -52,8 +52,10 @@ def sensor_noise(track: Track, events: Events, tuning: Tuning) -> dict[str, Sens
     """Noise of the sensor rows with enough readings, as their innovations ν have it.
 
     R̂ = mean ν² - (S - R), the innovations' covariance less what of it the filter lays to its own prediction, H P⁻ Hᵀ.
-    All that the innovations have too much or too little is laid to R, so it means something only where Q is right: with
-    a Q too small it is too large. P⁻ follows from R; taken again and again the estimate comes to rest.
+    Each reading counts by 1 / S², the inverse of the variance of ν²: where S is settled, as in the source, all count
+    alike, and the first ones, predicted from a wide prior, do not spoil it. All that the innovations have too much or
+    too little is laid to R, so it means something only where Q is right: with a Q too small it is too large. P⁻
+    follows from R; taken again and again the estimate comes to rest.
 
     Args:
         track: What was concluded, under `tuning`.
@@ -77,8 +79,10 @@ def sensor_noise(track: Track, events: Events, tuning: Tuning) -> dict[str, Sens
             nu, S, most = nu[known], S[known], g[known]
             R = float(tuning.r[model.row_start[s] + k])
             square = np.minimum(nu**2, most * S) / _expected(most, np.ones(n))
-            std = float(np.sqrt(2.0 * np.mean(S**2) / n))
-            found[model.row_names[model.row_start[s] + k]] = SensorNoise(float(np.mean(square - S)) + R, std, n)
+            weight = S**-2
+            excess = float(np.sum(weight * (square - S)) / np.sum(weight))
+            std = float(np.sqrt(2.0 / np.sum(weight)))
+            found[model.row_names[model.row_start[s] + k]] = SensorNoise(R + excess, std, n)
     return found
 
 
