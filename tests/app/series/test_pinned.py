@@ -1,0 +1,94 @@
+"""Lanes of pinned runs, and of what they differ by from what runs, against the folds themselves."""
+
+import numpy as np
+import pytest
+
+from app.engine import commands
+from app.engine.engine import Engine
+from app.series.lane import Lane, Wanted
+from app.series.series import Series
+from estimators.fold import fold
+from estimators.log import Log
+from estimators.tuning import Tuning
+from tests.app.runs.test_scores import carry_out
+from tests.app.scripted import MODEL, Scripted, readings, row_count, twin, wait_for
+from tests.app.series.test_lane import Browser
+
+MEAN = f"mean:{MODEL.states[0].name}"
+FIRST = Tuning.of(MODEL)
+N = 900
+
+
+def values(n, seed=8):
+    rng = np.random.default_rng(seed)
+    return np.arange(1, n + 1) * 0.1, 40 + np.cumsum(rng.normal(size=n)) * 0.1 + rng.normal(size=n)
+
+
+@pytest.fixture
+def engine():
+    source = Scripted()
+    running = Engine(twin(), lambda report: source)
+    running.start()
+    source.put(readings(*values(N)))
+    wait_for(lambda: row_count(running) == N)
+    carry_out(running, commands.Pin(0))
+    carry_out(running, commands.SetTuning("Q.rate", 0.1))
+    yield running
+    running.stop()
+
+
+def mean(tuning):
+    log = Log(MODEL.width)
+    log.extend(readings(*values(N)))
+    return fold("kf", MODEL, tuning, log).mean[:, 0]
+
+
+def taken(series, lane):
+    """What a browser has after this lane's next frame; None if there is none."""
+    frames, browser = series.frames([lane]), Browser()
+    for frame in frames:
+        browser.take(frame)
+    return browser if frames else None
+
+
+def points(series, run):
+    lane = Lane("pinned", Wanted((MEAN,), run=run, points=2000), series.columns)
+    series.open(lane)
+    found = taken(series, lane)
+    series.close(lane)
+    return found
+
+
+def test_a_pinned_run_gives_its_own_points(engine):
+    shown = points(Series(engine), "0")
+    np.testing.assert_allclose(shown.x, np.arange(N) * 0.1, atol=1e-9)
+    np.testing.assert_allclose(shown.values[MEAN], mean(FIRST), rtol=1e-6)
+
+
+def test_a_difference_is_that_of_the_same_rows_and_follows_what_runs(engine):
+    series = Series(engine)
+    lane = Lane("less", Wanted((MEAN,), run="difference:0", points=2000), series.columns)
+    series.open(lane)
+    expected = mean(FIRST) - mean(FIRST.set("Q.rate", 0.1))
+    assert np.abs(expected).max() > 0.1
+    np.testing.assert_allclose(taken(series, lane).values[MEAN], expected, atol=1e-5)
+    assert taken(series, lane) is None
+    carry_out(engine, commands.SetTuning("R.winding", 3.0))
+    expected = mean(FIRST) - mean(FIRST.set("Q.rate", 0.1).set("R.winding", 3.0))
+    np.testing.assert_allclose(taken(series, lane).values[MEAN], expected, atol=1e-5)
+
+
+def test_what_is_not_pinned_gives_nothing(engine):
+    series = Series(engine)
+    assert points(series, "1") is None and points(series, "difference:7") is None
+    carry_out(engine, commands.Unpin(0))
+    assert points(series, "0") is None
+
+
+def test_nothing_is_held_of_a_run_that_nobody_looks_at(engine):
+    series = Series(engine)
+    live = Lane("live", Wanted((MEAN,)), series.columns)
+    series.open(live)
+    assert points(series, "0") is not None and "0" in series._kept
+    series.frames([live])
+    assert series._kept == {}
