@@ -6,6 +6,7 @@ import { compact, spaced } from "./format.js";
 
 const [WIDTH, HEIGHT, EDGE] = [260, 64, 6]; // of the drawing
 const MOST = 3; // curves that stay open
+const LOOK = 300; // ms between two looks at whether something is wanted
 const AGAIN = 10_000; // ms between two looks at what the innovations say
 const SOON = 1000; // the same while it is being folded
 const DROPS = 3; // how many of the values nearest the optimum rule the height of the curve
@@ -22,7 +23,7 @@ export class Around {
       label.addEventListener("click", () => this.toggle(key));
       label.addEventListener("keydown", (event) => ["Enter", " "].includes(event.key) && (event.preventDefault(), event.stopPropagation(), this.toggle(key)));
     }
-    link.addEventListener("status", (event) => this.heard(event.detail));
+    setInterval(() => link.socket && link.status.tuning && this.heard(link.status), LOOK);
   }
 
   toggle(key) {

@@ -67,6 +67,7 @@ export class Chart {
         hooks: {
           setSelect: [(self) => this.selected(self)],
           drawAxes: what.under ? [(self) => what.under(self, this)] : [],
+          drawSeries: what.between ? [(self, series) => what.between(self, series)] : [],
           draw: what.over ? [(self) => what.over(self, this)] : [],
           setCursor: [(self) => this.pointed(self)],
         },

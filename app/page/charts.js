@@ -16,6 +16,7 @@ const DENSITY = 1.6; // px to a group of rows
 
 // The columns of a state's chart from the live lane, in the order of its series.
 const OF_STATE = ["upper", "lower", "truth", "mean"];
+const BEFORE = 3; // which of them is that of the revision before
 const MOST_GROWTH = 4; // halvings of the window while there is less than that to show
 const OF_ROW = ["reading", "held", "refused", "screened"];
 
@@ -149,10 +150,8 @@ function stateChart(charts, state) {
       line("truth", { width: 1.5, dash: [5, 3], spanGaps: true }), line("estimate", { width: 1.75 }),
     ],
     bands: [{ series: [1, 2], fill: () => colour("band") }],
-    under: (plot) => {
-      marks(plot, charts.episodes);
-      charts.pins.draw(plot, state);
-    },
+    under: (plot) => marks(plot, charts.episodes),
+    between: (plot, series) => series === BEFORE && charts.pins.draw(plot, state), // over the band, beneath the estimate
     over: (plot) => integrityLines(plot, charts, state),
     data: () => {
       let [upper, lower, truth, mean] = own.map((name) => live.column(name));

@@ -5,6 +5,7 @@ import { element, setText } from "./dom.js";
 import { compact, span } from "./format.js";
 import { swatch } from "./pins.js";
 
+const LOOK = 300; // ms between two looks at whether there is something new
 const AGAIN = 5000; // ms between two looks at the scores while the log grows
 const COVERED = 0.95; // share of errors that their 95 % band should hold
 const ALIKE = 0.8; // share of the longest time from which on scores can be compared
@@ -20,7 +21,8 @@ export class Runs {
     this.compared = element("section", { class: "compared", "aria-label": "Two runs compared", hidden: true });
     this.table = element("table", { class: "runs" });
     node.replaceChildren(this.error, this.table, this.compared);
-    link.addEventListener("status", (event) => this.heard(event.detail));
+    // Not by the status: a twin whose source has ended says no more.
+    setInterval(() => link.socket && link.status.runs && this.heard(link.status), LOOK);
   }
 
   // While somebody looks, and is not just writing.

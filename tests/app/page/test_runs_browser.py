@@ -83,7 +83,8 @@ def test_pin_overlay_and_unpin(page, session):
     wait_for(lambda: coloured(page, "#charts article") > 100, PATIENCE)
     assert coloured(page, ".chart.difference .plot") > 100
     assert "as it was" in page.locator(".pins").inner_text()
-    kept, now = engine.revisions.find(first).track.track.mean[-1, 0], pull_all(engine).track.mean[-1, 0]
+    # Of the rate, which nobody measures.
+    kept, now = engine.revisions.find(first).track.track.mean[-1, 1], pull_all(engine).track.mean[-1, 1]
     wait_for(lambda: page.locator(".difference .reading").inner_text().startswith(f"{first}: "), PATIENCE)
     shown = float(page.locator(".difference .reading").inner_text().split(": ")[1])
     assert shown == pytest.approx(kept - now, rel=0.01, abs=1e-3)
@@ -97,6 +98,7 @@ def test_pin_overlay_and_unpin(page, session):
     page.locator("body").press("b")
     settled(engine, first + 2)
     assert engine.status().tuning is engine.revisions.find(first).tuning
+    wait_for(lambda: page.evaluate("window.nisus.link.status.runs.last") == first + 1, PATIENCE)
     page.locator("body").press("b")
     settled(engine, first + 3)
     assert engine.status().tuning.q[0] == 100.0
