@@ -34,7 +34,13 @@ FEWEST = 2048
 """The same of a filter so slow that no more can be afforded."""
 
 LONGEST = 2.0
-"""Seconds that one value may take."""
+"""Seconds that one value should take."""
+
+TOO_LONG = 10.0
+"""Seconds that the fewest events may take."""
+
+TRIED = 32
+"""Events that are folded to know how long one takes."""
 
 CHUNK = 256
 """Events between two looks at whether anybody still wants to know."""
@@ -159,14 +165,20 @@ class Sweeps:
 
     def sweep(self, key: str) -> None:
         """Fold every value of a key, and leave what is found to `around`."""
-        taken = self._affordable()
-        if taken is None:
+        taken = window(self._engine, FEWEST)
+        if taken is None or not self._goes_on(taken):
             return
+        most, reason = self._affordable(taken)
+        if most > FEWEST:
+            taken = window(self._engine, most)
+            if taken is None:
+                return
         value, revision = value_of(taken.tuning, key), taken.pull.revision
         swept = Swept(key, revision, value, len(taken.pull.events))
         values = values_around(taken.tuning, key)
-        if not values:
-            self._known[key] = Swept(key, revision, value, swept.events, (), True, f"{key} is 0: nothing to scale")
+        if reason or not values:
+            swept = replace(swept, done=True, reason=reason or f"{key} is 0: nothing to scale")
+            self._known[key] = swept
             return
         points: list[Point] = []
         for k, (factor, tuning) in enumerate(values):
@@ -195,18 +207,18 @@ class Sweeps:
         failed = _failures(track) > _failures(taken.track)
         return Point(factor, value, _number(likelihood, failed), _number(nis, failed))
 
-    def _affordable(self) -> Window | None:
-        """The last events, no more than can be folded in reasonable time."""
-        begun = window(self._engine, FEWEST)
-        if begun is None or not self._goes_on(begun):
-            return None
-        fold = begun.fold(self._engine, begun.estimator, begun.tuning)
-        fold.advance(min(CHUNK, fold.log.n // 2))
+    def _affordable(self, taken: Window) -> tuple[int, str]:
+        """How many events can be folded in reasonable time, or why none."""
+        if self._engine.model.black_box:
+            return 0, f"{self._engine.model.name} is a black box, too slow to be folded again beside what runs"
+        fold = taken.fold(self._engine, taken.estimator, taken.tuning)
+        fold.advance(min(TRIED, fold.log.n // 2))
         start = time.perf_counter()
-        events = fold.advance(CHUNK)
+        events = fold.advance(TRIED)
         each = (time.perf_counter() - start) / max(1, events)
-        most = int(min(MOST, max(FEWEST, LONGEST / max(each, 1e-9))))
-        return window(self._engine, most)
+        if each * len(taken.pull.events) > TOO_LONG:
+            return 0, f"{taken.estimator} takes {each * FEWEST:.0f} s for {FEWEST} events, too slow to be folded again"
+        return int(min(MOST, max(FEWEST, LONGEST / max(each, 1e-9)))), ""
 
     def _goes_on(self, taken: Window) -> bool:
         return not self._stopping and self._engine.tuning is taken.tuning

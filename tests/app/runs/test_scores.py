@@ -85,7 +85,7 @@ def test_what_was_scored_stays_known_when_its_track_goes(started):
     carry_out(engine, commands.SetTuning("Q.rate", 0.05))
     scores = RunScores(engine)
     first = scores.all()[0][1]
-    assert first is not None
+    assert first is not None and scores.all()[0][1] is first
     carry_out(engine, commands.SetTuning("R.winding", 2.0))
     (run, known), *_ = scores.all()
     assert run.track is None and known is first

@@ -93,6 +93,15 @@ def test_another_tuning_ends_a_sweep(started):
     assert sweeps.around("Q.rate").points == ()
 
 
+def test_what_is_too_slow_says_so(started, monkeypatch):
+    engine = started(600)
+    sweeps = Sweeps(engine)
+    monkeypatch.setattr("app.runs.sweep.TOO_LONG", 0.0)
+    sweeps.sweep("Q.rate")
+    found = sweeps.around("Q.rate")
+    assert found.done and not found.points and "too slow to be folded again" in found.reason
+
+
 def test_the_thread_folds_what_was_asked_for_and_ends(started):
     engine = started(600)
     sweeps = Sweeps(engine)

@@ -25,7 +25,9 @@ def same(a, b):
     return (a.gate, a.gate_kind, a.reopen) == (b.gate, b.gate_kind, b.reopen)
 
 
-@pytest.mark.parametrize("name", ["motor_can", "motor_winding", "battery_panasonic", "agv_corridor", "thermal_field"])
+@pytest.mark.parametrize(
+    "name", ["motor_can", "motor_winding", "motor_bench_joint", "agv_corridor", "thermal_field", "road_car"]
+)
 def test_a_twin_as_it_is_comes_back(name):
     twin = load_twin(name)
     back = pasted(twin, tuning_yaml(twin.config, twin.estimator, twin.tuning))
