@@ -22,7 +22,7 @@ export class Pins {
         key: "difference", title: "difference", unit: bracketed(this.state.unit), note: "pinned − running", weight: 1,
         series: [{ show: false }],
         data: () => [charts.range, [null, null]],
-        over: (plot) => this.pinned.forEach((pin) => trace(plot, pin.less, `mean:${this.state.name}`, pin.place)),
+        over: (plot) => this.pinned.forEach((pin) => trace(plot, pin.less, this.state, pin.place)),
         range: () => {
           const [low, high] = this.extent("less", this.state.name);
           return range.fit(Math.min(0, low), Math.max(0, high));
@@ -96,7 +96,7 @@ export class Pins {
 
   // Beneath the lines of a state's own chart.
   draw(plot, state) {
-    for (const pin of this.pinned) trace(plot, pin.lane, `mean:${state.name}`, pin.place);
+    for (const pin of this.pinned) trace(plot, pin.lane, state, pin.place);
   }
 
   // Lowest and highest that is shown of a state; of all pinned runs.
@@ -141,9 +141,11 @@ export function swatch(place) {
   return line;
 }
 
-// Draw a lane's column; its points stand at times of their own.
-function trace(plot, lane, name, place) {
-  const values = lane.column(name);
+// Draw a lane's mean of a state; its points stand at times of their own. An angle has no line from π to -π.
+function trace(plot, lane, state, place) {
+  const round = 2 * Math.PI;
+  const mean = lane.column(`mean:${state.name}`);
+  const values = state.circular ? mean.map((value) => (typeof value === "number" ? value - round * Math.round(value / round) : value)) : mean;
   const { ctx, bbox } = plot;
   const { min, max } = plot.scales.x;
   ctx.save();
@@ -162,7 +164,7 @@ function trace(plot, lane, name, place) {
       continue;
     }
     const [x, y] = [plot.valToPos(lane.x[k], "x", true), plot.valToPos(values[k], "y", true)];
-    if (open) ctx.lineTo(x, y);
+    if (open && !(state.circular && Math.abs(values[k] - values[k - 1]) > Math.PI)) ctx.lineTo(x, y);
     else ctx.moveTo(x, y);
     open = true;
   }

@@ -34,9 +34,15 @@ def test_a_twin_as_it_is_comes_back(name):
     assert back.estimator == twin.estimator and same(back.tuning, twin.tuning)
     for other in ESTIMATORS:
         assert back.options_of(other) == twin.options_of(other)
-    limits = [(s.range, s.rate, s.stuck) for s in twin.config.sensors.values()]
-    assert [(back.config.sensors[n].range, back.config.sensors[n].rate, back.config.sensors[n].stuck)
-            for n in twin.config.sensors] == limits  # fmt: skip
+
+
+def test_limits_of_a_sensor_stay_with_it():
+    given = {"sensors.yoke.range": "[-40, 180]", "sensors.yoke.rate": "5"}
+    twin = load_twin("motor_can", overrides=given)
+    back = pasted(twin, tuning_yaml(twin.config, "ekf", twin.tuning.set("R.yoke", 2.0)))
+    yoke, before = back.config.sensors["yoke"], twin.config.sensors["yoke"]
+    assert (yoke.range, yoke.rate) == (before.range, before.rate) and yoke.range is not None
+    assert back.tuning.get("R.yoke") == 2.0
 
 
 def test_what_was_turned_comes_back():
