@@ -19,7 +19,7 @@ export class Pins {
     const range = new Range();
     this.chart = new Chart(
       {
-        key: "difference", title: "difference", unit: bracketed(this.state.unit), note: "pinned − running", weight: 1,
+        key: "difference", title: "pinned − running", unit: bracketed(this.state.unit), weight: 1,
         series: [{ show: false }],
         data: () => [charts.range, [null, null]],
         over: (plot) => this.pinned.forEach((pin) => trace(plot, pin.less, this.state, pin.place)),
@@ -35,7 +35,7 @@ export class Pins {
       ...model.states.map((state) => element("option", { value: state.name, selected: state === this.state }, state.label)));
     this.legend = element("ul", { class: "pins", "aria-label": "Pinned runs" });
     this.chart.head.children[0].after(this.select);
-    this.chart.head.children[3].after(this.legend);
+    this.chart.head.querySelector(".space").before(this.legend);
     this.chart.node.classList.add("difference");
     this.chart.node.hidden = true;
     charts.node.after(this.chart.node);
@@ -48,11 +48,11 @@ export class Pins {
     if (key === this.key) return;
     this.key = key;
     for (const pin of this.pinned) if (!pinned.some((item) => item.number === pin.number && !item.running)) this.close(pin);
-    this.pinned = pinned.map((item) => ({ lane: new Lane(), less: new Lane(), ...this.pinned.find((pin) => pin.number === item.number), ...item }));
+    this.pinned = pinned.map((item) => ({ lane: new Lane(), less: new Lane(), reading: element("output", {}), ...this.pinned.find((pin) => pin.number === item.number), ...item }));
     this.legend.replaceChildren(
       ...this.pinned.map((pin) =>
         element("li", { style: `color: var(--pin-${pin.place})` },
-          swatch(pin.place), element("span", {}, `run ${pin.number}${pin.name ? ` ${pin.name}` : ""}${pin.running ? " (runs)" : ""}`),
+          swatch(pin.place), element("span", {}, `${pin.number}${pin.name ? ` ${pin.name}` : ""}${pin.running ? " (runs)" : ""}`), pin.reading,
           element("button", { type: "button", title: `Unpin run ${pin.number}`, "aria-label": `Unpin run ${pin.number}`, onclick: () => this.link.ask("Unpin", { number: pin.number }) }, "×")),
       ),
     );
@@ -122,15 +122,15 @@ export class Pins {
     return [Math.min(low, Math.max(under, low - reach)), Math.max(high, Math.min(over, high + reach))];
   }
 
-  // What the differences are at the cursor, else at the end.
+  // What the differences are at the cursor, else at the end: each beside its name in the legend.
   read() {
     const at = this.chart.plot.cursor.left >= 0 ? this.chart.plot.posToVal(this.chart.plot.cursor.left, "x") : Infinity;
-    const said = this.pinned.filter((pin) => !pin.running).map((pin) => {
+    for (const pin of this.pinned) {
       const values = pin.less.column(`mean:${this.state.name}`);
-      const value = pin.less.x.findLastIndex((x, k) => x <= at && typeof values[k] === "number");
-      return `${pin.number}: ${value < 0 ? "–" : compact(values[value], 3)}`;
-    });
-    return said.join("  ");
+      const index = pin.less.x.findLastIndex((x, k) => x <= at && typeof values[k] === "number");
+      setText(pin.reading, index < 0 ? "" : compact(values[index], 2));
+    }
+    return "";
   }
 }
 
