@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import uuid
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,8 @@ from starlette.websockets import WebSocket
 
 from estimators.errors import NisusError
 
+from ..analysis.diagnosis import Diagnosis
+from ..analysis.forecast import Forecasts, question_from_json
 from ..engine.interface import Running
 from ..rerun.feed import RerunFeed
 from ..series.series import Series
@@ -87,6 +89,7 @@ class PageServer:
         self._engine = engine
         self._review = review
         self._series = Series(engine)
+        self._forecasts, self._diagnosis = Forecasts(engine), Diagnosis(engine)
         self._boot = uuid.uuid4().hex
         self._socket = listen(port)
         self.port: int = self._socket.getsockname()[1]
@@ -138,6 +141,8 @@ class PageServer:
             Route("/api/recordings", self._list_recordings),
             Route("/api/faults", self._faults),
             Route("/api/command", self._command, methods=["POST"]),
+            Route("/api/forecast", self._forecast, methods=["POST"]),
+            Route("/api/diagnose", self._diagnose),
             Route(f"/viewer/{viewer_version()}/{{name}}", self._viewer_file),
             Route("/rec/{name}", self._recording),
             WebSocketRoute("/api/stream", self._page_stream),
@@ -183,16 +188,22 @@ class PageServer:
         return Json(faults_json(self._engine))
 
     async def _command(self, request: Request) -> Response:
-        if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
-            return PlainTextResponse("Nisus: Content-Type must be application/json.\n", 415)
-        try:
-            command = command_from_json(json.loads(await bounded_body(request)), self._engine)
-        except TooLarge as error:
-            return PlainTextResponse(f"Nisus: {error}.\n", 413)
-        except (NisusError, ValueError, RecursionError) as error:
-            return Json({"error": one_line(str(error))}, 400)
-        self._engine.submit(command)
-        return Json({"submitted": type(command).__name__}, 202)
+        async def submit(body: Any) -> Response:
+            command = command_from_json(body, self._engine)
+            self._engine.submit(command)
+            return Json({"submitted": type(command).__name__}, 202)
+
+        return await _answered(request, submit)
+
+    async def _forecast(self, request: Request) -> Response:
+        async def ask(body: Any) -> Response:
+            question = question_from_json(body, self._engine.model)
+            return Json(await asyncio.to_thread(self._forecasts.ask, question))
+
+        return await _answered(request, ask)
+
+    async def _diagnose(self, request: Request) -> Response:
+        return Json(await asyncio.to_thread(self._diagnosis.look))
 
     async def _viewer_file(self, request: Request) -> Response:
         name = request.path_params["name"]
@@ -264,6 +275,18 @@ class PageServer:
                 # Until the frame is drawn, or the status is due.
                 await asyncio.wait_for(drawn.wait(), STATUS_PERIOD)
             await asyncio.sleep(max(0.0, PERIOD - (time.monotonic() - begun)))
+
+
+async def _answered(request: Request, take: Callable[[Any], Awaitable[Response]]) -> Response:
+    """What `take` makes of a request's JSON; its refusal as one line."""
+    if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+        return PlainTextResponse("Nisus: Content-Type must be application/json.\n", 415)
+    try:
+        return await take(json.loads(await bounded_body(request)))
+    except TooLarge as error:
+        return PlainTextResponse(f"Nisus: {error}.\n", 413)
+    except (NisusError, ValueError, RecursionError) as error:
+        return Json({"error": one_line(str(error))}, 400)
 
 
 async def _given(feed: RerunFeed) -> AsyncIterator[str | bytes]:

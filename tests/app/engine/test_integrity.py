@@ -73,7 +73,7 @@ def test_another_revision_has_none_until_it_is_computed(engine):
 
 def test_the_thread_publishes_and_stops(engine):
     folds = threading.active_count()
-    watch = IntegrityWatch(MODEL, engine._window, EVERY, every=0.01)
+    watch = IntegrityWatch(MODEL, engine.last_events, EVERY, every=0.01)
     watch.start()
     wait_for(lambda: watch.of(0) is not None)
     watch.stop()
