@@ -31,6 +31,9 @@ TIMES = 160
 PATIENCE = 8.0
 """Seconds that one may take to compute."""
 
+ALONE = 1.0
+"""Seconds of a step where there has been one reading only."""
+
 SHARES = (0.1, 0.5, 0.9)
 """Probabilities of a limit of which the times are told."""
 
@@ -70,6 +73,21 @@ class Forecasts:
         self._engine = engine
         self._one = threading.Lock()
 
+    def may(self) -> dict[str, Any]:
+        """What may be asked: the longest horizon and the length of a step, s.
+
+        Raises:
+            ConfigError: If nothing has come yet.
+        """
+        step = _step(self._here(), 0.0, self._engine.model.max_step)
+        return {"step": step, "longest": MOST_STEPS * step}
+
+    def _here(self) -> Here:
+        here = self._engine.here()
+        if here is None:
+            raise ConfigError("forecast: no reading has come yet, so there is no estimate to go on from")
+        return here
+
     def ask(self, question: Question) -> dict[str, Any]:
         """What would be, see `forecast_json`.
 
@@ -80,9 +98,7 @@ class Forecasts:
             raise ConfigError("forecast: another one is under way; ask again")
         try:
             begun = time.monotonic()
-            here = self._engine.here()
-            if here is None:
-                raise ConfigError("forecast: no reading has come yet, so there is no estimate to go on from")
+            here = self._here()
             step = _step(here, question.horizon, self._engine.model.max_step)
 
             def between() -> None:
@@ -105,8 +121,7 @@ class Forecasts:
                 most=TIMES,
                 between=between,
             )
-            answer = forecast_json(self._engine.model, here, found)
-            return {**answer, "step": step, "longest": MOST_STEPS * step, "took": time.monotonic() - begun}
+            return {**forecast_json(self._engine.model, here, found), "step": step, "took": time.monotonic() - begun}
         finally:
             self._one.release()
 
@@ -163,7 +178,7 @@ def _crossing(item: Crossing, t: np.ndarray) -> dict[str, Any]:
 
 def _step(here: Here, horizon: float, longest: float) -> float:
     """As long as readings are apart, which the filter is used to; no longer than the model allows."""
-    step = min(here.step if math.isfinite(here.step) else horizon / TIMES, longest)
+    step = min(here.step if math.isfinite(here.step) else ALONE, longest)
     steps = math.ceil(horizon / step)
     if steps > MOST_STEPS:
         raise ConfigError(

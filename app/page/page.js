@@ -1,6 +1,7 @@
 // The page: trust on top, tuning to the left, charts in the middle, scene and lists to the right, time below.
 
 import { Charts } from "./charts.js";
+import { Diagnose } from "./diagnose.js";
 import { $, element, setAttribute } from "./dom.js";
 import { Episodes } from "./episodes.js";
 import { Explore } from "./explore.js";
@@ -15,6 +16,7 @@ import { Transport } from "./transport.js";
 import { Trust } from "./trust.js";
 import { Tune } from "./tune.js";
 import { View } from "./view.js";
+import { WhatIf } from "./whatif.js";
 
 const settings = JSON.parse(document.body.dataset.settings);
 const theme = document.documentElement.dataset.theme;
@@ -69,9 +71,11 @@ const transport = new Transport(model, link, view, charts);
 const explore = new Explore(settings.viewer, theme);
 const stage = new Stage(settings.viser, theme);
 
-const middle = new Tabs($("middle-tabs"), null, (name) => {
-  if (name === "explore") explore.show();
-  else explore.hide();
+// What is hidden neither computes nor asks.
+const panes = { explore, whatif: new WhatIf($("whatif"), model, link), diagnose: new Diagnose($("diagnose"), link) };
+const middle = new Tabs($("middle-tabs"), null, (shown) => {
+  for (const [name, pane] of Object.entries(panes)) if (name !== shown) pane.hide();
+  panes[shown]?.show();
 });
 side.show(side.chosen ?? "scene");
 // The scene once the charts stand: its three.js keeps the page busy while it starts.
@@ -116,6 +120,8 @@ keys([
   ["e", "episodes", () => side.show("episodes")],
   ["s", "scene", () => side.show("scene")],
   ["x", "explore in Rerun, and back", () => middle.show(middle.chosen === "explore" ? "charts" : "explore")],
+  ["w", "what if, and back", () => middle.show(middle.chosen === "whatif" ? "charts" : "whatif")],
+  ["d", "diagnose, and back", () => middle.show(middle.chosen === "diagnose" ? "charts" : "diagnose")],
   ["t", "tune, where the page is narrow", drawer],
 ]);
 

@@ -141,7 +141,7 @@ class PageServer:
             Route("/api/recordings", self._list_recordings),
             Route("/api/faults", self._faults),
             Route("/api/command", self._command, methods=["POST"]),
-            Route("/api/forecast", self._forecast, methods=["POST"]),
+            Route("/api/forecast", self._forecast, methods=["GET", "POST"]),
             Route("/api/diagnose", self._diagnose),
             Route(f"/viewer/{viewer_version()}/{{name}}", self._viewer_file),
             Route("/rec/{name}", self._recording),
@@ -196,6 +196,12 @@ class PageServer:
         return await _answered(request, submit)
 
     async def _forecast(self, request: Request) -> Response:
+        if request.method == "GET":
+            try:
+                return Json(await asyncio.to_thread(self._forecasts.may))
+            except NisusError as error:
+                return Json({"error": one_line(str(error))}, 409)
+
         async def ask(body: Any) -> Response:
             question = question_from_json(body, self._engine.model)
             return Json(await asyncio.to_thread(self._forecasts.ask, question))
