@@ -204,7 +204,7 @@ class Engine:
             self._cursors = [item for item in self._cursors if item is not cursor]
 
     def pull(self, cursor: Cursor, limit: int | None = None, *, align: int = 1) -> Pull:
-        """Copies of the rows since the cursor, at most `limit`, and the notices since; from a multiple of `align` on."""
+        """Copies of the rows since the cursor, from a multiple of `align` on, at most `limit`; the notices since."""
         with self._reading():
             log, fold = self._log, self._fold
             fresh = cursor.log != self._logs or (cursor.revision != self._revision and not cursor.follows_log)

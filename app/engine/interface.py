@@ -71,7 +71,7 @@ class Running(Protocol):
         """Forget a cursor."""
 
     def pull(self, cursor: Cursor, limit: int | None = None, *, align: int = 1) -> Pull:
-        """Copies of the rows since the cursor, at most `limit`, and the notices since; from a multiple of `align` on."""
+        """Copies of the rows since the cursor, from a multiple of `align` on, at most `limit`; the notices since."""
 
     def rows(self, start: int, stop: int) -> Pull:
         """Copies of the rows with these absolute indices, as far as they are there."""

@@ -43,8 +43,8 @@ class Pull:
     `fresh`: these rows start afresh (another revision or log, or the first pull): forget what was drawn. `first` is the
     absolute index of the first row; if it is below what was pulled before, a late reading rewrote the rows from there.
     `pictures` are those of a large field since the cursor; one with an index that was seen before takes its place.
-    `oldest` is the absolute index of the first row that is still there, `changed` that of the first of these that is new
-    or another; those before it were asked for to be aligned.
+    `oldest` is the absolute index of the first row that is still there, `changed` that of the first of these that is
+    new or another; those before it were asked for to be aligned.
     """
 
     revision: int

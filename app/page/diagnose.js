@@ -80,7 +80,7 @@ function rowCard(row, marginal) {
 
 // Sizes with their 95 % intervals.
 function figures(row) {
-  const interval = ([value, low, high]) => (low === null ? compact(value, 3) : `${compact(value, 3)} (${compact(low, 2)} to ${compact(high, 2)})`);
+  const interval = ([value, low, high]) => (low === null ? compact(value, 2) : `${compact(value, 2)} (${compact(low, 2)} to ${compact(high, 2)})`);
   const parts = [`${row.n.toLocaleString("en")} readings`];
   if (row.scale?.[0] != null) parts.push(`bands should be ${interval(row.scale)} times as wide`);
   if (row.bias?.[0] != null) parts.push(`bias ${interval(row.bias)} σ`);
@@ -148,7 +148,7 @@ function faultsCard({ faults, unseen_reason: reason }) {
   const verdict = blind ? `${blind} of ${faults.length} faults show in no reading, however large.` : "Every fault shows in the readings, if it is large enough.";
   return card(
     "Smallest visible faults", "good: small beside what matters to you", verdict,
-    table(["fault of", "seen from", "unseen"], faults.map((item) => [words(item.subject), item.size, item.unseen])),
+    table(["fault of", "seen from", "unseen"], faults.map((item) => [words(item.subject), plain(item.size), plain(item.unseen)])),
   );
 }
 
@@ -163,5 +163,8 @@ function integrityCard({ integrity, unseen_reason: reason }) {
     table(["state", "2σ", "bound", "by"], entries.map(([name, entry]) => [words(name), `${compact(entry.two_sigma, 2)}${spaced(entry.unit)}`, entry.bound === null ? "none" : `${compact(entry.bound, 2)}${spaced(entry.unit)}`, words(entry.fault)])),
   );
 }
+
+// "4.9e+03 %" as 4900 %.
+const plain = (text) => text.replace(/\d+(\.\d+)?e\+\d+/g, (figures) => String(Math.round(Number(figures))));
 
 const table = (heads, rows) => element("table", {}, element("tr", {}, ...heads.map((head) => element("th", {}, head))), ...rows.map((row) => element("tr", {}, ...row.map((cell) => element("td", {}, cell)))));

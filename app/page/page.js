@@ -17,6 +17,7 @@ import { Trust } from "./trust.js";
 import { Tune } from "./tune.js";
 import { View } from "./view.js";
 import { WhatIf } from "./whatif.js";
+import { XY } from "./xy.js";
 
 const settings = JSON.parse(document.body.dataset.settings);
 const theme = document.documentElement.dataset.theme;
@@ -76,11 +77,20 @@ const panes = { explore, whatif: new WhatIf($("whatif"), model, link), diagnose:
 const middle = new Tabs($("middle-tabs"), null, (shown) => {
   for (const [name, pane] of Object.entries(panes)) if (name !== shown) pane.hide();
   panes[shown]?.show();
+  $("layout").hidden = shown !== "charts-panel";
+  $("legend").hidden = shown === "diagnose" || shown === "explore";
 });
+const turn = (name) => middle.show(middle.chosen === name ? "charts-panel" : name);
+const xy = new XY($("xy"), model, link, view, charts);
+let stages = false;
+middle.show("charts-panel");
+side.shown = (name) => {
+  xy.visible(name === "xy");
+  if (stages) stage.visible(name === "scene");
+};
 side.show(side.chosen ?? "scene");
 // The scene once the charts stand: its three.js keeps the page busy while it starts.
-const staged = (name) => stage.visible(name === "scene");
-link.addEventListener("frames", () => setTimeout(() => ((side.shown = staged), staged(side.chosen)), 300), { once: true });
+link.addEventListener("frames", () => setTimeout(() => ((stages = true), side.shown(side.chosen)), 300), { once: true });
 
 async function record() {
   if (link.status.recording) await link.ask("Record", { path: null });
@@ -118,10 +128,11 @@ keys([
   ["u", "undo the last edit", () => tune.undo()],
   ["U", "redo", () => tune.redo()],
   ["e", "episodes", () => side.show("episodes")],
+  ["y", "two states against each other", () => side.show("xy")],
   ["s", "scene", () => side.show("scene")],
-  ["x", "explore in Rerun, and back", () => middle.show(middle.chosen === "explore" ? "charts" : "explore")],
-  ["w", "what if, and back", () => middle.show(middle.chosen === "whatif" ? "charts" : "whatif")],
-  ["d", "diagnose, and back", () => middle.show(middle.chosen === "diagnose" ? "charts" : "diagnose")],
+  ["x", "explore in Rerun, and back", () => turn("explore")],
+  ["w", "what if, and back", () => turn("whatif")],
+  ["d", "diagnose, and back", () => turn("diagnose")],
   ["t", "tune, where the page is narrow", drawer],
 ]);
 

@@ -34,7 +34,7 @@ export function distribution({ low, high, counts }, label) {
   const width = (high - low) / counts.length;
   const heights = counts.map((count) => count / n / width);
   const top = Math.max(0.45, 1.05 * Math.max(...heights));
-  const { node, x, y } = frame([low, high], [0, top], label, { xs: [-3, 0, 3].map((v) => [v, `${v} σ`]), ys: [[0], [0.4]] });
+  const { node, x, y } = frame([low, high], [0, top], label, { xs: [[-3, "−3σ"], [0, "0"], [3, "3σ"]], ys: [[0], [0.4]] });
   heights.forEach((height, k) => {
     if (height) node.append(svg("rect", { class: "bar", x: x(low + k * width) + 0.3, width: x(low + width) - x(low) - 0.6, y: y(height), height: y(0) - y(height) }));
   });
@@ -61,7 +61,7 @@ export function stems({ r, bound }, label, step) {
 export function quantiles(pairs, label) {
   const most = Math.max(3, ...pairs.flat().map((value) => Math.min(8, Math.abs(value))));
   const ends = [-most, most];
-  const { node, x, y } = frame(ends, ends, label, { xs: [-2, 0, 2].map((v) => [v, `${v} σ`]), ys: [[-2], [0], [2]] });
+  const { node, x, y } = frame(ends, ends, label, { xs: [[-2, "−2σ"], [0, "0"], [2, "2σ"]], ys: [[-2], [0], [2]] });
   node.append(svg("line", { class: "expected", x1: x(-most), y1: y(-most), x2: x(most), y2: y(most) }));
   for (const [normal, own] of pairs) node.append(svg("circle", { class: "dot", r: 1.8, cx: x(normal), cy: y(Math.max(-most, Math.min(most, own))) }));
   return node;

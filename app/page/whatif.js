@@ -2,10 +2,12 @@
 // it reaches a limit. Nothing is asked while this is hidden.
 
 import { Chart, colour, dots, edge, line } from "./chart.js";
+import { turned, unbroken } from "./charts.js";
 import { element, setText } from "./dom.js";
-import { bracketed, clock, compact, spaced, span, words } from "./format.js";
+import { bracketed, compact, spaced, span, words } from "./format.js";
 import { Lane } from "./lane.js";
 import { Range, extent, within } from "./ranges.js";
+import { TimeAxis } from "./time_axis.js";
 
 const AGAIN = 2000; // ms between two forecasts, while the twin goes on
 const REST = 4; // times as long as a forecast took, at least
@@ -53,16 +55,18 @@ export class WhatIf {
       ...[...this.rows.values()].map((row) => row.node),
     );
     this.charts = element("div", { class: "fans" });
-    this.node.replaceChildren(asked, this.problem, this.charts, element("p", { class: "faint foot" }, "From now without readings, by the filter that runs. Bands ± 1σ, ± 2σ. ", this.method));
+    const axis = element("div", { class: "axis", "aria-hidden": "true" });
+    this.node.replaceChildren(asked, this.problem, this.charts, axis, element("p", { class: "faint foot" }, "From now without readings, by the filter that runs. Bands ± 1σ, ± 2σ. ", this.method));
     const states = [...this.model.states].sort((a, b) => (a.rows.length > 0) - (b.rows.length > 0)).slice(0, MOST);
     const actions = { select: () => {}, home: () => {}, wheel: () => {} };
     this.parts = states.map((state) => new Chart(fan(this, state), actions));
     this.charts.append(...this.parts.map((chart) => chart.node));
     this.parts.forEach((chart, k) => {
       chart.span = [0, 1];
-      chart.begin(k === this.parts.length - 1);
+      chart.begin();
       if (!states[k].probability && !states[k].circular) chart.head.insertBefore(limitField(this, states[k]), chart.reading);
     });
+    this.axis = new TimeAxis(axis);
   }
 
   // History before now, in the style of the charts.
@@ -151,6 +155,7 @@ export class WhatIf {
     const now = this.times[0];
     const range = [now - PAST * this.found.t.at(-1), this.times.at(-1)];
     for (const chart of this.parts) chart.show(chart.what.data(), range);
+    this.axis.show(range);
   }
 }
 
@@ -250,7 +255,6 @@ function fan(whatif, state) {
       { series: [first, first + 1], fill: () => colour("band") },
       { series: [first + 2, first + 3], fill: () => colour("band") },
     ],
-    ticks: (self, splits) => splits.map((value) => clock(value, 0)),
     over: (plot) => lines(plot, whatif.times?.[0], whatif.limits[state.name]),
     data: () => {
       const { found, times } = whatif;
@@ -259,11 +263,10 @@ function fan(whatif, state) {
       const none = new Array(times.length).fill(null);
       const empty = new Array(before).fill(null);
       const told = found.states[state.name];
-      return [
-        [...lane.x.slice(0, before), ...times],
-        ...past.map((name) => [...lane.column(name).slice(0, before), ...none]),
-        ...future.map((name) => [...empty, ...(told[name] ?? none)]),
-      ];
+      const was = past.map((name) => lane.column(name).slice(0, before));
+      const will = future.map((name) => told[name] ?? none);
+      if (state.circular) [[was, -1, [0, 1]], [will, -1, [0, 1, 2, 3]]].forEach(([columns, mean, edges]) => around(columns, mean, edges));
+      return [[...lane.x.slice(0, before), ...times], ...was.map((values) => [...values, ...none]), ...will.map((values) => [...empty, ...values])];
     },
     range: (chart) => {
       if (state.probability) return [-0.03, 1.03];
@@ -280,6 +283,14 @@ function fan(whatif, state) {
       return `in ${span(x - now)} ${compact(mean, 4)}${around}${spaced(state.unit)}`;
     },
   };
+}
+
+// Columns of an angle, the edges of a band about its mean.
+function around(columns, place, edges) {
+  const mean = columns.at(place);
+  columns.forEach((values, k) => {
+    columns[k] = edges.includes(k) ? values.map((value, i) => (value === null || mean[i] === null ? null : turned(mean[i]) + value - mean[i])) : unbroken(values);
+  });
 }
 
 // Now, upright; the limit, level.

@@ -121,7 +121,7 @@ class Lane:
         groups = run.groups(size, at, last, list(wanted.columns))
         self._told, self._dirty = told, FOREVER
         # The last group may grow.
-        self._sent = (first, groups.start + groups.count)
+        self._sent = (first, groups.start + groups.n)
         return self._packed(groups, origin, fresh, first, run.revision)
 
     def _sized(self, rows: int) -> int:

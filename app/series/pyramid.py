@@ -33,13 +33,13 @@ class Groups(NamedTuple):
     rising: np.ndarray
 
     @property
-    def count(self) -> int:
+    def n(self) -> int:
         """Number of groups."""
         return int(self.first.size)
 
     def since(self, number: int) -> Groups:
         """Those from a number on."""
-        return self.part(number, self.start + self.count)
+        return self.part(number, self.start + self.n)
 
     def part(self, start: int, stop: int) -> Groups:
         """Those with numbers from `start` to before `stop`, as far as they are there."""
@@ -51,7 +51,7 @@ class Groups(NamedTuple):
         """These up to where the others begin, and then the others."""
         before = self.part(self.start, more.start)
         columns = (np.concatenate(pair) for pair in zip(before[2:], more[2:], strict=True))
-        return Groups(self.size, before.start if before.count else more.start, *columns)
+        return Groups(self.size, before.start if before.n else more.start, *columns)
 
 
 def no_groups(size: int, columns: int) -> Groups:
@@ -81,8 +81,8 @@ def grouped(size: int, first: int, t: np.ndarray, values: np.ndarray) -> Groups:
 def coarser(groups: Groups) -> Groups:
     """Groups of `FACTOR` of these."""
     start = groups.start // FACTOR
-    ends = np.arange(start + 1, (groups.start + groups.count - 1) // FACTOR + 1) * FACTOR - groups.start
-    starts, lasts = np.concatenate(([0], ends)), np.concatenate((ends, [groups.count])) - 1
+    ends = np.arange(start + 1, (groups.start + groups.n - 1) // FACTOR + 1) * FACTOR - groups.start
+    starts, lasts = np.concatenate(([0], ends)), np.concatenate((ends, [groups.n])) - 1
     low, high = np.fmin.reduceat(groups.low, starts, axis=0), np.fmax.reduceat(groups.high, starts, axis=0)
     middle = groups.low + groups.high
     # Where several become one, it rises if their middles do.
@@ -108,12 +108,12 @@ class Pyramid:
         fresh = grouped(FIRST, first, t, values)
         for k in range(len(self._levels) + 1):
             if k == len(self._levels):
-                if self._levels[-1].groups.count < 2 * FACTOR:
+                if self._levels[-1].groups.n < 2 * FACTOR:
                     break
                 self._levels.append(_Level(FIRST * FACTOR**k, self._columns))
                 fresh = coarser(self._levels[k - 1].groups)
             self._levels[k].put(fresh)
-            if not fresh.count:
+            if not fresh.n:
                 break
             fresh = coarser(self._levels[k].groups.since(fresh.start // FACTOR * FACTOR))
 
@@ -128,7 +128,7 @@ class Pyramid:
             if level.groups.size == size:
                 return level.groups
         groups = self._levels[-1].groups
-        while groups.size < size and groups.count:
+        while groups.size < size and groups.n:
             groups = coarser(groups)
         return groups
 
@@ -154,11 +154,9 @@ class _Level:
         at = fresh.start - self._start
         if not 0 <= at <= self._n:
             self._start, at = fresh.start, 0
-        needed = at + fresh.count
-        for column, new in zip(self._room, fresh[2:], strict=True):
-            if needed > len(column):
-                self._room = [np.resize(old, (2 * needed, *old.shape[1:])) for old in self._room]
-                break
+        needed = at + fresh.n
+        if needed > len(self._room[0]):
+            self._room = [np.resize(column, (2 * needed, *column.shape[1:])) for column in self._room]
         for column, new in zip(self._room, fresh[2:], strict=True):
             column[at:needed] = new
         self._n = needed

@@ -14,7 +14,7 @@ from ..series.columns import columns_of, rows_of
 
 
 def model_json(engine: Running) -> dict[str, Any]:
-    """The twin in names, units and configured values, and every estimator with its options, or why it does not apply."""
+    """The twin in names, units and configured values; every estimator with its options, or why it does not apply."""
     model, twin = engine.model, engine.twin
     view = twin.config.view
     direct = {(dot.sensor, dot.row): int(dot.state) for dot in observed(model)}

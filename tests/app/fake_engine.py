@@ -90,11 +90,21 @@ class FakeEngine:
     def cursor(self):
         return SimpleNamespace(n=0, revision=None, told=0)
 
-    def pull(self, cursor, limit=None):
+    def span(self):
+        return (int(self.log.t[0]), int(self.log.t[self.log.n - 1])) if self.log.n else (0, 0)
+
+    def index_at(self, t):
+        return int(np.searchsorted(self.log.t[: self.log.n], t))
+
+    def rows(self, start, stop):
+        return self._pull(start, False, stop)
+
+    def pull(self, cursor, limit=None, *, align=1):
         fresh = cursor.revision != self.state.revision
-        first = 0 if fresh else min(cursor.n, getattr(self, "changed", cursor.n))
+        changed = 0 if fresh else min(cursor.n, getattr(self, "changed", cursor.n))
         self.changed = self.log.n
-        pull = self._pull(first, fresh)
+        pull = self._pull(changed // align * align, fresh)
+        pull.changed = changed
         pull.notices = self.notices[cursor.told :]
         cursor.n, cursor.revision, cursor.told = self.log.n, self.state.revision, len(self.notices)
         return pull
@@ -111,11 +121,12 @@ class FakeEngine:
         mean, cov = self.fold.moments()
         return SimpleNamespace(t=self.state.t, mean=mean, cov=cov, points=self.fold.points(), peaks=self.peaks)
 
-    def _pull(self, first, fresh):
-        rows = slice(first, self.log.n)
+    def _pull(self, first, fresh, stop=None):
+        rows = slice(first, self.log.n if stop is None else min(stop, self.log.n))
         return SimpleNamespace(
             revision=self.state.revision, fresh=fresh, first=first, events=self.log.events.select(rows),
             track=self.fold.track.select(rows).copy(), notices=[],
+            oldest=0, changed=first,
         )  # fmt: skip
 
 
