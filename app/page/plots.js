@@ -11,6 +11,7 @@ const TOP = 6;
 const RIGHT = 6;
 
 const svg = (name, attributes, ...children) => element(`svg:${name}`, attributes, ...children);
+const two = (value) => (Math.abs(value) < 0.005 ? "0.00" : value.toFixed(2));
 const round = (value) => Math.round(10 * value) / 10;
 
 // A frame of axes: x(v) and y(v) give places, `node` is what to append to.
@@ -105,9 +106,9 @@ export function correlations(names, matrix, label) {
     row.forEach((value, j) => {
       const place = { x: round(room + j * side), y: round(i * side), width: side - 1, height: side - 1 };
       const cell = svg("rect", { ...place, class: value < 0 ? "against" : "with", "fill-opacity": value === null ? 0 : Math.abs(value) });
-      cell.append(svg("title", {}, `${names[i]}, ${names[j]}: ${value === null ? "–" : value.toFixed(2)}`));
+      cell.append(svg("title", {}, `${names[i]}, ${names[j]}: ${value === null ? "–" : two(value)}`));
       node.append(cell);
-      if (side >= 26 && value !== null) node.append(svg("text", { x: round(place.x + side / 2), y: round(place.y + side / 2 + 3.5), "text-anchor": "middle", class: Math.abs(value) > 0.6 ? "over" : "" }, value.toFixed(2)));
+      if (side >= 26 && value !== null) node.append(svg("text", { x: round(place.x + side / 2), y: round(place.y + side / 2 + 3.5), "text-anchor": "middle", class: Math.abs(value) > 0.6 ? "over" : "" }, two(value)));
     });
   });
   return node;
