@@ -5,9 +5,10 @@ its kind INPUT that changes no input or some, so the state moves on as it does b
 what the fold itself would say. `f` is discrete, so the steps should be as long as those between the readings that the
 filter has had.
 
-A filter that consists of its members (ensembles, bootstrap particles) is asked for them after each step. A member keeps
-its place while no reading comes, so that their paths tell when each passes a limit for the first time. All others give
-moments, and of them the probability of being beyond the limit at each time, which is less than that of having been.
+A filter that consists of its members (ensembles, bootstrap particles) is asked for them at every time and some between.
+A member keeps its place while no reading comes, so that their paths tell when each passes a limit for the first time.
+All others give moments, and of them the probability of being beyond the limit at each time, which is less than that of
+having been.
 """
 
 from __future__ import annotations
@@ -27,6 +28,10 @@ from .tuning import Tuning
 
 SIGMAS = (-2.0, -1.0, 1.0, 2.0)
 """Edges of the bands, in standard deviations; of members the quantiles that a normal variable has there."""
+
+LOOKS = 4
+"""Looks at the members from one time to the next, where there are so many steps: whoever comes back between two looks
+is not seen to have passed."""
 
 
 class Crossing(NamedTuple):
@@ -103,12 +108,13 @@ def forecast(
     by_members = fold.estimator.blocks is not None and model.nx <= LARGE
     rows = np.searchsorted(fold.log.t[: fold.log.n], instants, side="right")
     each = fine // times
+    apart = np.unique(np.linspace(0, each, min(LOOKS, each) + 1).astype(int))[1:]
     watch = _Watch(model, limits or {}, columns)
     bands = np.empty((times + 1, len(SIGMAS), len(model.shown)))
     points = np.zeros((0, model.nx))
     for k in range(times + 1):
-        stops = rows[max(0, (k - 1) * each + 1) : k * each + 1]
-        for stop in stops if by_members and limits else stops[-1:]:
+        looks = (k - 1) * each + apart if k and by_members and limits else [k * each]
+        for stop in rows[looks]:
             fold.advance(int(stop) - fold.n)
             if by_members:
                 points = fold.points()

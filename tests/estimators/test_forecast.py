@@ -91,7 +91,7 @@ def test_members_have_the_quantiles_and_first_passages_of_paths(estimator, count
     exact = folded("kf", WALK, log)
     (mean,), ((start,),) = exact.moments()
     n, limit, horizon, step = 2000, 3.0, 10.0, 0.25
-    found = ahead(made, horizon, step, limits={"s": limit}, most=10)
+    found = ahead(made, horizon, step, limits={"s": limit}, most=10)  # four steps from one time to the next
     assert found.members == n and found.t.size == 11
     std = np.sqrt(start + 0.3 * found.t)
     # The filter's own cloud stands for N(mean, start) with as many members, after two updates by chance.
