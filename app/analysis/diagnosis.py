@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from typing import Any
 
@@ -37,11 +36,10 @@ MOST_NAMES = 48
 
 
 class Diagnosis:
-    """Answers `GET /api/diagnose`; from any thread, never from the engine's."""
+    """Answers `GET /api/diagnose`; from any thread but the engine's, one question at a time."""
 
     def __init__(self, engine: Running) -> None:
         self._engine, self._slow = engine, Slow(engine)
-        self._lock = threading.Lock()
         self._known: tuple[float, dict[str, Any]] | None = None
 
     def look(self) -> dict[str, Any]:
@@ -51,12 +49,11 @@ class Diagnosis:
         left of a cloud over time, `correlation` a map of the present covariance, `observability`, `faults` and
         `integrity` what could be wrong unnoticed, `cost` microseconds of an event.
         """
-        with self._lock:
-            known = self._known
-            if known is None or time.monotonic() - known[0] > FRESH:
-                answer = self._look()
-                self._known = known = time.monotonic(), answer
-            return known[1]
+        known = self._known
+        if known is None or time.monotonic() - known[0] > FRESH:
+            answer = self._look()
+            self._known = known = time.monotonic(), answer
+        return known[1]
 
     def _look(self) -> dict[str, Any]:
         engine = self._engine

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -67,11 +66,10 @@ def question_from_json(body: Any, model: StateSpaceModel) -> Question:
 
 
 class Forecasts:
-    """Answers questions about one running twin, one at a time; from any thread, never from the engine's."""
+    """Answers questions about one running twin; from any thread, never from the engine's."""
 
     def __init__(self, engine: Running) -> None:
         self._engine = engine
-        self._one = threading.Lock()
 
     def may(self) -> dict[str, Any]:
         """What may be asked: the longest horizon and the length of a step, s.
@@ -94,36 +92,31 @@ class Forecasts:
         Raises:
             NisusError: If nothing has come yet, the question is too large, or `forecast` refuses it.
         """
-        if not self._one.acquire(timeout=PATIENCE):
-            raise ConfigError("forecast: another one is under way; ask again")
-        try:
-            begun = time.monotonic()
-            here = self._here()
-            step = _step(here, question.horizon, self._engine.model.max_step)
+        begun = time.monotonic()
+        here = self._here()
+        step = _step(here, question.horizon, self._engine.model.max_step)
 
-            def between() -> None:
-                if time.monotonic() - begun > PATIENCE:
-                    raise ConfigError(
-                        f"forecast: {question.horizon:g} s in steps of {step:.3g} s take longer than {PATIENCE:g} s to "
-                        f"compute with {here.estimator}; ask for a shorter horizon"
-                    )
+        def between() -> None:
+            if time.monotonic() - begun > PATIENCE:
+                raise ConfigError(
+                    f"forecast: {question.horizon:g} s in steps of {step:.3g} s take longer than {PATIENCE:g} s to "
+                    f"compute with {here.estimator}; ask for a shorter horizon"
+                )
 
-            found = forecast(
-                here.estimator,
-                self._engine.model,
-                here.tuning,
-                here.base,
-                here.t,
-                question.horizon,
-                step,
-                inputs=_events(question.inputs, here.t, self._engine.model),
-                limits=question.limits,
-                most=TIMES,
-                between=between,
-            )
-            return {**forecast_json(self._engine.model, here, found), "step": step, "took": time.monotonic() - begun}
-        finally:
-            self._one.release()
+        found = forecast(
+            here.estimator,
+            self._engine.model,
+            here.tuning,
+            here.base,
+            here.t,
+            question.horizon,
+            step,
+            inputs=_events(question.inputs, here.t, self._engine.model),
+            limits=question.limits,
+            most=TIMES,
+            between=between,
+        )
+        return {**forecast_json(self._engine.model, here, found), "step": step, "took": time.monotonic() - begun}
 
 
 def forecast_json(model: StateSpaceModel, here: Here, found: Forecast) -> dict[str, Any]:

@@ -48,7 +48,7 @@ export class Diagnose {
     this.node.replaceChildren(
       element("p", { class: "summary" }, element("b", {}, `${good} of ${found.rows.length} sensor rows are consistent. `), `Last ${found.events.toLocaleString("en")} events, ${span(found.span)}, ${found.estimator}.${cost}`),
       ...found.rows.map((row) => rowCard(row, found.marginal)),
-      element("div", { class: "cards" }, ...[ranksCard(found), particlesCard(found), correlationCard(found), observabilityCard(found), faultsCard(found), integrityCard(found)].filter(Boolean)),
+      element("div", { class: "cards" }, ...[ranksCard(found), particlesCard(found), correlationCard(found), ...unseenCards(found)].filter(Boolean)),
     );
     window.nisus.diagnosed = (window.nisus.diagnosed ?? 0) + 1;
   }
@@ -129,6 +129,13 @@ function correlationCard({ correlation }) {
 }
 
 const n = (count, value, a, b) => (count < 2 ? "There is one state." : `All can be told apart; closest are ${a} and ${b} (${value.toFixed(2)}).`);
+
+// One word for all where one reason speaks against all.
+function unseenCards(found) {
+  const reason = found.observability.reason;
+  if (reason && reason === found.unseen_reason) return [card("Observability, visible faults, integrity", "", `${reason}.`)];
+  return [observabilityCard(found), faultsCard(found), integrityCard(found)];
+}
 
 function observabilityCard({ observability }) {
   const { reason, rank, of, conditioning, states, weakest, span: seconds, note } = observability;

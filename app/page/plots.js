@@ -81,7 +81,7 @@ export function flat({ counts, low, high }, label) {
 export function decades(t, lines, most, label, ends) {
   const log = (value) => Math.log10(Math.max(1, value));
   const top = log(most || Math.max(...lines.flatMap(([values]) => values)));
-  const ticks = Array.from({ length: Math.floor(top) + 1 }, (_, k) => [k, compact(10 ** k, 2)]);
+  const ticks = Array.from({ length: Math.floor(top) + 1 }, (_, k) => [k, k < 3 ? String(10 ** k) : `${10 ** (k - 3)}k`]);
   const { node, x, y } = frame([t[0], t.at(-1)], [0, top || 1], label, { xs: [[t[0], ends[0]], [t.at(-1), ends[1]]], ys: ticks });
   const texts = node.querySelectorAll('text[text-anchor="middle"]');
   texts[0]?.setAttribute("text-anchor", "start");

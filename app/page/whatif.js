@@ -47,7 +47,8 @@ export class WhatIf {
     this.slider = element("input", { type: "range", min: 0, max: STEPS, step: 1, "aria-label": "Horizon", oninput: () => this.turn() });
     this.length = element("output", {});
     this.problem = element("p", { class: "error", role: "alert" });
-    this.method = element("span", { class: "faint" });
+    this.method = element("span", {});
+    this.state = element("span", { class: "state", role: "status" });
     this.rows = new Map(this.model.inputs.map((input) => [input.name, inputRow(this, input)]));
     const asked = element(
       "section", { class: "asked", "aria-label": "The future that is asked for" },
@@ -56,7 +57,7 @@ export class WhatIf {
     );
     this.charts = element("div", { class: "fans" });
     const axis = element("div", { class: "axis", "aria-hidden": "true" });
-    this.node.replaceChildren(asked, this.problem, this.charts, axis, element("p", { class: "faint foot" }, "From now without readings, by the filter that runs. Bands ± 1σ, ± 2σ. ", this.method));
+    this.node.replaceChildren(asked, this.problem, this.charts, axis, element("p", { class: "faint foot" }, "From now on without readings, by the filter that runs. Bands ± 1σ, ± 2σ. ", this.method, this.state));
     const states = [...this.model.states].sort((a, b) => (a.rows.length > 0) - (b.rows.length > 0)).slice(0, MOST);
     const actions = { select: () => {}, home: () => {}, wheel: () => {} };
     this.parts = states.map((state) => new Chart(fan(this, state), actions));
@@ -112,6 +113,7 @@ export class WhatIf {
     const asked = `${status.t} ${status.revision} ${question}`;
     if (asked === this.asked) return this.next(AGAIN); // paused: nothing would come out differently
     this.busy = true;
+    setText(this.state, "computing …");
     const begun = performance.now();
     try {
       if (this.horizon === null || !this.longest) await this.learn();
@@ -125,6 +127,7 @@ export class WhatIf {
       setText(this.problem, error.message);
     }
     this.busy = false;
+    setText(this.state, "");
     this.next(Math.max(AGAIN, REST * (performance.now() - begun)));
   }
 
@@ -276,10 +279,10 @@ function fan(whatif, state) {
       return range.fit(Math.min(low, limit ?? low), Math.max(high, limit ?? high));
     },
     says: (value) => {
-      const [x, upper, mean] = [value(0), value(first), value(first + 4)];
+      const [x, upper, lower, mean] = [value(0), value(first), value(first + 1), value(first + 4)];
       const now = whatif.times?.[0] ?? 0;
       if (!(x >= now)) return "";
-      const around = Number.isFinite(upper) ? ` ± ${compact(upper - mean, 2)}` : "";
+      const around = Number.isFinite(upper) ? ` ± ${compact((upper - lower) / 2, 2)}` : "";
       return `in ${span(x - now)} ${compact(mean, 4)}${around}${spaced(state.unit)}`;
     },
   };

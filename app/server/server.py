@@ -34,6 +34,7 @@ from .api import Json, command_from_json, episodes_json, faults_json, one_line, 
 from .bounds import BODY, TooLarge, bounded_body, bounds
 from .gate import Gate, session_token
 from .model_json import model_json
+from .one_at_a_time import OneAtATime
 from .page_stream import PageStream
 from .port import listen
 from .viewer_assets import FILES, viewer_assets, viewer_version
@@ -90,6 +91,7 @@ class PageServer:
         self._review = review
         self._series = Series(engine)
         self._forecasts, self._diagnosis = Forecasts(engine), Diagnosis(engine)
+        self._forecasting, self._diagnosing = OneAtATime("forecast"), OneAtATime("diagnosis")
         self._boot = uuid.uuid4().hex
         self._socket = listen(port)
         self.port: int = self._socket.getsockname()[1]
@@ -204,12 +206,15 @@ class PageServer:
 
         async def ask(body: Any) -> Response:
             question = question_from_json(body, self._engine.model)
-            return Json(await asyncio.to_thread(self._forecasts.ask, question))
+            return Json(await self._forecasting.do(lambda: self._forecasts.ask(question)))
 
         return await _answered(request, ask)
 
     async def _diagnose(self, request: Request) -> Response:
-        return Json(await asyncio.to_thread(self._diagnosis.look))
+        try:
+            return Json(await self._diagnosing.do(self._diagnosis.look))
+        except NisusError as error:
+            return Json({"error": one_line(str(error))}, 503)
 
     async def _viewer_file(self, request: Request) -> Response:
         name = request.path_params["name"]

@@ -1,12 +1,15 @@
 """What if, asked of a running twin: against the closed form; what is refused; and that nothing is disturbed."""
 
+import asyncio
 import json
+import threading
 
 import numpy as np
 import pytest
 
-from app.analysis.forecast import MOST_STEPS, Forecasts, question_from_json
+from app.analysis.forecast import Forecasts, question_from_json
 from app.engine.engine import Engine
+from app.server.one_at_a_time import OneAtATime
 from app.server.server import PageServer
 from estimators.errors import ConfigError
 from estimators.models import MODELS
@@ -99,3 +102,25 @@ def test_the_page_asks_by_post(tmp_path, monkeypatch):
         assert client.post("/api/forecast", b"{").status == 400
     finally:
         server.stop()
+
+
+def test_a_question_waits_for_the_one_before_it_and_not_for_ever(monkeypatch):
+    monkeypatch.setattr("app.server.one_at_a_time.PATIENCE", 0.01)
+    go_on, under_way = threading.Event(), []
+
+    def slow():
+        under_way.append(1)
+        go_on.wait()
+        return len(under_way)
+
+    async def ask():
+        line = OneAtATime("forecast")
+        first = asyncio.create_task(line.do(slow))
+        while not under_way:
+            await asyncio.sleep(0)
+        with pytest.raises(ConfigError, match="forecast: another one is under way; ask again"):
+            await line.do(slow)
+        go_on.set()
+        return await first, await line.do(slow)
+
+    assert asyncio.run(ask()) == (1, 2)
