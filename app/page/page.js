@@ -80,6 +80,7 @@ const middle = new Tabs($("middle-tabs"), null, (shown) => {
   $("layout").hidden = shown !== "charts-panel";
   $("legend").hidden = shown === "diagnose" || shown === "explore";
 });
+window.nisus.panes = panes;
 const turn = (name) => middle.show(middle.chosen === name ? "charts-panel" : name);
 const xy = new XY($("xy"), model, link, view, charts);
 let stages = false;
