@@ -7,14 +7,17 @@ import threading
 import numpy as np
 import pytest
 
-from app.analysis.forecast import Forecasts, question_from_json
+from app.analysis.forecast import Forecasts, forecast_json, question_from_json
 from app.engine.engine import Engine
 from app.server.one_at_a_time import OneAtATime
 from app.server.server import PageServer
 from estimators.errors import ConfigError
+from estimators.forecast import Forecast
+from estimators.log import READING, Events
 from estimators.models import MODELS
 from tests.app.scripted import MODEL, Scripted, pull_all, readings
 from tests.app.served import SECRET, Client, shown_twin
+from tests.support import SECOND
 
 
 def running(n=200):
@@ -53,6 +56,33 @@ def test_the_answer_is_the_closed_form_in_steps_of_the_readings():
         assert np.all(np.abs(np.array(state["lower1"]) - means[:, j] + stds[:, j]) < 0.02 * stds[:, j])
     limit = said["limits"]["temperature"]
     assert limit["above"] and limit["overall"] == max(limit["probability"])
+
+
+def test_a_place_on_the_earth_is_told_to_a_hundredth_of_its_deviation():
+    engine = running()
+    here = engine.here()
+    std = np.full((3, 2), 0.02)
+    mean = np.array([[4_123_456.789, 0.0], [4_123_457.123, 0.0], [4_123_457.456, 0.0]])
+    bands = mean[:, None] + np.array([-2, -1, 1, 2])[None, :, None] * std[:, None]
+    said = forecast_json(MODEL, here, Forecast(np.arange(3.0), mean, std, bands, 0, ()))
+    np.testing.assert_allclose(said["states"]["temperature"]["mean"], mean[:, 0], rtol=0, atol=2e-4)
+    np.testing.assert_allclose(said["states"]["rate"]["upper2"], 0.04)
+
+
+def test_inputs_hold_from_the_time_that_is_asked_for():
+    engine = Engine(shown_twin(model=MODELS["motor_drive"], estimator="ekf"), lambda report: Scripted())
+    times = np.arange(1, 40) * SECOND
+    y = np.full((39, MODELS["motor_drive"].width), np.nan)
+    y[:, 0] = 45.0
+    engine._accept([Events(times, times, np.full(39, READING, np.int8), np.zeros(39, np.int32), y)])
+    as_now, later, at_once = (
+        ask(engine, horizon=60.0, inputs=inputs) for inputs in ({}, {"i_q": [[30.0, 400.0]]}, {"i_q": 400.0})
+    )
+    winding = [np.array(said["states"]["winding"]["mean"]) for said in (as_now, later, at_once)]
+    before = np.array(later["t"]) <= 30.0
+    np.testing.assert_array_equal(winding[1][before], winding[0][before])
+    assert np.all(winding[1][~before] > winding[0][~before]) and np.all(winding[2][1:] > winding[0][1:])
+    assert as_now["inputs"]["i_q"] == 0.0
 
 
 def test_nothing_of_the_running_twin_changes():

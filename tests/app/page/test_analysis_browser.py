@@ -1,4 +1,4 @@
-"""What if and Diagnose in headless Chromium: they draw on a running twin, follow what is asked, and rest while hidden."""
+"""What if and Diagnose in headless Chromium: they draw, follow what is asked, and rest while hidden."""
 
 import pytest
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import binom, norm, probplot
+from scipy.stats import binom
 
 from estimators.diagnostics.innovations import (
     autocorrelation,
@@ -60,13 +60,13 @@ def test_a_histogram_counts_everything_also_what_lies_beyond():
     assert found.counts.sum() == 6 and found.counts[0] == 2 and found.counts[-1] == 2 and found.counts[16] == 2
 
 
-def test_quantile_pairs_lie_where_scipy_puts_them():
+def test_quantile_pairs_lie_where_statsmodels_puts_them():
+    plots = pytest.importorskip("statsmodels.graphics.gofplots")
     e = series(0.0, 41)
     found = quantile_pairs(e)
-    theory, ordered = probplot(e, fit=False)
-    np.testing.assert_allclose(found[:, 1], ordered)
-    # SciPy's plotting positions are Filliben's; those of Hazen differ by less than 0.3 / n in probability.
-    assert np.all(np.abs(norm.cdf(found[:, 0]) - norm.cdf(theory)) < 0.3 / 41)
+    expected = plots.ProbPlot(e, a=0.5)  # plotting positions (i - a) / (n + 1 - 2a)
+    np.testing.assert_allclose(found[:, 0], expected.theoretical_quantiles, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(found[:, 1], expected.sample_quantiles, rtol=1e-12)
     many = quantile_pairs(series(0.0, 20_000))
     assert len(many) <= 60 and many[0, 1] == series(0.0, 20_000).min() and many[-1, 1] == series(0.0, 20_000).max()
     assert len(quantile_pairs(np.full(3, np.nan))) == 0
