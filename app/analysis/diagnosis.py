@@ -45,9 +45,10 @@ class Diagnosis:
     def look(self) -> dict[str, Any]:
         """The figures of the last rows, at most `FRESH` seconds old.
 
-        `rows` are the sensors' rows (row_figures.py), `ranks` counts of an ensemble's histogram, `particles` what is
-        left of a cloud over time, `correlation` a map of the present covariance, `observability`, `faults` and
-        `integrity` what could be wrong unnoticed, `cost` microseconds of an event.
+        `rows` are the first of the sensors' rows (row_figures.py), `rows_in_all` how many there are, `ranks` counts of
+        an ensemble's histogram, `particles` what is left of a cloud over time, `correlation` a map of the present
+        covariance, `observability`, `faults` and `integrity` what could be wrong unnoticed, `cost` microseconds of an
+        event.
         """
         known = self._known
         if known is None or time.monotonic() - known[0] > FRESH:
@@ -69,6 +70,7 @@ class Diagnosis:
             "span": float(events.t[-1] - events.t[0]) * 1e-9 if len(events) else 0.0,
             "marginal": marginal,
             "rows": rows_json(engine.model, events, track, tuning, marginal=marginal),
+            "rows_in_all": len(engine.model.row_names),
             "ranks": _ranks(status),
             "particles": _particles(status, events, track),
             "correlation": _correlation(engine),

@@ -269,7 +269,7 @@ function integrityLines(plot, charts, state) {
 }
 
 // An angle between -π and π, and a curve of such, which leaves the chart at one edge and comes back at the other.
-export const turned = (value) => (typeof value === "number" ? value - 2 * Math.PI * Math.round(value / (2 * Math.PI)) : value);
+const turned = (value) => (typeof value === "number" ? value - 2 * Math.PI * Math.round(value / (2 * Math.PI)) : value);
 
 export function unbroken(values) {
   const angles = values.map(turned);

@@ -6,6 +6,10 @@ import { compact, span, spaced, words } from "./format.js";
 import { correlations, decades, distribution, flat, quantiles, shares, stems } from "./plots.js";
 
 const AGAIN = 3000; // ms between two looks
+const FEW = 6; // rows that are all open
+const LEANS = 0.1; // share of the readings in one half of the ranks, beyond a half of them
+const UNEVEN = 1.4; // of the outer ranks against the others
+const ORDER = ["bad", "unknown", "good"];
 const SIGNS = { good: "●", bad: "◐", unknown: "○" };
 const HEALTH = { good: "tracking", bad: "suspect", unknown: "waiting" };
 
@@ -13,7 +17,8 @@ export class Diagnose {
   constructor(node, link) {
     Object.assign(this, { node, link });
     this.shown = false;
-    this.asked = this.drawn = null;
+    this.drawn = null;
+    this.turned = new Map(); // rows that the user has opened or closed, by name
   }
 
   show() {
@@ -44,10 +49,13 @@ export class Diagnose {
 
   draw(found) {
     const good = found.rows.filter((row) => row.tone === "good").length;
+    const left = found.rows_in_all > found.rows.length ? ` (the first of ${found.rows_in_all})` : "";
+    const rows = [...found.rows].sort((a, b) => ORDER.indexOf(a.tone) - ORDER.indexOf(b.tone));
+    const open = (row) => this.turned.get(row.name) ?? (found.rows.length <= FEW || row.tone === "bad");
     const cost = found.cost === null ? "" : ` An event costs ${compact(found.cost, 3)} µs.`;
     this.node.replaceChildren(
-      element("p", { class: "summary" }, element("b", {}, `${good} of ${found.rows.length} sensor rows are consistent. `), `Last ${found.events.toLocaleString("en")} events, ${span(found.span)}, ${found.estimator}.${cost}`),
-      ...found.rows.map((row) => rowCard(row, found.marginal)),
+      element("p", { class: "summary" }, element("b", {}, `${good} of ${found.rows.length} sensor rows${left} are consistent. `), `Last ${found.events.toLocaleString("en")} events, ${span(found.span)}, ${found.estimator}.${cost}`),
+      ...rows.map((row) => rowCard(row, found.marginal, open(row), (now) => this.turned.set(row.name, now))),
       element("div", { class: "cards" }, ...[ranksCard(found), particlesCard(found), correlationCard(found), ...unseenCards(found)].filter(Boolean)),
     );
     window.nisus.diagnosed = (window.nisus.diagnosed ?? 0) + 1;
@@ -57,11 +65,12 @@ export class Diagnose {
 // A plot under its name and what a good one looks like.
 const figure = (name, good, plot) => element("figure", {}, element("figcaption", {}, element("b", {}, name), " ", element("span", { class: "faint" }, good)), plot);
 
-function rowCard(row, marginal) {
+function rowCard(row, marginal, open, turned) {
   const name = words(row.name);
   const [first, ...rest] = row.verdict.split(": ");
-  const head = element("header", { "data-health": HEALTH[row.tone] }, element("i", {}, SIGNS[row.tone]), element("b", {}, words(first)), element("span", {}, rest.join(": ")));
-  const card = element("article", { class: "row", "aria-label": `Innovations of ${name}` }, head);
+  const head = element("summary", { "data-health": HEALTH[row.tone] }, element("i", {}, SIGNS[row.tone]), element("b", {}, words(first)), element("span", {}, rest.join(": ")));
+  const card = element("details", { class: "row", open, "aria-label": `Innovations of ${name}` }, head);
+  head.addEventListener("click", () => turned(!card.open)); // a key's click, too
   if (!row.n) return card;
   const third = marginal
     ? figure("Ranks", "good: flat, within the band", flat(row.ranks, `Rank histogram of ${name}`))
@@ -97,10 +106,18 @@ function ranksCard({ ranks }) {
   if (!ranks) return null;
   const { counts, low, high } = ranks;
   const n = counts.reduce((sum, count) => sum + count, 0);
-  const ends = counts[0] + counts.at(-1);
-  const even = counts.every((count) => count >= low && count <= high);
-  const words_ = even ? "flat: the spread is right" : ends > (2 * n) / counts.length ? "the ends are full: the spread is too small, or there is a bias" : "the middle is full: the spread is too large";
-  return card("Readings among the members", "good: flat, within the band", `Of ${n.toLocaleString("en")} values since the start ${words_}.`, flat(ranks, "Rank histogram of the ensemble"));
+  return card("Readings among the members", "good: flat, within the band", `Of ${n.toLocaleString("en")} values since the start: ${shape(counts, n)}.`, flat(ranks, "Rank histogram of the ensemble"));
+}
+
+// What matters, not what a test would find among so many.
+function shape(counts, n) {
+  const expected = n / counts.length;
+  const ends = (counts[0] + counts.at(-1)) / (2 * expected);
+  const low = counts.slice(0, counts.length / 2).reduce((sum, count) => sum + count, 0) / n;
+  if (Math.abs(low - 0.5) > LEANS) return `most lie ${low > 0.5 ? "low" : "high"}, so the prediction reads too ${low > 0.5 ? "high" : "low"}`;
+  if (ends > UNEVEN) return `the ends hold ${compact(ends, 2)} times what they should, so the spread is too small`;
+  if (ends < 1 / UNEVEN) return `the ends hold ${compact(ends, 2)} of what they should, so the spread is too large`;
+  return "about flat, so the spread is right";
 }
 
 function particlesCard({ particles }) {

@@ -2,7 +2,7 @@
 // it reaches a limit. Nothing is asked while this is hidden.
 
 import { Chart, colour, dots, edge, line } from "./chart.js";
-import { turned, unbroken } from "./charts.js";
+import { unbroken } from "./charts.js";
 import { element, setText } from "./dom.js";
 import { bracketed, compact, spaced, span, words } from "./format.js";
 import { Lane } from "./lane.js";
@@ -10,9 +10,11 @@ import { Range, extent, within } from "./ranges.js";
 import { TimeAxis } from "./time_axis.js";
 
 const AGAIN = 2000; // ms between two forecasts, while the twin goes on
-const REST = 4; // times as long as a forecast took, at least
+const REST = 2; // times as long as a forecast took, at least
+const LONGEST_REST = 10000; // ms
 const SOON = 120; // ms after an edit
 const PAST = 0.35; // of the horizon, shown before now
+const MARGIN = 0.02; // of the horizon, before what is shown
 const MOST = 24; // states
 const STEPS = 200; // of the horizon's slider
 
@@ -25,6 +27,7 @@ export class WhatIf {
     this.limits = kept.limits ?? {};
     this.inputs = {}; // those that were chosen, by name
     this.lane = new Lane();
+    this.states = [...model.states].sort((a, b) => (a.rows.length > 0) - (b.rows.length > 0)).slice(0, MOST);
     this.shown = false;
     link.addEventListener("frames", () => this.shown && this.draw());
   }
@@ -58,7 +61,7 @@ export class WhatIf {
     this.charts = element("div", { class: "fans" });
     const axis = element("div", { class: "axis", "aria-hidden": "true" });
     this.node.replaceChildren(asked, this.problem, this.charts, axis, element("p", { class: "faint foot" }, "From now on without readings, by the filter that runs. Bands ± 1σ, ± 2σ. ", this.method, this.state));
-    const states = [...this.model.states].sort((a, b) => (a.rows.length > 0) - (b.rows.length > 0)).slice(0, MOST);
+    const { states } = this;
     const actions = { select: () => {}, home: () => {}, wheel: () => {} };
     this.parts = states.map((state) => new Chart(fan(this, state), actions));
     this.charts.append(...this.parts.map((chart) => chart.node));
@@ -73,12 +76,13 @@ export class WhatIf {
   // History before now, in the style of the charts.
   look() {
     const columns = [
-      ...this.model.states.flatMap((state) => ["mean", "upper", "lower", "truth"].map((kind) => `${kind}:${state.name}`)),
-      ...this.model.states.flatMap((state) => state.rows.map((row) => `reading:${row}`)),
+      ...this.states.flatMap((state) => ["mean", "upper", "lower", "truth"].map((kind) => `${kind}:${state.name}`)),
+      ...this.states.flatMap((state) => state.rows.map((row) => `reading:${row}`)),
       ...this.model.inputs.map((input) => `input:${input.name}`),
     ];
-    const past = PAST * (this.horizon ?? this.model.window);
-    this.link.look("whatif", { span: past, points: 300, columns }, (...frame) => this.lane.take(...frame));
+    // More than is shown: what is forecast may be seconds old.
+    const past = 1.5 * PAST * (this.horizon ?? this.model.window) + LONGEST_REST / 1000;
+    this.link.look("whatif", { span: past, points: 400, columns }, (...frame) => this.lane.take(...frame));
   }
 
   turn() {
@@ -106,10 +110,14 @@ export class WhatIf {
     if (this.shown) this.timer = setTimeout(() => this.ask(), delay);
   }
 
+  get question() {
+    return JSON.stringify({ horizon: this.horizon, inputs: this.inputs, limits: this.limits });
+  }
+
   async ask() {
     if (this.busy) return this.next(SOON);
     const status = this.link.status;
-    const question = JSON.stringify({ horizon: this.horizon, inputs: this.inputs, limits: this.limits });
+    let { question } = this;
     const asked = `${status.t} ${status.revision} ${question}`;
     if (asked === this.asked) return this.next(AGAIN); // paused: nothing would come out differently
     this.busy = true;
@@ -117,9 +125,9 @@ export class WhatIf {
     const begun = performance.now();
     try {
       if (this.horizon === null || !this.longest) await this.learn();
-      const body = JSON.stringify({ horizon: this.horizon, inputs: this.inputs, limits: this.limits });
+      question = this.question;
       const headers = { "Content-Type": "application/json" };
-      const found = await told(await fetch("/api/forecast", { method: "POST", headers, body }));
+      const found = await told(await fetch("/api/forecast", { method: "POST", headers, body: question }));
       this.asked = asked;
       this.take(found);
       setText(this.problem, "");
@@ -128,7 +136,9 @@ export class WhatIf {
     }
     this.busy = false;
     setText(this.state, "");
-    this.next(Math.max(AGAIN, REST * (performance.now() - begun)));
+    // What was chosen meanwhile is asked for at once.
+    const rest = Math.max(AGAIN, Math.min(LONGEST_REST, REST * (performance.now() - begun)));
+    this.next(question === this.question ? rest : SOON);
   }
 
   // How far can be asked for.
@@ -156,7 +166,9 @@ export class WhatIf {
   draw() {
     if (!this.found) return;
     const now = this.times[0];
-    const range = [now - PAST * this.found.t.at(-1), this.times.at(-1)];
+    const horizon = this.found.t.at(-1);
+    const first = Math.max(now - PAST * horizon, Math.min(now, this.lane.x[0] ?? now));
+    const range = [first - MARGIN * horizon, this.times.at(-1)];
     for (const chart of this.parts) chart.show(chart.what.data(), range);
     this.axis.show(range);
   }
@@ -291,8 +303,10 @@ function fan(whatif, state) {
 // Columns of an angle, the edges of a band about its mean.
 function around(columns, place, edges) {
   const mean = columns.at(place);
+  const broken = unbroken(mean);
   columns.forEach((values, k) => {
-    columns[k] = edges.includes(k) ? values.map((value, i) => (value === null || mean[i] === null ? null : turned(mean[i]) + value - mean[i])) : unbroken(values);
+    const side = (value, i) => (value === null || broken[i] === null ? null : broken[i] + value - mean[i]);
+    columns[k] = edges.includes(k) ? values.map(side) : unbroken(values);
   });
 }
 
