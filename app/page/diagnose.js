@@ -169,7 +169,7 @@ function observabilityCard({ observability }) {
 function faultsCard({ faults, unseen_reason: reason }) {
   if (reason || !faults.length) return card("Smallest visible faults", "", `${reason || "Nothing to nudge"}.`);
   const blind = faults.filter((item) => item.share === null).length;
-  const verdict = blind ? `${blind} of ${faults.length} faults show in no reading, however large.` : "Every fault shows in the readings, if it is large enough.";
+  const verdict = blind ? `${blind} of ${faults.length} pass unseen, as large as they can be.` : "Every one is seen, if it is large enough.";
   return card(
     "Smallest visible faults", "good: small beside what matters to you", verdict,
     table(["fault of", "seen from", "unseen"], faults.map((item) => [words(item.subject), plain(item.size), plain(item.unseen)])),

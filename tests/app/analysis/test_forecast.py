@@ -154,3 +154,12 @@ def test_a_question_waits_for_the_one_before_it_and_not_for_ever(monkeypatch):
         return await first, await line.do(slow)
 
     assert asyncio.run(ask()) == (1, 2)
+
+
+def test_what_goes_wrong_in_the_thread_is_told_to_who_asked():
+    def wrong():
+        assert threading.current_thread().daemon  # a process that ends does not wait for it
+        raise ZeroDivisionError("in the model")
+
+    with pytest.raises(ZeroDivisionError, match="in the model"):
+        asyncio.run(OneAtATime("forecast").do(wrong))
