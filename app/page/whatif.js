@@ -24,7 +24,8 @@ export class WhatIf {
     this.key = `nisus.whatif.${model.twin}`;
     const kept = JSON.parse(localStorage.getItem(this.key) ?? "{}");
     this.horizon = kept.horizon ?? null;
-    this.limits = kept.limits ?? {};
+    const names = model.states.map((state) => state.name);
+    this.limits = Object.fromEntries(Object.entries(kept.limits ?? {}).filter(([name]) => names.includes(name)));
     this.inputs = {}; // those that were chosen, by name
     this.lane = new Lane();
     this.states = [...model.states].sort((a, b) => (a.rows.length > 0) - (b.rows.length > 0)).slice(0, MOST);
@@ -235,17 +236,19 @@ function limitField(whatif, state) {
   return element("label", { class: "limit" }, "limit ", field, said);
 }
 
-// "reaches 80 °C in 4.2 min (68 % within 10 min)".
+// "reaches 80 °C in 4.2 min (68 % within 10 min)". To have been beyond is likelier than to be beyond at some time, which
+// is all that moments tell.
 function sentence(whatif, name, found) {
   if (!found) return "";
   const { unit } = whatif.model.states.find((state) => state.name === name);
+  const { members, t } = whatif.found;
   const limit = `${compact(found.limit)}${spaced(unit)}`;
-  const within = span(whatif.found.t.at(-1));
-  const share = found.overall > 0.995 ? "over 99 %" : `${Math.round(100 * found.overall)} %`;
-  const verb = found.above ? "reaches" : "falls to";
-  if (found.middle !== null) return `${verb} ${limit} in ${span(found.middle)} (${share} within ${within})`;
+  const within = span(t.at(-1));
+  const share = found.overall > 0.995 ? "over 99 %" : `${members ? "" : "at least "}${Math.round(100 * found.overall)} %`;
+  if (found.middle !== null) return `${found.above ? "reaches" : "falls to"} ${limit} in ${span(found.middle)} (${share} within ${within})`;
   if (found.overall >= 0.005) return `${found.above ? "may reach" : "may fall to"} ${limit}: ${share} within ${within}`;
-  return `stays ${found.above ? "below" : "above"} ${limit} for ${within} (over 99 %)`;
+  const side = `${found.above ? "below" : "above"} ${limit}`;
+  return members ? `stays ${side} for ${within} (over 99 %)` : `${side} at any time for ${within} (over 99 %)`;
 }
 
 // A chart of one state: what was, and to the right of now the fan of what may be.
