@@ -69,7 +69,7 @@ class Diagnosis:
             "events": len(events),
             "span": float(events.t[-1] - events.t[0]) * 1e-9 if len(events) else 0.0,
             "marginal": marginal,
-            "rows": rows_json(engine.model, events, track, tuning, marginal=marginal),
+            "rows": _agreed(rows_json(engine.model, events, track, tuning, marginal=marginal), status),
             "rows_in_all": len(engine.model.row_names),
             "ranks": _ranks(status),
             "particles": _particles(status, events, track),
@@ -95,6 +95,15 @@ def last_rows(engine: Running, most: int) -> tuple[int, Events, Track]:
     events = Events.concat([piece.events for piece in pieces], engine.model.width)
     track = Track(*(np.concatenate(columns) for columns in zip(*(piece.track for piece in pieces), strict=True)))
     return pieces[0].revision, events, track
+
+
+def _agreed(rows: list[dict[str, Any]], status: Status) -> list[dict[str, Any]]:
+    """The rows, of which none is called good while the twin's own tests say what is wrong with it."""
+    for row in rows:
+        state, text = status.sensors.get(row["sensor"], ("", ""))
+        if row["tone"] == "good" and state in ("suspect", "degraded", "diverged") and row["name"] in text:
+            row["verdict"], row["tone"] = f"{row['name']}: {text}", "bad"
+    return rows
 
 
 def _ranks(status: Status) -> dict[str, Any] | None:

@@ -30,6 +30,9 @@ LAGS = 50
 FEW = 50
 """Readings below which nothing is called consistent."""
 
+SLOW, SLOW_SHARE = 25, 0.02
+"""A slow error is the part of the innovations' variance that stays over so many lags; it matters from this share on."""
+
 MOST_ROWS = 24
 """Rows that are looked at, as many as have charts."""
 
@@ -112,6 +115,11 @@ def verdict(
             longer = "over " if lag == correlated.r.size else ""
             parts.append(f"what is missing lasts {longer}{lag * period:.3g} s")
         return f"{name}: {'; '.join(parts)}", "bad"
+    r = correlated.r[:SLOW]
+    mean = float(np.mean(r)) if np.isfinite(r).all() else 0.0
+    # Of a white series the mean of K correlations has a variance of 1 / (n K), nearly.
+    if n >= FEW and mean - 2.0 / np.sqrt(n * SLOW) > SLOW_SHARE:
+        return f"{name}: innovations stay on one side for long, a slow error of about {np.sqrt(mean):.2f} σ", "bad"
     if n < FEW:
         return f"{name}: {n} readings are too few to say", "unknown"
     if calibration.role == "held out":

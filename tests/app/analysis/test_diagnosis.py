@@ -1,16 +1,18 @@
 """The figures of a running twin against NumPy's over the same rows, and what is said of them."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.stats import norm
 
-from app.analysis.diagnosis import Diagnosis, last_rows
-from app.analysis.row_figures import LAGS
+from app.analysis.diagnosis import Diagnosis, _agreed, last_rows
+from app.analysis.row_figures import LAGS, verdict
 from app.engine.commands import SetEstimator
 from app.engine.engine import Engine
 from app.engine.execute import execute
+from estimators.diagnostics.innovations import autocorrelation
 from estimators.log import READING
 from tests.app.scripted import Scripted, pull_all, readings, twin, wait_for
 from tests.app.served import shown_twin
@@ -71,6 +73,26 @@ def test_a_slow_error_is_said_in_words():
     (row,) = said["rows"]
     assert row["tone"] == "bad" and "innovations are correlated (+" in row["verdict"]
     assert "what is missing lasts" in row["verdict"] and row["correlation"][1] > 0.2
+
+
+def test_a_small_error_that_stays_is_said_though_no_two_neighbours_tell_it():
+    rng = np.random.default_rng(8)
+    e = rng.normal(size=1000)
+    nothing = autocorrelation(e, LAGS)
+    stays = autocorrelation(e + 0.4 * np.sign(np.sin(2 * np.pi * np.arange(1000) / 250)), LAGS)
+    calm = SimpleNamespace(words=(), role="used")
+    assert verdict("y", calm, nothing, 1000, 0.5) == ("y: consistent, as far as 1,000 readings tell", "good")
+    words, tone = verdict("y", calm, stays, 1000, 0.5)
+    # A square wave of ± 0.4 in readings of deviation √(1 + 0.16), of which 25 lags of 125 keep four fifths and more.
+    size = float(words.split("about ")[1].split(" ")[0])
+    assert tone == "bad" and 0.28 < size < 0.40
+
+
+def test_a_sensor_in_doubt_is_not_called_consistent():
+    rows = [{"name": "y", "sensor": "y", "tone": "good", "verdict": "y: consistent"}]
+    calm, doubt = (SimpleNamespace(sensors={"y": told}) for told in (("tracking", ""), ("suspect", "y spikes")))
+    assert _agreed([dict(rows[0])], calm) == rows
+    assert _agreed(rows, doubt)[0]["verdict"] == "y: y spikes" and rows[0]["tone"] == "bad"
 
 
 def test_only_the_last_rows_are_looked_at():
