@@ -91,8 +91,8 @@ def test_diagnose_draws_what_the_rows_say(page):
         assert "good: " in row.locator("figcaption").first.inner_text()
         assert row.locator("svg rect.bar").count() > 5 and row.locator("svg line.stem").count() == 50
     assert page.locator("#diagnose svg.map rect").count() == 16
-    assert page.get_by_label("Smallest visible faults").is_visible()
     # What takes many folds comes later.
+    wait_for(lambda: page.get_by_label("Smallest visible faults", exact=True).count() == 1, PATIENCE)
     wait_for(lambda: page.locator("#diagnose .shares tr").count() == 4, PATIENCE)
     wait_for(lambda: "µs" in page.locator("#diagnose .summary").inner_text(), PATIENCE)
 
