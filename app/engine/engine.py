@@ -21,7 +21,7 @@ from estimators.diagnostics.sensor_states import sensor_states
 from estimators.errors import EstimatorError, NisusError
 from estimators.fold import Fold
 from estimators.late import inflated
-from estimators.log import TICK, Events, Log
+from estimators.log import READING, TICK, Events, Log
 from estimators.numerics.peaks import peaks_of
 from estimators.registry import find_estimator
 from estimators.snapshots import SPARSE_EVERY, Base
@@ -40,10 +40,10 @@ from .faults import Faulty
 from .feeder import Feeder, Finished, Restarted
 from .host_clock import HostClock
 from .idle_ticks import IdleTicks
-from .integrity import IntegrityWatch, Window, window
+from .integrity import MOST, IntegrityWatch, Window, window
 from .interface import Records
 from .notices import Notices
-from .outputs import Belief, Cursor, Pull, Status
+from .outputs import Belief, Cursor, Here, Pull, Status
 from .playback import playback_status
 from .refolder import Refolded, Refolder, Requests
 from .revisions import Revisions
@@ -60,6 +60,9 @@ if TYPE_CHECKING:
     from ..twin.twin import Twin
 
 STATUS_AGE = 0.1
+
+LATELY = 1024
+"""Events of which it is told how far readings are apart."""
 
 
 class Engine:
@@ -118,8 +121,8 @@ class Engine:
         self._alerts = Alerts(self.notices, lambda: self._chronicle.account.in_alarm)
         self._silence = Silence(self.notices, section.stale_after)
         self._stall = Stall(self._say_stalled)
-        self._integrity = IntegrityWatch(self.model, self._window, self._policy.false_alarm_every)
-        self._blame = Blame(self.model, lambda: self._chronicle.account.episodes, self._window, self.notices)
+        self._integrity = IntegrityWatch(self.model, self.last_events, self._policy.false_alarm_every)
+        self._blame = Blame(self.model, lambda: self._chronicle.account.episodes, self.last_events, self.notices)
         self._status: tuple[float, Status] | None = None
         self.recorder: Records | None = None
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
@@ -305,6 +308,27 @@ class Engine:
         peaks = peaks_of(points, model.circular) if several else []
         return Belief(clock, mean, cov, points, tuple(peaks) if len(peaks) > 1 else ())
 
+    def here(self) -> Here | None:
+        """The filter as it stands, to fold on from; None while nothing has come. Copies its state, and no more."""
+        with self._reading():
+            fold, log = self._fold, self._log
+            if not fold.n:
+                return None
+            lately = slice(max(0, fold.n - LATELY), fold.n)
+            read = log.t[lately][log.kind[lately] == READING]
+            step = (
+                float(read[-1] - read[0]) * 1e-9 / (np.unique(read).size - 1)
+                if read.size and read[-1] > read[0]
+                else np.nan
+            )
+            t = int(log.t[fold.n - 1])
+            return Here(self._revision, fold.estimator.name, fold.tuning, fold.base_here(), t, step)
+
+    def last_events(self, most: int = MOST) -> Window | None:
+        """The last events, to fold them again; None while there are none, or a refold is waited for."""
+        with self._reading():
+            return None if self._requests.waiting else window(self._fold, self._revision, most)
+
     def status(self) -> Status:
         """What a panel shows; computed at most ten times a second."""
         kept = self._status
@@ -363,11 +387,6 @@ class Engine:
     def _cause(self, leading: Episode | None, health: int) -> str:
         """Why the twin is not to be trusted now."""
         return self._blame.told(leading).text if leading is not None and health not in (WAITING, TRACKING) else ""
-
-    def _window(self) -> Window | None:
-        """What the integrity bounds are computed from; nothing while a refold is waited for."""
-        with self._reading():
-            return None if self._requests.waiting else window(self._fold, self._revision)
 
     # The engine's own thread
 

@@ -15,7 +15,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from estimators.diagnostics.sensitivity import Bound, Sensitivity, bounds_of, sensitivity
+from estimators.diagnostics.sensitivity import Bound, Sensitivity, Smallest, bounds_of, sensitivity, smallest_of
 from estimators.fold import Fold
 from estimators.log import Events, Log
 from estimators.model.state_space import StateSpaceModel
@@ -35,12 +35,16 @@ LOWEST = 19
 
 @dataclass(frozen=True)
 class Integrity:
-    """Bounds by state, as of the log's time `t` (ns), for one revision; or the reason why there are none."""
+    """Bounds by state, as of the log's time `t` (ns), for one revision; or the reason why there are none.
+
+    `smallest` are the smallest faults that are seen.
+    """
 
     revision: int
     t: int
     reason: str = ""
     bounds: dict[str, Bound] = field(default_factory=dict)
+    smallest: tuple[Smallest, ...] = ()
 
     def age(self, now: int | None) -> float | None:
         """Seconds of the log since then; `now` is the time of its last event, ns."""
@@ -124,7 +128,8 @@ class IntegrityWatch:
         except Exception as error:  # noqa: BLE001  a user's model may raise anything; the twin goes on
             self._latest = Integrity(taken.revision, t, f"{type(error).__name__}: {error}")
             return
-        self._latest = Integrity(taken.revision, t, found.reason, bounds_of(self._model, found))
+        bounds = bounds_of(self._model, found)
+        self._latest = Integrity(taken.revision, t, found.reason, bounds, smallest_of(found))
 
     def _compute(self, taken: Window) -> Sensitivity:
         log = Log.of(self._model, capacity=len(taken.events))

@@ -17,8 +17,9 @@ from estimators.tuning import Tuning
 from sources.source import Source
 
 from .commands import Command
+from .integrity import MOST, Window
 from .notices import Notices
-from .outputs import Belief, Cursor, Pull, Status
+from .outputs import Belief, Cursor, Here, Pull, Status
 from .revisions import Revisions
 
 if TYPE_CHECKING:
@@ -88,6 +89,12 @@ class Running(Protocol):
 
     def belief(self) -> Belief:
         """The estimate now."""
+
+    def here(self) -> Here | None:
+        """The filter as it stands, to fold on from; None while nothing has come."""
+
+    def last_events(self, most: int = MOST) -> Window | None:
+        """The last events, to fold them again; None while there are none, or a refold is waited for."""
 
     def span(self) -> tuple[int, int]:
         """Times of the first and the last event, ns; zeros while there is none."""

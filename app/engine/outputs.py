@@ -11,6 +11,7 @@ from estimators.diagnostics.clock_fit import ClockFit
 from estimators.diagnostics.field_pictures import Picture
 from estimators.log import Events
 from estimators.numerics.peaks import Peak
+from estimators.snapshots import Base
 from estimators.track import Track
 from estimators.tuning import Tuning
 from sources.faults.layer import FaultStatus
@@ -66,6 +67,21 @@ class Belief:
     cov: np.ndarray
     points: np.ndarray
     peaks: tuple[Peak, ...] = ()
+
+
+@dataclass(frozen=True)
+class Here:
+    """The filter as it stands after the last event, of time `t` (ns), and what it takes to fold on from there.
+
+    `step` is how far readings were apart lately, s; NaN where there were not two.
+    """
+
+    revision: int
+    estimator: str
+    tuning: Tuning
+    base: Base
+    t: int
+    step: float
 
 
 @dataclass(frozen=True)

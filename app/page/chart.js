@@ -21,7 +21,8 @@ export const dots = (name, size = 4, ring = false) => ({
 });
 
 export class Chart {
-  // what: {title, unit, note, weight, series, bands, range(self, low, high), scale, draw: [hook], values: [label of a tick]}
+  // what: {title, unit, note, weight, series, bands, range(self, low, high), scale, draw: [hook], values: [label of a tick],
+  // sync: charts of one name share their cursor}
   constructor(what, { select, home, wheel }) {
     this.what = what;
     this.reading = element("output", { class: "reading" });
@@ -48,7 +49,7 @@ export class Chart {
         legend: { show: false },
         padding: [6, 10, null, 0],
         cursor: {
-          sync: { key: CURSOR, scales: ["x", null] },
+          sync: { key: what.sync ?? CURSOR, scales: ["x", null] },
           drag: { x: true, y: false, setScale: false },
           points: { show: false },
           y: false,

@@ -277,7 +277,7 @@ function integrityLines(plot, charts, state) {
 // An angle between -π and π, and a curve of such, which leaves the chart at one edge and comes back at the other.
 const turned = (value) => (typeof value === "number" ? value - 2 * Math.PI * Math.round(value / (2 * Math.PI)) : value);
 
-function unbroken(values) {
+export function unbroken(values) {
   const angles = values.map(turned);
   return angles.map((value, k) => (k && Math.abs(value - angles[k - 1]) > Math.PI ? null : value));
 }

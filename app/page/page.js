@@ -1,6 +1,7 @@
 // The page: trust on top, tuning to the left, charts in the middle, scene and lists to the right, time below.
 
 import { Charts } from "./charts.js";
+import { Diagnose } from "./diagnose.js";
 import { $, element, setAttribute } from "./dom.js";
 import { Episodes } from "./episodes.js";
 import { Explore } from "./explore.js";
@@ -15,6 +16,7 @@ import { Transport } from "./transport.js";
 import { Trust } from "./trust.js";
 import { Tune } from "./tune.js";
 import { View } from "./view.js";
+import { WhatIf } from "./whatif.js";
 import { XY } from "./xy.js";
 
 const settings = JSON.parse(document.body.dataset.settings);
@@ -70,10 +72,16 @@ const transport = new Transport(model, link, view, charts);
 const explore = new Explore(settings.viewer, theme);
 const stage = new Stage(settings.viser, theme);
 
-const middle = new Tabs($("middle-tabs"), null, (name) => {
-  if (name === "explore") explore.show();
-  else explore.hide();
+// What is hidden neither computes nor asks.
+const panes = { explore, whatif: new WhatIf($("whatif"), model, link), diagnose: new Diagnose($("diagnose"), link) };
+const middle = new Tabs($("middle-tabs"), null, (shown) => {
+  for (const [name, pane] of Object.entries(panes)) if (name !== shown) pane.hide();
+  panes[shown]?.show();
+  $("layout").hidden = shown !== "charts-panel";
+  $("legend").hidden = shown === "diagnose" || shown === "explore";
 });
+window.nisus.panes = panes;
+const turn = (name) => middle.show(middle.chosen === name ? "charts-panel" : name);
 const xy = new XY($("xy"), model, link, view, charts);
 let stages = false;
 middle.show("charts-panel");
@@ -124,7 +132,9 @@ keys([
   ["e", "episodes", () => side.show("episodes")],
   ["y", "two states against each other", () => side.show("xy")],
   ["s", "scene", () => side.show("scene")],
-  ["x", "explore in Rerun, and back", () => middle.show(middle.chosen === "explore" ? "charts-panel" : "explore")],
+  ["x", "explore in Rerun, and back", () => turn("explore")],
+  ["w", "what if, and back", () => turn("whatif")],
+  ["d", "diagnose, and back", () => turn("diagnose")],
   ["t", "tune, where the page is narrow", drawer],
 ]);
 

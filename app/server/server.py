@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import uuid
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,8 @@ from starlette.websockets import WebSocket
 
 from estimators.errors import NisusError
 
+from ..analysis.diagnosis import Diagnosis
+from ..analysis.forecast import Forecasts, question_from_json
 from ..engine.interface import Running
 from ..rerun.feed import RerunFeed
 from ..series.series import Series
@@ -32,6 +34,7 @@ from .api import Json, command_from_json, episodes_json, faults_json, one_line, 
 from .bounds import BODY, TooLarge, bounded_body, bounds
 from .gate import Gate, session_token
 from .model_json import model_json
+from .one_at_a_time import OneAtATime
 from .page_stream import PageStream
 from .port import listen
 from .runs_api import RunsApi
@@ -89,6 +92,8 @@ class PageServer:
         self._review = review
         self._series = Series(engine)
         self._runs = RunsApi(engine)
+        self._forecasts, self._diagnosis = Forecasts(engine), Diagnosis(engine)
+        self._forecasting, self._diagnosing = OneAtATime("forecast"), OneAtATime("diagnosis")
         self._boot = uuid.uuid4().hex
         self._socket = listen(port)
         self.port: int = self._socket.getsockname()[1]
@@ -143,6 +148,8 @@ class PageServer:
             Route("/api/recordings", self._list_recordings),
             Route("/api/faults", self._faults),
             Route("/api/command", self._command, methods=["POST"]),
+            Route("/api/forecast", self._forecast, methods=["GET", "POST"]),
+            Route("/api/diagnose", self._diagnose),
             Route(f"/viewer/{viewer_version()}/{{name}}", self._viewer_file),
             Route("/rec/{name}", self._recording),
             WebSocketRoute("/api/stream", self._page_stream),
@@ -188,16 +195,31 @@ class PageServer:
         return Json(faults_json(self._engine))
 
     async def _command(self, request: Request) -> Response:
-        if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
-            return PlainTextResponse("Nisus: Content-Type must be application/json.\n", 415)
+        async def submit(body: Any) -> Response:
+            command = command_from_json(body, self._engine)
+            self._engine.submit(command)
+            return Json({"submitted": type(command).__name__}, 202)
+
+        return await _answered(request, submit)
+
+    async def _forecast(self, request: Request) -> Response:
+        if request.method == "GET":
+            try:
+                return Json(await asyncio.to_thread(self._forecasts.may))
+            except NisusError as error:
+                return Json({"error": one_line(str(error))}, 409)
+
+        async def ask(body: Any) -> Response:
+            question = question_from_json(body, self._engine.model)
+            return Json(await self._forecasting.do(lambda: self._forecasts.ask(question)))
+
+        return await _answered(request, ask)
+
+    async def _diagnose(self, request: Request) -> Response:
         try:
-            command = command_from_json(json.loads(await bounded_body(request)), self._engine)
-        except TooLarge as error:
-            return PlainTextResponse(f"Nisus: {error}.\n", 413)
-        except (NisusError, ValueError, RecursionError) as error:
-            return Json({"error": one_line(str(error))}, 400)
-        self._engine.submit(command)
-        return Json({"submitted": type(command).__name__}, 202)
+            return Json(await self._diagnosing.do(self._diagnosis.look))
+        except NisusError as error:
+            return Json({"error": one_line(str(error))}, 503)
 
     async def _viewer_file(self, request: Request) -> Response:
         name = request.path_params["name"]
@@ -269,6 +291,18 @@ class PageServer:
                 # Until the frame is drawn, or the status is due.
                 await asyncio.wait_for(drawn.wait(), STATUS_PERIOD)
             await asyncio.sleep(max(0.0, PERIOD - (time.monotonic() - begun)))
+
+
+async def _answered(request: Request, take: Callable[[Any], Awaitable[Response]]) -> Response:
+    """What `take` makes of a request's JSON; its refusal as one line."""
+    if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+        return PlainTextResponse("Nisus: Content-Type must be application/json.\n", 415)
+    try:
+        return await take(json.loads(await bounded_body(request)))
+    except TooLarge as error:
+        return PlainTextResponse(f"Nisus: {error}.\n", 413)
+    except (NisusError, ValueError, RecursionError) as error:
+        return Json({"error": one_line(str(error))}, 400)
 
 
 async def _given(feed: RerunFeed) -> AsyncIterator[str | bytes]:

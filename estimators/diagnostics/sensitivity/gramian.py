@@ -92,7 +92,7 @@ def gramian(
         tuning: As the twin's.
         log: The events; it must not grow meanwhile (give a copy).
         base: Where the log starts, if older events were dropped.
-        windows: Parts of equal time. Each begins at the estimate of that time with the covariance of the prior.
+        windows: Parts of equal time, or 0. Each begins at the estimate of that time with the covariance of the prior.
         most: Events to look at, from the end; None for what takes seconds.
         executor: As `sensitivity`.
 
@@ -117,7 +117,7 @@ def gramian(
         mean, _ = fold.moments()
         bases.append(Base(mean, np.diag(model.prior_std**2), fold.clock, fold.u))
     spans = list(zip(begins, [*begins[1:], log.n], bases, strict=True))
-    parts = [(begin, log.n, bases[0]), *(span for span in spans if span[1] > span[0])]
+    parts = [(begin, log.n, bases[0]), *(span for span in spans if windows and span[1] > span[0])]
     views = each(lambda part: _view(name, model, tuning, log, *part), parts, executor)
     if any(view.beyond for view in views):
         note = "; ".join(filter(None, [note, f"{name} does not follow nudges in proportion: the Gramian says little"]))

@@ -42,12 +42,18 @@ def test_what_is_published_is_the_sensitivity_of_the_same_events(engine):
     log = Log(MODEL.width)
     log.extend(readings(*series(600)))
     tuning, name = engine.folded_with()
-    expected = bounds_of(MODEL, sensitivity(name, MODEL, tuning, log, false_alarm=engine.policy.false_alarm_every))
+    computed = sensitivity(name, MODEL, tuning, log, false_alarm=engine.policy.false_alarm_every)
+    expected = bounds_of(MODEL, computed)
     assert found.reason == "" and found.t == int(log.t[log.n - 1])
     assert set(found.bounds) == set(expected) == set(MODEL.state_names)
     for state, bound in expected.items():
         np.testing.assert_allclose(found.bounds[state][1:4], bound[1:4], rtol=1e-12)
         assert found.bounds[state].bound > found.bounds[state].two_sigma
+    # Of the one sensor's noise of 2 °C.
+    (smallest,) = found.smallest
+    size = float(computed.smallest_visible[0])
+    assert (smallest.subject, smallest.size) == ("sensor winding", f"{size:.3g} °C" if np.isfinite(size) else "none")
+    assert smallest.share == pytest.approx(size / 2.0)
 
 
 def test_api_and_panel_show_it_beside_two_sigma(engine):
@@ -73,7 +79,7 @@ def test_another_revision_has_none_until_it_is_computed(engine):
 
 def test_the_thread_publishes_and_stops(engine):
     folds = threading.active_count()
-    watch = IntegrityWatch(MODEL, engine._window, EVERY, every=0.01)
+    watch = IntegrityWatch(MODEL, engine.last_events, EVERY, every=0.01)
     watch.start()
     wait_for(lambda: watch.of(0) is not None)
     watch.stop()

@@ -1,0 +1,338 @@
+// What if: the twin goes on from now without readings, with inputs that are chosen here. A fan for each state, and when
+// it reaches a limit. Nothing is asked while this is hidden.
+
+import { Chart, colour, dots, edge, line } from "./chart.js";
+import { unbroken } from "./charts.js";
+import { element, setText } from "./dom.js";
+import { bracketed, compact, spaced, span, words } from "./format.js";
+import { Lane } from "./lane.js";
+import { Range, extent, within } from "./ranges.js";
+import { TimeAxis } from "./time_axis.js";
+
+const AGAIN = 2000; // ms between two forecasts, while the twin goes on
+const REST = 2; // times as long as a forecast took, at least
+const LONGEST_REST = 10000; // ms
+const SOON = 120; // ms after an edit
+const PAST = 0.35; // of the horizon, shown before now
+const MARGIN = 0.02; // of the horizon, before what is shown
+const MOST = 24; // states
+const STEPS = 200; // of the horizon's slider
+
+export class WhatIf {
+  constructor(node, model, link) {
+    Object.assign(this, { node, model, link });
+    this.key = `nisus.whatif.${model.twin}`;
+    const kept = JSON.parse(localStorage.getItem(this.key) ?? "{}");
+    this.horizon = kept.horizon ?? null;
+    const names = model.states.map((state) => state.name);
+    this.limits = Object.fromEntries(Object.entries(kept.limits ?? {}).filter(([name]) => names.includes(name)));
+    this.inputs = {}; // those that were chosen, by name
+    this.lane = new Lane();
+    this.states = [...model.states].sort((a, b) => (a.rows.length > 0) - (b.rows.length > 0)).slice(0, MOST);
+    this.shown = false;
+    link.addEventListener("frames", () => this.shown && this.draw());
+  }
+
+  show() {
+    this.shown = true;
+    if (!this.parts) this.begin();
+    this.look();
+    this.ask();
+  }
+
+  hide() {
+    if (!this.shown) return;
+    this.shown = false;
+    clearTimeout(this.timer);
+    this.link.look("whatif", null);
+  }
+
+  begin() {
+    this.slider = element("input", { type: "range", min: 0, max: STEPS, step: 1, "aria-label": "Horizon", oninput: () => this.turn() });
+    this.length = element("output", {});
+    this.problem = element("p", { class: "error", role: "alert" });
+    this.method = element("span", {});
+    this.state = element("span", { class: "state", role: "status" });
+    this.rows = new Map(this.model.inputs.map((input) => [input.name, inputRow(this, input)]));
+    const asked = element(
+      "section", { class: "asked", "aria-label": "The future that is asked for" },
+      element("label", { class: "choice" }, element("b", {}, "Horizon"), this.slider, this.length),
+      ...[...this.rows.values()].map((row) => row.node),
+    );
+    this.charts = element("div", { class: "fans" });
+    const axis = element("div", { class: "axis", "aria-hidden": "true" });
+    this.node.replaceChildren(asked, this.problem, this.charts, axis, element("p", { class: "faint foot" }, "From now on without readings, by the filter that runs. Bands ± 1σ, ± 2σ. ", this.method, this.state));
+    const { states } = this;
+    const actions = { select: () => {}, home: () => {}, wheel: () => {} };
+    this.parts = states.map((state) => new Chart(fan(this, state), actions));
+    this.charts.append(...this.parts.map((chart) => chart.node));
+    this.parts.forEach((chart, k) => {
+      chart.span = [0, 1];
+      chart.begin();
+      if (!states[k].probability && !states[k].circular) chart.head.insertBefore(limitField(this, states[k]), chart.reading);
+    });
+    this.axis = new TimeAxis(axis);
+  }
+
+  // History before now, in the style of the charts.
+  look() {
+    const columns = [
+      ...this.states.flatMap((state) => ["mean", "upper", "lower", "truth"].map((kind) => `${kind}:${state.name}`)),
+      ...this.states.flatMap((state) => state.rows.map((row) => `reading:${row}`)),
+      ...this.model.inputs.map((input) => `input:${input.name}`),
+    ];
+    // More than is shown: what is forecast may be seconds old.
+    const past = 1.5 * PAST * (this.horizon ?? this.model.window) + LONGEST_REST / 1000;
+    this.link.look("whatif", { span: past, points: 400, columns }, (...frame) => this.lane.take(...frame));
+  }
+
+  turn() {
+    this.horizon = this.shortest * (this.longest / this.shortest) ** (this.slider.value / STEPS);
+    this.placeSlider();
+    this.changed();
+    this.look();
+  }
+
+  placeSlider() {
+    const place = (STEPS * Math.log(this.horizon / this.shortest)) / Math.log(this.longest / this.shortest);
+    if (document.activeElement !== this.slider) this.slider.value = Math.round(place);
+    this.slider.setAttribute("aria-valuetext", span(this.horizon));
+    setText(this.length, span(this.horizon));
+  }
+
+  changed() {
+    localStorage.setItem(this.key, JSON.stringify({ horizon: this.horizon, limits: this.limits }));
+    this.asked = null;
+    this.next(SOON);
+  }
+
+  next(delay) {
+    clearTimeout(this.timer);
+    if (this.shown) this.timer = setTimeout(() => this.ask(), delay);
+  }
+
+  get question() {
+    return JSON.stringify({ horizon: this.horizon, inputs: this.inputs, limits: this.limits });
+  }
+
+  async ask() {
+    if (this.busy) return this.next(SOON);
+    const status = this.link.status;
+    let { question } = this;
+    const asked = `${status.t} ${status.revision} ${question}`;
+    if (asked === this.asked) return this.next(AGAIN); // paused: nothing would come out differently
+    this.busy = true;
+    setText(this.state, "computing …");
+    const begun = performance.now();
+    try {
+      if (this.horizon === null || !this.longest) await this.learn();
+      question = this.question;
+      const headers = { "Content-Type": "application/json" };
+      const found = await told(await fetch("/api/forecast", { method: "POST", headers, body: question }));
+      this.asked = asked;
+      this.take(found);
+      setText(this.problem, "");
+    } catch (error) {
+      setText(this.problem, error.message);
+    }
+    this.busy = false;
+    setText(this.state, "");
+    // What was chosen meanwhile is asked for at once.
+    const rest = Math.max(AGAIN, Math.min(LONGEST_REST, REST * (performance.now() - begun)));
+    this.next(question === this.question ? rest : SOON);
+  }
+
+  // How far can be asked for.
+  async learn() {
+    const may = await told(await fetch("/api/forecast"));
+    this.longest = may.longest;
+    this.shortest = Math.min(may.longest / 2, 10 * may.step);
+    const horizon = this.horizon ?? 3 * this.model.window;
+    this.horizon = Math.min(this.longest, Math.max(this.shortest, horizon));
+    this.placeSlider();
+    this.look();
+  }
+
+  take(found) {
+    this.found = found;
+    this.origin = Number(this.link.status.origin ?? 0) / 1e9;
+    this.times = found.t.map((t) => found.now - this.origin + t);
+    setText(this.method, `Limits: ${found.method}.`);
+    for (const [name, row] of this.rows) row.show(found.inputs[name], this.lane.columns[`input:${name}`] ?? []);
+    for (const [name, output] of Object.entries(this.said ?? {})) setText(output, sentence(this, name, found.limits[name]));
+    this.draw();
+    window.nisus.forecasts = (window.nisus.forecasts ?? 0) + 1;
+  }
+
+  draw() {
+    if (!this.found) return;
+    const now = this.times[0];
+    const horizon = this.found.t.at(-1);
+    const first = Math.max(now - PAST * horizon, Math.min(now, this.lane.x[0] ?? now));
+    const range = [first - MARGIN * horizon, this.times.at(-1)];
+    for (const chart of this.parts) chart.show(chart.what.data(), range);
+    this.axis.show(range);
+  }
+}
+
+async function told(answer) {
+  const text = await answer.text();
+  if (answer.ok) return JSON.parse(text);
+  throw new Error(answer.headers.get("content-type")?.includes("json") ? JSON.parse(text).error : text.trim());
+}
+
+// One input: its value now, a slider over what it has been and as much again to either side, and a field.
+function inputRow(whatif, input) {
+  const name = words(input.name);
+  const label = `${name}${input.unit ? ` [${input.unit}]` : ""}`;
+  const slider = element("input", { type: "range", step: "any", "aria-label": `${label} from now on`, oninput: () => choose(Number(slider.value)) });
+  const field = element("input", { type: "text", inputmode: "decimal", "aria-label": `${label} from now on, as a number`, onchange: () => choose(Number(field.value.replace(",", "."))) });
+  const back = element("button", { type: "button", class: "back", title: "As it is now", "aria-label": `${name} as it is now`, onclick: () => choose(null) }, "↺");
+  const node = element("div", { class: "choice" }, element("span", { title: label }, name), slider, field, element("span", { class: "unit" }, input.unit), back);
+  let now = NaN;
+  function choose(value) {
+    if (value === null || !Number.isFinite(value)) delete whatif.inputs[input.name];
+    else whatif.inputs[input.name] = Number(value.toPrecision(4));
+    place();
+    whatif.changed();
+  }
+  function place() {
+    const value = whatif.inputs[input.name] ?? now;
+    node.toggleAttribute("data-turned", input.name in whatif.inputs);
+    if (document.activeElement !== field) field.value = compact(value, 4);
+    if (document.activeElement !== slider) slider.value = value;
+  }
+  return {
+    node,
+    show(value, history) {
+      now = value;
+      const [low, high] = extent([[...history, value, whatif.inputs[input.name] ?? value]], 0, history.length + 1);
+      const width = high - low || Math.abs(high) || 1;
+      if (!(Number(slider.min) <= low && high <= Number(slider.max) && slider.dataset.placed)) {
+        slider.min = low - width;
+        slider.max = high + width;
+        slider.dataset.placed = "";
+      }
+      place();
+    },
+  };
+}
+
+function limitField(whatif, state) {
+  const said = element("output", { class: "said", "aria-label": `When ${state.label} reaches its limit` });
+  (whatif.said ??= {})[state.name] = said;
+  const field = element("input", {
+    type: "text", inputmode: "decimal", placeholder: "none", value: whatif.limits[state.name] ?? "", "aria-label": `Limit of ${state.label}${spaced(state.unit)}`,
+    onchange: () => {
+      const value = Number(field.value.replace(",", "."));
+      if (field.value.trim() === "" || !Number.isFinite(value)) {
+        delete whatif.limits[state.name];
+        field.value = "";
+        setText(said, "");
+      } else whatif.limits[state.name] = value;
+      whatif.changed();
+    },
+  });
+  return element("label", { class: "limit" }, "limit ", field, said);
+}
+
+// "reaches 80 °C in 4.2 min (68 % within 10 min)". To have been beyond is likelier than to be beyond at some time, which
+// is all that moments tell.
+function sentence(whatif, name, found) {
+  if (!found) return "";
+  const { unit } = whatif.model.states.find((state) => state.name === name);
+  const { members, t } = whatif.found;
+  const limit = `${compact(found.limit)}${spaced(unit)}`;
+  const within = span(t.at(-1));
+  const share = found.overall > 0.995 ? "over 99 %" : `${members ? "" : "at least "}${Math.round(100 * found.overall)} %`;
+  if (found.middle !== null) return `${found.above ? "reaches" : "falls to"} ${limit} in ${span(found.middle)} (${share} within ${within})`;
+  if (found.overall >= 0.005) return `${found.above ? "may reach" : "may fall to"} ${limit}: ${share} within ${within}`;
+  const side = `${found.above ? "below" : "above"} ${limit}`;
+  return members ? `stays ${side} for ${within} (over 99 %)` : `${side} at any time for ${within} (over 99 %)`;
+}
+
+// A chart of one state: what was, and to the right of now the fan of what may be.
+function fan(whatif, state) {
+  const range = new Range();
+  const { lane } = whatif;
+  const past = ["upper", "lower", ...state.rows.map((row) => `reading:${row}`), "truth", "mean"].map((name) => (name.includes(":") ? name : `${name}:${state.name}`));
+  const future = ["upper2", "lower2", "upper1", "lower1", "mean"];
+  const first = past.length + 1; // series of the fan's outer edge
+  return {
+    title: state.label,
+    unit: bracketed(state.unit),
+    note: state.rows.length ? null : "not measured",
+    weight: state.rows.length ? 1 : 1.4,
+    sync: "future",
+    series: [
+      edge(), edge(), ...state.rows.map(() => dots("reading", 4)), line("truth", { width: 1.5, dash: [5, 3], spanGaps: true }), line("estimate", { width: 1.75 }),
+      edge(), edge(), edge(), edge(), line("estimate", { width: 1.75, dash: [6, 3] }),
+    ],
+    bands: [
+      { series: [1, 2], fill: () => colour("band") },
+      { series: [first, first + 1], fill: () => colour("band") },
+      { series: [first + 2, first + 3], fill: () => colour("band") },
+    ],
+    over: (plot) => lines(plot, whatif.times?.[0], whatif.limits[state.name]),
+    data: () => {
+      const { found, times } = whatif;
+      const count = within(lane.x, [-Infinity, times[0]])[1] + 1;
+      const before = lane.x.length && lane.x[0] <= times[0] ? Math.min(count, lane.x.length) : 0;
+      const none = new Array(times.length).fill(null);
+      const empty = new Array(before).fill(null);
+      const told = found.states[state.name];
+      const was = past.map((name) => lane.column(name).slice(0, before));
+      const will = future.map((name) => told[name] ?? none);
+      if (state.circular) [[was, -1, [0, 1]], [will, -1, [0, 1, 2, 3]]].forEach(([columns, mean, edges]) => around(columns, mean, edges));
+      return [[...lane.x.slice(0, before), ...times], ...was.map((values) => [...values, ...none]), ...will.map((values) => [...empty, ...values])];
+    },
+    range: (chart) => {
+      if (state.probability) return [-0.03, 1.03];
+      const [x, ...columns] = chart.data;
+      const limit = whatif.limits[state.name];
+      const [low, high] = extent(columns, 0, x.length - 1);
+      return range.fit(Math.min(low, limit ?? low), Math.max(high, limit ?? high));
+    },
+    says: (value) => {
+      const [x, upper, lower, mean] = [value(0), value(first), value(first + 1), value(first + 4)];
+      const now = whatif.times?.[0] ?? 0;
+      if (!(x >= now)) return "";
+      const around = Number.isFinite(upper) ? ` ± ${compact((upper - lower) / 2, 2)}` : "";
+      return `in ${span(x - now)} ${compact(mean, 4)}${around}${spaced(state.unit)}`;
+    },
+  };
+}
+
+// Columns of an angle, the edges of a band about its mean.
+function around(columns, place, edges) {
+  const mean = columns.at(place);
+  const broken = unbroken(mean);
+  columns.forEach((values, k) => {
+    const side = (value, i) => (value === null || broken[i] === null ? null : broken[i] + value - mean[i]);
+    columns[k] = edges.includes(k) ? values.map(side) : unbroken(values);
+  });
+}
+
+// Now, upright; the limit, level.
+function lines(plot, now, limit) {
+  const { ctx, bbox } = plot;
+  ctx.save();
+  ctx.lineWidth = devicePixelRatio;
+  const draw = (name, dash, ...points) => {
+    ctx.strokeStyle = colour(name);
+    ctx.setLineDash(dash.map((length) => length * devicePixelRatio));
+    ctx.beginPath();
+    ctx.moveTo(...points[0]);
+    ctx.lineTo(...points[1]);
+    ctx.stroke();
+  };
+  if (now !== undefined) {
+    const x = plot.valToPos(now, "x", true);
+    draw("faint", [], [x, bbox.top], [x, bbox.top + bbox.height]);
+  }
+  if (limit !== undefined) {
+    const y = plot.valToPos(limit, "y", true);
+    draw("ink", [8, 4], [bbox.left, y], [bbox.left + bbox.width, y]);
+  }
+  ctx.restore();
+}

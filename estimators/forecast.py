@@ -1,0 +1,211 @@
+"""What if: a fold that goes on over a future without readings.
+
+The filter's state, as it stands, is the base of a fold over a log of inputs alone. Each step of that log is an event of
+its kind INPUT that changes no input or some, so the state moves on as it does between readings: what is forecast is
+what the fold itself would say. `f` is discrete, so the steps should be as long as those between the readings that the
+filter has had.
+
+A filter that consists of its members (ensembles, bootstrap particles) is asked for them at every time and some between.
+A member keeps its place while no reading comes, so that their paths tell when each passes a limit for the first time.
+All others give moments, and of them the probability of being beyond the limit at each time, which is less than that of
+having been.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import ndtr
+
+from .errors import EstimatorError
+from .fold import Fold
+from .log import INPUT, Events, Log
+from .model.state_space import LARGE, StateSpaceModel
+from .snapshots import Base
+from .tuning import Tuning
+
+SIGMAS = (-2.0, -1.0, 1.0, 2.0)
+"""Edges of the bands, in standard deviations; of members the quantiles that a normal variable has there."""
+
+LOOKS = 4
+"""Looks at the members from one time to the next, where there are so many steps: whoever comes back between two looks
+is not seen to have passed."""
+
+
+class Crossing(NamedTuple):
+    """A limit of one state, in its unit, and the probability (T,) of it.
+
+    `above` says from which side it is looked at: whether the mean is below it now. By members, `probability` is that of
+    having passed it up to each time; by moments, of being beyond it at each time.
+    """
+
+    state: str
+    limit: float
+    above: bool
+    probability: np.ndarray
+
+
+class Forecast(NamedTuple):
+    """The future of the shown states at T times, the first of them now.
+
+    t (T,): seconds from now. mean and std (T, shown), bands (T, 4, shown) at `SIGMAS`, in the units of the states.
+    `members` is how many were looked at, 0 where moments speak.
+    """
+
+    t: np.ndarray
+    mean: np.ndarray
+    std: np.ndarray
+    bands: np.ndarray
+    members: int
+    crossings: tuple[Crossing, ...]
+
+
+def forecast(
+    estimator: str,
+    model: StateSpaceModel,
+    tuning: Tuning,
+    base: Base,
+    now: int,
+    horizon: float,
+    step: float,
+    *,
+    inputs: Events | None = None,
+    limits: Mapping[str, float] | None = None,
+    most: int = 160,
+    between: Callable[[], None] = lambda: None,
+) -> Forecast:
+    """Fold on from a base without readings.
+
+    Args:
+        estimator: Name in the registry; that which left the base goes on from its whole state.
+        model: Of the twin.
+        tuning: Of the twin.
+        base: The filter as it stands, see `Fold.base_here`.
+        now: Time from which on to look, ns; not before the base's clock.
+        horizon: How far, s.
+        step: Length of a step at most, s.
+        inputs: Events of inputs from now on; the others stay as they are.
+        limits: Of shown states, by name.
+        most: Times at most, without the first.
+        between: Called between two times; what it raises ends the forecast.
+
+    Raises:
+        EstimatorError: If horizon or step are not positive, `now` is before the base, a limit is of no shown state, or
+            of an angle or a mode, which has none; and as `Fold`.
+        EventError: If an input does not fit the model.
+    """
+    if not (0.0 < horizon < np.inf and step > 0.0):
+        raise EstimatorError(f"horizon is {horizon:g} s in steps of {step:g} s; both must be positive")
+    if now < base.clock:
+        raise EstimatorError("now is before the time of the state; a forecast begins where the filter stands")
+    columns = {name: _column(model, name) for name in limits or {}}
+    times = max(1, min(most, int(np.ceil(horizon / step))))
+    fine = times * max(1, int(np.ceil(horizon / (times * step))))
+    instants = now + np.rint(np.linspace(0.0, 1e9 * horizon, fine + 1)).astype(np.int64)
+    fold = Fold(estimator, model, tuning, _future(model, base, instants, inputs), base=base)
+    by_members = fold.estimator.blocks is not None and model.nx <= LARGE
+    rows = np.searchsorted(fold.log.t[: fold.log.n], instants, side="right")
+    each = fine // times
+    apart = np.unique(np.linspace(0, each, min(LOOKS, each) + 1).astype(int))[1:]
+    watch = _Watch(model, limits or {}, columns)
+    bands = np.empty((times + 1, len(SIGMAS), len(model.shown)))
+    points = np.zeros((0, model.nx))
+    for k in range(times + 1):
+        looks = (k - 1) * each + apart if k and by_members and limits else [k * each]
+        for stop in rows[looks]:
+            fold.advance(int(stop) - fold.n)
+            if by_members:
+                points = fold.points()
+                watch.members(points, fold.track.mean[-1])
+        between()
+        mean, std = fold.track.mean[-1], fold.track.std[-1]
+        bands[k] = _quantiles(points[:, model.shown], mean, model) if by_members else mean + np.outer(SIGMAS, std)
+        watch.moments(mean, std, by_members)
+    last = rows[::each] - 1
+    t = (instants[::each] - now) * 1e-9
+    return Forecast(t, fold.track.mean[last], fold.track.std[last], bands, len(points), watch.crossings())
+
+
+def first_time(t: np.ndarray, probability: np.ndarray, share: float) -> float:
+    """When a probability (T,) reaches a share for the first time, s, on a line between two times; NaN if it never does.
+
+    Args:
+        t: Times (T,), s.
+        probability: At these times.
+        share: From 0 to 1.
+    """
+    reached = np.flatnonzero(probability >= share)
+    if not reached.size:
+        return np.nan
+    k = int(reached[0])
+    if k == 0:
+        return float(t[0])
+    part = (share - probability[k - 1]) / (probability[k] - probability[k - 1])
+    return float(t[k - 1] + part * (t[k] - t[k - 1]))
+
+
+def _column(model: StateSpaceModel, name: str) -> int:
+    names = [state.name for state in model.shown_states]
+    if name not in names:
+        raise EstimatorError(f"limits: {model.name} shows no state {name!r}; it has {', '.join(names)}")
+    column = names.index(name)
+    if model.shown_states[column].circular or int(model.shown[column]) == model.mode:
+        kind = "an angle" if model.shown_states[column].circular else "a mode"
+        raise EstimatorError(f"limits: {name} is {kind}, which has no side beyond a limit")
+    return column
+
+
+def _future(model: StateSpaceModel, base: Base, instants: np.ndarray, inputs: Events | None) -> Log:
+    """A log that asks the state to move on to each instant, and holds the inputs between."""
+    n = instants.size
+    nothing = np.full((n, model.width), np.nan)
+    steps = Events(instants, instants, np.full(n, INPUT, np.int8), np.zeros(n, np.int32), nothing)
+    log = Log.of(model, capacity=n + (len(inputs) if inputs is not None else 0))
+    log.first, log.floor, log.version = base.first, base.clock, base.version
+    log.extend(steps if inputs is None else Events.concat([steps, inputs], model.width))
+    return log
+
+
+def _quantiles(points: np.ndarray, mean: np.ndarray, model: StateSpaceModel) -> np.ndarray:
+    """Of members (k, shown) about their mean (shown,), at `SIGMAS`: (4, shown); angles by the shorter way."""
+    off = points - mean
+    turns = np.array([state.circular for state in model.shown_states], bool)
+    off[:, turns] = (off[:, turns] + np.pi) % (2.0 * np.pi) - np.pi
+    found: np.ndarray = mean + np.quantile(off, ndtr(SIGMAS), axis=0)
+    return found
+
+
+class _Watch:
+    """Watches limits while the states move."""
+
+    def __init__(self, model: StateSpaceModel, limits: Mapping[str, float], columns: Mapping[str, int]) -> None:
+        self._model, self._limits, self._columns = model, limits, columns
+        self._above: dict[str, bool] = {}
+        self._passed: dict[str, np.ndarray] = {}
+        self._found: dict[str, list[float]] = {name: [] for name in limits}
+
+    def members(self, points: np.ndarray, mean: np.ndarray) -> None:
+        """Note the members (k, nx) that are beyond; the mean (shown,) says from which side to look."""
+        for name, limit in self._limits.items():
+            above = self._above.setdefault(name, bool(mean[self._columns[name]] < limit))
+            x = points[:, self._model.shown[self._columns[name]]]
+            beyond = x >= limit if above else x <= limit
+            self._passed[name] = self._passed[name] | beyond if name in self._passed else beyond
+
+    def moments(self, mean: np.ndarray, std: np.ndarray, by_members: bool) -> None:
+        """One more time: of the members that have passed, or of a normal distribution, (shown,) both."""
+        for name, limit in self._limits.items():
+            j = self._columns[name]
+            above = self._above.setdefault(name, bool(mean[j] < limit))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                far = (mean[j] - limit) / std[j] * (1.0 if above else -1.0)
+            self._found[name].append(float(np.mean(self._passed[name])) if by_members else float(ndtr(far)))
+
+    def crossings(self) -> tuple[Crossing, ...]:
+        """What was found."""
+        return tuple(
+            Crossing(name, limit, self._above[name], np.array(self._found[name]))
+            for name, limit in self._limits.items()
+        )
