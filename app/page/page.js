@@ -67,7 +67,7 @@ new Episodes($("episodes"), link, view, charts);
 new Runs($("runs"), link);
 const transport = new Transport(model, link, view, charts);
 const explore = new Explore(settings.viewer, theme);
-const stage = new Stage(settings.viser, theme);
+const stage = new Stage(settings.viser, theme, link);
 
 const middle = new Tabs($("middle-tabs"), null, (name) => {
   if (name === "explore") explore.show();
@@ -114,7 +114,7 @@ keys([
   ["u", "undo the last edit", () => tune.undo()],
   ["U", "redo", () => tune.redo()],
   ["e", "episodes", () => side.show("episodes")],
-  ["s", "scene", () => side.show("scene")],
+  ["s", "scene; once more: large, and back", () => (side.chosen === "scene" ? stage.enlarge() : side.show("scene"))],
   ["x", "explore in Rerun, and back", () => middle.show(middle.chosen === "explore" ? "charts" : "explore")],
   ["t", "tune, where the page is narrow", drawer],
 ]);

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import uuid
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,9 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
-from estimators.errors import NisusError
+from estimators.errors import ConfigError, NisusError
 
+from ..drawing.choices import Choices
 from ..engine.interface import Running
 from ..rerun.feed import RerunFeed
 from ..series.series import Series
@@ -71,6 +72,7 @@ class PageServer:
         viser_port: int | None,
         secret: str,
         review: Path | None = None,
+        choices: Choices | None = None,
     ) -> None:
         """Take the port.
 
@@ -80,12 +82,14 @@ class PageServer:
             viser_port: Where the private Viser server listens; None if there is none.
             secret: What Viser asks for.
             review: The recording that is reviewed, offered beside those that this process writes.
+            choices: What may be chosen about Viser's scene; None if there is none.
 
         Raises:
             ConfigError: If the port cannot be had.
         """
         self._engine = engine
         self._review = review
+        self._choices = choices
         self._series = Series(engine)
         self._boot = uuid.uuid4().hex
         self._socket = listen(port)
@@ -132,12 +136,14 @@ class PageServer:
     def _application(self) -> Starlette:
         routes: list[Any] = [
             Route("/", self._page),
+            Route("/explore", self._page),
             Route("/api/status", self._status),
             Route("/api/model", self._model),
             Route("/api/episodes", self._episodes),
             Route("/api/recordings", self._list_recordings),
             Route("/api/faults", self._faults),
             Route("/api/command", self._command, methods=["POST"]),
+            Route("/api/scene", self._scene, methods=["GET", "POST"]),
             Route(f"/viewer/{viewer_version()}/{{name}}", self._viewer_file),
             Route("/rec/{name}", self._recording),
             WebSocketRoute("/api/stream", self._page_stream),
@@ -154,7 +160,8 @@ class PageServer:
         return _WithHeaders(application, self.port)  # type: ignore[return-value]
 
     async def _page(self, request: Request) -> Response:
-        text = (PAGE / "index.html").read_text()
+        name = "explore.html" if request.url.path == "/explore" else "index.html"
+        text = (PAGE / name).read_text()
         settings = {"viewer": f"/viewer/{viewer_version()}", "boot": self._boot, "viser": self._viser is not None}
         # In an attribute, not in a script: the policy allows no inline ones.
         quoted = json.dumps(settings).replace("&", "&amp;").replace('"', "&quot;")
@@ -164,7 +171,8 @@ class PageServer:
         return Json(self._state())
 
     def _state(self) -> dict[str, Any]:
-        return {**status_json(self._engine), "recordings": sorted(self._recordings())}
+        scene = [] if self._choices is None else self._choices.json()
+        return {**status_json(self._engine), "recordings": sorted(self._recordings()), "scene": scene}
 
     async def _model(self, request: Request) -> Response:
         return Json(await asyncio.to_thread(model_json, self._engine))
@@ -183,16 +191,26 @@ class PageServer:
         return Json(faults_json(self._engine))
 
     async def _command(self, request: Request) -> Response:
-        if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
-            return PlainTextResponse("Nisus: Content-Type must be application/json.\n", 415)
-        try:
-            command = command_from_json(json.loads(await bounded_body(request)), self._engine)
-        except TooLarge as error:
-            return PlainTextResponse(f"Nisus: {error}.\n", 413)
-        except (NisusError, ValueError, RecursionError) as error:
-            return Json({"error": one_line(str(error))}, 400)
-        self._engine.submit(command)
-        return Json({"submitted": type(command).__name__}, 202)
+        def submit(body: Any) -> Response:
+            command = command_from_json(body, self._engine)
+            self._engine.submit(command)
+            return Json({"submitted": type(command).__name__}, 202)
+
+        return await _answered(request, submit)
+
+    async def _scene(self, request: Request) -> Response:
+        """What may be chosen about the scene; or choose, with `{"key": …, "value": …}`."""
+        choices = self._choices
+        if choices is None:
+            return PlainTextResponse("Nisus: there is no scene.\n", 404)
+
+        def choose(body: Any) -> Response:
+            if not isinstance(body, dict):
+                raise ConfigError(f"scene: {body!r} is no object")
+            choices.choose(str(body.get("key")), str(body.get("value")))
+            return Json(choices.json())
+
+        return Json(choices.json()) if request.method != "POST" else await _answered(request, choose)
 
     async def _viewer_file(self, request: Request) -> Response:
         name = request.path_params["name"]
@@ -264,6 +282,18 @@ class PageServer:
                 # Until the frame is drawn, or the status is due.
                 await asyncio.wait_for(drawn.wait(), STATUS_PERIOD)
             await asyncio.sleep(max(0.0, PERIOD - (time.monotonic() - begun)))
+
+
+async def _answered(request: Request, take: Callable[[Any], Response]) -> Response:
+    """What `take` makes of the JSON that a request brings, or why not."""
+    if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+        return PlainTextResponse("Nisus: Content-Type must be application/json.\n", 415)
+    try:
+        return take(json.loads(await bounded_body(request)))
+    except TooLarge as error:
+        return PlainTextResponse(f"Nisus: {error}.\n", 413)
+    except (NisusError, ValueError, RecursionError) as error:
+        return Json({"error": one_line(str(error))}, 400)
 
 
 async def _given(feed: RerunFeed) -> AsyncIterator[str | bytes]:
