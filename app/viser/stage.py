@@ -14,17 +14,22 @@ from ..drawing.heatmap import kinds
 from ..drawing.palette import LIGHT
 from ..engine.interface import Running
 from ..engine.outputs import Belief
+from .battery_scene import BatteryScene
 from .belief_scene import BeliefScene
 from .camera import Cameras, Outlook
 from .field_scene import FieldScene
 from .history import History
+from .motor_scene import MotorScene
 from .vehicle_scene import VehicleScene
 
 if TYPE_CHECKING:
     from config.schema import ViewSection
 
-BELIEF, FIELD, VEHICLE = "belief", "field", "vehicle"
+BELIEF, FIELD, VEHICLE, MOTOR, BATTERY = "belief", "field", "vehicle", "motor", "battery"
 FOLLOW, STAY = "vehicle", "walls"
+
+AMBIENT, ABOVE = 2.5, 0.9
+"""Strength of the lights: π of the first alone would show each colour as it is."""
 
 HEAVY = 0.4
 """Seconds between two redraws of what is many points."""
@@ -45,7 +50,13 @@ class Stage:
 
     def __init__(self, server: viser.ViserServer, engine: Running) -> None:
         self._server, self._engine = server, engine
-        server.scene.set_up_direction("+z")
+        api = server.scene
+        api.set_up_direction("+z")
+        # Nearly the same light from everywhere: colours mean something, so shading must not change them much.
+        api.configure_default_lights(False)
+        api.configure_environment_map(None)
+        api.add_light_ambient("/light/all", intensity=AMBIENT)
+        api.add_light_directional("/light/above", intensity=ABOVE, position=(-0.5, -1.0, 1.2))
         self.model, self._view = engine.model, engine.twin.config.view
         self._truth = engine.model.grid is not None and engine.twin.tells_field
         self.choices = Choices(choices_of(self.model, self._view, truth=self._truth))
@@ -102,6 +113,12 @@ class Stage:
             return FieldScene(api, model, self.palette, truth=self._truth)  # type: ignore[return-value]
         if show == VEHICLE:
             return VehicleScene(api, model, section, self.palette)
+        if show == MOTOR:
+            return MotorScene(
+                api, model, {str(part): name for part, name in (section.parts or {}).items()}, self.palette
+            )
+        if show == BATTERY:
+            return BatteryScene(api, model, section.charge or (), section.temperature, self.palette)
         chosen = [values[axis] for axis in AXES if values.get(axis, NO_AXIS) != NO_AXIS]
         return BeliefScene(api, model, [model.state_names.index(name) for name in chosen], self.palette)
 
