@@ -26,6 +26,7 @@ from starlette.websockets import WebSocket
 from estimators.errors import ConfigError, NisusError
 
 from ..drawing.choices import Choices
+from ..drawing.palette import EITHER, THEMES
 from ..engine.interface import Running
 from ..rerun.feed import RerunFeed
 from ..series.series import Series
@@ -247,7 +248,8 @@ class PageServer:
         """Feed one Rerun viewer: each frame when it has drawn the one before."""
         await browser.accept()
         layout = browser.query_params.get("layout", "1") == "1"
-        feed = await asyncio.to_thread(RerunFeed, self._engine, layout=layout)
+        palette = THEMES.get(browser.query_params.get("theme", ""), EITHER)
+        feed = await asyncio.to_thread(RerunFeed, self._engine, layout=layout, palette=palette)
         drawn = asyncio.Event()
         drawn.set()
         listener = asyncio.create_task(_listen_to(browser, drawn))

@@ -11,7 +11,7 @@ from estimators.log import READING
 from estimators.model.state_space import StateSpaceModel
 
 from ..drawing.geometry import segments
-from ..drawing.heatmap import ESTIMATE, RIM, Frame, Scale, image_of, kinds, palette, positioned, sensor_colors
+from ..drawing.heatmap import ESTIMATE, RIM, Frame, Scale, gradient, image_of, kinds, positioned, sensor_colors
 from ..drawing.palette import Palette
 from ..engine.outputs import Belief, Pull
 from .camera import Outlook
@@ -34,7 +34,7 @@ class FieldScene:
         self._kinds = {kind.title: kind for kind in kinds(truth)}
         self._kind = ESTIMATE
         self._scales = {kind.name: Scale(kind) for kind in self._kinds.values()}
-        self._palettes = {kind.name: palette(kind.colors) for kind in self._kinds.values()}
+        self._palettes = {kind.name: gradient(kind.colors) for kind in self._kinds.values()}
         self._latest: dict[str, np.ndarray] = {}
         self._drawn = -np.inf
         self._dirty = False

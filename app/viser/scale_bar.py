@@ -8,7 +8,7 @@ import numpy as np
 import viser
 
 from ..drawing.geometry import segments
-from ..drawing.heatmap import ESTIMATE, NOTHING, Scale, palette
+from ..drawing.heatmap import ESTIMATE, NOTHING, Scale, gradient
 from ..drawing.palette import RGB, Palette
 
 TICKS = 9
@@ -23,7 +23,7 @@ class ScaleBar:
         self, api: viser.SceneApi, name: str, labels: Sequence[str], unit: str, theme: Palette, *, y: float, top: float
     ) -> None:
         self._labels, self._unit, self._y, self._top = labels, unit, y, top
-        self._scale, self._colors = Scale(ESTIMATE), palette(ESTIMATE.colors)
+        self._scale, self._colors = Scale(ESTIMATE), gradient(ESTIMATE.colors)
         strip = np.repeat(self._colors[:NOTHING][None], 8, axis=0)
         # An image lies in the plane of x and y, its top at -y: up it goes by a right angle about x.
         half = float(np.sqrt(0.5))
