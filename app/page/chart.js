@@ -2,7 +2,7 @@
 
 import { element, setText } from "./dom.js";
 
-const GAP = 52; // px for the labels of the value axis
+export const GAP = 52; // px for the labels of the value axis
 export const CURSOR = "time";
 
 const styles = getComputedStyle(document.documentElement);
@@ -39,14 +39,14 @@ export class Chart {
   }
 
   // Once it is in the page, and has a size.
-  begin(last) {
+  begin() {
     const { what } = this;
     this.plot = new uPlot(
       {
         width: Math.max(50, this.canvas.clientWidth),
         height: Math.max(40, this.canvas.clientHeight),
         legend: { show: false },
-        padding: [6, 10, last ? 0 : 4, 0],
+        padding: [6, 10, null, 0],
         cursor: {
           sync: { key: CURSOR, scales: ["x", null] },
           drag: { x: true, y: false, setScale: false },
@@ -59,8 +59,8 @@ export class Chart {
           y: { ...what.scale, range: (self, low, high) => what.range(this, low, high) },
         },
         axes: [
-          { show: true, ...axis(), size: last ? 22 : 0, values: last ? what.ticks : () => [], ticks: { show: last, stroke: () => colour("rule"), size: 4 } },
-          { ...axis(), size: GAP, space: 26, ...(what.axis ?? {}) },
+          { ...axis(), size: 3, values: (self, splits) => splits.map(() => null) }, // time stands below all charts
+          { ...axis(), size: GAP, space: 20, ...(what.axis ?? {}) },
         ],
         series: [{}, ...what.series],
         bands: what.bands ?? [],
@@ -134,7 +134,7 @@ export class Chart {
   }
 }
 
-const axis = () => ({
+export const axis = () => ({
   stroke: () => colour("faint"),
   font: "11px system-ui, sans-serif",
   grid: { stroke: () => colour("grid"), width: 1 },

@@ -1,12 +1,16 @@
 // The stack of charts: one time axis, one cursor. States that nobody measures first, then the others, NIS, innovations.
 
 import { Chart, colour, dots, edge, line } from "./chart.js";
+import { $ } from "./dom.js";
 import { bracketed, clock, compact, spaced, withDeviation, words } from "./format.js";
 import { Lane } from "./lane.js";
+import { Layout } from "./layout.js";
 import { marks } from "./marks.js";
+import { TimeAxis } from "./time_axis.js";
 import { Range, bandExtent, extent, within } from "./ranges.js";
 
 const MOST = 24; // charts of states or rows
+const FEW = 6; // states of which those that nobody measures have more room
 const DENSITY = 1.6; // px to a group of rows
 
 // The columns of a state's chart from the live lane, in the order of its series.
@@ -35,10 +39,12 @@ export class Charts {
     ];
     this.charts = this.parts.map((part) => new Chart(part, actions));
     node.replaceChildren(...this.charts.map((chart) => chart.node));
-    this.charts.forEach((chart, k) => {
+    for (const chart of this.charts) {
       chart.span = this.range;
-      chart.begin(k === this.charts.length - 1);
-    });
+      chart.begin();
+    }
+    this.axis = new TimeAxis($("axis"));
+    this.layout = new Layout(this.charts, node, $("layout"), model.twin);
     view.addEventListener("change", () => this.ask());
     link.addEventListener("frames", () => this.draw());
     link.addEventListener("episodes", (event) => (this.episodes = event.detail));
@@ -84,8 +90,8 @@ export class Charts {
     if (this.view.following) {
       this.range = followed(x[0], end, this.view.span);
     }
-    const ended = this.range;
-    for (const chart of this.charts) chart.show(chart.what.data(), ended);
+    for (const chart of this.charts) if (!chart.node.hidden) chart.show(chart.what.data(), this.range);
+    this.axis.show(this.range);
     window.nisus.drawn = (window.nisus.drawn ?? 0) + 1;
     window.nisus.revision = this.live.revision;
     this.node.dataset.revision = this.live.revision;
@@ -128,23 +134,29 @@ function stateChart(charts, state) {
   const own = OF_STATE.map((kind) => `${kind}:${state.name}`);
   const marksOf = { reading: () => dots("reading", 4), held: () => dots("reading", 5, true), refused: () => dots("refused", 6), screened: () => dots("refused", 7, true) };
   return {
+    key: `state:${state.name}`,
     title: state.label,
     unit: bracketed(state.unit),
     note: state.rows.length ? null : "not measured",
-    weight: state.rows.length ? 1 : 1.5,
+    weight: state.rows.length || charts.model.states.length > FEW ? 1 : 1.5,
     // upper, lower, previous mean, readings …, truth, mean: what matters most lies on top
     series: [
       edge(), edge(), line("previous", { width: 1 }), ...rows.map((name) => marksOf[name.split(":")[0]]()),
       line("truth", { width: 1.5, dash: [5, 3], spanGaps: true }), line("estimate", { width: 1.75 }),
     ],
     bands: [{ series: [1, 2], fill: () => colour("band") }],
-    ticks: ticks,
     under: (plot) => marks(plot, charts.episodes),
     over: (plot) => integrityLines(plot, charts, state),
     data: () => {
-      const [upper, lower, truth, mean] = own.map((name) => live.column(name));
-      const table = [live.x, upper, lower, ...rows.map((name) => live.column(name)), truth, mean];
-      return joined(table, [previous.x, previous.column(`mean:${state.name}`)], 3);
+      let [upper, lower, truth, mean] = own.map((name) => live.column(name));
+      let dotted = rows.map((name) => live.column(name));
+      let before = previous.column(`mean:${state.name}`);
+      if (state.circular) {
+        [upper, lower] = [upper, lower].map((side) => side.map((value, k) => (value === null ? null : turned(mean[k]) + value - mean[k])));
+        [truth, mean, before] = [truth, mean, before].map(unbroken);
+        dotted = dotted.map((values) => values.map(turned));
+      }
+      return joined([live.x, upper, lower, ...dotted, truth, mean], [previous.x, before], 3);
     },
     range: (chart) => {
       if (state.probability) return [-0.03, 1.03];
@@ -170,6 +182,7 @@ function nisChart(charts) {
   const names = ["nis_high", "nis_low", "nis", "nis_mean"];
   const log = (value) => (typeof value === "number" ? Math.log10(Math.max(value, 1e-9)) : value);
   return {
+    key: "nis",
     title: "NIS",
     unit: "",
     note: "mean of the last readings, in its 95 % bounds",
@@ -180,7 +193,6 @@ function nisChart(charts) {
       splits: (self, axis, low, high) => [0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100, 300, 1000].map(Math.log10).filter((v) => low <= v && v <= high),
       values: (self, splits) => splits.map((v) => compact(10 ** v, 1)),
     },
-    ticks,
     under: (plot) => marks(plot, charts.episodes),
     data: () => {
       const [low, high] = nisRange(live);
@@ -206,13 +218,13 @@ function innovationChart(charts, row) {
   const { live } = charts;
   const names = ["innovation_upper", "innovation_lower", "innovation"].map((kind) => `${kind}:${row.name}`);
   return {
+    key: `innovation:${row.name}`,
     title: words(row.name),
     unit: bracketed(row.unit),
     note: "innovation, reading − prediction",
     weight: 0.62,
     series: [line("bound", { width: 1, spanGaps: true }), line("bound", { width: 1, spanGaps: true }), dots("reading", 3)],
     bands: [{ series: [1, 2], fill: () => colour("bounds") }],
-    ticks,
     under: (plot) => marks(plot, charts.episodes),
     data: () => [live.x, ...names.map((name) => live.column(name))],
     range: (chart) => {
@@ -225,12 +237,6 @@ function innovationChart(charts, row) {
     },
     says: (value) => `${compact(value(3), 3)}${spaced(row.unit)}  ± ${compact(value(1), 3)} expected`,
   };
-}
-
-function ticks(self, splits) {
-  const step = splits.length > 1 ? splits[1] - splits[0] : 1;
-  const fraction = step >= 1 ? 0 : Math.min(3, Math.ceil(-Math.log10(step)));
-  return splits.map((value) => clock(value, fraction));
 }
 
 // How wrong the state could be by one fault that nobody sees, to either side of the estimate.
@@ -260,6 +266,14 @@ function integrityLines(plot, charts, state) {
     ctx.stroke();
   }
   ctx.restore();
+}
+
+// An angle between -π and π, and a curve of such, which leaves the chart at one edge and comes back at the other.
+const turned = (value) => (typeof value === "number" ? value - 2 * Math.PI * Math.round(value / (2 * Math.PI)) : value);
+
+function unbroken(values) {
+  const angles = values.map(turned);
+  return angles.map((value, k) => (k && Math.abs(value - angles[k - 1]) > Math.PI ? null : value));
 }
 
 // Two tables of other times as one, in which the other's columns stand from place `at` on. Where a table has no row it says undefined, over which its lines go on; rows of one

@@ -15,8 +15,9 @@ export function compact(value, digits = 4) {
   if (!Number.isFinite(value)) return "–";
   if (value === 0) return "0";
   const size = Math.abs(value);
-  if (size >= 1e6 || size < 1e-4) return value.toExponential(Math.max(0, digits - 2)).replace("e+", "e");
-  return String(Number(value.toPrecision(digits)));
+  const rounded = Number(value.toPrecision(digits));
+  if (size < 1e6 && size >= 1e-4) return String(rounded);
+  return rounded.toExponential().replace("e+", "e");
 }
 
 export const spaced = (unit) => (unit && unit !== "1" ? ` ${unit}` : "");

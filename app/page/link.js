@@ -26,7 +26,7 @@ export class Link extends EventTarget {
     socket.onopen = () => {
       this.delay = 250;
       this.tell("connection", "live");
-      this.say({ lanes: this.lanes });
+      this.say({ lanes: this.lanes, pair: this.pair ?? null });
     };
     socket.onclose = () => {
       if (this.socket !== socket) return;
@@ -72,6 +72,12 @@ export class Link extends EventTarget {
     this.say({ lanes: { [name]: wanted } });
   }
 
+  // The belief over a pair of states now, told as "belief" as it changes; null for no more.
+  watch(pair) {
+    this.pair = pair;
+    this.say({ pair });
+  }
+
   take(data) {
     if (typeof data !== "string") {
       const [header, seconds, columns] = unpacked(data);
@@ -86,6 +92,7 @@ export class Link extends EventTarget {
     }
     if (message.episodes) this.tell("episodes", (this.episodes = message.episodes));
     if (message.notices) this.tell("notices", message.notices);
+    if (message.belief) this.tell("belief", message.belief);
     if (message.error) console.error(message.error);
     if (message.frames) {
       this.tell("frames", null);

@@ -15,6 +15,7 @@ import { Transport } from "./transport.js";
 import { Trust } from "./trust.js";
 import { Tune } from "./tune.js";
 import { View } from "./view.js";
+import { XY } from "./xy.js";
 
 const settings = JSON.parse(document.body.dataset.settings);
 const theme = document.documentElement.dataset.theme;
@@ -73,10 +74,16 @@ const middle = new Tabs($("middle-tabs"), null, (name) => {
   if (name === "explore") explore.show();
   else explore.hide();
 });
+const xy = new XY($("xy"), model, link, view, charts);
+let stages = false;
+middle.show("charts-panel");
+side.shown = (name) => {
+  xy.visible(name === "xy");
+  if (stages) stage.visible(name === "scene");
+};
 side.show(side.chosen ?? "scene");
 // The scene once the charts stand: its three.js keeps the page busy while it starts.
-const staged = (name) => stage.visible(name === "scene");
-link.addEventListener("frames", () => setTimeout(() => ((side.shown = staged), staged(side.chosen)), 300), { once: true });
+link.addEventListener("frames", () => setTimeout(() => ((stages = true), side.shown(side.chosen)), 300), { once: true });
 
 async function record() {
   if (link.status.recording) await link.ask("Record", { path: null });
@@ -114,8 +121,9 @@ keys([
   ["u", "undo the last edit", () => tune.undo()],
   ["U", "redo", () => tune.redo()],
   ["e", "episodes", () => side.show("episodes")],
+  ["y", "two states against each other", () => side.show("xy")],
   ["s", "scene; once more: large, and back", () => (side.chosen === "scene" ? stage.enlarge() : side.show("scene"))],
-  ["x", "explore in Rerun, and back", () => middle.show(middle.chosen === "explore" ? "charts" : "explore")],
+  ["x", "explore in Rerun, and back", () => middle.show(middle.chosen === "explore" ? "charts-panel" : "explore")],
   ["t", "tune, where the page is narrow", drawer],
 ]);
 

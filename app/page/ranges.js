@@ -2,7 +2,8 @@
 
 const MARGIN = 0.08;
 const ROOMY = 0.5;
-const WIDE = 8; // times the middle width of a band, beyond which it does not rule the axis: a prior of ± 2000 m
+const WIDE = 8; // times the usual width of a band, beyond which it does not rule the axis: a prior of ± 2000 m
+const USUAL = 0.2; // share of the rows whose band is narrower than the usual one
 
 export class Range {
   constructor() {
@@ -40,7 +41,7 @@ export function bandExtent(lower, upper, from, to) {
   const widths = [];
   for (let k = from; k <= to; k++) if (typeof upper[k] === "number" && typeof lower[k] === "number") widths.push(upper[k] - lower[k]);
   if (!widths.length) return [Infinity, -Infinity];
-  const most = WIDE * widths.sort((a, b) => a - b)[widths.length >> 1];
+  const most = WIDE * widths.sort((a, b) => a - b)[Math.floor(USUAL * widths.length)];
   let low = Infinity;
   let high = -Infinity;
   for (let k = from; k <= to; k++) {

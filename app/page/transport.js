@@ -58,10 +58,16 @@ export class Transport {
     $("pause").disabled = status.finished && status.seekable;
     $("step").hidden = $("speed").hidden = !status.seekable;
     $("step").disabled = !status.paused;
-    if (status.seekable && document.activeElement !== $("speed")) $("speed").value = String(status.speed ?? 1);
+    if (status.seekable && document.activeElement !== $("speed")) this.offerSpeed(String(status.speed ?? 1));
     setText($("state"), status.finished ? "ended" : status.paused ? "paused" : "");
     const now = status.origin && status.t !== null ? this.now : NaN;
     setText($("now"), clock(now, 1));
+  }
+
+  // A speed from the command line may be another than those of the list.
+  offerSpeed(value) {
+    if (![...$("speed").options].some((option) => option.value === value)) $("speed").append(element("option", { value }, `${value}×`));
+    $("speed").value = value;
   }
 
   get now() {

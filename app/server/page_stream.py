@@ -17,6 +17,7 @@ from ..engine.interface import Running
 from ..series.lane import Lane, wanted_from_json
 from ..series.series import Series
 from .api import episodes_json, one_line
+from .belief_json import belief_json, pair_from_json
 
 PERIOD = 0.1
 """Seconds between two frames, at least."""
@@ -47,6 +48,8 @@ class PageStream:
         self._boot = boot
         self._episodes: list[dict[str, Any]] | None = None
         self._notice = 0
+        self._pair: tuple[int, int] | None = None
+        self._believed: tuple[int, int] | None = None
 
     async def run(self) -> None:
         """Serve until either side ends it."""
@@ -86,6 +89,8 @@ class PageStream:
             raise ConfigError(f"page: {message!r} is no object")
         if message.get("drawn"):
             self._drawn.set()
+        if "pair" in message:
+            self._pair, self._believed = pair_from_json(message["pair"], self._engine), None
         lanes = message.get("lanes", {})
         if not isinstance(lanes, dict):
             raise ConfigError(f"page: lanes is {lanes!r}; it must be an object")
@@ -141,6 +146,11 @@ class PageStream:
             message["notices"] = [
                 {"number": item.number, "t": item.t, "level": item.level, "text": item.text} for item in notices
             ]
+        if self._pair is not None and status["t"] is not None:
+            now = (status["revision"], status["t"])
+            if now != self._believed:
+                self._believed = now
+                message["belief"] = await _finished(asyncio.to_thread(belief_json, self._engine, *self._pair))
         if message:
             await self._browser.send_text(json.dumps(message, allow_nan=False, separators=(",", ":")))
 

@@ -7,25 +7,27 @@ import viser
 
 from ..drawing.geometry import round_step
 from ..drawing.palette import LIGHT, RGB
-from ..series.columns import DOTS, LINE, LOWER, UPPER
+from ..series.columns import LINE, LOWER, UPPER
 from ..series.lane import drawn
 from ..series.pyramid import FACTOR, grouped
 from .history import History
 from .time_units import Unit
 
-COLUMNS = {"nis_high": UPPER, "nis_low": LOWER, "nis_mean": LINE, "nis": DOTS}
+COLUMNS = {"nis_high": UPPER, "nis_low": LOWER, "nis_mean": LINE}
 
 GROUPS = 100
 """Groups of rows that are drawn at most, each as two points."""
 
+HIGHEST = 4.0
+"""Times the upper bound, up to which the mean is drawn."""
+
 
 class NisChart:
-    """NIS of each reading, and its mean over the last ones, between the bounds that a consistent filter keeps."""
+    """The mean NIS of the last readings, between the bounds that a consistent filter keeps."""
 
     def __init__(self, gui: viser.GuiApi, unit: Unit) -> None:
         self._unit = unit
         none, line = "rgba(0,0,0,0)", {"spanGaps": True, "points": {"show": False}}
-        dot = {"stroke": _css(LIGHT.previous), "width": 0, "points": {"show": True, "size": 3, "width": 0}}
         axis = {"font": "11px sans-serif", "stroke": _css(LIGHT.previous), "ticks": {"size": 4}}
         below = {"size": 24, "label": f"time [{unit.name}]", "labelSize": 14, "labelFont": "11px sans-serif"}
         nothing = np.full(2, np.nan)
@@ -36,11 +38,10 @@ class NisChart:
                 {"label": "high", "stroke": none, "auto": False, **line},
                 {"label": "low", "stroke": none, "auto": False, **line},
                 {"label": "mean", "stroke": _css(LIGHT.estimate), "width": 1.5, "auto": False, **line},
-                {"label": "NIS", "auto": False, **dot},
                 # uPlot finds no range of a series with NaN; this one is not seen and spans it for all.
                 {"label": "range", "stroke": none, "width": 0, "points": {"show": False}},
             ),  # type: ignore[arg-type]
-            title="NIS, its mean and 95 % bounds",
+            title="NIS: mean of the last readings, 95 % bounds",
             bands=({"series": (1, 2), "fill": "rgba({},{},{},0.22)".format(*LIGHT.bound)},),
             scales={"x": {"time": False}},
             axes=(axis | below, axis | {"size": 44}),
@@ -64,8 +65,8 @@ class NisChart:
         groups = grouped(size, history.base + start, history.column("t")[start:], values[start:])
         times, points = drawn(groups, np.array(list(COLUMNS.values())))
         highest = float(points[:, 0].max())
-        top = round_step(1.3 * max(highest, float(points[:, 2].max())))
-        # One outlier must not flatten the rest: what lies above is drawn at the top.
+        # A bad start must not flatten the rest: what lies far above the bounds is drawn at the top.
+        top = round_step(1.2 * max(highest, min(HIGHEST * highest, float(points[:, 2].max()))))
         columns = np.minimum(points, top)
         ends = np.where(np.arange(times.size) % 2 == 0, 0.0, top)
         self.handle.data = ((times - origin) * (1e-9 / self._unit.seconds), *columns.T, ends)
