@@ -101,7 +101,9 @@ class BeliefScene:
         )
         self._peaks = [
             (
-                api.add_point_cloud(f"/scene/peaks/{k}/mean", one, palette.ink, point_size=0.05, visible=False, **dot),
+                api.add_point_cloud(
+                    f"/scene/peaks/{k}/mean", one, palette.estimate, point_size=0.05, visible=False, **dot
+                ),
                 api.add_label(f"/scene/peaks/{k}/weight", " ", visible=False, font_screen_scale=0.8,
                               anchor="bottom-left"),
             )

@@ -85,6 +85,7 @@ class Cameras:
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
         self._outlook: Outlook | None = None
+        self._first: np.ndarray | None = None
         self._aspects: dict[int, float] = {}
 
         async def connected(client: viser.ClientHandle) -> None:
@@ -93,7 +94,9 @@ class Cameras:
 
         async def updated(camera: viser.CameraHandle) -> None:
             known = self._aspects.get(camera.client.client_id)
-            if known is None or abs(camera.aspect - known) > SAME * known:
+            # A browser may come to where all of them begin only after it got a place of its own.
+            begins = self._first is not None and np.allclose(camera.position, self._first, rtol=1e-4)
+            if known is None or abs(camera.aspect - known) > SAME * known or begins:
                 self._fit(camera)
 
         async def gone(client: viser.ClientHandle) -> None:
@@ -107,7 +110,8 @@ class Cameras:
         if self._outlook is None:
             # Once only: it would move the cameras of browsers that are there.
             camera = self._server.initial_camera
-            camera.position, camera.up = place(outlook, 1.0)
+            self._first, camera.up = place(outlook, 1.0)
+            camera.position = self._first
             camera.look_at, camera.fov, camera.far = np.zeros(3), outlook.fov, FAR
         self._outlook = outlook
         for client in self._server.get_clients().values():

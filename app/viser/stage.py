@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
 import viser
 
 from estimators.model.state_space import StateSpaceModel
@@ -82,6 +83,8 @@ class Stage:
             self.scene = self._build(show, values)
             self.cameras.show(self.scene.outlook)
             self._built, self._heavy = wanted, -HEAVY
+            # Viser has a dark of its own.
+            self._server.scene.set_background_image(np.full((2, 2, 3), self.palette.panel, np.uint8), format="png")
         self._late |= values != self._values
         self._values = values
         if isinstance(self.scene, FieldScene):

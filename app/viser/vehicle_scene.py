@@ -103,7 +103,7 @@ class VehicleScene:
         self._cloud = api.add_point_cloud(f"{world}/cloud", one, light, point_size=0.15, **dot)
         self._peaks = [
             (
-                api.add_point_cloud(f"{world}/peaks/{k}/mean", one, palette.ink, point_size=0.6, **dot),
+                api.add_point_cloud(f"{world}/peaks/{k}/mean", one, palette.estimate, point_size=0.6, **dot),
                 api.add_label(f"{world}/peaks/{k}/weight", " ", visible=False, anchor="bottom-left"),
             )
             for k in range(PEAKS)
