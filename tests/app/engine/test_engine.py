@@ -95,10 +95,10 @@ def test_a_cursor_with_a_span_begins_near_the_end(started):
         if not revision:
             engine.submit(commands.SetTuning("R.winding", 9.0))
             wait_for(lambda: engine.status().revision == 1)
-    source.put(readings([50.5], [40.0]))
+    source.put(readings([99.5], [40.0]))
     wait_for(lambda: row_count(engine) == 101)
     late = engine.pull(cursor)
-    assert (late.fresh, late.first, len(late.events)) == (False, 50, 51)
+    assert (late.fresh, late.first, len(late.events)) == (False, 99, 2)
 
 
 def test_readings_beyond_the_horizon_are_counted_and_dropped(started):
