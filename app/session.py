@@ -89,6 +89,7 @@ class Session:
                     viser_port=self.view.port,
                     secret=secret,
                     review=review,
+                    choices=self.view.stage.choices,
                 )
             except BaseException:
                 self.engine.stop()

@@ -161,10 +161,17 @@ class MaintenanceSection(Section):
 class SceneSection(Section):
     """The three-dimensional scene."""
 
-    kind: Literal["belief", "vehicle"] = "belief"
-    """belief: the estimate as a point with its 2-sigma ellipsoid, over `axes`. vehicle: a body on a plane."""
+    kind: Literal["belief", "vehicle", "motor", "battery"] = "belief"
+    """belief: the estimate as a point with its 1- and 2-sigma ellipsoids, over `axes`; every twin has it. vehicle: a
+    body on a plane. motor: one cut open, in the colours of its temperatures. battery: its cells."""
     axes: Annotated[tuple[Text, ...], Field(min_length=1, max_length=3)] | None = None
-    """belief: the states along x, y and z. Default: the first three."""
+    """belief: the states along x, y and z at first. Default: the first three."""
+    parts: dict[Literal["winding", "tooth", "yoke", "magnet"], Text] | None = None
+    """motor: which state is the temperature of which part. Parts that are not here are grey."""
+    charge: Annotated[tuple[Text, ...], Field(min_length=1, max_length=24)] | None = None
+    """battery: the state of charge of each cell, from 0 to 1."""
+    temperature: Annotated[tuple[Text, ...], Field(max_length=24)] = ()
+    """battery: the temperature of each cell. Default: cells have no colour."""
     position: tuple[Text, Text] | None = None
     """vehicle: the states of the position to the east and to the north."""
     heading: Text | None = None
@@ -173,9 +180,12 @@ class SceneSection(Section):
     """vehicle: what it moves among, as lines of points [east, north] in metres. Default: nothing."""
 
     @model_validator(mode="after")
-    def _vehicle(self) -> SceneSection:
-        if self.kind == "vehicle" and self.position is None:
-            raise PydanticCustomError("neither", "is a vehicle and has no {keys}", {"keys": "position"})
+    def _complete(self) -> SceneSection:
+        needed = {"vehicle": "position", "motor": "parts", "battery": "charge"}.get(self.kind)
+        if needed is not None and not getattr(self, needed):
+            raise PydanticCustomError("neither", "is a {kind} and has no {keys}", {"kind": self.kind, "keys": needed})
+        if self.temperature and len(self.temperature) != len(self.charge or ()):
+            raise PydanticCustomError("neither", "has not as many temperatures as states of charge", {})
         return self
 
 

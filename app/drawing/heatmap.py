@@ -12,6 +12,7 @@ from estimators.model.field import Field
 from estimators.model.state_space import StateSpaceModel
 
 from .geometry import round_step, tick_text
+from .palette import EITHER
 
 WARM = ("#0b1354", "#3b2e8c", "#7b2f8d", "#b73779", "#e8604c", "#f9a03f", "#fcf3a6")
 """Low to high values of a quantity."""
@@ -25,7 +26,7 @@ SIGNED = ("#1d4ed8", "#7aa2f0", "#f5f5f5", "#f2a07a", "#b91c1c")
 NOTHING = 255
 """Index of the colour of what is unknown: grey."""
 
-QUIET, ODD, FAR, SILENT, RIM = (255, 255, 255), (245, 158, 11), (220, 38, 38), (120, 120, 128), (51, 65, 85)
+QUIET, ODD, FAR, SILENT, RIM = (255, 255, 255), EITHER.reading, EITHER.refused, EITHER.faint, (51, 65, 85)
 """Colours of a sensor whose innovation is below two of its deviations, below three, above; that said nothing; and of
 the line around it."""
 
@@ -57,7 +58,7 @@ def image_of(picture: Picture, kind: Kind) -> np.ndarray | None:
     return {ESTIMATE.name: picture.mean, DEVIATION.name: picture.std, TRUE.name: picture.truth}[kind.name]
 
 
-def palette(colors: tuple[str, ...]) -> np.ndarray:
+def gradient(colors: tuple[str, ...]) -> np.ndarray:
     """256 colours (256, 3) uint8 between some, evenly spaced; the last stands for `NOTHING`."""
     anchors = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in colors], float)
     at = np.linspace(0, len(colors) - 1, NOTHING)

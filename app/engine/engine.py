@@ -192,9 +192,9 @@ class Engine:
         """Queue a command."""
         self._inbox.put(command)
 
-    def cursor(self, *, follows_log: bool = False) -> Cursor:
-        """A cursor for one consumer, for `pull`; give it back with `release`. See `Cursor` for `follows_log`."""
-        cursor = Cursor(follows_log=follows_log)
+    def cursor(self, *, follows_log: bool = False, span: int | None = None) -> Cursor:
+        """A cursor for one consumer, for `pull`; give it back with `release`. See `Cursor` for the rest."""
+        cursor = Cursor(follows_log=follows_log, span=span)
         with self._reading():
             self._cursors.append(cursor)
         return cursor
@@ -211,7 +211,7 @@ class Engine:
             fresh = cursor.log != self._logs or (cursor.revision != self._revision and not cursor.follows_log)
             cursor.log, cursor.revision = self._logs, self._revision
             if fresh:
-                cursor.next, cursor.picture = 0, -1
+                cursor.next, cursor.picture = self._from(cursor.span), -1
             start = max(cursor.next // align * align, log.first)
             end = log.first + fold.n
             if limit is not None:
@@ -235,6 +235,13 @@ class Engine:
         if lines:
             cursor.notice = lines[-1].number + 1
         return replace(pull, notices=lines)
+
+    def _from(self, span: int | None) -> int:
+        """Absolute index of the first folded event in the last `span` ns; 0 of all."""
+        n = self._fold.n
+        if span is None or not n:
+            return 0
+        return self._log.first + int(np.searchsorted(self._log.t[:n], self._log.t[n - 1] - span))
 
     def rows(self, start: int, stop: int) -> Pull:
         """Copies of the rows with these absolute indices, as far as they are there; no cursor moves."""

@@ -66,8 +66,8 @@ class Running(Protocol):
     def status(self) -> Status:
         """What a panel shows."""
 
-    def cursor(self, *, follows_log: bool = False) -> Cursor:
-        """A cursor for one consumer, for `pull`; give it back with `release`."""
+    def cursor(self, *, follows_log: bool = False, span: int | None = None) -> Cursor:
+        """A cursor for one consumer, for `pull`; give it back with `release`. See `Cursor`."""
 
     def release(self, cursor: Cursor) -> None:
         """Forget a cursor."""

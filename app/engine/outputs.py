@@ -25,10 +25,12 @@ class Cursor:
     """How far one consumer has read. `next` is the absolute index of the next row; a rewritten row moves it back.
 
     `picture` is the index of the last picture of a large field that was read. One that `follows_log` starts again with
-    another log only; for the others another revision does so too.
+    another log only; for the others another revision does so too. Whoever starts so gets no rows that are more than
+    `span` (ns) older than the newest; None gets all.
     """
 
     follows_log: bool = False
+    span: int | None = None
     log: int = -1
     revision: int = -1
     next: int = 0

@@ -33,7 +33,7 @@ export class ExploreStream {
   open() {
     clearTimeout(this.timer);
     if (this.socket || this.asleep || document.hidden) return;
-    const socket = new WebSocket(`ws://${location.host}/rerun/stream?layout=${this.layout ? 1 : 0}`);
+    const socket = new WebSocket(`ws://${location.host}/rerun/stream?layout=${this.layout ? 1 : 0}&theme=${document.documentElement.dataset.theme}`);
     socket.binaryType = "arraybuffer";
     this.socket = socket;
     // One message after the other: each is drawn before the next is looked at.

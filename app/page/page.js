@@ -70,7 +70,7 @@ new Episodes($("episodes"), link, view, charts);
 const runs = new Runs($("runs"), link);
 const transport = new Transport(model, link, view, charts);
 const explore = new Explore(settings.viewer, theme);
-const stage = new Stage(settings.viser, theme);
+const stage = new Stage(settings.viser, theme, link);
 
 // What is hidden neither computes nor asks.
 const panes = { explore, whatif: new WhatIf($("whatif"), model, link), diagnose: new Diagnose($("diagnose"), link) };
@@ -131,7 +131,7 @@ keys([
   ["b", "between what runs and the run before it", () => runs.swap()],
   ["e", "episodes", () => side.show("episodes")],
   ["y", "two states against each other", () => side.show("xy")],
-  ["s", "scene", () => side.show("scene")],
+  ["s", "scene; once more: large, and back", () => (side.chosen === "scene" ? stage.enlarge() : side.show("scene"))],
   ["x", "explore in Rerun, and back", () => turn("explore")],
   ["w", "what if, and back", () => turn("whatif")],
   ["d", "diagnose, and back", () => turn("diagnose")],

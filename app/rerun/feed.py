@@ -23,6 +23,7 @@ import rerun as rr
 from estimators.log import Events
 from estimators.track import Track
 
+from ..drawing.palette import EITHER, Palette
 from ..engine.notices import KEPT
 from .rows import RerunRows
 
@@ -49,16 +50,17 @@ Message = str | bytes
 class RerunFeed:
     """Gives what the viewer of one browser needs next. Not to be called by two threads at once."""
 
-    def __init__(self, engine: Running, *, layout: bool = True) -> None:
+    def __init__(self, engine: Running, *, layout: bool = True, palette: Palette = EITHER) -> None:
         """Prepare; nothing is pulled yet.
 
         Args:
             engine: Whose rows to give.
             layout: Whether the first recording brings the blueprint; False if the viewer has it from an earlier feed.
+            palette: The colours of the viewer's theme.
         """
         self._engine = engine
         self._cursor = engine.cursor()
-        self._layout = layout
+        self._layout, self._palette = layout, palette
         self._frame = 0
         self._notices: deque[Notice] = deque(maxlen=KEPT)
         self._name = uuid.uuid4().hex[:8]
@@ -133,7 +135,9 @@ class RerunFeed:
         name = f"{self._name}-{pull.revision}"
         self._stream = rr.RecordingStream(self.application, recording_id=name, send_properties=False)
         self._bytes = self._stream.binary_stream()
-        rows = self._rows = RerunRows(self._stream, self._engine, series=SERIES, layout=self._layout)
+        rows = self._rows = RerunRows(
+            self._stream, self._engine, series=SERIES, layout=self._layout, palette=self._palette
+        )
         self._layout = False
         self._frame = 0
         announcement = json.dumps({"recording": f"Recording:{self.application}:{name}", "revision": pull.revision})

@@ -10,7 +10,8 @@ from estimators.log import READING, Events
 from estimators.model.state_space import StateSpaceModel
 from estimators.track import Track
 
-from ..drawing.heatmap import RIM, Frame, Scale, image_of, kinds, palette, positioned, sensor_colors
+from ..drawing.heatmap import RIM, Frame, Scale, gradient, image_of, kinds, positioned, sensor_colors
+from ..drawing.palette import EITHER, Palette
 from .sink import Sink
 from .style import GAP
 
@@ -18,13 +19,14 @@ from .style import GAP
 class FieldDrawing:
     """Logs the pictures of a field below /field, and one line for all innovations of a sensor."""
 
-    def __init__(self, model: StateSpaceModel, *, truth: bool) -> None:
+    def __init__(self, model: StateSpaceModel, *, truth: bool, theme: Palette = EITHER) -> None:
+        self._theme = theme
         assert model.grid is not None
         self._model = model
         self._frame = Frame.of(model.grid)
         self._bar = max(3, round(GAP * self._frame.width))
         self._kinds = kinds(truth)
-        self._palettes = {kind.name: palette(kind.colors) for kind in self._kinds}
+        self._palettes = {kind.name: gradient(kind.colors) for kind in self._kinds}
         self._scales = {kind.name: Scale(kind) for kind in self._kinds}
         places, self._which = positioned(model)
         self._dots = self._frame.pixels(places) if len(places) else np.zeros((0, 2))
@@ -58,7 +60,12 @@ class FieldDrawing:
             sink.static(
                 f"/field/{kind.name}/cells",
                 rr.Points2D(
-                    self._probes, radii=-3.0, colors=[(16, 185, 129)], labels=names, show_labels=False, draw_order=40.0
+                    self._probes,
+                    radii=-3.0,
+                    colors=[self._theme.estimate],
+                    labels=names,
+                    show_labels=False,
+                    draw_order=40.0,
                 ),
             )
 

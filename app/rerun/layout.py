@@ -12,20 +12,9 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.quantiles import chi_square_quantile
 
 from ..drawing.direct_readings import observed
+from ..drawing.palette import EITHER, RGB, Palette
 from . import layout_field
-from .style import (
-    BAND,
-    ESTIMATE,
-    EVENTS,
-    PREVIOUS,
-    READING,
-    REFUSED,
-    TIMELINE,
-    TRUTH,
-    pair_name,
-    row_title,
-    with_unit,
-)
+from .style import EVENTS, TIMELINE, band_color, pair_name, row_title, with_unit
 
 LANES = 6
 """Sensors at most whose states are drawn, in a tab behind the twin's health."""
@@ -135,19 +124,23 @@ def _group_name(views: list[Any]) -> str:
     return ", ".join(str(view.name).split(" [")[0] for view in views)
 
 
-def styles(stream: rr.RecordingStream, model: StateSpaceModel, pairs: np.ndarray, root: str = "") -> None:
+def styles(
+    stream: rr.RecordingStream, model: StateSpaceModel, pairs: np.ndarray, root: str = "", palette: Palette = EITHER
+) -> None:
     """Log how everything is drawn; static, so that it holds at every time."""
 
     def style(path: str, what: Any) -> None:
         stream.log(f"{root}{path}", what, static=True)
 
-    def band(name: str, color: tuple[int, int, int]) -> rr.SeriesLines:
-        return rr.SeriesLines(colors=[color, BAND, BAND], names=[name, "+2σ", "−2σ"], widths=[2.0, 1.0, 1.0])
+    light, grey = band_color(palette), palette.previous
+
+    def band(name: str, color: RGB) -> rr.SeriesLines:
+        return rr.SeriesLines(colors=[color, light, light], names=[name, "+2σ", "−2σ"], widths=[2.0, 1.0, 1.0])
 
     for state in model.shown_states:
-        style(f"/state/{state.name}", band("estimate", ESTIMATE))
-        style(f"/truth/{state.name}", rr.SeriesLines(colors=[TRUTH], names=["truth"], widths=[1.0]))
-        style(f"/previous/state/{state.name}", rr.SeriesLines(colors=[PREVIOUS], names=["previous"], widths=[1.0]))
+        style(f"/state/{state.name}", band("estimate", palette.estimate))
+        style(f"/truth/{state.name}", rr.SeriesLines(colors=[palette.truth], names=["truth"], widths=[1.0]))
+        style(f"/previous/state/{state.name}", rr.SeriesLines(colors=[grey], names=["previous"], widths=[1.0]))
     dots = {model.row_names[model.row_start[item.sensor] + item.row] for item in observed(model)}
     for name in model.row_names:
         if model.grid is not None and name not in dots:
@@ -155,22 +148,21 @@ def styles(stream: rr.RecordingStream, model: StateSpaceModel, pairs: np.ndarray
         words = name.replace("_", " ")
         # Points are drawn over lines, so they must let them shine through.
         for kind, color, size, mark in (
-            ("reading", (*READING, 70), 1.5, "circle"),
-            ("refused", REFUSED, 3.5, "circle"),
-            ("screened", REFUSED, 4.0, "cross"),
+            ("reading", (*palette.reading, 70), 1.5, "circle"),
+            ("refused", palette.refused, 3.5, "circle"),
+            ("screened", palette.refused, 4.0, "cross"),
         ):
             title = words if kind == "reading" else f"{words}, {kind}"
             points = rr.SeriesPoints(colors=[color], names=[title], marker_sizes=[size], markers=[mark])
             style(f"/{kind}/{name}", points)
         if model.grid is None:
-            style(f"/innovation/{name}", band("innovation", READING))
+            style(f"/innovation/{name}", band("innovation", palette.reading))
     if model.grid is not None:
-        layout_field.styles(style, model)
-    style("/nis/reading", rr.SeriesPoints(colors=[BAND], names=["NIS of a reading"], marker_sizes=[1.5]))
-    style("/nis/window", rr.SeriesLines(
-        colors=[ESTIMATE, TRUTH, TRUTH], names=["windowed mean", "95 % low", "95 % high"], widths=[2.0, 1.0, 1.0]
-    ))  # fmt: skip
-    style("/previous/nis", rr.SeriesLines(colors=[PREVIOUS], names=["previous"], widths=[1.0]))
+        layout_field.styles(style, model, palette)
+    style("/nis/reading", rr.SeriesPoints(colors=[light], names=["NIS of a reading"], marker_sizes=[1.5]))
+    nis = {"names": ["windowed mean", "95 % low", "95 % high"], "widths": [2.0, 1.0, 1.0]}
+    style("/nis/window", rr.SeriesLines(colors=[palette.estimate, palette.bound, palette.bound], **nis))
+    style("/previous/nis", rr.SeriesLines(colors=[grey], names=["previous"], widths=[1.0]))
     for pair in pairs:
         # Rerun's 2D view has y downwards.
         style(f"/pair/{pair_name(model, pair)}/up", rr.Transform3D(scale=[1.0, -1.0, 1.0]))

@@ -11,9 +11,8 @@ import rerun.blueprint as rrb
 from estimators.model.state_space import StateSpaceModel
 
 from ..drawing.heatmap import Frame, kinds
+from ..drawing.palette import Palette
 from .style import GAP
-
-RMSE, SPREAD = (22, 163, 74), (37, 99, 235)
 
 
 def pictures(model: StateSpaceModel, root: str, *, truth: bool) -> rrb.Horizontal:
@@ -49,12 +48,12 @@ def sums(model: StateSpaceModel, chart: Callable[..., Any], *, truth: bool) -> l
     return found
 
 
-def styles(style: Callable[[str, Any], None], model: StateSpaceModel) -> None:
+def styles(style: Callable[[str, Any], None], model: StateSpaceModel, palette: Palette) -> None:
     """How the lines of a field are drawn."""
-    style("/field/rmse", rr.SeriesLines(colors=[RMSE], names=["RMSE"], widths=[2.0]))
-    style("/field/spread", rr.SeriesLines(colors=[SPREAD], names=["spread"], widths=[2.0]))
+    style("/field/rmse", rr.SeriesLines(colors=[palette.truth], names=["RMSE"], widths=[2.0]))
+    style("/field/spread", rr.SeriesLines(colors=[palette.estimate], names=["spread"], widths=[2.0]))
     for sensor in model.sensors:
         style(
             f"/innovation/{sensor.name}",
-            rr.SeriesLines(colors=[(245, 158, 11), (220, 38, 38)], names=["rms", "largest"], widths=[2.0, 1.0]),
+            rr.SeriesLines(colors=[palette.reading, palette.refused], names=["rms", "largest"], widths=[2.0, 1.0]),
         )

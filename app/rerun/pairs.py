@@ -10,9 +10,8 @@ from estimators.log import RESET, Events, truth_of
 from estimators.model.state_space import StateSpaceModel
 from estimators.track import Track
 
+from ..drawing.palette import EITHER, Palette
 from .sink import Sink
-from .style import ESTIMATE, PREVIOUS
-from .style import TRUTH as TRUTH_COLOR
 from .thin import last_of_stretch
 
 CORNERS = 65
@@ -108,7 +107,10 @@ def axis_scales(model: StateSpaceModel, pair: np.ndarray) -> np.ndarray:
 class PairDrawing:
     """Draws one pair of states below one path."""
 
-    def __init__(self, model: StateSpaceModel, index: int, pair: np.ndarray, path: str) -> None:
+    def __init__(
+        self, model: StateSpaceModel, index: int, pair: np.ndarray, path: str, palette: Palette = EITHER
+    ) -> None:
+        self._palette = palette
         self._model = model
         self._index = index
         self._pair = pair
@@ -160,18 +162,20 @@ class PairDrawing:
         cross = track.cross[:, self._index] / self._scale.prod()
         points = ellipse_points(mean, var, cross).astype(np.float32)
         count = np.full(t.size, 1)
-        sink.columns(f"{self._path}/ellipse", t, _lines(list(points), ESTIMATE, 1.0).partition(count))
+        sink.columns(f"{self._path}/ellipse", t, _lines(list(points), self._palette.estimate, 1.0).partition(count))
         dots = rr.Points2D.columns(
-            positions=mean.astype(np.float32), colors=[ESTIMATE] * t.size, radii=np.full(t.size, -3.0, np.float32)
+            positions=mean.astype(np.float32),
+            colors=[self._palette.estimate] * t.size,
+            radii=np.full(t.size, -3.0, np.float32),
         )
         sink.columns(f"{self._path}/mean", t, dots.partition(count))
         way = self._trail(sink, t, mean.astype(np.float32), past)
         numbers = rr.Points2D.columns(
-            positions=anchors(mean, points, way).astype(np.float32), colors=[ESTIMATE] * t.size,
+            positions=anchors(mean, points, way).astype(np.float32), colors=[self._palette.estimate] * t.size,
             labels=self._labels(track), radii=np.full(t.size, -0.01, np.float32),
         )  # fmt: skip
         sink.columns(f"{self._path}/numbers", t, numbers.partition(count))
-        sink.columns(f"{self._path}/way", t, _lines(way, PREVIOUS, 0.5).partition(count))
+        sink.columns(f"{self._path}/way", t, _lines(way, self._palette.previous, 0.5).partition(count))
 
     def _labels(self, track: Track) -> list[str]:
         units = [self._model.states[j].unit.replace("1", "") for j in self._pair]
@@ -206,7 +210,7 @@ class PairDrawing:
         near = np.unique(np.clip(np.searchsorted(times, wanted), 0, times.size - 1))
         values = np.stack((a[of_a], b[of_b]), axis=1)[near] / self._scale
         dots = rr.Points2D.columns(
-            positions=values.astype(np.float32), colors=[TRUTH_COLOR] * near.size,
+            positions=values.astype(np.float32), colors=[self._palette.truth] * near.size,
             radii=np.full(near.size, -4.0, np.float32),
         )  # fmt: skip
         sink.columns(f"{self._path}/truth", times[near], dots.partition(np.full(near.size, 1)))

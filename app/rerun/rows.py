@@ -11,6 +11,7 @@ from estimators.log import READING, Events, truth_of
 from estimators.track import FAILED, GATED, HEALTH_NAMES, Track
 
 from ..drawing.direct_readings import observed
+from ..drawing.palette import EITHER, Palette
 from ..engine.counts import estimated_rows
 from ..engine.interface import Running
 from ..engine.notices import Notice
@@ -19,7 +20,7 @@ from .field import FieldDrawing
 from .layout import LANES, blueprint, styles
 from .pairs import PairDrawing
 from .sink import Sink
-from .style import EVENTS, HEALTH_COLORS, SENSOR_COLORS, pair_name
+from .style import EVENTS, pair_name, state_colors
 from .thin import last_of_each_time
 
 PIXELS = 1200
@@ -38,7 +39,13 @@ class RerunRows:
     """
 
     def __init__(
-        self, stream: rr.RecordingStream, engine: Running, *, series: float | None, layout: bool = True
+        self,
+        stream: rr.RecordingStream,
+        engine: Running,
+        *,
+        series: float | None,
+        layout: bool = True,
+        palette: Palette = EITHER,
     ) -> None:
         """Log layout and styles.
 
@@ -48,7 +55,9 @@ class RerunRows:
             series: Stretches of time into which a long history is cut, each drawn by its extremes; those of the
                 charts' window are never cut finer than its `PIXELS`, which is what infinity gives. None draws all.
             layout: Whether to log the blueprint.
+            palette: The colours; of a file, whose viewer is not known, those between light and dark.
         """
+        self._palette = palette
         self.model = engine.model
         self.pairs = np.asarray(engine.pairs, int).reshape(-1, 2)
         self.sink = Sink(stream, window=float(engine.twin.config.view.window))
@@ -68,11 +77,11 @@ class RerunRows:
         self._health = -1
         self._drawn = np.zeros(0, np.int64)
         self._drawn_t = np.zeros(0, np.int64)
-        styles(self.sink.stream, self.model, self.pairs, root)
+        styles(self.sink.stream, self.model, self.pairs, root, self._palette)
         self.sink.static(
             "/health",
             rr.StateConfiguration(
-                values=list(HEALTH_NAMES), labels=list(HEALTH_NAMES), colors=np.array(HEALTH_COLORS, np.uint32)
+                values=list(HEALTH_NAMES), labels=list(HEALTH_NAMES), colors=state_colors(HEALTH_NAMES, self._palette)
             ),
         )
         self._sensors = list(self.model.sensor_names) if len(self.model.sensors) <= LANES else []
@@ -81,17 +90,18 @@ class RerunRows:
             self.sink.static(
                 f"/sensor/{name}",
                 rr.StateConfiguration(
-                    values=list(STATES), labels=list(STATES), colors=np.array(SENSOR_COLORS, np.uint32)
+                    values=list(STATES), labels=list(STATES), colors=state_colors(STATES, self._palette)
                 ),
             )
         if self._layout:
             layout = blueprint(self.model, self.pairs, window=self.sink.window, root=root, truth=self._tells_field)
             self.sink.stream.send_blueprint(layout)
-        self._field = FieldDrawing(self.model, truth=self._tells_field) if self.model.grid is not None else None
-        if self._field is not None:
+        self._field: FieldDrawing | None = None
+        if self.model.grid is not None:
+            self._field = FieldDrawing(self.model, truth=self._tells_field, theme=self._palette)
             self._field.static(self.sink)
         self._ellipses = [
-            PairDrawing(self.model, k, pair, f"/pair/{pair_name(self.model, pair)}/up")
+            PairDrawing(self.model, k, pair, f"/pair/{pair_name(self.model, pair)}/up", self._palette)
             for k, pair in enumerate(self.pairs)
         ]
 

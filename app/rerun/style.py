@@ -1,17 +1,16 @@
-"""Colours and names that Rerun's charts, pictures and recordings share."""
+"""Names and colours that Rerun's charts, pictures and recordings share; the colours are the page's."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
+
+import numpy as np
 
 from estimators.model.state_space import StateSpaceModel
 
-ESTIMATE = (37, 99, 235)
-BAND = (147, 187, 253)
-TRUTH = (22, 163, 74)
-READING = (245, 158, 11)
-REFUSED = (220, 38, 38)
-PREVIOUS = (160, 160, 168)
+from ..drawing.palette import RGB, Palette, mixed
+
 EVENTS = "/events"
 """Where the lines for people are, whichever revision the charts show."""
 
@@ -20,9 +19,16 @@ TIMELINE = "time"
 GAP = 0.05
 """Between the picture of a field and its scale, and the width of the scale, of the picture's width."""
 
-HEALTH_COLORS = (0x60A5FAFF, 0x16A34AFF, 0xFACC15FF, 0xF59E0BFF, 0xDC2626FF, 0x9CA3AFFF)
-SENSOR_COLORS = (0x60A5FAFF, 0x16A34AFF, 0xFACC15FF, 0xF59E0BFF, 0x9CA3AFFF, 0x64748BFF)
-"""Of the states of a sensor, in the order of `STATES`."""
+
+def state_colors(names: Sequence[str], palette: Palette) -> np.ndarray:
+    """Colours of states of health, as Rerun packs them (n,) uint32; what is no health is grey."""
+    colors = [palette.health.get(name, palette.faint) for name in names]
+    return np.array([(r << 24) | (g << 16) | (b << 8) | 255 for r, g, b in colors], np.uint32)
+
+
+def band_color(palette: Palette) -> RGB:
+    """Of the lines at ± 2 σ, and of what else belongs to the estimate but is not the line itself."""
+    return mixed(palette.estimate, palette.panel, 0.45)
 
 
 def with_unit(name: str, unit: str) -> str:

@@ -14,6 +14,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+from urllib.parse import urlsplit
 
 import rich
 import viser
@@ -53,6 +54,13 @@ def guarded_server(secret: str, label: str) -> viser.ViserServer:
     # The theme only hides the button; a client could still ask for the tunnel.
     server._websock_server.unregister_handler(_messages.ShareUrlRequest)
     return server
+
+
+def addresses(server: viser.ViserServer) -> list[str]:
+    """Of each browser that is connected, the query of the address at which it asked for its WebSocket."""
+    # Viser tells who is there, but not what they asked for.
+    connections = list(server._websock_server._live_connections.values())
+    return [urlsplit(there.request.path).query for there in connections if there.request is not None]
 
 
 @contextmanager

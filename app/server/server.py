@@ -23,10 +23,12 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
-from estimators.errors import NisusError
+from estimators.errors import ConfigError, NisusError
 
 from ..analysis.diagnosis import Diagnosis
 from ..analysis.forecast import Forecasts, question_from_json
+from ..drawing.choices import Choices
+from ..drawing.palette import EITHER, THEMES
 from ..engine.interface import Running
 from ..rerun.feed import RerunFeed
 from ..series.series import Series
@@ -75,6 +77,7 @@ class PageServer:
         viser_port: int | None,
         secret: str,
         review: Path | None = None,
+        choices: Choices | None = None,
     ) -> None:
         """Take the port.
 
@@ -84,12 +87,14 @@ class PageServer:
             viser_port: Where the private Viser server listens; None if there is none.
             secret: What Viser asks for.
             review: The recording that is reviewed, offered beside those that this process writes.
+            choices: What may be chosen about Viser's scene; None if there is none.
 
         Raises:
             ConfigError: If the port cannot be had.
         """
         self._engine = engine
         self._review = review
+        self._choices = choices
         self._series = Series(engine)
         self._runs = RunsApi(engine)
         self._forecasts, self._diagnosis = Forecasts(engine), Diagnosis(engine)
@@ -141,6 +146,7 @@ class PageServer:
     def _application(self) -> Starlette:
         routes: list[Any] = [
             Route("/", self._page),
+            Route("/explore", self._page),
             Route("/api/status", self._status),
             Route("/api/model", self._model),
             Route("/api/episodes", self._episodes),
@@ -150,6 +156,7 @@ class PageServer:
             Route("/api/command", self._command, methods=["POST"]),
             Route("/api/forecast", self._forecast, methods=["GET", "POST"]),
             Route("/api/diagnose", self._diagnose),
+            Route("/api/scene", self._scene, methods=["GET", "POST"]),
             Route(f"/viewer/{viewer_version()}/{{name}}", self._viewer_file),
             Route("/rec/{name}", self._recording),
             WebSocketRoute("/api/stream", self._page_stream),
@@ -166,7 +173,8 @@ class PageServer:
         return _WithHeaders(application, self.port)  # type: ignore[return-value]
 
     async def _page(self, request: Request) -> Response:
-        text = (PAGE / "index.html").read_text()
+        name = "explore.html" if request.url.path == "/explore" else "index.html"
+        text = (PAGE / name).read_text()
         settings = {"viewer": f"/viewer/{viewer_version()}", "boot": self._boot, "viser": self._viser is not None}
         # In an attribute, not in a script: the policy allows no inline ones.
         quoted = json.dumps(settings).replace("&", "&amp;").replace('"', "&quot;")
@@ -176,7 +184,8 @@ class PageServer:
         return Json(self._state())
 
     def _state(self) -> dict[str, Any]:
-        return {**status_json(self._engine), "recordings": sorted(self._recordings())}
+        scene = [] if self._choices is None else self._choices.json()
+        return {**status_json(self._engine), "recordings": sorted(self._recordings()), "scene": scene}
 
     async def _model(self, request: Request) -> Response:
         return Json(await asyncio.to_thread(model_json, self._engine))
@@ -221,6 +230,20 @@ class PageServer:
         except NisusError as error:
             return Json({"error": one_line(str(error))}, 503)
 
+    async def _scene(self, request: Request) -> Response:
+        """What may be chosen about the scene; or choose, with `{"key": …, "value": …}`."""
+        choices = self._choices
+        if choices is None:
+            return PlainTextResponse("Nisus: there is no scene.\n", 404)
+
+        async def choose(body: Any) -> Response:
+            if not isinstance(body, dict):
+                raise ConfigError(f"scene: {body!r} is no object")
+            choices.choose(str(body.get("key")), str(body.get("value")))
+            return Json(choices.json())
+
+        return Json(choices.json()) if request.method != "POST" else await _answered(request, choose)
+
     async def _viewer_file(self, request: Request) -> Response:
         name = request.path_params["name"]
         if name not in FILES:
@@ -256,7 +279,8 @@ class PageServer:
         """Feed one Rerun viewer: each frame when it has drawn the one before."""
         await browser.accept()
         layout = browser.query_params.get("layout", "1") == "1"
-        feed = await asyncio.to_thread(RerunFeed, self._engine, layout=layout)
+        palette = THEMES.get(browser.query_params.get("theme", ""), EITHER)
+        feed = await asyncio.to_thread(RerunFeed, self._engine, layout=layout, palette=palette)
         drawn = asyncio.Event()
         drawn.set()
         listener = asyncio.create_task(_listen_to(browser, drawn))

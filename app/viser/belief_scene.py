@@ -1,4 +1,4 @@
-"""The belief plot: the estimate over up to three states, as a point in its 2σ ellipsoid, on axes with numbers."""
+"""The belief plot: the estimate over two or three states, in its ellipses of 1σ and 2σ, on axes with numbers."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.peaks import Peak
 
 from ..drawing.geometry import circle, disc, ellipsoid, round_step, segments, tick_text
+from ..drawing.palette import Palette, mixed
 from ..engine.outputs import Belief
-from .camera import fit_cameras
+from .camera import Outlook
 from .history import History
 
-TRAIL = 120
+TRAIL = 80
 """Rows of the track that are drawn behind the point."""
 
 TICKS = (-2, -1, 0, 1, 2)
@@ -25,6 +26,12 @@ PEAKS = 6
 
 HALF = 2.5
 """Half an axis, in ticks."""
+
+SIZES = ((1, 0.022), (3, 0.036), (10, 0.06), (100, 0.1))
+"""A point that stands for so many of its kind, or more, is drawn so large: particles of more weight are larger."""
+
+OUTSIDE = 1.3
+"""Place on an axis, which ends at 1, up to which points are drawn."""
 
 
 class _Axis:
@@ -54,147 +61,155 @@ class _Axis:
 
 
 class BeliefScene:
-    """Two states: a plane seen from above. Three: a box that the user turns."""
+    """Up to two states: a plane seen from above. Three: a box that the user turns."""
 
-    def __init__(self, server: viser.ViserServer, model: StateSpaceModel, axes: tuple[str, ...] | None) -> None:
+    def __init__(self, api: viser.SceneApi, model: StateSpaceModel, axes: list[int], palette: Palette) -> None:
         self.model = model
-        chosen = [model.state_names.index(name) for name in axes] if axes else list(range(min(3, model.nx)))
-        self.axes = [_Axis(j) for j in chosen]
-        self.flat = model.nx < 3
-        self._stale = True
-        api = server.scene
-        api.set_up_direction("+z")
+        self.axes = [_Axis(j) for j in axes]
+        self.flat = flat = len(axes) < 3
+        self._known = False
+        self.root = api.add_frame("/scene", show_axes=False)
         line = {"thickness_units": "screen"}
-        flat = self.flat
         ticks = np.array(TICKS) / HALF
-        api.add_line_segments("/grid", _grid(ticks, flat), (214, 220, 230), thickness=1, **line)
-        api.add_line_segments("/box", _frame(flat), (148, 163, 184), thickness=1.5, **line)
+        api.add_line_segments("/scene/grid", _grid(ticks, flat), palette.rule, thickness=1, **line)
+        api.add_line_segments("/scene/box", _frame(flat), palette.bound, thickness=1.5, **line)
+        shown = range(2 if flat else 3)
         self._labels = [
-            [api.add_label(f"/ticks/{k}/{i}", " ", position=_beside(k, tick, 1.09, flat), anchor="center-center",
-                           font_screen_scale=0.75) for i, tick in enumerate(ticks)]
-            for k in range(2 if flat else 3)
+            [api.add_label(f"/scene/ticks/{k}/{i}", " ", position=_beside(k, tick, 1.09, flat), anchor="center-center",
+                           font_screen_scale=0.75, visible=k < len(axes)) for i, tick in enumerate(ticks)]
+            for k in shown
         ]  # fmt: skip
         self._titles = [
-            api.add_label(f"/titles/{k}", " ", position=_title_place(k, flat), font_screen_scale=0.9,
-                          anchor="bottom-left" if flat and k else "center-center")
-            for k in range(2 if flat else 3)
+            api.add_label(f"/scene/titles/{k}", " ", position=_title_place(k, flat), font_screen_scale=0.9,
+                          anchor="bottom-left" if k and (flat or k == 2) else "center-center", visible=k < len(axes))
+            for k in shown
         ]  # fmt: skip
-        nothing = np.zeros((1, 2, 3), np.float32)
-        dot = {"point_shape": "circle", "precision": "float32", "point_shading": "flat"}
         one = np.zeros((1, 3), np.float32)
-        # All that moves with the estimate hangs on one frame, so that no redraw shows half of a step.
-        self._belief = api.add_frame("/belief", show_axes=False)
-        self._trail = api.add_line_segments("/belief/trail", nothing, (120, 160, 240), thickness=2, **line)
-        self._points = api.add_point_cloud("/belief/points", one, (124, 58, 237), point_size=0.03, visible=False, **dot)
-        self._truth = api.add_point_cloud("/truth", one, (22, 163, 74), point_size=0.04, visible=False, **dot)
+        dot = {"point_shape": "circle", "precision": "float32", "point_shading": "flat"}
+        light = mixed(palette.estimate, palette.panel, 0.35)
+        self._trail = api.add_line_segments("/scene/trail", np.zeros((1, 2, 3), np.float32), light, thickness=2, **line)
+        self._clouds = [
+            api.add_point_cloud(f"/scene/points/{k}", one, mixed(palette.estimate, palette.panel, 0.2), point_size=size,
+                                visible=False, point_shape="circle", point_shading="flat")
+            for k, (_, size) in enumerate(SIZES)
+        ]  # fmt: skip
+        self._truth = api.add_point_cloud("/scene/truth", one, palette.truth, point_size=0.05, visible=False,
+                                          **dot | {"point_shape": "diamond"})  # fmt: skip
+        self._belief = api.add_frame("/scene/belief", show_axes=False)
         self._mean = api.add_point_cloud(
-            "/belief/mean", one + [0.0, 0.0, 0.04 if flat else 0.0], (29, 78, 216), point_size=0.04, **dot
+            "/scene/belief/mean", one + [0.0, 0.0, 0.04 if flat else 0.0], palette.estimate, point_size=0.04, **dot
         )
         self._peaks = [
             (
-                api.add_point_cloud(f"/peaks/{k}/mean", one, (190, 24, 93), point_size=0.05, visible=False, **dot),
-                api.add_label(f"/peaks/{k}/weight", " ", visible=False, font_screen_scale=0.8, anchor="bottom-left"),
+                api.add_point_cloud(
+                    f"/scene/peaks/{k}/mean", one, palette.estimate, point_size=0.05, visible=False, **dot
+                ),
+                api.add_label(f"/scene/peaks/{k}/weight", " ", visible=False, font_screen_scale=0.8,
+                              anchor="bottom-left"),
             )
             for k in range(PEAKS)
-        ]
+        ]  # fmt: skip
+        self._bodies = [self._body(api, sigmas, palette, line) for sigmas in (1, 2)]
+        margin = np.array([[-1.3, -1.32, 0.0], [1.12, -1.32, 0.0], [-1.3, 1.22, 0.0], [1.12, 1.22, 0.0]])
         if flat:
-            vertices, faces = disc()
-            body = api.add_mesh_simple("/belief/ellipse/disc", vertices, faces, color=(96, 146, 246), opacity=0.25,
-                                       side="double", cast_shadow=False, receive_shadow=False)  # fmt: skip
-            rim = api.add_line_segments("/belief/ellipse/rim", circle(), (37, 99, 235), thickness=2, **line)
-            self._bodies = [body, rim]
+            # From far away, so that it looks as on paper.
+            self.outlook = Outlook(margin, np.array([0.0, -0.001, 1.0]), np.array([0.0, 1.0, 0.0]), np.radians(9.2))
         else:
-            shape = {"cast_shadow": False, "receive_shadow": False}
-            body = api.add_icosphere("/belief/ellipse/body", 1.0, (96, 146, 246), opacity=0.28, subdivisions=4, **shape)
-            wire = api.add_icosphere("/belief/ellipse/wire", 1.0, (59, 110, 220), wireframe=True, opacity=0.25,
-                                     subdivisions=2, **shape)  # fmt: skip
-            self._bodies = [body, wire]
-        camera = server.initial_camera
-        if flat:
-            camera.position, camera.look_at, camera.up = (0.0, -0.01, 17.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)
-            fit_cameras(server, float(np.radians(9.2)))
-        else:
-            camera.position, camera.look_at, camera.up = (3.6, -5.2, 3.4), (0.0, 0.0, -0.1), (0.0, 0.0, 1.0)
-            fit_cameras(server, float(np.radians(33)))
-
-    def controls(self, gui: viser.GuiApi) -> None:
-        """A dropdown an axis, where there is a choice."""
-        if self.model.nx < 3:
-            return
-        for k, axis in enumerate(self.axes):
-            choice = gui.add_dropdown(
-                f"Axis {'xyz'[k]}", self.model.state_names, initial_value=self.model.state_names[axis.state]
+            box = np.stack(np.meshgrid([-1.15, 1.15], [-1.15, 1.15], [-1.1, 1.15]), axis=-1).reshape(-1, 3)
+            titles = np.array([_title_place(k, False) for k in range(3)])
+            self.outlook = Outlook(
+                np.vstack((box, titles)), np.array([3.6, -5.2, 3.4]), np.array([0.0, 0.0, 1.0]), np.radians(33)
             )
 
-            @choice.on_update
-            def _(event: viser.GuiEvent, k: int = k, choice: Any = choice) -> None:
-                # A whole new axis: the drawing thread sees either the old one or the new.
-                self.axes[k] = _Axis(self.model.state_names.index(choice.value))
+    def _body(self, api: viser.SceneApi, sigmas: int, palette: Palette, line: dict[str, Any]) -> tuple[int, list[Any]]:
+        """The ellipse or ellipsoid at some σ: how many, and its handles."""
+        name, flat = f"/scene/belief/{sigmas}", {"cast_shadow": False, "receive_shadow": False}
+        opacity = {1: 0.28, 2: 0.16}[sigmas]
+        if not self.flat:
+            body = api.add_icosphere(f"{name}/body", 1.0, palette.estimate, opacity=opacity, subdivisions=4, **flat)
+            return sigmas, [body]
+        vertices, faces = disc()
+        plate = api.add_mesh_simple(
+            f"{name}/disc", vertices, faces, color=palette.estimate, opacity=opacity, side="double", **flat
+        )
+        rim = api.add_line_segments(f"{name}/rim", circle(), palette.estimate, thickness=3.0 - sigmas, **line)
+        return sigmas, [plate, rim]
 
-    def draw(self, history: History, belief: Belief) -> None:
-        """Send where everything is now."""
-        axes = list(self.axes)
-        index = [axis.state for axis in axes]
-        lift = np.array([0.0, 0.0, 0.02 if len(axes) < 3 else 0.0])
+    def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
+        """Send where everything is now; trail and points only if `heavy`."""
+        axes, index = self.axes, [axis.state for axis in self.axes]
+        lift = np.array([0.0, 0.0, 0.02 if self.flat else 0.0])
         mean, cov = belief.mean[index], belief.cov[np.ix_(index, index)]
         known = bool(np.isfinite(mean).all() and np.isfinite(cov).all())
         # What was drawn before would else stand for an estimate that is not a number.
+        heavy |= known != self._known
+        self._known = known
         self._belief.visible = known
         if known:
-            self._draw_belief(history, belief, axes, mean, cov, lift)
-        self._mark(axes, index, belief.peaks if known else (), lift)
-        self._cloud(self._truth, axes, self._true_point(history, index), lift)
+            heavy |= self._draw_belief(mean, cov)
+        self._mark(index, belief.peaks if known else (), lift)
+        self._truth.visible = self._put(self._truth, self._true_point(history, index), lift)
+        if heavy:
+            self._draw_points(belief.points[:, index] if known and len(belief.points) else np.zeros((0, len(axes))))
+            trail = self._place(history.settled("mean", TRAIL)[:, self._columns(index)])
+            trail[(np.abs(trail) > 1.0).any(axis=1)] = np.nan
+            self._trail.points = segments(trail)
 
-    def _draw_belief(
-        self, history: History, belief: Belief, axes: list[_Axis], mean: np.ndarray, cov: np.ndarray, lift: np.ndarray
-    ) -> None:
-        index = [axis.state for axis in axes]
-        for k, axis in enumerate(axes):
+    def _columns(self, index: list[int]) -> list[int]:
+        """Where these states are among those that the track has."""
+        return [int(np.searchsorted(self.model.shown, j)) for j in index]
+
+    def _draw_belief(self, mean: np.ndarray, cov: np.ndarray) -> bool:
+        """Move the ellipses; whether an axis changed, so that all else has to move too."""
+        changed = False
+        for k, axis in enumerate(self.axes):
             # A mode's axis always shows all of its values.
             last = 0.0 if axis.state != self.model.mode or self.model.jump is None else len(self.model.jump.modes) - 1.0
             middle, reach = (last / 2, 0.55 * last) if last else (mean[k], 2 * np.sqrt(max(cov[k, k], 0.0)))
             if axis.fit(float(middle), float(reach)):
                 self._number(k, axis)
-        scale = np.array([HALF * axis.step for axis in axes])
-        full = np.zeros((3, 3))
-        n = len(axes)
+                changed = True
+        scale = np.array([HALF * axis.step for axis in self.axes])
+        full, n = np.zeros((3, 3)), len(self.axes)
         full[:n, :n] = cov / np.outer(scale, scale)
         if n < 3:
             full[2, 2] = 2 * full.max() + 1.0  # the largest, so that the ellipse is the first two axes
         if n == 1:
             full[1, 1] = 1e-4
-        half, turn = ellipsoid(full)
-        centre = self._place(axes, mean[None])[0]
-        self._belief.position = centre
-        for handle in self._bodies:
-            handle.wxyz = turn
-            handle.scale = (float(half[0]), float(half[1]), float(half[2]) if n == 3 else 1.0)
-        trail = self._place(axes, history.settled("mean", TRAIL)[:, index])
-        trail[(np.abs(trail) > 1.0).any(axis=1)] = np.nan
-        self._trail.points = segments(np.vstack((trail, centre)) - centre)
-        self._cloud(
-            self._points, axes, belief.points[:, index] if len(belief.points) else np.zeros((0, n)), lift, centre
-        )
+        self._belief.position = self._place(mean[None])[0]
+        for sigmas, handles in self._bodies:
+            half, turn = ellipsoid(full, sigmas)
+            for handle in handles:
+                handle.wxyz = turn
+                handle.scale = (float(half[0]), float(half[1]), float(half[2]) if n == 3 else 1.0)
+        return changed
 
-    def _mark(self, axes: list[_Axis], index: list[int], peaks: tuple[Peak, ...], lift: np.ndarray) -> None:
+    def _draw_points(self, states: np.ndarray) -> None:
+        """Draw what stands for the belief; of points that are the same one, the larger the more there are."""
+        points, counts = np.unique(states, axis=0, return_counts=True)
+        bounds = [size for size, _ in SIZES] + [np.inf]
+        for k, handle in enumerate(self._clouds):
+            handle.visible = self._put(handle, points[(counts >= bounds[k]) & (counts < bounds[k + 1])], 0.02)
+
+    def _mark(self, index: list[int], peaks: tuple[Peak, ...], lift: np.ndarray) -> None:
         """Put a dot with its weight at each peak, where there are several."""
         for k, (dot, label) in enumerate(self._peaks):
-            place = self._place(axes, peaks[k].mean[None, index])[0] if k < len(peaks) else np.full(3, np.nan)
-            shown = bool(np.isfinite(place).all() and (np.abs(place) <= 1.3).all())
+            place = self._place(peaks[k].mean[None, index])[0] if k < len(peaks) else np.full(3, np.nan)
+            shown = bool(np.isfinite(place).all() and (np.abs(place) <= OUTSIDE).all())
             if shown:
                 dot.points = (place + 2 * lift)[None].astype(np.float32)
-                label.position = tuple(place + 2 * lift)
+                label.position = tuple(place + 2 * lift + [0.04, 0.04, 0.0])
                 label.text = f"{100 * peaks[k].weight:.0f} %"
             dot.visible = label.visible = shown
 
-    def _cloud(
-        self, handle: Any, axes: list[_Axis], states: np.ndarray, lift: np.ndarray, origin: np.ndarray | float = 0.0
-    ) -> None:
-        places = self._place(axes, states) + lift
-        places = places[np.isfinite(places).all(axis=1) & (np.abs(places) <= 1.3).all(axis=1)]
-        handle.visible = bool(len(places))
+    def _put(self, handle: Any, states: np.ndarray, lift: np.ndarray | float) -> bool:
+        """Draw states as points; whether there are any to be seen."""
+        places = self._place(states)
+        places[:, 2] += np.max(lift) if self.flat else 0.0
+        places = places[np.isfinite(places).all(axis=1) & (np.abs(places) <= OUTSIDE).all(axis=1)]
         if len(places):
-            handle.points = places - origin
+            handle.points = places
+        return bool(len(places))
 
     def _true_point(self, history: History, index: list[int]) -> np.ndarray:
         events = history.events(slice(-4096, None))
@@ -205,16 +220,16 @@ class BeliefScene:
                 point[0, k] = values[-1]
         return point
 
-    def _place(self, axes: list[_Axis], states: np.ndarray) -> np.ndarray:
+    def _place(self, states: np.ndarray) -> np.ndarray:
         out = np.zeros((len(states), 3))
-        for k, axis in enumerate(axes):
-            out[:, k] = axis.place(states[:, k])
+        for k, axis in enumerate(self.axes):
+            out[:, k] = axis.place(states[:, k]) if axis.step else np.nan
         return out
 
     def _number(self, k: int, axis: _Axis) -> None:
         state = self.model.states[axis.state]
         unit = f" [{state.unit}]" if state.unit and state.unit != "1" else ""
-        self._titles[k].text = f"{self.model.label(state.name)}{unit}"
+        self._titles[k].text = f"{self.model.label(state.name).replace('_', ' ')}{unit}"
         for tick, label in zip(TICKS, self._labels[k], strict=True):
             label.text = tick_text(axis.middle + tick * axis.step, axis.step)
 
@@ -228,7 +243,7 @@ def _beside(k: int, along: float, away: float, flat: bool) -> tuple[float, float
 
 def _title_place(k: int, flat: bool) -> tuple[float, float, float]:
     if flat:
-        return ((0.0, -1.22, 0.0), (-1.0, 1.04, 0.0))[k]
+        return ((0.0, -1.24, 0.0), (-1.0, 1.04, 0.0))[k]
     return _beside(k, 0.0, (1.38, 1.62)[k], flat) if k < 2 else (-1.0, -1.0, 1.16)
 
 

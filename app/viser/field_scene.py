@@ -1,21 +1,21 @@
-"""The scene of a large field: a picture with its scale, the sensors on it, and a chart of what the errors come to."""
+"""The scene of a large field: a picture with its scale, and the sensors on it."""
 
 from __future__ import annotations
 
 import time
-from collections import deque
 
 import numpy as np
 import viser
 
-from estimators.diagnostics.field_pictures import Picture
 from estimators.log import READING
 from estimators.model.state_space import StateSpaceModel
 
 from ..drawing.geometry import segments
-from ..drawing.heatmap import ESTIMATE, RIM, Frame, Scale, image_of, kinds, palette, positioned, sensor_colors
-from ..engine.outputs import Pull
-from .camera import fit_cameras
+from ..drawing.heatmap import ESTIMATE, RIM, Frame, Scale, gradient, image_of, kinds, positioned, sensor_colors
+from ..drawing.palette import Palette
+from ..engine.outputs import Belief, Pull
+from .camera import Outlook
+from .history import History
 
 EVERY = 0.5
 """Seconds between two pictures at least."""
@@ -23,57 +23,52 @@ EVERY = 0.5
 TICKS = 12
 """Numbers beside the scale at most."""
 
-KEPT = 4096
-"""Pictures of which the numbers are kept for the chart."""
-
 
 class FieldScene:
     """A plane seen from above, with one of the field's pictures at a time."""
 
-    def __init__(self, server: viser.ViserServer, model: StateSpaceModel, *, truth: bool) -> None:
+    def __init__(self, api: viser.SceneApi, model: StateSpaceModel, theme: Palette, *, truth: bool) -> None:
         assert model.grid is not None
         self._unit, self._name = model.grid.unit, model.grid.name.replace("_", " ")
         self._frame = frame = Frame.of(model.grid)
         self._kinds = {kind.title: kind for kind in kinds(truth)}
         self._kind = ESTIMATE
         self._scales = {kind.name: Scale(kind) for kind in self._kinds.values()}
-        self._palettes = {kind.name: palette(kind.colors) for kind in self._kinds.values()}
+        self._palettes = {kind.name: gradient(kind.colors) for kind in self._kinds.values()}
         self._latest: dict[str, np.ndarray] = {}
         self._drawn = -np.inf
         self._dirty = False
-        self.numbers: deque[Picture] = deque(maxlen=KEPT)
         places, self._which = positioned(model)
         self._normalised = np.full(len(places), np.nan)
         # The picture's longer side is 2 long; the scale stands to its right.
         self._size = 2.0 * np.array([frame.width, frame.height]) / max(frame.width, frame.height)
         self._left = -0.5 * self._size[0] - 0.12
         right = self._left + self._size[0]
-        api = server.scene
-        api.set_up_direction("+z")
+        self.root = api.add_frame("/scene", show_axes=False)
         flat = {"cast_shadow": False, "receive_shadow": False}
         # Viser's images have their top at -y.
         turn = (0.0, 1.0, 0.0, 0.0)
         blank = np.full((frame.height, frame.width, 3), 240, np.uint8)
         self._image = api.add_image(
-            "/field", blank, *self._size, format="png", wxyz=turn,
+            "/scene/field", blank, *self._size, format="png", wxyz=turn,
             position=(self._left + 0.5 * self._size[0], 0.0, 0.0), **flat,
         )  # fmt: skip
         self._bar = api.add_image(
-            "/scale", blank[:, :1], 0.06, self._size[1], format="png", wxyz=turn,
+            "/scene/scale", blank[:, :1], 0.06, self._size[1], format="png", wxyz=turn,
             position=(right + 0.11, 0.0, 0.0), **flat,
         )  # fmt: skip
         self._labels = [
-            api.add_label(f"/ticks/{k}", " ", anchor="center-left", font_screen_scale=0.75, visible=False)
+            api.add_label(f"/scene/ticks/{k}", " ", anchor="center-left", font_screen_scale=0.75, visible=False)
             for k in range(TICKS)
         ]
         self._tick_x = right + 0.17
         self._title = api.add_label(
-            "/title", " ", position=(self._left, 0.5 * self._size[1] + 0.05, 0.0), anchor="bottom-left",
+            "/scene/title", " ", position=(self._left, 0.5 * self._size[1] + 0.05, 0.0), anchor="bottom-left",
             font_screen_scale=0.9,
         )  # fmt: skip
         corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * self._size + [self._left, -0.5 * self._size[1]]
         api.add_line_segments(
-            "/frame", segments(np.column_stack((corners, np.full(5, 0.002)))), (148, 163, 184), thickness=1.5,
+            "/scene/frame", segments(np.column_stack((corners, np.full(5, 0.002)))), theme.bound, thickness=1.5,
             thickness_units="screen",
         )  # fmt: skip
         dots = {"point_shape": "circle", "precision": "float32", "point_shading": "flat"}
@@ -81,18 +76,20 @@ class FieldScene:
         if len(places):
             where = self._place(frame.pixels(places), 0.006)
             low = where - [0.0, 0.0, 0.002]
-            api.add_point_cloud("/sensors/rims", low, RIM, point_size=0.022, **dots)
+            api.add_point_cloud("/scene/sensors/rims", low, RIM, point_size=0.022, **dots)
             self._points = api.add_point_cloud(
-                "/sensors/dots", where, sensor_colors(self._normalised), point_size=0.016, **dots
+                "/scene/sensors/dots", where, sensor_colors(self._normalised), point_size=0.016, **dots
             )
         cells = np.array([state.position for state in model.shown_states], float)
         api.add_point_cloud(
-            "/cells", self._place(frame.pixels(cells), 0.01), (16, 185, 129), point_size=0.03, point_shape="diamond",
-            precision="float32", point_shading="flat",
+            "/scene/cells", self._place(frame.pixels(cells), 0.01), theme.estimate, point_size=0.03,
+            point_shape="diamond", precision="float32", point_shading="flat",
         )  # fmt: skip
-        camera = server.initial_camera
-        camera.position, camera.look_at, camera.up = (0.0, -0.01, 17.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)
-        fit_cameras(server, float(np.radians(9.2)))
+        across, upright = (self._left, right + 0.32), (-0.5 * self._size[1] - 0.04, 0.5 * self._size[1] + 0.14)
+        self.outlook = Outlook(
+            np.array([[x, y, 0.0] for x in across for y in upright]),
+            np.array([0.0, -0.001, 1.0]), np.array([0.0, 1.0, 0.0]), np.radians(9.2),
+        )  # fmt: skip
 
     def _place(self, pixels: np.ndarray, height: float) -> np.ndarray:
         """Pixels (k, 2) of the picture as places in the scene (k, 3)."""
@@ -102,29 +99,14 @@ class FieldScene:
         y = (0.5 - share[:, 1]) * self._size[1]
         return np.column_stack((x, y, np.full(len(pixels), height))).astype(np.float32)
 
-    def controls(self, gui: viser.GuiApi) -> None:
-        """Which picture is shown."""
-        choice = gui.add_dropdown("Picture", tuple(self._kinds), initial_value=self._kind.title)
-
-        @choice.on_update
-        def _(event: viser.GuiEvent) -> None:
-            self._kind = self._kinds[choice.value]
+    def show(self, title: str) -> None:
+        """Show the picture of that title."""
+        if self._kinds[title] is not self._kind:
+            self._kind = self._kinds[title]
             self._drawn, self._dirty = -np.inf, True
-
-        gui.add_html(
-            '<div style="font-size:0.75em;padding:0 0.9em 0.5em">Dots: sensors. White: the innovation is below 2σ; '
-            "orange: below 3σ; red: above; grey: silent. Green: the cells that are charted.</div>"
-        )
 
     def take(self, pull: Pull) -> None:
         """Take note of what a pull brings."""
-        if pull.fresh:
-            self.numbers.clear()
-        first = pull.pictures[0].before if pull.pictures else np.inf
-        while self.numbers and self.numbers[-1].before >= first:
-            self.numbers.pop()
-        for picture in pull.pictures:
-            self.numbers.append(picture._replace(mean=None, std=None, truth=None))
         for kind in self._kinds.values():
             for picture in reversed(pull.pictures):
                 image = image_of(picture, kind)
@@ -142,7 +124,7 @@ class FieldScene:
                 self._normalised[of] = ratio[self._which[of, 1]]
                 self._dirty = True
 
-    def draw(self) -> None:
+    def draw(self, history: History, belief: Belief | None, heavy: bool = True) -> None:
         """Send the picture that is chosen, if it has changed and the last one is old enough."""
         now = time.monotonic()
         kind = self._kind

@@ -1,4 +1,4 @@
-"""The rows of the track that the charts and the scene still need, kept in arrays of the view's own."""
+"""The rows of the track that the scene and the chart still need, kept in arrays of the view's own."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ from estimators.log import Events
 from ..engine.outputs import Pull
 
 _EVENTS = ("t", "kind", "channel", "value")
-_COLUMNS = (*_EVENTS, "mean", "std", "nis", "nis_mean", "nis_low", "nis_high", "verdict", "screened")
+_COLUMNS = (*_EVENTS, "mean", "nis", "nis_mean", "nis_low", "nis_high", "verdict")
 
 
 class History:
     """A sliding copy of the track: the last `span` nanoseconds, and never more than `2 * limit` rows.
 
     Row i of the arrays is event `base + i` of the log. Rows that a late reading or another revision rewrites are
-    simply pulled again, and overwrite what is here from there on. What the charts show of older rows they keep
-    themselves.
+    simply pulled again, and overwrite what is here from there on.
     """
 
     def __init__(self, nx: int, width: int, limit: int = 32_768) -> None:
@@ -25,10 +24,8 @@ class History:
         self.span: int | None = None
         self.base = 0
         self.n = 0
-        self.origin: int | None = None
-        """Time of the first event ever seen, from which the charts count seconds."""
-        shapes = {"value": (width,), "screened": (width,), "mean": (nx,), "std": (nx,)}
-        kinds = {"t": np.int64, "kind": np.int8, "channel": np.int32, "verdict": np.int8, "screened": np.int8}
+        shapes = {"value": (width,), "mean": (nx,)}
+        kinds = {"t": np.int64, "kind": np.int8, "channel": np.int32, "verdict": np.int8}
         # Filled, not empty: the pages are paid for now, and memory stays flat.
         self._columns = {
             name: np.full((2 * limit, *shapes.get(name, ())), 0, kinds.get(name, np.float64)) for name in _COLUMNS
@@ -50,7 +47,7 @@ class History:
         return self.column(name)[-4 * rows :][last.astype(bool)][-rows:]
 
     def clear(self) -> None:
-        """Forget all rows; the origin of time stays."""
+        """Forget all rows."""
         self.base, self.n = 0, 0
 
     def take(self, pull: Pull) -> int:
@@ -64,20 +61,13 @@ class History:
             self.base, self.n = pull.first, 0
         if not count:
             return self.n
-        if pull.first == 0 or self.origin is None:
-            self.origin = int(pull.events.t[0])
         start = pull.first - self.base
         if start + count > 2 * self.limit:
             start -= self._drop(start - self.limit)
         for name, column in self._columns.items():
             batch = getattr(pull.events if name in _EVENTS else pull.track, name)
-            # Charts have no use for the variances that readings bring, in columns after the values; rows of a reading
-            # are fewer than values of an event can be.
-            at = column[start : start + count]
-            if at.ndim > 1:
-                at[:, : batch.shape[1]] = batch[:, : at.shape[1]]
-            else:
-                at[:] = batch
+            # Pictures have no use for the variances that readings bring, in columns after the values.
+            column[start : start + count] = batch[:, : column.shape[1]] if column.ndim > 1 else batch
         self.n = start + count
         return start
 

@@ -48,13 +48,13 @@ def _same(a: Any, b: Any) -> bool:
     return a == b
 
 
-def number_text(value: float, whole: bool = False) -> str:
-    """A number as the field shows it: four digits, no more; all of them of a count."""
-    return f"{value:.0f}" if whole else f"{value:.4g}"
+def number_text(value: float) -> str:
+    """A number as the field shows it: four digits, no more."""
+    return f"{value:.4g}"
 
 
 class NumberRow:
-    """One number: a slider (logarithmic, linear or none) and, unless the slider says it all, a field to type in."""
+    """One variance: a logarithmic slider, which one that is configured as zero has not, and a field to type in."""
 
     def __init__(
         self,
@@ -67,11 +67,6 @@ class NumberRow:
         value: float,
         configured: float,
         command: Callable[[float], Command],
-        low: float = 0.0,
-        high: float = np.inf,
-        logarithmic: bool = False,
-        whole: bool = False,
-        hint: str | None = None,
         complain: Callable[[str], None] = lambda text: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -80,26 +75,16 @@ class NumberRow:
         self._held = Held(clock)
         self._value = value
         self._base = configured
-        self._logarithmic = logarithmic and configured > 0
-        self._whole = whole
         self.slider: viser.GuiSliderHandle[float] | None = None
-        self.field: viser.GuiTextHandle | None = None
         name = label.replace("_", " ")
-        if self._logarithmic:
-            note = hint or f"Powers of ten from the configured {number_text(configured)} {unit}".strip()
+        if configured > 0:
+            note = f"Powers of ten from the configured {number_text(configured)} {unit}".strip()
             self.slider = gui.add_slider(
                 name, -float(DECADES), float(DECADES), 0.01, self._place(value), marks=((0.0, ""),), hint=note
             )
-        elif np.isfinite([low, high]).all() and high > low:
-            step = 1.0 if whole else 10.0 ** np.floor(np.log10((high - low) / 200))
-            shown = f"{name} [{unit}]" if unit and unit != "1" else name
-            self.slider = gui.add_slider(
-                shown, low, high, float(step), float(np.clip(value, low, high)), marks=(), hint=hint
-            )
-        if self._logarithmic or self.slider is None:
-            under = unit if self.slider is not None else f"{name} [{unit}]" if unit and unit != "1" else name
-            self.field = gui.add_text(under or " ", number_text(value, whole), hint=hint)
-            self.field.on_update(self.typed)
+        under = unit if self.slider is not None else f"{name} [{unit}]" if unit and unit != "1" else name
+        self.field = gui.add_text(under or " ", number_text(value))
+        self.field.on_update(self.typed)
         if self.slider is not None:
             self.slider.on_update(self.dragged)
 
@@ -109,17 +94,16 @@ class NumberRow:
             return
         # The handle's value, not the event's: events run in a pool of threads and may overtake each other.
         place = self.slider.value
-        value = float(f"{self._base * 10.0**place:.3g}") if self._logarithmic else float(place)
+        value = float(f"{self._base * 10.0**place:.3g}")
         self._value = value
         self._held.edited(value)
-        if self.field is not None:
-            self.field.value = number_text(value, self._whole)
+        self.field.value = number_text(value)
         self._complain("")
         self._coalescer.dragged(self.key, self._command(value))
 
     def typed(self, event: viser.GuiEvent) -> None:
         """The user typed into the field."""
-        if event.client is None or self.field is None:
+        if event.client is None:
             return
         text = self.field.value.strip().replace(",", ".")
         try:
@@ -144,19 +128,9 @@ class NumberRow:
         self._value = value
         if self.slider is not None:
             self.slider.value = self._place(value)
-        if self.field is not None:
-            self.field.value = number_text(value, self._whole)
-
-    def remove(self) -> None:
-        """Take the row off the panel."""
-        for handle in (self.slider, self.field):
-            if handle is not None:
-                handle.remove()
+        self.field.value = number_text(value)
 
     def _place(self, value: float) -> float:
-        if not self._logarithmic:
-            assert self.slider is not None
-            return float(np.clip(value, self.slider.min, self.slider.max))
         if value <= 0:
             return -float(DECADES)
         return float(np.clip(round(np.log10(value / self._base), 2), -DECADES, DECADES))

@@ -25,19 +25,7 @@ SECONDS = Unit("s", 1.0, 1)
 UNITS = (SECONDS, Unit("min", 60.0, 2), Unit("h", 3600.0, 3), Unit("d", 86400.0, 4))
 
 
-def unit_for(span: float, present: Unit = SECONDS) -> Unit:
-    """The unit of an axis over `span` seconds, if it has been in the `present` one so far.
-
-    A larger unit comes when the span holds three of it, the smaller one comes back when it does not hold one: a span
-    that grows, or that varies a little, changes the unit seldom and never to and fro.
-    """
+def unit_for(span: float) -> Unit:
+    """The largest unit of which `span` seconds hold three; seconds if they hold none."""
     fitting = [unit for unit in UNITS if span >= MANY * unit.seconds]
-    best = fitting[-1] if fitting else SECONDS
-    return best if best.seconds > present.seconds or span < present.seconds else present
-
-
-def window_name(window: float) -> str:
-    """A length of time for people, in the largest unit of which it is three or more, and a round number."""
-    whole = [unit for unit in UNITS if window >= MANY * unit.seconds and window % unit.seconds == 0.0]
-    unit = whole[-1] if whole else SECONDS
-    return f"{window / unit.seconds:g} {unit.name}"
+    return fitting[-1] if fitting else SECONDS

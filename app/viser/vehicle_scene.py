@@ -13,36 +13,50 @@ import viser
 
 from estimators.log import READING, truth_of
 from estimators.model.state_space import StateSpaceModel
+from estimators.track import FAILED, GATED
 
 from ..drawing.direct_readings import observed
 from ..drawing.geometry import about_z, circle, disc, ellipsoid, segments
+from ..drawing.palette import Palette, mixed
 from ..engine.outputs import Belief
-from .camera import distance_for, fit_cameras
+from .camera import Outlook
 from .history import History
 
-TRAIL = 600
+TRAIL = 300
+"""Points of a line where something was, at most."""
+
 PEAKS = 4
-POINTS = 1500
+POINTS = 600
+"""Position readings of one sensor that are drawn at most."""
+
 SOFTNESS = 0.3
 """Part of the way to the vehicle that the view moves in one frame."""
 
 FOV = float(np.radians(40))
+UP = np.array([0.0, 0.0, 1.0])
 
-ABOVE = np.array([0.0, -0.28, 0.96])
+SLANTED = np.array([0.0, -0.68, 0.73])
+"""From the vehicle to the first view of it."""
+
+ABOVE = np.array([0.0, -0.12, 0.99])
 """From walls to the first view of them, nearly as on a plan: a corridor would else be a line."""
 
-NEAREST = 15.0
-"""Metres from which the first view looks at walls at least: a vehicle is some 4 m long."""
+AROUND = 18.0
+"""Metres around the vehicle that the first view shows where there are no walls; a vehicle is some 4 m long."""
+
+NEAREST = 3.0
+"""Metres around the middle of walls that the first view shows at least."""
 
 
 class VehicleScene:
     """The plane with east to the right and north up the screen, under a camera that the user turns freely.
 
-    The view follows by moving the world under the camera, never the camera: a user's own turning and zooming is not
-    disturbed, and coordinates near the camera stay small, which single precision needs.
+    In a pane that is higher than wide, long walls have their east up. The view follows by moving the world under the
+    camera, never the camera: a user's own turning and zooming is not disturbed, and coordinates near the camera stay
+    small, which single precision needs.
     """
 
-    def __init__(self, server: viser.ViserServer, model: StateSpaceModel, scene: Any) -> None:
+    def __init__(self, api: viser.SceneApi, model: StateSpaceModel, scene: Any, palette: Palette) -> None:
         names = model.state_names
         self.east, self.north = (names.index(name) for name in scene.position)
         self.heading = names.index(scene.heading) if scene.heading else None
@@ -59,75 +73,69 @@ class VehicleScene:
         self.follow = self._home is None
         self._anchor: np.ndarray | None = None if self._home is None else self._home.copy()
         self._course = 0.0
-        api = server.scene
-        api.set_up_direction("+z")
-        self.world = api.add_frame("/world", show_axes=False)
+        self._known = False
+        self.root = api.add_frame("/scene", show_axes=False)
+        self.world = api.add_frame("/scene/world", show_axes=False)
         self._grid = api.add_grid(
-            "/grid", infinite_grid=True, cell_size=10.0, section_size=50.0, fade_distance=900.0,
-            cell_color=(226, 232, 240), section_color=(186, 196, 210), shadow_opacity=0.0,
+            "/scene/grid", infinite_grid=True, cell_size=10.0, section_size=50.0, fade_distance=900.0,
+            cell_color=palette.grid, section_color=palette.rule, shadow_opacity=0.0,
         )  # fmt: skip
-        line = {"thickness_units": "screen"}
+        line, world = {"thickness_units": "screen"}, "/scene/world"
         nothing = np.zeros((1, 2, 3), np.float32)
-        self._trail = api.add_line_segments("/world/trail", nothing, (37, 99, 235), thickness=3, **line)
-        self._truth = api.add_line_segments("/world/truth", nothing, (22, 163, 74), thickness=2, **line)
-        self._readings = api.add_point_cloud(
-            "/world/readings", np.zeros((1, 3), np.float32), (245, 158, 11), point_size=0.5, point_shape="circle",
-            precision="float32", point_shading="flat", visible=False,
-        )  # fmt: skip
-        vertices, faces = disc()
-        self._ellipse = api.add_mesh_simple(
-            "/world/ellipse", vertices, faces, color=(96, 146, 246), opacity=0.35, side="double", cast_shadow=False,
-            receive_shadow=False,
-        )  # fmt: skip
-        self._rim = api.add_line_segments("/world/rim", circle(), (37, 99, 235), thickness=2, **line)
-        walls = [segments(np.array([(*corner, 0.3) for corner in line])) for line in scene.walls]
-        if walls:
-            api.add_line_segments("/world/walls", np.concatenate(walls), (71, 85, 105), thickness=3, **line)
+        self._trail = api.add_line_segments(f"{world}/trail", nothing, palette.estimate, thickness=3, **line)
+        self._truth = api.add_line_segments(f"{world}/truth", nothing, palette.truth, thickness=2, **line)
         dot = {"point_shape": "circle", "precision": "float32", "point_shading": "flat", "visible": False}
         one = np.zeros((1, 3), np.float32)
-        self._cloud = api.add_point_cloud("/world/cloud", one, (124, 58, 237), point_size=0.15, **dot)
+        self._readings, self._refused = (
+            api.add_point_cloud(f"{world}/{name}", one, color, point_size=0.5, **dot)
+            for name, color in (("readings", palette.reading), ("refused", palette.refused))
+        )
+        vertices, faces = disc()
+        self._ellipse = api.add_mesh_simple(
+            f"{world}/ellipse", vertices, faces, color=palette.estimate, opacity=0.25, side="double",
+            cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+        self._rim = api.add_line_segments(f"{world}/rim", circle(), palette.estimate, thickness=2, **line)
+        walls = [segments(np.array([(*corner, 0.3) for corner in line])) for line in scene.walls]
+        if walls:
+            api.add_line_segments(f"{world}/walls", np.concatenate(walls), palette.faint, thickness=3, **line)
+        light = mixed(palette.estimate, palette.panel, 0.2)
+        self._cloud = api.add_point_cloud(f"{world}/cloud", one, light, point_size=0.15, **dot)
         self._peaks = [
             (
-                api.add_point_cloud(f"/world/peaks/{k}/mean", one, (190, 24, 93), point_size=0.6, **dot),
-                api.add_label(f"/world/peaks/{k}/weight", " ", visible=False, anchor="bottom-left"),
+                api.add_point_cloud(f"{world}/peaks/{k}/mean", one, palette.estimate, point_size=0.6, **dot),
+                api.add_label(f"{world}/peaks/{k}/weight", " ", visible=False, anchor="bottom-left"),
             )
             for k in range(PEAKS)
         ]
-        self._vehicle = api.add_frame("/world/vehicle", show_axes=False)
-        api.add_box("/world/vehicle/body", (30, 64, 175), (4.4, 1.8, 0.7), position=(0, 0, 0.65), cast_shadow=False)
-        api.add_box(
-            "/world/vehicle/cabin", (147, 180, 245), (2.2, 1.6, 0.6), position=(-0.3, 0, 1.3), cast_shadow=False
-        )
-        camera = server.initial_camera
-        camera.position, camera.look_at, camera.up = (0.0, -55.0, 60.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
-        if self._home is not None:
+        self._vehicle = api.add_frame(f"{world}/vehicle", show_axes=False)
+        dark, pale = mixed(palette.estimate, palette.ink, 0.3), mixed(palette.estimate, palette.panel, 0.5)
+        api.add_box(f"{world}/vehicle/body", dark, (4.4, 1.8, 0.7), position=(0, 0, 0.65), cast_shadow=False)
+        api.add_box(f"{world}/vehicle/cabin", pale, (2.2, 1.6, 0.6), position=(-0.3, 0, 1.3), cast_shadow=False)
+        around = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+        if self._home is None:
+            self.outlook = Outlook(AROUND * around, SLANTED, UP, FOV)
+        else:
             outline = np.column_stack((corners - self._home, np.zeros(len(corners))))
-            camera.position = ABOVE * max(NEAREST, distance_for(outline, ABOVE, FOV))
-        camera.far = 20_000.0
-        fit_cameras(server, FOV)
+            self.outlook = Outlook(np.vstack((outline, NEAREST * around)), ABOVE, UP, FOV, turns=True)
         self._move_world()
 
-    def controls(self, gui: viser.GuiApi) -> None:
-        """What a user may choose about the scene."""
-        rest = "" if self._home is None else "; else the whole of the walls"
-        follow = gui.add_checkbox("Follow", self.follow, hint=f"Keep the vehicle in the middle{rest}")
-
-        @follow.on_update
-        def _(event: viser.GuiEvent) -> None:
-            self.follow = follow.value
-
-    def draw(self, history: History, belief: Belief) -> None:
-        """Send where everything is now."""
+    def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
+        """Send where everything is now; lines, readings and particles only if `heavy`."""
         if not history.n:
             return
         mean = history.column("mean")
-        self._trail.points = segments(self._plane(mean[:, self.east], mean[:, self.north], 0.06))
-        self._draw_truth(history)
-        self._draw_readings(history)
         known = bool(np.isfinite(belief.mean[[self.east, self.north]]).all())
         # What was drawn before would else stand for an estimate that is not a number.
+        heavy |= known != self._known
+        self._known = known
         self._vehicle.visible = known
-        self._draw_cloud(belief.points if known else (), belief.peaks if known else ())
+        self._mark(belief.peaks if known else ())
+        if heavy:
+            self._trail.points = segments(self._plane(mean[:, self.east], mean[:, self.north], 0.06))
+            self._draw_truth(history)
+            self._draw_readings(history)
+            self._draw_cloud(belief.points if known else ())
         if known:
             self._draw_vehicle(mean, belief)
         else:
@@ -183,31 +191,28 @@ class VehicleScene:
 
     def _draw_readings(self, history: History) -> None:
         kind, channel, value = (history.column(name) for name in ("kind", "channel", "value"))
-        parts = []
-        for sensor, row, row_n in self._fixes:
-            mine = np.flatnonzero((kind == READING) & (channel == sensor))[-POINTS:]
-            parts.append(np.stack((value[mine, row], value[mine, row_n], np.full(mine.size, 0.1)), axis=1))
-        points = np.concatenate(parts) if parts else np.zeros((0, 3))
-        points = points[np.isfinite(points).all(axis=1)]
-        self._readings.visible = bool(len(points))
-        if len(points):
-            self._readings.points = points
+        refused = np.isin(history.column("verdict"), (GATED, FAILED))
+        for handle, wanted in ((self._readings, ~refused), (self._refused, refused)):
+            parts = [np.zeros((0, 3))]
+            for sensor, row, row_n in self._fixes:
+                mine = np.flatnonzero((kind == READING) & (channel == sensor) & wanted)[-POINTS:]
+                parts.append(np.stack((value[mine, row], value[mine, row_n], np.full(mine.size, 0.1)), axis=1))
+            _put(handle, np.concatenate(parts))
 
-    def _draw_cloud(self, points: Any, peaks: Any) -> None:
-        """The points that stand for the belief, and a dot with its weight at each peak, where there are several."""
-        plane = [self.east, self.north]
-        points = points[:, plane] if len(points) else np.zeros((0, 2))
-        points = points[np.isfinite(points).all(axis=1)]
-        self._cloud.visible = bool(len(points))
-        if len(points):
-            self._cloud.points = np.column_stack((points, np.full(len(points), 0.2))).astype(np.float32)
+    def _draw_cloud(self, points: Any) -> None:
+        """The points that stand for the belief."""
+        plane = points[:, [self.east, self.north]] if len(points) else np.zeros((0, 2))
+        _put(self._cloud, np.column_stack((plane, np.full(len(plane), 0.2))))
+
+    def _mark(self, peaks: Any) -> None:
+        """A dot with its weight at each peak, where there are several."""
         several = peaks if len(peaks) > 1 else ()
         for k, (dot, label) in enumerate(self._peaks):
-            shown = k < len(several) and bool(np.isfinite(several[k].mean[plane]).all())
+            place = several[k].mean[[self.east, self.north]] if k < len(several) else np.full(2, np.nan)
+            shown = bool(np.isfinite(place).all())
             if shown:
-                place = (*several[k].mean[plane], 1.2)
-                dot.points = np.array([place], np.float32)
-                label.position = place
+                dot.points = np.array([(*place, 1.2)], np.float32)
+                label.position = (*(place + 0.6), 1.2)
                 label.text = f"{100 * several[k].weight:.0f} %"
             dot.visible = label.visible = shown
 
@@ -220,3 +225,10 @@ class VehicleScene:
         if np.hypot(*step) > 1.0:  # not so if one of the two is NaN
             self._course = float(np.arctan2(step[1], step[0]))
         return self._course
+
+
+def _put(handle: Any, points: np.ndarray) -> None:
+    points = points[np.isfinite(points).all(axis=1)]
+    handle.visible = bool(len(points))
+    if len(points):
+        handle.points = points.astype(np.float32)

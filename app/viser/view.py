@@ -1,25 +1,22 @@
-"""The left pane of the page: scene, control panel and charts, served by Viser to any number of browsers."""
+"""Viser: the stage of the page, and the same scene with a small panel in a window of its own, for any browsers."""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sequence
 from typing import Any
+from urllib.parse import parse_qs
 
-import viser
-
+from ..drawing.palette import THEMES
 from ..engine.interface import Running
-from ..engine.notices import Notice
-from ..server.private_viser import guarded_server, unprinted
-from .belief_scene import BeliefScene
-from .charts import Charts
+from ..series.series import Series
+from ..server.private_viser import addresses, guarded_server, unprinted
 from .coalescer import Coalescer
-from .field_chart import FieldChart
 from .field_scene import FieldScene
 from .history import History
 from .panel import Panel
-from .time_units import unit_for
-from .vehicle_scene import VehicleScene
+from .stage import Stage
 
 FRAME = 0.1
 """Seconds between two frames, when they are cheap."""
@@ -33,55 +30,30 @@ SLOWEST = 2.0
 ROWS = 16_384
 """Rows pulled at once, so that a long history does not hold the engine's lock for long."""
 
-COLUMN = 400
-"""Width of the panel's and the charts' column, in pixels."""
-
 
 class ViserView:
     """Pulls rows from the engine at its own rate, with a cursor of its own, and never keeps the engine waiting.
+
+    While no browser is there it pulls, computes and sends nothing. A browser says by the address of its WebSocket what
+    it shows: `?part=scene` for the scene alone, so that the panel is not kept up for it, and `theme=dark`.
 
     `port` is known once the view is built; browsers reach it through the page's server only, which knows `secret`.
     """
 
     def __init__(self, engine: Running, *, secret: str) -> None:
         self.engine = engine
-        view = engine.twin.config.view
-        model = engine.model
         self.server = guarded_server(secret, engine.twin.title)
         self.port: int = self.server.get_port()
-        gui = self.server.gui
-        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(37, 99, 235))
-        gui.main_panel.dock_right()
-        gui.main_panel.set_width(COLUMN)
         self.coalescer = Coalescer(engine.submit)
-        self.panel = Panel(self.server, engine, self.coalescer)
-        self.scene: VehicleScene | BeliefScene | FieldScene
-        truth = model.grid is not None and engine.twin.tells_field
-        if model.grid is not None:
-            self.scene = FieldScene(self.server, model, truth=truth)
-        elif view.scene.kind == "vehicle":
-            self.scene = VehicleScene(self.server, model, view.scene)
-        else:
-            self.scene = BeliefScene(self.server, model, view.scene.axes)
-        with self.panel.scene_folder:
-            self.scene.controls(gui)
-        below = gui.add_panel()
-        with below.add_tab("Charts"):
-            unit = unit_for(view.window)
-            self.field_chart = FieldChart(gui, model.grid, unit, truth=truth) if model.grid is not None else None
-            self.charts = Charts(self.server, model, view.window)
-        below.dock_below(gui.main_panel)
-        self.charts.window_choice.on_update(self._choose_window)
-        if self.charts.state_choice is not None:
-            self.charts.state_choice.on_update(self._choose_state)
-        limit = 32_768 if model.grid is None else 4096
+        self.stage = Stage(self.server, engine)
+        self.panel = Panel(self.server, engine, self.coalescer, self.stage)
+        model, large = engine.model, engine.model.grid is not None
+        limit = 4096 if large else 32_768
         self.history = History(len(model.shown), model.width, limit)
+        self.history.span = int(engine.twin.config.view.window * 1e9)
+        self._series = Series(engine)
         self._rows = min(ROWS, limit)
         self._cursor: Any = None
-        self._begin_again(view.window)
-        self._revision: int | None = None
-        self._wanted_window: str | None = None
-        self._redraw = True
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="viser view", daemon=True)
 
@@ -94,74 +66,65 @@ class ViserView:
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
-        self.engine.release(self._cursor)
+        self._rest()
         with unprinted():
             self.server.stop()
 
-    def frame(self) -> None:
-        """Bring the panel, the charts and the scene up to what the engine has now."""
-        if self._wanted_window is not None:
-            window, self._wanted_window = self.charts.windows[self._wanted_window], None
-            self.charts.set_window(window)
-            self._begin_again(window)
-        changed = self._redraw
-        notices: list[Notice] = []
+    def frame(self, *, panel: bool = True) -> None:
+        """Bring the scene, and if it is seen the panel, up to what the engine has now."""
         with self.server.atomic():
-            while True:
-                pull = self.engine.pull(self._cursor, self._rows)
-                notices += pull.notices
-                changed |= bool(len(pull.events)) or pull.fresh
-                if pull.fresh:
-                    self.charts.clear()
-                if isinstance(self.scene, FieldScene):
-                    self.scene.take(pull)
-                first = self.history.take(pull)
-                self.charts.update(self.history, max(0, first - self.history.trim()))
-                if len(pull.events) < self._rows:
-                    break
-            if pull.revision != self._revision:
-                self._revision = pull.revision
-                self.charts.set_previous(self.engine.previous())
-                changed = True
+            if self.stage.prepare() or self._cursor is None:
+                self._begin()
+            changed = self._pull() or self.stage.due
             if changed:
-                self._redraw = False
-                self.charts.draw(self.history)
-                if not isinstance(self.scene, FieldScene):
-                    self.scene.draw(self.history, self.engine.belief())
-                elif self.field_chart is not None:
-                    self.field_chart.draw(self.scene.numbers, self.history, self.charts.window, self.charts.unit)
-            if isinstance(self.scene, FieldScene):
-                self.scene.draw()
-            self.panel.note(notices)
-            self.panel.sync(self.engine.status(), self.history.origin, self.charts.unit)
+                self.stage.draw(self.history)
+            if panel:
+                self.panel.sync(self.history, self._series.origin())
 
-    def _begin_again(self, window: float | None) -> None:
-        """Pull the history from its start, to keep as much of it as the window shows."""
+    def _begin(self) -> None:
+        """Pull what the window shows, from its start."""
+        self._rest()
+        self._cursor = self.engine.cursor(span=self.history.span)
+
+    def _rest(self) -> None:
         if self._cursor is not None:
             self.engine.release(self._cursor)
-        self._cursor = self.engine.cursor()
-        self.history.clear()
-        self.charts.clear()
-        self.history.span = None if window is None else int(window * 1e9)
+            self._cursor = None
+            self.history.clear()
 
-    def _choose_window(self, event: viser.GuiEvent) -> None:
-        if event.client is not None:
-            self._wanted_window = self.charts.window_choice.value
+    def _pull(self) -> bool:
+        """Take what is new; whether there was anything."""
+        changed = False
+        while True:
+            pull = self.engine.pull(self._cursor, self._rows)
+            changed |= bool(len(pull.events)) or pull.fresh
+            if isinstance(self.stage.scene, FieldScene):
+                self.stage.scene.take(pull)
+            self.history.take(pull)
+            self.history.trim()
+            if len(pull.events) < self._rows:
+                return changed
 
-    def _choose_state(self, event: viser.GuiEvent) -> None:
-        if event.client is not None and self.charts.state_choice is not None:
-            self.charts.choose_state(self.charts.state_choice.value)
-            self._redraw = True
+    def _look(self, there: Sequence[str]) -> None:
+        """Draw for the browsers that are there, whose addresses have these queries."""
+        asked = [parse_qs(query) for query in there]
+        # Two browsers may differ; one scene has the colours that the last of them can see best.
+        self.stage.palette = THEMES.get(asked[-1].get("theme", ["light"])[0], THEMES["light"])
+        self.frame(panel=any(query.get("part") != ["scene"] for query in asked))
 
     def _run(self) -> None:
         due = time.monotonic()
         while not self._stop.wait(FRAME / 2):
             self.coalescer.flush()
+            there = addresses(self.server)
+            if not there:
+                self._rest()
+                continue
             now = time.monotonic()
             if now >= due:
                 begun = time.thread_time()
                 try:
-                    self.frame()
+                    self._look(there)
                 except Exception as error:  # noqa: BLE001  a picture that cannot be drawn must not end the others
                     self.engine.notices.report("view error", f"view error: {type(error).__name__}: {error}", "error")
                 # This thread's own work counts, not the time it waited for its turn.

@@ -89,7 +89,7 @@ class FakeEngine:
         self.state.options = ESTIMATORS[self.state.estimator].complete(dict(self.state.tuning.options))
         return self.state
 
-    def cursor(self):
+    def cursor(self, *, span=None):
         return SimpleNamespace(n=0, revision=None, told=0)
 
     def span(self):

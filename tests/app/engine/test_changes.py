@@ -12,8 +12,6 @@ from app.engine.engine import Engine
 from app.recording.writer import Recorder
 from app.server.api import command_from_json, status_json
 from app.twin.twin import load_twin
-from app.viser.restore import began_html
-from app.viser.view import ViserView
 from estimators.errors import ConfigError
 from estimators.tuning import Tuning
 from tests.app.scripted import Scripted, pull_all, readings, wait_for
@@ -93,39 +91,13 @@ def test_a_review_goes_back_to_what_was_recorded(review):
     assert_same(pull_all(engine).track, seen)
 
 
-def test_the_panel_says_what_was_recorded_and_has_the_way_back(review):
-    engine, seen = review
-    view = ViserView(engine, secret="s3cret")
-    try:
-        view.frame()
-        began = view.panel.began
-        assert "As recorded</b>: Unscented Kalman filter" in began.line.content and not began.button.visible
-        carry_out(engine, commands.SetEstimator("kf"), commands.SetTuning("gate", None))
-        view.frame()
-        assert began.button.visible and began.button.label == "Back to as recorded"
-        assert "As recorded: estimator Unscented Kalman filter; gate 99 %." in began.line.content
-        revision = engine.status().revision
-        began._pressed(SimpleNamespace(client=None))
-        began._pressed(SimpleNamespace(client=BROWSER))
-        wait_for(lambda: engine.status().revision > revision and not engine.status().refolding)
-        view.frame()
-        assert not began.button.visible
-        assert view.panel.estimator.handle.value == "Unscented Kalman filter"
-        assert view.panel.gate.handle.value == "99 %"
-        assert_same(pull_all(engine).track, seen)
-    finally:
-        view.stop()
-
-
 def test_a_live_twin_goes_back_to_its_file():
     twin = load_twin("motor_winding")
     engine = Engine(twin, lambda report: Scripted())
-    assert (status_json(engine)["began_as"], began_html(twin, {})) == ("configured", "")
+    assert status_json(engine)["began_as"] == "configured"
     found = turned(twin, twin.estimator, twin.tuning.set("Q.rate", 123.0))
     was = twin.tuning.get("Q.rate")
     assert found == {"Q.rate": was}
-    unit = next(item.unit for item in twin.tuning.items() if item.key == "Q.rate")
-    assert f"Turned since the start.</b> As configured: Q.rate {was:.6g} {unit}." in began_html(twin, found)
     with pytest.raises(ConfigError, match="Restore: has name; it takes no field"):
         command_from_json({"command": "Restore", "name": "kf"}, engine)
 

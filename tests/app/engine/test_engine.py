@@ -81,6 +81,26 @@ def test_cursor_is_taken_back_by_a_late_reading(started):
     np.testing.assert_array_equal(again.events.t, np.array([2.5, 3.0]) * SECOND)
 
 
+def test_a_cursor_with_a_span_begins_near_the_end(started):
+    """Also of the next revision; rows that come, or are rewritten, it gets all."""
+    source = Scripted()
+    engine = started(source)
+    source.put(readings(np.arange(1.0, 101.0), np.full(100, 40.0)))
+    wait_for(lambda: row_count(engine) == 100)
+    cursor = engine.cursor(span=10 * SECOND)
+    for revision in (0, 1):
+        pull = engine.pull(cursor)
+        assert (pull.fresh, pull.revision, pull.first, len(pull.events)) == (True, revision, 89, 11)
+        np.testing.assert_array_equal(pull.events.t, np.arange(90, 101) * SECOND)
+        if not revision:
+            engine.submit(commands.SetTuning("R.winding", 9.0))
+            wait_for(lambda: engine.status().revision == 1)
+    source.put(readings([99.5], [40.0]))
+    wait_for(lambda: row_count(engine) == 101)
+    late = engine.pull(cursor)
+    assert (late.fresh, late.first, len(late.events)) == (False, 99, 2)
+
+
 def test_readings_beyond_the_horizon_are_counted_and_dropped(started):
     source = Scripted()
     engine = started(source)

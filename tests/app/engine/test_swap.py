@@ -126,7 +126,6 @@ class Running:
         self.engine = Engine(twin, lambda report: self.source)
         self.engine.start()
         self.view = ViserView(self.engine, secret="s3cret")
-        self.view._wanted_window = "all"
         self.feed = RerunFeed(self.engine)
         self.cold = {}
 
@@ -183,21 +182,12 @@ class Running:
         assert options.items() >= SMALL.get(name, {}).items()
         assert (status.estimator, status.options, self.engine.folded_with()[1]) == (name, options, name)
         self.view.frame()
-        panel, charts = self.view.panel, self.view.charts
+        panel, history = self.view.panel, self.view.history
         assert panel.estimator.handle.value == ESTIMATORS[name].title
-        assert panel.options.shown == name and sorted(panel.options.rows) == sorted(options)
         assert f"revision {status.revision}" in panel.status.content
-        seconds = (pull.events.t - pull.events.t[0]) * 1e-9
-        # Of several events at one time, the chart shows the last.
-        last = np.append(pull.events.t[1:] != pull.events.t[:-1], True)
-        for chart, j in zip(charts._charts, charts._shown, strict=True):
-            x, high, low, mean = chart.data[0], chart.data[1], chart.data[2], chart.data[8]
-            assert (x[0], x[-1]) == (0.0, pytest.approx(seconds[-1])) and np.isfinite([x, high, low, mean]).all()
-            # A chart keeps the extremes of each stretch of time, so those of the whole are the track's.
-            # A probability has no band.
-            expected, band = pull.track.mean[last, j], 2.0 * pull.track.std[last, j] * (j != self.twin.model.mode)
-            assert (mean.min(), mean.max()) == (expected.min(), expected.max())
-            assert (low.min(), high.max()) == ((expected - band).min(), (expected + band).max())
+        # What the scene and the chart are drawn from is the end of the track.
+        assert history.n and history.base + history.n == self.given
+        np.testing.assert_array_equal(history.column("mean"), pull.track.mean[history.base :])
         assert "engine error" not in status.counts, [line.text for line in self.engine.notices.since(0)]
 
     def check_rerun(self, tmp_path):

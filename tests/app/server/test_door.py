@@ -9,6 +9,7 @@ from rerun.chunk import RrdReader
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from app.drawing.choices import Choice, Choices
 from app.engine import commands
 from app.engine.engine import Engine
 from app.server.server import PageServer
@@ -26,7 +27,10 @@ class Page:
         self.source = Scripted()
         self.engine = Engine(shown_twin(), lambda report: behind(self.source))
         self.viser = FakeViser()
-        self.server = PageServer(self.engine, port=0, viser_port=self.viser.port, secret=SECRET, review=review)
+        self.choices = Choices([Choice("x", "x", ("temperature", "rate"), "temperature")])
+        self.server = PageServer(
+            self.engine, port=0, viser_port=self.viser.port, secret=SECRET, review=review, choices=self.choices
+        )
         self.server.start()
         self.engine.start()
         self.client = Client(self.server)
@@ -93,7 +97,15 @@ def test_foreign_host_is_refused(page, hosts, upgrade):
     ["http://evil.example", "https://127.0.0.1:{port}", "http://127.0.0.1:1", "http://localhost:{port}", "null"],
 )
 @pytest.mark.parametrize(
-    "method, path", [("GET", "/"), ("POST", "/api/command"), ("GET", "/viser/"), ("WS", STREAM), ("WS", "/viser/")]
+    "method, path",
+    [
+        ("GET", "/"),
+        ("POST", "/api/command"),
+        ("POST", "/api/scene"),
+        ("GET", "/viser/"),
+        ("WS", STREAM),
+        ("WS", "/viser/"),
+    ],
 )
 def test_foreign_origin_is_refused(page, origin, method, path):
     client = page.client
@@ -111,7 +123,18 @@ def test_websocket_without_origin_is_refused(page, path):
 
 
 @pytest.mark.parametrize(
-    "path", ["/", "/api/status", "/api/recordings", "/rec/reviewed.rrd", "/page/style.css", "/viser/", "/nothing"]
+    "path",
+    [
+        "/",
+        "/explore",
+        "/api/status",
+        "/api/scene",
+        "/api/recordings",
+        "/rec/reviewed.rrd",
+        "/page/style.css",
+        "/viser/",
+        "/nothing",
+    ],
 )
 def test_no_token_no_answer(page, path):
     client = page.client
@@ -180,7 +203,7 @@ def test_the_reviewed_recording_is_served(page):
 
 
 def test_every_answer_forbids_to_leave_the_machine(page):
-    for path in ("/", "/api/status", "/page/style.css", "/viser/", "/nothing"):
+    for path in ("/", "/explore", "/api/status", "/page/style.css", "/viser/", "/nothing"):
         policy = page.client.get(path).headers["content-security-policy"]
         rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
         for name, sources in rules.items():
@@ -253,6 +276,28 @@ def test_a_bad_command_is_answered_with_one_line(page, body, says):
 
 
 # Viser behind it
+
+
+def test_the_scene_is_chosen_and_the_status_tells_it(page):
+    offered = json.loads(page.client.get("/api/scene").text)
+    assert offered == [{"key": "x", "label": "x", "options": ["temperature", "rate"], "value": "temperature"}]
+    assert json.loads(page.client.post("/api/scene", {"key": "x", "value": "rate"}).text)[0]["value"] == "rate"
+    assert page.choices.values() == {"x": "rate"}
+    assert json.loads(page.client.get("/api/status").text)["scene"][0]["value"] == "rate"
+    for body in ({"key": "x", "value": "mass"}, {"key": "w", "value": "rate"}, {}, [], 7):
+        answer = page.client.post("/api/scene", body)
+        assert answer.status == 400 and answer.text.count("\n") == 0 and json.loads(answer.text)["error"]
+    assert page.choices.values() == {"x": "rate"}
+
+
+def test_each_view_has_a_page_of_its_own(page):
+    """Rerun's is without the rest of the page; Viser's is Viser's own, whose socket passes on what it is asked for."""
+    alone = page.client.get("/explore").text
+    assert 'id="rerun"' in alone and 'id="tune"' not in alone and "{{settings}}" not in alone
+    with page.connect("/viser/?part=scene&theme=dark", subprotocols=["viser-test"]) as socket:
+        socket.send("hello")
+        assert socket.recv(timeout=PATIENCE) == "hello"
+    assert page.viser.requests[-1] == ("/?part=scene&theme=dark", [SECRET])
 
 
 def test_viser_files_pass_without_prefix_and_with_the_secret(page):

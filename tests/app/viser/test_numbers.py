@@ -1,4 +1,4 @@
-"""What the Viser pane computes before it draws: decimation, ellipsoids, ticks, ranges, the sliding history."""
+"""What Viser's scenes compute before they draw: ellipsoids, ticks, where cameras stand, the sliding history."""
 
 from types import SimpleNamespace
 
@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from app.drawing.geometry import ellipsoid, quaternion, round_step, segments, tick_text
-from app.viser.camera import vertical_angle
-from app.viser.charts import Range
-from app.viser.decimate import Buckets, bridge
+from app.viser.camera import MARGIN, Outlook, place
 from app.viser.history import History
 
 
@@ -64,107 +62,46 @@ def test_segments_leave_gaps_open():
     np.testing.assert_array_equal(segments(points)[:, :, 0], [[0, 1], [3, 4]])
 
 
+def seen(outlook, aspect):
+    """Where the points are on the screen, from -1 to 1 across and from bottom to top, through a pinhole."""
+    position, up = place(outlook, aspect)
+    forward = -position / np.linalg.norm(position)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    sight = outlook.points - position
+    depth = np.tan(outlook.fov / 2) * (sight @ forward)
+    return np.stack((sight @ right / (depth * aspect), sight @ np.cross(right, forward) / depth), axis=1)
+
+
+CORRIDOR = np.array([[x, y, 0.0] for x in (-24.0, 24.0) for y in (-3.0, 3.0)])
+
+
 @pytest.mark.parametrize("aspect", [0.3, 0.5, 1.0, 1.9])
-def test_camera_sees_the_same_in_a_narrow_pane(aspect):
-    """Half the scene's width at distance 1 stays tan(fov/2) in the narrower direction."""
-    half_height = np.tan(vertical_angle(0.6, aspect) / 2)
-    assert min(half_height, half_height * aspect) == pytest.approx(np.tan(0.3))
+@pytest.mark.parametrize("turns", [False, True])
+def test_a_camera_fills_its_pane_with_the_scene(aspect, turns):
+    """Something touches the margin, and nothing is beyond it."""
+    outlook = Outlook(CORRIDOR, np.array([0.0, -0.3, 0.9]), np.array([0.0, 0.0, 1.0]), 0.6, turns)
+    assert np.abs(seen(outlook, aspect)).max() == pytest.approx(MARGIN)
 
 
-def test_decimation_keeps_every_extreme():
-    rng = np.random.default_rng(1)
-    t = np.sort(rng.integers(0, 60_000_000_000, 50_000))
-    values = rng.normal(size=(t.size, 3))
-    values[17_321] = [40.0, -50.0, 60.0]
-    buckets = Buckets(3, 200_000_000)
-    buckets.update(t, 0, lambda start, end: values[start:end])
-    times, drawn = buckets.points(0)
-    assert times.size <= 2 * 301
-    assert np.all(np.diff(times) >= 0)
-    for bucket in range(0, 300, 7):
-        rows = t // 200_000_000 == bucket
-        points = times // 200_000_000 == bucket
-        np.testing.assert_array_equal(drawn[points].min(axis=0), values[rows].min(axis=0))
-        np.testing.assert_array_equal(drawn[points].max(axis=0), values[rows].max(axis=0))
-
-
-def test_decimation_in_pieces_equals_decimation_at_once():
-    """Rows that come a few at a time, and rows rewritten by a late one, give what one pass over all rows gives."""
-    rng = np.random.default_rng(2)
-    t = np.sort(rng.integers(0, 10_000_000_000, 2_000))
-    values = rng.normal(size=(t.size, 2))
-    pieces, end = Buckets(2, 100_000_000), 0
-    while end < t.size:
-        begin, end = end, min(t.size, end + int(rng.integers(1, 60)))
-        pieces.update(t[:end], begin, lambda start, stop: values[start:stop])
-    values[1_500:] += 10.0
-    pieces.update(t, 1_500, lambda start, stop: values[start:stop])
-    whole = Buckets(2, 100_000_000)
-    whole.update(t, 0, lambda start, stop: values[start:stop])
-    for one, other in zip(pieces.points(0), whole.points(0), strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_decimation_outlives_the_rows_it_came_from():
-    """Buckets whose rows are gone stay as they were, and one whose first rows are gone keeps their extremes."""
-    rng = np.random.default_rng(3)
-    t = np.arange(0, 10_000_000_000, 1_000_000)
-    values = rng.normal(size=(t.size, 2))
-    buckets, seen = Buckets(2, 700_000_000), 0
-    for end in range(37, t.size + 37, 37):
-        end, gone = min(end, t.size), max(0, end - 300)
-        buckets.update(
-            t[gone:end], seen - gone, lambda start, stop, gone=gone: values[gone + start : gone + stop]
-        )  # fmt: skip
-        seen = end
-    whole = Buckets(2, 700_000_000)
-    whole.update(t, 0, lambda start, stop: values[start:stop])
-    for name in ("first", "last", "low", "high"):
-        np.testing.assert_array_equal(getattr(buckets, name), getattr(whole, name))
-    buckets.forget(5_000_000_000)
-    assert buckets.last[0] >= 5_000_000_000 and buckets.first.size == (whole.last >= 5_000_000_000).sum()
-
-
-def test_coarser_buckets_are_those_of_twice_the_width():
-    rng = np.random.default_rng(4)
-    t = np.sort(rng.integers(0, 10_000_000_000, 3_000))
-    values = rng.normal(size=(t.size, 2))
-    fine, coarse = Buckets(2, 100_000_000), Buckets(2, 200_000_000)
-    for buckets in (fine, coarse):
-        buckets.update(t, 0, lambda start, stop: values[start:stop])
-    fine.coarsen()
-    for name in ("first", "last", "low", "high"):
-        np.testing.assert_array_equal(getattr(fine, name), getattr(coarse, name))
-
-
-def test_decimation_draws_a_lone_reading_once():
-    values = np.full((10, 1), np.nan)
-    values[4] = 3.0
-    buckets = Buckets(1, 1_000)
-    buckets.update(np.arange(10), 0, lambda start, end: values[start:end])
-    _, drawn = buckets.points(0)
-    assert np.isfinite(drawn).sum() == 1
-
-
-def test_bridge_fills_between_but_not_beyond():
-    np.testing.assert_array_equal(bridge(np.array([np.nan, 1.0, np.nan, 3.0, np.nan])), [np.nan, 1.0, 2.0, 3.0, np.nan])
-
-
-def test_range_grows_at_once_and_does_not_twitch():
-    axis = Range()
-    first = axis.series([np.array([0.0, 1.0, 0.5])])
-    assert first[0] < 0.0 and first[1] > 1.0
-    np.testing.assert_array_equal(axis.series([np.array([0.1, 0.9, 0.5])]), first)
-    assert axis.series([np.array([0.0, 5.0, np.nan])])[1] > 5.0
-    assert axis.series([np.array([0.0, 1.0, 0.5])])[1] < 2.0
+def test_a_long_scene_is_turned_in_a_high_pane_only():
+    plan = Outlook(CORRIDOR, np.array([0.0, -0.01, 1.0]), np.array([0.0, 1.0, 0.0]), 0.6, True)
+    high, wide = seen(plan, 0.45), seen(plan, 1.6)
+    across, upright = np.ptp(high, axis=0)
+    assert upright == pytest.approx(2 * MARGIN, rel=0.01)
+    # East is up: the two eastern corners are the highest. North is then to the left.
+    assert set(np.argsort(high[:, 1])[2:]) == {2, 3} and high[3, 0] < high[2, 0]
+    assert np.ptp(wide, axis=0)[0] == pytest.approx(2 * MARGIN, rel=0.01) and wide[2, 0] > wide[0, 0]
+    still = np.ptp(seen(plan._replace(turns=False), 0.45), axis=0)
+    assert upright * across > 3 * still[0] * still[1]
 
 
 def pull(first, t, fresh=False):
     n = len(t)
     column = np.arange(first, first + n, dtype=float)
     track = SimpleNamespace(
-        mean=column[:, None], std=column[:, None], nis=column, nis_mean=column, nis_low=column, nis_high=column,
-        verdict=np.zeros(n, np.int8), screened=np.zeros((n, 1), np.int8),
+        mean=column[:, None], nis=column, nis_mean=column, nis_low=column, nis_high=column,
+        verdict=np.zeros(n, np.int8),
     )  # fmt: skip
     readings = SimpleNamespace(
         t=np.array(t, np.int64), kind=np.zeros(n, np.int8), channel=np.zeros(n, np.int32), value=column[:, None]
@@ -184,14 +121,13 @@ def test_history_overwrites_rewritten_rows():
     np.testing.assert_array_equal(history.column("t"), [0, 10, 15, 20, 30])
 
 
-def test_history_slides_and_keeps_the_origin_of_time():
+def test_history_slides():
     history = History(1, 1)
     history.span = 1_000
     for first in range(0, 100_000, 500):
         history.take(pull(first, range(100 + first, 600 + first)))
         history.trim()
     assert history.n <= 2_000
-    assert history.origin == 100
     np.testing.assert_array_equal(history.column("mean")[:, 0] + 100, history.column("t"))
 
 

@@ -1,10 +1,11 @@
-"""The Viser pane against an engine without threads: who may connect, what an edit submits, what a status shows."""
+"""Viser against an engine without threads: who may connect, what an edit submits, what is shown and drawn."""
 
 import asyncio
 import base64
 import http.client
 import os
 import socket
+import threading
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -14,33 +15,20 @@ import viser
 import websockets
 from viser import _messages
 
-from app.engine.commands import (
-    ClearFault,
-    InjectFault,
-    Pause,
-    Record,
-    Reset,
-    Seek,
-    SetEstimator,
-    SetOption,
-    SetTuning,
-    Speed,
-    UseSensor,
-)
-from app.server.private_viser import HEADER, guarded_server
+from app.drawing.palette import DARK, LIGHT
+from app.engine.commands import SetEstimator, SetTuning
+from app.server.private_viser import HEADER, addresses, guarded_server
 from app.viser.coalescer import DRAG_INTERVAL, TYPING_PAUSE
-from app.viser.faults import WHOLE
 from app.viser.history import History
 from app.viser.rows import PATIENCE
 from app.viser.vehicle_scene import VehicleScene
 from app.viser.view import ViserView
 from config.schema import SceneSection, ViewSection
-from estimators.log import READING, RESET, TRUTH, Events
+from estimators.log import READING, TRUTH, Events
 from estimators.models import MODELS
 from estimators.numerics.peaks import Peak
-from sources.faults.fault import Fault
-from sources.faults.layer import FaultStatus
 from tests.app.fake_engine import FakeEngine, events
+from tests.app.scripted import wait_for
 
 WINDING = MODELS["motor_winding"]
 BROWSER = SimpleNamespace(client_id=0)
@@ -197,64 +185,9 @@ def test_dragging_submits_the_latest_value_at_a_bounded_rate(view, engine, clock
     assert engine.commands[-1] == SetTuning("Q.temperature", 1.0)
 
 
-def test_every_control_submits_its_command(view, engine):
-    panel = view.panel
-    edit(panel.estimator.handle, panel._titles["ukf"])
-    edit(panel.gate.handle, "99.73 %")
-    edit(panel.sensors["winding"].handle, False)
-    edit(panel.speed.handle, "max")
-    edit(panel.run_buttons, "Pause")
-    edit(panel.run_buttons, "Reset")
-    view.frame()
-    edit(panel.options.rows["alpha"].slider, 0.5)
-    assert engine.commands == [
-        SetEstimator("ukf"), SetTuning("gate", 0.9973), UseSensor("winding", False), Speed(np.inf), Pause(True),
-        Reset(), SetOption("alpha", 0.5),
-    ]  # fmt: skip
-
-
-def test_a_fault_is_put_in_and_all_are_ended(view, engine):
-    faults = view.panel.faults
-    edit(faults.kind, "bias")
-    edit(faults.target, "winding")
-    edit(faults.inject, True)
-    assert engine.commands == [] and "has no size" in view.panel._note.content
-    edit(faults.size, "2 x")
-    edit(faults.inject, True)
-    assert engine.commands == [] and "it must be a number" in view.panel._note.content
-    edit(faults.size, "2,5")
-    edit(faults.inject, True)
-    assert "must be" not in view.panel._note.content
-    edit(faults.kind, "silence")
-    edit(faults.target, WHOLE)
-    edit(faults.inject, True)
-    edit(faults.stop, True)
-    assert engine.commands == [InjectFault("bias", "winding", size=2.5), InjectFault("silence"), ClearFault()]
-    engine.state.faults = (FaultStatus(0, Fault("bias", "winding", size=2.5), None, 0, 0),)
-    view.frame()
-    assert "bias of winding, size 2.5 °C" in faults.active.content
-
-
-def test_seek_goes_where_the_slider_is_left(view, engine, clock):
-    engine.state.span = (1_000_000_000, 61_000_000_000)
-    view.frame()
-    assert view.panel.seek.visible and view.panel.seek.max == 60.0
-    edit(view.panel.seek, 10.0)
-    edit(view.panel.seek, 20.0)
-    clock.now += TYPING_PAUSE
-    view.coalescer.flush()
-    assert engine.commands == [Seek(20.0)]
-
-
-def test_recording_takes_a_bare_name(view, engine):
-    view.panel.file.value = "../../etc/run"
-    edit(view.panel.record, True)
-    view.frame()
-    assert [type(command) for command in engine.commands] == [Record]
-    assert str(engine.commands[0].path) == "run.rrd"
-    assert view.panel.record.label == "Stop recording" and "run.rrd" in view.panel._record_state.content
-    edit(view.panel.record, True)
-    assert engine.commands[-1] == Record(None)
+def test_the_estimator_submits_its_command(view, engine):
+    edit(view.panel.estimator.handle, view.panel._titles["ukf"])
+    assert engine.commands == [SetEstimator("ukf")]
 
 
 # What a status shows
@@ -263,33 +196,15 @@ def test_recording_takes_a_bare_name(view, engine):
 def test_status_moves_the_controls_without_an_echo(view, engine):
     """As after a change by another browser or the API."""
     engine.submit(SetTuning("Q.rate", 0.1))
-    engine.submit(UseSensor("winding", False))
     engine.submit(SetEstimator("ukf"))
-    engine.submit(Pause(True))
     count = len(engine.commands)
     view.frame()
     row = view.panel.rows["Q.rate"]
     assert (row.slider.value, row.field.value) == (pytest.approx(2.0), "0.1")
-    assert view.panel.sensors["winding"].handle.value is False
     assert view.panel.estimator.handle.value == view.panel._titles["ukf"]
-    assert view.panel.options.shown == "ukf" and view.panel.options.folder.visible
-    assert tuple(view.panel.run_buttons.options)[0] == "Resume"
+    assert "revision 2" in view.panel.status.content
     view.coalescer.flush()
     assert len(engine.commands) == count
-
-
-def test_a_count_is_whole_on_its_slider_and_in_its_field(view, engine):
-    engine.submit(SetEstimator("etkf"))
-    view.frame()
-    assert view.panel.options.rows["rotation"].slider.step == 1.0
-    engine.submit(SetEstimator("pf"))
-    view.frame()
-    rows = view.panel.options.rows
-    assert rows["fraction"].slider.step < 0.1
-    assert rows["particles"].field.value == "2000"
-    engine.submit(SetOption("particles", 12345.0))
-    view.frame()
-    assert rows["particles"].field.value == "12345"
 
 
 def test_slow_engine_does_not_snap_the_slider_back(view, engine, clock):
@@ -303,62 +218,93 @@ def test_slow_engine_does_not_snap_the_slider_back(view, engine, clock):
     assert row.slider.value == 0.0, "what the engine did not take must not stay on the panel"
 
 
-def test_live_source_offers_reset_only(view, engine):
-    engine.state.seekable, engine.state.speed = False, None
-    view.frame()
-    assert tuple(view.panel.run_buttons.options) == ("Reset",)
-    assert not view.panel.speed.handle.visible
-
-
-def test_text_from_outside_is_escaped(view, engine):
-    engine.notices.append(SimpleNamespace(t=2_000_000_000, level="warn", text="<script>alert(1)</script>"))
-    view.frame()
-    assert "<script>" not in view.panel._events_list.content
-    assert "&lt;script&gt;" in view.panel._events_list.content
-
-
 # What is drawn
 
 
-def test_chart_holds_band_mean_readings_truth_and_previous(view, engine):
-    before = engine.fold.track.mean.copy()
-    engine.submit(SetTuning("Q.temperature", 10.0))
-    view.frame()
-    x, high, low, reading, _, _, previous, truth, mean, _, _, _ = view.charts._charts[0].data
-    track, readings = engine.fold.track, engine.log.events
-    used = readings.kind == READING
-    # One bucket of the 60 s window holds the reading and the truth of one second: x doubles, values stay.
-    np.testing.assert_allclose(np.unique(x), np.unique(readings.t - readings.t[0]) * 1e-9)
-    np.testing.assert_allclose(np.unique(mean), np.unique(track.mean[:, 0]))
-    assert high.max() == pytest.approx((track.mean + 2 * track.std)[:, 0].max())
-    assert low.min() == pytest.approx((track.mean - 2 * track.std)[:, 0].min())
-    np.testing.assert_allclose(np.sort(reading[np.isfinite(reading)]), np.sort(readings.value[used, 0]))
-    np.testing.assert_allclose(np.unique(truth), np.unique(readings.value[~used, 0]))
-    np.testing.assert_allclose(np.unique(previous.round(9)), np.unique(before[:, 0].round(9)))
+def test_the_chart_holds_nis_in_its_bounds(view, engine):
+    track, t = engine.fold.track, engine.log.events.t
+    x, high, low, mean, ends = view.panel.nis.handle.data
+    first = int(np.flatnonzero(~np.isfinite(track.nis_mean))[-1]) + 1 if np.isnan(track.nis_mean).any() else 0
+    assert x[-1] == pytest.approx((t[-1] - t[0]) * 1e-9) and x.size <= 200
+    assert (mean.min(), mean.max()) == (track.nis_mean[first:].min(), track.nis_mean[first:].max())
+    assert low.min() == track.nis_low[first:].min()
+    assert high.max() == track.nis_high[first:].max() < ends.max()
 
 
-@pytest.mark.parametrize("window", ["10 s", "all"])
-def test_a_reset_at_the_time_of_the_last_reading_ends_the_line(window, view, engine):
-    """As after the end of a source: the line and its band end at the prior, not where they were before."""
-    view._wanted_window = window
+def test_the_chart_has_at_most_200_points_and_keeps_extremes(view, engine):
+    rng = np.random.default_rng(4)
+    t = 70.0 + 0.01 * np.arange(5000)
+    engine.put(events(WINDING, READING, 0, t, 45.0 + rng.normal(0, 2, t.size)))
+    view.panel._drawn = -np.inf
     view.frame()
-    engine.put(events(WINDING, RESET, 0, [engine.state.t * 1e-9], np.zeros((1, 0))))
-    view.frame()
-    for j, state in enumerate(WINDING.states):
-        _, high, low, *_, mean, _, _, _ = view.charts._charts[j].data
-        ends = mean[-1], high[-1], low[-1]
-        assert ends == pytest.approx((state.mean, state.mean + 2 * state.std, state.mean - 2 * state.std))
+    x, high, low, mean, ends = view.panel.nis.handle.data
+    shown = view.history.column("nis_mean")
+    assert 50 < x.size <= 200 and np.all(np.diff(x) >= 0)
+    assert (mean.min(), mean.max()) == (shown.min(), shown.max())
 
 
-def test_chart_shows_the_window_only(view, engine):
-    view._wanted_window = "10 s"
-    view.frame()
-    x = view.charts._charts[0].data[0]
-    assert x.min() >= 59.0 - 10.0 - 0.1 and x.max() == pytest.approx(59.0)
-    view._wanted_window = "all"
-    view.frame()
-    x = view.charts._charts[0].data[0]
-    assert (x.min(), x.max()) == (0.0, pytest.approx(59.0))
+def test_the_chart_is_drawn_at_most_twice_a_second(view, engine, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(view.panel.nis, "draw", lambda history, origin: drawn.append(history.n))
+    for k in range(20):
+        engine.put(events(WINDING, READING, 0, [80.0 + k], [45.0]))
+        view.frame()
+    assert len(drawn) <= 1
+
+
+def test_only_what_is_seen_is_kept_up(view, engine):
+    """A browser that shows the scene alone costs no panel; one without it does."""
+    engine.put(events(WINDING, READING, 0, [90.0], [45.0]))
+    shown = view.panel.status.content
+    view._look(["part=scene&theme=dark"])
+    assert view.panel.status.content == shown and view.stage.palette is DARK
+    view._look(["part=scene&theme=dark", "theme=light"])
+    assert view.panel.status.content != shown and view.stage.palette is LIGHT
+    assert "89.0 s" in view.panel.status.content
+
+
+def test_nobody_there_nothing_pulled(engine, monkeypatch):
+    """Until a browser connects, and again when it has gone; it sees the newest rows at once."""
+    pulled, released = [], []
+    pull = engine.pull
+    monkeypatch.setattr(engine, "pull", lambda *given, **more: pulled.append(1) or pull(*given, **more))
+    monkeypatch.setattr(engine, "release", lambda cursor: released.append(1))
+    view = ViserView(engine, secret="s3cret")
+    connected, leave, gone = threading.Event(), threading.Event(), threading.Event()
+
+    async def browse():
+        async with websockets.connect(
+            f"ws://127.0.0.1:{view.port}/?part=scene&theme=dark",
+            additional_headers={HEADER: "s3cret"},
+            subprotocols=[f"viser-v{viser.__version__}"],
+            compression=None,
+        ) as connection:
+            await connection.recv()
+            connected.set()
+            await asyncio.to_thread(leave.wait)
+        gone.set()
+
+    try:
+        view.start()
+        wait_for(lambda: view._thread.is_alive())
+        assert addresses(view.server) == [] and pulled == [] and view.history.n == 0
+        browser = threading.Thread(target=lambda: asyncio.run(browse()))
+        browser.start()
+        assert connected.wait(30)
+        wait_for(lambda: view.history.n == engine.log.n)
+        assert addresses(view.server) == ["part=scene&theme=dark"] and pulled
+        leave.set()
+        assert gone.wait(30)
+        browser.join()
+        wait_for(lambda: view._cursor is None)
+        count = len(pulled)
+        engine.put(events(WINDING, READING, 0, [100.0], [45.0]))
+        for _ in range(3):
+            view.coalescer.flush()
+        assert len(pulled) == count and released and view.history.n == 0
+    finally:
+        leave.set()
+        view.stop()
 
 
 def test_nothing_new_is_not_drawn_again(view, engine):
@@ -370,26 +316,23 @@ def test_nothing_new_is_not_drawn_again(view, engine):
 
 def test_belief_scene_follows_the_estimate(view, engine):
     belief = engine.belief()
-    axes = view.scene.axes
+    axes = view.stage.scene.axes
     place = [axis.place(belief.mean[axis.state]) for axis in axes]
-    np.testing.assert_allclose(view.scene._belief.position[:2], place, atol=1e-6)
+    np.testing.assert_allclose(view.stage.scene._belief.position[:2], place, atol=1e-6)
     assert np.all(np.abs(place) < 1.0)
-    labels = [float(label.text) for label in view.scene._labels[0]]
+    labels = [float(label.text) for label in view.stage.scene._labels[0]]
     assert labels[0] < belief.mean[0] < labels[-1]
 
 
 def test_blocks_of_true_states_are_drawn(engine):
-    """Both states in one event, the second not always known: each chart and the belief's point get their own."""
+    """Both states in one event, the second not always known: the belief's point gets the last of each."""
     t = 100.0 + np.arange(5)
     block = np.stack((50.0 + t, [0.1, np.nan, 0.3, 0.4, np.nan]), axis=1)
     engine.put(events(WINDING, TRUTH, 0, t, block))
     view = ViserView(engine, secret="x")
     try:
         view.frame()
-        for j, expected in enumerate((block[:, 0], [0.1, 0.3, 0.4])):
-            values = view.charts._values(view.history, view.history.n - 5, view.history.n)[:, 3 * WINDING.nx + j]
-            np.testing.assert_array_equal(values[np.isfinite(values)], expected)
-        np.testing.assert_array_equal(view.scene._true_point(view.history, [1, 0]), [[0.4, 154.0]])
+        np.testing.assert_array_equal(view.stage.scene._true_point(view.history, [1, 0]), [[0.4, 154.0]])
     finally:
         view.stop()
 
@@ -400,14 +343,14 @@ def test_peaks_are_marked_with_their_weights_while_there_are_several(view, engin
     engine.peaks = tuple(
         Peak(weight, belief.mean + side * std, belief.cov) for weight, side in ((0.75, 0.5), (0.25, -0.5))
     )
-    view.scene.draw(view.history, engine.belief())
-    (first, heavy), (second, light), (third, _) = view.scene._peaks[:3]
+    view.stage.scene.draw(view.history, engine.belief())
+    (first, heavy), (second, light), (third, _) = view.stage.scene._peaks[:3]
     assert first.visible and second.visible and not third.visible
     assert (heavy.text, light.text) == ("75 %", "25 %")
-    place = [axis.place(engine.peaks[1].mean[axis.state]) for axis in view.scene.axes]
+    place = [axis.place(engine.peaks[1].mean[axis.state]) for axis in view.stage.scene.axes]
     np.testing.assert_allclose(second.points[0, : len(place)], place[:3], atol=0.05)
     engine.peaks = ()
-    view.scene.draw(view.history, engine.belief())
+    view.stage.scene.draw(view.history, engine.belief())
     assert not (first.visible or second.visible)
 
 
@@ -423,7 +366,7 @@ def test_vehicle_scene_stands_at_the_heaviest_peak_among_its_walls():
     try:
         walls = (((-5.0, -1.0), (5.0, -1.0), (5.0, 1.0)),)
         section = SceneSection(kind="vehicle", position=("east", "north"), heading="heading", walls=walls)
-        scene = VehicleScene(server, MODELS["agv_corridor"], section)
+        scene = VehicleScene(server.scene, MODELS["agv_corridor"], section, LIGHT)
         peaks = (Peak(0.7, np.array([4.0, 0.5, 0.0]), 0.01 * np.eye(3)), Peak(0.3, -np.ones(3), 0.01 * np.eye(3)))
         cloud = np.array([[4.0, 0.5, 0.0], [-1.0, -1.0, -1.0], [np.nan, 0.0, 0.0]])
         belief = SimpleNamespace(mean=np.array([2.5, 0.0, -0.3]), cov=np.eye(3), points=cloud, peaks=peaks)
@@ -445,16 +388,11 @@ def test_the_first_view_holds_all_walls_and_stays_until_it_is_to_follow():
     try:
         walls = (((80.0, -3.0), (140.0, -3.0), (140.0, 45.0)), ((90.0, 0.0), (80.0, 1.0)))
         section = SceneSection(kind="vehicle", position=("east", "north"), heading="heading", walls=walls)
-        scene = VehicleScene(server, MODELS["agv_corridor"], section)
-        camera = server.initial_camera
-        forward = (camera.look_at - camera.position) / np.linalg.norm(camera.look_at - camera.position)
-        sideways = np.array([1.0, 0.0, 0.0])
-        tangents = []
-        for corner in [corner for line in walls for corner in line]:
-            sight = np.array([*corner, 0.0]) + scene.world.position - camera.position
-            tangents += [abs(sight @ axis) / (sight @ forward) for axis in (sideways, np.cross(sideways, forward))]
-        # Some wall fills the view but for its margin of a tenth; none is out of it.
-        assert max(tangents) == pytest.approx(0.9 * np.tan(camera.fov / 2))
+        scene = VehicleScene(server.scene, MODELS["agv_corridor"], section, LIGHT)
+        np.testing.assert_allclose(scene.world.position, [-110.0, -21.0, 0.0])
+        # What a camera is to see are the walls, about their middle (test_numbers.py: it then sees them).
+        corners = scene.outlook.points[:5, :2] - scene.world.position[:2]
+        np.testing.assert_allclose(corners, [corner for line in walls for corner in line])
         rows = History(3, 4, 16)
         rows.n = 1
         cov = 0.01 * np.eye(3)
@@ -499,15 +437,15 @@ def test_vehicle_scene_keeps_the_vehicle_in_the_middle():
     view = ViserView(engine, secret="x")
     try:
         view.frame()
-        np.testing.assert_allclose(view.scene.world.position, [-600.0, 0.0, 0.0], atol=2.0)
-        np.testing.assert_allclose(view.scene._vehicle.position[:2], engine.belief().mean[:2], atol=1e-6)
-        assert view.scene._readings.points.shape == (60, 3)
-        way = np.unique(np.asarray(view.scene._truth.points).reshape(-1, 3), axis=0)
+        np.testing.assert_allclose(view.stage.scene.world.position, [-600.0, 0.0, 0.0], atol=2.0)
+        np.testing.assert_allclose(view.stage.scene._vehicle.position[:2], engine.belief().mean[:2], atol=1e-6)
+        assert view.stage.scene._readings.points.shape == (60, 3)
+        way = np.unique(np.asarray(view.stage.scene._truth.points).reshape(-1, 3), axis=0)
         np.testing.assert_allclose(way[:, 0], 10 * t[t != 30.0], err_msg="where both true states are known")
         np.testing.assert_allclose(way[:, 1], 3.0)
-        assert view.scene._course == pytest.approx(0.0, abs=0.05)
+        assert view.stage.scene._course == pytest.approx(0.0, abs=0.05)
         cov = engine.belief().cov[:2, :2]
-        np.testing.assert_allclose(view.scene._ellipse.scale[:2], 2 * np.sqrt(np.linalg.eigvalsh(cov)), rtol=1e-6)
+        np.testing.assert_allclose(view.stage.scene._ellipse.scale[:2], 2 * np.sqrt(np.linalg.eigvalsh(cov)), rtol=1e-6)
     finally:
         view.stop()
 

@@ -1,0 +1,78 @@
+"""The colours of the page, for Viser's scenes and Rerun's charts: one meaning each, in light and in dark.
+
+`app/page/style.css` has the same under the same names (a test compares them), chosen so that who sees no red or no
+green tells them apart (after Okabe and Ito, 2008).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+RGB = tuple[int, int, int]
+
+
+def rgb(color: str) -> RGB:
+    """`#rrggbb` as three numbers from 0 to 255."""
+    return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)
+
+
+def mixed(a: RGB, b: RGB, share: float) -> RGB:
+    """A colour between two: `share` of the second."""
+    x, y, z = (round(p + share * (q - p)) for p, q in zip(a, b, strict=True))
+    return x, y, z
+
+
+@dataclass(frozen=True)
+class Palette:
+    """One theme; `health` is by the names of `HEALTH_NAMES`."""
+
+    ground: RGB
+    panel: RGB
+    ink: RGB
+    faint: RGB
+    rule: RGB
+    grid: RGB
+    estimate: RGB
+    truth: RGB
+    reading: RGB
+    refused: RGB
+    previous: RGB
+    bound: RGB
+    health: dict[str, RGB] = field(hash=False)
+
+
+LIGHT = Palette(
+    ground=rgb("#f3f5f8"), panel=rgb("#ffffff"), ink=rgb("#14202f"), faint=rgb("#5b6a7d"), rule=rgb("#d9dfe8"),
+    grid=rgb("#edf0f4"), estimate=rgb("#0b62c4"), truth=rgb("#111827"), reading=rgb("#d98a00"), refused=rgb("#cc3f0c"),
+    previous=rgb("#9aa3b0"), bound=rgb("#8794a5"),
+    health={
+        "waiting": rgb("#7b8798"), "tracking": rgb("#008a5e"), "suspect": rgb("#b07800"), "degraded": rgb("#b85600"),
+        "diverged": rgb("#b3261e"), "stale": rgb("#7b8798"),
+    },
+)  # fmt: skip
+
+DARK = Palette(
+    ground=rgb("#0c1118"), panel=rgb("#131a23"), ink=rgb("#e4eaf2"), faint=rgb("#94a3b5"), rule=rgb("#273242"),
+    grid=rgb("#1c2531"), estimate=rgb("#69b1ff"), truth=rgb("#f3f4f6"), reading=rgb("#f2b134"), refused=rgb("#ff7a45"),
+    previous=rgb("#6c7888"), bound=rgb("#7d8b9e"),
+    health={
+        "waiting": rgb("#8a97a8"), "tracking": rgb("#2fc791"), "suspect": rgb("#f0bf4c"), "degraded": rgb("#ff9d4d"),
+        "diverged": rgb("#ff7b72"), "stale": rgb("#8a97a8"),
+    },
+)  # fmt: skip
+
+THEMES = {"light": LIGHT, "dark": DARK}
+
+
+def between(a: Palette, b: Palette) -> Palette:
+    """The palette halfway between two."""
+    both = {
+        item.name: mixed(getattr(a, item.name), getattr(b, item.name), 0.5)
+        for item in fields(Palette)
+        if item.name != "health"
+    }
+    return Palette(**both, health={name: mixed(color, b.health[name], 0.5) for name, color in a.health.items()})
+
+
+EITHER = between(LIGHT, DARK)
+"""For files: nobody knows on what ground their viewer draws."""

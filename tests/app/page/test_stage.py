@@ -1,0 +1,86 @@
+"""The scene on the page in headless Chromium: chosen, large, and each view in a window of its own."""
+
+import pytest
+
+from app.cli.run import live_source
+from app.session import Page, Session
+from app.twin.twin import load_twin
+from tests.app.page.test_page import FLAGS, PATIENCE, until
+from tests.app.scripted import wait_for
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture
+def session():
+    twin = load_twin("motor_winding")
+    session = Session(twin, live_source(twin, 4.0), page=Page(0, open_browser=False))
+    session.start()
+    yield session
+    session.stop()
+
+
+@pytest.fixture
+def context(chromium):
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+        context = browser.new_context(viewport={"width": 1400, "height": 900})
+        context.set_default_timeout(PATIENCE * 1000)
+        yield context
+        browser.close()
+
+
+def asked(session):
+    """The queries of the browsers' sockets, as Viser's server knows them."""
+    from app.server.private_viser import addresses
+
+    return sorted(addresses(session.view.server))
+
+
+def test_the_scene_is_chosen_enlarged_and_opened_alone(context, session):
+    assert asked(session) == [] and session.view.history.n == 0
+    page = context.new_page()
+    page.goto(session.url)
+    wait_for(lambda: asked(session) == ["theme=light&part=scene"], PATIENCE)
+    wait_for(lambda: session.view.history.n > 0, PATIENCE)
+    # Its panel is not kept up while only the page shows the scene.
+    assert session.view.panel.status.content == ""
+
+    select = page.get_by_label("Scene: Show")
+    select.select_option("belief")
+    wait_for(lambda: session.view.stage.choices.values()["show"] == "belief", PATIENCE)
+    page.get_by_label("Scene: x", exact=True).select_option("rate")
+    wait_for(lambda: session.view.stage.choices.values()["y"] == "temperature", PATIENCE)
+    until(page, "document.querySelector('[aria-label=\"Scene: y\"]').value === 'temperature'")
+
+    # Once more S: the scene is larger than the charts, and stays so over a reload.
+    assert page.evaluate("document.getElementById('stage').clientWidth") < 400
+    page.locator("body").press("s")
+    until(page, "document.getElementById('stage').clientWidth > document.getElementById('charts').clientWidth")
+    page.reload()
+    until(page, "document.getElementById('stage').clientWidth > document.getElementById('charts').clientWidth")
+
+    # Hidden, nothing is sent for it.
+    page.get_by_role("tab", name="Runs").click()
+    wait_for(lambda: asked(session) == [], PATIENCE)
+    page.get_by_role("tab", name="Scene").click()
+
+    with context.expect_page() as opened:
+        page.get_by_label("Scene in a window of its own").click()
+    alone = opened.value
+    alone.get_by_text("Process noise Q").wait_for()
+    wait_for(lambda: asked(session) == ["theme=light", "theme=light&part=scene"], PATIENCE)
+    wait_for(lambda: "revision 0" in session.view.panel.status.content, PATIENCE)
+
+
+def test_rerun_has_a_window_of_its_own(context, session):
+    page = context.new_page()
+    errors = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto(session.url)
+    page.goto(f"{session.url.partition('?')[0]}explore")
+    until(page, "window.nisus?.explored > 0")
+    assert page.evaluate("document.getElementById('notice').hidden")
+    assert page.evaluate("document.getElementById('rerun').clientHeight") > 700
+    assert errors == []
