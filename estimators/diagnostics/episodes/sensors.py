@@ -10,7 +10,7 @@ import numpy as np
 from ...log import READING
 from ...track import GATED, REASONS, SCREENED, USED
 from .. import words
-from ..effects import KINDS, Effect, common_scale, effects, onset
+from ..effects import KINDS, Effect, against, common_scale, effects, onset
 from ..evidence import AGREEING, DISAGREEING, REFUSED, STUCK
 from .course import JOINED, Course, Run, runs, standardised, unusual
 from .episode import Episode, Found
@@ -20,6 +20,9 @@ LOOKED_AT = 4000
 
 WANDERING = 0.5
 """Lag-1 correlation from which innovations that are too large are those of a mean that moves: noise does not wander."""
+
+DECISIVE = float(np.log(1000.0))
+"""log Λ from which readings that follow an effect are back to normal: they are a thousand times likelier without it."""
 
 MOST = 0.5
 """Share of refused readings from which an episode is one of refusals."""
@@ -36,6 +39,7 @@ class Shown(NamedTuple):
 
     Row `k` of the sensor, its readings `begun` to `over`, and the effect: `cause` and `size` with its 95 % interval.
     `correlation`: lag 1, of its innovations, where it is needed to say whether Q or R is to blame for their scale.
+    `back`: whether what follows is back to normal, though the slowest of the tests has not fallen yet.
     """
 
     k: int
@@ -46,6 +50,7 @@ class Shown(NamedTuple):
     low: float = np.nan
     high: float = np.nan
     correlation: float = 0.0
+    back: bool = False
 
 
 def of_sensors(course: Course) -> Iterator[Found]:
@@ -64,7 +69,7 @@ def of_sensors(course: Course) -> Iterator[Found]:
 def _of_sensor(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run: Run) -> Episode:
     """The episode of a run of readings of a sensor, whose events are `rows`."""
     events, track, model = course.events, course.track, course.model
-    k, begun, over, cause, size, low, high, correlation = _shown(course, s, rows, masks, run)
+    k, begun, over, cause, size, low, high, correlation, back = _shown(course, s, rows, masks, run)
     nu = track.innovation[rows[begun:over], k]
     about = float(np.nanmean(nu)) if np.isfinite(nu).any() else np.nan
     reasons = ""
@@ -72,6 +77,9 @@ def _of_sensor(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run:
         bits = int(np.bitwise_or.reduce(track.screened[rows[begun:over], k]))
         reasons = " and ".join(reason for place, reason in enumerate(REASONS) if bits >> place & 1)
     start = events.t[rows[begun]] * 1e-9
+    text = words.of_sensor(model, course.tuning, s, k, cause, size, about, correlation, start, reasons)
+    if run.lasts and over < rows.size and (back or run.end < rows.size):
+        text = f"{text}; {words.of_return(events.t[rows[over]] * 1e-9)}"
     return Episode(
         start=start,
         end=None if run.lasts else events.t[rows[max(over - 1, begun)]] * 1e-9,
@@ -81,7 +89,7 @@ def _of_sensor(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run:
         low=low,
         high=high,
         unit=model.sensors[s].rows[k].unit if cause == "stuck" else UNITS.get(cause, ""),
-        text=words.of_sensor(model, course.tuning, s, k, cause, size, about, correlation, start, reasons),
+        text=text,
     )
 
 
@@ -130,7 +138,7 @@ def _most_telling(course: Course, s: int, rows: np.ndarray, said: np.ndarray, ru
     """
     first = max(0, run.begin - LOOKED_AT)
     unknown = [Effect("narrow", np.nan, np.nan, np.nan, -np.inf)]
-    best = int(said[0]) if said.size else 0, run.begin, run.end, unknown
+    best = int(said[0]) if said.size else 0, run.begin, run.end, unknown, np.zeros(0)
     shifted = best
     for k in said:
         e = standardised(course, rows[first : run.end], int(k))
@@ -144,7 +152,7 @@ def _most_telling(course: Course, s: int, rows: np.ndarray, said: np.ndarray, ru
             ranked = effects(e[begun:over])
             if ranked[0].cause != cause:
                 continue
-            found = int(k), first + int(known[begun]), first + int(known[over - 1]) + 1, ranked
+            found = int(k), first + int(known[begun]), first + int(known[over - 1]) + 1, ranked, e[over:]
             if ranked[0].ratio > best[3][0].ratio:
                 best = found
             if cause == "shifted" and ranked[0].ratio > shifted[3][0].ratio:
@@ -154,10 +162,11 @@ def _most_telling(course: Course, s: int, rows: np.ndarray, said: np.ndarray, ru
         if np.isfinite(shifted[3][0].ratio):
             best = shifted
         else:
-            best = (*best[:3], sorted(ranked, key=lambda item: item.cause != "correlated"))
+            best = (*best[:3], sorted(ranked, key=lambda item: item.cause != "correlated"), best[4])
     effect = best[3][0]
     correlation = next((item.size for item in best[3] if item.cause in ("correlated", "alternating")), 0.0)
-    return Shown(*best[:3], effect.cause, effect.size, effect.low, effect.high, correlation)
+    back = against(best[4], effect) >= DECISIVE
+    return Shown(*best[:3], effect.cause, effect.size, effect.low, effect.high, correlation, back)
 
 
 def _together(course: Course, rows: np.ndarray, run: Run, cause: str) -> Shown:

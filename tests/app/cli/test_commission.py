@@ -60,7 +60,7 @@ def test_what_is_printed_is_what_is_read_again(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_every_figure_comes_back(tmp_path: Path) -> None:
-    normals = {"winding": Normal(-0.25, 1.75, -0.125, {"narrow": 12.5, "high": 3.0, "stuck": 100.0})}
+    normals = {"winding": Normal(-0.25, 1.75, -0.125, {"narrow": 12.5, "shifted up": 3.0, "stuck": 100.0})}
     twin = load_twin(drive(tmp_path, TWIN + lines(normals)))
     np.testing.assert_array_equal(twin.tuning.baseline, baseline_of(twin.model, normals))
 

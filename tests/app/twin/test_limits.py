@@ -107,8 +107,7 @@ def test_a_range_of_validity_takes_the_place_of_the_models(tmp_path) -> None:
         (
             "range: [0, 50]\n    saturation: [60, 90]",
             "",
-            "sensors.winding.saturation is 60 to 90 °C, and range is 0 to 50: "
-            "no reading keeps both; let them overlap",
+            "sensors.winding.saturation is 60 to 90 °C, and range is 0 to 50: no reading keeps both; let them overlap",
         ),
         ("range: [0, 50]\n    saturation: [50, 90]", "", "no reading keeps both"),
         ("range: [20, 20.1]", "", "sensors.winding.range leaves 0.1 °C, less than the noise of the sensor .0.5 °C"),
