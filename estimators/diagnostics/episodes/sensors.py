@@ -24,6 +24,9 @@ WANDERING = 0.5
 DECISIVE = float(np.log(1000.0))
 """log Λ from which readings that follow an effect are back to normal: they are a thousand times likelier without it."""
 
+LEFT = 2.0
+"""Likelihood ratio, nats, below which nothing of an effect is left: that of a size on the edge of its 95 % interval."""
+
 MOST = 0.5
 """Share of refused readings from which an episode is one of refusals."""
 
@@ -165,8 +168,19 @@ def _most_telling(course: Course, s: int, rows: np.ndarray, said: np.ndarray, ru
             best = (*best[:3], sorted(ranked, key=lambda item: item.cause != "correlated"), best[4])
     effect = best[3][0]
     correlation = next((item.size for item in best[3] if item.cause in ("correlated", "alternating")), 0.0)
-    back = against(best[4], effect) >= DECISIVE
+    back = _is_back(best[4], effect)
     return Shown(*best[:3], effect.cause, effect.size, effect.low, effect.high, correlation, back)
+
+
+def _is_back(e: np.ndarray, effect: Effect) -> bool:
+    """Whether what followed an effect, e (n,), does without it: it is gone for sure, and no lesser one is left of it.
+
+    A filter follows a sensor that is off, so that a shift shrinks while its cause lasts.
+    """
+    if not e.size or against(e, effect) < DECISIVE:
+        return False
+    left = (item for item in effects(e) if item.cause == effect.cause and item.size * effect.size > 0.0)
+    return all(item.ratio < LEFT for item in left)
 
 
 def _together(course: Course, rows: np.ndarray, run: Run, cause: str) -> Shown:

