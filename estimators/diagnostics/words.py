@@ -145,8 +145,10 @@ def of_silence(model: StateSpaceModel, s: int, cause: str, start: float, lasted:
     return f"{name} is silent {since(start)}: {_lost(model, s)}; check its wiring and its bus"
 
 
-def of_return(start: float) -> str:
+def of_return(cause: str, start: float) -> str:
     """What is added of a sensor that is in order again while its alarm has not fallen, or may come back."""
+    if cause == "stuck":
+        return f"it moves again {since(start)}"
     return f"back to normal {since(start)}: the alarm goes with more such readings"
 
 

@@ -82,7 +82,7 @@ def _of_sensor(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run:
     start = events.t[rows[begun]] * 1e-9
     text = words.of_sensor(model, course.tuning, s, k, cause, size, about, correlation, start, reasons)
     if run.lasts and over < rows.size and (back or run.end < rows.size):
-        text = f"{text}; {words.of_return(events.t[rows[over]] * 1e-9)}"
+        text = f"{text}; {words.of_return(cause, events.t[rows[over]] * 1e-9)}"
     return Episode(
         start=start,
         end=None if run.lasts else events.t[rows[max(over - 1, begun)]] * 1e-9,
@@ -129,8 +129,8 @@ def _stuck(values: np.ndarray, k: int, run: Run) -> Shown:
     """A value that repeats itself: from its first reading until the first that is another."""
     begun = _after_last(values[: run.begin] != values[run.begin])
     others = np.flatnonzero(values[begun : run.end] != values[begun])
-    over = run.end if run.lasts or not others.size else begun + int(others[0])
-    return Shown(k, begun, over, cause="stuck", size=float(values[begun]))
+    over = begun + int(others[0]) if others.size else run.end
+    return Shown(k, begun, over, cause="stuck", size=float(values[begun]), back=bool(others.size))
 
 
 def _most_telling(course: Course, s: int, rows: np.ndarray, said: np.ndarray, run: Run) -> Shown:

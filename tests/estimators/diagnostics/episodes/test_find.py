@@ -368,3 +368,18 @@ def test_a_reset_is_advised_only_when_no_sensor_is_off():
     assert text((GATED, GATED)).endswith(f"and gauge, chain contradict it still: hold them {remedy}")
     assert text((USED, GATED)).endswith(f"and chain contradicts it still: hold it {remedy}")
     assert text((USED, USED)).endswith("Reset starts again from the prior; then look at which sensor spoke first")
+
+
+def test_a_sensor_that_moves_again_is_not_said_to_be_stuck_only():
+    """Its episode lasts while other alarms of it follow: here its noise is tenfold after the hundred equal readings."""
+
+    def gauge(x, z, rng):
+        return np.where(np.arange(END - BEGIN)[:, None] < 100, x[0], x + 2.0 * z)
+
+    course = cut(BEGIN + 50, gauge=gauge)
+    (each,) = [item.episode for item in found_in(course) if item.key == ("sensor", "gauge")]
+    assert each.cause == "stuck" and "again" not in each.text
+    course = cut(BEGIN + 150, gauge=gauge)
+    (each,) = [item.episode for item in found_in(course) if item.key == ("sensor", "gauge")]
+    assert each.cause == "stuck" and each.end is None
+    assert each.text.endswith(f"it moves again since {BEGIN + 101}.0 s")
