@@ -89,12 +89,12 @@ class Account(NamedTuple):
     lasting: tuple[Entry, ...] = ()
 
     def leading(self, states: Mapping[str, str]) -> Episode | None:
-        """The worst of those that last, the earliest of them; `states` of the sensors tell which of them is lost."""
+        """The worst of those that last, the newest of them; `states` of the sensors tell which of them is lost."""
 
         def badness(entry: Entry) -> tuple[int, float]:
             kind, name = entry.key
             lost = kind in OF_SENSORS and states.get(name) in ("degraded", "stale")
-            return min(_badness(entry.episode)[0], RANKS["silent"] if lost else UNRANKED), entry.episode.start
+            return min(_badness(entry.episode)[0], RANKS["silent"] if lost else UNRANKED), -entry.episode.start
 
         first = min(self.lasting, key=badness, default=None)
         return None if first is None else first.episode
@@ -115,7 +115,8 @@ class Account(NamedTuple):
 
 
 def _badness(episode: Episode) -> tuple[int, float]:
-    return RANKS.get(episode.cause, UNRANKED), episode.start
+    """The worst first, of them the newest: what has just begun is what somebody has to look at."""
+    return RANKS.get(episode.cause, UNRANKED), -episode.start
 
 
 class Chronicle:

@@ -41,8 +41,8 @@ def status_html(status: Status, origin: int | None, unit: Unit = SECONDS) -> str
         remedy = (
             f"The estimate is not a number{when}. <b>Reset</b> starts again from the prior; or choose another filter."
         )
-    elif status.health == DIVERGED:
-        remedy = "The readings contradict the estimate. <b>Reset</b> starts again from the prior."
+    elif status.health == DIVERGED and not status.cause:
+        remedy = "The readings contradict the estimate."
     elif status.cause:
         more = f" ({status.episodes_open - 1} more under Events)" if status.episodes_open > 1 else ""
         remedy = html.escape(status.cause) + more

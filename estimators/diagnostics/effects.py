@@ -94,6 +94,21 @@ def effects(e: np.ndarray) -> list[Effect]:
     return sorted(found, key=lambda effect: -effect.ratio)
 
 
+def against(e: np.ndarray, effect: Effect) -> float:
+    """log Λ, nats, of white noise over an effect of that size in a run e (n,), finite; 0 for spikes, which are rare."""
+    e = np.clip(e, -FURTHEST, FURTHEST)
+    size = effect.size
+    if effect.cause == "shifted":
+        return float(np.sum(0.5 * size**2 - size * e))
+    if effect.cause in ("narrow", "wide"):
+        variance = max(size**2, 1e-12)
+        return 0.5 * float(np.sum(np.log(variance) + e**2 / variance - e**2))
+    if effect.cause in ("correlated", "alternating"):
+        rest = 1.0 - min(size**2, 0.99)
+        return 0.5 * float(np.sum(np.log(rest) + (e[1:] - size * e[:-1]) ** 2 / rest - e[1:] ** 2))
+    return 0.0
+
+
 def common_scale(e: np.ndarray, dof: np.ndarray) -> Effect:
     """The scale of all rows of a sensor together, from e = √(NIS / dof) (n,) and the degrees of freedom (n,)."""
     whole = float(np.sum(dof))

@@ -10,7 +10,7 @@ import numpy as np
 from ...log import READING
 from ...track import GATED, REASONS, SCREENED, USED
 from .. import words
-from ..effects import KINDS, Effect, common_scale, effects, onset
+from ..effects import KINDS, Effect, against, common_scale, effects, onset
 from ..evidence import AGREEING, DISAGREEING, REFUSED, STUCK
 from .course import JOINED, Course, Run, runs, standardised, unusual
 from .episode import Episode, Found
@@ -20,6 +20,12 @@ LOOKED_AT = 4000
 
 WANDERING = 0.5
 """Lag-1 correlation from which innovations that are too large are those of a mean that moves: noise does not wander."""
+
+DECISIVE = float(np.log(1000.0))
+"""log Λ from which readings that follow an effect are back to normal: they are a thousand times likelier without it."""
+
+LEFT = 2.0
+"""Likelihood ratio, nats, below which nothing of an effect is left: that of a size on the edge of its 95 % interval."""
 
 MOST = 0.5
 """Share of refused readings from which an episode is one of refusals."""
@@ -36,6 +42,7 @@ class Shown(NamedTuple):
 
     Row `k` of the sensor, its readings `begun` to `over`, and the effect: `cause` and `size` with its 95 % interval.
     `correlation`: lag 1, of its innovations, where it is needed to say whether Q or R is to blame for their scale.
+    `back`: whether what follows is back to normal, though the slowest of the tests has not fallen yet.
     """
 
     k: int
@@ -46,6 +53,7 @@ class Shown(NamedTuple):
     low: float = np.nan
     high: float = np.nan
     correlation: float = 0.0
+    back: bool = False
 
 
 def of_sensors(course: Course) -> Iterator[Found]:
@@ -64,7 +72,7 @@ def of_sensors(course: Course) -> Iterator[Found]:
 def _of_sensor(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run: Run) -> Episode:
     """The episode of a run of readings of a sensor, whose events are `rows`."""
     events, track, model = course.events, course.track, course.model
-    k, begun, over, cause, size, low, high, correlation = _shown(course, s, rows, masks, run)
+    k, begun, over, cause, size, low, high, correlation, back = _shown(course, s, rows, masks, run)
     nu = track.innovation[rows[begun:over], k]
     about = float(np.nanmean(nu)) if np.isfinite(nu).any() else np.nan
     reasons = ""
@@ -72,6 +80,9 @@ def _of_sensor(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run:
         bits = int(np.bitwise_or.reduce(track.screened[rows[begun:over], k]))
         reasons = " and ".join(reason for place, reason in enumerate(REASONS) if bits >> place & 1)
     start = events.t[rows[begun]] * 1e-9
+    text = words.of_sensor(model, course.tuning, s, k, cause, size, about, correlation, start, reasons)
+    if run.lasts and over < rows.size and (back or run.end < rows.size):
+        text = f"{text}; {words.of_return(cause, events.t[rows[over]] * 1e-9)}"
     return Episode(
         start=start,
         end=None if run.lasts else events.t[rows[max(over - 1, begun)]] * 1e-9,
@@ -81,7 +92,7 @@ def _of_sensor(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run:
         low=low,
         high=high,
         unit=model.sensors[s].rows[k].unit if cause == "stuck" else UNITS.get(cause, ""),
-        text=words.of_sensor(model, course.tuning, s, k, cause, size, about, correlation, start, reasons),
+        text=text,
     )
 
 
@@ -118,8 +129,8 @@ def _stuck(values: np.ndarray, k: int, run: Run) -> Shown:
     """A value that repeats itself: from its first reading until the first that is another."""
     begun = _after_last(values[: run.begin] != values[run.begin])
     others = np.flatnonzero(values[begun : run.end] != values[begun])
-    over = run.end if run.lasts or not others.size else begun + int(others[0])
-    return Shown(k, begun, over, cause="stuck", size=float(values[begun]))
+    over = begun + int(others[0]) if others.size else run.end
+    return Shown(k, begun, over, cause="stuck", size=float(values[begun]), back=bool(others.size))
 
 
 def _most_telling(course: Course, s: int, rows: np.ndarray, said: np.ndarray, run: Run) -> Shown:
@@ -130,7 +141,7 @@ def _most_telling(course: Course, s: int, rows: np.ndarray, said: np.ndarray, ru
     """
     first = max(0, run.begin - LOOKED_AT)
     unknown = [Effect("narrow", np.nan, np.nan, np.nan, -np.inf)]
-    best = int(said[0]) if said.size else 0, run.begin, run.end, unknown
+    best = int(said[0]) if said.size else 0, run.begin, run.end, unknown, np.zeros(0)
     shifted = best
     for k in said:
         e = standardised(course, rows[first : run.end], int(k))
@@ -144,7 +155,7 @@ def _most_telling(course: Course, s: int, rows: np.ndarray, said: np.ndarray, ru
             ranked = effects(e[begun : min(over, begun + LOOKED_AT)])
             if ranked[0].cause != cause:
                 continue
-            found = int(k), first + int(known[begun]), first + int(known[over - 1]) + 1, ranked
+            found = int(k), first + int(known[begun]), first + int(known[over - 1]) + 1, ranked, e[over:]
             if ranked[0].ratio > best[3][0].ratio:
                 best = found
             if cause == "shifted" and ranked[0].ratio > shifted[3][0].ratio:
@@ -154,10 +165,22 @@ def _most_telling(course: Course, s: int, rows: np.ndarray, said: np.ndarray, ru
         if np.isfinite(shifted[3][0].ratio):
             best = shifted
         else:
-            best = (*best[:3], sorted(ranked, key=lambda item: item.cause != "correlated"))
+            best = (*best[:3], sorted(ranked, key=lambda item: item.cause != "correlated"), best[4])
     effect = best[3][0]
     correlation = next((item.size for item in best[3] if item.cause in ("correlated", "alternating")), 0.0)
-    return Shown(*best[:3], effect.cause, effect.size, effect.low, effect.high, correlation)
+    back = _is_back(best[4], effect)
+    return Shown(*best[:3], effect.cause, effect.size, effect.low, effect.high, correlation, back)
+
+
+def _is_back(e: np.ndarray, effect: Effect) -> bool:
+    """Whether what followed an effect, e (n,), does without it: it is gone for sure, and no lesser one is left of it.
+
+    A filter follows a sensor that is off, so that a shift shrinks while its cause lasts.
+    """
+    if not e.size or against(e, effect) < DECISIVE:
+        return False
+    left = (item for item in effects(e) if item.cause == effect.cause and item.size * effect.size > 0.0)
+    return all(item.ratio < LEFT for item in left)
 
 
 def _together(course: Course, rows: np.ndarray, run: Run, cause: str) -> Shown:

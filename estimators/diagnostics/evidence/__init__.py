@@ -4,19 +4,19 @@ from .alarms import (
     AGREEING,
     CAUSES,
     DISAGREEING,
-    HIGH,
     IMPOVERISHED,
     LOST,
-    LOW,
     MISSED,
     NARROW,
     OUTSIDE,
     REFUSED,
     SENSORS,
+    SHIFTED_DOWN,
+    SHIFTED_UP,
     STUCK,
     TRUTH_MISSED,
 )
-from .bank import causes_now, chances_of, fresh, heard_last, no_baseline, threshold_of, watched
+from .bank import causes_now, chances_of, fresh, heard_last, no_baseline, normal_nis, threshold_of, watched
 from .hypotheses import BITS, FURTHEST, RATIOS, SHIFTS, TESTS
 from .row_tests import highest
 from .watch import PATIENCE, watch_rows
@@ -27,10 +27,10 @@ __all__ = [
     "CAUSES",
     "DISAGREEING",
     "FURTHEST",
-    "HIGH",
+    "SHIFTED_UP",
     "IMPOVERISHED",
     "LOST",
-    "LOW",
+    "SHIFTED_DOWN",
     "MISSED",
     "NARROW",
     "OUTSIDE",
@@ -48,6 +48,7 @@ __all__ = [
     "heard_last",
     "highest",
     "no_baseline",
+    "normal_nis",
     "threshold_of",
     "watch_rows",
     "watched",

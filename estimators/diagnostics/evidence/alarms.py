@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 CAUSES = (
-    "narrow", "wide", "high", "low", "correlated", "alternating", "spiky", "refused", "stuck", "disagreeing",
-    "agreeing", "missed",
+    "narrow", "wide", "shifted up", "shifted down", "correlated", "alternating", "spiky", "refused", "stuck",
+    "disagreeing", "agreeing", "missed",
 )  # fmt: skip
-"""What a test says of a row: its bands are too narrow or too wide; it reads high or low; its innovations are
-correlated, or change sign; spikes; the gate refuses it; it repeats itself; the rows of one sensor contradict each
-other, or are closer than their noise; the truth that was told is outside the band. Bits of `Track.alarms`, in this
-order."""
+"""What a test says of a row: its bands are too narrow or too wide; it is shifted, up or down;
+its innovations are correlated, or change sign; spikes; the gate refuses it; it repeats itself; the rows of one sensor
+contradict each other, or are closer than their noise; the truth that was told is outside the band. Bits of
+`Track.alarms`, in this order."""
 
-NARROW, WIDE, HIGH, LOW, CORRELATED, ALTERNATING, SPIKY, REFUSED, STUCK, DISAGREEING, AGREEING, MISSED = (
-    1 << k for k in range(len(CAUSES))
-)
+(
+    NARROW, WIDE, SHIFTED_UP, SHIFTED_DOWN, CORRELATED, ALTERNATING, SPIKY, REFUSED, STUCK, DISAGREEING, AGREEING,
+    MISSED,
+) = (1 << k for k in range(len(CAUSES)))  # fmt: skip
 
 LOST = REFUSED | STUCK
 """Causes for which a sensor tells nothing more."""

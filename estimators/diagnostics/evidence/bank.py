@@ -41,6 +41,17 @@ def no_baseline(model: StateSpaceModel) -> np.ndarray:
     return baseline
 
 
+def normal_nis(model: StateSpaceModel, baseline: np.ndarray) -> np.ndarray:
+    """How many times the NIS that the filter expects of each sensor was normal, (sensors,), 1 at least.
+
+    E eᵀe / n of innovations e whose n rows have biases b and scales s is mean(b² + s²).
+    """
+    each = baseline[:, 0] ** 2 + baseline[:, 1] ** 2
+    counts = [len(sensor.rows) for sensor in model.sensors]
+    means = [each[start : start + n].mean() for start, n in zip(model.row_start, counts, strict=True)]
+    return np.maximum(np.array(means, float), 1.0)
+
+
 def watched(
     model: StateSpaceModel,
     gate: float | None,
@@ -58,9 +69,9 @@ def watched(
         expected: Sensors that must speak, (sensors,); None for those that have spoken.
 
     Returns:
-        `baseline` (rows, 3 + TESTS); `ranges` (shown + inputs, 2) in which the model was fitted, and `fitted`, 1 if
-        there is any; `column` (nx,) of a state in the track, or -1; `expected` (sensors,); `chances` (2,), log Λ of a
-        refused and of an accepted reading; `marginal`; `n_tests` in all.
+        `baseline` (rows, 3 + TESTS); `normal` (sensors,), see `normal_nis`; `ranges` (shown + inputs, 2) in which the
+        model was fitted, and `fitted`, 1 if there is any; `column` (nx,) of a state in the track, or -1; `expected`
+        (sensors,); `chances` (2,), log Λ of a refused and of an accepted reading; `marginal`; `n_tests` in all.
     """
     shown = model.shown
     column = np.full(model.nx, -1, np.int64)
@@ -76,6 +87,7 @@ def watched(
     several = int(np.sum(counts > 1))
     return {
         "baseline": np.ascontiguousarray(baseline, float),
+        "normal": normal_nis(model, baseline),
         "ranges": ranges,
         "fitted": int(np.any(np.isfinite(ranges))),
         "column": column,

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from .alarms import ALTERNATING, CORRELATED, HIGH, LOW, NARROW, REFUSED, SPIKY, STUCK, WIDE
+from .alarms import ALTERNATING, CORRELATED, NARROW, REFUSED, SHIFTED_DOWN, SHIFTED_UP, SPIKY, STUCK, WIDE
 
 SCALES = (1.5, 2.5, 6.0, 0.6, 0.3, 0.05)
 """Variances of e that are tested."""
@@ -51,8 +51,8 @@ BITS = np.array(
     [
         *[NARROW] * 3,
         *[WIDE] * 3,
-        *[HIGH] * 3,
-        *[LOW] * 3,
+        *[SHIFTED_UP] * 3,
+        *[SHIFTED_DOWN] * 3,
         *[CORRELATED] * 2,
         *[ALTERNATING] * 2,
         *[SPIKY] * 2,

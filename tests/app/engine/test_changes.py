@@ -126,7 +126,7 @@ def test_a_live_twin_goes_back_to_its_file():
     assert found == {"Q.rate": was}
     unit = next(item.unit for item in twin.tuning.items() if item.key == "Q.rate")
     assert f"Turned since the start.</b> As configured: Q.rate {was:.6g} {unit}." in began_html(twin, found)
-    with pytest.raises(ConfigError, match="Restore: has name; it takes no field"):
+    with pytest.raises(ConfigError, match="Restore: name is not known; it takes no field"):
         command_from_json({"command": "Restore", "name": "kf"}, engine)
 
 

@@ -201,7 +201,10 @@ def test_the_cause_is_that_of_a_sensor_that_is_lost_before_that_of_one_that_is_n
 
     noisy, lost = entry("sensor", "a", "wide", 1.0), entry("sensor", "b", "narrow", 2.0)
     account = Account((noisy.episode, lost.episode), (noisy, lost))
-    assert account.leading({"a": "suspect", "b": "suspect"}).text == "a wide"
+    # Of two that are as bad the newest, whatever their order.
+    assert account.leading({"a": "suspect", "b": "suspect"}).text == "b narrow"
+    assert Account((), (lost, noisy)).leading({"a": "suspect", "b": "suspect"}).text == "b narrow"
+    assert account.leading({"a": "degraded", "b": "suspect"}).text == "a wide"
     assert account.leading({"a": "suspect", "b": "degraded"}).text == "b narrow"
     silent, gone = entry("silence", "c", "silent", 3.0), entry("twin", "diverged", "diverged", 4.0)
     assert Account((), (noisy, silent)).leading({"a": "suspect", "c": "degraded"}).text == "c silent"

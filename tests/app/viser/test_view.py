@@ -218,7 +218,7 @@ def test_a_fault_is_put_in_and_all_are_ended(view, engine):
     edit(faults.kind, "bias")
     edit(faults.target, "winding")
     edit(faults.inject, True)
-    assert engine.commands == [] and "has no size" in view.panel._note.content
+    assert engine.commands == [] and "size is missing" in view.panel._note.content
     edit(faults.size, "2 x")
     edit(faults.inject, True)
     assert engine.commands == [] and "it must be a number" in view.panel._note.content

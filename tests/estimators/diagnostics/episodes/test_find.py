@@ -1,16 +1,18 @@
 """Episodes of one fault each, put into readings that were in order: who, what, from when to when, in words."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 
 from estimators.diagnostics.episodes import CAUSES, JOINED, Episode, course_of, episode_json, episodes, found_in
-from estimators.diagnostics.evidence import IMPOVERISHED, LOW, NARROW
+from estimators.diagnostics.evidence import IMPOVERISHED, NARROW, SHIFTED_DOWN
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold
 from estimators.log import INPUT, READING, TICK, TRUTH, Events
 from estimators.model.state_space import Input, Noise, Row, Sensor, State, StateSpaceModel
+from estimators.track import DIVERGED, GATED, TRACKING, USED
 from estimators.tuning import Tuning
 from tests.support import SECOND, as_log
 
@@ -131,7 +133,7 @@ SENSORS = {
         {"gauge": lambda x, z, rng: x + 5.0 + 0.2 * z, "gate": 0.9999},
         ("gauge", "", 0.99, 1.0),
         "gauge is refused by the gate since",
-        "(100 % of its readings): the sensor is wrong, or the twin is; Reset, or hold gauge out",
+        "(100 % of its readings): the sensor is wrong, or the twin is; hold gauge out to see whether the others agree",
     ),
     "stuck": (
         {"gauge": lambda x, z, rng: np.full_like(x, 0.125)},
@@ -310,7 +312,7 @@ def test_episodes_of_several_bits_are_one():
     course = course_of(folded())
     track = course.track.copy()
     rows = np.flatnonzero((course.events.kind == READING) & (course.events.channel == 1))
-    track.alarms[rows[100:120], 0], track.alarms[rows[110:130], 3] = NARROW, LOW
+    track.alarms[rows[100:120], 0], track.alarms[rows[110:130], 3] = NARROW, SHIFTED_DOWN
     assert len(found_in(course._replace(track=track))) == 1
 
 
@@ -328,3 +330,62 @@ def test_numbers_are_those_of_python():
     for cause in ("shifted", "stuck"):
         for each in episodes(folded(**SENSORS[cause][0])):
             assert {type(value) for value in each} <= {float, str, type(None)}
+
+
+def cut(until, **faults):
+    """A course that is known only up to a second of the log."""
+    course = course_of(folded(**faults))
+    n = int(np.searchsorted(course.events.t, until * SECOND, side="right"))
+    return course._replace(events=course.events.select(slice(0, n)), track=course.track.select(slice(0, n)))
+
+
+def test_what_is_back_to_normal_is_said_while_the_slowest_test_still_falls():
+    """After a shift of 5 σ that of 0.2 σ falls for hundreds of readings; its end shows in a few."""
+    fault = {"gauge": lambda x, z, rng: x + 0.2 * z + 1.5}
+    for until in (*range(BEGIN + 20, END, 20), END):
+        (each,) = [item.episode for item in found_in(cut(until, **fault)) if item.key == ("sensor", "gauge")]
+        assert each.end is None and "back to normal" not in each.text, until
+    course = cut(END + 15, **fault)
+    gauge = np.flatnonzero((course.events.kind == READING) & (course.events.channel == 0))
+    assert course.track.alarms[gauge[-1], 0] != 0
+    (each,) = [item.episode for item in found_in(course) if item.key == ("sensor", "gauge")]
+    since = float(re.search(r"; back to normal since ([\d.]+) s: the alarm goes", each.text)[1])
+    # The filter has followed by 4 of the 5 σ, so that the last readings of the fault look much like those after it.
+    assert each.end is None and abs(since - END) <= 15
+
+
+def test_a_reset_is_advised_only_when_no_sensor_is_off():
+    """The estimate is lost while two sensors are refused, then while one is, then with all in order."""
+    fault = {"gauge": lambda x, z, rng: x + 9.0, "chain": lambda x, z, rng: x + 9.0 + 0.1 * z, "gate": 0.9999}
+    course = course_of(folded(**fault))
+
+    def text(verdicts):
+        track = course.track.copy()
+        n = int(np.searchsorted(course.events.t, (BEGIN + 60) * SECOND))
+        track.alarms[:], track.health[:n] = 0, TRACKING
+        track.health[n - 40 : n] = DIVERGED
+        kind, channel = course.events.kind[:n], course.events.channel[:n]
+        for s, verdict in enumerate(verdicts):
+            track.verdict[:n][(kind == READING) & (channel == s)] = verdict
+        part = course._replace(events=course.events.select(slice(0, n)), track=track.select(slice(0, n)))
+        return only([item.episode for item in found_in(part)], "diverged").text
+
+    remedy = "out first, one by one, and Reset when the rest agrees"
+    assert text((GATED, GATED)).endswith(f"and gauge, chain contradict it still: hold them {remedy}")
+    assert text((USED, GATED)).endswith(f"and chain contradicts it still: hold it {remedy}")
+    assert text((USED, USED)).endswith("Reset starts again from the prior; then look at which sensor spoke first")
+
+
+def test_a_sensor_that_moves_again_is_not_said_to_be_stuck_only():
+    """Its episode lasts while other alarms of it follow: here its noise is tenfold after the hundred equal readings."""
+
+    def gauge(x, z, rng):
+        return np.where(np.arange(END - BEGIN)[:, None] < 100, x[0], x + 2.0 * z)
+
+    course = cut(BEGIN + 50, gauge=gauge)
+    (each,) = [item.episode for item in found_in(course) if item.key == ("sensor", "gauge")]
+    assert each.cause == "stuck" and "again" not in each.text
+    course = cut(BEGIN + 150, gauge=gauge)
+    (each,) = [item.episode for item in found_in(course) if item.key == ("sensor", "gauge")]
+    assert each.cause == "stuck" and each.end is None
+    assert each.text.endswith(f"it moves again since {BEGIN + 101}.0 s")

@@ -93,7 +93,7 @@ def bank_of_a_row():
     for v in (1.5, 2.5, 6.0, 0.6, 0.3, 0.05):
         yield ("narrow" if v > 1 else "wide"), lambda e, _, v=v: log_normal(e, 0.0, v) - white(e)
     for m in (0.2, 0.5, 1.5, -0.2, -0.5, -1.5):
-        yield ("high" if m > 0 else "low"), lambda e, _, m=m: log_normal(e, m, 1.0) - white(e)
+        yield ("shifted up" if m > 0 else "shifted down"), lambda e, _, m=m: log_normal(e, m, 1.0) - white(e)
     for phi in (0.25, 0.6, -0.25, -0.6):
         cause = "correlated" if phi > 0 else "alternating"
         yield cause, lambda e, last, phi=phi: log_normal(e, phi * last, 1.0 - phi**2) - white(e)
