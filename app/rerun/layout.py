@@ -107,7 +107,9 @@ def blueprint(
     else:
         charts = _stacked(states)
         above = [*charts, rrb.Horizontal(*_tabs(innovations), nis)]
-        shares = [1.25 * min(len(states), AT_ONCE) / len(charts)] * len(charts) + [1.1, 0.8, 1.5]
+        # A tab of sensors is as high as their lanes, of which up to three are read at once.
+        lanes = 0.5 + 0.4 * min(len(model.sensors), AT_ONCE) if len(healths) > 1 else 0.8
+        shares = [1.25 * min(len(states), AT_ONCE) / len(charts)] * len(charts) + [1.1, lanes, 1.5]
     return rrb.Blueprint(
         rrb.Vertical(*above, *_tabs(healths), bottom, row_shares=shares),
         rrb.TopPanel(state="hidden"),
