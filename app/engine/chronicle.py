@@ -89,12 +89,17 @@ class Account(NamedTuple):
     lasting: tuple[Entry, ...] = ()
 
     def leading(self, states: Mapping[str, str]) -> Episode | None:
-        """The worst of those that last, the newest of them; `states` of the sensors tell which of them is lost."""
+        """The worst of those that last, the newest of them.
 
-        def badness(entry: Entry) -> tuple[int, float]:
+        `states` of the sensors tell which of them is lost, and which is in order again: its episode, which lasts until
+        it is certain to be over, comes last.
+        """
+
+        def badness(entry: Entry) -> tuple[bool, int, float]:
             kind, name = entry.key
-            lost = kind in OF_SENSORS and states.get(name) in ("degraded", "stale")
-            return min(_badness(entry.episode)[0], RANKS["silent"] if lost else UNRANKED), -entry.episode.start
+            state = states.get(name) if kind in OF_SENSORS else None
+            lost = RANKS["silent"] if state in ("degraded", "stale") else UNRANKED
+            return state == "tracking", min(_badness(entry.episode)[0], lost), -entry.episode.start
 
         first = min(self.lasting, key=badness, default=None)
         return None if first is None else first.episode

@@ -209,4 +209,7 @@ def test_the_cause_is_that_of_a_sensor_that_is_lost_before_that_of_one_that_is_n
     silent, gone = entry("silence", "c", "silent", 3.0), entry("twin", "diverged", "diverged", 4.0)
     assert Account((), (noisy, silent)).leading({"a": "suspect", "c": "degraded"}).text == "c silent"
     assert Account((), (noisy, silent, gone)).leading({"c": "stale"}).text == "diverged diverged"
+    # A sensor in order again has an episode that lasts until it is certain to be over: the one that is lost leads.
+    assert account.leading({"a": "tracking", "b": "suspect"}).text == "b narrow"
+    assert Account((), (noisy,)).leading({"a": "tracking"}) is noisy.episode
     assert Account().leading({}) is None
