@@ -17,7 +17,7 @@ else the delays of the moment would add up from one step to the next.
 
 With known arrivals that time comes to where the held ones are says nothing: a clock that is a little more ahead than
 the horizon would be let in after a while, and all that other clocks stamp would be stale from then on. And a reading
-that fits but was on its way for long says nothing of the clock now, so it does not contradict those that are held.
+that fits but was measured before the held ones had come says nothing of the clock now, so it does not contradict them.
 
 It is a pure function of the events in the order of arrival: the outcome does not depend on how they were cut into
 batches. Queries and resets, which are ours, pass. Readings are judged by sensor, inputs together, true states together:
@@ -26,6 +26,7 @@ events do not tell their source.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -162,6 +163,7 @@ class ClockGuard:
         self._sensors, self._horizon = sensors, horizon
         self._agree = min(max(SECOND // 2, horizon // 2), SETTLED)
         self._settled = max(SETTLED, 2 * self._agree)
+        self._spread = horizon + self._agree
         self._everything = sensors + 2
         self._state = np.zeros((sensors + 3, 11), np.int64)
         self._shift = np.zeros(sensors + 2, np.int64)
@@ -249,10 +251,18 @@ class ClockGuard:
             self._release(work, row)
             run = None
         verdict = self._verdict(work, i)
+        if run is not None and run.ahead and run.live and verdict == BACK:
+            if int(work.arrival[i]) - run.arrived <= self._settled:
+                # Late, whatever the clock says now.
+                work.emit([i])
+                return
+        rest: list[int] = []
         if run is not None and (
             self._contradicts(work, run, i) if verdict == FITS else run.full or not self._agrees(work, run, i)
         ):
-            self._dissolve(work, row)
+            if verdict != FITS and run.live and not run.full:
+                rest = [k for k in run.at if abs(self._offset(work, k) - self._offset(work, i)) <= self._spread]
+            self._dissolve(work, row, rest)
             run = None
         if verdict == FITS or (run is None and verdict == BACK and not self._can_be_set_back(work, i)):
             if verdict == FITS:
@@ -264,12 +274,16 @@ class ClockGuard:
             begin = int(self._state[self._everything, LAST])
             run = self._runs[row] = Run(verdict == AHEAD, live, begin, self._agree, MOST_LIVE if live else MOST)
             self._state[row, HOLDING] = 1
-        run.add(i, int(work.t[i]), int(work.arrival[i]))
+        for k in (*rest, i):
+            run.add(k, int(work.t[k]), int(work.arrival[k]))
         if len(run.at) >= ENOUGH and run.span >= self._settled and self._overlaps(run, row):
             self._anchor(work, row)
 
     def _is_live(self, work: Work, i: int) -> bool:
         return bool(work.live[i] or self._state[work.rows[i], LIVE])
+
+    def _offset(self, work: Work, i: int) -> int:
+        return int(work.t[i]) - int(work.arrival[i])
 
     def _has_come(self, work: Work, run: Run) -> bool:
         """Whether time has come to where those are that are held ahead; to their last one, if arrivals are known."""
@@ -278,18 +292,19 @@ class ClockGuard:
     def _contradicts(self, work: Work, run: Run, i: int) -> bool:
         """Whether an event that fits tells that those that are held do not.
 
-        One that was on its way for longer than usual was stamped before them, maybe. It tells only that no more came.
+        By a clock that was not set it was measured at t - `OFFSET` of the host's time at the earliest. If that is
+        after the first of those that are held had come, it says so; else it may have been on its way meanwhile.
         """
-        arrival, state = int(work.arrival[i]), self._state[work.rows[i]]
-        if not run.live or int(work.t[i]) - arrival >= state[OFFSET] - self._agree:
-            return True
-        return arrival - run.arrived > self._settled
+        return not run.live or int(work.t[i]) - int(self._state[work.rows[i], OFFSET]) > run.begun + self._agree
 
     def _agrees(self, work: Work, run: Run, i: int) -> bool:
         """Whether an event says the same of its clock as those that are held, but for delays."""
         t = int(work.t[i])
         if run.live:
-            return abs(t - int(work.arrival[i]) - run.top) <= self._horizon + self._agree
+            lower = run.top - self._offset(work, i)
+            # On its way for long, while others come on time.
+            delayed = lower > 0 and int(work.arrival[i]) - run.arrived <= self._settled
+            return delayed or abs(lower) <= self._spread
         if t < run.t[-1] - self._horizon:
             return False
         reach = int(self._reach(self._state, work.rows[i], self._horizon, False))
@@ -356,13 +371,17 @@ class ClockGuard:
             self._let_in(work, i)
         work.emit(run.at, settled=True)
 
-    def _dissolve(self, work: Work, row: int) -> None:
-        """What is held was not true: refused if it is ahead; what is back goes to the log, which counts it as stale."""
+    def _dissolve(self, work: Work, row: int, rest: Sequence[int] = ()) -> None:
+        """What is held was not true: refused if it is ahead; what is back goes to the log, which counts it as stale.
+
+        But for the `rest`, which stays held with what contradicted it.
+        """
         run = self._end(row)
+        gone = [i for i in run.at if i not in set(rest)] if rest else run.at
         if not run.ahead:
-            work.emit(run.at)
+            work.emit(gone)
             return
-        for i in run.at:
+        for i in gone:
             stamp, shift = int(work.raw[i]), int(self._shift[row])
             work.refused.append(Refused(int(work.kind[i]), int(work.channel[i]), stamp, run.begin - shift))
 
