@@ -67,6 +67,9 @@ range in which the model was fitted; the truth that was told is missed."""
 SENSORS = 58
 """Sensors that have a bit of their own in `Track.flags`; the others share the last."""
 
+LEARNT = 16.0
+"""Readings of a sensor from which on its period is known; before, it is silent the later the fewer there are."""
+
 SCALES = (1.5, 2.5, 6.0, 0.6, 0.3, 0.05)
 """Variances of e that are tested."""
 
@@ -445,7 +448,10 @@ def _time(own, now, every, tests, policy):
     if n <= 16 or n & (n - 1) == 0:
         # The rate of a sensor is known better and better; the threshold follows it in ever wider steps.
         own[_THRESHOLD] = max(math.log(every / max(period, 1e-3) * tests), math.log(8.0 * tests))
-    own[_DUE] = now + max(policy.silent_periods * period, 2.0 * own[_LONGEST]) if n > 2 else np.inf
+    # A mean of few gaps is no period yet: of three readings that begin in haste the next is no silence.
+    usual = policy.silent_periods * period
+    patience = max(usual, min(usual * LEARNT / n, policy.stale_after))
+    own[_DUE] = now + max(patience, 2.0 * own[_LONGEST]) if n > 2 else np.inf
     own[_SILENT] = 0.0
 
 
