@@ -58,7 +58,7 @@ class Order:
             )
         begin = int(change[0])
         rest = t[begin:]
-        alone = t[0] - self._horizon > rest[:MANY].max() and np.all(np.diff(t[change[:ENOUGH]]) > 0)
+        alone = t[0] - self._horizon > rest.max() and np.all(np.diff(t[change[:ENOUGH]]) > 0)
         if alone:
             after = (t[0] - t[begin]) * 1e-9
             self._report(
