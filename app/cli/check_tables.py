@@ -21,6 +21,8 @@ MOST = 12
 
 WORSE = "worse than no filter"
 
+UNKNOWN = "How late readings come is not known: the log has one time for each, that at which it was measured."
+
 
 class Bar(NamedTuple):
     """Two lengths to compare, in `unit`: 2 σ and the integrity bound, or an RMS and the open loop's."""
@@ -201,6 +203,7 @@ def _open_loop(checked: Checked) -> Part:
 
 
 def _timing(checked: Checked) -> Part:
+    known = any(np.isfinite(item.lateness).any() for item in checked.arrivals)
     rows = [
         (
             item.sensor,
@@ -208,12 +211,13 @@ def _timing(checked: Checked) -> Part:
             _number(item.rate),
             _number(item.gap),
             f"{100 * item.missing:.2g}" if np.isfinite(item.missing) else "-",
-            " / ".join(_number(value) for value in item.lateness),
+            " / ".join(_number(value) for value in item.lateness) if known else "not known",
         )
         for item in checked.arrivals
     ]
     head = ("sensor", "readings", "a second", "longest gap, s", "missing, %", "lateness, s: half, 99 %, worst")
-    return Part("When readings come", (), head, _cut(rows))
+    said = () if known else (UNKNOWN,)
+    return Part("When readings come", said, head, _cut(rows))
 
 
 def _health(checked: Checked) -> Part:

@@ -20,8 +20,8 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.screen import reasons_by_sensor
 from estimators.track import FAILED, HEALTH_NAMES, REASONS, USED
 from estimators.tuning import TOGETHER
+from sources.source import WRONG_TIME
 
-from ..intake import WRONG_TIME
 from ..twin.twin import Twin
 from .fold_episodes import Told, as_json, dropped
 

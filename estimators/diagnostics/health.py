@@ -34,7 +34,7 @@ class HealthPolicy(NamedTuple):
     refuses more than `diverged_gated` of the window (or they fail), or when a number is not finite. A reset begins a
     new window. It is suspect, or degraded where a sensor is lost, when a test of evidence/ is in alarm: by chance
     once in `false_alarm_every` seconds. A sensor is silent after `silent_periods` of its mean periods, and twice its
-    longest silence so far.
+    longest silence so far; of so many more, as long as its period is known from few readings.
     """
 
     window: int = 50

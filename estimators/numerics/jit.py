@@ -158,6 +158,12 @@ def flag_rows(target, rows, columns):
 
 
 @jit
+def counts(target, n):
+    """The n int32s at an address."""
+    return carray(_to_mask(target), (n,))
+
+
+@jit
 def masks(target, rows, columns):
     """The (rows, columns) int32s at an address."""
     return carray(_to_mask(target), (rows, columns))

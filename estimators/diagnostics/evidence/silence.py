@@ -9,6 +9,9 @@ import numpy as np
 from ...numerics.jit import jit
 from .bank import COUNT, DUE, FIRST, LAST, LONGEST, NEXT_DUE, SILENT, SILENT_SENSORS, THRESHOLD, sensor_part
 
+LEARNT = 16.0
+"""Readings of a sensor from which on its period is known; before, it is silent the later the fewer there are."""
+
 
 @jit
 def note_time(own, now, every, tests, policy):
@@ -25,7 +28,10 @@ def note_time(own, now, every, tests, policy):
     if n <= 16 or n & (n - 1) == 0:
         # The rate of a sensor is known better and better; the threshold follows it in ever wider steps.
         own[THRESHOLD] = max(math.log(every / max(period, 1e-3) * tests), math.log(8.0 * tests))
-    own[DUE] = now + max(policy.silent_periods * period, 2.0 * own[LONGEST]) if n > 2 else np.inf
+    # A mean of few gaps is no period yet: of three readings that begin in haste the next is no silence.
+    usual = policy.silent_periods * period
+    patience = max(usual, min(usual * LEARNT / n, policy.stale_after))
+    own[DUE] = now + max(patience, 2.0 * own[LONGEST]) if n > 2 else np.inf
     own[SILENT] = 0.0
 
 

@@ -10,7 +10,7 @@ from app.engine.engine import Engine
 from app.engine.host_clock import HostClock, clock_text
 from app.engine.notices import Notices
 from app.engine.silence import Silence
-from app.intake import CLOCK_MOVED, WRONG_TIME, Planned
+from app.intake import CLOCK_MOVED, Planned
 from app.recording.reader import read_recording
 from app.recording.writer import Recorder
 from app.server.api import command_from_json, status_json
@@ -20,6 +20,7 @@ from estimators.errors import ConfigError
 from estimators.events.maintenance import model_versions
 from estimators.log import MAINTENANCE
 from estimators.track import STALE, WAITING
+from sources.source import WRONG_TIME
 from tests.app.scripted import MODEL, Scripted, fresh_status, pull_all, readings, row_count, twin, wait_for
 from tests.support import SECOND
 

@@ -192,7 +192,10 @@ class SensorOracle:
         if n <= 16 or math.log2(n).is_integer():
             readings = POLICY.false_alarm_every / max(period, 1e-3)
             self.h = math.log(max(readings, 8.0) * N_TESTS)
-        self.due = now + max(POLICY.silent_periods * period, 2.0 * self.longest) if n > 2 else math.inf
+        patience = POLICY.silent_periods * period
+        if n < 16:
+            patience = max(patience, min(patience * 16 / n, POLICY.stale_after))
+        self.due = now + max(patience, 2.0 * self.longest) if n > 2 else math.inf
         self.silent = False
 
     def scale(self, nis, dof):
@@ -417,6 +420,28 @@ def test_pieces_and_late_arrivals_change_nothing(seed, pieces, late):
         at, turn = end, turn + 1
     growing.advance()
     assert_same(growing.track, whole.track)
+
+
+def silent_rows(t):
+    """At which of some times sensor `one`, which speaks at t (s), is silent for the twin, which is asked at 100 Hz."""
+    ticks = np.arange(0.0, 15.0, 0.01)
+    batch = [Events.one(round(s * SECOND), 0, READING, 0, (0.0,), MODEL.width) for s in t]
+    batch += [Events.one(round(s * SECOND), 0, TICK, 0, (), MODEL.width) for s in ticks]
+    log = as_log(Events.concat(batch, MODEL.width))
+    track = fold("kf", MODEL, Tuning.of(MODEL), log, policy=POLICY)
+    return log.t[: log.n][track.flags & 1 != 0] / SECOND
+
+
+@pytest.mark.parametrize("hasty", [0.004, 0.01, 0.02])
+def test_a_sensor_that_begins_in_haste_is_not_silent_when_it_finds_its_pace(hasty):
+    """Three readings that come together, then ten a second."""
+    assert silent_rows([0.0, hasty, 2 * hasty, *np.arange(1, 160) * 0.1]).size == 0
+
+
+@pytest.mark.parametrize(("n", "after"), [(3, 0.1 * 6 * 16 / 3), (5, 0.1 * 6 * 16 / 5), (16, 0.6), (100, 0.6)])
+def test_a_sensor_that_ends_early_is_silent_all_the_same(n, after):
+    silent = silent_rows(np.arange(n) * 0.1)
+    assert 0.0 < silent[0] - (n - 1) * 0.1 - after <= 0.01 + 1e-9 and np.all(np.diff(silent) < 0.011)
 
 
 # The state machine
