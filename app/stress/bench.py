@@ -120,13 +120,18 @@ class Bench:
         start, end = self.window(mistake)
         return self.origin + round(start * 1e9), self.origin + round(end * 1e9)
 
-    def found_after(self, mistake: Mistake, estimator: str) -> float:
+    def found_after(self, mistake: Mistake, estimator: str, span: tuple[int, int] | None = None) -> float:
         """Share of the time that a mistake lasts after which the twin says so, as it ships; or infinity.
+
+        Args:
+            mistake: Made on this log.
+            estimator: The filter.
+            span: Looked at instead of the time that it lasts, ns of the log.
 
         Raises:
             NisusError: As `fold`.
         """
-        start, end = self.span(mistake)
+        start, end = span or self.span(mistake)
         gate = self.twin.tuning.gate
         word = first_word(self.fold(mistake, estimator, gate).fold, start, self.fold(None, estimator, gate).fold)
         share = np.inf if word is None else word * 1e9 / (end - start)
