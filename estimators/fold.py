@@ -198,7 +198,7 @@ class Fold:
 
     @property
     def evidence(self) -> np.ndarray:
-        """The state of the bank of tests now; see diagnostics/evidence.py."""
+        """The state of the bank of tests now; see diagnostics/evidence/."""
         return self._evidence.copy()
 
     @property

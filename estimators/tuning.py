@@ -47,7 +47,7 @@ class Tuning:
     `gate_kind` is "soft", counts with its noise inflated (gate/soften.py). A sensor that stays refused is judged
     (gate/reopening.py); if nothing tells whether it or the twin is wrong, the asset is believed after `reopen` seconds,
     None for never. `options` are the estimator's own. `baseline` (rows, ...) is what was normal of the innovations when
-    it was accepted (diagnostics/evidence.py), or None for white ones.
+    it was accepted (diagnostics/evidence/), or None for white ones.
     """
 
     model: StateSpaceModel

@@ -44,7 +44,7 @@ def causes_in(path):
 
 def test_the_causes_are_those_that_the_code_gives():
     folder = ROOT / "estimators/diagnostics"
-    given = causes_in(folder / "episodes.py") | causes_in(folder / "effects.py")
+    given = set().union(*(causes_in(path) for path in (folder / "effects.py", *folder.glob("episodes/*.py"))))
     # Those of the twin as a whole are names of its health; what never came into the log, only its reader knows.
     assert given | {"stale", "diverged", "dropped"} == set(CAUSES)
 

@@ -75,7 +75,7 @@ def as_dict(
     `log_likelihood` has the price of the readings that were refused, which `log_likelihood_used` leaves out; `refused`
     is their share. `calibration` has an entry for each sensor row, used or held out, and each state whose truth is
     told: see estimators/diagnostics/calibration.py. `episodes` have start and end in seconds of the log (end null while
-    one lasts), and `suspects`, the faults that explain them best: see estimators/diagnostics/episodes.py and
+    one lasts), and `suspects`, the faults that explain them best: see estimators/diagnostics/episodes/ and
     sensitivity/suspects.py.
     """
     return {

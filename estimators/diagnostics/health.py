@@ -31,7 +31,7 @@ class HealthPolicy(NamedTuple):
     `window` readings are averaged. Without a reading for `degraded_after` seconds the twin is degraded, after
     `stale_after` stale. It is diverged when the windowed NIS is `diverged_nis` times what it should be, when the gate
     refuses more than `diverged_gated` of the window (or they fail), or when a number is not finite. A reset begins a
-    new window. It is suspect, or degraded where a sensor is lost, when a test of evidence.py is in alarm: by chance
+    new window. It is suspect, or degraded where a sensor is lost, when a test of evidence/ is in alarm: by chance
     once in `false_alarm_every` seconds. A sensor is silent after `silent_periods` of its mean periods, and twice its
     longest silence so far.
     """

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..compiled.model import compile_model
 from ..model.mode_as_number import indicator
-from ..model.state_space import StateSpaceModel
+from ..model.state_space import Input, State, StateSpaceModel
 from ..tuning import Tuning
 
 CORRELATED = 0.15
@@ -163,3 +163,13 @@ def of_particles(effective: float, ancestors: float, start: float) -> str:
     many = "one particle" if ancestors < 2.0 else f"{ancestors:.0f} particles"
     what = f"the cloud is impoverished {since(start)}: {effective:.3g} particles count, and all descend from {many}"
     return f"{what}; more particles, pf-ekf or pf-reg, or a larger Q of the states that hardly move"
+
+
+def of_range(item: State | Input, size: float, start: float) -> str:
+    """A state or an input that is outside the range in which the model was fitted."""
+    assert item.fitted is not None
+    low, high = item.fitted
+    return (
+        f"{item.name} is {size:.4g} {item.unit}, outside {low:g} to {high:g} where the model was fitted, "
+        f"{since(start)}: bands hold only inside; use a model fitted there"
+    )
