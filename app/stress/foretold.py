@@ -3,9 +3,9 @@
 A mistake that moves the means of the innovations moves them by as much in every log: the same noise is folded with and
 without it, by a filter without chance, and the difference is put to the criterion of the smallest visible fault
 (visibility.py). One that changes their noise, or what comes when, is rehearsed: made in other logs of the asset. Of a
-recording there is only this one: a fault is made in it with other draws, a wrong belief is looked at in what follows of
-it. What is found in all of them, in half the time that it lasts, is visible: the time to an alarm has an exponential
-tail. What is found in none is invisible.
+recording there is only this one: a fault is made in it with other draws, a wrong belief begins later in it. What is
+found in all of them, in half the time that it lasts, is visible: the time to an alarm has an exponential tail. What is
+found in none is invisible.
 """
 
 from __future__ import annotations
@@ -92,12 +92,12 @@ class Oracle:
         return Foretold(CHANCE if min(after) < 1.0 else INVISIBLE)
 
     def _later(self, mistake: Mistake, estimator: str) -> list[float]:
-        """When a wrong belief is found in what follows of a recording, one share for each whole length of the logs."""
+        """When a wrong belief is found that begins later in a recording: a share for each length of the logs."""
         if self._whole is None:
             self._whole = Bench(self.twin, OTHERS, (REHEARSALS + 1) * self.duration)
         whole, step = self._whole, round(self.duration * 1e9)
         begins = [whole.origin + k * step for k in range(1, round(whole.length / self.duration))]
-        return [whole.found_after(mistake, estimator, (begin, begin + step)) for begin in begins]
+        return [whole.found_within(mistake, estimator, begin, begin + step) for begin in begins]
 
 
 def shift_of(bench: Bench, mistake: Mistake, estimator: str) -> Foretold | None:
