@@ -16,7 +16,7 @@ from app.stress.told import first_word, green_share, recovery, said_at
 from app.stress.trial import MISNAMED, NAMED, make
 from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import Episode
-from estimators.log import READING, TICK, TRUTH, Log
+from estimators.log import INPUT, READING, TICK, TRUTH, Log
 from estimators.models import MODELS
 from estimators.track import DEGRADED, SUSPECT, TRACKING, WAITING
 from estimators.tuning import Tuning
@@ -67,9 +67,9 @@ def test_an_episode_is_heard_of_in_the_first_row_that_alarms_after_it_began():
 def test_the_matrix_can_be_made():
     """Each mistake of it is a fault that the source takes, or an entry of the tuning that can be set."""
     tuning = Tuning.of(MODEL)
-    events = log_of(
-        MODEL.width, *((float(k), 1, [0.0, 10.0 + k, 100.0, 40.0, 20.0][: len(MODEL.inputs)]) for k in range(5))
-    )
+    inputs = [(float(k), INPUT, [0.0, 10.0 + k, 100.0, 40.0, 20.0][: len(MODEL.inputs)]) for k in range(5)]
+    readings = [(5.0, READING, [40.0], s) for s in range(len(MODEL.sensors))]
+    events = log_of(MODEL.width, *inputs, *readings)
     found = matrix(MODEL, tuning, events.events, asset=True)
     names = [item.name for item in found]
     assert len(set(names)) == len(names) and len(found) > 60
@@ -84,6 +84,12 @@ def test_the_matrix_can_be_made():
     # Twenty-five percent of an input that never changes, half of what another varies by; one that is zero has no size.
     assert "speed +25 rad/s" in names and "i_q +2 A" in names and not any(name.startswith("i_d +") for name in names)
     assert not any(item.of_asset for item in matrix(MODEL, tuning, events.events, asset=False))
+    # Nothing is done to a sensor that says nothing, nor in its name.
+    mute = [item.name for item in matrix(MODEL, tuning, log_of(MODEL.width, *inputs, *readings[1:]).events, asset=True)]
+    assert "winding stuck" in names and "winding and tooth swapped" in names and "clock of winding 1 s behind" in names
+    assert set(mute) == {
+        name for name in names if "winding" not in name or name.startswith(("capacity_", "winding_"))
+    } | {"tooth and yoke swapped"}
 
 
 def test_subject_and_cause():
