@@ -137,14 +137,13 @@ def _share(k: int, verdict: np.ndarray, refusal: int, begun: int, run: Run, *, c
 def _stuck(values: np.ndarray, masks: np.ndarray, k: int, run: Run) -> Shown | None:
     """A value that repeats itself: from its first reading until the first that is another.
 
-    None if most of the alarms are of something else, in the course of which a coarse sensor repeats itself, too.
+    None if most alarms until then are of something else, in the course of which a coarse sensor repeats itself, too.
     """
     at = run.begin + int(np.argmax(masks[run.begin : run.end] & STUCK != 0))
     begun = _after_last(values[:at] != values[at])
     others = np.flatnonzero(values[begun : run.end] != values[begun])
     over = begun + int(others[0]) if others.size else run.end
-    alarmed = run.begin + np.flatnonzero(masks[run.begin : run.end])
-    if np.mean((alarmed >= begun) & (alarmed < over) | (masks[alarmed] & STUCK != 0)) < MOST:
+    if np.mean(run.begin + np.flatnonzero(masks[run.begin : over]) >= begun) < MOST:
         return None
     return Shown(k, begun, run.end if run.lasts else over, cause="stuck", size=float(values[begun]))
 
