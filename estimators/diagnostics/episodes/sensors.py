@@ -113,8 +113,8 @@ def _shown(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run: Run
     if refused.size and np.mean(verdict[begin:end] == SCREENED) >= MOST:
         k = int(np.argmax((course.track.screened[rows[begin:end]] != 0).sum(axis=0)))
         return _share(k, verdict, SCREENED, _after_last(verdict[:begin] != SCREENED), run, cause="screened")
-    for k in np.flatnonzero(said & STUCK):
-        stuck = _stuck(course.events.value[rows, k], masks[:, k], int(k), run)
+    for row in np.flatnonzero(said & STUCK):
+        stuck = _stuck(course.events.value[rows, row], masks[:, row], int(row), run)
         if stuck is not None:
             return stuck
     # Other tests fall more slowly than that of refusals: those readings are in order already. A gate that refuses some
