@@ -13,6 +13,7 @@ from estimators.diagnostics.failure_cause import failures
 from estimators.diagnostics.intervals import Interval
 from estimators.diagnostics.score import Score
 from estimators.fold import Fold
+from estimators.fold_failures import cause_of
 from estimators.gate.reopening import Decision
 from estimators.gate.stories import softened
 from estimators.model.state_space import StateSpaceModel
@@ -156,7 +157,7 @@ def _screened(twin: Twin, counts: Counter[str], fold: Fold) -> dict[str, dict[st
 def _why(fold: Fold) -> str | None:
     """What of the model made the first reading or estimate fail that did."""
     rows = failures(fold.track)
-    return fold.cause(int(rows[0])) if rows.size else None
+    return cause_of(fold, int(rows[0])) if rows.size else None
 
 
 def as_text(

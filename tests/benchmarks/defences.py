@@ -66,7 +66,7 @@ def bare_kernel() -> Any:
 
 def _pair(estimator: str, model: Any, tuning: Tuning, log: Log) -> tuple[Fold, Fold]:
     defended, bare = (Fold(estimator, model, tuning, log) for _ in range(2))
-    bare._run = bare_kernel()
+    bare._machine._run = bare_kernel()
     return defended, bare
 
 

@@ -3,6 +3,7 @@
 from .course import JOINED, Course, Folded, course_of, standardised
 from .episode import CAUSES, Episode, Found, anchor, episode_json
 from .find import episodes, found_in
+from .going import Going
 
 __all__ = [
     "CAUSES",
@@ -11,6 +12,7 @@ __all__ = [
     "Episode",
     "Folded",
     "Found",
+    "Going",
     "anchor",
     "course_of",
     "episode_json",

@@ -168,7 +168,8 @@ def _most_telling(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, s
         kinds = _kinds(course, s, int(k), masks[run.begin : run.end, k])
         for cause in kinds:
             begun, over = _likeliest(e, alarm, cause)
-            ranked = sorted(effects(e[begun:over]), key=lambda item: item.cause not in kinds)
+            ranked = effects(e[begun : min(over, begun + LOOKED_AT)])
+            ranked.sort(key=lambda item: item.cause not in kinds)
             if ranked[0].cause != cause:
                 continue
             found = int(k), first + int(known[begun]), first + int(known[over - 1]) + 1, ranked
@@ -207,7 +208,8 @@ def _together(course: Course, rows: np.ndarray, run: Run, cause: str) -> Shown:
     e = np.sqrt(nis[known] / dof[known])
     alarm = min(int(np.searchsorted(known, run.begin - first)), e.size - 1)
     begun, over = _likeliest(e, alarm, "narrow" if cause == "disagreeing" else "wide")
-    _, size, low, high, _ = common_scale(e[begun:over], dof[known][begun:over])
+    looked_at = slice(begun, min(over, begun + LOOKED_AT))
+    _, size, low, high, _ = common_scale(e[looked_at], dof[known][looked_at])
     return Shown(0, first + int(known[begun]), first + int(known[over - 1]) + 1, cause, size, low, high)
 
 
@@ -217,7 +219,7 @@ def _likeliest(e: np.ndarray, alarm: int, cause: str) -> tuple[int, int]:
     A test falls more slowly than its cause goes, so the end is looked for as the onset is, backwards.
     """
     begun = onset(e[: alarm + 1], cause)
-    run = e[begun : begun + LOOKED_AT]
+    run = e[begun:]
     return begun, max(begun + run.size - onset(run[::-1], cause), min(alarm + 1, begun + run.size))
 
 

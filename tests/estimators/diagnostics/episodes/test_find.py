@@ -173,6 +173,12 @@ def test_one_fault_of_a_sensor_is_one_episode(cause):
     assert "\n" not in each.text and each.text[-1] != "."
 
 
+def test_one_that_lasts_for_more_readings_than_its_size_is_made_of_ends_where_it_ended(monkeypatch):
+    monkeypatch.setattr("estimators.diagnostics.episodes.sensors.LOOKED_AT", 60)
+    (each,) = (item for item in episodes(folded(**SENSORS["narrow"][0])) if item.subject == "gauge")
+    assert each.end is not None and abs(each.end - END) <= FAR
+
+
 @pytest.mark.parametrize("cause", ["refused", "stuck"])
 def test_what_is_certain_has_its_readings_exactly(cause):
     (each,) = (item for item in episodes(folded(**SENSORS[cause][0])) if item.cause == cause)
