@@ -51,10 +51,8 @@ def matrix(model: StateSpaceModel, tuning: Tuning, events: Events, *, asset: boo
 def _of_noises(model: StateSpaceModel) -> Iterator[Mistake]:
     q = [f"Q.{noise.name}" for noise in model.noises]
     r = [f"R.{name}" for name in model.row_names]
-    # With so much noise a coarse sensor would hardly ever repeat itself: where the asset rests, it is stuck first.
-    too_wide = LARGE_BANDS | {"stuck"}
     for factor in (10.0, 100.0):
-        yield Mistake(f"R x{factor:g}", too_wide, belief=dict.fromkeys(r, factor))
+        yield Mistake(f"R x{factor:g}", LARGE_BANDS, belief=dict.fromkeys(r, factor))
     yield Mistake("R /10", frozenset({"narrow", "alternating"}), belief=dict.fromkeys(r, 0.1))
     for factor in (10.0, 100.0):
         yield Mistake(f"Q /{factor:g}", SMALL_BANDS, belief=dict.fromkeys(q, 1.0 / factor))
