@@ -11,7 +11,20 @@ from ...log import READING
 from ...track import GATED, REASONS, SCREENED, USED
 from .. import words
 from ..effects import KINDS, Effect, against, common_scale, effects, onset
-from ..evidence import AGREEING, DISAGREEING, REFUSED, STUCK
+from ..evidence import (
+    AGREEING,
+    ALTERNATING,
+    BITS,
+    CORRELATED,
+    DISAGREEING,
+    NARROW,
+    REFUSED,
+    SHIFTED_DOWN,
+    SHIFTED_UP,
+    SPIKY,
+    STUCK,
+    WIDE,
+)
 from .course import JOINED, Course, Run, runs, standardised, unusual
 from .episode import Episode, Found
 
@@ -28,7 +41,13 @@ LEFT = 2.0
 """Likelihood ratio, nats, below which nothing of an effect is left: that of a size on the edge of its 95 % interval."""
 
 MOST = 0.5
-"""Share of refused readings from which an episode is one of refusals."""
+"""Share of the readings of an episode that are refused, or repeat themselves, from which it is one of that."""
+
+TOLD_BY = {
+    "shifted": SHIFTED_UP | SHIFTED_DOWN, "narrow": NARROW, "wide": WIDE, "correlated": CORRELATED,
+    "alternating": ALTERNATING, "spiky": SPIKY,
+}  # fmt: skip
+"""Which tests say so of each kind of effect."""
 
 OF_ALL_ROWS = ("disagreeing", "agreeing")
 """Causes that are of a sensor as a whole, not of one of its rows."""
@@ -105,9 +124,10 @@ def _shown(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run: Run
     if refused.size and np.mean(verdict[begin:end] == SCREENED) >= MOST:
         k = int(np.argmax((course.track.screened[rows[begin:end]] != 0).sum(axis=0)))
         return _share(k, verdict, SCREENED, _after_last(verdict[:begin] != SCREENED), run, cause="screened")
-    stuck = np.flatnonzero(said & STUCK)
-    if stuck.size:
-        return _stuck(course.events.value[rows, stuck[0]], int(stuck[0]), run)
+    for row in np.flatnonzero(said & STUCK):
+        stuck = _stuck(course.events.value[rows, row], masks[:, row], int(row), run)
+        if stuck is not None:
+            return stuck
     # Other tests fall more slowly than that of refusals: those readings are in order already. A gate that refuses some
     # readings has a reason that shows in the others.
     until = begin + _after_last(np.any(masks[begin:end] & REFUSED, axis=1))
@@ -116,7 +136,7 @@ def _shown(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run: Run
     if said[0] & (DISAGREEING | AGREEING) and not np.any(said & ~(DISAGREEING | AGREEING)):
         cause = "disagreeing" if said[0] & DISAGREEING else "agreeing"
         return _together(course, rows, run, cause)
-    return _most_telling(course, s, rows, np.flatnonzero(said), run)
+    return _most_telling(course, s, rows, masks, np.flatnonzero(said), run)
 
 
 def _share(k: int, verdict: np.ndarray, refusal: int, begun: int, run: Run, *, cause: str) -> Shown:
@@ -125,15 +145,21 @@ def _share(k: int, verdict: np.ndarray, refusal: int, begun: int, run: Run, *, c
     return Shown(k, begun, over, cause, float(np.mean(verdict[begun:over] == refusal)))
 
 
-def _stuck(values: np.ndarray, k: int, run: Run) -> Shown:
-    """A value that repeats itself: from its first reading until the first that is another."""
-    begun = _after_last(values[: run.begin] != values[run.begin])
+def _stuck(values: np.ndarray, masks: np.ndarray, k: int, run: Run) -> Shown | None:
+    """A value that repeats itself: from its first reading until the first that is another.
+
+    None if most alarms until then are of something else, in the course of which a coarse sensor repeats itself, too.
+    """
+    at = run.begin + int(np.argmax(masks[run.begin : run.end] & STUCK != 0))
+    begun = _after_last(values[:at] != values[at])
     others = np.flatnonzero(values[begun : run.end] != values[begun])
     over = begun + int(others[0]) if others.size else run.end
+    if np.mean(run.begin + np.flatnonzero(masks[run.begin : over]) >= begun) < MOST:
+        return None
     return Shown(k, begun, over, cause="stuck", size=float(values[begun]), back=bool(others.size))
 
 
-def _most_telling(course: Course, s: int, rows: np.ndarray, said: np.ndarray, run: Run) -> Shown:
+def _most_telling(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, said: np.ndarray, run: Run) -> Shown:
     """The row, of those that `said` something, that shows most of what is wrong.
 
     What moves one way and then back has no mean over the whole: where innovations wander, the part that is shifted
@@ -150,9 +176,11 @@ def _most_telling(course: Course, s: int, rows: np.ndarray, said: np.ndarray, ru
             continue
         e = unusual(course, s, int(k), e[known])
         alarm = min(int(np.searchsorted(known, run.begin - first)), e.size - 1)
-        for cause in KINDS:
+        kinds = _kinds(course, s, int(k), masks[run.begin : run.end, k])
+        for cause in kinds:
             begun, over = _likeliest(e, alarm, cause)
             ranked = effects(e[begun : min(over, begun + LOOKED_AT)])
+            ranked.sort(key=lambda item: item.cause not in kinds)
             if ranked[0].cause != cause:
                 continue
             found = int(k), first + int(known[begun]), first + int(known[over - 1]) + 1, ranked, e[over:]
@@ -181,6 +209,15 @@ def _is_back(e: np.ndarray, effect: Effect) -> bool:
         return False
     left = (item for item in effects(e) if item.cause == effect.cause and item.size * effect.size > 0.0)
     return all(item.ratio < LEFT for item in left)
+
+
+def _kinds(course: Course, s: int, k: int, masks: np.ndarray) -> list[str]:
+    """The kinds of effects that can be the reason of alarms of row k: what was normal is none unless its test spoke."""
+    if course.tuning.baseline is None:
+        return list(KINDS)
+    peaks = course.tuning.baseline[course.model.row_start[s] + k, 3:]
+    said = int(np.bitwise_or.reduce(masks))
+    return [kind for kind in KINDS if said & TOLD_BY[kind] or not np.any(peaks[BITS & TOLD_BY[kind] != 0] > 0.0)]
 
 
 def _together(course: Course, rows: np.ndarray, run: Run, cause: str) -> Shown:

@@ -2,7 +2,9 @@
 
 from .alarms import (
     AGREEING,
+    ALTERNATING,
     CAUSES,
+    CORRELATED,
     DISAGREEING,
     IMPOVERISHED,
     LOST,
@@ -13,8 +15,10 @@ from .alarms import (
     SENSORS,
     SHIFTED_DOWN,
     SHIFTED_UP,
+    SPIKY,
     STUCK,
     TRUTH_MISSED,
+    WIDE,
 )
 from .bank import causes_now, chances_of, fresh, heard_last, no_baseline, normal_nis, threshold_of, watched
 from .hypotheses import BITS, FURTHEST, RATIOS, SHIFTS, TESTS
@@ -23,8 +27,10 @@ from .watch import PATIENCE, watch_rows
 
 __all__ = [
     "AGREEING",
+    "ALTERNATING",
     "BITS",
     "CAUSES",
+    "CORRELATED",
     "DISAGREEING",
     "FURTHEST",
     "SHIFTED_UP",
@@ -39,9 +45,11 @@ __all__ = [
     "REFUSED",
     "SENSORS",
     "SHIFTS",
+    "SPIKY",
     "STUCK",
     "TESTS",
     "TRUTH_MISSED",
+    "WIDE",
     "causes_now",
     "chances_of",
     "fresh",

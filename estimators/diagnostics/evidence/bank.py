@@ -8,7 +8,7 @@ import numpy as np
 
 from ...model.state_space import StateSpaceModel
 from ...numerics.jit import floats, inlined, jit
-from .hypotheses import JOINT, REFUSED_SHARE, TESTS
+from .hypotheses import GAINS, JOINT, REFUSED_SHARE, TESTS
 
 # The twin's part of the state: rows in alarm and lost; when the next sensor will be silent; when the log began, whether
 # a reading came; states whose truth is missed; sensors that are silent; readings more, poor than not, of a cloud of
@@ -24,9 +24,9 @@ SENSOR = JOINT + 8
 
 # A row's part: W of its tests, then what they say; the last e, and the same without what was normal; the last value;
 # its smallest step; how often it stands there already; how often values were repeated, of how many; readings since the
-# last one far out.
-MASK, RAW, WHITE, VALUE, QUANTUM, RUN, EQUAL, COUNTED, CALM_FOR = range(TESTS, TESTS + 9)
-ROW = TESTS + 9
+# last one far out; what is expected of the next e by each filter that follows noise.
+MASK, RAW, WHITE, VALUE, QUANTUM, RUN, EQUAL, COUNTED, CALM_FOR, EXPECTED = range(TESTS, TESTS + 10)
+ROW = EXPECTED + len(GAINS)
 """Numbers in the state for each row."""
 
 # A shown state's part: the mean square of its standardised errors, how often it was told, whether it is missed. After
@@ -165,6 +165,7 @@ def forget(state, sensors, rows, states):
         own = row_part(state, sensors, k)
         own[:TESTS] = 0.0
         own[MASK] = own[CALM_FOR] = 0.0
+        own[EXPECTED:ROW] = 0.0
         own[RAW] = own[WHITE] = np.nan
     begin = TWIN + sensors * SENSOR + rows * ROW
     state[begin : begin + states * STATE] = 0.0

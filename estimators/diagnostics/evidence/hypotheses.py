@@ -1,4 +1,4 @@
-"""The ways of being wrong that are tested: each is another density of e given the e before, against white N(0, 1)."""
+"""The ways of being wrong that are tested: each is another density of e given those before, against white N(0, 1)."""
 
 from __future__ import annotations
 
@@ -16,6 +16,12 @@ SHIFTS = (0.2, 0.5, 1.5, -0.2, -0.5, -1.5)
 
 CORRELATIONS = (0.25, 0.6, -0.25, -0.6)
 """Lag-1 correlations of e that are tested, at unit variance."""
+
+GAINS, FADING = (0.2, 0.5), 0.95
+"""Gains of a filter that follows noise: it undoes at the next readings what it did at the last. Where nothing moves its
+innovations are (1 - L) / (1 - (1 - gain) L) of white noise, L the lag; fading in place of 1 leaves an offset to the
+other tests. At unit variance, too. Their lag-1 correlation is small, but they fall below white noise at all long lags
+together."""
 
 SPIKE_SHARES, SPIKE = (0.03, 0.003), 5.0
 """Spikes: these shares of e have so many standard deviations."""
@@ -38,10 +44,11 @@ ANOTHER_VALUE = math.log((1.0 - REPEATING) / (1.0 - UNKNOWN_QUANTUM))
 QUADRATIC = len(SCALES) + len(SHIFTS) + len(CORRELATIONS)
 """Tests whose log Λ is quadratic in e and the e before; they come first."""
 
-TESTS = QUADRATIC + len(SPIKE_SHARES) + 2
-"""Tests of a row: the quadratic ones, spikes, refusals, repetition."""
+TESTS = QUADRATIC + len(GAINS) + len(SPIKE_SHARES) + 2
+"""Tests of a row: the quadratic ones, noise that is followed, spikes, refusals, repetition."""
 
-AT_SPIKES = QUADRATIC
+AT_GAINS = QUADRATIC
+AT_SPIKES = AT_GAINS + len(GAINS)
 AT_REFUSALS, AT_REPETITION = range(TESTS - 2, TESTS)
 
 JOINT = len(SCALES)
@@ -54,6 +61,7 @@ BITS = np.array(
         *[SHIFTED_UP] * 3,
         *[SHIFTED_DOWN] * 3,
         *[CORRELATED] * 2,
+        *[ALTERNATING] * 2,
         *[ALTERNATING] * 2,
         *[SPIKY] * 2,
         REFUSED,
@@ -76,6 +84,16 @@ RATIOS = np.array(
     ]
 )
 """Coefficients (a, b, c, d, f) of log Λ = a e² + b e e₋ + c e₋² + d e + f, (QUADRATIC, 5); e₋ is the e before."""
+
+
+def _ratio_of_gain(gain: float) -> tuple[float, ...]:
+    step = 1.0 - gain - FADING
+    rest = 1.0 / (1.0 + step * step / (1.0 - (1.0 - gain) ** 2))
+    return step, 0.5 / rest, -0.5 * math.log(rest)
+
+
+FOLLOWED = np.array([_ratio_of_gain(gain) for gain in GAINS])
+"""Coefficients (a, b, c) of m ← fading m + a e, log Λ = ½ e² - b (e - m)² + c, (gains, 3); m is expected of e."""
 
 SPIKE_STEPS = 64.0
 _SQUARES = np.arange(FURTHEST**2 * SPIKE_STEPS + 2.0) / SPIKE_STEPS

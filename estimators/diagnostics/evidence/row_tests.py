@@ -1,7 +1,7 @@
 """The tests of one sensor row, and those of all rows of a sensor together.
 
 Under the model the standardised innovations e of a row are N(0, 1) and white. Each way of being wrong is another
-density of e given the one before (hypotheses.py), and the cumulated log-likelihood ratio tests it:
+density of e given those before (hypotheses.py), and the cumulated log-likelihood ratio tests it:
 
     W ← min(max(W, 0) + log Λ, cap);  alarm when W ≥ h,  over when W < 0.85 h
 
@@ -24,16 +24,20 @@ import math
 import numpy as np
 
 from ...numerics.jit import inlined, jit
-from .alarms import AGREEING, DISAGREEING, SPIKY, STUCK
-from .bank import CALM_FOR, COUNTED, EQUAL, QUANTUM, RAW, ROW, RUN, VALUE, WHITE
+from .alarms import AGREEING, ALTERNATING, DISAGREEING, SPIKY, STUCK
+from .bank import CALM_FOR, COUNTED, EQUAL, EXPECTED, QUANTUM, RAW, ROW, RUN, VALUE, WHITE
 from .hypotheses import (
     ANOTHER_VALUE,
+    AT_GAINS,
     AT_REFUSALS,
     AT_REPETITION,
     AT_SPIKES,
     BITS,
     CORRELATIONS,
+    FADING,
+    FOLLOWED,
     FURTHEST,
+    GAINS,
     JOINT,
     QUADRATIC,
     RATIOS,
@@ -118,6 +122,11 @@ def weigh(own, e, h, base, before):
             threshold = h + base[3 + k]
             if own[k] >= threshold or own[k] >= LASTING * threshold and before & BITS[k] != 0:
                 mask |= BITS[k]
+    for k in range(len(GAINS)):
+        off = white - own[EXPECTED + k]
+        own[EXPECTED + k] = FADING * own[EXPECTED + k] + FOLLOWED[k, 0] * white
+        ratio = 0.5 * square - FOLLOWED[k, 1] * off * off + FOLLOWED[k, 2]
+        mask |= alarm(add(own, AT_GAINS + k, ratio, h, base[3 + AT_GAINS + k]), ALTERNATING, before)
     own[CALM_FOR] = 0.0 if abs(white) > FAR_OUT else own[CALM_FOR] + 1.0
     for k in range(len(SPIKE_SHARES)):
         if own[CALM_FOR] >= CALM:

@@ -2,12 +2,22 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from estimators.diagnostics.episodes import CAUSES, JOINED, Episode, course_of, episode_json, episodes, found_in
-from estimators.diagnostics.evidence import IMPOVERISHED, NARROW, SHIFTED_DOWN
+from estimators.diagnostics.evidence import (
+    BITS,
+    IMPOVERISHED,
+    NARROW,
+    SHIFTED_DOWN,
+    SHIFTED_UP,
+    SPIKY,
+    STUCK,
+    no_baseline,
+)
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold
 from estimators.log import INPUT, READING, TICK, TRUTH, Events
@@ -314,6 +324,37 @@ def test_episodes_of_several_bits_are_one():
     rows = np.flatnonzero((course.events.kind == READING) & (course.events.channel == 1))
     track.alarms[rows[100:120], 0], track.alarms[rows[110:130], 3] = NARROW, SHIFTED_DOWN
     assert len(found_in(course._replace(track=track))) == 1
+
+
+def test_a_noisy_sensor_that_rests_for_a_while_is_not_stuck():
+    """It is what it was for most of its alarms: 170 s too noisy, then 30 s of one value."""
+
+    def change(x, z, rng):
+        y = x + 0.6 * z
+        y[170:] = y[170]
+        return y
+
+    fold = folded(gauge=change)
+    rows = np.flatnonzero((fold.log.kind[: fold.n] == READING) & (fold.log.channel[: fold.n] == 0))
+    assert np.any(fold.track.alarms[rows, 0] & STUCK)
+    assert [each.cause for each in episodes(fold) if each.subject == "gauge"] == ["narrow"]
+
+
+def test_what_was_normal_is_no_cause_unless_its_test_spoke():
+    """Spikes of 6 σ, one reading in 15, as always; from BEGIN on 1 σ more."""
+    course = course_of(folded())
+    track, rng = course.track.copy(), np.random.default_rng(1)
+    rows = np.flatnonzero((course.events.kind == READING) & (course.events.channel == 0))
+    e = rng.standard_normal(N)
+    e[::15] = 6.0 * rng.choice([-1.0, 1.0], e[::15].shape)
+    e[BEGIN:END] += 1.0
+    track.innovation[rows, 0] = e * track.innovation_std[rows, 0]
+    track.alarms[rows[BEGIN + 20 : END], 0] = SHIFTED_UP
+    baseline = no_baseline(MODEL)
+    baseline[0, 3:][BITS & (SPIKY | NARROW) != 0] = 1e4
+    for normal, cause in ((None, "spiky"), (baseline, "shifted")):
+        own = course._replace(track=track, tuning=replace(course.tuning, baseline=normal))
+        assert [item.episode.cause for item in found_in(own)] == [cause]
 
 
 # For scripts

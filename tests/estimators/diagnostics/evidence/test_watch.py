@@ -84,6 +84,27 @@ def white(e):
     return log_normal(e, 0.0, 1.0)
 
 
+GAINS, FADING = (0.2, 0.5), 0.95
+"""Of filters that follow noise: e is (1 - fading L) / (1 - (1 - gain) L) of white noise, at unit variance."""
+
+
+class Follower:
+    """log Λ of the innovations of a filter that follows noise: an ARMA(1, 1) by its noise, found from all e before."""
+
+    def __init__(self, gain):
+        self.gain, self.noise, self.e = gain, 0.0, 0.0
+        # Its impulse response, summed by force, gives the variance of e.
+        h = [1.0]
+        for _ in range(500):
+            h.append((1.0 - gain) * h[-1] - (FADING if len(h) == 1 else 0.0))
+        self.variance = 1.0 / sum(x * x for x in h)
+
+    def ratio(self, e):
+        expected = (1.0 - self.gain) * self.e - FADING * self.noise
+        self.noise, self.e = e - expected, e
+        return log_normal(e, expected, self.variance) - white(e)
+
+
 def mixed(e, share):
     return math.log(share * math.exp(log_normal(e, 0.0, 25.0)) + (1.0 - share) * math.exp(white(e)))
 
@@ -97,11 +118,14 @@ def bank_of_a_row():
     for phi in (0.25, 0.6, -0.25, -0.6):
         cause = "correlated" if phi > 0 else "alternating"
         yield cause, lambda e, last, phi=phi: log_normal(e, phi * last, 1.0 - phi**2) - white(e)
+    for _ in GAINS:
+        yield "alternating", None  # of all e before: see Follower
     for share in (0.03, 0.003):
         yield "spiky", lambda e, _, share=share: mixed(e, share) - white(e)
 
 
 OF_INNOVATIONS = tuple(bank_of_a_row())
+FIRST_GAIN = next(k for k, (_, ratio) in enumerate(OF_INNOVATIONS) if ratio is None)
 PER_ROW = len(OF_INNOVATIONS) + 2
 N_TESTS = 4 * PER_ROW + 6
 
@@ -127,6 +151,7 @@ class RowOracle:
 
     def forget(self):
         self.tests = [Cusum(cause) for cause, _ in OF_INNOVATIONS]
+        self.followers = {FIRST_GAIN + k: Follower(gain) for k, gain in enumerate(GAINS)}
         self.refusals, self.repetition = Cusum("refused"), Cusum("stuck")
         self.raw = self.before = None
         self.calm = 0
@@ -141,6 +166,9 @@ class RowOracle:
         self.calm = 0 if abs(white) > 3.5 else self.calm + 1
         said = set()
         for k, (test, (cause, ratio)) in enumerate(zip(self.tests, OF_INNOVATIONS, strict=True)):
+            if k in self.followers:
+                said |= test.put(self.followers[k].ratio(white), h, self.base[3 + k], self.said)
+                continue
             if self.before is None and cause in ("correlated", "alternating"):
                 continue
             last = 0.0 if self.before is None else self.before
