@@ -11,10 +11,7 @@ from estimators.events.clocks import ClockGuard, Moved, Passed, Refused
 from estimators.events.maintenance import maintained
 from estimators.log import INPUT, READING, Events
 from estimators.model.state_space import StateSpaceModel
-from sources.source import Report
-
-WRONG_TIME = "wrong time"
-"""Key of events that are refused for their time."""
+from sources.source import WRONG_TIME, Report
 
 CLOCK_MOVED = "clock moved"
 """Key of a source's clock that was set."""

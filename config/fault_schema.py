@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from .fields import Count, NotNegative, Number, Positive, Section, Text
+from .fields import Count, Number, Seconds, Section, SomeSeconds, Text
 
 
 class FaultSection(Section):
@@ -39,9 +39,9 @@ class FaultSection(Section):
     """The row of the sensor that fails. Default: null, all."""
     other: Text | None = None
     """The sensor with which `sensor` is swapped."""
-    start: NotNegative = 0.0
+    start: SomeSeconds = 0.0
     """Seconds after the first event at which it begins. Default: 0."""
-    end: Positive | None = None
+    end: Seconds | None = None
     """Seconds after the first event at which it ends. Default: null, never."""
     size: Number | None = None
     """How much: in the unit of the row or input (drift: a second), a factor, or seconds, as the kind says."""

@@ -9,9 +9,18 @@ from pydantic_core import PydanticCustomError
 
 from estimators.errors import LARGEST
 
+LONGEST = 1e9
+"""Seconds that anything may last: 32 years."""
+
+LATEST = 9e9
+"""Seconds from 1970 until the year 2255: times are int64 nanoseconds, which end soon after."""
+
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=LARGEST)]
 NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=LARGEST)]
+Seconds = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=LONGEST)]
+SomeSeconds = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=LONGEST)]
+Time = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LATEST, le=LATEST)]
 Count = Annotated[int, Field(strict=True, ge=1)]
 Option = Number | Annotated[str, Field(min_length=1)]
 Flag = Annotated[bool, Field(strict=True)]

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from .fields import NotNegative, Number, Positive, Section, as_list, one_of
+from .fields import Number, Positive, Seconds, Section, SomeSeconds, as_list, one_of
 from .source_schema import RangeSection
 
 Pair = tuple[Number | None, Number | None]
@@ -31,6 +31,8 @@ def _rising(pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
 
 
 def _holds_something(given: RangeSection) -> RangeSection:
+    if given.min is None and given.max is None:
+        raise PydanticCustomError("neither", "gives neither {keys}", {"keys": "min nor max"})
     if given.min is not None and given.max is not None and not given.min < given.max:
         raise PydanticCustomError("range", "its min must be below its max")
     return given
@@ -60,7 +62,7 @@ class StuckSection(Section):
     readings: Annotated[int, Field(strict=True, ge=2)] | None = None
     """The reading that is equal to as many as these, itself among them, is stuck. Default: told by `seconds`, or by
     `quantum`."""
-    seconds: Positive | None = None
+    seconds: Seconds | None = None
     """Readings that have been equal for so long are stuck. Default: told by `readings`, or by `quantum`."""
     quantum: Positives | None = None
     """Step of the sensor's converter, in its unit; a list gives one a row. Values less than half of it apart are equal.
@@ -81,6 +83,6 @@ class StuckSection(Section):
 class DuplicatesSection(Section):
     """Readings that come again."""
 
-    within: NotNegative
+    within: SomeSeconds
     """Seconds after a reading within which one of the same values is that reading again, as of a gateway that repeats
-    what it hears. Below the sensor's own period."""
+    what it hears. Below the sensor's own period, and below `time.stale_after`."""

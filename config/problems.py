@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any, get_args
 
 from pydantic import ValidationError
@@ -14,6 +15,9 @@ from .yaml_lines import Key, Places, dotted
 
 MOST = 5
 """Problems shown at once."""
+
+FEW = 8
+"""Words up to which all that a value may be are shown; of more, the near ones."""
 
 
 def shown(value: Any) -> str:
@@ -73,7 +77,7 @@ def _line(problem: ErrorDetails, key: Key, value: Any, places: Places) -> str:
         key, value = (*key, "type"), context["tag"]
         rule = nearest(value, [item.strip("'") for item in context["expected_tags"].split(", ")])
     else:
-        rule = _rule(kind, context, problem["msg"])
+        rule = _rule(kind, context, problem["msg"], value)
     return f"{places.at(key)}: {dotted(key)} is {shown(value)}; {rule}"
 
 
@@ -110,7 +114,7 @@ _RULES = {
 }
 
 
-def _rule(kind: str, context: dict[str, Any], text: str) -> str:
+def _rule(kind: str, context: dict[str, Any], text: str, value: Any) -> str:
     if kind == "greater_than":
         return "it must be positive" if context["gt"] == 0 else f"it must be above {context['gt']:g}"
     if kind == "greater_than_equal":
@@ -120,11 +124,14 @@ def _rule(kind: str, context: dict[str, Any], text: str) -> str:
     if kind == "less_than":
         return f"it must be below {context['lt']:g}"
     if kind == "literal_error":
-        return f"it must be {context['expected']}"
+        words = re.findall(r"'([^']*)'", context["expected"])
+        return nearest(str(value), words) if len(words) > FEW else f"it must be {context['expected']}"
     if kind == "too_short":
         return f"it needs {context['min_length']} or more entries"
     if kind == "too_long":
         return f"it may have {context['max_length']} entries at most"
+    if kind == "string_too_long":
+        return f"it may have {context['max_length']} characters at most"
     if kind == "string_too_short":
         return "it must not be empty"
     if kind == "string_pattern_mismatch":

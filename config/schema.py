@@ -12,6 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from .fault_schema import FaultSection
 from .fields import (
+    LONGEST,
     Count,
     Flag,
     LevelSection,
@@ -19,14 +20,17 @@ from .fields import (
     Number,
     Option,
     Positive,
+    Seconds,
     Section,
+    SomeSeconds,
     SpreadSection,
     Text,
+    Time,
 )
 from .limits_schema import DuplicatesSection, Positives, Ranges, StuckSection, Validity
 from .source_schema import SourceSection
 
-GateProbability = Annotated[float, Field(strict=True, gt=0, lt=1)]
+GateProbability = Annotated[float, Field(strict=True, ge=0.5, lt=1)]
 
 
 class PriorSection(Section):
@@ -100,11 +104,11 @@ class GateSection(Section):
     """What becomes of readings far from their prediction."""
 
     probability: GateProbability
-    """Probability with which a good reading passes, for example 0.9973."""
+    """Probability with which a good reading passes, for example 0.9973; at least 0.5."""
     kind: Literal["hard", "soft"] = "hard"
     """hard: a reading outside is refused. soft: it counts, with its noise inflated until it lies on the gate, so that
     the further off it is the less it moves the estimate; kf-steady and `adapt: R` take no soft one."""
-    reopen: Positive | Literal["never"] = 30.0
+    reopen: Seconds | Literal["never"] = 30.0
     """A sensor that stays refused is judged by what the other sensors say: it is isolated, or the twin was wrong and
     lets it in. Where nothing tells, the asset is believed so many seconds after the first refused reading. never: a
     sensor that is refused stays refused. Default: 30."""
@@ -118,22 +122,22 @@ class GateSection(Section):
 class TimeSection(Section):
     """How the twin treats lateness and silence."""
 
-    horizon: NotNegative = 2.0
+    horizon: SomeSeconds = 2.0
     """Seconds: a reading later than this is counted as stale and dropped. Size it by the worst credible latency."""
-    degraded_after: Positive | None = None
+    degraded_after: Seconds | None = None
     """Seconds without a used reading after which the twin says that it is degraded. Default: the slowest time constant
     of the model at the prior, but at least 3 s and three periods of the slowest simulated sensor, and at most
     stale_after; `nisus fold` prints where it comes from."""
-    stale_after: Positive = 15.0
+    stale_after: Seconds = 15.0
     """Seconds without a used reading after which the twin says that it is stale. Above degraded_after."""
     late: Literal["exact", "inflate", "auto"] = "auto"
     """What becomes of a reading that comes late, within the horizon. exact: it is put where it was measured and the
     filter goes back; nothing is lost. inflate: it is used when it comes, with a variance larger by what the model says
     that the reading has moved since; cheap, not exact, and not for filters with a fixed R. auto: exact, unless going
     back once may take longer than late_allowed, by an arithmetic that `nisus fold` prints. Default: auto."""
-    late_allowed: Positive = 0.25
+    late_allowed: Seconds = 0.25
     """Seconds that going back for one late reading may take, for late: auto. Default: 0.25."""
-    tick: Positive = 0.5
+    tick: Annotated[float, Field(strict=True, ge=0.01, le=LONGEST)] = 0.5
     """Seconds of silence after which the estimate is predicted and shown without a reading."""
 
     @model_validator(mode="after")
@@ -150,9 +154,9 @@ class TimeSection(Section):
 class MaintenanceSection(Section):
     """Something of the asset that was changed."""
 
-    at: Number
+    at: Time
     """When, in seconds of the source's time."""
-    what: Text
+    what: Annotated[str, Field(min_length=1, max_length=200)]
     """What was changed, for people."""
     states: Annotated[tuple[Text, ...], Field(min_length=1)]
     """The states that it concerns: they are as uncertain as at the start again, and keep their mean."""
@@ -195,11 +199,11 @@ class ViewSection(Section):
     pairs: tuple[tuple[Text, Text], ...] | None = None
     """Pairs of states whose joint covariance is drawn as an ellipse. Default: the first two states; of a large field
     none."""
-    window: Positive = 60.0
+    window: Seconds = 60.0
     """Seconds that the charts show at first."""
     cells: Annotated[tuple[Text, ...], Field(min_length=1)] | None = None
     """Cells of a large field whose estimate is kept at every event and charted. Default: 16 spread over it."""
-    picture: Positive | None = None
+    picture: Seconds | None = None
     """Seconds of the asset's time between two pictures of a large field. Default: a sixtieth of the window."""
     scene: SceneSection = SceneSection()
     """The three-dimensional scene. Default: the belief over the first three states."""

@@ -10,15 +10,18 @@ from pydantic_core import PydanticCustomError
 
 from .fault_schema import FaultSection
 from .fields import (
+    LONGEST,
     Count,
     LevelSection,
     Number,
     Numbers,
     Positive,
+    Seconds,
     Section,
     SpreadSection,
     Text,
     Texts,
+    Time,
     as_list,
     one_of,
 )
@@ -178,7 +181,7 @@ class SineSection(Section):
     """Mean, in the input's unit. Default: 0."""
     amplitude: Number
     """Amplitude, in the input's unit."""
-    period: Positive
+    period: Seconds
     """Period, s."""
     phase: Number = 0.0
     """Phase at t = 0, rad. Default: 0."""
@@ -191,7 +194,7 @@ class ProfileSection(Section):
     """A constant, in the input's unit."""
     steps: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] | None = None
     """[[t, value], ...]: from t seconds on, the value; before the first, the first value."""
-    repeat: Positive | None = None
+    repeat: Seconds | None = None
     """Seconds after which `steps` start again. Default: null, never."""
     sine: SineSection | None = None
     """A sine wave."""
@@ -254,9 +257,9 @@ class AssetSection(Section):
 
     seed: Annotated[int, Field(strict=True, ge=0)] = 0
     """Seed of the noise; the same seed gives the same run. Default: 0."""
-    step: Positive = 1.0
+    step: Annotated[float, Field(strict=True, ge=1e-6, le=LONGEST)] = 1.0
     """Seconds between two steps of the simulation. Default: 1."""
-    duration: Positive | None = None
+    duration: Seconds | None = None
     """Seconds after which it ends. Default: null, never."""
     initial: dict[str, Number] = {}
     """True state at the start, by state, in its unit. Default: the prior's mean."""
@@ -334,7 +337,7 @@ class TimeColumnSection(Section):
     """Its name."""
     unit: Literal["s", "ms", "us", "ns", "min", "h"] = "s"
     """Its unit. Default: s."""
-    shift: Number = 0.0
+    shift: Time = 0.0
     """Seconds added to it: -0.2 where a row tells of the 0.2 s that end with it, so that an input holds for these and
     not for the next. Default: 0."""
 

@@ -48,8 +48,8 @@ def quoted(text: str) -> str:
 
 
 def shown_name(name: str) -> str:
-    """A name from a file as a message shows it: as it is, unless it is long or unprintable."""
-    return name if len(name) <= MOST and name.isprintable() else quoted(name)
+    """A name from a file as a message shows it: as it is, unless it is empty, long or unprintable."""
+    return name if 0 < len(name) <= MOST and name.isprintable() else quoted(name)
 
 
 def nearest(name: str, names: Iterable[str]) -> str:

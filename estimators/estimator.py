@@ -29,7 +29,7 @@ import numpy as np
 from numba import types
 
 from .compiled.context import context_type
-from .errors import EstimatorError
+from .errors import EstimatorError, nearest, quoted
 from .model.state_space import StateSpaceModel
 from .numerics.jit import F1, F2, address, caller, f64, i64
 from .numerics.peaks import Peak
@@ -145,10 +145,7 @@ class Estimator:
         values = {}
         for name, given in options.items():
             if name not in known:
-                raise EstimatorError(
-                    f"estimator {self.name} has no option {name!r}; "
-                    + (f"it has {', '.join(known)}" if known else "it has none")
-                )
+                raise EstimatorError(f"estimator {self.name} has no option {quoted(name)}; {nearest(name, known)}")
             option = known[name]
             values[name] = value = self._number(option, given)
             if not option.low <= value <= option.high:
@@ -171,7 +168,7 @@ class Estimator:
             if given in option.choices:
                 return float(option.choices.index(given))
             wanted = f"one of {', '.join(option.choices)}" if option.choices else "a number"
-            raise EstimatorError(f"estimator {self.name}: {option.name} is {given!r}; it must be {wanted}")
+            raise EstimatorError(f"estimator {self.name}: {option.name} is {quoted(given)}; it must be {wanted}")
         try:
             return float(given)
         except (TypeError, ValueError):

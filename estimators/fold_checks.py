@@ -8,7 +8,9 @@ import numpy as np
 
 from .errors import LARGEST, EstimatorError
 from .estimator import Estimator, Options
+from .events.checks import admitted
 from .gaussian.robust import ADAPT_R
+from .log import Log
 from .model.state_space import LARGE, StateSpaceModel
 from .numerics.linalg import EPSILON
 from .snapshots import Base
@@ -37,6 +39,25 @@ def check_pairs(pairs: Any, model: StateSpaceModel) -> np.ndarray:
         wrong = int(given.min() if given.min() < 0 else given.max())
         raise EstimatorError(f"pairs name state {wrong}; {model.name} has states 0 to {model.nx - 1}")
     return np.ascontiguousarray(given, np.int64)
+
+
+def check_log(log: Log, n: int, model: StateSpaceModel, estimator: Estimator, options: Options) -> None:
+    """Where log and model meet: refuse what the model has no place for, and variances that cannot be honoured.
+
+    Raises:
+        EstimatorError: If the log is too narrow, or the estimator takes no variances of single readings.
+        EventError: If an event from the n-th on does not fit the model.
+    """
+    layout = model.layout
+    if log.width < layout.least:
+        raise EstimatorError(
+            f"the log has {log.width} value column(s); an event of {model.name} needs {layout.least}: make it by "
+            "Log.of(model)"
+        )
+    if not layout.same(log.layout):
+        admitted(log.events.select(slice(n, None)), log.width, layout)
+    if log.has_variances:
+        check_variances(estimator, options)
 
 
 def check_tuning(tuning: Tuning, model: StateSpaceModel) -> None:

@@ -193,7 +193,8 @@ def begin(code, context, mean, cov, state):
 @jit
 def judge(start, end, t, kind, channel, value, context, policy, bounds, evidence, track):
     """What the rows `start` to `end`, which are folded, say of the estimate: windowed NIS, alarms, health."""
-    assess(start, end, t, kind, track, policy, bounds)
+    normal = floats(context.normal, context.n_sensors)
+    assess(start, end, t, kind, channel, track, normal, policy, bounds)
     watch_rows(start, end, t, kind, channel, value, context, policy, evidence, track)
 
 

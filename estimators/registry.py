@@ -9,7 +9,7 @@ from .ensemble.ensrf import ENSRF
 from .ensemble.etkf import ETKF
 from .ensemble.letkf import LETKF
 from .ensemble.localisation import check_placed
-from .errors import EstimatorError, nearest
+from .errors import EstimatorError, nearest, quoted
 from .estimator import Estimator, Options
 from .gaussian.ckf import CKF
 from .gaussian.ekf import EKF
@@ -42,7 +42,7 @@ def find_entry(name: str) -> Estimator:
         EstimatorError: If there is none, with near names, or all.
     """
     if name not in ESTIMATORS:
-        raise EstimatorError(f"estimator {name!r} does not exist; {nearest(name, ESTIMATORS)}")
+        raise EstimatorError(f"estimator {quoted(name)} does not exist; {nearest(name, ESTIMATORS)}")
     return ESTIMATORS[name]
 
 

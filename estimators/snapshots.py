@@ -49,24 +49,32 @@ class Base(NamedTuple):
 class Snapshot(NamedTuple):
     """What a fold goes on from before an event.
 
-    Clock (ns), inputs (nu,), state of the filter, evidence against it, state of the screen, doubts of the sensors.
+    Clock (1,) in ns, inputs (nu,), state of the filter, evidence against it, state of the screen, doubts of the
+    sensors.
     """
 
-    clock: int
+    clock: np.ndarray
     u: np.ndarray
     state: np.ndarray
     evidence: np.ndarray
     edge: np.ndarray
     doubt: np.ndarray
 
+    def copy(self) -> Snapshot:
+        """Another one, which does not change with this."""
+        return Snapshot(*(part.copy() for part in self))
+
+    def put(self, other: Snapshot) -> None:
+        """Take over what another one holds."""
+        for mine, its in zip(self, other, strict=True):
+            mine[:] = its
+
 
 class Story(NamedTuple):
     """Events folded apart: their track, where that ended, and by how much each state was widened before (nx,)."""
 
     track: Track
-    clock: int
-    u: np.ndarray
-    state: np.ndarray
+    end: Snapshot
     widened: np.ndarray
 
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, flag_rows, flags, ints, jit, masks
+from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, counts, flag_rows, flags, ints, jit, masks
 
 NONE, USED, GATED, HELD_OUT, MISSING, FAILED, SCREENED = range(7)
 """Verdict on an event: not a reading; used; refused by the gate; held out and scored; no finite row; not usable,
@@ -45,7 +45,7 @@ class Track(NamedTuple):
     was used, gated or failed, or since a reset. consistency: DIVERGED where the window alone says so, else TRACKING.
     whitened (N, ny): the innovation as it would be drawn from N(0, I), by row of the reading; of a prediction that is
     not Gaussian each row by itself, Φ⁻¹(F(y)). alarms (N, width): bits of the causes that are in alarm after this
-    event, by row of the reading or state of the truth; flags: bits of what else is wrong (diagnostics/evidence.py).
+    event, by row of the reading or state of the truth; flags: bits of what else is wrong (diagnostics/evidence/).
     screened (N, ny): bits of `REASONS` for which a row of the reading was refused at the edge.
     effective: of particles, their effective sample size after a reading that was used, before resampling; ancestors:
     how many of some readings ago these descend from (particle/lineage.py); NaN elsewhere.
@@ -78,7 +78,7 @@ class Track(NamedTuple):
         """Columns for `rows` events, filled with NaN (so that their memory is paid for at once)."""
         matrix = [np.full((rows, k), np.nan) for k in (nx, nx, pairs, ny, ny)]
         vectors = [np.full(rows, np.nan) for _ in range(2)]
-        codes = [np.zeros(rows, np.int8) for _ in range(2)]
+        codes = [np.zeros(rows, np.int32), np.zeros(rows, np.int8)]
         windowed = [np.full(rows, np.nan) for _ in range(4)]
         health = [np.zeros(rows, np.int8) for _ in range(2)]
         evidence = [np.full((rows, ny), np.nan), np.zeros((rows, width or ny), np.int32), np.zeros(rows, np.int64)]
@@ -103,9 +103,9 @@ class Track(NamedTuple):
 # As in log.py: `len` counts rows, not columns.
 Track._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[method-assign, assignment]
 
-_A2, _B2 = types.Array(types.int32, 2, "C"), types.Array(types.int8, 2, "C")
+_A1, _A2, _B2 = types.int32[::1], types.Array(types.int32, 2, "C"), types.Array(types.int8, 2, "C")
 track_type = types.NamedTuple(
-    (F2, F2, F2, F2, F2, F1, F1, B1, B1, F1, F1, F1, F1, B1, B1, F2, _A2, I1, _B2, F1, F1), Track
+    (F2, F2, F2, F2, F2, F1, F1, _A1, B1, F1, F1, F1, F1, B1, B1, F2, _A2, I1, _B2, F1, F1), Track
 )
 
 
@@ -121,7 +121,7 @@ def borrowed_columns(track):
         borrowed_rows(track.innovation_std),
         borrowed(track.nis),
         borrowed(track.log_likelihood),
-        flags(track.dof.ctypes.data, n),
+        counts(track.dof.ctypes.data, n),
         flags(track.verdict.ctypes.data, n),
         borrowed(track.age),
         borrowed(track.nis_mean),

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .errors import LARGEST, ConfigError, nearest
+from .errors import LARGEST, ConfigError, nearest, quoted, shown_name
 from .model.state_space import StateSpaceModel
 
 _versions = count(1)
@@ -17,8 +17,14 @@ _versions = count(1)
 GATE_KINDS = ("hard", "soft")
 """What becomes of a reading beyond the gate: it is refused; it counts with its noise inflated."""
 
+LEAST_GATE = 0.5
+"""Probability with which a good reading passes, at least: a gate that refuses most of them is no gate."""
+
 REOPEN = 30.0
 """Seconds after which the asset is believed, if a tuning does not say otherwise."""
+
+LONGEST = 1e9
+"""Seconds of `reopen`, at most: 32 years."""
 
 GATE_KEYS = {"gate": "gate", "gate.kind": "gate_kind", "gate.reopen": "reopen"}
 """Keys of the gate, and the fields that they turn."""
@@ -47,7 +53,7 @@ class Tuning:
     `gate_kind` is "soft", counts with its noise inflated (gate/soften.py). A sensor that stays refused is judged
     (gate/reopening.py); if nothing tells whether it or the twin is wrong, the asset is believed after `reopen` seconds,
     None for never. `options` are the estimator's own. `baseline` (rows, ...) is what was normal of the innovations when
-    it was accepted (diagnostics/evidence.py), or None for white ones.
+    it was accepted (diagnostics/evidence/), or None for white ones.
     """
 
     model: StateSpaceModel
@@ -119,29 +125,36 @@ class Tuning:
             ConfigError: If there is no such key, or the value breaks its rule.
         """
         if key == "gate":
-            if value is not None and not 0.0 < float(value) < 1.0:
-                raise ConfigError(f"gate is {value}; it must lie between 0 and 1, or be null for no gate")
-            gate = None if value is None else float(value)
-            return replace(self, gate=gate, version=next(_versions))
+            number = _number(value)
+            if value is not None and not LEAST_GATE <= number < 1.0:
+                raise ConfigError(
+                    f"gate is {_shown(value)}; it must lie between {LEAST_GATE:g} and 1, or be null for no gate"
+                )
+            return replace(self, gate=None if value is None else number, version=next(_versions))
         if key == "gate.kind":
             if value not in GATE_KINDS:
-                raise ConfigError(f"gate.kind is {value!r}; it must be hard or soft")
+                raise ConfigError(f"gate.kind is {_shown(value)}; it must be hard or soft")
             return replace(self, gate_kind=str(value), version=next(_versions))
         if key == "gate.reopen":
-            if value is not None and not 0.0 < float(value) <= LARGEST:
-                raise ConfigError(f"gate.reopen is {value}; it must be a positive number of seconds, or null for never")
-            reopen = None if value is None else float(value)
-            return replace(self, reopen=reopen, version=next(_versions))
+            number = _number(value)
+            if value is not None and not 0.0 < number <= LONGEST:
+                raise ConfigError(
+                    f"gate.reopen is {_shown(value)}; it must be a positive number of seconds, {LONGEST:g} at most, or "
+                    "null for never"
+                )
+            return replace(self, reopen=None if value is None else number, version=next(_versions))
         group, index = self._locate(key)
         if group == "used":
+            if not isinstance(value, (bool, np.bool_)):
+                raise ConfigError(f"{key} is {_shown(value)}; it must be true or false")
             changed: np.ndarray = self.used.copy()
-            changed[index] = bool(value)
+            changed[index] = value
         else:
-            number = float(value) if value is not None else np.nan
+            number = _number(value)
             if not np.isfinite(number):
-                raise ConfigError(f"{key} is {value}; it must be a finite number")
+                raise ConfigError(f"{key} is {_shown(value)}; it must be a finite number")
             if abs(number) > LARGEST:
-                raise ConfigError(f"{key} is {value}; it must be {LARGEST:g} at most")
+                raise ConfigError(f"{key} is {number:g}; it must be {LARGEST:g} at most")
             if group == "q" and number < 0:
                 raise ConfigError(f"{key} is {number:g}; a variance must be zero or positive")
             if group == "r" and not (number > 0 or number == 0 and self._without_noise(index)):
@@ -185,7 +198,21 @@ class Tuning:
         if prefix == "R" and name in model.sensor_names:
             k = model.sensor_names.index(name)
             return "r", slice(model.row_start[k], model.row_start[k] + len(model.sensors[k].rows))
-        raise ConfigError(f"{key} is not a tuning key of {model.name}; {nearest(key, self.keys())}")
+        raise ConfigError(f"{shown_name(key)} is not a tuning key of {model.name}; {nearest(key, self.keys())}")
+
+
+def _number(value: float | bool | str | None) -> float:
+    """A value that should be a number; NaN if it is none."""
+    return float("nan") if value is None or isinstance(value, (str, bool, np.bool_)) else float(value)
+
+
+def _shown(value: float | bool | str | None) -> str:
+    """A value as a message shows it, in the words of YAML and JSON."""
+    if value is None:
+        return "null"
+    if isinstance(value, (bool, np.bool_)):
+        return "true" if value else "false"
+    return quoted(value) if isinstance(value, str) else f"{value:g}"
 
 
 def _mean(values: Any) -> float:

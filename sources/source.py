@@ -15,6 +15,9 @@ Report = Callable[[str, str], None]
 NEVER = "never seen"
 """Key of what a channel is mapped to and the source does not give."""
 
+WRONG_TIME = "wrong time"
+"""Key of events that are refused for their time."""
+
 TRUNCATED = "truncated file"
 """Key of a file of which something is lost."""
 

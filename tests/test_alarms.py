@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from app.engine.outputs import Status
+from config.schema import TwinSection
 from estimators.diagnostics.episodes import CAUSES, anchor
 from estimators.diagnostics.sensor_states import STATES
 from estimators.track import HEALTH_NAMES
@@ -44,7 +46,7 @@ def causes_in(path):
 
 def test_the_causes_are_those_that_the_code_gives():
     folder = ROOT / "estimators/diagnostics"
-    given = causes_in(folder / "episodes.py") | causes_in(folder / "effects.py")
+    given = set().union(*(causes_in(path) for path in (folder / "effects.py", *folder.glob("episodes/*.py"))))
     # Those of the twin as a whole are names of its health; what never came into the log, only its reader knows.
     assert given | {"stale", "diverged", "dropped"} == set(CAUSES)
 
@@ -63,8 +65,63 @@ def test_each_state_has_its_heading(state):
     assert "Response:" in body or "Clears:" in body
 
 
+def constants_of(path):
+    """The assignments at the top level of a module, each as texts by name."""
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.Assign):
+            (target,) = node.targets
+            several = isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple)
+            pairs = zip(target.elts, node.value.elts, strict=True) if several else [(target, node.value)]
+            try:
+                yield {name.id: ast.literal_eval(value) for name, value in pairs}
+            except ValueError:
+                continue  # It is computed.
+
+
+def outcomes():
+    """What is decided of sensors that stay refused."""
+    (found,) = (names for names in constants_of(ROOT / "estimators/gate/stories.py") if "DOUBTED" in names)
+    return set(found.values())
+
+
+OF_THE_PROGRAM = {"chronicle", "blame", "engine error", "view error", "recording failed", "stale", "readings"}
+"""Keys of notices that report what is wrong with the program or a disk; the others are no
+alarm, or a state of health."""
+
+
+def notices():
+    """Words under which the running twin counts what it reports, and those of its panel."""
+    found = set()
+    for path in (ROOT / "app").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "report":
+                found |= {arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant)}
+    values = {}
+    for path in (ROOT / "app/intake.py", ROOT / "app/viser/status.py"):
+        for names in constants_of(path):
+            values |= names
+    found |= {values[name] for name in ("WRONG_TIME", "CLOCK_MOVED", "MAINTENANCE")}
+    return (found | {*values["COUNTED"], *values["SELDOM"]}) - OF_THE_PROGRAM
+
+
+SETTINGS = {"commissioned", "integrity"}
+"""A section of the YAML and a figure of the status that change what the twin says."""
+
+
+def test_the_settings_are_there():
+    assert "commissioned" in TwinSection.model_fields and "integrity" in Status.__dataclass_fields__
+
+
+@pytest.mark.parametrize("word", sorted(outcomes() | notices() | SETTINGS))
+def test_each_word_of_a_notice_says_what_to_do(word):
+    body = sections()[anchor(word)]
+    assert body.strip() and "*Clears:*" in body
+    assert "*Response:*" in body or word in STATES or anchor(word) in CAUSES
+
+
 def test_nothing_is_explained_that_is_never_said():
-    assert set(sections()) == {anchor(name) for name in (*CAUSES, *HEALTH_NAMES, *STATES)}
+    said = {*CAUSES, *HEALTH_NAMES, *STATES, *outcomes(), *notices(), *SETTINGS}
+    assert set(sections()) == {anchor(name) for name in said}
 
 
 def test_the_readme_leads_there():

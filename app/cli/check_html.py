@@ -7,25 +7,33 @@ from html import escape
 
 import numpy as np
 
+from estimators.diagnostics.sensitivity.words import digits
+
 from .check_tables import WORSE, Bar, Part
 
 STYLE = """
 @page { size: A4; margin: 14mm }
 body { font: 14px/1.45 system-ui, sans-serif; color: #1f2937; background: #fff; max-width: 62em; margin: 2em auto;
        padding: 0 1.5em }
-h1 { font-size: 1.5em; margin: 0 0 .2em } h2 { font-size: 1.1em; margin: 1.8em 0 .4em }
+h1 { font-size: 1.5em; margin: 0 0 .2em } h2 { font-size: 1.1em; margin: 1.8em 0 .4em; break-after: avoid }
 p { margin: .3em 0 }
 table { border-collapse: collapse; width: 100%; font-size: .9em; font-variant-numeric: tabular-nums }
 th, td { text-align: left; vertical-align: top; padding: .35em .7em .35em 0; border-bottom: 1px solid #e5e7eb }
 th { color: #6b7280; font-weight: 500 }
-tr { break-inside: avoid }
-.yes { color: #15803d } .partly { color: #b45309 } .no { color: #b91c1c } .yes, .partly, .no { font-weight: 600 }
+tr, svg { break-inside: avoid }
+.good { color: #15803d } .partly { color: #b45309 } .bad { color: #b91c1c }
+.good, .partly, .bad { font-weight: 600 }
+.short { white-space: nowrap }
 .worse { color: #b91c1c }
-svg { display: block; margin: .6em 0; max-width: 100% }
+svg { display: block; margin: .6em 0; max-width: 100%; height: auto }
+@media print { body { font-size: 10.5px; max-width: none; margin: 0; padding: 0 } }
 """
 
 ROW, LEFT, LONG = 34, 150, 420
 """Pixels: height of a pair of bars, width of the names, length of the longest bar."""
+
+SHORT = 24
+"""Characters of a cell up to which it stands in one line."""
 
 FIRST, SECOND = "#2563eb", "#f59e0b"
 
@@ -59,20 +67,25 @@ def _worse(text: str) -> str:
 
 def _table(part: Part) -> str:
     head = "".join(f"<th>{escape(cell)}</th>" for cell in part.head)
-    rows = "\n".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in part.rows)
+    marks = part.marks or ("",) * len(part.rows)
+    rows = "\n".join(
+        "<tr>" + "".join(_cell(cell, mark if k == 1 else "") for k, cell in enumerate(row)) + "</tr>"
+        for row, mark in zip(part.rows, marks, strict=True)
+    )
     return f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>"
 
 
-def _cell(text: str) -> str:
-    mark = f' class="{text}"' if text in ("yes", "partly", "no") else _worse(text)
-    return f"<td{mark}>{escape(text)}</td>"
+def _cell(text: str, mark: str = "") -> str:
+    kinds = [mark, "short" if len(text) <= SHORT else "", "worse" if WORSE in text else ""]
+    named = " ".join(filter(None, kinds))
+    return f'<td class="{named}">{escape(text)}</td>' if named else f"<td>{escape(text)}</td>"
 
 
 def _bars(bars: Sequence[Bar], legend: tuple[str, str]) -> str:
     """Two bars a row, each row to its own scale: their units differ."""
-    height = ROW * len(bars) + 24
+    width, height = LEFT + LONG + 130, ROW * len(bars) + 24
     drawn = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{LEFT + LONG + 130}" height="{height}" font-size="12" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" font-size="12" '
         f'role="img" aria-label="{escape(legend[0])} beside {escape(legend[1])}">'
     ]
     for k, (color, text) in enumerate(zip((FIRST, SECOND), legend, strict=True)):
@@ -86,7 +99,8 @@ def _bars(bars: Sequence[Bar], legend: tuple[str, str]) -> str:
         for y, value, color in ((top, bar.first, FIRST), (top + 12, bar.second, SECOND)):
             finite = bool(np.isfinite(value))
             length = LONG * value / longest if finite and longest > 0.0 else 0.0
-            text = f"{value:.3g} {bar.unit}" if finite else "no number"
+            unit = "" if bar.unit == "1" else f" {bar.unit}"
+            text = f"{digits(value)}{unit}" if finite else "no number"
             drawn.append(f'<rect x="{LEFT}" y="{y}" width="{length:.1f}" height="10" fill="{color}"/>')
             drawn.append(f'<text x="{LEFT + length + 6:.1f}" y="{y + 9}">{escape(text)}</text>')
     return "\n".join([*drawn, "</svg>"])

@@ -11,9 +11,9 @@ from estimators.diagnostics.calibration import LIMITS
 from estimators.diagnostics.checklist.dimension import BUSY, spread_error
 from estimators.diagnostics.checklist.posterior import OFTEN
 from estimators.diagnostics.sensitivity import Sensitivity
-from estimators.diagnostics.sensitivity.words import subject_text
+from estimators.diagnostics.sensitivity.words import digits, subject_text
 from estimators.log import MAINTENANCE
-from estimators.track import HEALTH_NAMES
+from estimators.track import HEALTH_NAMES, Track
 
 from .checked import Checked
 from .scores import scores_file
@@ -78,12 +78,12 @@ def _dimension(checked: Checked) -> Line:
     entry = fold.estimator
     question = "Is n small enough for O(n³) at this rate, or is an ensemble required?"
     figures = (
-        f"{found.nx:,} states, {found.rate:.3g} readings a second; a covariance step is {found.flops:.3g} operations "
-        f"on {found.memory / 1e6:.3g} MB; {entry.name} takes {1e6 * found.seconds:.3g} µs a reading, "
+        f"{found.nx:,} states, {found.rate:.3g} readings a second; a covariance step is {digits(found.flops)} "
+        f"operations on {scaled(found.memory, 'B')}; {entry.name} takes {scaled(found.seconds, 's')} a reading, "
         f"{100 * found.share:.2g} % of one processor"
     )
     if np.isfinite(found.largest) and found.largest > found.nx:
-        figures += f", by n³ all of it at {found.largest:,.0f} states"
+        figures += f" (growing with n³, all of it at {found.largest:,.0f} states)"
     members = fold.options.get("members", fold.options.get("particles", 0.0))
     if members:
         figures += f"; {members:,.0f} members: each σ is off by {100 * spread_error(members):.2g} % by chance"
@@ -135,6 +135,30 @@ def _posterior(checked: Checked) -> Line:
     return Line("posterior", question, answer, "; ".join(said), remedy)
 
 
+def scaled(value: float, unit: str) -> str:
+    """A positive number to three digits with the prefix that fits: `29.8 µs`, `648 B`."""
+    steps = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"))
+    factor, prefix = next((step for step in steps if value >= step[0]), (1e-9, "n"))
+    return f"{value / factor:.3g} {prefix}{unit}"
+
+
+def health_shares(track: Track) -> str:
+    """How much of the track was in which state of health, the longest first."""
+    share = np.bincount(track.health, minlength=len(HEALTH_NAMES)) / max(1, len(track))
+    return ", ".join(f"{HEALTH_NAMES[k]} {_percent(share[k])}" for k in np.argsort(-share, kind="stable") if share[k])
+
+
+def _percent(share: float) -> str:
+    """A share of which neither 0 % nor 100 % is said unless it is."""
+    if 0.0 < share < 0.0005:
+        return "less than 0.1 %"
+    return "more than 99.9 %" if 0.9995 <= share < 1.0 else f"{100 * share:.3g} %"
+
+
+def _every(seconds: float) -> str:
+    return "a day" if seconds == 86400.0 else f"in {seconds:g} s"
+
+
 def blamed(found: Sensitivity) -> list[tuple[str, str, float]]:
     """Who takes the blame for whom: pairs that look alike in the readings.
 
@@ -160,16 +184,17 @@ def _observability(checked: Checked) -> Line:
     if whole is None:
         return Line("observability", question, NONE, found.reason, "")
     figures = (
-        f"rank {whole.rank} of {checked.twin.model.nx}, conditioning {whole.conditioning:.3g}; the weakest direction "
-        f"is {whole.text}"
+        f"rank {whole.rank} of {checked.twin.model.nx}, conditioning {digits(whole.conditioning)}; "
+        f"the weakest direction is {whole.text}"
     )
     if found.windows:
         ranks = [window.rank for window in found.windows]
-        figures += f"; in {len(ranks)} windows alone rank {min(ranks)} to {max(ranks)}"
+        every = f"{min(ranks)}" if min(ranks) == max(ranks) else f"{min(ranks)} to {max(ranks)}"
+        figures += f"; of {len(ranks)} parts of the log each alone gives rank {every}"
     pairs = blamed(told)
     if pairs:
         first, second, value = pairs[0]
-        figures += f"; {len(pairs)} pair(s) look alike in the readings, first {first} and {second} ({value:+.3f})"
+        figures += f"; {len(pairs)} pair(s) look alike in the readings, most of all {first} and {second} ({value:+.2f})"
     if whole.beyond:
         return Line("observability", question, NONE, f"{figures}; {found.note}", "")
     free = checked.twin.model.prior_std > 0.0
@@ -225,14 +250,12 @@ def _timing(checked: Checked) -> Line:
 
 def _health(checked: Checked) -> Line:
     question = "Are NIS, whiteness and refusals monitored, with alerts and a documented response?"
-    track = checked.fold.track
-    share = np.bincount(track.health, minlength=len(HEALTH_NAMES)) / max(1, len(track))
-    parts = ", ".join(f"{name} {100 * value:.3g} %" for name, value in zip(HEALTH_NAMES, share, strict=True) if value)
     found = checked.episodes
     wrong = [entry for entry in checked.calibration if entry.words]
+    rate = _every(checked.twin.policy.false_alarm_every)
     figures = (
-        f"a false alarm every {checked.twin.policy.false_alarm_every:g} s at most; health {parts}; {len(found)} "
-        f"episode(s); calibration off in {len(wrong)} of {len(checked.calibration)} rows and states"
+        f"at most one false alarm {rate}; {health_shares(checked.fold.track)}; {len(found)} episode(s); "
+        f"calibration off in {len(wrong)} of {len(checked.calibration)} rows and states"
     )
     remedy = found[0].text if found else wrong[0].words[0] if wrong else ""
     return Line("health", question, YES, figures, remedy)

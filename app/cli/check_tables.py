@@ -10,10 +10,9 @@ import numpy as np
 from estimators.diagnostics.calibration import BANDS
 from estimators.diagnostics.sensitivity import bounds_of
 from estimators.diagnostics.sensitivity.information import directions
-from estimators.diagnostics.sensitivity.words import range_text, size_text, subject_text
-from estimators.track import HEALTH_NAMES
+from estimators.diagnostics.sensitivity.words import digits, range_text, size_text, subject_text
 
-from .check_list import blamed, checklist
+from .check_list import BLAME, Line, blamed, checklist, health_shares
 from .checked import Checked
 from .fold_report import calibration_lines
 
@@ -21,6 +20,8 @@ MOST = 12
 """Rows of a table on the page; JSON has all."""
 
 WORSE = "worse than no filter"
+
+UNKNOWN = "How late readings come is not known: the log has one time for each, that at which it was measured."
 
 
 class Bar(NamedTuple):
@@ -33,7 +34,10 @@ class Bar(NamedTuple):
 
 
 class Part(NamedTuple):
-    """One section: a title, what is said before the table, its head and rows; `bars` are what HTML draws of it."""
+    """One section: a title, what is said before the table, its head and rows; `bars` are what HTML draws of it.
+
+    `marks` are of its rows: whether the second cell says something good, partly so, or bad; "" if nothing.
+    """
 
     title: str
     said: tuple[str, ...]
@@ -41,6 +45,7 @@ class Part(NamedTuple):
     rows: tuple[tuple[str, ...], ...] = ()
     bars: tuple[Bar, ...] = ()
     legend: tuple[str, str] = ("", "")
+    marks: tuple[str, ...] = ()
 
 
 def sections(checked: Checked) -> list[Part]:
@@ -51,6 +56,7 @@ def sections(checked: Checked) -> list[Part]:
         _integrity(checked),
         _visible(checked),
         _observability(checked),
+        _blame(checked),
         _held_out(checked),
         _open_loop(checked),
         _timing(checked),
@@ -59,14 +65,14 @@ def sections(checked: Checked) -> list[Part]:
 
 
 def _number(value: float) -> str:
-    return f"{value:.3g}" if np.isfinite(value) else "-"
+    return digits(value) if np.isfinite(value) else "-"
 
 
 def _cut(rows: Sequence[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
     """At most `MOST` rows, and one that says how many more there are."""
     if len(rows) <= MOST + 1:
         return tuple(rows)
-    return (*rows[:MOST], (f"... and {len(rows) - MOST} more", *[""] * (len(rows[0]) - 1)))
+    return (*rows[:MOST], (f"... and {len(rows) - MOST} more, see --json", *[""] * (len(rows[0]) - 1)))
 
 
 def _title(checked: Checked) -> Part:
@@ -78,8 +84,16 @@ def _title(checked: Checked) -> Part:
 
 
 def _checklist(checked: Checked) -> Part:
-    rows = [(line.question, line.answer, line.figures, line.remedy) for line in checklist(checked)]
-    return Part("Checklist", (), ("question", "answer", "figures", "remedy"), tuple(rows))
+    lines = checklist(checked)
+    rows = tuple((line.question, line.answer, line.figures, line.remedy) for line in lines)
+    head = ("question", "answer", "figures", "remedy")
+    return Part("Checklist", (), head, rows, marks=tuple(map(_mark, lines)))
+
+
+def _mark(line: Line) -> str:
+    """Whether the answer is good news: to the question for peaks and tails that is a no."""
+    good, bad = ("no", "") if line.key == "posterior" else ("yes", "no")
+    return {good: "good", bad: "bad", "not told": ""}.get(line.answer, "partly")
 
 
 def _integrity(checked: Checked) -> Part:
@@ -108,8 +122,9 @@ def _visible(checked: Checked) -> Part:
     for nudge, size, (low, high) in zip(found.nudges, found.smallest_visible, found.unseen, strict=True):
         seen = size_text(nudge, size) if np.isfinite(size) else "cannot be seen within its range"
         rows.append((subject_text(nudge), seen, range_text(nudge, low, high)))
-    said = f"A constant fault, there for all of {seconds:.4g} s, seen with 95 %."
-    return Part(title, (said,), ("fault", "smallest visible", "passes unseen"), _cut(rows))
+    said = [f"{found.note}."] if found.note else []
+    said.append(f"A constant fault, there for all of {seconds:.4g} s, seen with a probability of 95 %.")
+    return Part(title, tuple(said), ("fault", "smallest visible", "passes unseen"), _cut(rows))
 
 
 def _observability(checked: Checked) -> Part:
@@ -127,17 +142,26 @@ def _observability(checked: Checked) -> Part:
         )
         for view in (found.whole, *found.windows)
     ]
-    said = [f"{found.note}."] if found.note else []
-    pairs = blamed(checked.sensitivity)
-    for one, other, value in pairs[:MOST]:
-        said.append(f"{one} and {other} take the blame for each other: correlation {value:+.3f}.")
-    if len(pairs) > MOST:
-        said.append(f"So do {len(pairs) - MOST} more pairs.")
+    said = (f"{found.note}.",) if found.note else ()
+    return Part(title, said, ("part of the log", "rank", "conditioning", "weakest direction"), _cut(rows))
+
+
+def _blame(checked: Checked) -> Part:
     told = checked.sensitivity
+    title = "Who takes the blame for whom"
+    if told.reason:
+        return Part(title, (f"Not computed: {told.reason}.",))
+    said = [f"{told.note}."] if told.note else []
+    rows = [(one, other, f"{value:+.2f}") for one, other, value in blamed(told)]
+    said.append(
+        "What the readings cannot tell apart: a fault of one looks like a fault of the other."
+        if rows
+        else f"No two faults look alike: no correlation is beyond {BLAME:g}."
+    )
     untold = [item for item in directions(told.fisher, told.nudges) if not item.deviation < 1.0] if told.nudges else []
     if untold:
         said.append(f"With all unknown together {len(untold)} combination(s) cannot be told, first {untold[0].text}.")
-    return Part(title, tuple(said), ("part of the log", "rank", "conditioning", "weakest direction"), _cut(rows))
+    return Part(title, tuple(said), ("one", "other", "correlation") if rows else (), _cut(rows) if rows else ())
 
 
 def _held_out(checked: Checked) -> Part:
@@ -179,6 +203,7 @@ def _open_loop(checked: Checked) -> Part:
 
 
 def _timing(checked: Checked) -> Part:
+    known = any(np.isfinite(item.lateness).any() for item in checked.arrivals)
     rows = [
         (
             item.sensor,
@@ -186,19 +211,17 @@ def _timing(checked: Checked) -> Part:
             _number(item.rate),
             _number(item.gap),
             f"{100 * item.missing:.2g}" if np.isfinite(item.missing) else "-",
-            " / ".join(_number(value) for value in item.lateness),
+            " / ".join(_number(value) for value in item.lateness) if known else "not known",
         )
         for item in checked.arrivals
     ]
     head = ("sensor", "readings", "a second", "longest gap, s", "missing, %", "lateness, s: half, 99 %, worst")
-    return Part("When readings come", (), head, _cut(rows))
+    said = () if known else (UNKNOWN,)
+    return Part("When readings come", said, head, _cut(rows))
 
 
 def _health(checked: Checked) -> Part:
-    track = checked.fold.track
-    share = np.bincount(track.health, minlength=len(HEALTH_NAMES)) / max(1, len(track))
-    parts = [f"{name} {100 * value:.3g} %" for name, value in zip(HEALTH_NAMES, share, strict=True) if value]
-    said = [", ".join(parts) + "."]
+    said = [f"{health_shares(checked.fold.track)}."]
     said += [episode.text for episode in checked.episodes[:MOST]]
     if len(checked.episodes) > MOST:
         said.append(f"... and {len(checked.episodes) - MOST} more episodes.")

@@ -77,7 +77,7 @@ def check(twin: Twin, log: Log, counts: Counter[str]) -> Checked:
         tails=tails(model, log, fold.track, marginal=fold.marginal),
         gramian=gramian(twin.estimator, *given),
         sensitivity=sensitivity(twin.estimator, *given, false_alarm=twin.policy.false_alarm_every),
-        arrivals=arrivals(model, log),
+        arrivals=tuple(item for item, fed in zip(arrivals(model, log), twin.expected, strict=True) if fed or item.n),
         calibration=calibration_of(twin, fold),
         episodes=episodes(fold),
         held_out=held_out(twin.estimator, *given),

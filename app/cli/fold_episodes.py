@@ -13,8 +13,7 @@ from estimators.diagnostics.sensitivity.suspects import ALIKE, TELLING, Suspect,
 from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.log import READING
-
-from ..intake import WRONG_TIME
+from sources.source import WRONG_TIME
 
 SHOWN = 10
 

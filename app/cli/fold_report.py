@@ -13,14 +13,15 @@ from estimators.diagnostics.failure_cause import failures
 from estimators.diagnostics.intervals import Interval
 from estimators.diagnostics.score import Score
 from estimators.fold import Fold
+from estimators.fold_failures import cause_of
 from estimators.gate.reopening import Decision
 from estimators.gate.stories import softened
 from estimators.model.state_space import StateSpaceModel
 from estimators.screen import reasons_by_sensor
 from estimators.track import FAILED, HEALTH_NAMES, REASONS, USED
 from estimators.tuning import TOGETHER
+from sources.source import WRONG_TIME
 
-from ..intake import WRONG_TIME
 from ..twin.twin import Twin
 from .fold_episodes import Told, as_json, dropped
 
@@ -75,7 +76,7 @@ def as_dict(
     `log_likelihood` has the price of the readings that were refused, which `log_likelihood_used` leaves out; `refused`
     is their share. `calibration` has an entry for each sensor row, used or held out, and each state whose truth is
     told: see estimators/diagnostics/calibration.py. `episodes` have start and end in seconds of the log (end null while
-    one lasts), and `suspects`, the faults that explain them best: see estimators/diagnostics/episodes.py and
+    one lasts), and `suspects`, the faults that explain them best: see estimators/diagnostics/episodes/ and
     sensitivity/suspects.py.
     """
     return {
@@ -156,7 +157,7 @@ def _screened(twin: Twin, counts: Counter[str], fold: Fold) -> dict[str, dict[st
 def _why(fold: Fold) -> str | None:
     """What of the model made the first reading or estimate fail that did."""
     rows = failures(fold.track)
-    return fold.cause(int(rows[0])) if rows.size else None
+    return cause_of(fold, int(rows[0])) if rows.size else None
 
 
 def as_text(

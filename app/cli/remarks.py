@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sources.source import NEVER, TRUNCATED
+from sources.source import NEVER, TRUNCATED, WRONG_TIME
 from sources.tables.order import REMARKS as ORDER
 
-from ..intake import CLOCK_MOVED, WRONG_TIME
+from ..intake import CLOCK_MOVED
 from ..stderr import complain
 
 REMARKS = (*ORDER, NEVER, TRUNCATED, CLOCK_MOVED)

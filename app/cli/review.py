@@ -23,11 +23,15 @@ if TYPE_CHECKING:
 
 
 def recorded_twin(recorded: Recorded) -> Twin:
-    """The twin as it was when the recording ended: its YAML, with the last tuning and estimator."""
+    """The twin as it was when the recording ended: its YAML, with the last tuning and estimator.
+
+    What was normal of the innovations is no knob, and stands in the YAML.
+    """
     from dataclasses import replace
 
-    twin = restore_twin(recorded.text, recorded.twin_path)
+    twin = restore_twin(recorded.text, recorded.twin_path, recorded.overrides)
     tuning, estimator = tuning_from_json(recorded.tuning, twin.model)
+    tuning = replace(tuning, baseline=twin.tuning.baseline)
     return replace(twin, tuning=tuning, estimator=estimator, recorded=True)
 
 

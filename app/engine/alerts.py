@@ -8,6 +8,7 @@ import numpy as np
 
 from estimators.diagnostics.failure_cause import failures
 from estimators.fold import Fold
+from estimators.fold_failures import cause_of
 from estimators.gate.stories import AGREES
 
 from .counts import UNSETTLED, complaints, estimated_rows
@@ -118,7 +119,7 @@ class Alerts:
         rows = failures(fold.track, first)
         if rows.size:
             self._tries += 1
-            text = fold.cause(int(rows[0]))
+            text = cause_of(fold, int(rows[0]))
             if text is not None:
                 self._tries = TRIES
                 self._notices.say(text, level="error", t=int(fold.log.t[rows[0]]))

@@ -1,8 +1,9 @@
 """The chronicle: episodes of the running twin, as they begin and end, outside the engine's thread.
 
 It pulls rows with a cursor, as a view does, and looks for episodes among the last of them (tail.py). What began before
-those is carried on: its size and words stay as they were when it was seen whole. A late reading takes rows back, and
-another revision begins a new chronicle; what lasts through that is not said again.
+those is carried on: its onset, size and words stay as they were when it was seen whole, and of a sensor's what its end
+depends on is kept (episodes/going.py). A late reading takes rows back, and another revision begins a new chronicle;
+what lasts through that is not said again.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimators.diagnostics.episodes import JOINED, Course, Episode, Found, found_in
+from estimators.diagnostics.episodes import JOINED, Course, Episode, Found, Going, found_in
 from estimators.registry import find_estimator
 from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING, WAITING
 
@@ -60,11 +61,25 @@ LOST = ("stuck", "refused", "screened")
 
 
 class Entry(NamedTuple):
-    """An episode, what it is of, and when its first alarm was, ns."""
+    """An episode, what it is of, when its first alarm was, ns, and what is kept of its rows that are forgotten."""
 
     key: tuple[str, str]
     at: int
     episode: Episode
+    going: Going = Going()
+
+    def is_at(self, item: Found) -> bool:
+        """Whether it goes on in what was found in the rows that are kept."""
+        return self.at == item.at or self.going.quiet + item.begin <= JOINS.get(self.key[0], 0)
+
+    def over(self, course: Course) -> Entry:
+        """The same after rows that follow those that are forgotten."""
+        kind, name = self.key
+        return self._replace(going=self.going.over(course, name, self.episode, self.at)) if kind == "sensor" else self
+
+    def likely_end(self, otherwise: float) -> float:
+        """When it ended, s, if it did: of a sensor not before its first alarm."""
+        return max(self.going.end, self.at * 1e-9) if self.key[0] == "sensor" else otherwise
 
 
 class Account(NamedTuple):
@@ -74,12 +89,17 @@ class Account(NamedTuple):
     lasting: tuple[Entry, ...] = ()
 
     def leading(self, states: Mapping[str, str]) -> Episode | None:
-        """The worst of those that last, the earliest of them; `states` of the sensors tell which of them is lost."""
+        """The worst of those that last, the newest of them.
 
-        def badness(entry: Entry) -> tuple[int, float]:
+        `states` of the sensors tell which of them is lost, and which is in order again: its episode, which lasts until
+        it is certain to be over, comes last.
+        """
+
+        def badness(entry: Entry) -> tuple[bool, int, float]:
             kind, name = entry.key
-            lost = kind in OF_SENSORS and states.get(name) in ("degraded", "stale")
-            return min(_badness(entry.episode)[0], RANKS["silent"] if lost else UNRANKED), entry.episode.start
+            state = states.get(name) if kind in OF_SENSORS else None
+            lost = RANKS["silent"] if state in ("degraded", "stale") else UNRANKED
+            return state == "tracking", min(_badness(entry.episode)[0], lost), -entry.episode.start
 
         first = min(self.lasting, key=badness, default=None)
         return None if first is None else first.episode
@@ -100,7 +120,8 @@ class Account(NamedTuple):
 
 
 def _badness(episode: Episode) -> tuple[int, float]:
-    return RANKS.get(episode.cause, UNRANKED), episode.start
+    """The worst first, of them the newest: what has just begun is what somebody has to look at."""
+    return RANKS.get(episode.cause, UNRANKED), -episode.start
 
 
 class Chronicle:
@@ -174,36 +195,44 @@ class Chronicle:
             self._find()
             self._say(before, again, passage)
 
-    def _find(self) -> None:
-        """Bring the entries up to the rows that are there."""
+    def _course(self, rows: slice) -> Course:
+        """Some of the rows that are there."""
         tail = self._tail
         tuning, estimator = self._engine.folded_with()
         marginal = find_estimator(estimator, tuning.model).family in ("particle", "ensemble")
-        course = Course(self._engine.model, tuning, marginal, tail.events, tail.track, tail.heard)
+        events, track = tail.events.select(rows), tail.track.select(rows)
+        return Course(self._engine.model, tuning, marginal, events, track, tail.heard)
+
+    def _find(self) -> None:
+        """Bring the entries up to the rows that are there."""
+        course = self._course(slice(None))
+        first = int(course.events.t[0])
         left = dict(self._carried)
         entries = []
         for item in found_in(course):
             known = left.get(item.key)
-            if known is not None and item.begin <= JOINS.get(item.key[0], 0):
+            if known is not None and known.is_at(item):
                 del left[item.key]
-                entries.append(_continued(known, item, int(tail.events.t[-1])))
+                entries.append(_continued(known, item, course))
             else:
                 entries.append(Entry(item.key, item.at, item.episode))
-        # What is not in alarm any more ended where the rows begin.
-        end = float(tail.events.t[0] * 1e-9)
-        ended = [e._replace(episode=e.episode._replace(end=e.episode.end or end)) for e in left.values()]
+        # An alarm that is there no more, as a late reading came before it, has been none.
+        ended = [_left(entry, course) for entry in left.values() if entry.at < first]
         self._entries = sorted([*self._over, *ended, *entries], key=lambda e: (e.episode.start, e.episode.subject))
         lasting = tuple(e for e in self._entries if e.episode.end is None)
         self.account = Account(tuple(e.episode for e in self._entries), lasting)
 
     def _cut(self) -> None:
         """Cut the older rows off, and keep what was found there."""
+        gone = self._tail.cut_at
+        forgotten = self._course(slice(0, gone))
+        first = int(self._tail.events.t[gone])
         self._tail.cut()
-        first = int(self._tail.events.t[0])
-        begun = [entry for entry in self._entries if entry.at < first]
+        begun = [entry for entry in self._entries if entry.episode.start * 1e9 < first]
         over = [e for e in begun if e.episode.end is not None and e.episode.end * 1e9 < first]
         self._over = over[-KEPT:]
-        self._carried = {e.key: e for e in begun if e.episode.end is None or e.episode.end * 1e9 >= first}
+        left = [e for e in begun if e.episode.end is None or e.episode.end * 1e9 >= first]
+        self._carried = {e.key: e.over(forgotten) for e in left}
 
     def _say(self, before: list[Entry], again: bool, passage: int) -> None:
         """Say what is new against the entries before; `again`: those of another revision, or of rows taken back.
@@ -243,13 +272,30 @@ class Chronicle:
             say(f"{episode.subject}: {what}, after {_duration(episode)}", t=round(episode.end * 1e9))
 
 
-def _continued(known: Entry, item: Found, now: int) -> Entry:
+def _continued(known: Entry, item: Found, course: Course) -> Entry:
     """An episode that began before the rows that are kept."""
-    old, new = known.episode, item.episode
+    old, new, going = known.episode, item.episode, known.going
+    if item.at == known.at and new.cause != old.cause:
+        # All its alarms are still there, and say more than the first of them.
+        return Entry(item.key, item.at, new)
+    end = new.end
     if new.cause in LOST and old.cause not in LOST:
-        old = new._replace(start=old.start)
-    size = (new.end or now * 1e-9) - old.start if old.unit == "s" else old.size
-    return Entry(known.key, known.at, old._replace(end=new.end, size=size))
+        # What shows it is all in these rows.
+        old, going = new._replace(start=old.start), Going()
+    elif end is not None:
+        end = known.over(course).likely_end(end)
+    size = (new.end or float(course.events.t[-1]) * 1e-9) - old.start if old.unit == "s" else old.size
+    return Entry(known.key, known.at, old._replace(end=end, size=size), going)
+
+
+def _left(known: Entry, course: Course) -> Entry:
+    """An episode that began before the rows that are kept, of which none is in alarm."""
+    after = known.over(course)
+    if known.key[0] == "sensor" and after.going.quiet <= JOINED:
+        return known._replace(episode=known.episode._replace(end=None))
+    # What is not seen in rows that are forgotten ended where those begin that are kept.
+    end = known.episode.end or after.likely_end(float(course.events.t[0] * 1e-9))
+    return known._replace(episode=known.episode._replace(end=end))
 
 
 def _changes(before: list[Entry], now: list[Entry], again: bool) -> tuple[list[Entry], list[Entry]]:

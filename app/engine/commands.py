@@ -19,13 +19,13 @@ class SetEstimator:
 
 @dataclass(frozen=True)
 class SetTuning:
-    """Turn one entry of the tuning: `Q.<noise>`, `R.<row>`, `p.<parameter>`, or one of the gate.
+    """Turn one entry of the tuning: `Q.<noise>`, `R.<row>`, `p.<parameter>`, `use.<sensor>`, or one of the gate.
 
     These are `gate` (None: no gate), `gate.kind` (hard or soft) and `gate.reopen` (None: never).
     """
 
     key: str
-    value: float | str | None
+    value: float | bool | str | None
 
 
 @dataclass(frozen=True)

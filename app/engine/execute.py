@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from estimators.errors import ConfigError
+from estimators.errors import ConfigError, nearest, quoted
 from estimators.estimator import Estimator
 from estimators.events.maintenance import maintained
 from estimators.fold_checks import check_variances
@@ -57,6 +57,10 @@ def retuned(command: Refolding, engine: Running) -> tuple[str, Tuning]:
         _check(entry, engine, options)
         return estimator, tuning.with_options(options)
     if isinstance(command, commands.UseSensor):
+        names = engine.model.sensor_names
+        if command.name not in names:
+            near = nearest(command.name, names)
+            raise ConfigError(f"UseSensor: name is {quoted(command.name)}, no sensor of {engine.model.name}; {near}")
         return estimator, tuning.set(f"use.{command.name}", command.used)
     return estimator, tuning.set(command.key, command.value)
 

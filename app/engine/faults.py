@@ -6,7 +6,7 @@ from dataclasses import replace
 from math import inf
 from typing import Any, Protocol, runtime_checkable
 
-from estimators.errors import ConfigError, SourceError, nearest
+from estimators.errors import LARGEST, ConfigError, SourceError, nearest, quoted
 from estimators.model.state_space import StateSpaceModel
 from sources.faults.fault import Fault
 from sources.faults.kinds import KINDS, OLDER, find_kind, numbers, problem
@@ -14,6 +14,9 @@ from sources.faults.layer import Faults, FaultStatus
 from sources.source import Source
 
 from . import commands
+
+FIELDS = {"end": "duration", "sensor": "target", "input": "target", "parameter": "target"}
+"""Fields of a fault that have another name in the command."""
 
 
 @runtime_checkable
@@ -43,12 +46,15 @@ def fault_of(command: commands.InjectFault, model: StateSpaceModel) -> Fault:
         ConfigError: If the kind or the target is not known, or a number is missing or cannot be.
     """
     if OLDER.get(command.kind, command.kind) not in KINDS:
-        raise ConfigError(f"InjectFault: kind is {command.kind!r}; {nearest(command.kind, list(KINDS))}")
+        raise ConfigError(f"InjectFault: kind is {quoted(command.kind)}; {nearest(command.kind, list(KINDS))}")
+    lasts = inf if command.duration is None else command.duration
+    if not (0.0 < lasts <= LARGEST or lasts == inf):
+        raise ConfigError(f"InjectFault: duration is {lasts:g} s; it must be positive, and {LARGEST:g} s at most")
     fault = Fault(
         command.kind,
         row=command.row,
         other=command.other,
-        end=inf if command.duration is None else command.duration,
+        end=lasts,
         size=command.size,
         rate=command.rate,
         every=command.every,
@@ -57,9 +63,13 @@ def fault_of(command: commands.InjectFault, model: StateSpaceModel) -> Fault:
     if command.target is not None:
         what, name = _target(command.kind, command.target, model)
         fault = replace(fault, **{what: name})  # type: ignore[arg-type]
+    elif "twin" not in find_kind(command.kind).of:
+        needs = " or ".join(find_kind(command.kind).of)
+        raise ConfigError(f"InjectFault: target is missing; a fault of kind {command.kind} needs the name of a {needs}")
     wrong = problem(fault, model)
     if wrong:
-        raise ConfigError(f"InjectFault: {' '.join(part for part in wrong if part)}".replace(": end ", ": duration "))
+        field, text = wrong
+        raise ConfigError(f"InjectFault: {FIELDS.get(field, field)} {text}")
     return fault
 
 
@@ -70,16 +80,18 @@ def _target(kind: str, target: str, model: StateSpaceModel) -> tuple[str, str]:
         "input": model.input_names,
         "parameter": tuple(item.name for item in model.parameters),
     }
-    what, dot, name = target.partition(".")
-    if dot and what in known:
-        return what, name
     takes = [what for what in known if what in find_kind(kind).of]
+    what, dot, name = target.partition(".")
+    if dot and what in takes:
+        return what, name
     for what in takes:
         if target in known[what]:
             return what, target
     names = [name for what in takes for name in known[what]]
     remedy = nearest(target, names) if names else "there is none"
-    raise ConfigError(f"InjectFault: target is {target!r}, no {' or '.join(takes)} of {model.name}; {remedy}")
+    if "twin" in find_kind(kind).of:
+        remedy += "; null is the whole source"
+    raise ConfigError(f"InjectFault: target is {quoted(target)}, no {' or '.join(takes)} of {model.name}; {remedy}")
 
 
 def check_fault(command: commands.InjectFault | commands.ClearFault, source: Source, model: StateSpaceModel) -> None:

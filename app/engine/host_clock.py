@@ -61,8 +61,8 @@ class HostClock:
 
 
 def clock_text(fit: ClockFit) -> str:
-    """Offset and drift in a few words."""
-    offset = f"{fit.offset:+.3f} s"
+    """Offset and drift in a few words; what rounds to zero is not negative."""
+    offset = f"{fit.offset:+z.3f} s"
     if math.isnan(fit.drift_ppm):
         return offset
-    return f"{offset}, {fit.drift_ppm:+.1f} ± {fit.drift_error_ppm:.1g} ppm"
+    return f"{offset}, {fit.drift_ppm:+z.1f} ± {fit.drift_error_ppm:.1g} ppm"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from estimators.errors import ConfigError, nearest, printable
+from estimators.errors import ConfigError, nearest, printable, quoted
 from estimators.model.state_space import StateSpaceModel
 
 LONGEST = 200
@@ -18,13 +18,13 @@ def check_maintenance(what: str, states: Sequence[str], model: StateSpaceModel) 
         ConfigError: If nothing says what was done, or a state is missing, unknown or named twice.
     """
     if not what.strip() or len(what) > LONGEST or printable(what) != what or "\n" in what:
-        raise ConfigError(f"Maintenance: what is {what[:40]!r}; say what was changed, in 1 to {LONGEST} characters")
+        raise ConfigError(f"Maintenance: what is {quoted(what)}; say what was changed, in 1 to {LONGEST} characters")
     if not states:
         raise ConfigError("Maintenance: states is empty; name the states that it concerns")
     for name in states:
         if name not in model.state_names:
             raise ConfigError(
-                f"Maintenance: {model.name} has no state {name!r}; {nearest(name, model.state_names[:1000])}"
+                f"Maintenance: {model.name} has no state {quoted(name)}; {nearest(name, model.state_names[:1000])}"
             )
     if len(set(states)) != len(states):
         raise ConfigError("Maintenance: states names one twice; name each once")

@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from estimators.fold_failures import questions_of
+
 from ..stderr import complain
 from .call_watch import CallWatch
 
@@ -94,7 +96,7 @@ class Stall:
             return
         if self._asked is None:
             self._asked = work
-            guilty = _in_python(work[1]) or unanswered(work[1].questions())
+            guilty = _in_python(work[1]) or unanswered(questions_of(work[1]))
         elif gone >= self._long:
             guilty = "a fold"
         else:

@@ -68,9 +68,14 @@ class Tail:
             _put(column, self._columns[k][at:end])
         self.n = end
 
+    @property
+    def cut_at(self) -> int:
+        """Where the older half ends."""
+        return self.n // 2
+
     def cut(self) -> None:
         """Cut the older half off."""
-        count = self.n // 2
+        count = self.cut_at
         kind, channel, t = self.events.kind[:count], self.events.channel[:count], self.events.t[:count]
         reading = kind == READING
         # Ascending in time: the last of equal indices is what stays.

@@ -1,15 +1,17 @@
 """The recording: an .rrd file that Rerun opens, and that holds all it takes to fold again, to the bit.
 
-Beside what charts show, the file keeps under /nisus, as plain columns: `twin` (YAML, base), `tuning` (each one, with
-the event from which it was in force), `events` (the log), `base` (where a fold of them starts, if that has moved) and
-`notices` (lines for people). The track is not among them: log and tuning give it again. Rows carry their absolute
-index; a late reading makes a recorder write the events again from where it belongs. `recorded` reads them back.
+Beside what charts show, the file keeps under /nisus, as plain columns: `twin` (YAML, what the command line changed of
+it, base), `tuning` (each one, with the event from which it was in force), `events` (the log), `base` (where a fold of
+them starts, if that has moved) and `notices` (lines for people). The track is not among them: log and tuning give it
+again. Rows carry their absolute index; a late reading makes a recorder write the events again from where it belongs.
+`reader` reads them back.
 """
 
 from __future__ import annotations
 
 import base64
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -117,7 +119,16 @@ TAKEN = "is there already; choose another name, or remove it"
 class RecordingFile:
     """An .rrd that is being written, in a stream of its own: no viewer can hold it up."""
 
-    def __init__(self, path: Path, *, name: str, text: str, twin_path: Path, base: Base | None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        name: str,
+        text: str,
+        twin_path: Path,
+        base: Base | None,
+        overrides: Mapping[str, str] | None = None,
+    ) -> None:
         """Begin a file.
 
         Args:
@@ -126,6 +137,7 @@ class RecordingFile:
             text: The twin's YAML.
             twin_path: Where the YAML was, for the model's file beside it.
             base: Where the fold of the first event starts, if older events were dropped before.
+            overrides: What the command line changed of the YAML, by key.
 
         Raises:
             SourceError: If the file cannot be written.
@@ -142,7 +154,14 @@ class RecordingFile:
         self.rows = 0
         self.stream.log(
             "/nisus/twin",
-            rr.AnyValues(format=FORMAT, name=name, yaml=text, path=str(twin_path), base=base_to_json(base)),
+            rr.AnyValues(
+                format=FORMAT,
+                name=name,
+                yaml=text,
+                path=str(twin_path),
+                base=base_to_json(base),
+                overrides=json.dumps(dict(overrides or {})),
+            ),  # fmt: skip
             static=True,
         )
 

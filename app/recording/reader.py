@@ -6,9 +6,10 @@ and an index that is not new cuts off what came after it.
 
 from __future__ import annotations
 
+import json
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from .rrd import BEGIN, MESSAGE_HEADER, STREAM_HEADER, whole_until
 class Recorded:
     """What a recording holds: twin, the last tuning, the log as it was at the end, lines (t, level, text).
 
+    `text` is the twin's YAML, `overrides` what the command line changed of it, which older recordings do not tell.
     A fold of `events` starts at `base` (None: the prior). `first` is the index of their first event in the session,
     `rows` how many there are, and `closed` whether the recording was finished when it ended.
     """
@@ -36,6 +38,7 @@ class Recorded:
     name: str
     text: str
     twin_path: Path
+    overrides: Mapping[str, str]
     base: Base | None
     tuning: str
     tunings: int
@@ -85,6 +88,7 @@ def read_recording(path: Path) -> Recorded:
         name=str(header["name"]),
         text=str(header["yaml"]),
         twin_path=Path(str(header["path"])),
+        overrides=json.loads(str(header.get("overrides", "{}"))),
         base=None if base is None else base._replace(first=start),
         tuning=str(tunings[-1]),
         tunings=len(tunings),

@@ -180,7 +180,9 @@ class _Part:
         self._edited, self._undrawn = False, True
         self._turned: float | None = None
         try:
-            self.file = RecordingFile(path, name=twin.name, text=twin.text, twin_path=twin.path, base=self._base)
+            self.file = RecordingFile(
+                path, name=twin.name, text=twin.text, twin_path=twin.path, base=self._base, overrides=twin.overrides
+            )
             self._drawing = draw(self.file.stream)
         except BaseException:
             self.release()
@@ -298,7 +300,9 @@ def write_recording(
     ]
     try:
         path.unlink(missing_ok=True)
-        file = RecordingFile(path, name=twin.name, text=twin.text, twin_path=twin.path, base=None)
+        file = RecordingFile(
+            path, name=twin.name, text=twin.text, twin_path=twin.path, base=None, overrides=twin.overrides
+        )
         drawing = RerunRows(file.stream, SimpleNamespace(model=twin.model, pairs=twin.pairs, twin=twin), series=None)
         file.tuning(twin.tuning, twin.estimator, 0, 0)
         for start in range(0, log.n, ROWS):

@@ -17,7 +17,7 @@ from . import layout_field
 from .style import EVENTS, TIMELINE, band_color, pair_name, row_title, with_unit
 
 LANES = 6
-"""Sensors at most whose states are drawn, in a tab behind the twin's health."""
+"""Sensors at most whose states are drawn, below the twin's health."""
 
 AT_ONCE = 3
 """Charts of states that are shown at the same time; more come in tabs, which cost nothing while they are hidden."""
@@ -73,9 +73,13 @@ def blueprint(
         # From a little below zero, whose label would stand on that of the time.
         axis_y=rrb.ScalarAxis(range=(-0.08 * nis_limit(model), nis_limit(model)), zoom_lock=True),
     )
-    health = rrb.StateTimelineView(origin=f"{root}/health", name="health", time_view=axis)
-    sensors = rrb.StateTimelineView(origin=f"{root}/sensor", name="sensors", time_view=axis)
-    healths = [health, sensors] if len(model.sensors) <= LANES else [health]
+    told = len(model.sensors) if len(model.sensors) <= LANES else 0
+    health = rrb.StateTimelineView(
+        origin=f"{root}/",
+        contents=[f"+ {root}/health", *([f"+ {root}/sensor/**"] if told else [])],
+        name="health and sensors" if told else "health",
+        time_view=axis,
+    )
     columns = rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["LogLevel", "Body"])
     events = rrb.TextLogView(origin=EVENTS, name="events", columns=columns)
     ellipses = [
@@ -96,9 +100,11 @@ def blueprint(
     else:
         charts = _stacked(states)
         above = [*charts, rrb.Horizontal(*_tabs(innovations), nis)]
-        shares = [1.25 * min(len(states), AT_ONCE) / len(charts)] * len(charts) + [1.1, 0.8, 1.5]
+        # As high as the lanes, of which those of up to three sensors are read at once.
+        lanes = 0.75 + 0.4 * min(told, AT_ONCE)
+        shares = [1.25 * min(len(states), AT_ONCE) / len(charts)] * len(charts) + [1.1, lanes, 1.5]
     return rrb.Blueprint(
-        rrb.Vertical(*above, *_tabs(healths), bottom, row_shares=shares),
+        rrb.Vertical(*above, health, bottom, row_shares=shares),
         rrb.TopPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),

@@ -14,7 +14,7 @@ from typing import Any
 from starlette.responses import JSONResponse
 
 from estimators.diagnostics.episodes import anchor, episode_json
-from estimators.errors import ConfigError, printable
+from estimators.errors import ConfigError, nearest, printable, quoted, shown_name
 from estimators.track import HEALTH_NAMES
 
 from ..engine import commands, faults
@@ -151,18 +151,25 @@ def command_from_json(body: Any, engine: Running) -> commands.Command:
             refuse it: better said to who asked than shown later as an event.
     """
     known = {kind.__name__: kind for kind in typing.get_args(commands.Command)}
-    name = body.get("command") if isinstance(body, dict) else body
-    if not isinstance(body, dict) or not isinstance(name, str) or name not in known:
-        raise ConfigError(f"command: {name!r} is not known; one of {', '.join(known)}")
+    if not isinstance(body, dict):
+        raise ConfigError(f'the body is {_shown(body)}; it must be like {{"command": "Reset"}}')
+    if "command" not in body:
+        raise ConfigError(f"command is missing; {nearest('', known)}")
+    name = body["command"]
+    if not isinstance(name, str) or name not in known:
+        raise ConfigError(f"command is {_shown(name)}; {nearest(name if isinstance(name, str) else '', known)}")
     kind = known[name]
     hints = typing.get_type_hints(kind)
     given = {key: value for key, value in body.items() if key != "command"}
-    names = [item.name for item in dataclasses.fields(kind)]
-    needed = {item.name for item in dataclasses.fields(kind) if item.default is dataclasses.MISSING}
-    if not needed <= set(given) <= set(names):
-        has, takes = (", ".join(part) or "no field" for part in (given, names))
-        raise ConfigError(f"{kind.__name__}: has {has}; it takes {takes}")
-    command = kind(**{name: _converted(kind.__name__, name, given[name], hints[name]) for name in given})
+    fields = {item.name: item for item in dataclasses.fields(kind)}
+    for field in given:
+        if field not in fields:
+            remedy = nearest(field, fields) if fields else "it takes no field"
+            raise ConfigError(f"{name}: {shown_name(field)} is not known; {remedy}")
+    for field, item in fields.items():
+        if field not in given and item.default is dataclasses.MISSING:
+            raise ConfigError(f"{name}: {field} is missing; it takes {', '.join(fields)}")
+    command = kind(**{field: _converted(name, field, given[field], hints[field]) for field in given})
     _check(command, engine)
     return command
 
@@ -213,7 +220,9 @@ def _converted(command: str, name: str, value: Any, hint: Any) -> Any:
             return None
         if kind in (bool, str) and isinstance(value, kind):
             return value
-        if kind is int and isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**53:
+        if kind is int and isinstance(value, int) and not isinstance(value, bool):
+            if abs(value) >= 2**53:
+                raise ConfigError(f"{command}: {name} is too large; it must be below 2^53")
             return value
         if typing.get_origin(kind) is tuple and isinstance(value, list) and all(isinstance(v, str) for v in value):
             return tuple(value)
@@ -225,8 +234,13 @@ def _converted(command: str, name: str, value: Any, hint: Any) -> Any:
             if not math.isnan(number):
                 return number
         if kind is Path and isinstance(value, str):
-            return _recording(f"{command}: {name} is {value!r}", value)
+            return _recording(f"{command}: {name} is {_shown(value)}", value)
     wanted = " or ".join({"float": "a number", "int": "a whole number", "bool": "true or false", "NoneType": "null",
                           "str": "a text", "Path": "a path", "tuple": "a list of texts"}[kind.__name__]
                          for kind in allowed)  # fmt: skip
-    raise ConfigError(f"{command}: {name} is {value!r}; it must be {wanted}")
+    raise ConfigError(f"{command}: {name} is {_shown(value)}; it must be {wanted}")
+
+
+def _shown(value: Any) -> str:
+    """A value of the request as an answer shows it: as JSON has it, shortened."""
+    return quoted(value) if isinstance(value, str) else shown_name(json.dumps(value))

@@ -11,6 +11,7 @@ from config.source_schema import AssetSection, CanSection
 from estimators.errors import SourceError
 from estimators.fold import Fold
 from estimators.log import MARK, TICK, TRUTH, Events, Log
+from estimators.snapshots import Base
 from estimators.tuning import Tuning
 from sources.faults.layer import Faults
 from sources.faults.source import with_faults
@@ -129,8 +130,22 @@ class Bench:
         start, end = self.span(mistake)
         gate = self.twin.tuning.gate
         word = first_word(self.fold(mistake, estimator, gate).fold, start, self.fold(None, estimator, gate).fold)
-        share = np.inf if word is None else word * 1e9 / (end - start)
-        return share if share < 1.0 else np.inf
+        return _share(word, end - start)
+
+    def found_within(self, mistake: Mistake, estimator: str, begin: int, end: int) -> float:
+        """The same of a wrong belief that holds from `begin` to `end`, ns of the log, after the right one.
+
+        Raises:
+            NisusError: As `fold`.
+        """
+        gate = self.twin.tuning.gate
+        calm = self.fold(None, estimator, gate).fold
+        at, base = calm.base_at(int(np.searchsorted(calm.log.t[: calm.n], begin)))
+        log = calm.log.copy()
+        log.n = int(np.searchsorted(log.t[: log.n], end))
+        log.drop_front(at)
+        fold = self._folded(estimator, self._tuning(estimator, mistake).set("gate", gate), log, base)
+        return _share(first_word(fold, begin, calm), end - begin)
 
     def fold(self, mistake: Mistake | None, estimator: str, gate: float | None) -> Folded:
         """The log with a mistake, or without, folded with a filter and a gate.
@@ -175,10 +190,20 @@ class Bench:
         truth = log.events.select(slice(None))
         untold = Log.of(twin.model, capacity=max(1, len(truth)))
         untold.extend(without_truth(truth))
-        fold = Fold(estimator, twin.model, tuning, untold, pairs=twin.pairs, policy=twin.policy)
+        return Folded(self._folded(estimator, tuning, untold), truth, stale)
+
+    def _folded(self, estimator: str, tuning: Tuning, log: Log, base: Base | None = None) -> Fold:
+        twin = self.twin
+        fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=twin.policy, base=base)
         fold.advance()
         fold.finish()
-        return Folded(fold, truth, stale)
+        return fold
+
+
+def _share(word: float | None, length: int) -> float:
+    """Which share of a length (ns) a word came after (s); infinite if it came later, or never."""
+    share = np.inf if word is None else word * 1e9 / length
+    return share if share < 1.0 else np.inf
 
 
 def _everything(source: object, width: int) -> Events:

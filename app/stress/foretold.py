@@ -2,9 +2,10 @@
 
 A mistake that moves the means of the innovations moves them by as much in every log: the same noise is folded with and
 without it, by a filter without chance, and the difference is put to the criterion of the smallest visible fault
-(visibility.py). One that changes their noise, or what comes when, is rehearsed: made in other logs of the asset (of a
-recording there is only this one: with other draws of the fault). What is found in all of them, in half the time that
-it lasts, is visible: the time to an alarm has an exponential tail. What is found in none is invisible.
+(visibility.py). One that changes their noise, or what comes when, is rehearsed: made in other logs of the asset. Of a
+recording there is only this one: a fault is made in it with other draws, a wrong belief begins later in it. What is
+found in all of them, in half the time that it lasts, is visible: the time to an alarm has an exponential tail. What is
+found in none is invisible.
 """
 
 from __future__ import annotations
@@ -59,6 +60,7 @@ class Oracle:
     def __init__(self, twin: Twin, duration: float) -> None:
         self.twin, self.duration = twin, duration
         self._benches: list[Bench] = []
+        self._whole: Bench | None = None
         self._rehearsed: dict[tuple[str, str], Foretold] = {}
 
     def foretell(self, bench: Bench, mistake: Mistake, estimator: str) -> Foretold:
@@ -78,14 +80,24 @@ class Oracle:
 
     def _rehearse(self, mistake: Mistake, estimator: str) -> Foretold:
         if mistake.fault is None and asset_of(self.twin, 0) is None:
-            # There is no other log: what is wrong with the noises is what the bank is for.
-            return Foretold(VISIBLE)
-        while len(self._benches) < REHEARSALS:
-            self._benches.append(Bench(self.twin, OTHERS + len(self._benches), self.duration))
-        after = [bench.found_after(mistake, estimator) for bench in self._benches]
+            after = self._later(mistake, estimator)
+        else:
+            while len(self._benches) < REHEARSALS:
+                self._benches.append(Bench(self.twin, OTHERS + len(self._benches), self.duration))
+            after = [bench.found_after(mistake, estimator) for bench in self._benches]
+        if not after:
+            return Foretold(CHANCE)
         if max(after) <= SOON:
             return Foretold(VISIBLE)
         return Foretold(CHANCE if min(after) < 1.0 else INVISIBLE)
+
+    def _later(self, mistake: Mistake, estimator: str) -> list[float]:
+        """When a wrong belief is found that begins later in a recording: a share for each length of the logs."""
+        if self._whole is None:
+            self._whole = Bench(self.twin, OTHERS, (REHEARSALS + 1) * self.duration)
+        whole, step = self._whole, round(self.duration * 1e9)
+        begins = [whole.origin + k * step for k in range(1, round(whole.length / self.duration))]
+        return [whole.found_within(mistake, estimator, begin, begin + step) for begin in begins]
 
 
 def shift_of(bench: Bench, mistake: Mistake, estimator: str) -> Foretold | None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from estimators.errors import ConfigError
-from estimators.log import INPUT, Events
+from estimators.log import INPUT, READING, Events
 from estimators.model.state_space import Sensor, StateSpaceModel
 from estimators.tuning import Tuning
 from sources.faults.fault import Fault
@@ -33,14 +33,17 @@ def matrix(model: StateSpaceModel, tuning: Tuning, events: Events, *, asset: boo
     Args:
         model: The twin's.
         tuning: As it ships; sizes count in its standard deviations.
-        events: A log of it, which tells how large its inputs are.
+        events: A log of it, which tells how large its inputs are, and which sensors speak.
         asset: Whether its true parameters can be changed, as those of a simulation can.
     """
+    # What is done to a sensor that says nothing is done to nobody; swapped with it, another one falls silent.
+    spoken = set(events.channel[events.kind == READING].tolist())
+    sensors = [sensor for s, sensor in enumerate(model.sensors) if s in spoken]
     return [
         *_of_noises(model),
-        *_of_sensors(model, tuning),
+        *_of_sensors(model, tuning, sensors),
         *_of_inputs(model, events),
-        *_of_time(model),
+        *_of_time(sensors),
         *_of_model(model, tuning, asset),
     ]
 
@@ -68,8 +71,8 @@ def _rows(model: StateSpaceModel, sensor: Sensor, tuning: Tuning) -> list[tuple[
     return [(row, float(np.sqrt(tuning.r[start])))]
 
 
-def _of_sensors(model: StateSpaceModel, tuning: Tuning) -> Iterator[Mistake]:
-    for sensor in model.sensors:
+def _of_sensors(model: StateSpaceModel, tuning: Tuning, sensors: Sequence[Sensor]) -> Iterator[Mistake]:
+    for sensor in sensors:
         name = sensor.name
         own = frozenset({name, *(row.name for row in sensor.rows)})
         for row, std in _rows(model, sensor, tuning):
@@ -93,7 +96,7 @@ def _of_sensors(model: StateSpaceModel, tuning: Tuning) -> Iterator[Mistake]:
     if len(model.sensors) > 1:
         yield Mistake("all stuck", frozenset({"stuck"}), fault=_fault("stuck"))
     yield Mistake("all silent", frozenset({"silent", "stale"}), fault=_silent(model))
-    pair = _alike(model)
+    pair = _alike(sensors)
     if pair is not None:
         first, second = pair
         swapped = _fault("swap", sensor=first, other=second)
@@ -105,10 +108,10 @@ def _silent(model: StateSpaceModel) -> Callable[[float, float], list[Fault]]:
     return lambda start, end: [Fault("silence", name, start=start, end=end) for name in names]
 
 
-def _alike(model: StateSpaceModel) -> tuple[str, str] | None:
+def _alike(sensors: Sequence[Sensor]) -> tuple[str, str] | None:
     """The first two sensors whose readings could be taken for each other's."""
-    for k, one in enumerate(model.sensors):
-        for other in model.sensors[k + 1 :]:
+    for k, one in enumerate(sensors):
+        for other in sensors[k + 1 :]:
             if [row.unit for row in one.rows] == [row.unit for row in other.rows]:
                 return one.name, other.name
     return None
@@ -133,13 +136,14 @@ def _of_inputs(model: StateSpaceModel, events: Events) -> Iterator[Mistake]:
             yield Mistake(f"{item.name} lost", INPUT_WRONG, fault=lost, shifts=True)
 
 
-def _of_time(model: StateSpaceModel) -> Iterator[Mistake]:
+def _of_time(sensors: Sequence[Sensor]) -> Iterator[Mistake]:
     """What the log undoes by itself, and what it cannot."""
     yield Mistake("all 0.5 s late", NOTHING, fault=_fault("delay", size=0.5))
     yield Mistake("all late by chance, 0.2 s", NOTHING, fault=_fault("jitter", size=0.2))
     yield Mistake("neighbours in the wrong order", NOTHING, fault=_fault("reorder", rate=0.5))
     clock = frozenset({"clock", "silent", "stale", "shifted"})
-    for name in model.sensor_names:
+    for sensor in sensors:
+        name = sensor.name
         jump = _fault("clock_jump", sensor=name, size=-1.0)
         yield Mistake(f"clock of {name} 1 s behind", clock | MODEL, frozenset({name}), fault=jump)
         again = _fault("duplicate", sensor=name, count=4, every=0.001)

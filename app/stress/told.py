@@ -55,8 +55,11 @@ def first_word(fold: Fold, start: int, calm: Fold | None = None) -> float | None
     waiting = fold.track.health[: fold.n] == WAITING
     said = ~ok & ~waiting & (t >= start)
     if calm is not None:
-        before = np.searchsorted(calm.log.t[: calm.n], t, side="right") - 1
-        said &= green(calm)[np.maximum(before, 0)]
+        # What holds at a time is what held before its events, and after each of them.
+        before = np.searchsorted(calm.log.t[: calm.n], t, side="left") - 1
+        after = np.searchsorted(calm.log.t[: calm.n], t, side="right")
+        wrong = np.concatenate(([0], np.cumsum(~green(calm))))
+        said &= wrong[after] == wrong[np.maximum(before, 0)]
     rows = np.flatnonzero(said)
     return int(t[rows[0]] - start) / 1e9 if rows.size else None
 

@@ -39,8 +39,8 @@ def _remedy(status: Status, origin: int | None, unit: Unit) -> str:
     if status.lost is not None:
         when = "" if origin is None else f" since {unit.text((status.lost - origin) * 1e-9)}"
         return f"The estimate is not a number{when}: reset it, or choose another filter."
-    if status.health == DIVERGED:
-        return "The readings contradict the estimate: reset it, or choose another filter."
+    if status.health == DIVERGED and not status.cause:
+        return "The readings contradict the estimate."
     more = f" ({status.episodes_open - 1} more)" if status.cause and status.episodes_open > 1 else ""
     return html.escape(status.cause) + more
 

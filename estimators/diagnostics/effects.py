@@ -22,6 +22,8 @@ FURTHEST = 6.0
 SPIKE = 4.0
 """|e| from which an innovation is a spike where the others are in order."""
 
+FEWEST = 4
+"""Innovations whose correlation says nothing yet."""
 
 KINDS = ("shifted", "narrow", "wide", "correlated", "alternating", "spiky")
 """The ways in which innovations can differ."""
@@ -92,6 +94,21 @@ def effects(e: np.ndarray) -> list[Effect]:
     return sorted(found, key=lambda effect: -effect.ratio)
 
 
+def against(e: np.ndarray, effect: Effect) -> float:
+    """log Λ, nats, of white noise over an effect of that size in a run e (n,), finite; 0 for spikes, which are rare."""
+    e = np.clip(e, -FURTHEST, FURTHEST)
+    size = effect.size
+    if effect.cause == "shifted":
+        return float(np.sum(0.5 * size**2 - size * e))
+    if effect.cause in ("narrow", "wide"):
+        variance = max(size**2, 1e-12)
+        return 0.5 * float(np.sum(np.log(variance) + e**2 / variance - e**2))
+    if effect.cause in ("correlated", "alternating"):
+        rest = 1.0 - min(size**2, 0.99)
+        return 0.5 * float(np.sum(np.log(rest) + (e[1:] - size * e[:-1]) ** 2 / rest - e[1:] ** 2))
+    return 0.0
+
+
 def common_scale(e: np.ndarray, dof: np.ndarray) -> Effect:
     """The scale of all rows of a sensor together, from e = √(NIS / dof) (n,) and the degrees of freedom (n,)."""
     whole = float(np.sum(dof))
@@ -111,29 +128,66 @@ def _alone(e: np.ndarray) -> np.ndarray:
     return alone
 
 
+class Sums(NamedTuple):
+    """What the likelihood of an effect needs of a run e (n,) that is forgotten.
+
+    n, Σ e, Σ e², Σ e e₋ and Σ e² of those that have one before, e₋; and the last e.
+    """
+
+    n: int = 0
+    total: float = 0.0
+    squares: float = 0.0
+    products: float = 0.0
+    later: float = 0.0
+    last: float = 0.0
+
+
+NOTHING = Sums()
+
+
+def gains(e: np.ndarray, cause: str, run: Sums = NOTHING) -> tuple[np.ndarray, Sums]:
+    """How likely it is that `cause` is what is wrong in a run, up to each of its e.
+
+    Args:
+        e: Innovations (n,), finite.
+        cause: One of `KINDS`.
+        run: What came before them.
+
+    Returns:
+        Generalised log-likelihood ratios against none, (n,); where spikes are the cause, they rise with each. And the
+        sums of the whole run.
+    """
+    e = np.clip(e, -FURTHEST, FURTHEST)
+    if not e.size:
+        return e, run
+    n = run.n + np.arange(1, e.size + 1)
+    later = e**2
+    if run.n == 0:
+        later[0] = 0.0
+    total, squares = run.total + np.cumsum(e), run.squares + np.cumsum(e**2)
+    products = run.products + np.cumsum(e * np.append(run.last, e[:-1]))
+    after = run.later + np.cumsum(later)
+    sums = Sums(int(n[-1]), *(float(each[-1]) for each in (total, squares, products, after, e)))
+    gain = np.zeros(e.size)
+    if cause == "shifted":
+        gain = 0.5 * total**2 / n
+    elif cause in ("narrow", "wide"):
+        variance = np.maximum(squares / n, 1e-12)
+        side = variance > 1.0 if cause == "narrow" else variance < 1.0
+        gain = np.where(side, 0.5 * n * (variance - 1.0 - np.log(variance)), 0.0)
+    elif cause in ("correlated", "alternating"):
+        phi = np.clip(products / np.maximum(after, 1e-12), -0.995, 0.995)
+        side = phi > 0 if cause == "correlated" else phi < 0
+        gain = np.where(side & (n > FEWEST), -0.5 * n * np.log(1.0 - phi**2), 0.0)
+    elif cause == "spiky":
+        gain = np.where(np.abs(e) > SPIKE, n, 0.0)
+    return gain, sums
+
+
 def onset(e: np.ndarray, cause: str) -> int:
     """The index of e (n,), up to which nothing was wrong, most likely, if `cause` is what is wrong at the end.
 
     The start that maximises the generalised likelihood ratio of what follows it; the estimate of the time of change of
     Basseville & Nikiforov (1993), 2.6.
     """
-    back = np.clip(e[::-1], -FURTHEST, FURTHEST)
-    n = np.arange(1, e.size + 1)
-    if cause == "shifted":
-        gain = 0.5 * np.cumsum(back) ** 2 / n
-    elif cause in ("narrow", "wide"):
-        variance = np.maximum(np.cumsum(back**2) / n, 1e-12)
-        side = variance > 1.0 if cause == "narrow" else variance < 1.0
-        gain = np.where(side, 0.5 * n * (variance - 1.0 - np.log(variance)), 0.0)
-    elif cause in ("correlated", "alternating") and e.size > 2:
-        products = np.cumsum(back[:-1] * back[1:])
-        squares = np.maximum(np.cumsum(back[1:] ** 2), 1e-12)
-        phi = np.clip(products / squares, -0.995, 0.995)
-        side = phi > 0 if cause == "correlated" else phi < 0
-        gain = np.append(0.0, np.where(side & (n[1:] > 4), -0.5 * n[1:] * np.log(1.0 - phi**2), 0.0))
-    elif cause == "spiky":
-        far = np.flatnonzero(np.abs(e) > SPIKE)
-        return int(far[0]) if far.size else e.size - 1
-    else:
-        return e.size - 1
-    return e.size - 1 - int(np.argmax(gain))
+    return e.size - 1 - int(np.argmax(gains(e[::-1], cause)[0]))

@@ -29,11 +29,12 @@ class HealthPolicy(NamedTuple):
     """When a twin may be trusted.
 
     `window` readings are averaged. Without a reading for `degraded_after` seconds the twin is degraded, after
-    `stale_after` stale. It is diverged when the windowed NIS is `diverged_nis` times what it should be, when the gate
+    `stale_after` stale. It is diverged when the windowed NIS is `diverged_nis` times what was normal of its readings
+    when the tuning was accepted (without a baseline, and at least, what it should be), when the gate
     refuses more than `diverged_gated` of the window (or they fail), or when a number is not finite. A reset begins a
-    new window. It is suspect, or degraded where a sensor is lost, when a test of evidence.py is in alarm: by chance
+    new window. It is suspect, or degraded where a sensor is lost, when a test of evidence/ is in alarm: by chance
     once in `false_alarm_every` seconds. A sensor is silent after `silent_periods` of its mean periods, and twice its
-    longest silence so far.
+    longest silence so far; of so many more, as long as its period is known from few readings.
     """
 
     window: int = 50
@@ -80,16 +81,17 @@ def judges(verdict):
 
 
 @inlined
-def _keep(k, row, track, rows, nis, dofs):
+def _keep(k, row, track, channel, normal, rows, nis, dofs, due):
     """Write a reading into place k of the window."""
     used = track.verdict[row] == USED
     rows[k] = row
     nis[k] = track.nis[row] if used else 0.0
     dofs[k] = track.dof[row] if used else -1
+    due[k] = track.dof[row] * normal[channel[row]] if used else 0.0
 
 
 @inlined
-def _judge(i, total, dof, used, refused, track, policy, bounds):
+def _judge(i, total, due, dof, used, refused, track, policy, bounds):
     """Mean NIS of the window that ends at row i, its bounds, and what it alone says of the estimate."""
     if used > 0:
         track.nis_mean[i] = total / used
@@ -101,31 +103,34 @@ def _judge(i, total, dof, used, refused, track, policy, bounds):
         track.nis_high[i] = np.nan
     judged = used + refused
     track.consistency[i] = TRACKING
-    if judged >= FEW and (refused > policy.diverged_gated * judged or total > policy.diverged_nis * dof):
+    if judged >= FEW and (refused > policy.diverged_gated * judged or total > policy.diverged_nis * due):
         track.consistency[i] = DIVERGED
 
 
 @jit
-def assess(first, last, t, kind, track, policy, bounds):
+def assess(first, last, t, kind, channel, track, normal, policy, bounds):
     """Fill age, windowed NIS, its bounds and consistency of rows `first` to `last` of a track.
 
     A row looks only at rows before it, so the outcome does not depend on how a fold was cut into pieces. The window
     changes with a reading that is used, gated or failed; the other rows have that of the row before. A reset empties
-    it: what the readings said of the estimate before, they do not say of the new one.
+    it: what the readings said of the estimate before, they do not say of the new one. `normal` (sensors,) is how many
+    times the expected NIS was normal of each sensor, see evidence/bank.py.
     """
     window = policy.window
     # The window's readings, the oldest first, lie at `begin` to `end`: row, NIS (0 if it was refused), degrees of
-    # freedom (-1 if it was refused). It moves up, and back to the start when it has reached the end.
+    # freedom (-1 if it was refused), NIS that was normal (0 if it was refused). It moves up, and back to the
+    # start when it has reached the end.
     rows = np.empty(2 * window, np.int64)
     nis = np.empty(2 * window)
     dofs = np.empty(2 * window, np.int64)
+    dues = np.empty(2 * window)
     begin = window
     end = window
     row = first - 1
     while row >= 0 and kind[row] != RESET and end - begin < window and first - row < FAR * window:
         if judges(track.verdict[row]):
             begin -= 1
-            _keep(begin, row, track, rows, nis, dofs)
+            _keep(begin, row, track, channel, normal, rows, nis, dofs, dues)
         row -= 1
     dof = 0
     used = 0
@@ -143,10 +148,11 @@ def assess(first, last, t, kind, track, policy, bounds):
                     rows[k - begin] = rows[k]
                     nis[k - begin] = nis[k]
                     dofs[k - begin] = dofs[k]
+                    dues[k - begin] = dues[k]
                 end -= begin
                 begin = 0
             if judged:
-                _keep(end, i, track, rows, nis, dofs)
+                _keep(end, i, track, channel, normal, rows, nis, dofs, dues)
                 if dofs[end] >= 0:
                     dof += dofs[end]
                     used += 1
@@ -159,7 +165,8 @@ def assess(first, last, t, kind, track, policy, bounds):
                 begin += 1
             # Summed anew each time: a running sum would keep the rounding of an outlier.
             total = sum_of(end - begin, nis[begin:].ctypes.data)
-            _judge(i, total, dof, used, end - begin - used, track, policy, bounds)
+            due = sum_of(end - begin, dues[begin:].ctypes.data)
+            _judge(i, total, due, dof, used, end - begin - used, track, policy, bounds)
         else:
             track.age[i] = track.age[i - 1] + (t[i] - t[i - 1]) * 1e-9
             track.nis_mean[i] = track.nis_mean[i - 1]

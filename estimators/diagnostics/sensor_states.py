@@ -23,7 +23,7 @@ def sensor_states(
     Args:
         model: The model.
         used: Which sensors are used, (sensors,) of bool.
-        evidence: The bank's state, see evidence.py.
+        evidence: The bank's state, see evidence/.
         now: Time of the last event, s.
         policy: When the estimate may be trusted.
     """

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ..compiled.model import compile_model
 from ..model.mode_as_number import indicator
-from ..model.state_space import StateSpaceModel
+from ..model.state_space import Input, State, StateSpaceModel
 from ..tuning import Tuning
 
 CORRELATED = 0.15
@@ -112,7 +114,7 @@ def of_sensor(
         return f"{name} spikes {when}: {100 * size:.2g} % of its readings are outliers; set a gate, look at its wiring"
     if cause == "refused":
         what = f"{name} is refused by the gate {when} ({100 * size:.0f} % of its readings)"
-        return f"{what}: the sensor is wrong, or the twin is; Reset, or hold {sensor.name} out"
+        return f"{what}: the sensor is wrong, or the twin is; hold {sensor.name} out to see whether the others agree"
     if cause == "screened":
         what = f"{name} breaks its limits ({reasons}) {when}: {100 * size:.0f} % of its readings are not used"
         return f"{what}; {_lost(model, s)}; look at the sensor, or at sensors.{sensor.name} in the YAML"
@@ -143,12 +145,31 @@ def of_silence(model: StateSpaceModel, s: int, cause: str, start: float, lasted:
     return f"{name} is silent {since(start)}: {_lost(model, s)}; check its wiring and its bus"
 
 
-def of_twin(stale: bool, start: float) -> str:
-    """The twin as a whole."""
-    if stale:
-        return f"no reading was used {since(start)}: the estimate is the model's alone; check the source"
+def of_return(cause: str, start: float) -> str:
+    """What is added of a sensor that is in order again while its alarm has not fallen, or may come back."""
+    if cause == "stuck":
+        return f"it moves again {since(start)}"
+    return f"back to normal {since(start)}: the alarm goes with more such readings"
+
+
+def of_stale(start: float) -> str:
+    """A twin that no reading reaches."""
+    return f"no reading was used {since(start)}: the estimate is the model's alone; check the source"
+
+
+def of_loss(start: float, off: Sequence[str]) -> str:
+    """A twin whose estimate is lost; `off`: sensors that are refused, shifted, stuck or screened now.
+
+    While a fault lasts, a reset starts from wrong readings, and with the prior's wide bands believes them.
+    """
+    lost = f"the estimate is lost {since(start)}"
+    if not off:
+        return f"{lost}: Reset starts again from the prior; then look at which sensor spoke first"
+    many = len(off) > 1
+    names = ", ".join(off[:4]) + (", ..." if len(off) > 4 else "")
     return (
-        f"the estimate is lost {since(start)}: Reset starts again from the prior; then look at which sensor spoke first"
+        f"{lost}, and {names} {'contradict' if many else 'contradicts'} it still: hold {'them' if many else 'it'} out "
+        "first, one by one, and Reset when the rest agrees"
     )
 
 
@@ -163,3 +184,13 @@ def of_particles(effective: float, ancestors: float, start: float) -> str:
     many = "one particle" if ancestors < 2.0 else f"{ancestors:.0f} particles"
     what = f"the cloud is impoverished {since(start)}: {effective:.3g} particles count, and all descend from {many}"
     return f"{what}; more particles, pf-ekf or pf-reg, or a larger Q of the states that hardly move"
+
+
+def of_range(item: State | Input, size: float, start: float) -> str:
+    """A state or an input that is outside the range in which the model was fitted."""
+    assert item.fitted is not None
+    low, high = item.fitted
+    return (
+        f"{item.name} is {size:.4g} {item.unit}, outside {low:g} to {high:g} where the model was fitted, "
+        f"{since(start)}: bands hold only inside; use a model fitted there"
+    )

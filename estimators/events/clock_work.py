@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -44,6 +45,54 @@ def plain_events(batch: Events) -> Events:
     if all(a is b for a, b in zip(columns, batch, strict=False)):
         return batch
     return Events(columns[0], columns[1], columns[2], columns[3], batch.value)
+
+
+class Run:
+    """Events of one channel that agree on another time, held until it is told whether that is true.
+
+    `ahead` or back; `live` where arrivals are known. `begin` is the newest time of all that was said before. `agree` is
+    how far apart t - arrival may be of those that count as on time. `top` is the largest t - arrival, `begun` the
+    first arrival, `arrived` the last of those on time, `highest` the largest time. All in ns.
+    """
+
+    def __init__(self, ahead: bool, live: bool, begin: int, agree: int, most: int) -> None:
+        self.ahead, self.live, self.begin = ahead, live, begin
+        self._agree, self._most = agree, most
+        self.at: list[int] = []
+        self.t: list[int] = []
+        self.top = self.begun = self.arrived = self.highest = self._lowest = 0
+        self._on_time: deque[tuple[int, int, int]] = deque()
+
+    @property
+    def full(self) -> bool:
+        """Whether it never settled."""
+        return len(self.at) >= self._most
+
+    @property
+    def span(self) -> int:
+        """For how long they agree, by their own time; where arrivals are known by those too, of the ones on time.
+
+        A block that was held up and comes in one go has no span.
+        """
+        if not self.live:
+            return self.highest - self._lowest
+        (_, t, arrival), (_, newest, arrived) = self._on_time[0], self._on_time[-1]
+        return min(newest - t, arrived - arrival)
+
+    def add(self, i: int, t: int, arrival: int) -> None:
+        """The next of them: its place in the work, its time and its arrival."""
+        offset = t - arrival
+        first = not self.at
+        self.begun = arrival if first else self.begun
+        self.top = offset if first else max(offset, self.top)
+        self.highest, self._lowest = (t, t) if first else (max(t, self.highest), min(t, self._lowest))
+        self.at.append(i)
+        self.t.append(t)
+        if offset >= self.top - self._agree:
+            self._on_time.append((offset, t, arrival))
+            self.arrived = arrival
+        while self._on_time[0][0] < self.top - self._agree:
+            self._on_time.popleft()
 
 
 class Work:

@@ -3,14 +3,21 @@
 One reading stamped an hour ahead would make all that follow it stale. So a lone time far from where the clock of its
 source was expected is refused, and held until what comes next tells which it was:
 
-- *ahead*: after all that was said, by more than `HORIZON` and many of its own periods, and, where arrival is known,
-  ahead of it by more than ever lately. If the next readings are back in time it was a lone one, and is refused. If
-  they stay there, nothing was said for a while (a gap) and they are let in as they are; or the clock was set.
+- *ahead*: after all that was said, by more than the horizon (half of it where arrival is known) and many of its own
+  periods, and, where arrival is known, ahead of it by more than ever lately. If the next readings are back in time it
+  was a lone one, and is refused. If they stay there, nothing was said for a while (a gap) and they are let in as they
+  are; or the clock was set.
 - *back*: before the newest of its own channel by more than the horizon, so that the log would drop it as stale. If the
   next agree on it the clock was set back; else they go to the log, which drops and counts them, as any that is late.
 
 Where a clock was set, what it stamps from then on is moved so that its time goes on without a step: with known arrivals
-by the step of t - arrival, without by continuing its channel at its own pace.
+by the step of the largest t - arrival, as a delay makes it only smaller, without by continuing its channel at its own
+pace. A clock that comes back to where it was, or to where that of another channel is, is taken to be there exactly:
+else the delays of the moment would add up from one step to the next.
+
+With known arrivals that time comes to where the held ones are says nothing: a clock that is a little more ahead than
+the horizon would be let in after a while, and all that other clocks stamp would be stale from then on. And a reading
+that fits but was measured before the held ones had come says nothing of the clock now, so it does not contradict them.
 
 It is a pure function of the events in the order of arrival: the outcome does not depend on how they were cut into
 batches. Queries and resets, which are ours, pass. Readings are judged by sensor, inputs together, true states together:
@@ -19,7 +26,7 @@ events do not tell their source.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -28,7 +35,7 @@ from numba import types
 
 from ..numerics.jit import B1, I1, I2, i64, inlined, jit_brief
 from .batch import INPUT, READING, TRUTH, Events
-from .clock_work import Moved, Passed, Refused, Work, plain_events
+from .clock_work import Moved, Passed, Refused, Run, Work, plain_events
 
 SECOND = 10**9
 
@@ -42,13 +49,14 @@ PERIODS, PERIODS_LIVE = 10, 3
 """A reading may be so many periods ahead of the newest, without and with known arrivals."""
 
 AHEAD_OF_ARRIVAL = SECOND
-"""By which t - arrival may exceed its largest lately at least, ns; else by the horizon."""
+"""By which t - arrival may exceed its largest lately at least, ns; else by half the horizon."""
 
-RELAX = 100
-"""t - arrival at its largest comes down by one part in so many of the time that passes, where the clock falls back."""
+RELAX = 1000
+"""t - arrival at its largest comes down by one part in so many of the time that passes, where the clock falls back:
+no clock is worse, and after minutes of long delays it is still known what the clock says of itself."""
 
-MOST = 4096
-"""Events that are held of one channel; more that never settle are no clock."""
+MOST, MOST_LIVE = 1 << 17, 4096
+"""Events that are held of one channel, without and with known arrivals; more that never settle are no clock."""
 
 FITS, AHEAD, BACK = range(3)
 
@@ -66,8 +74,9 @@ def _reach(state, row, horizon, live):
         row = last
     if state[row, STEPS] < ENOUGH:
         return -1
-    periods = PERIODS_LIVE if live else PERIODS
-    return max(horizon, periods * (state[row, TOTAL] // state[row, STEPS]))
+    period = state[row, TOTAL] // state[row, STEPS]
+    # With half a horizon to spare, else what others stamp would be stale if it were on its way for a moment.
+    return max(horizon // 2, PERIODS_LIVE * period) if live else max(horizon, PERIODS * period)
 
 
 @inlined
@@ -84,7 +93,7 @@ def _judge(state, row, t, arrival, live, horizon):
         return FITS
     if live:
         known = row if state[row, SEEN] else everything
-        if t - arrival <= state[known, OFFSET] + max(horizon, AHEAD_OF_ARRIVAL):
+        if t - arrival <= state[known, OFFSET] + max(horizon // 2, AHEAD_OF_ARRIVAL):
             return FITS
     return AHEAD
 
@@ -146,17 +155,6 @@ def _compiled() -> tuple[Any, Any, Any, Any]:
     return _reach, _judge, _note, _scan
 
 
-@dataclass
-class _Run:
-    """Events of one channel that agree on another time, held until it is told whether that is true."""
-
-    verdict: int
-    now: int
-    at: list[int] = field(default_factory=list)
-    t: list[int] = field(default_factory=list)
-    offset: list[int] = field(default_factory=list)
-
-
 class ClockGuard:
     """Stands between a source and a log; `take` each batch, and `finish` at the end."""
 
@@ -165,11 +163,12 @@ class ClockGuard:
         self._sensors, self._horizon = sensors, horizon
         self._agree = min(max(SECOND // 2, horizon // 2), SETTLED)
         self._settled = max(SETTLED, 2 * self._agree)
+        self._spread = horizon + self._agree
         self._everything = sensors + 2
         self._state = np.zeros((sensors + 3, 11), np.int64)
         self._shift = np.zeros(sensors + 2, np.int64)
         self._steps: list[int] = []
-        self._runs: dict[int, _Run] = {}
+        self._runs: dict[int, Run] = {}
         self._held = Events.empty(0)
         self._raw = np.zeros(0, np.int64)
         self._reach, self._judge, self._note, self._scan = _compiled()
@@ -211,7 +210,7 @@ class ClockGuard:
             if row in self._runs:
                 run = self._runs[row]
                 first, last = (int(self._state[self._everything, k]) for k in (FIRST, LAST))
-                if run.verdict == AHEAD and (len(run.at) > 1 or run.t[0] - last <= last - first):
+                if run.ahead and (len(run.at) > 1 or run.t[0] - last <= last - first):
                     self._anchor(work, row)
                 else:
                     self._dissolve(work, row)
@@ -248,53 +247,86 @@ class ClockGuard:
         """Deal with an event that does not fit, or whose channel holds some."""
         row = int(work.rows[i])
         run = self._runs.get(row)
-        if run is not None:
-            if run.verdict == AHEAD and self._verdict(work, run.at[0]) == FITS:
-                # Time has come to where they are.
-                self._release(work, row)
-                run = None
-            elif self._verdict(work, i) == FITS or not self._agrees(work, run, i) or len(run.at) == MOST:
-                self._dissolve(work, row)
-                run = None
+        if run is not None and self._has_come(work, run):
+            self._release(work, row)
+            run = None
         verdict = self._verdict(work, i)
-        if run is None and (verdict == FITS or (verdict == BACK and not self._can_be_set_back(work, i))):
+        if run is not None and run.ahead and run.live and verdict == BACK:
+            if int(work.arrival[i]) - run.arrived <= self._settled:
+                # Late, whatever the clock says now.
+                work.emit([i])
+                return
+        rest: list[int] = []
+        if run is not None and (
+            self._contradicts(work, run, i) if verdict == FITS else run.full or not self._agrees(work, run, i)
+        ):
+            if verdict != FITS and run.live and not run.full:
+                rest = [k for k in run.at if abs(self._offset(work, k) - self._offset(work, i)) <= self._spread]
+            self._dissolve(work, row, rest)
+            run = None
+        if verdict == FITS or (run is None and verdict == BACK and not self._can_be_set_back(work, i)):
             if verdict == FITS:
                 self._let_in(work, i)
             work.emit([i])
             return
         if run is None:
-            run = self._runs[row] = _Run(verdict, int(self._state[self._everything, LAST]))
+            live = self._is_live(work, i)
+            begin = int(self._state[self._everything, LAST])
+            run = self._runs[row] = Run(verdict == AHEAD, live, begin, self._agree, MOST_LIVE if live else MOST)
             self._state[row, HOLDING] = 1
-        run.at.append(i)
-        run.t.append(int(work.t[i]))
-        run.offset.append(int(work.t[i]) - int(work.arrival[i]))
-        if len(run.at) >= ENOUGH and max(run.t) - min(run.t) >= self._settled:
+        for k in (*rest, i):
+            run.add(k, int(work.t[k]), int(work.arrival[k]))
+        if len(run.at) >= ENOUGH and run.span >= self._settled and self._overlaps(run, row):
             self._anchor(work, row)
 
     def _is_live(self, work: Work, i: int) -> bool:
         return bool(work.live[i] or self._state[work.rows[i], LIVE])
 
-    def _agrees(self, work: Work, run: _Run, i: int) -> bool:
-        """Whether an event says the same of its clock as those that are held."""
+    def _offset(self, work: Work, i: int) -> int:
+        return int(work.t[i]) - int(work.arrival[i])
+
+    def _has_come(self, work: Work, run: Run) -> bool:
+        """Whether time has come to where those are that are held ahead; to their last one, if arrivals are known."""
+        return run.ahead and self._verdict(work, run.at[-1 if run.live else 0]) == FITS
+
+    def _contradicts(self, work: Work, run: Run, i: int) -> bool:
+        """Whether an event that fits tells that those that are held do not.
+
+        By a clock that was not set it was measured at t - `OFFSET` of the host's time at the earliest. If that is
+        after the first of those that are held had come, it says so; else it may have been on its way meanwhile.
+        """
+        return not run.live or int(work.t[i]) - int(self._state[work.rows[i], OFFSET]) > run.begun + self._agree
+
+    def _agrees(self, work: Work, run: Run, i: int) -> bool:
+        """Whether an event says the same of its clock as those that are held, but for delays."""
         t = int(work.t[i])
-        if self._is_live(work, i):
-            return abs(t - int(work.arrival[i]) - run.offset[0]) <= self._agree
+        if run.live:
+            lower = run.top - self._offset(work, i)
+            # On its way for long, while others come on time.
+            delayed = lower > 0 and int(work.arrival[i]) - run.arrived <= self._settled
+            return delayed or abs(lower) <= self._spread
         if t < run.t[-1] - self._horizon:
             return False
         reach = int(self._reach(self._state, work.rows[i], self._horizon, False))
-        return run.verdict == AHEAD or reach < 0 or t <= run.t[-1] + reach
+        return run.ahead or reach < 0 or t <= run.t[-1] + reach
+
+    def _overlaps(self, run: Run, row: int) -> bool:
+        """Whether those that are held back reach into what was measured already, if only that tells of a clock.
+
+        Without arrivals a block that ends where the channel begins is one of files in a wrong order.
+        """
+        return run.ahead or run.live or run.highest > self._state[row, FIRST] + self._horizon
 
     def _can_be_set_back(self, work: Work, i: int) -> bool:
         """Whether a time that went back may be a clock's, and not a block of late readings, or files in a wrong order.
 
         With known arrivals it always may. Without, a channel cannot have measured twice at one time: what fills its
-        last gap is late, and what is before its first reading belongs there.
+        last gap is late.
         """
         if self._is_live(work, i):
             return True
         state, t, horizon = self._state[work.rows[i]], int(work.t[i]), self._horizon
-        in_gap = state[GAP_TO] > state[GAP_FROM] and state[GAP_FROM] - horizon <= t <= state[GAP_TO] + horizon
-        return bool(t >= state[FIRST] - horizon and not in_gap)
+        return not (state[GAP_TO] > state[GAP_FROM] and state[GAP_FROM] - horizon <= t <= state[GAP_TO] + horizon)
 
     def _anchor(self, work: Work, row: int) -> None:
         """What is held was true: let it in, with the clock set right if it was one that moved."""
@@ -302,27 +334,36 @@ class ClockGuard:
         first = run.at[0]
         now = int(self._state[self._everything, LAST])
         step = 0
-        if self._is_live(work, first):
+        if run.live:
             known = row if state[SEEN] else self._everything
-            step = int(self._state[known, OFFSET]) - max(run.offset)
-        elif run.verdict == BACK:
+            step = int(self._state[known, OFFSET]) - run.top
+        elif not run.ahead:
             step = int(state[LAST] + state[TOTAL] // max(1, state[STEPS])) - run.t[0]
-        elif now > run.now:
+        elif now > run.begin:
             # The others went on meanwhile, so this was no gap.
-            step = run.now - run.t[0]
+            step = run.begin - run.t[0]
         if step:
-            # The sensors of one source share its clock.
-            near = [known for known in self._steps if abs(known - step) <= self._agree]
-            step = near[-1] if near else step
-            self._steps = [*self._steps[-7:], *([] if near else [step])]
+            step = self._likely(row, step)
             work.moved.append(Moved(int(work.kind[first]), int(work.channel[first]), int(work.raw[first]), -step))
             self._shift[row] += step
             work.shift(row, run.at, step)
         self._release(work, row)
         for other in sorted(self._runs):
-            held = self._runs[other]
-            if held.verdict == AHEAD and self._verdict(work, held.at[0]) == FITS:
+            if self._has_come(work, self._runs[other]):
                 self._release(work, other)
+
+    def _likely(self, row: int, step: int) -> int:
+        """The step that a clock made, of those that are near to the one measured; that itself, if there is none.
+
+        The sensors of one source share its clock, so they make its steps and are where it is. And it may come back.
+        """
+        shift = self._shift - self._shift[row]
+        steps = [*self._steps, *(-known for known in self._steps), *shift.tolist(), -int(self._shift[row])]
+        near = [known for known in steps if known and abs(known - step) <= self._agree]
+        if near:
+            return min(near, key=lambda known: (abs(known + int(self._shift[row])) > 0, abs(known - step)))
+        self._steps = [*self._steps[-7:], step]
+        return step
 
     def _release(self, work: Work, row: int) -> None:
         run = self._end(row)
@@ -330,16 +371,21 @@ class ClockGuard:
             self._let_in(work, i)
         work.emit(run.at, settled=True)
 
-    def _dissolve(self, work: Work, row: int) -> None:
-        """What is held was not true: refused if it is ahead; what is back goes to the log, which counts it as stale."""
-        run = self._end(row)
-        if run.verdict == BACK:
-            work.emit(run.at)
-            return
-        expected = int(self._state[self._everything, LAST])
-        work.refused += [Refused(int(work.kind[i]), int(work.channel[i]), int(work.raw[i]), expected) for i in run.at]
+    def _dissolve(self, work: Work, row: int, rest: Sequence[int] = ()) -> None:
+        """What is held was not true: refused if it is ahead; what is back goes to the log, which counts it as stale.
 
-    def _end(self, row: int) -> _Run:
+        But for the `rest`, which stays held with what contradicted it.
+        """
+        run = self._end(row)
+        gone = [i for i in run.at if i not in set(rest)] if rest else run.at
+        if not run.ahead:
+            work.emit(gone)
+            return
+        for i in gone:
+            stamp, shift = int(work.raw[i]), int(self._shift[row])
+            work.refused.append(Refused(int(work.kind[i]), int(work.channel[i]), stamp, run.begin - shift))
+
+    def _end(self, row: int) -> Run:
         self._state[row, HOLDING] = 0
         return self._runs.pop(row)
 

@@ -32,7 +32,7 @@ f64 = types.float64
 i64 = types.int64
 
 
-CONSTANTS = ("errors.py", "batch.py", "state_space.py")
+CONSTANTS = ("errors.py", "batch.py", "state_space.py", "alarms.py", "hypotheses.py")
 """Files from which compiled code takes constants, and nothing else."""
 
 
@@ -48,9 +48,7 @@ def cache_folder() -> Path:
     package = Path(__file__).parent.parent
     for path in sorted(package.rglob("*.py")):
         source = path.read_bytes()
-        compiling = (
-            b"jit" in source or b"intrinsic" in source or path.name in ("errors.py", "batch.py", "state_space.py")
-        )
+        compiling = b"jit" in source or b"intrinsic" in source or path.name in CONSTANTS
         if compiling and package / "models" not in path.parents:
             digest.update(source)
     return base / "nisus" / "numba" / digest.hexdigest()[:16]
@@ -157,6 +155,12 @@ def flags(target, n):
 def flag_rows(target, rows, columns):
     """The (rows, columns) int8s at an address."""
     return carray(_to_byte(target), (rows, columns))
+
+
+@jit
+def counts(target, n):
+    """The n int32s at an address."""
+    return carray(_to_mask(target), (n,))
 
 
 @jit

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf, isfinite
 
-from estimators.errors import LARGEST, nearest
+from estimators.errors import LARGEST, nearest, quoted
 from estimators.model.state_space import StateSpaceModel
 
 from .fault import Fault
@@ -51,7 +51,9 @@ def _size(unit: str, text: str) -> Parameter:
 
 
 def _positive(unit: str, text: str) -> Parameter:
-    return Parameter("size", unit, text, None, lambda x: 0.0 < x <= LARGEST, "must be positive")
+    return Parameter(
+        "size", unit, text, None, lambda x: 0.0 < x <= LARGEST, f"must be positive, and {LARGEST:g} at most"
+    )
 
 
 def _seconds(name: str, text: str, default: float | None = None) -> Parameter:
@@ -80,7 +82,8 @@ _LIST = (
     Kind("noise", 6, "a draw of that standard deviation is added to each reading", VALUE,
          (_positive("row", "standard deviation of the added noise"),), rows=True),
     Kind("quantisation", 7, "what is said is rounded to multiples of size", VALUE,
-         (Parameter("size", "row", "the step", None, lambda x: 1e-9 <= x <= LARGEST, "must be 1e-9 or more"),),
+         (Parameter("size", "row", "the step", None, lambda x: 1e-9 <= x <= LARGEST,
+                    f"must be 1e-9 or more, and {LARGEST:g} at most"),),
          rows=True),
     Kind("dropout", 8, "with probability rate a reading arrives empty", ANY, (_rate("probability, a reading"),)),
     Kind("silence", 9, "nothing arrives; an input stays as it was told last", ANY),
@@ -123,7 +126,7 @@ def find_kind(name: str) -> Kind:
 def problem(fault: Fault, model: StateSpaceModel) -> tuple[str, str] | None:
     """What is wrong with a fault: its field (or an empty text, for the fault itself) and a text; None if nothing is."""
     if OLDER.get(fault.kind, fault.kind) not in KINDS:
-        return "kind", f"is {fault.kind!r}; {nearest(fault.kind, list(KINDS))}"
+        return "kind", f"is {quoted(fault.kind)}; {nearest(fault.kind, list(KINDS))}"
     kind = find_kind(fault.kind)
     return _of_target(fault, kind, model) or _of_numbers(fault, kind)
 
@@ -141,34 +144,37 @@ def _of_target(fault: Fault, kind: Kind, model: StateSpaceModel) -> tuple[str, s
     if what not in kind.of:
         if given:
             return what, f"means nothing to a fault of kind {fault.kind}; leave it out"
-        return "", f"is of kind {fault.kind} and has no {' or '.join(kind.of)}; add it"
+        return "", f"has no {' or '.join(kind.of)}; a fault of kind {fault.kind} needs one"
     for field, names, word in ((what, known.get(what, []), what), ("other", known["sensor"], "sensor")):
         name = getattr(fault, field, None)
         if name is not None and name not in names:
-            return field, f"is {name!r}, no {word} of {model.name}; {nearest(name, names)}"
+            return field, f"is {quoted(name)}, no {word} of {model.name}; {nearest(name, names)}"
     if (fault.other is not None) != kind.other:
         if kind.other:
-            return "", f"is of kind {fault.kind} and has no other; add it"
+            return "other", f"is missing; a fault of kind {fault.kind} needs it"
         return "other", f"means nothing to a fault of kind {fault.kind}; leave it out"
     rows = {sensor.name: [row.name for row in sensor.rows] for sensor in model.sensors}
     if kind.other:
         ours, theirs = len(rows[str(fault.sensor)]), len(rows[str(fault.other)])
         if fault.other == fault.sensor or ours != theirs:
-            return "other", f"is {fault.other!r}; it must be another sensor than {fault.sensor}, with {ours} row(s)"
+            return (
+                "other",
+                f"is {fault.other!r}; it must be another sensor than {fault.sensor}, with {ours} row(s)",
+            )
     if fault.row is not None:
         if not kind.rows or fault.sensor is None:
             return "row", f"means nothing to a fault of kind {fault.kind}; leave it out"
         if fault.row not in rows[fault.sensor]:
             near = nearest(fault.row, rows[fault.sensor])
-            return "row", f"is {fault.row!r}, no row of {fault.sensor}; {near}"
+            return "row", f"is {quoted(fault.row)}, no row of {fault.sensor}; {near}"
     return None
 
 
 def _of_numbers(fault: Fault, kind: Kind) -> tuple[str, str] | None:
     if not (isfinite(fault.start) and 0.0 <= fault.start <= LARGEST):
-        return "start", f"is {fault.start:g} s; it must be zero or positive"
+        return "start", f"is {fault.start:g} s; it must be zero or positive, and {LARGEST:g} s at most"
     if not fault.start < fault.end or not (fault.end <= LARGEST or fault.end == inf):
-        return "end", f"is {fault.end} s; it must be above start ({fault.start} s)"
+        return "end", f"is {fault.end:g} s; it must be above start ({fault.start:g} s), and {LARGEST:g} s at most"
     takes = {item.name: item for item in kind.parameters}
     for name in ("size", "rate", "every", "count"):
         value = getattr(fault, name)
@@ -177,7 +183,7 @@ def _of_numbers(fault: Fault, kind: Kind) -> tuple[str, str] | None:
                 return name, f"means nothing to a fault of kind {fault.kind}; leave it out"
         elif value is None:
             if takes[name].default is None:
-                return "", f"is of kind {fault.kind} and has no {name}; add it"
+                return name, f"is missing; a fault of kind {fault.kind} needs it"
         elif not (isfinite(value) and takes[name].holds(value)):
             return name, f"is {value:g}; it {takes[name].rule}"
     return None

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
+from estimators.errors import SourceError
 from estimators.log import BEFORE
 
-from ..source import Report
+from ..source import WRONG_TIME, Report
 
 MANY = 100_000
 """Rows one after the other at one time from which on the time is doubted."""
 
 BACKWARDS, STANDING = REMARKS = ("times run backwards", "time stands still")
 """Keys under which it is reported."""
+
+ENOUGH = 3
+"""Times that must follow each other before the one before them is called wrong, or the rows reversed."""
 
 
 class Order:
@@ -29,6 +33,40 @@ class Order:
         self._newest, self._newest_at = BEFORE, ""
         self._run, self._run_at, self._run_length = BEFORE, "", 0
         self._told: set[str] = set()
+
+    def first(self, file: str, line: np.ndarray, t: np.ndarray) -> int:
+        """How many of a file's first rows are to be left out: those of one time, ahead of all that follow.
+
+        Args:
+            file: Its name.
+            line: Lines of its first rows (n,).
+            t: Their times (n,), ns.
+
+        Raises:
+            SourceError: If the newest row comes first and the oldest last: nearly all would be too late.
+        """
+        if self._horizon is None or not t.size:
+            return 0
+        change = np.flatnonzero(np.diff(t)) + 1
+        if change.size < ENOUGH:
+            return 0
+        if np.all(np.diff(t) <= 0) and t[0] - t[-1] > self._horizon:
+            back = (t[0] - t[change[0]]) * 1e-9
+            raise SourceError(
+                f"{file}:{line[change[0]]}: {self._column} is {back:.6g} s before that of the row above, and so it "
+                f"goes on; a recording must begin with its oldest row: sort the rows by {self._column}"
+            )
+        begin = int(change[0])
+        rest = t[begin:]
+        alone = t[0] - self._horizon > rest.max() and np.all(np.diff(t[change[:ENOUGH]]) > 0)
+        if alone:
+            after = (t[0] - t[begin]) * 1e-9
+            self._report(
+                WRONG_TIME,
+                f"{file}:{line[0]}: {self._column} is {after:.6g} s after that of {file}:{line[begin]} and of all that "
+                f"follow; the row is left out: correct its {self._column}, or sort the rows by it",
+            )
+        return begin if alone else 0
 
     def look(self, file: str, line: np.ndarray, t: np.ndarray) -> None:
         """The next rows: their lines and times (ns), each (n,)."""

@@ -86,7 +86,8 @@ class Table:
         before = self._count
         try:
             for rows in rows_of(path, self._time, self._unit, self._columns, lambda: self._timeout):
-                batch = Events.empty(self._width) if rows is None else self._events(path, rows)
+                first = self._count == before
+                batch = Events.empty(self._width) if rows is None else self._events(path, rows, first)
                 if rows is None or len(batch):
                     yield batch
         except SourceError as error:
@@ -95,7 +96,8 @@ class Table:
             gist = str(error).removeprefix(f"{path}: ")
             self._report(TRUNCATED, f"{path.name}: damaged after {self._count - before} rows: {gist}")
 
-    def _events(self, path: Path, rows: Rows) -> Events:
+    def _events(self, path: Path, rows: Rows, first: bool) -> Events:
+        """The events of the next rows of a file, or of its first ones."""
         for key, line, text in rows.problems:
             self._report(key, f"{path.name}:{line}: {text}")
         known = rows.known
@@ -104,15 +106,18 @@ class Table:
                 "undated row",
                 f"{path.name}:{rows.line[row]}: {self._time} is not a time, or needs another unit; the row is left out",
             )
+        t, used = rows.t + self._shift, known.copy()
+        if first:
+            wrong = self._order.first(path.name, rows.line[known], t[known])
+            used[np.flatnonzero(known)[:wrong]] = False
         self._count += rows.t.size
         if len(self._valued) < len(self._columns):
             valued = np.flatnonzero(np.isfinite(rows.values).any(axis=0))
             self._valued.update(self._columns[k] for k in valued)
-        t = rows.t + self._shift
-        self._order.look(path.name, rows.line[known], t[known])
+        self._order.look(path.name, rows.line[used], t[used])
         state = np.where(rows.blank, ABSENT, PRESENT).astype(np.int8)
         plan = np.zeros(t.size, np.int64)
-        return self._mapping.events(plan, t, t, rows.values, state, (~known).astype(np.int8))
+        return self._mapping.events(plan, t, t, rows.values, state, (~used).astype(np.int8))
 
     def _never(self, name: str) -> str:
         fed = ", ".join(channel.name for channel in self._channels if name in channel.needed)

@@ -11,13 +11,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from app.intake import WRONG_TIME, Intake
+from app.intake import Intake
 from estimators.diagnostics.health import HealthPolicy
 from estimators.events.order import sorted_order
 from estimators.fold import Fold
 from estimators.log import MAINTENANCE, MARK, READING, RESET, TICK, TRUTH, Events, Log
 from estimators.model.limits import Limits
 from estimators.tuning import Tuning
+from sources.source import WRONG_TIME
 from tests.estimators.test_screen import model
 from tests.support import SECOND, assert_same
 

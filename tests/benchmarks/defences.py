@@ -15,7 +15,7 @@ from estimators.diagnostics.health import assess
 from estimators.fold import Fold
 from estimators.log import Log
 from estimators.models import MODELS
-from estimators.numerics.jit import jit_brief
+from estimators.numerics.jit import floats, jit_brief
 from estimators.tuning import Tuning
 
 from .filters import STEPS, noisy_log
@@ -57,7 +57,8 @@ def bare_kernel() -> Any:
             code, context, rule, first, start, end, t, kind, channel, value, width,
             clock, u, state, doubt, edge, spare, work, score, track,
         )  # fmt: skip
-        assess(start, end, t, kind, track, policy, bounds)
+        normal = floats(context.normal, context.n_sensors)
+        assess(start, end, t, kind, channel, track, normal, policy, bounds)
         return -1
 
     kernel.compile(fold_kernel.run_signature.args)
@@ -66,7 +67,7 @@ def bare_kernel() -> Any:
 
 def _pair(estimator: str, model: Any, tuning: Tuning, log: Log) -> tuple[Fold, Fold]:
     defended, bare = (Fold(estimator, model, tuning, log) for _ in range(2))
-    bare._run = bare_kernel()
+    bare._machine._run = bare_kernel()
     return defended, bare
 
 

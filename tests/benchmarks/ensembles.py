@@ -119,8 +119,8 @@ def analysis(model: StateSpaceModel, name: str, options: dict[str, float], repet
     gc.collect()
     peak = _peak(reset=True)
     times = [both(lambda: fold.advance(1)) for _ in range(repetitions)]
-    ensemble = fold._state.nbytes
-    memory = (ensemble + fold._work.nbytes + _peak() - peak) / ensemble
+    ensemble = fold._now.state.nbytes
+    memory = (ensemble + fold._machine.work.nbytes + _peak() - peak) / ensemble
     return median(t for t, _ in times), median(t for _, t in times), memory
 
 

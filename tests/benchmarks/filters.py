@@ -160,10 +160,11 @@ def alone(estimator: str, model: StateSpaceModel) -> Callable[[], None]:
     log = noisy_log(model, STEPS, step=0.1)
     fold = Fold(estimator, model, Tuning.of(model), log)
     fold.advance()
-    places = (fold._u, fold._state, fold._work, fold._score, log.value, *np.empty((2, model.width)))
+    machine, now = fold._machine, fold._now
+    places = (now.u, now.state, machine.work, machine.score, log.value, *np.empty((2, model.width)))
 
     def steps() -> None:
-        _steps(fold._code.predict, fold._code.update, fold._context, STEPS, *places)
+        _steps(machine.code.predict, machine.code.update, machine.context, STEPS, *places)
 
     return steps
 

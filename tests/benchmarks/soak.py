@@ -16,13 +16,13 @@ import numpy as np
 
 from app.engine.chronicle import SLOWEST
 from app.engine.engine import Engine
-from app.intake import WRONG_TIME
-from app.stress.trial import asset_of
+from app.stress.bench import asset_of
 from app.twin.twin import Twin, load_twin
 from estimators.log import MARK, Events
 from estimators.track import HEALTH_NAMES, SUSPECT, TRACKING, VERDICT_NAMES
 from sources.faults.fault import Fault
 from sources.faults.layer import Faults
+from sources.source import WRONG_TIME
 
 from .live import resident
 

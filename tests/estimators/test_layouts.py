@@ -85,16 +85,17 @@ def check(name, model, options):
     free.advance()
     fold = Fold(name, model, tuning, log)
     work = entry.work_size(fold.options, model.nx, model.width)
-    wholes = []
-    for field, size in (("_work", work), ("_state", fold._state.size), ("_spare", fold._state.size)):
-        inner, whole = guarded(getattr(fold, field), size)
-        setattr(fold, field, inner)
-        wholes.append(whole)
-    assert fold._state.size == entry.state_size(fold.options, model.nx)
+    size = fold._now.state.size
+    fold._machine.work, *wholes = guarded(fold._machine.work, work)
+    state, whole = guarded(fold._now.state, size)
+    fold._spare, spare = guarded(fold._spare, size)
+    fold._now = fold._now._replace(state=state)
+    wholes += [whole, spare]
+    assert fold._now.state.size == entry.state_size(fold.options, model.nx)
     fold.advance()
     for whole in wholes:
         assert np.all(whole[:GUARD] == np.pi) and np.all(whole[-GUARD:] == np.pi)
-    np.testing.assert_array_equal(fold._state, free._state)
+    np.testing.assert_array_equal(fold._now.state, free._now.state)
 
 
 @pytest.mark.parametrize("room", ["particle", "ensemble"])

@@ -42,11 +42,11 @@ def test_sizes_are_enough(name):
     fold = Fold(name, model, Tuning.of(model), log)
     work = entry.work_size(fold.options, model.nx, model.width)
     from_end = name in ("kf", "sr-kf", "kf-steady")  # these find their F from the end
-    fold._work = fold._work if from_end else np.full(work + 64, np.pi)
+    fold._machine.work = fold._machine.work if from_end else np.full(work + 64, np.pi)
     fold.advance()
     if not from_end:
-        assert np.all(fold._work[work:] == np.pi)
-    assert fold._state.size == entry.state_size(fold.options, model.nx)
+        assert np.all(fold._machine.work[work:] == np.pi)
+    assert fold._now.state.size == entry.state_size(fold.options, model.nx)
 
 
 @pytest.mark.parametrize("name", list(ESTIMATORS))

@@ -24,7 +24,11 @@ from ..calibration import LIMITS, standardised
 from ..intervals import Interval, correlation_interval
 from ..sensitivity.responses import each
 from ..sensitivity.size import MOST_STATES
+from ..sensitivity.words import digits
 from ..whiteness import ljung_box
+
+LEAST = 0.001
+"""Of a σ; what is smaller is said to be."""
 
 QUANTILE = 0.95
 """Of the differences along the track; a few at the start, where the spread is the prior's, need not matter."""
@@ -170,10 +174,15 @@ def _judged(track: Track, k: int) -> np.ndarray:
     return np.where(judged, standardised(track, k, False), np.nan)
 
 
+def _at_most(most: float) -> str:
+    return f"less than {LEAST:g} σ" if most < LEAST else f"at most {digits(most)} σ"
+
+
 def _in_words(exact: bool, apart: tuple[Curvature, ...], bad: list[White]) -> str:
     worst = max(apart, key=lambda item: item.most)
     figure = (
-        f"{QUANTILE:.0%} of the time {LINEARISED} and {UNSCENTED} are at most {worst.most:.2g} σ apart ({worst.name})"
+        f"{100 * QUANTILE:.0f} % of the time {LINEARISED} and {UNSCENTED} are {_at_most(worst.most)} apart "
+        f"({worst.name})"
     )
     if exact:
         figure = f"f and h are linear, so the Kalman filter is exact; {figure}"

@@ -7,7 +7,7 @@ What a fault does to the innovations is known here row by row. Scaled by s, it i
 on: their log likelihood ratio against no fault is N(λ/2, λ), and passes h with the probability whose quantile is z
 (Basseville & Nikiforov 1993, Detection of Abrupt Changes, 4.2 and 7.2). That test knows what the fault looks like.
 
-The bank (evidence.py) knows shifts of 0.2 σ and more, scales and correlations; what shifts a row by less than 0.1 σ
+The bank (evidence/) knows shifts of 0.2 σ and more, scales and correlations; what shifts a row by less than 0.1 σ
 lets all its sums fall, however long it lasts. Under a known shift m of a standard normal e, each sum's steps have the
 mean and the variance that follow from its log likelihood ratio
 
@@ -28,8 +28,7 @@ from ...numerics.jit import jit
 from ...numerics.quantiles import normal_quantile
 from ...track import USED, Track
 from ...tuning import Tuning
-from ..evidence import _RATIOS as RATIOS
-from ..evidence import FURTHEST, no_baseline, watched
+from ..evidence import FURTHEST, RATIOS, no_baseline, watched
 
 HALVINGS = 10
 """Of the bracket of a multiple, a factor of two wide: to 0.1 %."""
@@ -43,7 +42,7 @@ class Witness(NamedTuple):
 
     h (rows,) are thresholds by sensor row, z the quantile of the probability of detection; `used` (N,) marks the used
     readings; `places` and `columns` are the events and the row of the reading of each sensor row; baseline (rows, 3 +
-    tests) as in evidence.py.
+    tests) as in evidence/.
     """
 
     h: np.ndarray

@@ -1,7 +1,9 @@
 """`nisus check`: its figures, its page as text and as HTML."""
 
 import json
+import re
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from app.cli.check_html import as_html
 from app.cli.check_tables import Bar, Part
 from app.cli.main import main
+from estimators.diagnostics.sensitivity.words import range_text
 
 REQUIRED = {"checklist", "observability", "smallest_visible", "integrity", "held_out", "open_loop"}
 MORE = {"twin", "estimator", "span", "timing", "calibration", "posterior", "linearity", "dimension", "health"}
@@ -114,6 +117,32 @@ def test_html_escapes_what_users_name():
     page = parsed(as_html("<title>", [Part("head", ()), part]))
     assert not page.tags & {"script", "b", "i", "u", "s"}
     assert "<script>alert(1)</script>" in page.text and "<u>" in page.text and "no number" in page.text
+
+
+def test_a_mark_says_whether_the_answer_is_good_news():
+    """Asked for peaks and heavy tails, a twin does well to say no."""
+    rows = (("all well?", "yes"), ("anything wrong?", "no"))
+    page = parsed(as_html("t", [Part("head", ()), Part("b", (), ("q", "a"), rows, marks=("good", "good"))]))
+    marks = [value for tag, name, value in page.attributes if (tag, name) == ("td", "class")]
+    assert marks == ["short", "good short", "short", "good short"]
+
+
+def test_answers_are_marked_by_what_they_mean(checked):
+    found, html = checked
+    answers = found["checklist"]
+    assert (answers["posterior"]["answer"], answers["linearity"]["answer"]) == ("no", "yes")
+    assert '<td class="good short">no</td>' in html and 'class="bad' not in html
+    # A bare number has no exponent that a reader must count with.
+    assert re.search(r"\de\+0\d", html) is None
+
+
+@pytest.mark.parametrize(
+    "low, high, text",
+    [(-2.51, 2.51, "± 2.51 °C"), (-51.6, 137.2, "-51.6 to +137 °C"), (-0.0, 2283.0, "0 to +2,280 °C"),
+     (0.0, 0.0, "0 to 0 °C"), (-1.8e10, 1.8e10, "± 1.8e+10 °C"), (-1.0, np.inf, "any size")],
+)  # fmt: skip
+def test_ranges_in_words(low, high, text):
+    assert range_text(SimpleNamespace(kind="sensor", value=0.0, unit="°C"), low, high) == text
 
 
 def test_text_is_the_same_page(capsys):

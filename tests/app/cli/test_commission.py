@@ -1,5 +1,6 @@
 """`nisus commission`: what is normal, as lines of a YAML that are written, replaced and read again."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,10 +8,14 @@ import pytest
 
 from app.cli.arguments import Commission
 from app.cli.commission import commission_twin, lines, write
+from app.cli.fold import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.commission import Normal, baseline_of
 from estimators.diagnostics.evidence import CAUSES
 from estimators.errors import ConfigError
+from estimators.fold import fold
+from estimators.track import DIVERGED
+from estimators.tuning import Tuning
 
 TWIN = """\
 # A drive.
@@ -60,7 +65,7 @@ def test_what_is_printed_is_what_is_read_again(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_every_figure_comes_back(tmp_path: Path) -> None:
-    normals = {"winding": Normal(-0.25, 1.75, -0.125, {"narrow": 12.5, "high": 3.0, "stuck": 100.0})}
+    normals = {"winding": Normal(-0.25, 1.75, -0.125, {"narrow": 12.5, "shifted up": 3.0, "stuck": 100.0})}
     twin = load_twin(drive(tmp_path, TWIN + lines(normals)))
     np.testing.assert_array_equal(twin.tuning.baseline, baseline_of(twin.model, normals))
 
@@ -123,3 +128,19 @@ def test_a_wrong_section_is_one_line(tmp_path: Path, section: str, said: str) ->
     with pytest.raises(ConfigError) as problem:
         load_twin(path)
     assert said in str(problem.value) and "\n" not in str(problem.value)
+
+
+def test_a_twin_is_commissioned_against_white_innovations_whatever_was_normal_before(tmp_path: Path) -> None:
+    """Readings twenty times as noisy as R says are no longer diverged once that was normal; they are if told anew."""
+    path = drive(tmp_path, TWIN + "commissioned:\n  winding: {scale: 50}\n")
+    y = 40.0 + np.random.default_rng(1).normal(0.0, 40.0, 300)
+    (tmp_path / "drive.csv").write_text("t,y\n" + "".join(f"{k},{value:.3f}\n" for k, value in enumerate(y)))
+    twin = load_twin(path)
+    log, _ = read_log(twin, None)
+
+    def lost(tuning: Tuning) -> float:
+        return float(np.mean(fold(twin.estimator, twin.model, tuning, log, policy=twin.policy).health == DIVERGED))
+
+    assert lost(twin.tuning) == 0.0 and lost(replace(twin.tuning, baseline=None)) > 0.5
+    with pytest.raises(ConfigError, match="the twin is diverged or stale for"):
+        commission_twin(Commission(path))

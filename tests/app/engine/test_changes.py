@@ -98,7 +98,7 @@ def test_a_live_twin_goes_back_to_its_file():
     found = turned(twin, twin.estimator, twin.tuning.set("Q.rate", 123.0))
     was = twin.tuning.get("Q.rate")
     assert found == {"Q.rate": was}
-    with pytest.raises(ConfigError, match="Restore: has name; it takes no field"):
+    with pytest.raises(ConfigError, match="Restore: name is not known; it takes no field"):
         command_from_json({"command": "Restore", "name": "kf"}, engine)
 
 

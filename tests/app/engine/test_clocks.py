@@ -7,17 +7,19 @@ import pytest
 
 from app.engine import commands
 from app.engine.engine import Engine
-from app.engine.host_clock import HostClock
+from app.engine.host_clock import HostClock, clock_text
 from app.engine.notices import Notices
 from app.engine.silence import Silence
-from app.intake import CLOCK_MOVED, WRONG_TIME, Planned
+from app.intake import CLOCK_MOVED, Planned
 from app.recording.reader import read_recording
 from app.recording.writer import Recorder
 from app.server.api import command_from_json, status_json
+from estimators.diagnostics.clock_fit import ClockFit
 from estimators.errors import ConfigError
 from estimators.events.maintenance import model_versions
 from estimators.log import MAINTENANCE
 from estimators.track import STALE, WAITING
+from sources.source import WRONG_TIME
 from tests.app.scripted import MODEL, Scripted, fresh_status, pull_all, readings, row_count, twin, wait_for
 from tests.support import SECOND
 
@@ -81,6 +83,11 @@ def test_what_waits_for_the_next_is_counted(start):
     source.put(None)
     wait_for(lambda: fresh_status(engine).counts.get(WRONG_TIME) == 1)
     assert "held" not in fresh_status(engine).counts
+
+
+def test_what_rounds_to_zero_is_not_negative():
+    assert clock_text(ClockFit(-0.0002, -0.02, 0.03)) == "+0.000 s, +0.0 ± 0.03 ppm"
+    assert clock_text(ClockFit(-20.06, np.nan, np.nan)) == "-20.060 s"
 
 
 def test_offset_and_drift_are_in_status_page_and_events(start):

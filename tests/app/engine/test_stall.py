@@ -128,10 +128,15 @@ class Work:
         black_box = False
 
     def __init__(self, *questions):
-        self.questions = lambda: iter(questions)
+        self.questions = questions
 
 
-def test_work_that_takes_long_is_named_only_if_a_question_is_not_answered():
+@pytest.fixture
+def asked_of_work(monkeypatch):
+    monkeypatch.setattr(app.engine.stall, "questions_of", lambda work: iter(work.questions))
+
+
+def test_work_that_takes_long_is_named_only_if_a_question_is_not_answered(asked_of_work):
     now, said, leave = 0.0, [], threading.Event()
     stall = Stall(lambda text, level: said.append((level, text)), clock=lambda: now)
     with stall.watched(Work(("f", lambda: None), ("h", lambda: None))):
@@ -162,7 +167,7 @@ def test_questions_are_asked_until_one_is_not_answered():
     assert np.all(np.array(asked[:10]) == [*range(5)] * 2)
 
 
-def test_a_refold_that_never_returns_is_given_up_and_the_next_one_made(monkeypatch):
+def test_a_refold_that_never_returns_is_given_up_and_the_next_one_made(monkeypatch, asked_of_work):
     monkeypatch.setattr(app.engine.stall, "PATIENCE", 0.0)
     monkeypatch.setattr(app.engine.stall, "ANSWER", 0.1)
     leave, answers = threading.Event(), []

@@ -477,7 +477,7 @@ def test_a_recording_shows_its_events_whatever_was_turned_since(fed, tmp_path):
     assert lines == {"/events"}
     shown = blueprint(fed.engine.model, fed.engine.pairs, window=WINDOW, root="/revision_1")
     views = {view.name: view.origin for view in all_views(shown.root_container)}
-    assert views["events"] == "/events" and views["health"] == "/revision_1/health"
+    assert views["events"] == "/events" and views["health and sensors"] == "/revision_1/"
 
 
 def all_views(container):

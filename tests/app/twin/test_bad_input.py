@@ -209,7 +209,7 @@ def test_an_estimate_that_is_no_number_stays_off_the_page(twin, start):
     model = engine.model
     source.put(reading(model, 1.0, model.prior_mean[: len(model.sensors[0].rows)]))
     wait_for(lambda: len(pull_all(engine).events) == 1)
-    engine._fold._state[:] = np.nan
+    engine._fold._now.state[:] = np.nan
     source.put(reading(model, 1.1, model.prior_mean[: len(model.sensors[0].rows)]))
     wait_for(lambda: len(pull_all(engine).events) == 2)
     view = ViserView(engine, secret="s3cret")

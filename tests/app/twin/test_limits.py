@@ -86,6 +86,56 @@ def test_a_range_of_validity_takes_the_place_of_the_models(tmp_path) -> None:
             "valid: {rate: {min: 1, max: 1}}",
             "valid.rate is a mapping; its min must be below its max",
         ),
+        ("use: true", "valid: {temperature: {}}", "twin.yaml:7: valid.temperature gives neither min nor max; add it"),
+        (
+            "duplicates: {within: 50}",
+            "",
+            "twin.yaml:6: sensors.winding.duplicates.within is 50 s; it must be below time.s",
+        ),
+        ("duplicates: {within: 1e30}", "", "sensors.winding.duplicates.within is 1e.30; it must be 1e"),
+        ("stuck: {seconds: 1e12}", "", "sensors.winding.stuck.seconds is 1000000000000.0; it must be 1e"),
+        (
+            "range: [0, 50]\n    stuck: {quantum: 100}",
+            "",
+            "twin.yaml:7: sensors.winding.stuck.quantum is 100 °C; it must be below what the sensor can say, 50 °C",
+        ),
+        (
+            "stuck: {quantum: 100}",
+            "",
+            "stuck.quantum is 100 °C, so coarse that noise of 0.5 °C never moves the reading",
+        ),
+        (
+            "range: [0, 50]\n    saturation: [60, 90]",
+            "",
+            "sensors.winding.saturation is 60 to 90 °C, and range is 0 to 50: no reading keeps both; let them overlap",
+        ),
+        ("range: [0, 50]\n    saturation: [50, 90]", "", "no reading keeps both"),
+        ("range: [20, 20.1]", "", "sensors.winding.range leaves 0.1 °C, less than the noise of the sensor .0.5 °C"),
+        ("saturation: [20, 20.1]", "", "sensors.winding.saturation leaves 0.1 °C"),
+        ("use: true", "gate: 0.05", "twin.yaml:7: gate is 0.05; it must be 0.5 or more"),
+        ("use: true", "gate: {probability: 0.99, reopen: 1e12}", "gate.reopen is 1000000000000.0; it must be 1e"),
+        ("use: true", "time: {horizon: 1e12}", "time.horizon is 1000000000000.0; it must be 1e"),
+        ("use: true", "time: {tick: 1e-9}", "time.tick is 1e-09; it must be 0.01 or more"),
+        (
+            "use: true",
+            "maintenance: [{at: 1e12, what: fan, states: [temperature]}]",
+            "maintenance.0..at is 1000000000000.0; it must be 9e",
+        ),
+        (
+            "use: true",
+            f"maintenance: [{{at: 1, what: {'a' * 201}, states: [temperature]}}]",
+            "it may have 200 characters",
+        ),
+        (
+            "use: true",
+            "faults: [{kind: stuck, sensor: winding, start: 1e12}]",
+            "faults.0..start is 1000000000000.0; it must",
+        ),
+        (
+            "use: true",
+            "faults: [{kind: stuk, sensor: winding}]",
+            "twin.yaml:7: faults.0..kind is 'stuk'; did you mean stuck",
+        ),
     ],
 )
 def test_what_means_nothing_is_refused_with_its_place(tmp_path, limits, more, said) -> None:
@@ -156,3 +206,20 @@ def test_a_base_keeps_what_the_screen_remembers(tmp_path) -> None:
     again = base_from_json(base_to_json(base))
     assert again is not None and base.edge is not None and again.edge is not None
     assert again.edge.tobytes() == base.edge.tobytes() and base.edge.any()
+
+
+def test_copies_closer_than_a_simulated_sensors_period(tmp_path) -> None:
+    """The asset tells its period: 4 steps of half a second."""
+    text = """\
+model: motor_winding
+sensors: {winding: {duplicates: {within: %s}}}
+source: {type: simulator, step: 0.5, duration: 10, sensors: {winding: {every: 4}}}
+"""
+    path = tmp_path / "twin.yaml"
+    path.write_text(text % 2)
+    with pytest.raises(
+        ConfigError, match=r"twin.yaml:2: .*within is 2 s; it must be below the sensor's period \(2 s\)"
+    ):
+        load_twin(path)
+    path.write_text(text % 1.9)
+    assert load_twin(path).model.sensors[0].limits == Limits(duplicates=1.9)

@@ -155,7 +155,7 @@ def test_an_unknown_override_names_what_is_near() -> None:
         (
             "estimator: kf",
             "estimator: {name: ukf, options: {alfa: 1}}",
-            "motor.yaml:8: estimator ukf has no option 'alfa'; it has ",
+            "motor.yaml:8: estimator ukf has no option 'alfa'; did you mean alpha?",
         ),
         (
             "pairs: [[rate, temperature]]",

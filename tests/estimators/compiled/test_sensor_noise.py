@@ -50,7 +50,7 @@ def model(correlation):
 def context():
     declared = model(C)
     fold = Fold("kf", declared, Tuning.of(declared), Log(declared.width))
-    yield fold._context
+    yield fold._machine.context
     del fold
 
 

@@ -96,8 +96,8 @@ def test_more_of_the_same_is_silent(normals, seed):
 @pytest.mark.parametrize(
     ("change", "cause", "within"),
     [
-        (lambda rng, n: np.full(n, 0.5), "high", 60),
-        (lambda rng, n: np.full(n, -0.5), "low", 60),
+        (lambda rng, n: np.full(n, 0.5), "shifted up", 60),
+        (lambda rng, n: np.full(n, -0.5), "shifted down", 60),
         (lambda rng, n: rng.normal(0.0, 0.5, n), "narrow", 60),
     ],
     ids=["above", "below", "noisy"],

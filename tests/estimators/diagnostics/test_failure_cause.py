@@ -8,6 +8,7 @@ import pytest
 
 from estimators.diagnostics.failure_cause import failures
 from estimators.fold import Fold
+from estimators.fold_failures import cause_of
 from estimators.log import INPUT, READING, TICK, Events, Log
 from estimators.model.joint import Unknown, joint
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
@@ -89,7 +90,7 @@ def test_the_function_that_failed_is_named_with_file_line_and_state(name, change
     if not rows.size:
         assert name == "pf", "only members may have gone around it"
         return
-    line = growing.cause(int(rows[0]))
+    line = cause_of(growing, int(rows[0]))
     found = re.fullmatch(
         rf"\S*test_failure_cause.py:{culprit.__code__.co_firstlineno}: model walk: {says} at x = \[([-\d.e]+)\], "
         r"u = \[[01]\](, dt = 0.5 s)?, where the estimate got; it must be .*",
@@ -106,7 +107,7 @@ def test_the_function_that_failed_is_named_with_file_line_and_state(name, change
 def test_a_reading_that_fails_by_itself_blames_no_function():
     growing = driven(walk())
     assert failures(growing.track).size == 0
-    assert growing.cause(8) is None
+    assert cause_of(growing, 8) is None
 
 
 def test_failures_are_failed_readings_and_estimates_that_are_no_numbers():
@@ -134,14 +135,14 @@ def test_the_inputs_that_held_are_taken():
     growing.advance()
     rows = failures(growing.track)
     assert rows[0] == 4
-    assert "x = [3], u = [1], dt = 1 s" in growing.cause(4)
+    assert "x = [3], u = [1], dt = 1 s" in cause_of(growing, 4)
 
 
 @pytest.mark.parametrize(("changes", "culprit"), [({"f": root_step}, root_step), ({"Q": shrinking}, shrinking)])
 def test_the_models_own_function_is_named_where_a_parameter_is_estimated(changes, culprit):
     gain = Parameter("gain", "1", 1.0)
     growing = driven(joint(walk(parameters=(gain,), **changes), {"gain": Unknown(0.1, 0.0)}))
-    line = growing.cause(int(failures(growing.track)[0]))
+    line = cause_of(growing, int(failures(growing.track)[0]))
     assert f"test_failure_cause.py:{culprit.__code__.co_firstlineno}: model walk: " in line
 
 
@@ -154,7 +155,7 @@ def test_the_path_is_walked_in_the_models_own_steps():
     growing = Fold("ekf", model, Tuning.of(model), log)
     growing.advance()
     assert list(failures(growing.track)) == [2]
-    assert "f(x, u, dt) is [nan] at x = [2], u = [1], dt = 1 s" in growing.cause(2)
+    assert "f(x, u, dt) is [nan] at x = [2], u = [1], dt = 1 s" in cause_of(growing, 2)
 
 
 def test_a_block_that_returns_no_number_is_named_too():
@@ -173,7 +174,7 @@ def test_a_block_that_returns_no_number_is_named_too():
     growing = Fold("enkf", model, Tuning.of(model), log)
     growing.advance()
     assert list(failures(growing.track)) == [2]
-    assert re.search(r"test_failure_cause.py:\d+: model duffing: f\(x, u, dt\) is \[nan, nan\]", growing.cause(2))
+    assert re.search(r"test_failure_cause.py:\d+: model duffing: f\(x, u, dt\) is \[nan, nan\]", cause_of(growing, 2))
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "iekf", "ukf", "ckf", "sr-ekf", "sr-ukf", "enkf", "etkf", "ensrf"])

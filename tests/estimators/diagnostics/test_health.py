@@ -322,7 +322,7 @@ def events_of(rng, n):
     return t, kind, track
 
 
-def by_definition(t, kind, track, policy):
+def by_definition(t, kind, channel, track, normal, policy):
     """Each row's age, NIS of the window, bounds and consistency, from the words of `HealthPolicy` and of `assess`."""
     judged = np.isin(track.verdict, (USED, GATED, FAILED))
     quantiles = {q: chi2.ppf(q, np.arange(3 * policy.window + 1)) for q in (0.025, 0.975)}
@@ -334,11 +334,12 @@ def by_definition(t, kind, track, policy):
         rows = [k for k in range(max(after + 1, e - FAR * policy.window + 1, 0), e + 1) if judged[k]][-policy.window :]
         used = [k for k in rows if track.verdict[k] == USED]
         total, dof = float(np.sum(track.nis[used])), int(np.sum(track.dof[used], dtype=int))
+        due = float(np.sum(track.dof[used] * normal[channel[used]]))
         values = [np.nan] * 3
         if used:
             values = [total / len(used), *(quantiles[q][dof] / len(used) for q in (0.025, 0.975))]
         refused = len(rows) - len(used)
-        lost = refused > policy.diverged_gated * len(rows) or total > policy.diverged_nis * dof
+        lost = refused > policy.diverged_gated * len(rows) or total > policy.diverged_nis * due
         yield (t[i] - t[e]) / SECOND, *values, DIVERGED if len(rows) >= FEW and lost else TRACKING
 
 
@@ -348,12 +349,16 @@ def test_the_window_is_its_definition_in_any_pieces(seed):
     rng = np.random.default_rng(seed)
     policy = HealthPolicy(window=12, degraded_after=2.0, stale_after=6.0, diverged_nis=2.5, diverged_gated=0.25)
     t, kind, track = events_of(rng, 3000)
+    # With few digits, so that their sum is exact in any order.
+    channel, normal = rng.integers(0, 3, 3000).astype(np.int32), np.array([1.0, 1.5, 4.0])
     at = 0
     while at < len(t):
         end = min(len(t), at + int(rng.choice([1, 7, 40, 500])))
-        assess(at, end, t, kind, track, policy, chi_square_bounds(3 * policy.window))
+        assess(at, end, t, kind, channel, track, normal, policy, chi_square_bounds(3 * policy.window))
         at = end
-    age, mean, low, high, consistency = map(np.array, zip(*by_definition(t, kind, track, policy), strict=True))
+    age, mean, low, high, consistency = map(
+        np.array, zip(*by_definition(t, kind, channel, track, normal, policy), strict=True)
+    )
     assert set(consistency) == {TRACKING, DIVERGED}
     np.testing.assert_array_equal(track.age, age)
     np.testing.assert_array_equal(track.consistency, consistency)

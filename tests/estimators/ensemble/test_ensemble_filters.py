@@ -28,7 +28,7 @@ MATRICES = random_linear(np.random.default_rng(3), 4, 1)
 
 def members_of(fold):
     N = int(fold.options["members"])
-    return fold._state[: N * fold.model.nx].reshape(N, fold.model.nx).copy()
+    return fold._now.state[: N * fold.model.nx].reshape(N, fold.model.nx).copy()
 
 
 def analysed(name, model, options, sensor, y, seed=0):
@@ -386,7 +386,7 @@ def test_bits_are_the_same_on_any_number_of_threads(name, monkeypatch):
             monkeypatch.setattr(module, "crews", lambda numbers, start, crews=crews: crews)
         fold = Fold(name, LORENZ96, Tuning.of(LORENZ96).with_options(options), log)
         fold.advance()
-        states.append(fold._state.copy())
+        states.append(fold._now.state.copy())
     assert localisation.threaded()
     np.testing.assert_array_equal(states[0], states[1])
     np.testing.assert_array_equal(states[0], states[2])

@@ -99,6 +99,17 @@ def test_a_table_whose_clock_is_set_back_goes_on_at_its_own_pace():
     assert [move.by for move in made.moved] == [-300 * SECOND]
 
 
+@pytest.mark.parametrize("back", [299.0, 400.0, 1e6])
+def test_a_table_whose_clock_is_set_back_before_its_first_time_goes_on_once_it_overlaps(back):
+    """As far back as it likes; a block that never comes to what was measured may be of files in a wrong order."""
+    made = Outcome(events(T - np.where(T >= 300, back, 0.0)))
+    if back > 2000 - 300:
+        assert made.stale == 1700 and not made.moved
+        return
+    np.testing.assert_array_equal(made.seconds, T)
+    assert [move.by for move in made.moved] == [-round(back * SECOND)] and made.stale == 0
+
+
 def test_sensors_of_one_clock_keep_their_times_to_each_other():
     """Two sensors at 1 and 4 Hz: alone each would go on at its own pace, apart by up to a period of the slower."""
     t = np.concatenate((T, np.sort(np.random.default_rng(9).uniform(0.0, 500.0, T.size))))
@@ -111,6 +122,54 @@ def test_sensors_of_one_clock_keep_their_times_to_each_other():
     true = np.round(t * SECOND).astype(np.int64)[made.numbers.astype(int)]
     late = made.log.t[: made.log.n] - true
     assert np.all(late[:100] == 0) and np.ptp(late[true > 400 * SECOND]) == 0
+
+
+class Two:
+    """Two sensors at 100 Hz for 80 s, what is ahead of the clock of the first, and their delays; as they arrive."""
+
+    def __init__(self, ahead, delay):
+        self.true = np.repeat(np.arange(0.0, 80.0, 0.01), 2)
+        sensor = np.tile([0, 1], self.true.size // 2)
+        late = DELAY + np.where(sensor == 0, delay(self.true), 0.0)
+        stamp = self.true + np.where(sensor == 0, ahead(self.true), 0.0)
+        order = np.argsort(self.true + late, kind="stable")
+        self.late = late > HORIZON / SECOND
+        stream = events(stamp[order], (self.true + late)[order], channel=sensor[order])
+        self.made = Outcome(stream._replace(value=order[:, None].astype(float)))
+        self.kept = self.made.numbers.astype(int)
+        self.lost = np.setdiff1d(np.arange(self.true.size), self.kept)
+        self.off = np.abs(self.made.seconds - self.true[self.kept])
+
+
+@pytest.mark.parametrize("ahead", [1.5, 2.1, 2.97, 3.9])
+def test_a_clock_a_little_ahead_does_not_make_what_others_say_stale(ahead):
+    """When time has come to where it is, it is as much ahead as before."""
+    two = Two(lambda t: np.where(t >= 20, ahead, 0.0), lambda t: 0.0 * t)
+    assert two.lost.size == 0 and [move.by for move in two.made.moved] == [round(ahead * SECOND)]
+    assert two.off.max() < 1e-9
+
+
+@pytest.mark.parametrize("delay", [0.4, 3.0])
+def test_what_is_held_up_while_its_clock_comes_back_leaves_nothing_behind(delay):
+    """The step back is measured off by the delay. Only what was too long on its way is late; then all is as it was.
+
+    Where the delay is over, what was said in the seconds of it and what is said now come in turns, of two clocks to
+    all appearance: the one ahead is refused until the other has ended.
+    """
+    two = Two(lambda t: np.where((t >= 20) & (t < 40), HOUR, 0.0), lambda t: np.where((t >= 38) & (t < 55), delay, 0.0))
+    refused = len(two.made.refused)
+    assert 0 < refused <= 300 if delay == 3.0 else not refused
+    assert two.lost.size == two.made.stale + refused and np.all(two.late[two.lost] | (two.true[two.lost] >= 55))
+    assert not np.any(two.lost % 2) and two.off[two.true[two.kept] > 59].max() < 1e-9
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_clock_is_set_back_under_any_delays_and_only_what_was_late_is_stale(seed):
+    rng = np.random.default_rng(seed)
+    two = Two(lambda t: np.where((t >= 20) & (t < 50), -30.0, 0.0), lambda t: rng.exponential(0.8, t.size))
+    assert two.late.sum() > 500 and np.all(two.late[two.lost])
+    # The least of 200 delays is below 0.8 s / 200 times 7, but for one in a thousand.
+    assert len(two.made.moved) == 2 and two.off.max() <= 0.03
 
 
 @pytest.mark.parametrize("arrivals", [False, True])

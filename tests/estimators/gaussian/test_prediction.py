@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from estimators.fold import LONGEST, Fold, fold
+from estimators.fold import Fold, fold
+from estimators.interpreted.fold_loop import LONGEST
 from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS

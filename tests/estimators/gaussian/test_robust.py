@@ -173,7 +173,7 @@ def test_the_level_of_q_follows_the_nis_of_a_row(estimator):
     fold = folded(estimator, PLANE, [(3.0, -2.0)], {"adapt": 2, "memory": 50})
     H = np.array([[1.0, 0.5], [-1.0, 1.0]])
     nis = np.array([3.0, -2.0]) @ np.linalg.solve(H @ np.diag([4.0, 1.0]) @ H.T + np.diag([0.25, 0.5]), [3.0, -2.0])
-    np.testing.assert_allclose(fold._state[-1], 1.0 + (nis / 2 - 1.0) / 50, rtol=1e-12)
+    np.testing.assert_allclose(fold._now.state[-1], 1.0 + (nis / 2 - 1.0) / 50, rtol=1e-12)
 
 
 @pytest.mark.parametrize("robust", [1, 2])
@@ -214,7 +214,7 @@ def test_adaptation_recovers_a_wrong_r(estimator):
     for seed in range(runs):
         options = {"adapt": 1, "memory": MEMORY}
         fold = folded(estimator, model(q=q, r=1.0), simulated(seed, q, r), options)
-        found.append(fold._state[-1])
+        found.append(fold._now.state[-1])
         # What is in use is what the track shows: S = P + r.
         np.testing.assert_allclose(fold.track.innovation_std[-1, 0] ** 2, S, atol=5 * spread)
     assert abs(np.mean(found) - r) < 4 * spread / np.sqrt(runs)
@@ -230,7 +230,7 @@ def test_adaptation_recovers_a_wrong_q(estimator):
     runs = RUNS if estimator == "kf" else 3
     options = {"adapt": 2, "memory": MEMORY, "bound": 100.0}
     found = [
-        np.log(folded(estimator, model(q=0.1 * q, r=r), simulated(seed, q, r), options)._state[-1])
+        np.log(folded(estimator, model(q=0.1 * q, r=r), simulated(seed, q, r), options)._now.state[-1])
         for seed in range(runs)
     ]
     assert abs(np.mean(found) - np.log(10.0)) < 4 * spread / np.sqrt(runs)
@@ -241,13 +241,13 @@ def test_adaptation_recovers_a_wrong_q(estimator):
 @pytest.mark.parametrize(("tuned", "expected"), [(0.01, 0.1), (1000.0, 100.0)])
 def test_an_adapted_r_stays_within_its_bound(estimator, tuned, expected):
     fold = folded(estimator, model(q=0.04, r=tuned), simulated(0, 0.04, 4.0), {"adapt": 1, "memory": 50})
-    np.testing.assert_allclose(fold._state[-1], expected, rtol=1e-14)
+    np.testing.assert_allclose(fold._now.state[-1], expected, rtol=1e-14)
 
 
 @pytest.mark.parametrize(("tuned", "expected"), [(1e-4, 10.0), (1e3, 0.1)])
 def test_an_adapted_q_stays_within_its_bound(estimator, tuned, expected):
     fold = folded(estimator, model(q=tuned, r=1.0), simulated(0, 1.0, 1.0), {"adapt": 2, "memory": 50})
-    np.testing.assert_allclose(fold._state[-1], expected, rtol=1e-14 if expected == 10.0 else 0.2)
+    np.testing.assert_allclose(fold._now.state[-1], expected, rtol=1e-14 if expected == 10.0 else 0.2)
 
 
 def test_only_readings_that_were_used_adapt(estimator):
@@ -257,7 +257,7 @@ def test_only_readings_that_were_used_adapt(estimator):
     fold = folded(estimator, model(q=0.01), values, options, gate=0.99)
     assert list(fold.track.verdict[[0, 3]]) == [USED, GATED]
     fold_without = folded(estimator, model(q=0.01), [0.1, np.nan, 0.2, np.nan, 0.3], options, gate=0.99)
-    np.testing.assert_array_equal(fold._state, fold_without._state)
+    np.testing.assert_array_equal(fold._now.state, fold_without._now.state)
     tuning = Tuning.of(model()).with_options(options).set("use.y", False)
     held_out = Fold(estimator, model(), tuning, readings_of([0.5, 9.0]))
     held_out.advance()
@@ -281,7 +281,7 @@ def test_each_row_has_its_own_variance():
     tuning = Tuning.of(matrices.model).with_options({"adapt": 1, "memory": 500, "bound": 30})
     fold = Fold("ekf", matrices.model, tuning, log)
     fold.advance()
-    ratio = fold._state[-6:] / np.concatenate(matrices.R)
+    ratio = fold._now.state[-6:] / np.concatenate(matrices.R)
     expected = np.array([1.0, 1.0, 1.0, 1.0, 9.0, 1.0])
     S = fold.track.innovation_std
     for row, (sensor, column) in enumerate([(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]):
@@ -311,14 +311,14 @@ def test_pieces_and_rewinds_do_not_matter(estimator, options):
 def test_a_reset_forgets(estimator):
     options = {"adapt": 1, "memory": 10}
     fold = folded(estimator, model(q=0.01), [0.0, 3.0, -4.0], options)
-    assert fold._state[-1] != R
+    assert fold._now.state[-1] != R
     from estimators.log import RESET
 
     log = readings_of([0.0, 3.0, -4.0])
     log.extend(Events.one(5 * SECOND, 0, RESET, 0, [], 1))
     fold = Fold(estimator, model(q=0.01), Tuning.of(model(q=0.01)).with_options(options), log)
     fold.advance()
-    np.testing.assert_array_equal(fold._state[-2:], [R, R])
+    np.testing.assert_array_equal(fold._now.state[-2:], [R, R])
 
 
 def test_joseph_and_the_short_form_agree_where_both_hold():

@@ -110,7 +110,7 @@ WRONG = {
     "R of zero": (lambda log: fold("kf", MOTOR, log, R={"winding": 0.0}), "a variance must be positive"),
     "a held out name": (lambda log: fold("kf", MOTOR, log, held_out="gnss"), "use.gnss"),
     "a filter": (lambda log: fold("ufk", MOTOR, log), "did you mean ukf"),
-    "an option": (lambda log: fold("ukf", MOTOR, log, alhpa=0.5), "no option 'alhpa'; it has alpha"),
+    "an option": (lambda log: fold("ukf", MOTOR, log, alhpa=0.5), "no option 'alhpa'; did you mean alpha?"),
     "a word for an option": (
         lambda log: fold("pf", MOTOR, log, resampling="stratifed"),
         "resampling is 'stratifed'; it must be one of .*stratified",

@@ -151,7 +151,7 @@ def test_a_covariance_without_a_factor_fails_and_is_no_exception():
     events.extend(Events.one(SECOND, 0, READING, 0, [0.5], 2))
     fold_ = Fold("filterpy-ukf", PENDULUM, Tuning.of(PENDULUM), events)
     fold_.advance(1)
-    fold_._state[3:] = -np.eye(3).ravel()
+    fold_._now.state[3:] = -np.eye(3).ravel()
     fold_.advance()
     assert np.all(np.isnan(fold_.track.mean[1]))
     assert fold_.track.verdict[1] == FAILED

@@ -89,7 +89,7 @@ def test_a_field_is_folded_and_scored_by_its_shown_cells():
     fold = Fold("ensrf", model, tuning, log)
     fold.advance()
     mean, variances = fold.moments()
-    X = fold._state[: 30 * model.nx].reshape(30, model.nx)
+    X = fold._now.state[: 30 * model.nx].reshape(30, model.nx)
     np.testing.assert_allclose(mean, X.mean(0), rtol=1e-12)
     np.testing.assert_allclose(variances, X.var(0, ddof=1)[None], rtol=1e-9)
     np.testing.assert_allclose(fold.track.std[-1], np.sqrt(variances[0, model.shown]), rtol=1e-9)

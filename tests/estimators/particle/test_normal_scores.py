@@ -49,7 +49,7 @@ def test_scores_are_those_of_the_predicted_mixture(name):
     for k in range(growing.log.n):
         if growing.log.kind[k] == READING:
             sensor = int(growing.log.channel[k])
-            w, records = weights_of(growing.options, growing._state, model.nx)
+            w, records = weights_of(growing.options, growing._now.state, model.nx)
             H, y = MATRICES.H[sensor], growing.log.value[k, : ROWS[sensor]]
             P = records[:, model.nx :].reshape(len(w), -1, model.nx) if records.shape[1] > model.nx else None
             variances = np.tile(MATRICES.R[sensor], (len(w), 1))
@@ -76,7 +76,7 @@ def test_scores_of_the_rao_blackwellised_filter():
     events = [(1.0 * k, READING, rng.normal(1.5 * k, 1.0), sensor) for k in range(1, 8) for sensor in (0, 1)]
     growing = Fold("rbpf", model, Tuning.of(model).with_options({"particles": 40}), log_of(model.width, *events))
     for k in range(growing.log.n):
-        w, records = weights_of(growing.options, growing._state.copy(), model.nx)
+        w, records = weights_of(growing.options, growing._now.state.copy(), model.nx)
         growing.advance(1)
         if k % 2:
             x, P = records[:, :3], records[:, 3:].reshape(-1, 3, 3)
@@ -192,7 +192,7 @@ def test_ancestors_are_those_that_a_constant_tells(name):
     growing = Fold(name, model, Tuning.of(model).with_options({"particles": 300}), log)
     # The auxiliary filter resamples before it counts, the others after.
     growing.advance(20 if name == "apf" else 19)
-    constants = len(np.unique(weights_of(growing.options, growing._state, 2)[1][:, 1]))
+    constants = len(np.unique(weights_of(growing.options, growing._now.state, 2)[1][:, 1]))
     growing.advance()
     assert 1 < constants < 300
     assert np.all(growing.track.ancestors[:19] == 300) and np.all(growing.track.ancestors[19:] == constants)
@@ -208,7 +208,7 @@ def test_effective_sample_size_before_resampling():
         log_of(1, (0.0, READING, 2.2, 0), (0.0, READING, 2.4, 1)),
     )  # fmt: skip
     growing.advance(1)
-    w, records = weights_of(growing.options, growing._state.copy(), 1)
+    w, records = weights_of(growing.options, growing._now.state.copy(), 1)
     growing.advance()
     w = w * np.exp(-0.5 * (growing.log.value[1, 0] - records[:, 0]) ** 2 / 0.04)
     assert growing.track.effective[1] == pytest.approx(w.sum() ** 2 / np.sum(w**2), rel=1e-10)

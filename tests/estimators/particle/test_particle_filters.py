@@ -356,11 +356,11 @@ def test_snapshots_of_large_states_keep_to_their_memory(monkeypatch):
     tuning = Tuning.of(model).with_options({"particles": 500})
     plain = Fold("pf", model, tuning, log)
     plain.advance()
-    monkeypatch.setattr("estimators.snapshots.MEMORY", 10 * plain._state.nbytes)
+    monkeypatch.setattr("estimators.snapshots.MEMORY", 10 * plain._now.state.nbytes)
     small = Fold("pf", model, tuning, log)
     small.advance()
     assert len(plain._snapshots._kept) > 20
-    assert sum(kept.state.nbytes for kept in small._snapshots._kept.values()) <= 12 * plain._state.nbytes
+    assert sum(kept.state.nbytes for kept in small._snapshots._kept.values()) <= 12 * plain._now.state.nbytes
     small.rewind(2000)
     assert small.n <= 2000
     small.advance()

@@ -139,11 +139,11 @@ source:
     [
         ("{sensor: windin, kind: stuck}", "sensor is 'windin', no sensor of motor_winding; "),
         ("{sensor: winding, row: x, kind: stuck}", "row is 'x', no row of winding; "),
-        ("{sensor: winding, kind: stuk}", "kind is 'stuk'; it must be 'bias'"),
-        ("{sensor: winding, kind: bias}", "is of kind bias and has no size"),
-        ("{sensor: winding, kind: outliers, size: 3}", "is of kind outliers and has no rate"),
+        ("{sensor: winding, kind: stuk}", "faults[0].kind is 'stuk'; did you mean stuck?"),
+        ("{sensor: winding, kind: bias}", "size is missing; a fault of kind bias needs it"),
+        ("{sensor: winding, kind: outliers, size: 3}", "rate is missing; a fault of kind outliers needs it"),
         ("{sensor: winding, kind: stuck, size: 3}", "size means nothing to a fault of kind stuck; leave it out"),
-        ("{sensor: winding, kind: stuck, start: 4, end: 3}", "end is 3.0 s; it must be above start"),
+        ("{sensor: winding, kind: stuck, start: 4, end: 3}", "end is 3 s; it must be above start"),
     ],
 )
 def test_the_yaml_says_what_is_wrong_with_a_fault(tmp_path, fault, text):

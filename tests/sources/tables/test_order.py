@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from estimators.errors import SourceError
 from estimators.log import READING, Log
-from sources.source import Channel
+from sources.source import WRONG_TIME, Channel
 from sources.tables.order import BACKWARDS, MANY, STANDING, Order
 from sources.tables.table import Table
 from tests.sources.can.can_tools import Reports
@@ -80,3 +81,40 @@ def test_files_in_a_wrong_order_are_told_with_both(tmp_path):
     read_all(Table(files, time_column="t", time_unit="s", channels=X, width=1, report=reports, horizon=2.0))
     assert reports.counts == {BACKWARDS: 1}
     assert reports.texts[BACKWARDS].startswith("b.csv:2: t is 104 s before that of a.csv:6, more than")
+
+
+def read_table(tmp_path, t):
+    """What comes of a table with these times (s) and the row's number in x: numbers that came, and what was told."""
+    path = tmp_path / "pump.csv"
+    path.write_text("t,x\n" + "".join(f"{s:.3f},{k}\n" for k, s in enumerate(t)))
+    reports = Reports()
+    batch = read_all(Table([path], time_column="t", time_unit="s", channels=X, width=1, report=reports, horizon=2.0))
+    return batch.value[:, 0].astype(int).tolist(), reports
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+def test_a_first_time_ahead_of_all_others_is_the_one_that_is_left_out(tmp_path, rows):
+    came, reports = read_table(tmp_path, [3600.0] * rows + [*np.arange(600) * 0.5])
+    assert came == list(range(rows, rows + 600)) and reports.counts == {WRONG_TIME: 1}
+    text = reports.texts[WRONG_TIME]
+    assert text.startswith(f"pump.csv:2: t is 3600 s after that of pump.csv:{rows + 2} and of all that follow; ")
+
+
+@pytest.mark.parametrize(
+    "t", [[5.0, 0, 1, 2, 6, 7], [1.9, 0, 1, 1.5], [0, 3600, 1, 2, 3.0], [50, 51, 0, 1, 2, 3.0], [9.0, 1, 0, 2, 3]]
+)
+def test_what_may_be_right_is_kept(tmp_path, t):
+    """It is reached again, is within the horizon, is not the first, not alone, or what follows has no order either."""
+    came, reports = read_table(tmp_path, t)
+    assert came == list(range(len(t))) and WRONG_TIME not in reports.counts
+
+
+@pytest.mark.parametrize("rows", [20, 9000])
+def test_a_table_whose_newest_row_comes_first_is_refused_in_one_line(tmp_path, rows):
+    with pytest.raises(SourceError) as error:
+        read_table(tmp_path, np.repeat(np.arange(rows)[::-1] * 0.5, 2))
+    text = str(error.value)
+    assert text.startswith("pump.csv:4: t is 0.5 s before that of the row above") and text.endswith(
+        "sort the rows by t"
+    )
+    assert "\n" not in text

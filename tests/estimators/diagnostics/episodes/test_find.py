@@ -1,16 +1,28 @@
 """Episodes of one fault each, put into readings that were in order: who, what, from when to when, in words."""
 
 import json
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from estimators.diagnostics.episodes import CAUSES, JOINED, Episode, course_of, episode_json, episodes, found_in
-from estimators.diagnostics.evidence import IMPOVERISHED, LOW, NARROW
+from estimators.diagnostics.evidence import (
+    BITS,
+    IMPOVERISHED,
+    NARROW,
+    SHIFTED_DOWN,
+    SHIFTED_UP,
+    SPIKY,
+    STUCK,
+    no_baseline,
+)
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold
 from estimators.log import INPUT, READING, TICK, TRUTH, Events
 from estimators.model.state_space import Input, Noise, Row, Sensor, State, StateSpaceModel
+from estimators.track import DIVERGED, GATED, TRACKING, USED
 from estimators.tuning import Tuning
 from tests.support import SECOND, as_log
 
@@ -131,7 +143,7 @@ SENSORS = {
         {"gauge": lambda x, z, rng: x + 5.0 + 0.2 * z, "gate": 0.9999},
         ("gauge", "", 0.99, 1.0),
         "gauge is refused by the gate since",
-        "(100 % of its readings): the sensor is wrong, or the twin is; Reset, or hold gauge out",
+        "(100 % of its readings): the sensor is wrong, or the twin is; hold gauge out to see whether the others agree",
     ),
     "stuck": (
         {"gauge": lambda x, z, rng: np.full_like(x, 0.125)},
@@ -170,6 +182,12 @@ def test_one_fault_of_a_sensor_is_one_episode(cause):
     for part in words:
         assert part in each.text
     assert "\n" not in each.text and each.text[-1] != "."
+
+
+def test_one_that_lasts_for_more_readings_than_its_size_is_made_of_ends_where_it_ended(monkeypatch):
+    monkeypatch.setattr("estimators.diagnostics.episodes.sensors.LOOKED_AT", 60)
+    (each,) = (item for item in episodes(folded(**SENSORS["narrow"][0])) if item.subject == "gauge")
+    assert each.end is not None and abs(each.end - END) <= FAR
 
 
 @pytest.mark.parametrize("cause", ["refused", "stuck"])
@@ -304,8 +322,39 @@ def test_episodes_of_several_bits_are_one():
     course = course_of(folded())
     track = course.track.copy()
     rows = np.flatnonzero((course.events.kind == READING) & (course.events.channel == 1))
-    track.alarms[rows[100:120], 0], track.alarms[rows[110:130], 3] = NARROW, LOW
+    track.alarms[rows[100:120], 0], track.alarms[rows[110:130], 3] = NARROW, SHIFTED_DOWN
     assert len(found_in(course._replace(track=track))) == 1
+
+
+def test_a_noisy_sensor_that_rests_for_a_while_is_not_stuck():
+    """It is what it was for most of its alarms: 170 s too noisy, then 30 s of one value."""
+
+    def change(x, z, rng):
+        y = x + 0.6 * z
+        y[170:] = y[170]
+        return y
+
+    fold = folded(gauge=change)
+    rows = np.flatnonzero((fold.log.kind[: fold.n] == READING) & (fold.log.channel[: fold.n] == 0))
+    assert np.any(fold.track.alarms[rows, 0] & STUCK)
+    assert [each.cause for each in episodes(fold) if each.subject == "gauge"] == ["narrow"]
+
+
+def test_what_was_normal_is_no_cause_unless_its_test_spoke():
+    """Spikes of 6 σ, one reading in 15, as always; from BEGIN on 1 σ more."""
+    course = course_of(folded())
+    track, rng = course.track.copy(), np.random.default_rng(1)
+    rows = np.flatnonzero((course.events.kind == READING) & (course.events.channel == 0))
+    e = rng.standard_normal(N)
+    e[::15] = 6.0 * rng.choice([-1.0, 1.0], e[::15].shape)
+    e[BEGIN:END] += 1.0
+    track.innovation[rows, 0] = e * track.innovation_std[rows, 0]
+    track.alarms[rows[BEGIN + 20 : END], 0] = SHIFTED_UP
+    baseline = no_baseline(MODEL)
+    baseline[0, 3:][BITS & (SPIKY | NARROW) != 0] = 1e4
+    for normal, cause in ((None, "spiky"), (baseline, "shifted")):
+        own = course._replace(track=track, tuning=replace(course.tuning, baseline=normal))
+        assert [item.episode.cause for item in found_in(own)] == [cause]
 
 
 # For scripts
@@ -322,3 +371,62 @@ def test_numbers_are_those_of_python():
     for cause in ("shifted", "stuck"):
         for each in episodes(folded(**SENSORS[cause][0])):
             assert {type(value) for value in each} <= {float, str, type(None)}
+
+
+def cut(until, **faults):
+    """A course that is known only up to a second of the log."""
+    course = course_of(folded(**faults))
+    n = int(np.searchsorted(course.events.t, until * SECOND, side="right"))
+    return course._replace(events=course.events.select(slice(0, n)), track=course.track.select(slice(0, n)))
+
+
+def test_what_is_back_to_normal_is_said_while_the_slowest_test_still_falls():
+    """After a shift of 5 σ that of 0.2 σ falls for hundreds of readings; its end shows in a few."""
+    fault = {"gauge": lambda x, z, rng: x + 0.2 * z + 1.5}
+    for until in (*range(BEGIN + 20, END, 20), END):
+        (each,) = [item.episode for item in found_in(cut(until, **fault)) if item.key == ("sensor", "gauge")]
+        assert each.end is None and "back to normal" not in each.text, until
+    course = cut(END + 15, **fault)
+    gauge = np.flatnonzero((course.events.kind == READING) & (course.events.channel == 0))
+    assert course.track.alarms[gauge[-1], 0] != 0
+    (each,) = [item.episode for item in found_in(course) if item.key == ("sensor", "gauge")]
+    since = float(re.search(r"; back to normal since ([\d.]+) s: the alarm goes", each.text)[1])
+    # The filter has followed by 4 of the 5 σ, so that the last readings of the fault look much like those after it.
+    assert each.end is None and abs(since - END) <= 15
+
+
+def test_a_reset_is_advised_only_when_no_sensor_is_off():
+    """The estimate is lost while two sensors are refused, then while one is, then with all in order."""
+    fault = {"gauge": lambda x, z, rng: x + 9.0, "chain": lambda x, z, rng: x + 9.0 + 0.1 * z, "gate": 0.9999}
+    course = course_of(folded(**fault))
+
+    def text(verdicts):
+        track = course.track.copy()
+        n = int(np.searchsorted(course.events.t, (BEGIN + 60) * SECOND))
+        track.alarms[:], track.health[:n] = 0, TRACKING
+        track.health[n - 40 : n] = DIVERGED
+        kind, channel = course.events.kind[:n], course.events.channel[:n]
+        for s, verdict in enumerate(verdicts):
+            track.verdict[:n][(kind == READING) & (channel == s)] = verdict
+        part = course._replace(events=course.events.select(slice(0, n)), track=track.select(slice(0, n)))
+        return only([item.episode for item in found_in(part)], "diverged").text
+
+    remedy = "out first, one by one, and Reset when the rest agrees"
+    assert text((GATED, GATED)).endswith(f"and gauge, chain contradict it still: hold them {remedy}")
+    assert text((USED, GATED)).endswith(f"and chain contradicts it still: hold it {remedy}")
+    assert text((USED, USED)).endswith("Reset starts again from the prior; then look at which sensor spoke first")
+
+
+def test_a_sensor_that_moves_again_is_not_said_to_be_stuck_only():
+    """Its episode lasts while other alarms of it follow: here its noise is tenfold after the hundred equal readings."""
+
+    def gauge(x, z, rng):
+        return np.where(np.arange(END - BEGIN)[:, None] < 100, x[0], x + 2.0 * z)
+
+    course = cut(BEGIN + 50, gauge=gauge)
+    (each,) = [item.episode for item in found_in(course) if item.key == ("sensor", "gauge")]
+    assert each.cause == "stuck" and "again" not in each.text
+    course = cut(BEGIN + 150, gauge=gauge)
+    (each,) = [item.episode for item in found_in(course) if item.key == ("sensor", "gauge")]
+    assert each.cause == "stuck" and each.end is None
+    assert each.text.endswith(f"it moves again since {BEGIN + 101}.0 s")

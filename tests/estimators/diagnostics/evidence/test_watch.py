@@ -84,6 +84,27 @@ def white(e):
     return log_normal(e, 0.0, 1.0)
 
 
+GAINS, FADING = (0.2, 0.5), 0.95
+"""Of filters that follow noise: e is (1 - fading L) / (1 - (1 - gain) L) of white noise, at unit variance."""
+
+
+class Follower:
+    """log Λ of the innovations of a filter that follows noise: an ARMA(1, 1) by its noise, found from all e before."""
+
+    def __init__(self, gain):
+        self.gain, self.noise, self.e = gain, 0.0, 0.0
+        # Its impulse response, summed by force, gives the variance of e.
+        h = [1.0]
+        for _ in range(500):
+            h.append((1.0 - gain) * h[-1] - (FADING if len(h) == 1 else 0.0))
+        self.variance = 1.0 / sum(x * x for x in h)
+
+    def ratio(self, e):
+        expected = (1.0 - self.gain) * self.e - FADING * self.noise
+        self.noise, self.e = e - expected, e
+        return log_normal(e, expected, self.variance) - white(e)
+
+
 def mixed(e, share):
     return math.log(share * math.exp(log_normal(e, 0.0, 25.0)) + (1.0 - share) * math.exp(white(e)))
 
@@ -93,15 +114,18 @@ def bank_of_a_row():
     for v in (1.5, 2.5, 6.0, 0.6, 0.3, 0.05):
         yield ("narrow" if v > 1 else "wide"), lambda e, _, v=v: log_normal(e, 0.0, v) - white(e)
     for m in (0.2, 0.5, 1.5, -0.2, -0.5, -1.5):
-        yield ("high" if m > 0 else "low"), lambda e, _, m=m: log_normal(e, m, 1.0) - white(e)
+        yield ("shifted up" if m > 0 else "shifted down"), lambda e, _, m=m: log_normal(e, m, 1.0) - white(e)
     for phi in (0.25, 0.6, -0.25, -0.6):
         cause = "correlated" if phi > 0 else "alternating"
         yield cause, lambda e, last, phi=phi: log_normal(e, phi * last, 1.0 - phi**2) - white(e)
+    for _ in GAINS:
+        yield "alternating", None  # of all e before: see Follower
     for share in (0.03, 0.003):
         yield "spiky", lambda e, _, share=share: mixed(e, share) - white(e)
 
 
 OF_INNOVATIONS = tuple(bank_of_a_row())
+FIRST_GAIN = next(k for k, (_, ratio) in enumerate(OF_INNOVATIONS) if ratio is None)
 PER_ROW = len(OF_INNOVATIONS) + 2
 N_TESTS = 4 * PER_ROW + 6
 
@@ -127,6 +151,7 @@ class RowOracle:
 
     def forget(self):
         self.tests = [Cusum(cause) for cause, _ in OF_INNOVATIONS]
+        self.followers = {FIRST_GAIN + k: Follower(gain) for k, gain in enumerate(GAINS)}
         self.refusals, self.repetition = Cusum("refused"), Cusum("stuck")
         self.raw = self.before = None
         self.calm = 0
@@ -141,6 +166,9 @@ class RowOracle:
         self.calm = 0 if abs(white) > 3.5 else self.calm + 1
         said = set()
         for k, (test, (cause, ratio)) in enumerate(zip(self.tests, OF_INNOVATIONS, strict=True)):
+            if k in self.followers:
+                said |= test.put(self.followers[k].ratio(white), h, self.base[3 + k], self.said)
+                continue
             if self.before is None and cause in ("correlated", "alternating"):
                 continue
             last = 0.0 if self.before is None else self.before
@@ -192,7 +220,10 @@ class SensorOracle:
         if n <= 16 or math.log2(n).is_integer():
             readings = POLICY.false_alarm_every / max(period, 1e-3)
             self.h = math.log(max(readings, 8.0) * N_TESTS)
-        self.due = now + max(POLICY.silent_periods * period, 2.0 * self.longest) if n > 2 else math.inf
+        patience = POLICY.silent_periods * period
+        if n < 16:
+            patience = max(patience, min(patience * 16 / n, POLICY.stale_after))
+        self.due = now + max(patience, 2.0 * self.longest) if n > 2 else math.inf
         self.silent = False
 
     def scale(self, nis, dof):
@@ -417,6 +448,28 @@ def test_pieces_and_late_arrivals_change_nothing(seed, pieces, late):
         at, turn = end, turn + 1
     growing.advance()
     assert_same(growing.track, whole.track)
+
+
+def silent_rows(t):
+    """At which of some times sensor `one`, which speaks at t (s), is silent for the twin, which is asked at 100 Hz."""
+    ticks = np.arange(0.0, 15.0, 0.01)
+    batch = [Events.one(round(s * SECOND), 0, READING, 0, (0.0,), MODEL.width) for s in t]
+    batch += [Events.one(round(s * SECOND), 0, TICK, 0, (), MODEL.width) for s in ticks]
+    log = as_log(Events.concat(batch, MODEL.width))
+    track = fold("kf", MODEL, Tuning.of(MODEL), log, policy=POLICY)
+    return log.t[: log.n][track.flags & 1 != 0] / SECOND
+
+
+@pytest.mark.parametrize("hasty", [0.004, 0.01, 0.02])
+def test_a_sensor_that_begins_in_haste_is_not_silent_when_it_finds_its_pace(hasty):
+    """Three readings that come together, then ten a second."""
+    assert silent_rows([0.0, hasty, 2 * hasty, *np.arange(1, 160) * 0.1]).size == 0
+
+
+@pytest.mark.parametrize(("n", "after"), [(3, 0.1 * 6 * 16 / 3), (5, 0.1 * 6 * 16 / 5), (16, 0.6), (100, 0.6)])
+def test_a_sensor_that_ends_early_is_silent_all_the_same(n, after):
+    silent = silent_rows(np.arange(n) * 0.1)
+    assert 0.0 < silent[0] - (n - 1) * 0.1 - after <= 0.01 + 1e-9 and np.all(np.diff(silent) < 0.011)
 
 
 # The state machine

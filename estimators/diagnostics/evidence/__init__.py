@@ -1,0 +1,63 @@
+"""Evidence against the filter: a bank of sequential tests on the standardised innovations of every sensor row."""
+
+from .alarms import (
+    AGREEING,
+    ALTERNATING,
+    CAUSES,
+    CORRELATED,
+    DISAGREEING,
+    IMPOVERISHED,
+    LOST,
+    MISSED,
+    NARROW,
+    OUTSIDE,
+    REFUSED,
+    SENSORS,
+    SHIFTED_DOWN,
+    SHIFTED_UP,
+    SPIKY,
+    STUCK,
+    TRUTH_MISSED,
+    WIDE,
+)
+from .bank import causes_now, chances_of, fresh, heard_last, no_baseline, normal_nis, threshold_of, watched
+from .hypotheses import BITS, FURTHEST, RATIOS, SHIFTS, TESTS
+from .row_tests import highest
+from .watch import PATIENCE, watch_rows
+
+__all__ = [
+    "AGREEING",
+    "ALTERNATING",
+    "BITS",
+    "CAUSES",
+    "CORRELATED",
+    "DISAGREEING",
+    "FURTHEST",
+    "SHIFTED_UP",
+    "IMPOVERISHED",
+    "LOST",
+    "SHIFTED_DOWN",
+    "MISSED",
+    "NARROW",
+    "OUTSIDE",
+    "PATIENCE",
+    "RATIOS",
+    "REFUSED",
+    "SENSORS",
+    "SHIFTS",
+    "SPIKY",
+    "STUCK",
+    "TESTS",
+    "TRUTH_MISSED",
+    "WIDE",
+    "causes_now",
+    "chances_of",
+    "fresh",
+    "heard_last",
+    "highest",
+    "no_baseline",
+    "normal_nis",
+    "threshold_of",
+    "watch_rows",
+    "watched",
+]

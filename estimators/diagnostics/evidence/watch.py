@@ -1,0 +1,260 @@
+"""Watching: each new row of a track is put to the tests, and gets its alarms, its flags and the health of the twin."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...compiled.context import circular_states, sensor_rows, sensor_variances
+from ...log import INPUT, READING, RESET, TRUTH
+from ...numerics.jit import borrowed, borrowed_rows, floats, inlined, ints, jit
+from ...numerics.linalg import wrap
+from ...track import (
+    DEGRADED,
+    DIVERGED,
+    DUPLICATE,
+    FAILED,
+    GATED,
+    SCREENED,
+    STALE,
+    SUSPECT,
+    TRACKING,
+    USED,
+    WAITING,
+    borrowed_columns,
+)
+from .alarms import AGREEING, DISAGREEING, IMPOVERISHED, LOST, MISSED, OUTSIDE, REFUSED, SENSORS, STUCK, TRUTH_MISSED
+from .bank import (
+    BEGUN,
+    DUE,
+    HEARD,
+    LOST_ROWS,
+    MASK,
+    MISSED_STATES,
+    NEXT_DUE,
+    POOR,
+    POOR_CLOUD,
+    ROW,
+    SENSOR,
+    SILENT,
+    SILENT_SENSORS,
+    STATE,
+    SUSPECT_ROWS,
+    THRESHOLD,
+    TOGETHER,
+    TWIN,
+    forget,
+    row_part,
+    sensor_part,
+)
+from .hypotheses import AT_REFUSALS, TESTS
+from .row_tests import add, alarm, repeat, weigh, weigh_together
+from .silence import listen, note_time
+
+MISSES, MISSES_NO_MORE = 4.5, 3.0
+"""Root mean square of (estimate - truth) / σ, over about `TOLD` tellings, from which a truth is missed, and no more."""
+
+TOLD = 10
+
+FEW_PARTICLES = 4.0
+"""Effective sample size below which a cloud is poor; it is too if all of it descends from one particle."""
+
+PATIENCE = 60
+"""Readings more, poor than not, from which a cloud is impoverished; it is no more at half as many. Three times as many
+as lie between two counts of ancestors: of a sound cloud a count may be 1 by chance, hardly three in a row."""
+
+
+@jit
+def _miss(own, z, before):
+    """Whether the truth of a state is missed, after another error of z standard deviations."""
+    own[1] = min(own[1] + 1.0, TOLD)
+    own[0] += (min(z * z, 1e4) - own[0]) / own[1]
+    if own[1] == TOLD and own[0] > MISSES * MISSES:
+        return MISSED
+    return MISSED if before and own[0] > MISSES_NO_MORE * MISSES_NO_MORE else 0
+
+
+@inlined
+def _is_copy(i, track):
+    """Whether a reading came before: the copies that a gateway makes say nothing for or against anyone."""
+    for k in range(track.screened.shape[1]):
+        if track.screened[i, k] & DUPLICATE != 0:
+            return True
+    return False
+
+
+@jit
+def _hear(i, now, y, s, context, policy, state, track):
+    """Put a reading y of sensor s, and the variances that it may have brought, to all tests."""
+    width = track.alarms.shape[1]
+    sensors = context.n_sensors
+    chances = floats(context.chances, 2)
+    variances = sensor_variances(context, s)
+    first, count = sensor_rows(context, s)
+    own = sensor_part(state, s)
+    state[SILENT_SENSORS] -= own[SILENT]
+    note_time(own, now, policy.false_alarm_every, context.n_tests, policy)
+    state[NEXT_DUE] = min(state[NEXT_DUE], own[DUE])
+    h = own[THRESHOLD]
+    verdict = track.verdict[i]
+    judged = verdict == USED or verdict == GATED
+    together = 0
+    base = floats(context.baseline + 8 * first * (3 + TESTS), 3)
+    white = base[0] == 0.0 and base[1] == 1.0 and base[2] == 0.0
+    if judged and context.marginal == 0 and count > 1 and white:
+        together = weigh_together(own, track.nis[i], track.dof[i], h, int(own[TOGETHER]))
+        own[TOGETHER] = together
+    for k in range(count):
+        if not np.isfinite(y[k]):
+            continue
+        row = first + k
+        each = row_part(state, sensors, row)
+        before = int(each[MASK])
+        base = floats(context.baseline + 8 * row * (3 + TESTS), 3 + TESTS)
+        r = variances[k]
+        if width + k < y.size and np.isfinite(y[width + k]):
+            r = y[width + k]
+        mask = before & ~STUCK | repeat(each, y[k], r, h, base, before)
+        screened = track.screened[i, k] != 0
+        if judged or verdict == FAILED or screened:
+            ratio = chances[1] if verdict == USED and not screened else chances[0]
+            said = add(each, AT_REFUSALS, ratio, h, base[3 + AT_REFUSALS])
+            mask = mask & ~REFUSED | alarm(said, REFUSED, before)
+        if judged and not screened:
+            # A prediction that is not Gaussian says nothing where its distribution function is not known.
+            e = track.whitened[i, k]
+            if context.marginal == 0:
+                e = track.innovation[i, k] / track.innovation_std[i, k]
+            if np.isfinite(e):
+                mask = mask & LOST | weigh(each, e, h, base, before)
+        if k == 0:
+            mask = mask & ~(DISAGREEING | AGREEING) | int(own[TOGETHER])
+        each[MASK] = mask
+        track.alarms[i, k] = mask
+        state[SUSPECT_ROWS] += (mask != 0) - (before != 0)
+        state[LOST_ROWS] += (mask & LOST != 0) - (before & LOST != 0)
+
+
+@jit
+def _count_particles(effective, ancestors, state):
+    """Whether a cloud is impoverished, after another reading that it used."""
+    if effective < FEW_PARTICLES or ancestors < 2.0:
+        state[POOR] = min(state[POOR] + 1.0, float(PATIENCE))
+    else:
+        state[POOR] = max(state[POOR] - 1.0, 0.0)
+    if state[POOR] == PATIENCE:
+        state[POOR_CLOUD] = 1.0
+    elif state[POOR] <= PATIENCE // 2:
+        state[POOR_CLOUD] = 0.0
+
+
+@jit
+def _tell(i, first, truth, context, state, track):
+    """Compare the estimate with the truth of some states, from `first` on."""
+    begin = TWIN + context.n_sensors * SENSOR + context.n_rows * ROW
+    columns, circular = ints(context.column, context.nx), circular_states(context)
+    for k in range(truth.size):
+        if not np.isfinite(truth[k]):
+            continue
+        column = columns[first + k]
+        if column < 0 or not track.std[i, column] > 0.0:
+            continue
+        error = track.mean[i, column] - truth[k]
+        if circular[first + k] != 0:
+            error = wrap(error)
+        own = floats(state.ctypes.data + 8 * (begin + column * STATE), STATE)
+        before = own[2] != 0.0
+        missed = _miss(own, error / track.std[i, column], before)
+        own[2] = missed
+        track.alarms[i, k] = missed
+        state[MISSED_STATES] += (missed != 0) - before
+
+
+@jit
+def _range(i, u, context, track):
+    """Whether a state, or an input that holds, is outside the range in which the model was fitted."""
+    states = track.mean.shape[1]
+    ranges = floats(context.ranges, 2 * (states + u.size))
+    for k in range(states + u.size):
+        value = track.mean[i, k] if k < states else u[k - states]
+        if value < ranges[2 * k] or value > ranges[2 * k + 1]:
+            return True
+    return False
+
+
+@jit
+def _health(i, now, silent, flags, state, policy, track):
+    """The state of the twin after an event."""
+    finite = True
+    for j in range(track.mean.shape[1]):
+        finite &= np.isfinite(track.mean[i, j]) & np.isfinite(track.std[i, j])
+    if not finite:
+        return DIVERGED
+    if state[HEARD] == 0.0:
+        return STALE if now - state[BEGUN] > policy.stale_after else WAITING
+    if track.age[i] > policy.stale_after:
+        return STALE
+    if track.consistency[i] == DIVERGED:
+        return DIVERGED
+    if track.age[i] > policy.degraded_after or silent != 0 or state[LOST_ROWS] > 0.0:
+        return DEGRADED
+    if state[SUSPECT_ROWS] > 0.0 or flags != 0:
+        return SUSPECT
+    return TRACKING
+
+
+@jit
+def watch_rows(first, last, t, kind, channel, value, context, policy, state, track):
+    """Fill alarms, flags and health of rows `first` to `last` of a track, whose other columns are there.
+
+    `state` moves on with them, as a filter's state does with the events, so the outcome does not depend on how a fold
+    was cut into pieces.
+    """
+    sensors, rows, nu = context.n_sensors, context.n_rows, context.nu
+    track = borrowed_columns(track)
+    value = borrowed_rows(value)
+    state = borrowed(state)
+    width = track.alarms.shape[1]
+    expected = ints(context.expected, sensors)
+    u = floats(state.ctypes.data + 8 * (state.size - nu), nu)
+    for i in range(first, last):
+        now = t[i] * 1e-9
+        if not np.isfinite(state[BEGUN]):
+            state[BEGUN] = now
+            for s in range(sensors):
+                if expected[s] != 0:
+                    sensor_part(state, s)[DUE] = now + policy.stale_after
+            state[NEXT_DUE] = now + policy.stale_after
+        for k in range(width):
+            track.alarms[i, k] = 0
+        if kind[i] == READING:
+            if track.verdict[i] != SCREENED:
+                state[HEARD] = 1.0
+            if not _is_copy(i, track):
+                y = floats(value[i:].ctypes.data, value.shape[1])
+                _hear(i, now, y, channel[i], context, policy, state, track)
+            if np.isfinite(track.effective[i]):
+                _count_particles(track.effective[i], track.ancestors[i], state)
+        elif kind[i] == TRUTH:
+            truth = floats(value[i:].ctypes.data, min(width, context.nx - channel[i]))
+            _tell(i, channel[i], truth, context, state, track)
+        elif kind[i] == INPUT:
+            for k in range(nu):
+                if np.isfinite(value[i, k]):
+                    u[k] = value[i, k]
+        elif kind[i] == RESET:
+            forget(state, sensors, rows, track.mean.shape[1])
+        if now > state[NEXT_DUE]:
+            listen(state, sensors, now)
+        flags = 0
+        for s in range(sensors if state[SILENT_SENSORS] > 0.0 else 0):
+            if sensor_part(state, s)[SILENT] != 0.0:
+                flags |= 1 << min(s, SENSORS - 1)
+        silent = flags
+        if context.fitted != 0 and _range(i, u, context, track):
+            flags |= OUTSIDE
+        if state[MISSED_STATES] > 0.0:
+            flags |= TRUTH_MISSED
+        if state[POOR_CLOUD] != 0.0:
+            flags |= IMPOVERISHED
+        track.flags[i] = flags
+        track.health[i] = _health(i, now, silent, flags, state, policy, track)

@@ -1,0 +1,265 @@
+"""What a fold folds with: a filter as machine code, the context in which it sees model and tuning, and its scratch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from .compiled.context import context_of
+from .compiled.jacobians import scratch_size, sensor_jacobian
+from .compiled.model import compile_model
+from .diagnostics.evidence import fresh, no_baseline, watched
+from .diagnostics.health import Bounds, HealthPolicy, chi_square_bounds
+from .errors import ModelError
+from .estimator import Code, Estimator, Options
+from .fold_kernel import compiled
+from .gate import doubt
+from .gate.stories import widening
+from .interpreted import fold_loop
+from .interpreted.black_box_filters import driven
+from .interpreted.fold_loop import UNSET
+from .interpreted.view import View
+from .log import Log
+from .model.mode_as_number import indicator
+from .model.state_space import LARGE, StateSpaceModel
+from .numerics.quantiles import chi_square_quantile
+from .screen import fresh_screen, limits_of
+from .snapshots import Base, Snapshot, Story
+from .track import WHITENED, Track
+from .tuning import Tuning
+
+Moments = tuple[np.ndarray, np.ndarray]
+
+
+class Machine:
+    """Folds events in place; of itself it remembers nothing from one call to the next."""
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        options: Options,
+        model: StateSpaceModel,
+        tuning: Tuning,
+        pairs: np.ndarray,
+        policy: HealthPolicy,
+        *,
+        prior: Moments | None,
+        expected: np.ndarray | None,
+    ) -> None:
+        """All as `Fold` was given it, and checked."""
+        self.estimator, self.options, self.model, self.tuning = estimator, options, model, tuning
+        self.policy, self._pairs = policy, pairs
+        # Only particles can carry a mode that jumps; the others see it as a number.
+        self.compiled = compile_model(model if estimator.family == "particle" else indicator(model))
+        self.code: Code = driven(estimator) if model.black_box else estimator.code()
+        self._bounds: Bounds = chi_square_bounds(model.width * max(1, policy.window))
+        self.marginal = estimator.family in ("particle", "ensemble")
+        reopens = tuning.reopen is not None and model.nx <= LARGE
+        self.rule = doubt.rule_of(tuning.gate, tuning.gate_kind, reopens)
+        self.gate_limits = np.full(model.width + 1, np.inf)
+        if tuning.gate is not None:
+            self.gate_limits[1:] = chi_square_quantile(tuning.gate, np.arange(1, model.width + 1))
+        seen = self._see(expected, prior)
+        self.context: Any = seen
+        self._run, judge, self._begin, _ = compiled()
+        if model.black_box or estimator.interpreted:
+            self.context = View(self.compiled, seen, tuning, options, pairs, self.held)
+            self._run = partial(fold_loop.run_and_judge, judge, seen)
+            self._begin = fold_loop.begin
+        self.work = _scratch(estimator.work_size(options, model.nx, model.width) + 1)
+        self.score = np.empty(WHITENED + model.ny)
+
+    def _see(self, expected: np.ndarray | None, prior: Moments | None) -> np.void:
+        """The context of this model and tuning; the arrays that it points to are kept in `held`."""
+        model, tuning = self.model, self.tuning
+        baseline = no_baseline(model) if tuning.baseline is None else tuning.baseline
+        own = {
+            "p": np.ascontiguousarray(tuning.p, float),
+            "q": np.ascontiguousarray(tuning.q, float),
+            # Its own: what a reading brings stands here while it is folded, and other folds have the same tuning.
+            "r": np.array(tuning.r, float),
+            "used": tuning.used.astype(np.int8),
+            "gate": np.tile(self.gate_limits, (len(model.sensors), 1)),
+            "options": np.ascontiguousarray(self.estimator.tune(self.options, model, tuning), float),
+            "pairs": self._pairs,
+            "prepared": self.estimator.prepare(model, self.options),
+            **limits_of(model),
+            **watched(model, tuning.gate, self.marginal, baseline, expected),
+        }
+        self.held: dict[str, Any] = {**self.compiled.static, **own}
+        if prior is not None:
+            self.held["prior_mean"], self.held["prior_cov"] = prior
+        sizes = {
+            "nx": model.nx,
+            "nu": model.nu,
+            "n_parameters": own["p"].size,
+            "n_noises": own["q"].size,
+            "n_sensors": len(model.sensors),
+            "n_rows": own["r"].size,
+            "n_options": own["options"].size,
+            "n_pairs": len(self._pairs),
+            "n_shown": len(model.shown),
+            "n_prepared": own["prepared"].size,
+            "n_baseline": own["baseline"].size,
+            "width": model.width,
+            "seed": tuning.seed,
+        }
+        plain = {k: v.ctypes.data if isinstance(v, np.ndarray) else v for k, v in self.held.items()}
+        return context_of(**plain, **sizes)
+
+    @property
+    def prior(self) -> Moments:
+        """Mean (nx,) and covariance (nx, nx) at the log's start; of a large state the variances (1, nx)."""
+        return self.held["prior_mean"], self.held["prior_cov"]
+
+    @property
+    def failures(self) -> int:
+        """How often a black box failed."""
+        return int(getattr(self.context, "failures", 0))
+
+    @property
+    def failure(self) -> ModelError | None:
+        """What a black box said when it failed last."""
+        return getattr(self.context, "failure", None)
+
+    def fresh(self) -> Snapshot:
+        """Where a fold stands before the first event, but for the state of the filter, which is still to `begin`."""
+        model = self.model
+        numbers = self.estimator.state_size(self.options, model.nx) + self.estimator.memory(self.options, model)
+        return Snapshot(
+            clock=np.array([UNSET]),
+            u=np.array([item.default for item in model.inputs], float),
+            state=np.empty(numbers),
+            evidence=fresh(model),
+            edge=fresh_screen(model),
+            doubt=doubt.fresh(len(model.sensors)),
+        )
+
+    def rows(self, count: int) -> Track:
+        """Room for the track of so many events."""
+        model = self.model
+        return Track.allocate(count, len(model.shown), len(self._pairs), model.ny, model.width)
+
+    def begin(self, mean: np.ndarray, cov: np.ndarray, state: np.ndarray) -> None:
+        """Make the state stand for N(mean, cov)."""
+        self._begin(self.code, self.context, np.ascontiguousarray(mean), np.ascontiguousarray(cov), state)
+
+    def begin_at(self, base: Base, now: Snapshot) -> None:
+        """Let a fold stand where events that were dropped have led; see `Base`."""
+        now.clock[0], now.u[:] = base.clock, base.u
+        self.begin(base.mean, base.cov, now.state)
+        left = [(now.edge, base.edge)]
+        if base.estimator == self.estimator.name and base.state is not None and base.state.size == now.state.size:
+            left += [(now.state, base.state), (now.evidence, base.evidence), (now.doubt, base.doubt)]
+        for mine, its in left:
+            if its is not None and its.shape == mine.shape:
+                mine[:] = its
+
+    def moments(self, state: np.ndarray) -> Moments:
+        """Mean and covariance (beyond `LARGE` states the variances) of a state."""
+        return self.estimator.moments(self.options, state, self.model.nx)
+
+    def run(self, log: Log, start: int, stop: int, now: Snapshot, spare: np.ndarray, track: Track) -> int:
+        """Fold events `start` to `stop` of a log into the same rows of a track; `now` moves on with them.
+
+        Args:
+            log: The log.
+            start: The first event.
+            stop: The event after the last.
+            now: Where the fold stands; changed.
+            spare: For a state from which queries are answered, (numbers of `now.state`,); changed.
+            track: Its rows are filled.
+
+        Returns:
+            The row of a reading that asks for a decision, after which the loop stopped, or -1.
+        """
+        columns = log.t, log.kind, log.channel, log.value, log.width
+        return self._call(self.rule, log.first, start, stop, *columns, now, spare, track)
+
+    def _run_apart(self, log: Log, start: int, stop: int, now: Snapshot) -> Track:
+        """Fold events into a track of their own; nothing is decided of sensors."""
+        track = self.rows(stop - start)
+        within = slice(start, stop)
+        columns = log.t[within], log.kind[within], log.channel[within], log.value[within], log.width
+        spare, rule = np.empty_like(now.state), self.rule._replace(most=0)
+        self._call(rule, log.first + start, 0, stop - start, *columns, now, spare, track)
+        return track
+
+    def _call(
+        self, rule: doubt.Rule, first: int, start: int, stop: int, t: np.ndarray, kind: np.ndarray,
+        channel: np.ndarray, value: np.ndarray, width: int, now: Snapshot, spare: np.ndarray, track: Track,
+    ) -> int:  # fmt: skip
+        """See `fold_kernel.run_and_judge`."""
+        asking = self._run(
+            self.code, self.context, rule, first, start, stop, t, kind, channel, value, width,
+            now.clock, now.u, now.state, now.doubt, now.edge, spare, self.work, self.score, track,
+            self.policy, self._bounds, now.evidence,
+        )  # fmt: skip
+        return int(asking)
+
+    def second_story(
+        self, log: Log, at: int, snapshot: Snapshot, start: int, stop: int, sensor: int, innovation: np.ndarray
+    ) -> Story:
+        """Fold events as if the twin had been wrong before a refused reading.
+
+        Args:
+            log: The log.
+            at: An event at which the fold stood where `snapshot` says, not after `start`.
+            snapshot: Where it stood.
+            start: The refused reading.
+            stop: The event after the last.
+            sensor: Whose reading it is: its gate is off, and the covariance is widened before.
+            innovation: Of the reading, as it was refused, (width,).
+        """
+        end = snapshot.copy()
+        self._run_apart(log, at, start, end)
+        mean, cov = self.moments(end.state)
+        H = self._slope(sensor, mean, end.u)
+        added = widening(variances_of(cov), variances_of(self.prior[1]), H, innovation[: len(H)])
+        self.begin(mean, cov + (added if len(cov) == 1 else np.diag(added)), end.state)
+        with self._open(sensor):
+            track = self._run_apart(log, start, stop, end)
+        return Story(track, end, np.sqrt(added))
+
+    def _slope(self, sensor: int, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """dh/dx (ny, nx) of a sensor; nothing depends on a mode."""
+        if isinstance(self.context, View):
+            H = self.context.H(sensor, x, u)
+        else:
+            H = np.empty((len(self.model.sensors[sensor].rows), self.model.nx))
+            scratch = np.empty(scratch_size(self.model.nx, self.model.width))
+            sensor_jacobian(self.context, sensor, np.ascontiguousarray(x), u, H, scratch)
+        if self.model.mode >= 0:
+            H[:, self.model.mode] = 0.0
+        return H
+
+    @contextmanager
+    def _open(self, sensor: int) -> Iterator[None]:
+        """Meanwhile the sensor has no gate."""
+        self.held["gate"][sensor] = np.inf
+        try:
+            yield
+        finally:
+            self.held["gate"][sensor] = self.gate_limits
+
+    def settle(self) -> None:
+        """Python was stopped between two events: noise and gates are again what they were tuned to."""
+        self.held["r"][:] = self.tuning.r
+        self.held["gate"][:] = self.gate_limits
+
+
+def variances_of(cov: np.ndarray) -> np.ndarray:
+    """The diagonal (nx,) of a covariance, or of the variances (1, nx) that stand for that of a large state."""
+    variances: np.ndarray = cov[0] if len(cov) == 1 else np.diag(cov)
+    return variances
+
+
+def _scratch(size: int) -> np.ndarray:
+    """`size` numbers that begin at a cache line, so that vectors at multiples of their length lie across none."""
+    numbers = np.full(size + 8, np.nan)
+    first = -numbers.ctypes.data % 64 // 8
+    return numbers[first : first + size]
