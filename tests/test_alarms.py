@@ -10,7 +10,7 @@ from app.engine.outputs import Status
 from config.schema import TwinSection
 from estimators.diagnostics.episodes import CAUSES, anchor
 from estimators.diagnostics.sensor_states import STATES
-from estimators.track import HEALTH_NAMES
+from estimators.track import HEALTH_NAMES, VERDICT_NAMES
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "ALARMS.md").read_text()
@@ -84,24 +84,34 @@ def outcomes():
     return set(found.values())
 
 
-OF_THE_PROGRAM = {"chronicle", "blame", "engine error", "view error", "recording failed", "stale", "readings"}
+OF_THE_PROGRAM = {
+    "chronicle",
+    "blame",
+    "engine error",
+    "view error",
+    "recording failed",
+    "stale",
+    "readings",
+    "page error",
+}
 """Keys of notices that report what is wrong with the program or a disk; the others are no
 alarm, or a state of health."""
 
 
 def notices():
-    """Words under which the running twin counts what it reports, and those of its panel."""
+    """Words under which the running twin counts what it reports, and what it counts of readings."""
     found = set()
     for path in (ROOT / "app").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "report":
                 found |= {arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant)}
     values = {}
-    for path in (ROOT / "app/intake.py", ROOT / "app/viser/status.py"):
+    for path in (ROOT / "app/intake.py", ROOT / "sources/source.py"):
         for names in constants_of(path):
             values |= names
     found |= {values[name] for name in ("WRONG_TIME", "CLOCK_MOVED", "MAINTENANCE")}
-    return (found | {*values["COUNTED"], *values["SELDOM"]}) - OF_THE_PROGRAM
+    verdicts = {name for name in VERDICT_NAMES if name not in ("none", "used")}
+    return (found | verdicts | {"recovered"}) - OF_THE_PROGRAM
 
 
 SETTINGS = {"commissioned", "integrity"}

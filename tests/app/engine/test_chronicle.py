@@ -21,8 +21,12 @@ N = 1800
 def asset():
     rng = np.random.default_rng(7)
     t = 1.0 + np.arange(N)
-    y = 40.0 + rng.normal(0, np.sqrt(MODEL.sensors[0].rows[0].variance), N)
-    y[300:500] = 40.0 + 2.0 * (y[300:500] - 40.0)
+    # As the model has it: an asset that stands still is one for which Q is too large, and that is found too.
+    rate, wander = (rng.normal(0, np.sqrt(noise.variance), N) for noise in reversed(MODEL.noises))
+    truth = 40.0 + np.cumsum(wander + np.cumsum(rate))
+    noise = rng.normal(0, np.sqrt(MODEL.sensors[0].rows[0].variance), N)
+    noise[300:500] *= 2.0
+    y = truth + noise
     y[1600:] = y[1600]
     return t, y
 

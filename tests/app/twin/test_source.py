@@ -267,18 +267,18 @@ source:
     ("step", "duration", "expected"),
     [
         # motor_drive has three sensors.
-        ("1e-12", "600", "motor.yaml:4: source.step is 1e-12 s; the simulator would make 1.8e+15 events in 600 s, and may "
+        ("1e-6", "600", "motor.yaml:4: source.step is 1e-06 s; the simulator would make 1.8e+09 events in 600 s, and may "
             "make 1e+08; lengthen it, or shorten source.duration"),
-        ("0.5", "1e15", "motor.yaml:5: source.duration is 1e+15 s; the simulator would make 6e+15 events in 1e+15 s, and "
+        ("0.5", "1e9", "motor.yaml:5: source.duration is 1e+09 s; the simulator would make 6e+09 events in 1e+09 s, and "
             "may make 1e+08; shorten it, or lengthen source.step"),
-        ("1e-7", "null", "motor.yaml:4: source.step is 1e-07 s; the simulator would make 3e+09 events in 100 s, and may "
+        ("1e-6", "null", "motor.yaml:4: source.step is 1e-06 s; the simulator would make 3e+08 events in 100 s, and may "
             "make 1e+08; lengthen it"),
-        ("1e10", "null", "motor.yaml:4: source.step is 1e+10 s; the simulator would make RUNS steps of f in 1e+10 s, and "
+        ("1e9", "null", "motor.yaml:4: source.step is 1e+09 s; the simulator would make RUNS steps of f in 1e+09 s, and "
             "may make 1e+08; shorten it"),
     ],
 )  # fmt: skip
 def test_a_simulation_that_would_never_end_is_one_line(step: str, duration: str, expected: str) -> None:
-    runs = f"{1e10 / MODELS['motor_drive'].max_step:.3g}"
+    runs = f"{1e9 / MODELS['motor_drive'].max_step:.3g}"
     text = LENGTHY.replace("STEP", step).replace("DURATION", duration)
     with pytest.raises(ConfigError) as caught:
         twin_of(text)
