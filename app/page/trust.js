@@ -85,5 +85,6 @@ export class Trust {
     }[state];
     setText($("connection"), text ?? "");
     $("connection").hidden = !text;
+    $("connection").dataset.state = state;
   }
 }

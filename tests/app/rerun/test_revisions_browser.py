@@ -55,12 +55,16 @@ def test_the_viewer_is_covered_until_it_has_drawn_the_next(browser):  # noqa: F8
         t = np.arange(1.0, 101.0)
         source.put(readings(t, 40 + np.sin(t)))
         page.goto(server.url, timeout=PATIENCE * 1000)
-        until(page, "window.nisus?.drawn > 0")
+        page.get_by_role("tab", name="Explore").click()
+        until(page, "window.nisus?.explored > 0")
         page.evaluate(NOTE)
         before = at_rest(page)
         engine.submit(commands.SetTuning("Q.temperature", 0.5))
         wait_for(lambda: engine.status().revision == 1, PATIENCE)
-        until(page, "window.nisus.revision === 1 && !window.nisus.viewer.announced && window.covered.length > 1")
+        until(
+            page,
+            "window.nisus.panes.explore.revisions.drawn === 1 && !window.nisus.viewer.announced && window.covered.length > 1",
+        )
         covered = page.evaluate("window.covered")
         assert [shown for shown, *_ in covered] == [True, False]
         assert not covered[-1][1]

@@ -21,11 +21,11 @@ def test_the_file_opens_the_page_and_the_next_session_asks_for_its_own_address(b
     page = browser.new_context().new_page()
     try:
         page.goto(opening.path.as_uri())
-        page.locator("#connection[data-state=live]").wait_for(timeout=PATIENCE * 1000)
+        page.locator("#connection[data-state=live]").wait_for(state="attached", timeout=PATIENCE * 1000)
         # The token is in a cookie then, no longer in the address.
         assert page.url == f"http://127.0.0.1:{server.port}/" and server.entered.is_set()
         page.reload()
-        page.locator("#connection[data-state=live]").wait_for(timeout=PATIENCE * 1000)
+        page.locator("#connection[data-state=live]").wait_for(state="attached", timeout=PATIENCE * 1000)
         server.stop()
         wait_for(lambda: "trying again" in page.locator("#connection").inner_text(), PATIENCE)
         server = PageServer(engine, port=server.port, viser_port=None, secret=SECRET)
