@@ -61,10 +61,8 @@ def test_the_viewer_is_covered_until_it_has_drawn_the_next(browser):  # noqa: F8
         before = at_rest(page)
         engine.submit(commands.SetTuning("Q.temperature", 0.5))
         wait_for(lambda: engine.status().revision == 1, PATIENCE)
-        until(
-            page,
-            "window.nisus.panes.explore.revisions.drawn === 1 && !window.nisus.viewer.announced && window.covered.length > 1",
-        )
+        until(page, "window.nisus.panes.explore.revisions.drawn === 1 && !window.nisus.viewer.announced")
+        until(page, "window.covered.length > 1")
         covered = page.evaluate("window.covered")
         assert [shown for shown, *_ in covered] == [True, False]
         assert not covered[-1][1]
