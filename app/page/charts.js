@@ -28,7 +28,7 @@ export class Charts {
     this.episodes = [];
     this.shown = null;
     this.range = [0, model.window];
-    const order = [...model.states].sort((a, b) => (a.rows.length > 0) - (b.rows.length > 0)).slice(0, MOST);
+    const order = (this.states = [...model.states].sort((a, b) => (a.rows.length > 0) - (b.rows.length > 0)).slice(0, MOST));
     const actions = {
       select: (since, until) => view.show(since, until),
       home: () => view.follow(view.configured),
@@ -60,8 +60,9 @@ export class Charts {
   get columns() {
     const { model } = this;
     return [
-      ...model.states.flatMap((state) => OF_STATE.map((kind) => `${kind}:${state.name}`)),
-      ...model.rows.flatMap((row) => [...OF_ROW, "innovation", "innovation_upper", "innovation_lower"].map((kind) => `${kind}:${row.name}`)),
+      ...this.states.flatMap((state) => OF_STATE.map((kind) => `${kind}:${state.name}`)),
+      ...this.states.flatMap((state) => state.rows.flatMap((row) => OF_ROW.map((kind) => `${kind}:${row}`))),
+      ...model.rows.slice(0, MOST).flatMap((row) => ["innovation", "innovation_upper", "innovation_lower"].map((kind) => `${kind}:${row.name}`)),
       "nis", "nis_mean", "nis_low", "nis_high",
     ];
   }
@@ -74,7 +75,7 @@ export class Charts {
     this.asked = wanted;
     const place = JSON.parse(wanted);
     this.link.look("charts", { ...place, columns: this.columns }, (...frame) => this.live.take(...frame));
-    const before = this.model.states.map((state) => `mean:${state.name}`);
+    const before = this.states.map((state) => `mean:${state.name}`);
     this.link.look("previous", { ...place, run: "previous", columns: before }, (...frame) => this.previous.take(...frame));
     this.pins.ask(place);
     if (!this.view.following) {
