@@ -215,12 +215,14 @@ class Machine:
             sensor: Whose reading it is: its gate is off, and the covariance is widened before.
             innovation: Of the reading, as it was refused, (width,).
         """
-        end = snapshot.copy()
+        # No doubt is carried over: in this story no sensor is wrong.
+        end = snapshot.copy()._replace(doubt=doubt.fresh(len(self.model.sensors)))
         self._run_apart(log, at, start, end)
         mean, cov = self.moments(end.state)
         H = self._slope(sensor, mean, end.u)
         added = widening(variances_of(cov), variances_of(self.prior[1]), H, innovation[: len(H)])
         self.begin(mean, cov + (added if len(cov) == 1 else np.diag(added)), end.state)
+        end.doubt[:] = doubt.fresh(len(self.model.sensors))
         with self._open(sensor):
             track = self._run_apart(log, start, stop, end)
         return Story(track, end, np.sqrt(added))

@@ -89,6 +89,7 @@ OF_THE_PROGRAM = {
     "blame",
     "engine error",
     "view error",
+    "sweep",
     "recording failed",
     "stale",
     "readings",

@@ -62,7 +62,11 @@ def run_twin(arguments: Run) -> int:
     if arguments.headless:
         status = session.engine.status()
         print(", ".join(f"{name} {count}" for name, count in status.counts.items() if count or name == "readings"))
-        failures = {notice.text: None for notice in session.engine.notices.since(0) if notice.level == "error"}
+        lines = session.engine.notices.since(0)
+        # What a page shows of a source that ended in the midst, nobody would see here.
+        failed = [line.text for line in lines if line.text.startswith("source failed")]
+        failures = dict.fromkeys([*failed, *(line.text for line in lines if line.level == "error")])
         for text in list(failures)[:SAID]:
             complain(text)
+        return 2 if failed else 0
     return 0

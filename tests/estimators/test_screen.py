@@ -357,7 +357,9 @@ def test_limits_that_mean_nothing_are_refused(make, said) -> None:
 def test_a_sensor_whose_readings_all_break_their_limits_is_an_episode_of_its_own() -> None:
     """Named with the limit and the share, from the first reading that broke it; not as one of a wrong R."""
     walk = model(Limits(range=((-30.0, 30.0),)))
-    y = np.random.default_rng(5).normal(0.0, 0.25, 600)
+    # As the model has it: of an asset that stands still Q would be too large, which is an episode, too.
+    rng, q, r = np.random.default_rng(5), walk.noises[0].variance, walk.sensors[0].rows[0].variance
+    y = np.cumsum(rng.normal(0.0, np.sqrt(q), 600)) + rng.normal(0.0, np.sqrt(r), 600)
     y[400:] += 100.0
     log = Log.of(walk)
     log.add("a", np.arange(600.0), y)

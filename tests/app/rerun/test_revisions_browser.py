@@ -67,7 +67,10 @@ def test_the_viewer_is_covered_until_it_has_drawn_the_next(browser):  # noqa: F8
         assert [shown for shown, *_ in covered] == [True, False]
         assert not covered[-1][1]
         held = colours(base64.b64decode(page.evaluate("window.picture").partition(",")[2]))
-        assert held.shape == before.shape and before.std() > 5
+        # The picture is one of whole pixels; the canvas on the page may begin between two.
+        rows, columns, _ = held.shape
+        assert before.shape[0] - rows in (0, 1) and before.shape[1] - columns in (0, 1) and before.std() > 5
+        before = before[:rows, :columns]
         assert np.mean(np.abs(held - before).max(axis=-1) > 32) < 0.01
     finally:
         page.context.close()

@@ -90,7 +90,7 @@ def bodies():
     for kind in KINDS:
         fields = dataclasses.fields(kind)
         for field in fields:
-            given = {item.name: usual[item.name] for item in fields if item.default is dataclasses.MISSING}
+            given = {item.name: usual.get(item.name, 0) for item in fields if item.default is dataclasses.MISSING}
             for odd in ODD:
                 yield {"command": kind.__name__, **given, field.name: odd}
     for key in ("gate", "gate.kind", "gate.reopen", "Q.yoke", "R.yoke", "R", "p.yoke_coolant", "use.yoke", "use."):

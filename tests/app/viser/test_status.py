@@ -27,8 +27,8 @@ def test_the_cause_is_in_the_status_and_cannot_bring_markup():
     assert text(html) == (
         f"{SIGNS['suspect']} suspect since 2.0 s revision 0 8.0 s winding reads 3 °C &lt; the prediction (2 more)"
     )
-    status.health = DIVERGED
-    assert "reset it" in text(status_html(status, SECOND))
+    status.health, status.cause = DIVERGED, ""
+    assert "The readings contradict the estimate." in text(status_html(status, SECOND))
 
 
 def test_a_note_cannot_bring_markup():

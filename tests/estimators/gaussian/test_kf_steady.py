@@ -68,7 +68,7 @@ def test_a_long_kalman_run_ends_at_the_same_estimate():
     # The slower pole of F - F K H is 0.92 here: after 1500 readings nothing of the start is left.
     for a, b in zip(steady.moments(), kalman.moments(), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9)
-    assert steady._state[-1] == AFTER
+    assert steady._now.state[-1] == AFTER
     # Of the first readings, whose gain should be large, it makes less; P knows.
     assert np.all(steady.track.std[5] > 1.5 * kalman.track.std[5])
 
@@ -220,7 +220,7 @@ def test_the_steady_gain_of_correlated_rows():
     steady, kalman = (folded(name, log, model=declared) for name in ("kf-steady", "kf"))
     for a, b in zip(steady.moments(), kalman.moments(), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9)
-    assert steady._state[-1] == AFTER
+    assert steady._now.state[-1] == AFTER
 
 
 def both(x, u, p, out):

@@ -261,7 +261,7 @@ def test_only_readings_that_were_used_adapt(estimator):
     tuning = Tuning.of(model()).with_options(options).set("use.y", False)
     held_out = Fold(estimator, model(), tuning, readings_of([0.5, 9.0]))
     held_out.advance()
-    np.testing.assert_array_equal(held_out._state[-2:], [R, R])
+    np.testing.assert_array_equal(held_out._now.state[-2:], [R, R])
 
 
 def test_each_row_has_its_own_variance():

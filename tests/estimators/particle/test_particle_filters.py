@@ -238,7 +238,7 @@ def test_a_cloud_that_explains_nothing_fails_visibly_and_recovers(name):
     run.advance()
     verdict = run.track.verdict
     assert verdict[0] == FAILED and verdict[-1] == USED
-    assert run._state[RECOVERIES] == np.sum(verdict == FAILED)
+    assert run._now.state[RECOVERIES] == np.sum(verdict == FAILED)
     for column in (run.track.mean, run.track.std, run.moments()[0], run.points()):
         assert np.all(np.isfinite(column))
     assert abs(run.track.mean[-1, 0] - 30.0) < 1.0
@@ -286,7 +286,7 @@ def test_every_child_of_the_auxiliary_filter_is_a_copy_of_its_parent():
         assert run.moments()[1][0, 0] > 0.0
         run.advance()
         assert run.track.verdict[0] == USED
-        first, second = block(run.options, run._state, 1)[:, 0]
+        first, second = block(run.options, run._now.state, 1)[:, 0]
         assert first == second
 
 
@@ -337,7 +337,7 @@ def test_copies_of_one_particle_widen_too():
     log = log_of(1, *((0.01 * k, READING, 2.0 if k == 0 else 4.0) for k in range(60)))
     run = Fold("pf", model, Tuning.of(model).with_options({"particles": 20}), log)
     run.advance(1)
-    block(run.options, run._state, 1)[:] = 2.0
+    block(run.options, run._now.state, 1)[:] = 2.0
     run.advance()
     failed = int((run.track.verdict == FAILED).sum())
     assert 10 < failed < 40 and np.all(run.track.verdict[1 + failed :] == USED)
@@ -389,11 +389,11 @@ def test_siblings_stand_side_by_side(name, scheme):
         tuning = tuning.with_options({"particles": 3000, "resampling": scheme})
     run = Fold(name, model, tuning, log_of(1, (0, TICK, 0), (1, READING, 2.3)))
     run.advance(1)
-    before = block(run.options, run._state, 1)[:, 0].copy()
+    before = block(run.options, run._now.state, 1)[:, 0].copy()
     run.advance()
     order = np.argsort(before)
-    ancestors = order[np.searchsorted(before[order], block(run.options, run._state, 1)[:, 0])]
-    assert np.array_equal(before[ancestors], block(run.options, run._state, 1)[:, 0])
+    ancestors = order[np.searchsorted(before[order], block(run.options, run._now.state, 1)[:, 0])]
+    assert np.array_equal(before[ancestors], block(run.options, run._now.state, 1)[:, 0])
     assert 100 < np.unique(ancestors).size < 2900
     assert np.all(np.diff(ancestors) >= 0)
 
@@ -441,7 +441,7 @@ def test_the_kernel_may_move_duplicates_only():
         tuning = Tuning.of(model).with_options({"particles": 3000, "fraction": 1.0, **options})
         run = Fold(name, model, tuning, log_of(1, (0, READING, 2.3)))
         run.advance()
-        clouds[name, *options.values()] = block(run.options, run._state, 1)[:, 0].copy()
+        clouds[name, *options.values()] = block(run.options, run._now.state, 1)[:, 0].copy()
     drawn, moved, all_moved = clouds["pf",], clouds["pf-reg", 1], clouds["pf-reg", 0]
     _, family, size = np.unique(drawn, return_inverse=True, return_counts=True)
     alone = size[family] == 1

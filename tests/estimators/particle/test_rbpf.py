@@ -249,7 +249,7 @@ def test_readings_beyond_the_numbers_fail_alone():
     run = Fold("rbpf", model, tuning, log)
     run.advance()
     assert run.track.verdict[4] == FAILED and np.all(run.track.verdict[[1, 2, 3, 5, 6, 7]] == USED)
-    assert run._state[RECOVERIES] == 0
+    assert run._now.state[RECOVERIES] == 0
     for column in (run.track.mean, run.track.std, run.points(), run.moments()[1]):
         assert np.all(np.isfinite(column))
 
@@ -280,7 +280,7 @@ def test_a_cloud_without_weight_recovers_visibly():
     log.extend(Events.one(5 * SECOND, 5 * SECOND, READING, 0, np.array([0.3]), 3))
     run = Fold("rbpf", model, Tuning.of(model).with_options({"particles": 100}), log)
     run.advance()
-    assert run._state[RECOVERIES] == 1
+    assert run._now.state[RECOVERIES] == 1
     assert np.all(np.isfinite(run.track.mean)) and run.track.verdict[-1] == USED
 
 
