@@ -45,7 +45,7 @@ export class Episodes {
       "li", { class: "episode", dataset: { open: String(episode.end === null), severity: episode.severity ?? "" } },
       element("button", { type: "button", title: "Show it in the charts", onclick: show }, element("time", {}, times), element("b", {}, `${words(episode.subject)}: ${episode.cause}`)),
       element("p", {}, episode.text),
-      element("a", { href: `/help/alarms#${episode.help.split("#")[1] ?? ""}`, target: "_blank", rel: "noopener" }, "what to do"),
+      element("small", { class: "faint" }, `more in ${episode.help}`),
     );
   }
 
