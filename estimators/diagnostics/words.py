@@ -114,6 +114,8 @@ def of_sensor(
         return f"{name} spikes {when}: {100 * size:.2g} % of its readings are outliers; set a gate, look at its wiring"
     if cause == "refused":
         what = f"{name} is refused by the gate {when} ({100 * size:.0f} % of its readings)"
+        if len(model.sensors) == 1:
+            return f"{what}: the sensor is wrong, or the twin is; look at the sensor, and Reset where that is right"
         return f"{what}: the sensor is wrong, or the twin is; hold {sensor.name} out to see whether the others agree"
     if cause == "screened":
         what = f"{name} breaks its limits ({reasons}) {when}: {100 * size:.0f} % of its readings are not used"
@@ -157,20 +159,21 @@ def of_stale(start: float) -> str:
     return f"no reading was used {since(start)}: the estimate is the model's alone; check the source"
 
 
-def of_loss(start: float, off: Sequence[str]) -> str:
-    """A twin whose estimate is lost; `off`: sensors that are refused, shifted, stuck or screened now.
+def of_loss(start: float, off: Sequence[str], sensors: int) -> str:
+    """A twin of so many sensors whose estimate is lost; `off`: those refused, shifted, stuck or screened now.
 
     While a fault lasts, a reset starts from wrong readings, and with the prior's wide bands believes them.
     """
     lost = f"the estimate is lost {since(start)}"
     if not off:
         return f"{lost}: Reset starts again from the prior; then look at which sensor spoke first"
+    if sensors == 1:
+        return f"{lost}, and {off[0]} contradicts it still: look at the sensor, and Reset where that is right"
     many = len(off) > 1
     names = ", ".join(off[:4]) + (", ..." if len(off) > 4 else "")
-    return (
-        f"{lost}, and {names} {'contradict' if many else 'contradicts'} it still: hold {'them' if many else 'it'} out "
-        "first, one by one, and Reset when the rest agrees"
-    )
+    one = "contradicts it still: hold it out first,"
+    says = "contradict it still: hold them out first, one by one," if many else one
+    return f"{lost}, and {names} {says} and Reset when the rest agrees"
 
 
 def of_truth(name: str, rmse: float, unit: str, size: float, start: float) -> str:

@@ -92,8 +92,11 @@ def _judge(state, row, t, arrival, live, horizon):
     if reach < 0 or t <= state[everything, LAST] + reach:
         return FITS
     if live:
-        known = row if state[row, SEEN] else everything
-        if t - arrival <= state[known, OFFSET] + max(horizon // 2, AHEAD_OF_ARRIVAL):
+        offset = state[row if state[row, SEEN] else everything, OFFSET]
+        if t - arrival <= offset + max(horizon // 2, AHEAD_OF_ARRIVAL):
+            return FITS
+        # By a clock that is right: the others were on their way for longer, and within the horizon that is no fault.
+        if -horizon <= offset and t <= arrival:
             return FITS
     return AHEAD
 

@@ -66,6 +66,9 @@ def of_twin(course: Course) -> Iterator[Found]:
             if code == STALE:
                 start -= float(track.age[run.begin])
             size = (t[run.end - 1] - t[run.begin]) * 1e-9
-            text = words.of_stale(start) if code == STALE else words.of_loss(start, sensors_off(course, run.end))
+            if code == STALE:
+                text = words.of_stale(start)
+            else:
+                text = words.of_loss(start, sensors_off(course, run.end), len(course.model.sensors))
             episode = Episode(start, run.over(t), "twin", cause, size, np.nan, np.nan, "s", text)
             yield Found(("twin", cause), run.begin, int(t[run.begin]), episode)

@@ -80,7 +80,9 @@ def test_what_diverges_says_since_when_and_is_reset(name, start, tmp_path):
     assert status.health == DIVERGED and status.since == (first + 1) * SECOND
     assert f"diverged since {first:.1f} s" in status_html(status, SECOND)
     # What to do depends on what else is wrong: the episode says it, which follows within a second.
-    wait_for(lambda: "winding" in fresh_status(engine).cause)
+    remedy = "winding contradicts it still: look at the sensor, and Reset where that is right"
+    wait_for(lambda: fresh_status(engine).cause.endswith(remedy))
+    assert remedy in status_html(fresh_status(engine), SECOND)
     wait_for(lambda: any("diverged" in line.text for line in engine.notices.since(0)))
     (line,) = [line for line in engine.notices.since(0) if "diverged" in line.text]
     assert line.level == "error" and "Reset" in line.text and line.t == status.since

@@ -178,10 +178,11 @@ def test_a_lost_filter_says_since_when_and_what_to_do(browser):
         page.goto(f"http://127.0.0.1:{view.port}/")
         # The 26th refused reading is more than half of the last fifty.
         page.get_by_text(f"diverged since {JUMP + 25}.0 s").wait_for()
+        page.get_by_text("winding contradicts it still: look at the sensor, and Reset").wait_for()
         engine.submit(Reset())
         page.get_by_text("tracking", exact=False).first.wait_for()
         assert engine.status().health == TRACKING
-        assert page.get_by_text("diverged since").count() == 0
+        assert page.get_by_text("diverged since").count() == 0 and page.get_by_text("Reset where").count() == 0
     finally:
         context.close()
         view.stop()

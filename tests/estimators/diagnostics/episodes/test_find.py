@@ -411,9 +411,11 @@ def test_a_reset_is_advised_only_when_no_sensor_is_off():
         part = course._replace(events=course.events.select(slice(0, n)), track=track.select(slice(0, n)))
         return only([item.episode for item in found_in(part)], "diverged").text
 
-    remedy = "out first, one by one, and Reset when the rest agrees"
-    assert text((GATED, GATED)).endswith(f"and gauge, chain contradict it still: hold them {remedy}")
-    assert text((USED, GATED)).endswith(f"and chain contradicts it still: hold it {remedy}")
+    remedy = "and Reset when the rest agrees"
+    assert text((GATED, GATED)).endswith(
+        f"and gauge, chain contradict it still: hold them out first, one by one, {remedy}"
+    )
+    assert text((USED, GATED)).endswith(f"and chain contradicts it still: hold it out first, {remedy}")
     assert text((USED, USED)).endswith("Reset starts again from the prior; then look at which sensor spoke first")
 
 
