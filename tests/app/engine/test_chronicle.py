@@ -62,8 +62,8 @@ def test_in_pieces_it_is_what_one_fold_says(engine, asset, piece):
     for start in range(0, N, piece):
         engine._accept([readings(t[start : start + piece], y[start : start + piece])])
         if piece > 1 or start % 5 == 0:
-            engine._chronicle.look()
-    engine._chronicle.look()
+            engine._watchers.chronicle.look()
+    engine._watchers.chronicle.look()
     expected = whole(engine)
     assert len(expected) >= 2 and expected[0].end is not None and expected[-1].cause == "stuck"
     same(engine.episodes(), expected)
@@ -75,11 +75,11 @@ def test_readings_that_come_late_take_rows_back(engine, asset):
     prompt = np.setdiff1d(np.arange(600), late)
     for part in np.array_split(prompt, 12):
         engine._accept([readings(t[part], y[part])])
-        engine._chronicle.look()
+        engine._watchers.chronicle.look()
     before = engine.episodes()
     for part in np.array_split(late[::-1], 5):
         engine._accept([readings(t[part], y[part])])
-        engine._chronicle.look()
+        engine._watchers.chronicle.look()
     same(engine.episodes(), whole(engine))
     assert before != engine.episodes()
     assert sum("too narrow" in text for text in said(engine)) == 1
@@ -90,7 +90,7 @@ def test_each_is_said_once_when_it_begins_and_when_it_is_over(engine, asset):
     lasted = False
     for start in range(0, 1580, 8):
         engine._accept([readings(t[start : start + 8], y[start : start + 8])])
-        engine._chronicle.look()
+        engine._watchers.chronicle.look()
         status = engine.status()
         engine._status = None
         if status.episodes_open:
@@ -185,7 +185,7 @@ def test_a_refused_sensor_is_said_once_and_not_reading_by_reading(asset):
     moved[300:] += 100.0
     told, refused = [], 0
     for start in range(0, 600, 10):
-        known = "winding" in engine._chronicle.account.in_alarm
+        known = "winding" in engine._watchers.chronicle.account.in_alarm
         lines = len(engine.notices.since(0))
         # As if each batch came a second after the one before.
         engine.notices._last.clear()
@@ -194,7 +194,7 @@ def test_a_refused_sensor_is_said_once_and_not_reading_by_reading(asset):
         if np.any(engine._fold.track.verdict[-10:] == GATED):
             refused += known
             told.append((known, any(text.startswith("winding: reading refused") for text in new)))
-        engine._chronicle.look()
+        engine._watchers.chronicle.look()
     assert refused > 3 and all(line != known for known, line in told)
     assert sum("is refused by the gate" in text for text in said(engine)) == 1
 

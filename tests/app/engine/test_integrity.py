@@ -35,7 +35,7 @@ def engine():
 
 def test_what_is_published_is_the_sensitivity_of_the_same_events(engine):
     assert engine.status().integrity is None
-    engine._integrity.look()
+    engine._watchers.integrity.look()
     engine._status = None
     found = engine.status().integrity
     log = Log(MODEL.width)
@@ -58,7 +58,7 @@ def test_what_is_published_is_the_sensitivity_of_the_same_events(engine):
 def test_the_api_shows_it_beside_two_sigma(engine):
     before = status_json(engine)
     assert (before["integrity"], before["integrity_age"]) == ({}, None)
-    engine._integrity.look()
+    engine._watchers.integrity.look()
     engine._status = None
     after = status_json(engine)
     assert set(after["integrity"]) == set(MODEL.state_names) and after["integrity_age"] == 0.0
@@ -67,9 +67,9 @@ def test_the_api_shows_it_beside_two_sigma(engine):
 
 
 def test_another_revision_has_none_until_it_is_computed(engine):
-    engine._integrity.look()
-    assert engine._integrity.of(0) is not None
-    assert engine._integrity.of(1) is None
+    engine._watchers.integrity.look()
+    assert engine._watchers.integrity.of(0) is not None
+    assert engine._watchers.integrity.of(1) is None
 
 
 def test_the_thread_publishes_and_stops(engine):
@@ -81,7 +81,7 @@ def test_the_thread_publishes_and_stops(engine):
     assert not watch.running
     assert threading.active_count() == folds
     engine.stop()
-    assert not engine._integrity.running
+    assert not engine._watchers.integrity.running
 
 
 def test_a_window_starts_at_a_snapshot_and_is_a_copy():

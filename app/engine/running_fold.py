@@ -1,0 +1,287 @@
+"""The running fold and the log that it follows: moved by the engine's thread alone, read by all others as copies."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimators.diagnostics.health import HealthPolicy
+from estimators.fold import Fold
+from estimators.log import READING, Events, Log
+from estimators.numerics.peaks import peaks_of
+from estimators.snapshots import SPARSE_EVERY, Base
+
+from .counts import RowCounts
+from .integrity import MOST, Window, window
+from .notices import Notices
+from .outputs import Belief, Cursor, Here, Pull
+from .refolder import Requests
+from .revisions import Revisions
+from .stall import Stall
+
+if TYPE_CHECKING:
+    from estimators.diagnostics.field_pictures import Picture
+    from estimators.tuning import Tuning
+
+    from ..twin.twin import Twin
+
+LATELY = 1024
+"""Events of which it is told how far readings are apart."""
+
+
+class RunningFold:
+    """The log, the fold that follows it, and the revisions before.
+
+    Whoever moves it (the methods at the end) holds the lock; whoever reads holds it for no longer than copying takes.
+    """
+
+    def __init__(self, twin: Twin, stall: Stall, base: Base | None) -> None:
+        """`stall` watches the thread that folds; `base` is where the fold starts, None: the prior."""
+        self.twin = twin
+        self.model = twin.model
+        self.pairs = twin.pairs
+        self._policy = twin.policy
+        self._history = max(2 * SPARSE_EVERY, twin.config.history)
+        self.estimator, self.tuning = twin.estimator, twin.tuning
+        self._lock = threading.Lock()
+        self._stall = stall
+        self._cursors: list[Cursor] = []
+        self._requests = Requests()
+        self.revisions = Revisions(self.estimator, self.tuning)
+        self._revision = 0
+        self._logs = 0
+        self._clear(base)
+        self.notices = Notices(lambda: self._log.newest if self._log.n else 0)
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        """Nothing changes meanwhile; also not beneath a fold that never returns, which keeps the lock for ever."""
+        while not (held := self._lock.acquire(timeout=0.05)) and self._stall.text is None:
+            pass
+        try:
+            yield
+        finally:
+            if held:
+                self._lock.release()
+
+    # For everybody, from any thread
+
+    @property
+    def policy(self) -> HealthPolicy:
+        """When the estimate may be trusted."""
+        return self._policy
+
+    def cursor(self, *, follows_log: bool = False, span: int | None = None) -> Cursor:
+        """A cursor for one consumer, for `pull`; give it back with `release`. See `Cursor` for the rest."""
+        cursor = Cursor(follows_log=follows_log, span=span)
+        with self._reading():
+            self._cursors.append(cursor)
+        return cursor
+
+    def release(self, cursor: Cursor) -> None:
+        """Forget a cursor."""
+        with self._reading():
+            self._cursors = [item for item in self._cursors if item is not cursor]
+
+    def pull(self, cursor: Cursor, limit: int | None = None, *, align: int = 1) -> Pull:
+        """Copies of the rows since the cursor, from a multiple of `align` on, at most `limit`; the notices since."""
+        with self._reading():
+            log, fold = self._log, self._fold
+            fresh = cursor.log != self._logs or (cursor.revision != self._revision and not cursor.follows_log)
+            cursor.log, cursor.revision = self._logs, self._revision
+            if fresh:
+                cursor.next, cursor.picture = self._from(cursor.span), -1
+            start = max(cursor.next // align * align, log.first)
+            end = log.first + fold.n
+            if limit is not None:
+                end = min(end, start + limit)
+            rows = slice(start - log.first, max(start, end) - log.first)
+            readings = log.events.select(rows)
+            pull = Pull(
+                self._revision,
+                fresh,
+                start,
+                Events(*(column.copy() for column in readings)),
+                fold.track.select(rows).copy(),
+                pictures=_since(fold, cursor.picture, max(start, end)),
+                oldest=log.first,
+                changed=max(cursor.next, log.first),
+            )
+            cursor.next = max(start, end)
+            if pull.pictures:
+                cursor.picture = pull.pictures[-1].before
+        lines = self.notices.since(cursor.notice)
+        if lines:
+            cursor.notice = lines[-1].number + 1
+        return replace(pull, notices=lines)
+
+    def _from(self, span: int | None) -> int:
+        """Absolute index of the first folded event in the last `span` ns; 0 of all."""
+        n = self._fold.n
+        if span is None or not n:
+            return 0
+        return self._log.first + int(np.searchsorted(self._log.t[:n], self._log.t[n - 1] - span))
+
+    def rows(self, start: int, stop: int) -> Pull:
+        """Copies of the rows with these absolute indices, as far as they are there; no cursor moves."""
+        with self._reading():
+            log, fold = self._log, self._fold
+            start = min(max(start, log.first), log.first + fold.n)
+            rows = slice(start - log.first, max(start, min(stop, log.first + fold.n)) - log.first)
+            readings = log.events.select(rows)
+            events = Events(*(column.copy() for column in readings))
+            return Pull(self._revision, False, start, events, fold.track.select(rows).copy(), oldest=log.first)
+
+    def index_at(self, t: int) -> int:
+        """Absolute index of the first folded event at or after a time, ns; the number of events if there is none."""
+        with self._reading():
+            return self._log.first + int(np.searchsorted(self._log.t[: self._fold.n], t))
+
+    def span(self) -> tuple[int, int]:
+        """Times of the first and the last event, ns; zeros while there is none."""
+        with self._reading():
+            return (int(self._log.t[0]), int(self._log.t[self._log.n - 1])) if self._log.n else (0, 0)
+
+    def base(self) -> Base | None:
+        """Where a fold of the present log starts, if its oldest events were dropped; else None, for the prior."""
+        return self._base
+
+    def origin(self, index: int) -> tuple[int, Base | None]:
+        """Where a fold that gives the rows from `index` on can start: at an event at or before it, from a base.
+
+        That is None for the prior. Revisions that follow have a snapshot there too, unless their state is so large
+        that theirs are wider apart.
+        """
+        with self._reading():
+            first = self._log.first
+            at, base = self._fold.base_at(max(0, index // SPARSE_EVERY * SPARSE_EVERY - first))
+            return first + at, base if at else self._base
+
+    def folded_with(self) -> tuple[Tuning, str]:
+        """Tuning and estimator of the fold that `pull` shows."""
+        with self._reading():
+            return self._fold.tuning, self._fold.estimator.name
+
+    def previous(self) -> Pull | None:
+        """The whole previous revision, for comparison, before a drag if one goes on; its arrays never change."""
+        return self.revisions.previous()
+
+    def belief(self) -> Belief:
+        """The estimate now."""
+        with self._reading():
+            mean, cov = self._fold.moments()
+            points, clock = self._fold.points(), self._fold.clock
+            model, several = self._fold.model, self._fold.estimator.peaks is not None
+        # Clustering takes milliseconds, which the engine's thread must not wait for.
+        peaks = peaks_of(points, model.circular) if several else []
+        return Belief(clock, mean, cov, points, tuple(peaks) if len(peaks) > 1 else ())
+
+    def here(self) -> Here | None:
+        """The filter as it stands, to fold on from; None while nothing has come. Copies its state, and no more."""
+        with self._reading():
+            fold, log = self._fold, self._log
+            if not fold.n:
+                return None
+            lately = slice(max(0, fold.n - LATELY), fold.n)
+            read = log.t[lately][log.kind[lately] == READING]
+            step = (
+                float(read[-1] - read[0]) * 1e-9 / (np.unique(read).size - 1)
+                if read.size and read[-1] > read[0]
+                else np.nan
+            )
+            t = int(log.t[fold.n - 1])
+            return Here(self._revision, fold.estimator.name, fold.tuning, fold.base_here(), t, step)
+
+    def last_events(self, most: int = MOST) -> Window | None:
+        """The last events, to fold them again; None while there are none, or a refold is waited for."""
+        with self._reading():
+            return None if self._requests.waiting else window(self._fold, self._revision, most)
+
+    # For the thread that moves it
+
+    def _clear(self, base: Base | None) -> None:
+        """An empty log and the fold that follows it."""
+        self._log = Log.of(self.model, capacity=self._history + 4 * SPARSE_EVERY)
+        if base is not None:
+            self._log.first, self._log.floor, self._log.version = base.first, base.clock, base.version
+        self._logs += 1
+        self._base = base
+        self._fold = self._make_fold(self.estimator, self.tuning, self._log, base)
+        self._row_counts = RowCounts(self.model)
+
+    def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
+        period = self.twin.picture if self.model.grid is not None else None
+        return Fold(
+            estimator,
+            self.model,
+            tuning,
+            log,
+            pairs=self.pairs,
+            policy=self._policy,
+            base=base,
+            picture=period,
+            expected=self.twin.expected,
+        )
+
+    def _extend(self, batch: Events, horizon: int | None, settled: np.ndarray | None) -> tuple[int, int]:
+        """Put events where they belong, and fold from there on; the first row that is new, and how many were stale."""
+        first, stale = self._log.extend(batch, horizon, settled)
+        before = min(first, self._fold.n)
+        if first < self._fold.n:
+            self._go_back(first)
+        self._fold.advance()
+        return before, stale
+
+    def _go_back(self, index: int) -> None:
+        """Events at and after `index` changed: fold them again, and let every cursor fetch them again."""
+        self._fold.rewind(index)
+        self._row_counts.changed(index)
+        absolute = self._log.first + index
+        self._requests.changed(absolute)
+        for cursor in self._cursors:
+            cursor.next = min(cursor.next, absolute)
+            cursor.picture = min(cursor.picture, absolute)
+
+    def _forget(self) -> None:
+        """Once there are many, drop the oldest events, up to a snapshot, from which later refolds start."""
+        if self._log.n <= self._history + 3 * SPARSE_EVERY:
+            return
+        count = (self._log.n - self._history) // SPARSE_EVERY * SPARSE_EVERY
+        count, self._base = self._fold.base_at(count)
+        if count:
+            self._row_counts.forget(self._fold.track.select(slice(0, count)), self._log.channel[:count])
+            self._fold.drop_front(count)
+            self._log.drop_front(count)
+
+    def _begin_again(self, base: Base | None) -> None:
+        """Another log, and the fold of it that follows: a new revision."""
+        self.estimator, self.tuning = self._fold.estimator.name, self._fold.tuning
+        self._clear(base)
+        self._count_up()
+        self.revisions.restarted(self._revision)
+
+    def _become(self, fold: Fold, row_counts: RowCounts) -> None:
+        """Go on with another fold of the same log, which has caught up with it: a new revision."""
+        old, log = self._fold, self._log
+        events = Events(*(column[: old.n].copy() for column in log.events))
+        pictures = _since(old, -1, log.first + old.n)
+        left = Pull(self._revision, False, log.first, events, old.track, pictures=pictures, oldest=log.first)
+        self.revisions.left(left, fold.estimator.name, fold.tuning)
+        self._fold, self._row_counts = fold, row_counts
+        self._count_up()
+
+    def _count_up(self) -> None:
+        self._revision += 1
+        self.notices.revision = self._revision
+
+
+def _since(fold: Fold, index: int, end: int) -> list[Picture]:
+    """The pictures of a fold after event `index`, up to event `end`."""
+    if fold.pictures is None:
+        return []
+    return [picture for picture in fold.pictures.taken if index < picture.before <= end]

@@ -1,0 +1,103 @@
+"""The status: what a panel shows of a running twin, put together from its fold and from all that watches it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimators.diagnostics.sensor_states import sensor_states
+from estimators.fold import Fold
+from estimators.registry import find_estimator
+from estimators.versions import model_version_at
+from sources.source import Source
+
+from .counts import RowCounts, last_run
+from .faults import Faulty
+from .outputs import Status
+from .playback import playback_status
+from .watchers import Watchers
+
+if TYPE_CHECKING:
+    from estimators.tuning import Tuning
+
+
+def status_of(
+    fold: Fold,
+    rows: RowCounts,
+    watchers: Watchers,
+    source: Source,
+    *,
+    estimator: str,
+    tuning: Tuning,
+    revision: int,
+    refolding: bool,
+    finished: bool,
+    recording: Path | None,
+    inflated: int,
+    held: int,
+    notices: Mapping[str, int],
+) -> Status:
+    """The status of a fold that stands still meanwhile.
+
+    Args:
+        fold: The running one.
+        rows: Counts of its rows.
+        watchers: What they found.
+        source: Of its readings.
+        estimator: That is asked for; another than the fold's while a refold is waited for.
+        tuning: The same of the tuning.
+        revision: Its number.
+        refolding: Whether a refold is waited for.
+        finished: Whether the source has ended.
+        recording: The file that is being written.
+        inflated: Late readings whose noise was inflated.
+        held: Events that wait for the next to tell whether their time is true.
+        notices: Counts of what was said.
+    """
+    model, log, track = fold.model, fold.log, fold.track
+    last = fold.n - 1
+    now = log.t[last] * 1e-9 if last >= 0 else 0.0
+    states = sensor_states(model, fold.tuning.used, fold.evidence, now, fold.policy)
+    health = int(track.health[last]) if last >= 0 else watchers.silence.health
+    account = watchers.chronicle.account
+    leading = account.leading(dict(zip(model.sensor_names, states, strict=True)))
+    layer = source.faults if isinstance(source, Faulty) else None
+    silenced, recovered = layer.lost if layer is not None else 0, fold.recoveries()
+    return Status(
+        estimator=estimator,
+        tuning=tuning,
+        options=find_estimator(estimator, model).complete(dict(tuning.options)),
+        revision=revision,
+        refolding=refolding,
+        t=int(log.t[last]) if last >= 0 else None,
+        health=health,
+        since=int(log.t[last_run(track.health)]) if last >= 0 else None,
+        cause=watchers.cause(leading, health) if last >= 0 else watchers.silence.cause,
+        sensors=account.of_sensors(model.sensor_names, states),
+        episodes_open=len(account.lasting),
+        lost=watchers.alerts.lost,
+        model_version=model_version_at(log, int(log.t[last])) if last >= 0 else log.version,
+        clock=watchers.clock.estimate,
+        counts={
+            **notices,
+            **({"inflated": inflated} if inflated else {}),
+            **({"held": held} if held else {}),
+            **rows.count(track, log.channel),
+            **({"recovered": recovered} if recovered else {}),
+            **({"silenced": silenced} if silenced else {}),
+        },
+        account=fold.account(),
+        nis=float(track.nis_mean[last]) if last >= 0 else np.nan,
+        nis_low=float(track.nis_low[last]) if last >= 0 else np.nan,
+        nis_high=float(track.nis_high[last]) if last >= 0 else np.nan,
+        **playback_status(source),
+        finished=finished,
+        recording=recording,
+        latency_ms=watchers.latency.percentile(99.0),
+        latency_p50_ms=watchers.latency.percentile(50.0),
+        integrity=watchers.integrity.of(revision),
+        faults=layer.status() if layer is not None else (),
+    )

@@ -1,0 +1,62 @@
+"""All that watches the running fold, in threads of its own or as rows come, and says what is wrong."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from estimators.log import Events
+from estimators.track import TRACKING, WAITING
+
+from .alerts import Alerts
+from .blame import Blame
+from .chronicle import Chronicle
+from .counts import Latency
+from .host_clock import HostClock
+from .integrity import IntegrityWatch
+from .interface import Running
+from .silence import Silence
+
+if TYPE_CHECKING:
+    from estimators.diagnostics.episodes import Episode
+
+
+class Watchers:
+    """The watchers of one engine."""
+
+    def __init__(self, engine: Running) -> None:
+        section, notices = engine.twin.config.time, engine.notices
+        self.latency = Latency()
+        self.clock = HostClock(notices, section.horizon)
+        self.chronicle = Chronicle(engine)
+        self.alerts = Alerts(notices, lambda: self.chronicle.account.in_alarm)
+        self.silence = Silence(notices, section.stale_after)
+        self.integrity = IntegrityWatch(engine.model, engine.last_events, engine.policy.false_alarm_every)
+        self.blame = Blame(engine.model, lambda: self.chronicle.account.episodes, engine.last_events, notices)
+
+    def start(self) -> None:
+        """Begin to watch."""
+        self.chronicle.start()
+        self.integrity.start()
+        self.blame.start()
+
+    def rest(self) -> None:
+        """Begin no more folds."""
+        self.integrity.stop()
+        self.blame.stop()
+
+    def stop(self) -> None:
+        """Look at the last rows, and end."""
+        self.chronicle.stop()
+
+    def arrived(self, batch: Events, passed: Events) -> None:
+        """A batch of a live source was folded; of it these passed."""
+        self.latency.note(batch)
+        self.clock.note(passed)
+
+    def episodes(self) -> list[Episode]:
+        """What was and is wrong, in the order of its start, with who is most likely off."""
+        return [self.blame.told(episode) for episode in self.chronicle.account.episodes]
+
+    def cause(self, leading: Episode | None, health: int) -> str:
+        """Why the twin is not to be trusted now, by the episode that leads."""
+        return self.blame.told(leading).text if leading is not None and health not in (WAITING, TRACKING) else ""
