@@ -16,6 +16,7 @@ from estimators.errors import SourceError
 
 from .engine.commands import Record
 from .engine.engine import Engine
+from .engine.workshop import Workshop
 from .recording.split import NEVER, Split
 from .recording.writer import FINE, Recorder
 from .rerun.rows import RerunRows
@@ -54,6 +55,7 @@ class Session:
         horizon: float | None = None,
         review: Path | None = None,
         split: Split = NEVER,
+        workshop: Workshop | None = None,
     ) -> None:
         """Put it together; nothing runs yet.
 
@@ -65,12 +67,13 @@ class Session:
             horizon: See `Engine`.
             review: The recording that is reviewed, for the page to offer.
             split: Into what parts to split a recording.
+            workshop: See `Engine`.
 
         Raises:
             NisusError: If the source cannot be opened, or the port is in use.
         """
         sys.setswitchinterval(SWITCH)
-        self.engine = Engine(twin, open_source, base=base, horizon=horizon)
+        self.engine = Engine(twin, open_source, base=base, horizon=horizon, workshop=workshop)
         self.recorder = Recorder(self.engine, lambda stream: RerunRows(stream, self.engine, series=FINE), split)
         self.engine.recorder = self.recorder
         self._page = page

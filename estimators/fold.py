@@ -45,6 +45,7 @@ class Fold:
         picture: float | None = None,
         prior: tuple[np.ndarray, np.ndarray] | None = None,
         expected: np.ndarray | None = None,
+        idle: bool = False,
     ) -> None:
         """Prepare; nothing is folded yet.
 
@@ -62,6 +63,8 @@ class Fold:
             prior: Mean (nx,) and covariance (nx, nx), positive semidefinite, in place of the model's; beyond `LARGE`
                 states the variances (1, nx). It holds at the log's start, and a reset goes back to it.
             expected: Sensors that must speak, (sensors,) of bool; None for those that have spoken.
+            idle: Folds nothing, ever, so that neither filter nor loop is compiled for it: what stands in the place of
+                a fold until one can be had. Its moments are those where it would start.
 
         Raises:
             EstimatorError: If the estimator does not exist, does not apply, an option is out of range, or log, tuning,
@@ -88,13 +91,17 @@ class Fold:
         """What was decided of sensors that stayed refused, see gate/reopening.py."""
         self._now = self._machine.fresh()
         self._spare = np.empty_like(self._now.state)
-        if base is None:
+        self.idle, self._start = idle, self._machine.prior if base is None else (base.mean, base.cov)
+        if base is not None:
+            check_base(base, model)
+        if idle:
+            self._now.state[:] = 0.0
+        elif base is not None:
+            self._machine.begin_at(base, self._now)
+        else:
             self._machine.begin(*self._machine.prior, self._now.state)
             if log.start != BEFORE:
                 self._now.clock[0] = log.start
-        else:
-            check_base(base, model)
-            self._machine.begin_at(base, self._now)
         self._snapshots = Snapshots(self._now.state.nbytes)
         self.pictures = Pictures(model.grid, picture) if model.grid is not None else None
         self._asked = -1
@@ -133,15 +140,16 @@ class Fold:
 
     def moments(self) -> Moments:
         """Mean (nx,) and covariance (nx, nx) at `clock`; beyond `LARGE` states the variances (1, nx) instead."""
-        return self._machine.moments(self._now.state)
+        return self._start if self.idle else self._machine.moments(self._now.state)
 
     def points(self) -> np.ndarray:
         """What to draw beside the mean, (k, nx): sigma points, particles; none for most filters."""
-        return self.estimator.points(self.options, self._now.state, self.model.nx)
+        nothing = np.empty((0, self.model.nx))
+        return nothing if self.idle else self.estimator.points(self.options, self._now.state, self.model.nx)
 
     def recoveries(self) -> int:
         """Number of recoveries since the filter started: a cloud of particles that had lost the asset was widened."""
-        return 0 if self.estimator.recoveries is None else self.estimator.recoveries(self._now.state)
+        return 0 if self.idle or self.estimator.recoveries is None else self.estimator.recoveries(self._now.state)
 
     def account(self) -> dict[str, float | list[float]]:
         """What the filter says of itself: `spread`, see diagnostics/account.py, and what only this kind of it can say.
@@ -151,7 +159,7 @@ class Fold:
         the rank histogram (`ranks`).
         """
         own = self.estimator.account
-        said = {} if own is None else own(self.options, self._now.state, self.model.nx)
+        said = {} if own is None or self.idle else own(self.options, self._now.state, self.model.nx)
         return {"spread": spread_ratio(self.track, self.policy.window), **said}
 
     @property
@@ -166,7 +174,7 @@ class Fold:
 
     def peaks(self) -> list[Peak]:
         """The peaks of the estimate, the heaviest first; a Gaussian filter has one."""
-        if self.estimator.peaks is not None:
+        if self.estimator.peaks is not None and not self.idle:
             return self.estimator.peaks(self.options, self._now.state, self.model.nx)
         return [Peak(1.0, *self.moments())]
 
@@ -184,6 +192,8 @@ class Fold:
             EventError: If the log was not made for this model, and an event does not fit it.
         """
         self._check_log()
+        if self.idle:
+            return 0
         end = self.log.n if limit is None else min(self.log.n, self.n + limit)
         begun = self.n
         if self.log.capacity > len(self._rows):

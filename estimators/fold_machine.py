@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -55,7 +55,6 @@ class Machine:
         self.policy, self._pairs = policy, pairs
         # Only particles can carry a mode that jumps; the others see it as a number.
         self.compiled = compile_model(model if estimator.family == "particle" else indicator(model))
-        self.code: Code = driven(estimator) if model.black_box else estimator.code()
         self._bounds: Bounds = chi_square_bounds(model.width * max(1, policy.window))
         self.marginal = estimator.family in ("particle", "ensemble")
         reopens = tuning.reopen is not None and model.nx <= LARGE
@@ -63,15 +62,28 @@ class Machine:
         self.gate_limits = np.full(model.width + 1, np.inf)
         if tuning.gate is not None:
             self.gate_limits[1:] = chi_square_quantile(tuning.gate, np.arange(1, model.width + 1))
-        seen = self._see(expected, prior)
-        self.context: Any = seen
-        self._run, judge, self._begin, _ = compiled()
-        if model.black_box or estimator.interpreted:
-            self.context = View(self.compiled, seen, tuning, options, pairs, self.held)
-            self._run = partial(fold_loop.run_and_judge, judge, seen)
-            self._begin = fold_loop.begin
+        self._seen = self._see(expected, prior)
+        self.context: Any = self._seen
+        self._in_python = model.black_box or estimator.interpreted
+        if self._in_python:
+            self.context = View(self.compiled, self._seen, tuning, options, pairs, self.held)
         self.work = _scratch(estimator.work_size(options, model.nx, model.width) + 1)
         self.score = np.empty(WHITENED + model.ny)
+
+    @cached_property
+    def code(self) -> Code:
+        """The filter: compiled, or loaded from the cache, at its first use."""
+        return driven(self.estimator) if self.model.black_box else self.estimator.code()
+
+    @cached_property
+    def _run(self) -> Callable:
+        """The loop, as `code` is."""
+        run, judge, _, _ = compiled()
+        return partial(fold_loop.run_and_judge, judge, self._seen) if self._in_python else run
+
+    @cached_property
+    def _begin(self) -> Callable:
+        return fold_loop.begin if self._in_python else compiled()[2]
 
     def _see(self, expected: np.ndarray | None, prior: Moments | None) -> np.void:
         """The context of this model and tuning; the arrays that it points to are kept in `held`."""

@@ -13,8 +13,10 @@ from rich.console import Console
 from estimators.fold import Fold
 from estimators.log import Log
 from estimators.model.state_space import StateSpaceModel
+from estimators.registry import ESTIMATORS, unfit
 
 from ..engine.call_watch import CallWatch
+from ..engine.workshop import Workshop
 from ..twin.twin import Twin
 
 PATIENCE = 1.0
@@ -32,6 +34,27 @@ def prepare(twin: Twin) -> None:
         Fold(twin.estimator, twin.model, twin.tuning, Log.of(twin.model), pairs=twin.pairs)
 
     attend(twin.model, work, "compiling filters, once", "compiled filters, once")
+
+
+def begin_to_compile(twin: Twin) -> Workshop:
+    """Let other processes compile what is not in the cache: the twin's filter, then all others that apply to it."""
+    workshop = Workshop([name for name, entry in ESTIMATORS.items() if unfit(entry, twin.model) is None])
+    workshop.ask(twin.estimator)
+    workshop.start()
+    return workshop
+
+
+def prepare_model(twin: Twin) -> None:
+    """Compile the twin's model alone, or load it from the cache.
+
+    Raises:
+        ModelError: If it does not compile.
+    """
+
+    def work() -> None:
+        Fold(twin.estimator, twin.model, twin.tuning, Log.of(twin.model), pairs=twin.pairs, idle=True)
+
+    attend(twin.model, work, "compiling the model, once", "compiled the model, once")
 
 
 def attend(model: StateSpaceModel, work: Callable[[], Any], doing: str, done: str | None = None) -> Any:

@@ -17,7 +17,7 @@ from ..session import Page, Session
 from ..stderr import complain
 from ..twin.twin import Twin, load_twin
 from .arguments import settings
-from .prepare import prepare
+from .prepare import begin_to_compile, prepare, prepare_model
 from .remarks import remarking
 
 if TYPE_CHECKING:
@@ -56,8 +56,13 @@ def run_twin(arguments: Run) -> int:
     page = None if arguments.headless else Page(arguments.port, not arguments.no_browser)
     if page is not None:
         check_port(page.port)
-    prepare(twin)
-    session = Session(twin, live_source(twin, arguments.speed), page=page, split=split)
+    workshop = None
+    if page is None:
+        prepare(twin)
+    else:
+        workshop = begin_to_compile(twin)
+        prepare_model(twin)
+    session = Session(twin, live_source(twin, arguments.speed), page=page, split=split, workshop=workshop)
     session.run(record=arguments.record, duration=arguments.duration, until_finished=arguments.headless)
     if arguments.headless:
         status = session.engine.status()

@@ -33,6 +33,7 @@ from .running_fold import RunningFold
 from .stall import Stall
 from .status import status_of
 from .watchers import Watchers
+from .workshop import Workshop
 
 if TYPE_CHECKING:
     from estimators.diagnostics.episodes import Episode
@@ -45,6 +46,13 @@ if TYPE_CHECKING:
 STATUS_AGE = 0.1
 
 
+class Ready:
+    """In the inbox: a filter that was waited for is compiled."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+
 class Engine(RunningFold):
     """A running twin: the thread that moves the fold, and what asks of it, tells of it and watches it."""
 
@@ -55,6 +63,7 @@ class Engine(RunningFold):
         *,
         base: Base | None = None,
         horizon: float | None = None,
+        workshop: Workshop | None = None,
     ) -> None:
         """Open the source and prepare the fold.
 
@@ -64,18 +73,22 @@ class Engine(RunningFold):
             base: Where the fold of the source's first event starts, if not at the prior (a recording's).
             horizon: Seconds of lateness allowed, in place of the twin's; infinity takes every reading (a recording's
                 were judged when they came).
+            workshop: Compiles filters, also the first, without which the log then begins. None: each is compiled where
+                it is needed.
 
         Raises:
             NisusError: If the source cannot be opened or the model does not compile.
         """
-        super().__init__(twin, Stall(self._say_stalled), base)
+        self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._workshop = workshop or Workshop()
+        super().__init__(twin, Stall(self._say_stalled), base, self._workshop.ready)
+        self._awaited = self.estimator if self._fold.idle else None
         section = twin.config.time
         allowed = section.horizon if horizon is None else horizon
         self._horizon = round(allowed * 1e9) if np.isfinite(allowed) else None
         self._first_base = base
         self._tick = section.tick
         self._options = Remembered(twin)
-        self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._begin_intake()
         self._feeder = Feeder(lambda: open_source(self.notices.report), self._inbox, self.notices.report)
         self._refolder = Refolder(self._inbox.put)
@@ -101,12 +114,15 @@ class Engine(RunningFold):
         self._thread.start()
         self._feeder.start()
         self._watchers.start()
+        if self._awaited is not None:
+            self._inbox.put(Ready(self._awaited))
 
     def stop(self) -> None:
         """Stop reading and folding."""
         self._stopping.set()
         self._watchers.rest()
         self._feeder.stop()
+        self._workshop.stop()
         self._refolder.stop()
         if self._thread.is_alive():
             self._thread.join(timeout=5.0 if self._stall.text is None else 0.1)
@@ -149,6 +165,8 @@ class Engine(RunningFold):
                 recording=self.recorder.path if self.recorder is not None else None,
                 inflated=self._late,
                 held=self._intake.held,
+                awaited=self._awaited,
+                compiling=self._workshop.states(),
                 notices=self.notices.counts(),
             )
         self._status = (time.monotonic(), status)
@@ -236,6 +254,9 @@ class Engine(RunningFold):
         """Carry one command out, or take a refold or a word from the feeder."""
         if isinstance(item, Refolded):
             self._adopt(item)
+        elif isinstance(item, Ready):
+            if item.name == self._awaited:
+                self.retune(self.estimator, self.tuning)
         elif isinstance(item, Restarted):
             self._restart()
         elif isinstance(item, Finished):
@@ -266,14 +287,18 @@ class Engine(RunningFold):
             self._take(event)
 
     def retune(self, estimator: str, tuning: Tuning) -> None:
-        """Fold the history again, beside the running fold, over a copy of the log."""
+        """Fold the history again, beside the running fold, over a copy of the log; when the filter is compiled."""
         self._options.leave(self.estimator, self.tuning)
         # First, so that nobody sees the new tuning without a refold that is waited for.
         ticket = self._requests.ask()
         self.estimator, self.tuning = estimator, tuning
+        self._awaited = None if self._workshop.ready(estimator) else estimator
+        self._status = None
+        if self._awaited is not None:
+            self._workshop.ask(estimator, lambda name: self._inbox.put(Ready(name)))
+            return
         log, base = self._log.copy(), self._base
         self._refolder.request(ticket, lambda: self._make_fold(estimator, tuning, log, base))
-        self._status = None
 
     def _adopt(self, done: Refolded) -> None:
         """Swap a finished refold in, after it has caught up with what came meanwhile."""
@@ -306,6 +331,8 @@ class Engine(RunningFold):
                 self._refuse(done.ticket, str(error))
                 return True
             self._become(fold, row_counts)
+            if self._finished:
+                fold.finish()
             self._watchers.alerts.again()
             self._watchers.alerts.look(fold, fold.n)
         return True

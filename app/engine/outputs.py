@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -98,7 +99,8 @@ class Status:
     revision, and of other things that happened to the twin. `account` is what the filter says of itself (see
     `Fold.account`). `latency_ms` is the 99th percentile from a reading's arrival to its row. `faults` are those that
     were put into the source, and hold or will. `integrity` bounds what could be wrong with each state unnoticed; None
-    until it is known.
+    until it is known. `compiling` are the filters that are not compiled yet: for how many seconds each has been, None
+    of one that waits; for `awaited` the running fold waits to give way.
     """
 
     estimator: str
@@ -130,3 +132,5 @@ class Status:
     latency_p50_ms: float | None
     faults: tuple[FaultStatus, ...] = ()
     integrity: Integrity | None = None
+    awaited: str | None = None
+    compiling: Mapping[str, float | None] = field(default_factory=dict)

@@ -67,6 +67,11 @@ class Revisions:
         self.version = 0
         """Counts up with every change, so that a page knows when to ask again."""
 
+    def began_with(self, estimator: str, tuning: Tuning) -> None:
+        """The first fold could be had; meanwhile its settings may have been turned."""
+        *earlier, running = self.runs
+        self._become([*earlier, replace(running, estimator=estimator, tuning=tuning)])
+
     def left(self, pull: Pull, estimator: str, tuning: Tuning) -> None:
         """The revision that ran gives way to the next.
 

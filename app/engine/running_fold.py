@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -40,8 +40,15 @@ class RunningFold:
     Whoever moves it (the methods at the end) holds the lock; whoever reads holds it for no longer than copying takes.
     """
 
-    def __init__(self, twin: Twin, stall: Stall, base: Base | None) -> None:
-        """`stall` watches the thread that folds; `base` is where the fold starts, None: the prior."""
+    def __init__(self, twin: Twin, stall: Stall, base: Base | None, ready: Callable[[str], bool]) -> None:
+        """Prepare the fold.
+
+        Args:
+            twin: What to fold.
+            stall: Watches the thread that folds.
+            base: Where the fold starts; None: the prior.
+            ready: Whether a filter is compiled; while the first is not, an idle fold stands in its place.
+        """
         self.twin = twin
         self.model = twin.model
         self.pairs = twin.pairs
@@ -49,7 +56,7 @@ class RunningFold:
         self._history = max(2 * SPARSE_EVERY, twin.config.history)
         self.estimator, self.tuning = twin.estimator, twin.tuning
         self._lock = threading.Lock()
-        self._stall = stall
+        self._stall, self._ready = stall, ready
         self._cursors: list[Cursor] = []
         self._requests = Requests()
         self.revisions = Revisions(self.estimator, self.tuning)
@@ -211,10 +218,11 @@ class RunningFold:
             self._log.first, self._log.floor, self._log.version = base.first, base.clock, base.version
         self._logs += 1
         self._base = base
-        self._fold = self._make_fold(self.estimator, self.tuning, self._log, base)
+        idle = not self._ready(self.estimator)
+        self._fold = self._make_fold(self.estimator, self.tuning, self._log, base, idle=idle)
         self._row_counts = RowCounts(self.model)
 
-    def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None) -> Fold:
+    def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None, *, idle: bool = False) -> Fold:
         period = self.twin.picture if self.model.grid is not None else None
         return Fold(
             estimator,
@@ -226,6 +234,7 @@ class RunningFold:
             base=base,
             picture=period,
             expected=self.twin.expected,
+            idle=idle,
         )
 
     def _extend(self, batch: Events, horizon: int | None, settled: np.ndarray | None) -> tuple[int, int]:
@@ -249,7 +258,7 @@ class RunningFold:
 
     def _forget(self) -> None:
         """Once there are many, drop the oldest events, up to a snapshot, from which later refolds start."""
-        if self._log.n <= self._history + 3 * SPARSE_EVERY:
+        if self._fold.idle or self._log.n <= self._history + 3 * SPARSE_EVERY:
             return
         count = (self._log.n - self._history) // SPARSE_EVERY * SPARSE_EVERY
         count, self._base = self._fold.base_at(count)
@@ -268,6 +277,10 @@ class RunningFold:
     def _become(self, fold: Fold, row_counts: RowCounts) -> None:
         """Go on with another fold of the same log, which has caught up with it: a new revision."""
         old, log = self._fold, self._log
+        if old.idle:  # the first
+            self._fold, self._row_counts = fold, row_counts
+            self.revisions.began_with(fold.estimator.name, fold.tuning)
+            return
         events = Events(*(column[: old.n].copy() for column in log.events))
         pictures = _since(old, -1, log.first + old.n)
         left = Pull(self._revision, False, log.first, events, old.track, pictures=pictures, oldest=log.first)

@@ -39,6 +39,8 @@ def status_of(
     inflated: int,
     held: int,
     notices: Mapping[str, int],
+    awaited: str | None,
+    compiling: Mapping[str, float | None],
 ) -> Status:
     """The status of a fold that stands still meanwhile.
 
@@ -56,6 +58,8 @@ def status_of(
         inflated: Late readings whose noise was inflated.
         held: Events that wait for the next to tell whether their time is true.
         notices: Counts of what was said.
+        awaited: The filter for whose compiling a refold waits.
+        compiling: See `Status`.
     """
     model, log, track = fold.model, fold.log, fold.track
     last = fold.n - 1
@@ -100,4 +104,6 @@ def status_of(
         latency_p50_ms=watchers.latency.percentile(50.0),
         integrity=watchers.integrity.of(revision),
         faults=layer.status() if layer is not None else (),
+        awaited=awaited,
+        compiling=compiling,
     )

@@ -55,7 +55,7 @@ export class Trust {
       setText($("more-lights"), `+${rest.length}${bad.length ? `, ${bad.length} not well` : ""}`);
       setAttribute($("more-lights"), "title", bad.map(([sensor, item]) => `${words(sensor)}: ${item.state}`).join("\n"));
     }
-    setText($("folding"), status.refolding ? `folding r${status.revision + 1} …` : `r${status.revision}`);
+    setText($("folding"), refolding(status));
     setAttribute($("record"), "aria-pressed", String(status.recording !== null));
     setAttribute($("record"), "title", status.recording === null ? "Record into a new .rrd file (R)" : `Recording ${status.recording}: end it (R)`);
     const latency = typeof status.latency_ms === "number" ? `${compact(status.latency_ms, 2)} ms` : "";
@@ -87,4 +87,10 @@ export class Trust {
     $("connection").hidden = !text;
     $("connection").dataset.state = state;
   }
+}
+
+// What a refold waits for, or the revision.
+function refolding({ awaited, compiling, refolding: waits, revision }) {
+  if (awaited !== null) return `compiling ${awaited}, ${Math.round(compiling[awaited] ?? 0)} s …`;
+  return waits ? `folding r${revision + 1} …` : `r${revision}`;
 }

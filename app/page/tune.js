@@ -45,12 +45,13 @@ export class Tune {
   filterSection() {
     const applies = this.model.estimators.filter((entry) => !entry.reason);
     const refused = this.model.estimators.filter((entry) => entry.reason);
-    const option = (entry) => element("option", { value: entry.name, disabled: Boolean(entry.reason), title: entry.reason ?? entry.assumes }, entry.title);
+    const option = (entry) => element("option", { value: entry.name, disabled: Boolean(entry.reason), title: entry.reason ?? entry.assumes, "data-title": entry.title }, entry.title);
     this.estimator = element(
       "select", { id: "estimator", "aria-label": "Estimator", onchange: () => this.choose(this.estimator.value) },
       element("optgroup", { label: "Estimators" }, ...applies.map(option)),
       refused.length ? element("optgroup", { label: "Do not apply here" }, ...refused.map(option)) : null,
     );
+    this.choices = new Map([...this.estimator.querySelectorAll("option:enabled")].map((item) => [item.value, item]));
     $("estimator-place").replaceChildren(this.estimator);
     this.about = element("p", { class: "about" });
     this.options = element("div", { class: "options" });
@@ -117,6 +118,7 @@ export class Tune {
   sync(status) {
     this.status = status;
     if (document.activeElement !== this.estimator) this.estimator.value = status.estimator;
+    for (const [name, option] of this.choices) setText(option, option.dataset.title + unready(status.compiling, name));
     const entry = this.model.estimators.find((item) => item.name === status.estimator);
     if (this.entry !== entry) this.build(entry);
     for (const [name, knob] of this.optionKnobs) {
@@ -236,4 +238,10 @@ export class Tune {
 
 export function section(title, hint, open, ...children) {
   return element("details", { class: "section", open }, element("summary", { title: hint }, title), ...children);
+}
+
+// Of a filter that is not compiled yet: for how long it has been, or that it is to come.
+function unready(compiling, name) {
+  if (!(name in compiling)) return "";
+  return compiling[name] === null ? " · to be compiled" : ` · compiling, ${Math.round(compiling[name])} s`;
 }

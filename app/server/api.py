@@ -64,6 +64,8 @@ def status_json(engine: Running) -> dict[str, Any]:
         "turned": _plain(turned(engine.twin, status.estimator, status.tuning)),
         "revision": status.revision,
         "refolding": status.refolding,
+        "awaited": status.awaited,
+        "compiling": dict(status.compiling),
         "t": status.t,
         "health": HEALTH_NAMES[status.health],
         "since": status.since,

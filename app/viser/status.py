@@ -25,6 +25,8 @@ def status_html(status: Status, origin: int | None, unit: Unit = SECONDS, palett
     at = "" if status.t is None or origin is None else unit.text((status.t - origin) * 1e-9)
     state = "ended" if status.finished else "paused" if status.paused else ""
     fold = "folding again" if status.refolding else f"revision {status.revision}"
+    if status.awaited is not None:
+        fold = f"compiling {status.awaited}, {status.compiling.get(status.awaited) or 0.0:.0f} s"
     color = "rgb({},{},{})".format(*palette.health[health])
     return (
         f'<div style="{STYLE};font-variant-numeric:tabular-nums">'

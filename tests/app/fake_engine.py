@@ -39,7 +39,7 @@ class FakeEngine:
             counts={"readings": 0, "gated": 0, "missing": 0, "stale": 0}, t=None, health=TRACKING, since=None,
             cause="", sensors={name: ("tracking", "") for name in model.sensor_names}, episodes_open=0,
             lost=None, model_version=1, clock=None, nis=np.nan, nis_low=np.nan, nis_high=np.nan, latency_ms=0.4,
-            seekable=True, span=None, finished=False, options={}, faults=(), integrity=None,
+            seekable=True, span=None, finished=False, options={}, faults=(), integrity=None, awaited=None, compiling={},
         )  # fmt: skip
         self.fold = Fold(estimator, model, tuning, self.log)
         self.before = None

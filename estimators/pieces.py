@@ -1,0 +1,77 @@
+"""What a fold compiles, in pieces that several processes can compile at once: the cache on disk hands the code over."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from .estimator import describe_signature, predict_signature, start_signature, update_signature
+from .fold_kernel import (
+    begin,
+    begin_signature,
+    judge,
+    judge_signature,
+    run,
+    run_and_judge,
+    run_signature,
+    screen_reading,
+    screen_signature,
+)
+from .numerics.threads import threaded
+from .registry import ESTIMATORS
+
+LOOP = "loop"
+"""In place of a filter's name: the loop over the events, which serves all of them."""
+
+
+class Piece(NamedTuple):
+    """A function that is compiled by itself: of the loop or a filter, by name, and its place among the pieces of that.
+
+    `after` are the places of those that it contains; with them in the cache it takes a tenth of the time.
+    """
+
+    of: str
+    place: int
+    after: tuple[int, ...] = ()
+
+
+def pieces_of(name: str) -> list[Piece]:
+    """The pieces of a filter or of the `LOOP`, what takes longest first."""
+    if name == LOOP:
+        return [Piece(LOOP, 0), Piece(LOOP, 1), Piece(LOOP, 2, (0, 1)), Piece(LOOP, 3), Piece(LOOP, 4)]
+    return [] if ESTIMATORS[name].interpreted else [Piece(name, place) for place in range(4)]
+
+
+def _function(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
+    """The function of a piece, and the types of its arguments."""
+    if piece.of == LOOP:
+        inner = run_signature.args[: -len(("policy", "bounds", "evidence"))]
+        return (
+            (judge, judge_signature.args),
+            (run, inner),
+            (run_and_judge, run_signature.args),
+            (begin, begin_signature.args),
+            (screen_reading, screen_signature.args),
+        )[piece.place]
+    start, predict, update, describe = ESTIMATORS[piece.of].functions
+    return (
+        (update, update_signature.args),
+        (predict, predict_signature.args),
+        (start, start_signature.args),
+        (describe, describe_signature.args),
+    )[piece.place]
+
+
+def make(piece: Piece) -> None:
+    """Compile a piece into the cache, if it is not there."""
+    # Code from the cache may call for threads.
+    threaded()
+    function, types = _function(piece)
+    function.compile(types)
+
+
+def is_made(piece: Piece) -> bool:
+    """Whether a piece is in the cache; asked of its index, which takes a tenth of a millisecond."""
+    function, types = _function(piece)
+    cache = function._cache
+    key = cache._index_key(types, function.targetctx.codegen())
+    return types in function.overloads or key in cache._cache_file._load_index()

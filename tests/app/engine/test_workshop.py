@@ -1,0 +1,237 @@
+"""Filters are compiled by other processes; the running one goes on meanwhile, and what follows it is the cold fold.
+
+What takes long here is a stand-in for the compiler: it waits until the test lets it go on. The oracle of every track is
+a fold of the same log that knows nothing of all this.
+"""
+
+import os
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.engine.commands import SetEstimator, SetTuning
+from app.engine.engine import Engine
+from app.engine.workshop import Workshop
+from estimators.fold import Fold, fold
+from estimators.log import Log
+from estimators.numerics.threads import threaded
+from estimators.pieces import LOOP, Piece, is_made, pieces_of
+from estimators.registry import ESTIMATORS
+from estimators.tuning import Tuning
+from tests.app.scripted import MODEL, Scripted, fresh_status, pull_all, readings, row_count, twin, wait_for
+from tests.support import assert_same
+
+
+def paper(folder: Path, what: str, piece: Piece) -> Path:
+    return folder / f"{what} {piece.of} {piece.place}"
+
+
+def slow_work(folder: Path, piece: Piece) -> None:
+    """In another process: says who does it, then waits to be let go on."""
+    begun = paper(folder, "begun", piece)
+    begun.with_suffix(".new").write_text(f"{os.getpid()} {os.nice(0)} {time.monotonic_ns()}")
+    begun.with_suffix(".new").rename(begun)
+    while not (paper(folder, "go", piece).exists() or (folder / "go").exists()):
+        time.sleep(0.005)
+    if paper(folder, "fail", piece).exists():
+        raise RuntimeError("as asked")
+    paper(folder, "done", piece).touch()
+
+
+@pytest.fixture
+def shop(tmp_path):
+    """A workshop whose work is `slow_work`; each filter given is as many pieces as its number says."""
+    shops = []
+
+    def open_shop(**counts):
+        pieces = {name: [Piece(name, place) for place in range(count)] for name, count in counts.items()}
+        if LOOP in pieces:
+            pieces[LOOP][-1] = Piece(LOOP, counts[LOOP] - 1, tuple(range(counts[LOOP] - 1)))
+        shops.append(
+            Workshop(
+                [name for name in counts if name != LOOP],
+                pieces=lambda name: pieces.get(name, []),
+                work=partial(slow_work, tmp_path),
+                is_done=lambda piece: paper(tmp_path, "done", piece).exists(),
+            )
+        )
+        return shops[-1]
+
+    yield open_shop
+    for item in shops:
+        item.stop()
+
+
+@pytest.fixture
+def started(shop):
+    engines = []
+
+    def start(**counts):
+        source, workshop = Scripted(), shop(**counts)
+        workshop.start()
+        engine = Engine(twin(), lambda report: source, workshop=workshop)
+        engines.append(engine)
+        engine.start()
+        return engine, source
+
+    yield start
+    for engine in engines:
+        engine.stop()
+
+
+def series(n, seed=1):
+    rng = np.random.default_rng(seed)
+    return np.arange(1, n + 1) * 0.01, 40 + np.cumsum(rng.normal(size=n)) * 0.1 + rng.normal(size=n)
+
+
+def cold(times, values, estimator, tuning=None):
+    log = Log(1)
+    log.extend(readings(times, values))
+    return fold(estimator, MODEL, tuning or Tuning.of(MODEL), log, pairs=np.array([[0, 1]]))
+
+
+def begun(tmp_path, piece):
+    """Process, niceness and time of a piece that was begun; None before."""
+    path = paper(tmp_path, "begun", piece)
+    return tuple(map(int, path.read_text().split())) if path.exists() else None
+
+
+def test_readings_are_folded_while_another_filter_is_compiled_and_the_swap_loses_nothing(started, tmp_path):
+    engine, source = started(ukf=2)
+    times, values = series(300)
+    source.put(readings(times[:100], values[:100]))
+    wait_for(lambda: row_count(engine) == 100)
+    engine.submit(SetEstimator("ukf"))
+    wait_for(lambda: begun(tmp_path, Piece("ukf", 0)) and fresh_status(engine).awaited == "ukf")
+    assert begun(tmp_path, Piece("ukf", 0))[0] != os.getpid()
+    for k in range(100, 200):
+        source.put(readings(times[k : k + 1], values[k : k + 1]))
+        wait_for(lambda upto=k + 1: row_count(engine) == upto)
+    status = fresh_status(engine)
+    assert (status.revision, engine.folded_with()[1], status.awaited) == (0, "kf", "ukf")
+    assert status.refolding and status.compiling["ukf"] > 0.0
+    assert_same(pull_all(engine).track, cold(times[:200], values[:200], "kf"))
+    (tmp_path / "go").touch()
+    wait_for(lambda: fresh_status(engine).revision == 1 and not fresh_status(engine).refolding)
+    source.put(readings(times[200:], values[200:]))
+    wait_for(lambda: row_count(engine) == 300)
+    status = fresh_status(engine)
+    assert (engine.folded_with()[1], status.awaited, status.compiling) == ("ukf", None, {})
+    assert_same(pull_all(engine).track, cold(times, values, "ukf"))
+    assert_same(engine.previous().track, cold(times[:200], values[:200], "kf"))
+
+
+def test_before_the_first_filter_is_compiled_the_log_grows_and_nothing_is_estimated(started, tmp_path):
+    engine, source = started(**{LOOP: 3}, kf=1)
+    times, values = series(200)
+    source.put(readings(times[:150], values[:150]))
+    wait_for(lambda: engine.span()[1] == round(times[149] * 1e9))
+    status, belief = fresh_status(engine), engine.belief()
+    assert row_count(engine) == 0 and status.t is None and status.health == 0
+    assert status.awaited == "kf" and engine.here() is None and engine.last_events() is None
+    np.testing.assert_array_equal(belief.mean, MODEL.prior_mean)
+    np.testing.assert_array_equal(np.sqrt(np.diag(belief.cov)), MODEL.prior_std)
+    # The last piece of the loop contains the others: it is not begun before they are there.
+    wait_for(lambda: begun(tmp_path, Piece(LOOP, 0)) and begun(tmp_path, Piece(LOOP, 1)))
+    assert begun(tmp_path, Piece(LOOP, 2)) is None
+    engine.submit(SetTuning("Q.rate", 0.5))
+    (tmp_path / "go").touch()
+    wait_for(lambda: row_count(engine) == 150)
+    source.put(readings(times[150:], values[150:]))
+    wait_for(lambda: row_count(engine) == 200)
+    assert_same(pull_all(engine).track, cold(times, values, "kf", Tuning.of(MODEL).set("Q.rate", 0.5)))
+    (run,) = engine.revisions.runs
+    assert run.number == fresh_status(engine).revision == 0 and run.tuning.get("Q.rate") == 0.5
+
+
+def test_who_chooses_another_filter_meanwhile_gets_that(started, tmp_path):
+    engine, source = started(ukf=1, ckf=1)
+    times, values = series(50)
+    source.put(readings(times, values))
+    wait_for(lambda: row_count(engine) == 50)
+    engine.submit(SetEstimator("ukf"))
+    wait_for(lambda: fresh_status(engine).awaited == "ukf")
+    engine.submit(SetEstimator("sr-kf"))
+    wait_for(lambda: engine.folded_with()[1] == "sr-kf")
+    (tmp_path / "go").touch()
+    wait_for(lambda: not fresh_status(engine).compiling)
+    engine.submit(SetTuning("Q.rate", 0.5))
+    wait_for(lambda: engine.folded_with()[0].get("Q.rate") == 0.5)
+    assert engine.folded_with()[1] == "sr-kf" and fresh_status(engine).awaited is None
+
+
+def test_what_is_asked_for_comes_first_and_the_rest_is_done_at_the_lowest_priority(shop, tmp_path):
+    workshop, told = shop(ukf=1, ckf=1, pf=1), []
+    workshop.start()
+    wait_for(lambda: begun(tmp_path, Piece("ukf", 0)))
+    workshop.ask("pf", told.append)
+    wait_for(lambda: begun(tmp_path, Piece("pf", 0)))
+    assert begun(tmp_path, Piece("ckf", 0)) is None and not told
+    states = workshop.states()
+    assert states["ckf"] is None and states["pf"] >= 0.0 and states["ukf"] >= 0.0
+    assert begun(tmp_path, Piece("pf", 0))[1] == os.nice(0)
+    (tmp_path / "go").touch()
+    wait_for(lambda: not workshop.states())
+    assert told == ["pf"] and workshop.ready("ckf")
+    for name in ("ukf", "ckf"):
+        assert begun(tmp_path, Piece(name, 0))[1] == 19
+    asked = []
+    workshop.ask("ukf", asked.append)
+    assert asked == ["ukf"]
+
+
+def test_what_fails_in_the_workshop_is_left_to_who_uses_it(shop, tmp_path):
+    workshop, told = shop(ukf=1, ckf=2), []
+    paper(tmp_path, "fail", Piece("ukf", 0)).touch()
+    workshop.start()
+    workshop.ask("ukf", told.append)
+    workshop.ask("ckf", told.append)
+    wait_for(lambda: begun(tmp_path, Piece("ukf", 0)) and begun(tmp_path, Piece("ckf", 0)))
+    paper(tmp_path, "go", Piece("ukf", 0)).touch()
+    wait_for(lambda: told == ["ukf"])
+    assert not paper(tmp_path, "done", Piece("ukf", 0)).exists()
+    # As if the system had ended a process for want of memory.
+    os.kill(begun(tmp_path, Piece("ckf", 0))[0], 9)
+    (tmp_path / "go").touch()
+    wait_for(lambda: told == ["ukf", "ckf"])
+
+
+def test_nothing_is_left_running(shop, tmp_path):
+    workshop = shop(ukf=1)
+    workshop.start()
+    wait_for(lambda: begun(tmp_path, Piece("ukf", 0)))
+    process = begun(tmp_path, Piece("ukf", 0))[0]
+    workshop.stop()
+    assert not Path(f"/proc/{process}").exists()
+
+
+def test_the_pieces_are_what_a_fold_compiles():
+    threaded()
+    for name in ("kf", "ukf"):
+        Fold(name, MODEL, Tuning.of(MODEL), Log(1))
+        assert all(map(is_made, (*pieces_of(LOOP), *pieces_of(name))))
+    assert [pieces_of(name) for name, entry in ESTIMATORS.items() if entry.interpreted] == [[]] * 4
+
+
+MADE = """
+from estimators.pieces import LOOP, is_made, make, pieces_of
+before = [is_made(piece) for piece in pieces_of("kf")]
+make(pieces_of("kf")[3])
+print(before, [is_made(piece) for piece in pieces_of("kf")])
+"""
+
+
+def test_a_piece_that_one_process_makes_another_finds(tmp_path):
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    said = [
+        subprocess.run([sys.executable, "-c", MADE], env=environment | {"XDG_CACHE_HOME": str(tmp_path)}, check=True,
+                       capture_output=True, text=True).stdout.strip()
+        for _ in range(2)
+    ]  # fmt: skip
+    none, one = [False] * 4, [False, False, False, True]
+    assert said == [f"{none} {one}", f"{one} {one}"]
