@@ -8,6 +8,7 @@ import numpy as np
 
 from ..recording.format import tuning_from_json
 from ..recording.reader import read_recording
+from ..running import Opening
 from ..server.port import check_port
 from ..session import Page, Session
 from ..stderr import complain
@@ -17,6 +18,8 @@ from .prepare import prepare
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
+
+    from sources.source import Source
 
     from ..recording.reader import Recorded
     from .arguments import Review
@@ -35,38 +38,48 @@ def recorded_twin(recorded: Recorded) -> Twin:
     return replace(twin, tuning=tuning, estimator=estimator, recorded=True)
 
 
-def open_review(path: Path, page: Page | None) -> tuple[Session, Recorded]:
-    """A session over the recorded readings: the same engine, the same fold.
+def opened_review(path: Path) -> Opening:
+    """What a recording holds, to be folded again: the same engine, the same fold. Its model is not compiled yet.
 
     Raises:
-        NisusError: If the recording cannot be read, its model is not there, or the page's port is in use.
+        NisusError: If the recording cannot be read, or its model is not there.
     """
-    if page is not None:
-        check_port(page.port)
     recorded = read_recording(path)
-    twin = recorded_twin(recorded)
-    prepare(twin)
 
-    def open_source(report: Callable[[str, str], None]) -> object:
+    def open_source(report: Callable[[str, str], None]) -> Source:
         from sources.memory import MemorySource
 
         return MemorySource(recorded.events)
 
-    session = Session(
-        twin,
-        open_source,  # type: ignore[arg-type]
-        page=page,
+    remarks = [("info", f"{path.name}: {recorded.rows} rows, {recorded.tunings} tuning(s), folded again")]
+    if not recorded.closed:
+        cut = f"{path.name}: was not closed, as by a kill or a full disk; it is reviewed as far as it goes"
+        remarks.append(("warn", cut))
+    return Opening(
+        recorded_twin(recorded),
+        open_source,
         base=recorded.base,
         horizon=np.inf,
         review=path,
+        said=recorded.notices,
+        remarks=remarks,
     )
-    session.engine.notices.restore(recorded.notices)
-    session.engine.notices.say(f"{path.name}: {recorded.rows} rows, {recorded.tunings} tuning(s), folded again")
-    if not recorded.closed:
-        cut = f"{path.name}: was not closed, as by a kill or a full disk; it is reviewed as far as it goes"
-        session.engine.notices.say(cut, level="warn")
-        complain(cut)
-    return session, recorded
+
+
+def open_review(path: Path, page: Page | None) -> tuple[Session, Opening]:
+    """A session over the recorded readings, and what it runs.
+
+    Raises:
+        NisusError: As `opened_review`, or if the page's port is in use.
+    """
+    if page is not None:
+        check_port(page.port)
+    opening = opened_review(path)
+    prepare(opening.twin)
+    for level, text in opening.remarks:
+        if level == "warn":
+            complain(text)
+    return Session(opening, page=page), opening
 
 
 def review_recording(arguments: Review) -> int:

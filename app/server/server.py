@@ -1,4 +1,4 @@
-"""The page server: one loopback port for the page, its API, its streams, recordings, and Viser behind it."""
+"""What is served of a running twin: the page, its API, its streams, recordings, and Viser behind it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
@@ -33,12 +32,11 @@ from ..engine.interface import Running
 from ..rerun.feed import RerunFeed
 from ..series.series import Series
 from .api import Json, command_from_json, episodes_json, faults_json, one_line, status_json
-from .bounds import BODY, TooLarge, bounded_body, bounds
-from .gate import Gate, session_token
+from .bounds import BODY, TooLarge, bounded_body
+from .door import Door
 from .model_json import model_json
 from .one_at_a_time import OneAtATime
 from .page_stream import PageStream
-from .port import listen
 from .runs_api import RunsApi
 from .viewer_assets import FILES, viewer_assets, viewer_version
 from .viser_proxy import ViserProxy
@@ -54,36 +52,24 @@ FOR_EVER = "public, max-age=31536000, immutable"
 KINDS = {".js": "text/javascript", ".wasm": "application/wasm"}
 
 
-def _policy(port: int, scripts: str) -> str:
-    """A content security policy under which no request leaves this server."""
-    # Not every browser takes 'self' to include the WebSockets of the same address.
-    sockets = f"ws://127.0.0.1:{port} ws://localhost:{port}"
-    return (
-        f"default-src 'self'; script-src 'self' {scripts}; style-src 'self' 'unsafe-inline'; "
-        f"img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob: {sockets}; "
-        "worker-src 'self' blob: data:; frame-src 'self'; frame-ancestors 'self'; object-src 'none'; "
-        "base-uri 'none'; form-action 'self'"
-    )
-
-
 class PageServer:
-    """Serves one engine to any number of browsers, from a thread of its own."""
+    """Serves one engine to any number of browsers, behind a door that may outlive it."""
 
     def __init__(
         self,
         engine: Running,
         *,
-        port: int,
+        port: int | Door,
         viser_port: int | None,
         secret: str,
         review: Path | None = None,
         choices: Choices | None = None,
     ) -> None:
-        """Take the port.
+        """Take the port, if it is not open yet.
 
         Args:
             engine: What to show.
-            port: On 127.0.0.1; 0 takes a free one.
+            port: On 127.0.0.1; 0 takes a free one. Or the door that is there: it shows this once it is started.
             viser_port: Where the private Viser server listens; None if there is none.
             secret: What Viser asks for.
             review: The recording that is reviewed, offered beside those that this process writes.
@@ -100,42 +86,31 @@ class PageServer:
         self._forecasts, self._diagnosis = Forecasts(engine), Diagnosis(engine)
         self._forecasting, self._diagnosing = OneAtATime("forecast"), OneAtATime("diagnosis")
         self._boot = uuid.uuid4().hex
-        self._socket = listen(port)
-        self.port: int = self._socket.getsockname()[1]
-        self._token = session_token()
+        self._own_door = not isinstance(port, Door)
+        self.door = port if isinstance(port, Door) else Door(port)
+        self.port, self.entered = self.door.port, self.door.entered
         self._assets: Future[Path] = Future()
         self._viser = ViserProxy(viser_port, secret) if viser_port is not None else None
-        gate = Gate(self._application(), self._token, self.port)
-        self.entered = gate.entered
-        config = uvicorn.Config(
-            gate, log_config=None, log_level="critical", access_log=False,
-            server_header=False, lifespan="off", ws_per_message_deflate=False, timeout_graceful_shutdown=1, **bounds(),
-        )  # fmt: skip
-        self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(
-            target=self._server.run, kwargs={"sockets": [self._socket]}, name="page server", daemon=True
-        )
+        self.application = self._application()
 
     @property
     def url(self) -> str:
         """Address of the page, with the token that it asks for."""
-        return f"http://127.0.0.1:{self.port}/?token={self._token}"
+        return self.door.url
 
     def start(self) -> None:
         """Serve; the Rerun viewer's files are prepared meanwhile, if this machine has not got them yet."""
         threading.Thread(target=self._prepare, name="viewer assets", daemon=True).start()
-        self._thread.start()
         self._runs.start()
-        while not self._server.started and self._thread.is_alive():
-            time.sleep(0.005)
+        self.door.show(self.application, self._boot)
+        if self._own_door:
+            self.door.start()
 
     def stop(self) -> None:
-        """Close all connections, and the port."""
-        self._server.should_exit = True
+        """Compute nothing any more; close all connections and the port, if it is this twin's own."""
         self._runs.stop()
-        if self._thread.is_alive():
-            self._thread.join(timeout=5.0)
-        self._socket.close()
+        if self._own_door:
+            self.door.stop()
 
     def _prepare(self) -> None:
         try:
@@ -169,8 +144,7 @@ class PageServer:
                 WebSocketRoute("/viser", self._viser.websocket),
                 Route("/viser/{path:path}", self._viser.http),
             ]
-        application = Starlette(routes=routes)
-        return _WithHeaders(application, self.port)  # type: ignore[return-value]
+        return Starlette(routes=routes)
 
     async def _page(self, request: Request) -> Response:
         name = "explore.html" if request.url.path == "/explore" else "index.html"
@@ -345,34 +319,3 @@ async def _listen_to(browser: WebSocket, drawn: asyncio.Event) -> None:
     """A word from the browser says that it has drawn what it got; whoever says anything longer is not the page."""
     while (word := (await browser.receive()).get("text")) is not None and len(word) <= BODY:
         drawn.set()
-
-
-class _WithHeaders:
-    """Adds the security headers to every answer."""
-
-    def __init__(self, application: Starlette, port: int) -> None:
-        self._application = application
-        common = [
-            (b"x-content-type-options", b"nosniff"),
-            (b"referrer-policy", b"no-referrer"),
-            (b"cross-origin-resource-policy", b"same-origin"),
-            (b"cross-origin-opener-policy", b"same-origin"),
-        ]
-        own = _policy(port, "'wasm-unsafe-eval'")
-        # Viser's client is one file of inline scripts that unpack themselves.
-        viser = _policy(port, "'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:")
-        self._own = [*common, (b"content-security-policy", own.encode())]
-        self._viser = [*common, (b"content-security-policy", viser.encode())]
-
-    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        extra = self._viser if scope.get("path", "").startswith("/viser") else self._own
-
-        async def send_more(message: Any) -> None:
-            if message["type"] == "http.response.start":
-                headers = [*message.get("headers", []), *extra]
-                if not any(name == b"cache-control" for name, _ in headers):
-                    headers.append((b"cache-control", b"no-cache"))
-                message = {**message, "headers": headers}
-            await send(message)
-
-        await self._application(scope, receive, send_more)

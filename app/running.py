@@ -1,0 +1,117 @@
+"""A twin that runs, with all around it: engine, recorder, and behind a page's door its scene and what serves it."""
+
+from __future__ import annotations
+
+import gc
+import secrets
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .engine.engine import Engine
+from .recording.split import NEVER, Split
+from .recording.writer import FINE, Recorder
+from .rerun.rows import RerunRows
+
+if TYPE_CHECKING:
+    from estimators.snapshots import Base
+    from sources.source import Source
+
+    from .server.door import Door
+    from .twin.twin import Twin
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What is to run: a twin on its source, or a recording of one.
+
+    `open_source`, `base` and `horizon` are those of `Engine`; `review` is the recording that is reviewed, `said` what
+    its session had said, `remarks` what there is to say of it now, (level, text). `files` are those from which the twin
+    was read, and `again` reads them once more; none of a recording, which holds its own.
+    """
+
+    twin: Twin
+    open_source: Callable[[Callable[[str, str], None]], Source]
+    base: Base | None = None
+    horizon: float | None = None
+    review: Path | None = None
+    said: Sequence[tuple[int, str, str]] = ()
+    remarks: Sequence[tuple[str, str]] = ()
+    files: tuple[Path, ...] = ()
+    again: Callable[[], Twin] | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+class RunningTwin:
+    """Starts what a twin needs, in order, and stops it in reverse."""
+
+    def __init__(
+        self, opening: Opening, *, door: Door | None, split: Split = NEVER, recordings: Path | None = None
+    ) -> None:
+        """Put it together; nothing runs yet.
+
+        Args:
+            opening: What to run.
+            door: Behind which the page shows it, once it is started; None for no page.
+            split: Into what parts to split a recording.
+            recordings: The folder of what the page records; None is the working directory.
+
+        Raises:
+            NisusError: If the source cannot be opened.
+        """
+        self.opening = opening
+        self.engine = Engine(opening.twin, opening.open_source, base=opening.base, horizon=opening.horizon)
+        if opening.said:
+            self.engine.notices.restore(list(opening.said))
+        for level, text in opening.remarks:
+            self.engine.notices.say(text, level=level)
+        self.recorder = Recorder(self.engine, lambda stream: RerunRows(stream, self.engine, series=FINE), split)
+        self.engine.recorder = self.recorder
+        self.view: Any = None
+        self.server: Any = None
+        if door is not None:
+            from .server.server import PageServer
+            from .viser.view import ViserView
+
+            secret = secrets.token_urlsafe(24)
+            try:
+                self.view = ViserView(self.engine, secret=secret)
+                self.server = PageServer(
+                    self.engine,
+                    port=door,
+                    viser_port=self.view.port,
+                    secret=secret,
+                    review=opening.review,
+                    choices=self.view.stage.choices,
+                )
+            except BaseException:
+                self.discard()
+                raise
+
+    def discard(self) -> None:
+        """Give up what was put together and never started."""
+        self.engine.stop()
+        if self.view is not None:
+            self.view.stop()
+
+    def start(self) -> None:
+        """Start everything."""
+        # What the start has built stays; looking through it again and again would hold readings up for milliseconds.
+        gc.collect()
+        gc.freeze()
+        self.recorder.start()
+        if self.server is not None:
+            self.view.start()
+            self.server.start()
+        self.engine.start()
+
+    def stop(self) -> None:
+        """Stop everything; a recording is finished."""
+        self.engine.stop()
+        self.recorder.stop()
+        if self.server is not None:
+            self.server.stop()
+            self.view.stop()
+        # Another twin may follow: what was of this one is then in nobody's way.
+        gc.unfreeze()
