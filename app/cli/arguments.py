@@ -18,10 +18,10 @@ Files = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
 @dataclass(frozen=True)
 class Run:
-    """Run a twin, and show it in the browser."""
+    """Run a twin, and show it in the browser; without a name, the gallery of all that ship."""
 
-    twin: Twin
-    """Name of a twin that ships (see `nisus twins`), or path of a YAML file."""
+    twin: Annotated[str | None, tyro.conf.Positional] = None
+    """Name of a twin that ships (see `nisus twins`), or path of a YAML file. Default: the gallery, to choose one."""
     estimator: str | None = None
     """Estimator to use instead of the twin's own; `nisus filters` lists all of them."""
     set: Settings = ()

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import uuid
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -31,11 +31,13 @@ from ..drawing.palette import EITHER, THEMES
 from ..engine.interface import Running
 from ..rerun.feed import RerunFeed
 from ..series.series import Series
+from .answer import answered
 from .api import Json, command_from_json, episodes_json, faults_json, one_line, status_json
-from .bounds import BODY, TooLarge, bounded_body
+from .bounds import BODY
 from .door import Door
 from .model_json import model_json
 from .one_at_a_time import OneAtATime
+from .page_file import PAGE, page_file
 from .page_stream import PageStream
 from .runs_api import RunsApi
 from .viewer_assets import FILES, viewer_assets, viewer_version
@@ -47,7 +49,6 @@ PERIOD = 0.2
 STATUS_PERIOD = 0.5
 """Seconds between two status messages."""
 
-PAGE = Path(__file__).parent.parent / "page"
 FOR_EVER = "public, max-age=31536000, immutable"
 KINDS = {".js": "text/javascript", ".wasm": "application/wasm"}
 
@@ -148,11 +149,8 @@ class PageServer:
 
     async def _page(self, request: Request) -> Response:
         name = "explore.html" if request.url.path == "/explore" else "index.html"
-        text = (PAGE / name).read_text()
         settings = {"viewer": f"/viewer/{viewer_version()}", "boot": self._boot, "viser": self._viser is not None}
-        # In an attribute, not in a script: the policy allows no inline ones.
-        quoted = json.dumps(settings).replace("&", "&amp;").replace('"', "&quot;")
-        return Response(text.replace("{{settings}}", quoted), media_type="text/html")
+        return page_file(name, settings)
 
     async def _status(self, request: Request) -> Response:
         return Json(self._state())
@@ -183,7 +181,7 @@ class PageServer:
             self._engine.submit(command)
             return Json({"submitted": type(command).__name__}, 202)
 
-        return await _answered(request, submit)
+        return await answered(request, submit)
 
     async def _forecast(self, request: Request) -> Response:
         if request.method == "GET":
@@ -196,7 +194,7 @@ class PageServer:
             question = question_from_json(body, self._engine.model)
             return Json(await self._forecasting.do(lambda: self._forecasts.ask(question)))
 
-        return await _answered(request, ask)
+        return await answered(request, ask)
 
     async def _diagnose(self, request: Request) -> Response:
         try:
@@ -216,7 +214,7 @@ class PageServer:
             choices.choose(str(body.get("key")), str(body.get("value")))
             return Json(choices.json())
 
-        return Json(choices.json()) if request.method != "POST" else await _answered(request, choose)
+        return Json(choices.json()) if request.method != "POST" else await answered(request, choose)
 
     async def _viewer_file(self, request: Request) -> Response:
         name = request.path_params["name"]
@@ -289,18 +287,6 @@ class PageServer:
                 # Until the frame is drawn, or the status is due.
                 await asyncio.wait_for(drawn.wait(), STATUS_PERIOD)
             await asyncio.sleep(max(0.0, PERIOD - (time.monotonic() - begun)))
-
-
-async def _answered(request: Request, take: Callable[[Any], Awaitable[Response]]) -> Response:
-    """What `take` makes of a request's JSON; its refusal as one line."""
-    if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
-        return PlainTextResponse("Nisus: Content-Type must be application/json.\n", 415)
-    try:
-        return await take(json.loads(await bounded_body(request)))
-    except TooLarge as error:
-        return PlainTextResponse(f"Nisus: {error}.\n", 413)
-    except (NisusError, ValueError, RecursionError) as error:
-        return Json({"error": one_line(str(error))}, 400)
 
 
 async def _given(feed: RerunFeed) -> AsyncIterator[str | bytes]:

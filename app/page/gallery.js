@@ -1,0 +1,65 @@
+// The gallery: every twin with a picture, what it teaches and the question it answers; beside them the recordings.
+
+import { card } from "./card.js";
+import { $, element, setText } from "./dom.js";
+import { keys } from "./keys.js";
+import { post, Session } from "./session.js";
+
+const settings = JSON.parse(document.body.dataset.settings);
+const session = new Session(settings.boot);
+
+$("theme").addEventListener("click", () => {
+  const root = document.documentElement;
+  root.dataset.theme = root.dataset.theme === "dark" ? "light" : "dark";
+  localStorage.setItem("nisus.theme", root.dataset.theme);
+});
+
+let shown = [];
+const open = () => location.assign("/");
+const start = (name) => session.tell(post("/api/gallery/start", { twin: name }));
+const stop = () => session.tell(post("/api/gallery/stop", {}));
+
+function draw(state) {
+  for (const item of shown) item.sync(state);
+  const { running, starting, failed } = state;
+  const now = [];
+  if (starting) now.push(element("span", { class: "pill", dataset: { health: "suspect" } }, `starting ${starting.title} … ${Math.floor(starting.seconds)} s`));
+  if (running)
+    now.push(
+      element("span", { class: "pill", dataset: { health: "tracking" } }, `● ${running.title} ${running.review ? "is open" : "runs"}`),
+      element("button", { type: "button", class: "go", onclick: open }, "Back to it"),
+      element("button", { type: "button", class: "go", onclick: stop }, running.review ? "Close" : "Stop"),
+    );
+  const key = JSON.stringify([running, starting]);
+  if ($("now").dataset.key !== key) {
+    $("now").dataset.key = key;
+    $("now").replaceChildren(...now);
+  }
+  $("failed").hidden = !failed;
+  setText($("failed"), failed ? `${failed.title} did not start. ${failed.text}` : "");
+}
+session.addEventListener("state", (event) => draw(event.detail));
+
+const find = () => {
+  const wanted = $("find").value.toLowerCase().split(/\s+/);
+  let left = 0;
+  for (const item of shown) {
+    item.node.hidden = !wanted.every((word) => item.words.includes(word));
+    left += !item.node.hidden;
+  }
+  $("none").hidden = left > 0;
+};
+$("find").addEventListener("input", find);
+
+const answer = await fetch("/api/gallery");
+if (!answer.ok) throw new Error(await answer.text());
+shown = (await answer.json()).map((item) => card(item, { start, open }));
+$("cards").replaceChildren(...shown.map((item) => item.node));
+if (session.state) draw(session.state);
+window.nisus = { session, cards: shown.length };
+
+keys([
+  ["/", "find a twin", () => $("find").focus()],
+  ["g", "back to the twin that runs", () => session.state?.running && open()],
+  ...shown.filter((item) => item.ready).map((item) => ["", `start ${item.name}`, () => start(item.name)]),
+]);
