@@ -66,7 +66,9 @@ class RunningTwin:
             self.engine.notices.restore(list(opening.said))
         for level, text in opening.remarks:
             self.engine.notices.say(text, level=level)
-        self.recorder = Recorder(self.engine, lambda stream: RerunRows(stream, self.engine, series=FINE), split)
+        self.recorder = Recorder(
+            self.engine, lambda stream: RerunRows(stream, self.engine, series=FINE), split, recordings or Path()
+        )
         self.engine.recorder = self.recorder
         self.view: Any = None
         self.server: Any = None

@@ -13,6 +13,7 @@ from config.loader import shipped
 
 from ..gallery.api import GalleryApi
 from ..gallery.gallery import Gallery, Opener, Wanted
+from ..gallery.recordings import Recordings
 from ..recording.format import tuning_from_json
 from ..recording.reader import read_recording
 from ..recording.split import NEVER, Split
@@ -117,15 +118,21 @@ class FileOpener:
 
 
 def open_session(
-    opening: Opening | None, wanted: Wanted | None, opener: Opener, *, page: Page | None, split: Split = NEVER
+    opening: Opening | None,
+    wanted: Wanted | None,
+    opener: Opener,
+    *,
+    page: Page | None,
+    split: Split = NEVER,
+    recordings: Path = Path(),
 ) -> Session:
     """A session that runs what was opened, and on a page the gallery beside it.
 
     Raises:
         NisusError: If the source cannot be opened, or the page's port is in use.
     """
-    session = Session(opening, page=page, split=split)
+    session = Session(opening, page=page, split=split, recordings=recordings)
     if page is not None:
         own = [wanted.twin] if wanted is not None and wanted.twin is not None and wanted.twin not in shipped() else []
-        GalleryApi(Gallery(session, opener, first=wanted, own=own))
+        GalleryApi(Gallery(session, opener, first=wanted, own=own), Recordings(recordings))
     return session

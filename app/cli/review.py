@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..gallery.gallery import Wanted
@@ -12,13 +13,11 @@ from .opener import FileOpener, open_session, opened_review
 from .prepare import prepare
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from ..running import Opening
     from .arguments import Review
 
 
-def open_review(path: Path, page: Page | None) -> tuple[Session, Opening]:
+def open_review(path: Path, page: Page | None, recordings: Path = Path()) -> tuple[Session, Opening]:
     """A session over the recorded readings, and what it runs.
 
     Raises:
@@ -31,11 +30,12 @@ def open_review(path: Path, page: Page | None) -> tuple[Session, Opening]:
     for level, text in opening.remarks:
         if level == "warn":
             complain(text)
-    return open_session(opening, Wanted(recording=path), FileOpener(), page=page), opening
+    return open_session(opening, Wanted(recording=path), FileOpener(), page=page, recordings=recordings), opening
 
 
 def review_recording(arguments: Review) -> int:
     """Carry the command out."""
-    session, _ = open_review(arguments.file, Page(arguments.port, not arguments.no_browser))
+    page = Page(arguments.port, not arguments.no_browser)
+    session, _ = open_review(arguments.file, page, arguments.recordings)
     session.run(record=None, duration=arguments.duration, until_finished=False)
     return 0

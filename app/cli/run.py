@@ -59,7 +59,7 @@ def run_twin(arguments: Run) -> int:
         check_port(page.port)
     if opening is not None:
         prepare(opening.twin)
-    session = open_session(opening, wanted, opener, page=page, split=split)
+    session = open_session(opening, wanted, opener, page=page, split=split, recordings=arguments.recordings)
     session.run(record=arguments.record, duration=arguments.duration, until_finished=arguments.headless)
     if arguments.headless:
         status = session.engine.status()

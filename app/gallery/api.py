@@ -21,13 +21,15 @@ from ..server.api import Json, one_line
 from ..server.page_file import PAGE, page_file
 from .gallery import Gallery, Wanted
 from .pictures import picture_file
+from .recordings import Recordings
+from .recordings_api import RecordingsApi
 from .shelf import shelf
 
 
 class GalleryApi:
     """Serves the gallery at the session's door, whatever else is shown there."""
 
-    def __init__(self, gallery: Gallery) -> None:
+    def __init__(self, gallery: Gallery, recordings: Recordings) -> None:
         """Furnish the door; before the session starts."""
         self._gallery = gallery
         door = gallery.session.door
@@ -42,6 +44,7 @@ class GalleryApi:
             Route("/api/gallery/start", self._start, methods=["POST"]),
             Route("/api/gallery/stop", self._stop, methods=["POST"]),
             Route("/api/gallery/picture", self._picture),
+            *RecordingsApi(gallery, recordings).routes(),
         ]
         door.furnish(routes, Starlette(routes=[page]))
 

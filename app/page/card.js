@@ -11,7 +11,7 @@ export function card(item, act) {
   const button = element("button", { type: "button", class: "start", onclick: () => (button.dataset.runs === "true" ? act.open() : act.start(item.name)) }, "Start");
   const facts = item.error ? "" : [item.source, many(item.states, "state"), many(item.rows, "row"), item.estimator].join(" · ");
   const node = element(
-    "li", { class: "card", dataset: { ready: String(ready), name: item.name } },
+    "li", { class: "card", dataset: { ready: String(ready), name: item.name, ...(item.log ? { log: "true" } : {}) } },
     picture(item),
     element("div", { class: "words" },
       item.question ? element("p", { class: "question" }, item.question) : null,
@@ -31,7 +31,7 @@ export function card(item, act) {
     setAttribute(button, "aria-label", `${runs ? "Back to" : "Start"} ${short}`);
   };
   const words = [item.name, item.title, item.question, item.teaches, facts].join(" ").toLowerCase();
-  return { node, sync, ready, words, name: item.name };
+  return { node, sync, ready, words, name: item.name, short, title: item.title, log: item.log };
 }
 
 // The reason and the remedy of what the message says first and after its semicolon.

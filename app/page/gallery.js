@@ -2,7 +2,9 @@
 
 import { card } from "./card.js";
 import { $, element, setText } from "./dom.js";
+import { drops } from "./drop.js";
 import { keys } from "./keys.js";
+import { Recordings } from "./recordings.js";
 import { post, Session } from "./session.js";
 
 const settings = JSON.parse(document.body.dataset.settings);
@@ -18,6 +20,17 @@ let shown = [];
 const open = () => location.assign("/");
 const start = (name) => session.tell(post("/api/gallery/start", { twin: name }));
 const stop = () => session.tell(post("/api/gallery/stop", {}));
+
+// What was said last of a file, until something else is said.
+let told = "";
+function say(text, wrong = false) {
+  told = wrong ? text : "";
+  setText($("sending"), wrong ? "" : text);
+  if (session.state) draw(session.state);
+  session.ask();
+}
+const files = drops({ twins: () => shown.filter((item) => item.log), say });
+const recordings = new Recordings($("recordings"), { open: files.open, drop: files.take, say: (text) => say(text, true) });
 
 function draw(state) {
   for (const item of shown) item.sync(state);
@@ -35,8 +48,9 @@ function draw(state) {
     $("now").dataset.key = key;
     $("now").replaceChildren(...now);
   }
-  $("failed").hidden = !failed;
-  setText($("failed"), failed ? `${failed.title} did not start. ${failed.text}` : "");
+  const wrong = told || (failed ? `${failed.title} did not start. ${failed.text}` : "");
+  $("failed").hidden = !wrong;
+  setText($("failed"), wrong);
 }
 session.addEventListener("state", (event) => draw(event.detail));
 
@@ -58,8 +72,11 @@ $("cards").replaceChildren(...shown.map((item) => item.node));
 if (session.state) draw(session.state);
 window.nisus = { session, cards: shown.length };
 
+if (location.hash === "#recordings") $("recordings").querySelector("button").focus();
+
 keys([
   ["/", "find a twin", () => $("find").focus()],
+  ["a", "add a file to the recordings", () => recordings.choose.click()],
   ["g", "back to the twin that runs", () => session.state?.running && open()],
   ...shown.filter((item) => item.ready).map((item) => ["", `start ${item.name}`, () => start(item.name)]),
 ]);

@@ -2,9 +2,9 @@
 
 Beside what charts show, the file keeps under /nisus, as plain columns: `twin` (YAML, what the command line changed of
 it, base), `tuning` (each one, with the event from which it was in force), `events` (the log), `base` (where a fold of
-them starts, if that has moved) and `notices` (lines for people). The track is not among them: log and tuning give it
-again. Rows carry their absolute index; a late reading makes a recorder write the events again from where it belongs.
-`reader` reads them back.
+them starts, if that has moved), `notices` (lines for people) and `summary` (what the session was worth, for lists). The
+track is not among them: log and tuning give it again. Rows carry their absolute index; a late reading makes a recorder
+write the events again from where it belongs. `reader` reads them back.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import base64
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -185,6 +186,10 @@ class RecordingFile:
             indexes=[rr.TimeColumn(TIMELINE, sequence=[index])],
             columns=rr.AnyValues.columns(json=[tuning_to_json(tuning, estimator)], revision=[revision]),
         )
+
+    def summary(self, found: Mapping[str, Any]) -> None:
+        """Write what the session was worth when the file was closed, for lists."""
+        self.stream.log("/nisus/summary", rr.AnyValues(json=json.dumps(dict(found))), static=True)
 
     def write(self, pull: Pull) -> None:
         """Write rows of the log, and the lines for people."""

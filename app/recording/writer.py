@@ -26,6 +26,7 @@ from ..rerun.rows import RerunRows
 from .disk import Disk
 from .format import RecordingFile
 from .split import NEVER, Split, part_path
+from .summary import summary_of
 
 if TYPE_CHECKING:
     from estimators.diagnostics.episodes import Episode
@@ -56,8 +57,9 @@ FINE = math.inf
 class Recorder:
     """Starts and stops recordings of one engine. `draw(stream)` gives what logs the charts' entities of a pull."""
 
-    def __init__(self, engine: Running, draw: Any, split: Split = NEVER) -> None:
+    def __init__(self, engine: Running, draw: Any, split: Split = NEVER, folder: Path = Path()) -> None:
         self._engine = engine
+        self.folder = folder
         self._draw = draw
         self._split = split
         self._wake = threading.Event()
@@ -260,6 +262,8 @@ class _Part:
                 self._drawing(replace(pull, fresh=fresh, notices=[]))
                 self.file.flush()
                 fresh = False
+        if not short:
+            self.file.summary(summary_of(self._engine))
         self.file.close()
 
     def abandon(self) -> None:
