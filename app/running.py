@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 import secrets
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -72,6 +72,8 @@ class RunningTwin:
         self.engine.recorder = self.recorder
         self.view: Any = None
         self.server: Any = None
+        self.gone: threading.Event | None = None
+        """Set, once this was started, when nobody is connected any more to what the page showed before."""
         if door is not None:
             from .server.server import PageServer
             from .viser.view import ViserView
@@ -99,13 +101,10 @@ class RunningTwin:
 
     def start(self) -> None:
         """Start everything."""
-        # What the start has built stays; looking through it again and again would hold readings up for milliseconds.
-        gc.collect()
-        gc.freeze()
         self.recorder.start()
         if self.server is not None:
             self.view.start()
-            self.server.start()
+            self.gone = self.server.start()
         self.engine.start()
 
     def stop(self) -> None:
@@ -115,5 +114,3 @@ class RunningTwin:
         if self.server is not None:
             self.server.stop()
             self.view.stop()
-        # Another twin may follow: what was of this one is then in nobody's way.
-        gc.unfreeze()

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from estimators.errors import SourceError
 
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
     from .recording.writer import Recorder
     from .twin.twin import Twin
 
+PATIENCE = 3.0
+"""Seconds for the browsers to let go of a twin that was stopped."""
+
 SWITCH = 0.0005
 """Seconds after which Python lets another thread run; its default of 5 ms is as long as a reading may take in all."""
 
@@ -37,6 +41,28 @@ class Page:
 
     port: int
     open_browser: bool
+
+
+def _settle(gone: threading.Event | None = None) -> None:
+    """What a start has built stays: looking through it again and again would hold readings up for milliseconds.
+
+    Not so what ran before, which is garbage once nobody is connected to it any more (`gone`).
+    """
+    if gone is not None:
+        gone.wait(PATIENCE)
+    gc.unfreeze()
+    gc.collect()
+    gc.freeze()
+
+
+class Beside(Protocol):
+    """A thread of the session."""
+
+    def start(self) -> None:
+        """Begin."""
+
+    def stop(self) -> None:
+        """End."""
 
 
 class Session:
@@ -71,6 +97,8 @@ class Session:
         self.door: Door | None = None
         self.running: RunningTwin | None = None
         self._changing = threading.RLock()
+        self.beside: list[Beside] = []
+        """What starts and stops with the session."""
         if page is not None:
             self.door = Door(page.port)
         try:
@@ -147,6 +175,7 @@ class Session:
                 if after is not None:
                     self.running = after
                     after.start()
+                    _settle(after.gone)
                 elif self.running is None and self.door is not None:
                     self.door.show(None)
 
@@ -156,9 +185,14 @@ class Session:
             self.door.start()
         if self.running is not None:
             self.running.start()
+        _settle()
+        for item in self.beside:
+            item.start()
 
     def stop(self) -> None:
         """Stop everything; a recording is finished."""
+        for item in self.beside:
+            item.stop()
         with self._changing:
             if self.running is not None:
                 self.running.stop()

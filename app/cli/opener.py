@@ -14,6 +14,7 @@ from config.loader import shipped
 from ..gallery.api import GalleryApi
 from ..gallery.gallery import Gallery, Opener, Wanted
 from ..gallery.recordings import Recordings
+from ..gallery.saved_files import SavedFiles
 from ..recording.format import tuning_from_json
 from ..recording.reader import read_recording
 from ..recording.split import NEVER, Split
@@ -134,5 +135,7 @@ def open_session(
     session = Session(opening, page=page, split=split, recordings=recordings)
     if page is not None:
         own = [wanted.twin] if wanted is not None and wanted.twin is not None and wanted.twin not in shipped() else []
-        GalleryApi(Gallery(session, opener, first=wanted, own=own), Recordings(recordings))
+        gallery = Gallery(session, opener, first=wanted, own=own)
+        GalleryApi(gallery, Recordings(recordings))
+        session.beside.append(SavedFiles(gallery))
     return session

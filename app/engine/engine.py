@@ -46,6 +46,7 @@ from .notices import Notices
 from .outputs import Belief, Cursor, Here, Pull, Status
 from .playback import playback_status
 from .refolder import Refolded, Refolder, Requests
+from .reload import Reloaded, merged
 from .revisions import Revisions
 from .silence import Silence
 from .stall import Stall
@@ -112,6 +113,7 @@ class Engine:
         self._requests = Requests()
         self.revisions = Revisions(self.estimator, self.tuning)
         self._revision = 0
+        self.reloads = 0
         self._stopping = threading.Event()
         self._finished = False
         self._idle_ticks = IdleTicks(section.tick)
@@ -121,8 +123,8 @@ class Engine:
         self._alerts = Alerts(self.notices, lambda: self._chronicle.account.in_alarm)
         self._silence = Silence(self.notices, section.stale_after)
         self._stall = Stall(self._say_stalled)
-        self._integrity = IntegrityWatch(self.model, self.last_events, self._policy.false_alarm_every)
-        self._blame = Blame(self.model, lambda: self._chronicle.account.episodes, self.last_events, self.notices)
+        self._integrity = IntegrityWatch(self.last_events, self._policy.false_alarm_every)
+        self._blame = Blame(lambda: self._chronicle.account.episodes, self.last_events, self.notices)
         self._status: tuple[float, Status] | None = None
         self.recorder: Records | None = None
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
@@ -191,6 +193,10 @@ class Engine:
     def submit(self, command: commands.Command) -> None:
         """Queue a command."""
         self._inbox.put(command)
+
+    def reload(self, twin: Twin, why: str) -> None:
+        """Queue going on with the twin as it was saved anew, of the same shape (see reload.py)."""
+        self._inbox.put(Reloaded(twin, why))
 
     def cursor(self, *, follows_log: bool = False, span: int | None = None) -> Cursor:
         """A cursor for one consumer, for `pull`; give it back with `release`. See `Cursor` for the rest."""
@@ -504,6 +510,8 @@ class Engine:
             self._adopt(item)
         elif isinstance(item, Restarted):
             self._restart()
+        elif isinstance(item, Reloaded):
+            self._reload(item)
         elif isinstance(item, Finished):
             self._put(self._intake.finish())
             with self._lock, self._stall.watched(self._fold):
@@ -529,6 +537,16 @@ class Engine:
         if wanted:
             self.retune(*wanted)
 
+    def _reload(self, item: Reloaded) -> None:
+        """Fold the history again with the twin as it was saved."""
+        estimator, tuning = merged(self.twin, item.twin, self.estimator, self.tuning)
+        self._options.leave(self.estimator, self.tuning)
+        self.twin, self.model = item.twin, item.twin.model
+        self._options.begin(item.twin)
+        self.reloads += 1
+        self.revisions.why = item.why
+        self.retune(estimator, tuning)
+
     def insert(self, event: Events) -> None:
         """Put in an event of our own."""
         with self._lock, self._stall.watched(self._fold):
@@ -537,6 +555,9 @@ class Engine:
     def retune(self, estimator: str, tuning: Tuning) -> None:
         """Fold the history again, beside the running fold, over a copy of the log."""
         self._options.leave(self.estimator, self.tuning)
+        if tuning.model is not self.model:
+            # Of a revision before the twin's files were saved.
+            tuning = replace(tuning, model=self.model)
         # First, so that nobody sees the new tuning without a refold that is waited for.
         ticket = self._requests.ask()
         self.estimator, self.tuning = estimator, tuning

@@ -35,7 +35,6 @@ class GalleryApi:
         door = gallery.session.door
         assert door is not None, "a gallery needs a page"
         self._door = door
-        page = Route("/", self._page)
         routes = [
             Route("/gallery", self._page),
             Mount("/page", StaticFiles(directory=PAGE)),
@@ -46,7 +45,7 @@ class GalleryApi:
             Route("/api/gallery/picture", self._picture),
             *RecordingsApi(gallery, recordings).routes(),
         ]
-        door.furnish(routes, Starlette(routes=[page]))
+        door.furnish(routes, Starlette(routes=[Route("/", self._page)]))
 
     async def _page(self, request: Request) -> Response:
         return page_file("gallery.html", {"boot": self._door.boot})

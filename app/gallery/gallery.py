@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -94,9 +94,20 @@ class Gallery:
             raise ConfigError(f"{quoted(wanted.twin)} is no twin of this gallery; {nearest(wanted.twin, self.names())}")
         self._begin(wanted, lambda: self._start(wanted))
 
-    def restart(self, wanted: Wanted, opening: Opening) -> None:
-        """Begin to start something that has been read already, in place of what runs."""
-        self._begin(wanted, lambda: self._put(wanted, opening))
+    def again(self, remark: str) -> None:
+        """Begin to start anew what runs, which says why.
+
+        Raises:
+            ConfigError: If something is being started already, or nothing runs.
+        """
+        wanted = self.running
+        if wanted is None:
+            raise ConfigError("nothing runs that could be started anew")
+        self._begin(wanted, lambda: self._start(wanted, remark))
+
+    def prepare(self, twin: Twin) -> None:
+        """Compile what a twin runs with; raises as `Opener.prepare`."""
+        self._opener.prepare(twin)
 
     def stop(self) -> None:
         """Stop what runs; the gallery stays."""
@@ -124,8 +135,10 @@ class Gallery:
             if self.session.running is None:
                 self.running = None
 
-    def _start(self, wanted: Wanted) -> None:
+    def _start(self, wanted: Wanted, remark: str | None = None) -> None:
         opening = self._opener.open(wanted)
+        if remark is not None:
+            opening = replace(opening, remarks=[*opening.remarks, ("warn", remark)])
         self._opener.prepare(opening.twin)
         self._put(wanted, opening)
 

@@ -8,17 +8,24 @@ export class Session extends EventTarget {
     super();
     this.boot = boot;
     this.state = null;
-    document.addEventListener("visibilitychange", () => this.ask());
+    this.woken = () => this.ask();
+    document.addEventListener("visibilitychange", this.woken);
     this.ask();
+  }
+
+  close() {
+    this.closed = true;
+    clearTimeout(this.timer);
+    document.removeEventListener("visibilitychange", this.woken);
   }
 
   async ask() {
     clearTimeout(this.timer);
-    if (document.hidden) return;
+    if (document.hidden || this.closed) return;
     const answer = await fetch("/api/session").catch(() => null);
     if (answer?.ok) this.take(await answer.json());
     clearTimeout(this.timer);
-    this.timer = setTimeout(() => this.ask(), this.state?.starting ? HASTE : REST);
+    if (!this.closed) this.timer = setTimeout(() => this.ask(), this.state?.starting ? HASTE : REST);
   }
 
   take(state) {

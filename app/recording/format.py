@@ -153,23 +153,18 @@ class RecordingFile:
         except OSError as error:
             raise SourceError(f"recording {path}: {error.strerror}; choose a place that can be written") from None
         self.rows = 0
-        self.stream.log(
-            "/nisus/twin",
-            rr.AnyValues(
-                format=FORMAT,
-                name=name,
-                yaml=text,
-                path=str(twin_path),
-                base=base_to_json(base),
-                overrides=json.dumps(dict(overrides or {})),
-            ),  # fmt: skip
-            static=True,
-        )
+        self._header = {"name": name, "path": str(twin_path), "base": base_to_json(base)}
+        self.twin(text, overrides or {})
 
     @property
     def size(self) -> int:
         """Bytes that the file has taken."""
         return self._file.size
+
+    def twin(self, text: str, overrides: Mapping[str, str]) -> None:
+        """Write the twin's YAML, again when it was saved anew: the last one counts."""
+        more = {"yaml": text, "overrides": json.dumps(dict(overrides))}
+        self.stream.log("/nisus/twin", rr.AnyValues(format=FORMAT, **self._header, **more), static=True)
 
     def base(self, base: Base | None, index: int, revision: int) -> None:
         """Write where a fold of a revision starts, from event `index` on; None is the prior."""

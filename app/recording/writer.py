@@ -162,7 +162,7 @@ class _Part:
 
     def __init__(self, engine: Running, asked: Path, draw: Any, *, before: _Part | None = None) -> None:
         """Begin a recording at the path that was asked for; or the part after another, from which it goes on."""
-        twin = engine.twin
+        twin = self._twin = engine.twin
         self._engine = engine
         self.asked = asked
         self.number: int
@@ -229,6 +229,9 @@ class _Part:
                 self._move(pull.first)
             if pull.revision != self._revision:
                 tuning, estimator = self._engine.folded_with()
+                if self._engine.twin is not self._twin:
+                    self._twin = self._engine.twin
+                    self.file.twin(self._twin.text, self._twin.overrides)
                 self.file.tuning(tuning, estimator, pull.first, pull.revision)
                 if begun and not pull.fresh:
                     self._edited, self._turned = True, time.monotonic()

@@ -49,6 +49,27 @@ class Shown:
         self.application, self.boot = application, boot
         self.left = asyncio.Event()
         """Set when something else has taken its place, by the thread of the server."""
+        self.over = threading.Event()
+        """Set once nobody is connected to it any more either."""
+        self._open = 0
+
+    async def stream(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve a WebSocket for as long as this is shown."""
+        self._open += 1
+        try:
+            await self.application(scope, _until(receive, self.left), send)
+        finally:
+            self._open -= 1
+            self._look()
+
+    def leave(self) -> None:
+        """Something else is shown; in the thread of the server."""
+        self.left.set()
+        self._look()
+
+    def _look(self) -> None:
+        if self.left.is_set() and not self._open:
+            self.over.set()
 
 
 class Door:
@@ -63,8 +84,8 @@ class Door:
         self._socket = listen(port)
         self.port: int = self._socket.getsockname()[1]
         self._token = session_token()
-        self._empty = Shown(self._nothing, uuid.uuid4().hex)
-        self._shown = self._empty
+        self._shown = Shown(self._nothing, uuid.uuid4().hex)
+        self._page: App | None = None
         self._own = Starlette()
         self._own.router.default = self._behind
         self._own.router.redirect_slashes = False
@@ -90,19 +111,30 @@ class Door:
         """What tells that which is shown from all that was: a page that knows another one loads again."""
         return self._shown.boot
 
-    def furnish(self, routes: Sequence[BaseRoute], empty: App) -> None:
-        """What is served whatever is shown, and what while nothing is; before the start."""
-        self._own.router.routes.extend(routes)
-        self._empty = Shown(empty, self._empty.boot)
-        self._shown = self._empty
+    @property
+    def furnished(self) -> bool:
+        """Whether there is more than what is shown: a gallery."""
+        return bool(self._own.routes)
 
-    def show(self, application: App | None, boot: str | None = None) -> None:
-        """Put an application behind the door in place of what is there, or nothing; from any thread."""
+    def furnish(self, routes: Sequence[BaseRoute], page: App) -> None:
+        """What is served whatever is shown, and which page while nothing is; before the start."""
+        self._own.router.routes.extend(routes)
+        self._page = page
+
+    def show(self, application: App | None, boot: str | None = None) -> threading.Event:
+        """Put an application behind the door in place of what is there, or nothing; from any thread.
+
+        Returns:
+            Set once nobody is connected any more to what was there.
+        """
         before = self._shown
         boot = uuid.uuid4().hex if boot is None else boot
-        self._shown = Shown(self._empty.application if application is None else application, boot)
+        self._shown = Shown(self._nothing if application is None else application, boot)
         if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(before.left.set)
+            self._loop.call_soon_threadsafe(before.leave)
+        else:
+            before.over.set()
+        return before.over
 
     def start(self) -> None:
         """Serve."""
@@ -124,8 +156,8 @@ class Door:
     async def _behind(self, scope: Scope, receive: Receive, send: Send) -> None:
         shown = self._shown
         scope.pop("router", None)
-        taken = _until(receive, shown.left) if scope["type"] == "websocket" else receive
-        await shown.application(scope, taken, send)
+        serve = shown.stream if scope["type"] == "websocket" else shown.application
+        await serve(scope, receive, send)
 
     async def _nothing(self, scope: Scope, receive: Receive, send: Send) -> None:
         """No twin runs. A page that still shows one is told to load again, others the reason."""
@@ -134,6 +166,8 @@ class Door:
             await browser.accept()
             await browser.send_text(json.dumps({"boot": self.boot}))
             await browser.close(GONE)
+        elif scope["path"] == "/" and self._page is not None:
+            await self._page(scope, receive, send)
         elif scope["path"].startswith("/api/"):
             await JSONResponse({"error": NOTHING}, 409)(scope, receive, send)
         else:

@@ -87,6 +87,8 @@ class PageServer:
         self._forecasts, self._diagnosis = Forecasts(engine), Diagnosis(engine)
         self._forecasting, self._diagnosing = OneAtATime("forecast"), OneAtATime("diagnosis")
         self._boot = uuid.uuid4().hex
+        self.unread: str | None = None
+        """What is wrong with the twin's files as they were saved last, if they are not what runs."""
         self._own_door = not isinstance(port, Door)
         self.door = port if isinstance(port, Door) else Door(port)
         self.port, self.entered = self.door.port, self.door.entered
@@ -99,13 +101,14 @@ class PageServer:
         """Address of the page, with the token that it asks for."""
         return self.door.url
 
-    def start(self) -> None:
+    def start(self) -> threading.Event:
         """Serve; the Rerun viewer's files are prepared meanwhile, if this machine has not got them yet."""
         threading.Thread(target=self._prepare, name="viewer assets", daemon=True).start()
         self._runs.start()
-        self.door.show(self.application, self._boot)
+        over = self.door.show(self.application, self._boot)
         if self._own_door:
             self.door.start()
+        return over
 
     def stop(self) -> None:
         """Compute nothing any more; close all connections and the port, if it is this twin's own."""
@@ -150,6 +153,7 @@ class PageServer:
     async def _page(self, request: Request) -> Response:
         name = "explore.html" if request.url.path == "/explore" else "index.html"
         settings = {"viewer": f"/viewer/{viewer_version()}", "boot": self._boot, "viser": self._viser is not None}
+        settings["gallery"] = self.door.furnished
         return page_file(name, settings)
 
     async def _status(self, request: Request) -> Response:
@@ -157,7 +161,8 @@ class PageServer:
 
     def _state(self) -> dict[str, Any]:
         scene = [] if self._choices is None else self._choices.json()
-        return {**status_json(self._engine), "recordings": sorted(self._recordings()), "scene": scene}
+        status = {**status_json(self._engine), "recordings": sorted(self._recordings()), "scene": scene}
+        return {**status, "unread": self.unread, "reloads": getattr(self._engine, "reloads", 0)}
 
     async def _model(self, request: Request) -> Response:
         return Json(await asyncio.to_thread(model_json, self._engine))
