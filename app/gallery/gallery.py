@@ -144,11 +144,14 @@ class Gallery:
 
     def _put(self, wanted: Wanted, opening: Opening) -> None:
         """Run it in place of what runs."""
-        ran = self.session.running
         # Two on one bus would hear each other's asset.
-        both = ran is not None and _on_a_bus(ran.opening) and _on_a_bus(opening)
+        both = _on_a_bus(opening) and self._runs_on_a_bus()
         self.session.change(lambda: self.session.prepared(opening), stop_first=both)
         self.running = wanted
+
+    def _runs_on_a_bus(self) -> bool:
+        ran = self.session.running
+        return ran is not None and _on_a_bus(ran.opening)
 
 
 def _on_a_bus(opening: Opening) -> bool:

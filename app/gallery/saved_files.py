@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import threading
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 
@@ -30,7 +31,8 @@ class SavedFiles:
 
     def __init__(self, gallery: Gallery, *, every: float = EVERY) -> None:
         self._gallery, self._every = gallery, every
-        self._of: RunningTwin | None = None
+        # Not to be kept alive by being looked at.
+        self._of: weakref.ref[RunningTwin] | None = None
         self._known: Stamp = ()
         self._seen: Stamp = ()
         self._stopping = threading.Event()
@@ -53,8 +55,8 @@ class SavedFiles:
             self._of = None
             return
         stamp = _stamp(running.opening.files)
-        if running is not self._of:
-            self._of, self._known, self._seen = running, stamp, stamp
+        if self._of is None or running is not self._of():
+            self._of, self._known, self._seen = weakref.ref(running), stamp, stamp
             return
         settled, self._seen = stamp == self._seen, stamp
         if settled and stamp != self._known and self._gallery.starting is None:
