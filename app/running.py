@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import secrets
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,13 +23,29 @@ if TYPE_CHECKING:
     from .twin.twin import Twin
 
 
+Stamp = tuple[tuple[int, int] | None, ...]
+"""Of some files: when each was written, ns, and how large it is; None where there is none."""
+
+
+def stamp_of(files: tuple[Path, ...]) -> Stamp:
+    """When each file was written and how large it is; None while an editor has taken it away."""
+    found: list[tuple[int, int] | None] = []
+    for file in files:
+        try:
+            stat = os.stat(file)
+            found.append((stat.st_mtime_ns, stat.st_size))
+        except OSError:
+            found.append(None)
+    return tuple(found)
+
+
 @dataclass(frozen=True)
 class Opening:
     """What is to run: a twin on its source, or a recording of one.
 
     `open_source`, `base` and `horizon` are those of `Engine`; `review` is the recording that is reviewed, `said` what
     its session had said, `remarks` what there is to say of it now, (level, text). `files` are those from which the twin
-    was read, and `again` reads them once more; none of a recording, which holds its own.
+    was read, `stamp` what they were then, and `again` reads them once more; none of a recording, which holds its own.
     """
 
     twin: Twin
@@ -39,8 +56,8 @@ class Opening:
     said: Sequence[tuple[int, str, str]] = ()
     remarks: Sequence[tuple[str, str]] = ()
     files: tuple[Path, ...] = ()
+    stamp: Stamp = ()
     again: Callable[[], Twin] | None = None
-    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 class RunningTwin:

@@ -18,7 +18,7 @@ from ..gallery.saved_files import SavedFiles
 from ..recording.format import tuning_from_json
 from ..recording.reader import read_recording
 from ..recording.split import NEVER, Split
-from ..running import Opening
+from ..running import Opening, stamp_of
 from ..session import Page, Session
 from ..twin.model import model_file
 from ..twin.twin import Twin, load_twin, restore_twin
@@ -53,8 +53,8 @@ def opened_twin(
         return load_twin(name, log_files=logs or None, overrides=overrides)
 
     twin = read()
-    files = [twin.path, *model_file(twin.loaded)]
-    return Opening(twin, live_source(twin, speed), files=tuple(files), again=read)
+    files = (twin.path, *model_file(twin.loaded))
+    return Opening(twin, live_source(twin, speed), files=files, stamp=stamp_of(files), again=read)
 
 
 def recorded_twin(recorded: Recorded) -> Twin:

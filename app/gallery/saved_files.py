@@ -6,7 +6,6 @@ another one, is started anew. What cannot be read is said with its line, and wha
 
 from __future__ import annotations
 
-import os
 import threading
 import weakref
 from collections.abc import Callable
@@ -16,14 +15,12 @@ from config.loader import shown_path
 from estimators.errors import NisusError
 
 from ..engine.reload import obstacle
-from ..running import RunningTwin
+from ..running import RunningTwin, Stamp, stamp_of
 from ..twin.twin import Twin
 from .gallery import Gallery
 
 EVERY = 0.4
 """Seconds between two looks at the files. An editor may write one in pieces: it is read once it stays as it is."""
-
-Stamp = tuple[tuple[int, int] | None, ...]
 
 
 class SavedFiles:
@@ -54,10 +51,9 @@ class SavedFiles:
         if running is None or running.opening.again is None:
             self._of = None
             return
-        stamp = _stamp(running.opening.files)
+        stamp = stamp_of(running.opening.files)
         if self._of is None or running is not self._of():
-            self._of, self._known, self._seen = weakref.ref(running), stamp, stamp
-            return
+            self._of, self._known, self._seen = weakref.ref(running), running.opening.stamp, stamp
         settled, self._seen = stamp == self._seen, stamp
         if settled and stamp != self._known and self._gallery.starting is None:
             changed = [
@@ -100,15 +96,3 @@ class SavedFiles:
                 running = self._gallery.session.running
                 if running is not None:
                     running.engine.notices.say(str(error), level="warn")
-
-
-def _stamp(files: tuple[Path, ...]) -> Stamp:
-    """When each file was written and how large it is; None while an editor has taken it away."""
-    found: list[tuple[int, int] | None] = []
-    for file in files:
-        try:
-            stat = os.stat(file)
-            found.append((stat.st_mtime_ns, stat.st_size))
-        except OSError:
-            found.append(None)
-    return tuple(found)

@@ -9,7 +9,7 @@ from app.session import Page
 from tests.app.scripted import wait_for
 from tests.app.served import Client
 
-PATIENCE = 120.0
+PATIENCE = 60.0
 
 
 class Opened:
