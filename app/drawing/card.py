@@ -1,8 +1,8 @@
 """A twin's picture for the gallery, as SVG: drawn from a fold of its own log, by what the twin is.
 
 A field is a map, a vehicle its track among its walls, a battery the charge of its cells, three states without a unit
-the curve that they draw, many a picture of state over time, a switch its probability; and everything else the state
-that nobody measures, with its band. Colours are the page's by name, so that light and dark are its own.
+the curve that they draw, many a picture of state over time; and everything else a parameter that is estimated, a switch
+or a state that nobody measures, with its band. Colours are the page's by name, so that light and dark are its own.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.track import Track
 
 from ..series.columns import Column, columns_of
-from .direct_readings import observed
+from .direct_readings import Observed, observed
 from .heatmap import DEVIATION, ERROR, ESTIMATE, Kind, Scale, gradient, image_of
 
 WIDTH, HEIGHT, MARGIN = 320, 140, 8
@@ -40,6 +40,7 @@ STYLE = (
     ".card-picture .band{fill:var(--band,#0b62c426);stroke:none}"
     ".card-picture .truth{fill:none;stroke:var(--truth,#111827);stroke-width:1.1;stroke-dasharray:4 3}"
     ".card-picture .reading{fill:var(--reading,#d98a00)}"
+    ".card-picture .refused{fill:var(--refused,#cc3f0c)}"
     ".card-picture .cloud{fill:var(--estimate,#0b62c4);fill-opacity:.35}"
     ".card-picture .wall{fill:none;stroke:var(--faint,#5b6a7d);stroke-width:1.4}"
 )
@@ -62,6 +63,8 @@ def picture_of(twin: Any, log: Log) -> str:
     events, track = log.events, fold.track
     if model.grid is not None:
         return _svg(_maps(fold.pictures.taken if fold.pictures is not None else []))
+    if scene.kind == "vehicle" and not scene.walls and _straight(model, scene.position, events, track):
+        return _svg(_chart(model, [_most_refused(model, track, events)], events, track))
     if scene.kind == "vehicle":
         return _svg(_path(model, scene, events, track, cloud))
     if scene.kind == "battery":
@@ -71,8 +74,9 @@ def picture_of(twin: Any, log: Log) -> str:
     names = scene.axes or model.state_names[:3]
     units = {model.states[model.state_names.index(name)].unit for name in names}
     if len(names) == 3 and units <= {"", "1"}:
-        return _svg(_curve(model, names[0], names[2], events, track, round(2e9 * window)))
-    return _svg(_chart(model, [_told_least(model)], events, track))
+        return _svg(_curve(model, names[0], names[2], events, track, round(1e9 * window)))
+    sought = next(iter(twin.config.estimate), None) or _told_least(model)
+    return _svg(_chart(model, [sought], events, track))
 
 
 def _told_least(model: StateSpaceModel) -> str:
@@ -82,6 +86,26 @@ def _told_least(model: StateSpaceModel) -> str:
     read = {model.state_names[item.state] for item in observed(model)}
     names = [state.name for state in model.shown_states]
     return next((name for name in names if name not in read), names[0])
+
+
+def _straight(model: StateSpaceModel, position: tuple[str, str], events: Events, track: Track) -> bool:
+    """Whether a drive is a line, of which a map would say nothing."""
+    columns = columns_of(model)
+    points = np.stack([columns[f"mean:{name}"].values(events, track) for name in position])
+    spread = np.linalg.eigvalsh(np.cov(points[:, np.isfinite(points).all(axis=0)]))
+    return bool(spread[0] < 1e-3 * spread[1])
+
+
+def _most_refused(model: StateSpaceModel, track: Track, events: Events) -> str:
+    """The state of whose readings the gate refused most."""
+    columns = columns_of(model)
+
+    def refused(item: Observed) -> int:
+        row = model.row_names[model.row_start[item.sensor] + item.row]
+        return int(np.isfinite(columns[f"refused:{row}"].values(events, track)).sum())
+
+    seen = observed(model)
+    return model.state_names[max(seen, key=refused).state] if seen else _told_least(model)
 
 
 def _chart(model: StateSpaceModel, names: Iterable[str], events: Events, track: Track) -> list[str]:
@@ -99,23 +123,27 @@ def _chart(model: StateSpaceModel, names: Iterable[str], events: Events, track: 
     main = max(names, key=lambda name: spread[name])
     lines = {name: place(values("mean", name)) for name in names}
     upper, lower, truth = (place(values(kind, main)) for kind in ("upper", "lower", "truth"))
-    dots = np.full(t.size, np.nan)
+    dots, refused = np.full(t.size, np.nan), np.full(t.size, np.nan)
     if main in read:
-        item = read[main]
-        start = model.row_start[item.sensor]
-        dots = values("reading", model.row_names[start + item.row])
+        row = model.row_names[model.row_start[read[main].sensor] + read[main].row]
+        dots, refused = values("reading", row), values("refused", row)
     # The prior's band may be as wide as all the world: what comes later sets the scale.
     later = slice(max(1, len(upper) // 10), None)
     shown = np.concatenate([*(line for line in lines.values()), truth, upper[later], lower[later]])
     y = _scale(shown, HEIGHT - MARGIN, MARGIN)
     x = np.linspace(MARGIN, WIDTH - MARGIN, len(upper))
-    at = np.flatnonzero(np.isfinite(dots))
-    at = at[:: max(1, at.size // DOTS)]
-    across = np.interp(t[at], [t[0], t[-1]], [MARGIN, WIDTH - MARGIN])
+
+    def marks(dots: np.ndarray, kind: str) -> list[str]:
+        at = np.flatnonzero(np.isfinite(dots))
+        at = at[:: max(1, at.size // DOTS)]
+        across = np.interp(t[at], [t[0], t[-1]], [MARGIN, WIDTH - MARGIN])
+        return [_dot(a, b, 1.5, kind) for a, b in zip(across, y(dots[at]), strict=True)]
+
     return [
         _band(x, y(upper), y(lower)),
-        *(_dot(a, b, 1.4, "reading") for a, b in zip(across, y(dots[at]), strict=True)),
+        *marks(dots, "reading"),
         *(_line(x, y(line), "estimate") for line in lines.values()),
+        *marks(refused, "refused"),
         _line(x, y(truth), "truth"),
     ]
 
@@ -136,6 +164,9 @@ def _path(model: StateSpaceModel, scene: Any, events: Events, track: Track, clou
         indices = [model.state_names.index(name) for name in (east, north)]
         points = np.asarray(cloud)[:: max(1, len(cloud) // (2 * DOTS))][:, indices]
     walls = [np.array(wall, float).T for wall in scene.walls]
+    if not walls:
+        # Nothing says which way is up: along the picture there is most room.
+        mean, truth = (_turned(*mean, *mean), _turned(*truth, *mean))
     all_x = np.concatenate([mean[0], truth[0], *(wall[0] for wall in walls)])
     all_y = np.concatenate([mean[1], truth[1], *(wall[1] for wall in walls)])
     x, y = _alike(all_x, all_y)
@@ -147,6 +178,14 @@ def _path(model: StateSpaceModel, scene: Any, events: Events, track: Track, clou
     ]
 
 
+def _turned(x: np.ndarray, y: np.ndarray, along_x: np.ndarray, along_y: np.ndarray) -> list[np.ndarray]:
+    """Points turned so that the longest axis of others lies flat."""
+    others = np.stack([along_x, along_y])
+    axis = np.linalg.eigh(np.cov(others[:, np.isfinite(others).all(axis=0)]))[1][:, -1]
+    axis = axis * (np.sign(axis[0]) or 1.0)
+    return [axis[0] * x + axis[1] * y, axis[0] * y - axis[1] * x]
+
+
 def _curve(model: StateSpaceModel, first: str, last: str, events: Events, track: Track, span: int) -> list[str]:
     """Two states against each other, truth and estimate."""
     columns = columns_of(model)
@@ -155,7 +194,8 @@ def _curve(model: StateSpaceModel, first: str, last: str, events: Events, track:
     told = [columns[f"truth:{name}"].values(events, track)[rows] for name in (first, last)]
     known = np.isfinite(told[0])
     mean = [columns[f"mean:{name}"].values(events, track)[rows] for name in (first, last)]
-    x, y = _scale(mean[0], MARGIN, WIDTH - MARGIN), _scale(mean[1], HEIGHT - MARGIN, MARGIN)
+    across, up = (np.concatenate([mean[k], told[k]]) for k in (0, 1))
+    x, y = _scale(across, MARGIN, WIDTH - MARGIN), _scale(up, HEIGHT - MARGIN, MARGIN)
     return [
         _line(x(mean[0]), y(mean[1]), "estimate"),
         _line(x(told[0][known]), y(told[1][known]), "truth"),

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from config.loader import find, load, shipped
+from config.loader import Loaded, find, load, shipped
 from estimators.errors import NisusError
 
+from ..running import Stamp, stamp_of
 from ..twin.missing import missing
-from ..twin.twin import Twin, load_twin
+from ..twin.twin import load_twin
 from .pictures import picture_file
 
 KINDS = {"simulator": "simulated", "can": "CAN bus", "can_log": "recorded", "table": "recorded", "merged": "recorded"}
@@ -35,7 +36,6 @@ class Card:
     states: int = 0
     rows: int = 0
     estimator: str = ""
-    scene: str = ""
     log: bool = False
     picture: bool = False
     missing: str | None = None
@@ -55,16 +55,21 @@ def shelf(own: Iterable[str] = ()) -> list[Card]:
 def card(name: str) -> Card:
     """The card of a twin, whatever is wrong with it."""
     try:
-        twin = load_twin(name)
+        path = find(name)
+        # A user's twin has a model of its own, which may change by itself.
+        read = _read if name in shipped() else _read.__wrapped__
+        found, loaded = read(name, stamp_of((path,)))
     except (NisusError, OSError) as error:
         return Card(name, _title(name), error=str(error).splitlines()[0])
-    return card_of(name, twin)
+    return replace(found, picture=picture_file(path).is_file(), missing=missing(loaded))
 
 
-def card_of(name: str, twin: Twin) -> Card:
-    """The card of a twin that is put together."""
+@lru_cache(maxsize=128)
+def _read(name: str, stamp: Stamp) -> tuple[Card, Loaded]:
+    """What a twin's files say, once for each time that they were saved."""
+    twin = load_twin(name)
     config = twin.config
-    return Card(
+    found = Card(
         name=name,
         title=twin.title,
         question=config.question,
@@ -73,15 +78,13 @@ def card_of(name: str, twin: Twin) -> Card:
         states=twin.model.nx,
         rows=len(twin.model.row_names),
         estimator=twin.estimator,
-        scene=config.view.scene.kind,
         log=config.source.type != "simulator",
-        picture=picture_file(find(name)).is_file(),
-        missing=missing(twin.loaded),
     )
+    return found, twin.loaded
 
 
 def _title(name: str) -> str:
     try:
         return load(name).config.title or Path(name).stem
     except (NisusError, OSError):
-        return Path(os.fspath(name)).stem
+        return Path(name).stem

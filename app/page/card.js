@@ -34,12 +34,16 @@ export function card(item, act) {
   return { node, sync, ready, words, name: item.name, short, title: item.title, log: item.log };
 }
 
-// The reason and the remedy of what the message says first and after its semicolon.
+// The reason, and on demand the place and the remedy, which take some lines.
 function reason(item) {
   if (item.error) return element("p", { class: "error" }, item.error);
   if (!item.missing) return null;
-  const [what, ...remedy] = item.missing.replace(/^\S+?:\d+: /, "").split("; ");
-  return element("div", { class: "missing" }, element("p", {}, `Its data ${what.replace(/^\S+ /, "")}`), element("p", { class: "faint" }, remedy.join("; ")));
+  const [what, ...remedy] = item.missing.replace(/^\S+?:\d+: \S+ /, "").split("; ");
+  return element(
+    "details", { class: "missing" },
+    element("summary", {}, "Its recording is not here: how to get it"),
+    element("p", {}, `It ${what}.`), ...remedy.map((line) => element("p", {}, `${line[0].toUpperCase()}${line.slice(1)}.`)),
+  );
 }
 
 function picture(item) {

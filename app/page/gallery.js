@@ -65,18 +65,19 @@ const find = () => {
 };
 $("find").addEventListener("input", find);
 
+const commands = [
+  ["/", "find a twin", () => $("find").focus()],
+  ["a", "add a file to the recordings", () => recordings.choose.click()],
+  ["g", "back to the twin that runs", () => session.state?.running && open()],
+];
+keys(commands);
+
 const answer = await fetch("/api/gallery");
 if (!answer.ok) throw new Error(await answer.text());
 shown = (await answer.json()).map((item) => card(item, { start, open }));
 $("cards").replaceChildren(...shown.map((item) => item.node));
+commands.push(...shown.filter((item) => item.ready).map((item) => ["", `start ${item.short}`, () => start(item.name)]));
 if (session.state) draw(session.state);
-window.nisus = { session, cards: shown.length };
-
+find();
 if (location.hash === "#recordings") $("recordings").querySelector("button").focus();
-
-keys([
-  ["/", "find a twin", () => $("find").focus()],
-  ["a", "add a file to the recordings", () => recordings.choose.click()],
-  ["g", "back to the twin that runs", () => session.state?.running && open()],
-  ...shown.filter((item) => item.ready).map((item) => ["", `start ${item.name}`, () => start(item.name)]),
-]);
+window.nisus = { session, cards: shown.length };

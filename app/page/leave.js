@@ -8,16 +8,15 @@ const READ = 8000; // ms that a line stays
 
 export class Leave {
   constructor(model, boot) {
-    setAttribute($("gallery"), "href", "/gallery");
+    for (const id of ["gallery", "others"]) setAttribute($(id), "href", "/gallery");
     this.boot = boot;
     this.model = model;
-    const files = drops({ twins: () => this.twins(), say: (text, wrong) => this.say(text, wrong) });
+    drops({ twins: () => this.twins(), say: (text, wrong) => this.say(text, wrong) });
     const go = (where) => location.assign(where);
     this.commands = [
       ["g", "gallery: another twin", () => go("/gallery")],
       ["", "recordings: open, download, delete", () => go("/gallery#recordings")],
     ];
-    this.open = files.open;
   }
 
   // Those that could read a log, this one first.

@@ -1,7 +1,7 @@
 // The list of recordings and logs: open, download, delete once it was asked again, and drop a file to add one.
 
 import { element, setText } from "./dom.js";
-import { compact, span } from "./format.js";
+import { compact, spaced, span } from "./format.js";
 import { post } from "./session.js";
 
 const REST = 1500; // ms, while some file is still being looked through
@@ -53,7 +53,7 @@ export class Recordings {
     ].filter(Boolean).join(" · ");
     const scores = [
       summary?.nis ? `NIS ${compact(summary.nis, 3)} [${compact(summary.nis_low, 3)}, ${compact(summary.nis_high, 3)}]` : null,
-      error ? `${error.name} ${compact(error.rmse, 2)} ${error.unit}${error.against === "truth" ? "" : ` ${error.against}`}` : null,
+      error ? `RMSE ${error.name} ${compact(error.rmse, 3)}${spaced(error.unit)}${error.against === "truth" ? "" : `, ${error.against}`}` : null,
     ].filter(Boolean).join(" · ");
     const confirm = element("div", { class: "confirm", hidden: true });
     const node = element(
@@ -91,7 +91,7 @@ export class Recordings {
   }
 }
 
-const size = (bytes) => (bytes < 1e5 ? `${Math.max(1, Math.round(bytes / 1e3))} kB` : bytes < 1e9 ? `${compact(bytes / 1e6, 3)} MB` : `${compact(bytes / 1e9, 3)} GB`);
+const size = (bytes) => (bytes < 1e6 ? `${Math.max(1, Math.round(bytes / 1e3))} kB` : bytes < 1e9 ? `${compact(bytes / 1e6, 3)} MB` : `${compact(bytes / 1e9, 3)} GB`);
 
 function when(seconds) {
   const date = new Date(1000 * seconds);
