@@ -1,34 +1,35 @@
-"""A running twin with all around it: engine, recorder, views, page. `run` and `review` differ in the source."""
+"""The process that runs twins: one port, one twin at a time, from the start to Ctrl-C."""
 
 from __future__ import annotations
 
 import gc
-import secrets
 import sys
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from estimators.errors import SourceError
 
 from .engine.commands import Record
-from .engine.engine import Engine
-from .engine.workshop import Workshop
 from .recording.split import NEVER, Split
-from .recording.writer import FINE, Recorder
-from .rerun.rows import RerunRows
-from .server.open_browser import Opening
+from .running import Opening, RunningTwin
+from .server.door import Door
+from .server.open_browser import Opening as BrowserOpening
 from .signals import restore, when_asked_to_end
 from .stderr import complain
 
 if TYPE_CHECKING:
-    from estimators.snapshots import Base
     from sources.source import Source
 
+    from .engine.engine import Engine
+    from .recording.writer import Recorder
     from .twin.twin import Twin
+
+PATIENCE = 3.0
+"""Seconds for the browsers to let go of a twin that was stopped."""
 
 SWITCH = 0.0005
 """Seconds after which Python lets another thread run; its default of 5 ms is as long as a reading may take in all."""
@@ -42,92 +43,166 @@ class Page:
     open_browser: bool
 
 
+def _settle(gone: threading.Event | None = None) -> None:
+    """What a start has built stays: looking through it again and again would hold readings up for milliseconds.
+
+    Not so what ran before, which is garbage once nobody is connected to it any more (`gone`).
+    """
+    if gone is not None:
+        gone.wait(PATIENCE)
+    gc.unfreeze()
+    gc.collect()
+    gc.freeze()
+
+
+class Beside(Protocol):
+    """A thread of the session."""
+
+    def start(self) -> None:
+        """Begin."""
+
+    def stop(self) -> None:
+        """End."""
+
+
 class Session:
-    """Starts what a twin needs, in order, and stops it in reverse."""
+    """A process: one page, and behind it one twin at a time, which may be none; see `app/gallery` for who changes it.
+
+    `run` and `review` differ in what runs first.
+    """
 
     def __init__(
         self,
-        twin: Twin,
-        open_source: Callable[[Callable[[str, str], None]], Source],
+        twin: Twin | Opening | None,
+        open_source: Callable[[Callable[[str, str], None]], Source] | None = None,
         *,
         page: Page | None,
-        base: Base | None = None,
-        horizon: float | None = None,
-        review: Path | None = None,
         split: Split = NEVER,
-        workshop: Workshop | None = None,
+        recordings: Path | None = None,
     ) -> None:
         """Put it together; nothing runs yet.
 
         Args:
-            twin: What to run.
-            open_source: See `Engine`.
+            twin: What to run first; None for nothing.
+            open_source: See `Engine`; of a twin.
             page: Where to serve the page; None for no page.
-            base: See `Engine`.
-            horizon: See `Engine`.
-            review: The recording that is reviewed, for the page to offer.
             split: Into what parts to split a recording.
-            workshop: See `Engine`.
+            recordings: The folder of what the page records; None is the working directory.
 
         Raises:
             NisusError: If the source cannot be opened, or the port is in use.
         """
         sys.setswitchinterval(SWITCH)
-        self.engine = Engine(twin, open_source, base=base, horizon=horizon, workshop=workshop)
-        self.recorder = Recorder(self.engine, lambda stream: RerunRows(stream, self.engine, series=FINE), split)
-        self.engine.recorder = self.recorder
-        self._page = page
-        self.view: Any = None
-        self.server: Any = None
+        self._page, self._split, self._recordings = page, split, recordings
+        self.door: Door | None = None
+        self.running: RunningTwin | None = None
+        self._changing = threading.RLock()
+        self.beside: list[Beside] = []
+        """What starts and stops with the session."""
         if page is not None:
-            from .server.server import PageServer
-            from .viser.view import ViserView
+            self.door = Door(page.port)
+        try:
+            if isinstance(twin, Opening):
+                self.running = self.prepared(twin)
+            elif twin is not None and open_source is not None:
+                self.running = self.prepared(Opening(twin, open_source))
+        except BaseException:
+            if self.door is not None:
+                self.door.stop()
+            raise
 
-            secret = secrets.token_urlsafe(24)
-            try:
-                self.view = ViserView(self.engine, secret=secret)
-                self.server = PageServer(
-                    self.engine,
-                    port=page.port,
-                    viser_port=self.view.port,
-                    secret=secret,
-                    review=review,
-                    choices=self.view.stage.choices,
-                )
-            except BaseException:
-                self.engine.stop()
-                if self.view is not None:
-                    self.view.stop()
-                raise
+    @property
+    def engine(self) -> Engine:
+        """That of the twin that runs."""
+        return self._ran.engine
+
+    @property
+    def recorder(self) -> Recorder:
+        """That of the twin that runs."""
+        return self._ran.recorder
+
+    @property
+    def view(self) -> Any:
+        """Its scene; None without a page."""
+        return self._ran.view
+
+    @property
+    def server(self) -> Any:
+        """What serves it; None without a page."""
+        return self._ran.server
+
+    @property
+    def _ran(self) -> RunningTwin:
+        assert self.running is not None, "no twin runs"
+        return self.running
 
     @property
     def url(self) -> str | None:
         """Address of the page, with its token."""
-        return self.server.url if self.server is not None else None
+        return self.door.url if self.door is not None else None
+
+    def prepared(self, opening: Opening) -> RunningTwin:
+        """A twin put together, for `change`.
+
+        Raises:
+            NisusError: If its source cannot be opened.
+        """
+        return RunningTwin(opening, door=self.door, split=self._split, recordings=self._recordings)
+
+    def change(self, make: Callable[[], RunningTwin] | None, *, stop_first: bool = False) -> None:
+        """Run another twin in place of the one that runs, or none; from any thread.
+
+        Args:
+            make: Puts it together. If that fails, what runs goes on, unless it had to be stopped first.
+            stop_first: Stop what runs before `make` is called: both would listen to one bus.
+
+        Raises:
+            NisusError: What `make` raises.
+        """
+        with self._changing:
+            before, after = self.running, None
+            try:
+                if make is not None and not stop_first:
+                    after = make()
+                if before is not None:
+                    self.running = None
+                    before.stop()
+                    del before
+                if make is not None and stop_first:
+                    after = make()
+            finally:
+                # What its browsers see until here is the twin that stands still.
+                if after is not None:
+                    self.running = after
+                    after.start()
+                    _settle(after.gone)
+                elif self.running is None and self.door is not None:
+                    self.door.show(None)
 
     def start(self) -> None:
         """Start everything."""
-        # What the start has built stays; looking through it again and again would hold readings up for milliseconds.
-        gc.collect()
-        gc.freeze()
-        self.recorder.start()
-        if self.server is not None:
-            self.view.start()
-            self.server.start()
-        self.engine.start()
+        if self.door is not None:
+            self.door.start()
+        if self.running is not None:
+            self.running.start()
+        _settle()
+        for item in self.beside:
+            item.start()
 
     def stop(self) -> None:
         """Stop everything; a recording is finished."""
-        self.engine.stop()
-        self.recorder.stop()
-        if self.server is not None:
-            self.server.stop()
-            self.view.stop()
+        for item in self.beside:
+            item.stop()
+        with self._changing:
+            if self.running is not None:
+                self.running.stop()
+        if self.door is not None:
+            self.door.stop()
 
-    def _open(self, url: str) -> Opening | None:
+    def _open(self, url: str) -> BrowserOpening | None:
         """Open the page in a browser; where that cannot be, the printed address is there."""
         try:
-            opening = Opening(url)
+            opening = BrowserOpening(url)
         except OSError as error:
             complain(f"the browser is not opened ({error.strerror}: {error.filename}); open the address above")
             return None
@@ -141,14 +216,15 @@ class Session:
             NisusError: If the page cannot be served, or, in the end, that `record` could not be written.
         """
         done = threading.Event()
-        opening: Opening | None = None
+        opening: BrowserOpening | None = None
         previous = when_asked_to_end(done.set)
         try:
             self.start()
             if record is not None:
                 self.engine.submit(Record(record))
             if self.url is not None:
-                print(f"Nisus shows {self.engine.twin.name} at\n\n    {self.url}\n\nCtrl-C ends it.", flush=True)
+                shown = "the gallery" if self.running is None else self.engine.twin.name
+                print(f"Nisus shows {shown} at\n\n    {self.url}\n\nCtrl-C ends it.", flush=True)
                 assert self._page is not None
                 if self._page.open_browser:
                     opening = self._open(self.url)
@@ -156,7 +232,7 @@ class Session:
             while not done.is_set() and time.monotonic() < end:
                 if until_finished and self.engine.status().finished:
                     break
-                if opening is not None and self.server.entered.is_set():
+                if opening is not None and self.door is not None and self.door.entered.is_set():
                     opening.close()
                     opening = None
                 done.wait(min(0.2, max(0.0, end - time.monotonic())))

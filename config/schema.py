@@ -224,6 +224,10 @@ class TwinSection(Section):
     """Short name: letters, digits, _ and -. Default: the file's name without its ending."""
     title: Text | None = None
     """One line shown at the top of the page. Default: the model's title."""
+    teaches: Text | None = None
+    """One sentence for the gallery: what there is to see and to learn. Default: nothing."""
+    question: Text | None = None
+    """The question to which this twin is an answer, for the gallery. Default: none."""
     model: Text
     """The model's name in the catalogue (motor_winding), or a Python file beside this one and the name of a model, or
     of a function that returns one, in it (./pump.py:Pump)."""

@@ -18,10 +18,10 @@ Files = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
 @dataclass(frozen=True)
 class Run:
-    """Run a twin, and show it in the browser."""
+    """Run a twin, and show it in the browser; without a name, the gallery of all that ship."""
 
-    twin: Twin
-    """Name of a twin that ships (see `nisus twins`), or path of a YAML file."""
+    twin: Annotated[str | None, tyro.conf.Positional] = None
+    """Name of a twin that ships (see `nisus twins`), or path of a YAML file. Default: the gallery, to choose one."""
     estimator: str | None = None
     """Estimator to use instead of the twin's own; `nisus filters` lists all of them."""
     set: Settings = ()
@@ -38,6 +38,8 @@ class Run:
     """Stop after this many seconds."""
     port: int = 9900
     """Port of the page, on 127.0.0.1; 0 picks a free one."""
+    recordings: Path = Path("recordings")
+    """Folder of what the page records, lists, and is given by dropping it there; made when it is needed."""
     no_browser: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the URL without opening a browser."""
     headless: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -186,6 +188,8 @@ class Review:
     """The .rrd file."""
     port: int = 9900
     """Port of the page, on 127.0.0.1; 0 picks a free one."""
+    recordings: Path = Path("recordings")
+    """Folder of what the page records, lists, and is given by dropping it there; made when it is needed."""
     no_browser: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the URL without opening a browser."""
     duration: float | None = None
@@ -216,6 +220,9 @@ class Twins:
 
     name: Annotated[str | None, tyro.conf.Positional] = None
     """Of a twin that ships, or path of a YAML file."""
+    picture: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Draw its picture for the gallery from a fold of its log, or those of all: config/cards/NAME.svg, or NAME.svg
+    beside any other YAML."""
 
 
 @dataclass(frozen=True)

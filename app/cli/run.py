@@ -2,38 +2,29 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from estimators.errors import ConfigError
 
 from ..engine.playback import FASTEST
+from ..gallery.gallery import Wanted
 from ..recording.format import TAKEN
 from ..recording.split import NEVER, parse_split
 from ..server.port import check_port
-from ..session import Page, Session
+from ..session import Page
 from ..stderr import complain
-from ..twin.twin import Twin, load_twin
 from .arguments import settings
-from .prepare import begin_to_compile, prepare, prepare_model
-from .remarks import remarking
+from .opener import FileOpener, live_source, open_session, opened_twin
+from .prepare import prepare
 
 if TYPE_CHECKING:
-    from sources.source import Source
-
     from .arguments import Run
 
 
-def live_source(twin: Twin, speed: float) -> Callable[[Callable[[str, str], None]], Source]:
-    """How to open the twin's source so that it comes in its own time: a bus as it is, anything else paced.
-
-    The faults that were injected last when a bus is opened again.
-    """
-    faults = twin.faults()
-    return lambda report: twin.open_source(remarking(report), speed=speed, faults=faults)
-
+__all__ = ["live_source", "run_twin"]
 
 SAID = 5
 """Failures that a run without a page prints at its end, since it has no list of events."""
@@ -50,19 +41,27 @@ def run_twin(arguments: Run) -> int:
     if arguments.record is not None and os.path.lexists(arguments.record):
         raise ConfigError(f"--record {arguments.record}: {TAKEN}")
     split = NEVER if arguments.record_split is None else parse_split(arguments.record_split)
-    twin = load_twin(
-        arguments.twin, log_files=arguments.log or None, overrides=settings(arguments.set, arguments.estimator)
-    )
     page = None if arguments.headless else Page(arguments.port, not arguments.no_browser)
+    opening, wanted, opener = None, None, FileOpener()
+    if arguments.twin is not None:
+        wanted = Wanted(arguments.twin)
+        read = functools.partial(
+            opened_twin,
+            arguments.twin,
+            logs=arguments.log,
+            overrides=settings(arguments.set, arguments.estimator),
+            speed=arguments.speed,
+        )
+        opening, opener = read(), FileOpener({arguments.twin: read})
+    elif page is None or arguments.record or arguments.log or arguments.set or arguments.estimator:
+        raise ConfigError("run: the twin is missing; name one (`nisus twins` lists those that ship)")
     if page is not None:
         check_port(page.port)
-    workshop = None
-    if page is None:
-        prepare(twin)
-    else:
-        workshop = begin_to_compile(twin)
-        prepare_model(twin)
-    session = Session(twin, live_source(twin, arguments.speed), page=page, split=split, workshop=workshop)
+    if opening is not None and page is None:
+        prepare(opening.twin)
+    elif opening is not None:
+        opening = opener.made_ready(opening)
+    session = open_session(opening, wanted, opener, page=page, split=split, recordings=arguments.recordings)
     session.run(record=arguments.record, duration=arguments.duration, until_finished=arguments.headless)
     if arguments.headless:
         status = session.engine.status()

@@ -5,7 +5,8 @@ from __future__ import annotations
 from itertools import takewhile
 from typing import TYPE_CHECKING
 
-from config.loader import Loaded, load, shipped
+from config.loader import Loaded, find, load, shipped, shown_path
+from estimators.errors import ConfigError
 
 from .compare_table import printed
 from .scores import read_scores
@@ -16,6 +17,10 @@ if TYPE_CHECKING:
 
 def show_twins(arguments: Arguments) -> int:
     """Carry the command out."""
+    if arguments.picture:
+        for name in shipped() if arguments.name is None else [arguments.name]:
+            print(_drawn(name))
+        return 0
     if arguments.name is None:
         for name in shipped():
             print(f"{name:<16} {load(name).config.title or ''}")
@@ -23,6 +28,28 @@ def show_twins(arguments: Arguments) -> int:
     loaded = load(arguments.name)
     print("\n".join(described(loaded)))
     return 0
+
+
+def _drawn(name: str) -> str:
+    """Fold a twin's log, draw its picture for the gallery and keep it; the file."""
+    from ..drawing.card import picture_of
+    from ..gallery.pictures import picture_file
+    from ..twin.twin import load_twin
+    from .fold import read_log
+    from .prepare import prepare
+
+    twin = load_twin(name)
+    prepare(twin)
+    # Of what never ends, or would take minutes, a part says as much.
+    duration = 10.0 * twin.config.view.window if twin.config.source.type == "simulator" else None
+    log, _ = read_log(twin, duration)
+    path = picture_file(find(name))
+    try:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(picture_of(twin, log), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{shown_path(path)}: {error.strerror}; the picture cannot be written there") from None
+    return shown_path(path)
 
 
 def described(loaded: Loaded) -> list[str]:

@@ -16,7 +16,6 @@ from estimators.diagnostics.episodes import Episode
 from estimators.diagnostics.sensitivity.suspects import in_words, suspects
 from estimators.errors import NisusError
 from estimators.log import Log
-from estimators.model.state_space import StateSpaceModel
 
 from .integrity import LOWEST, Stopped, Unhurried, Window, reason_against
 from .notices import Notices
@@ -36,7 +35,6 @@ class Blame:
 
     def __init__(
         self,
-        model: StateSpaceModel,
         episodes: Callable[[], Sequence[Episode]],
         take: Callable[[], Window | None],
         notices: Notices,
@@ -46,13 +44,12 @@ class Blame:
         """Prepare.
 
         Args:
-            model: Of the twin.
             episodes: Gives those known now.
             take: Gives a copy of the last events, or None if now is not the time.
             notices: Where a finding is said, once.
             every: Seconds between two looks.
         """
-        self._model, self._episodes, self._take, self._notices, self._every = model, episodes, take, notices, every
+        self._episodes, self._take, self._notices, self._every = episodes, take, notices, every
         self._words: dict[str, str] = {}
         self._seen: dict[str, float] = {}
         self._stopping = threading.Event()
@@ -84,7 +81,7 @@ class Blame:
         self._words = {subject: words for subject, words in self._words.items() if subject in subjects}
         self._seen = {subject: seen for subject, seen in self._seen.items() if subject in subjects}
         taken = self._take() if riddles else None
-        if taken is None or reason_against(self._model, taken.estimator):
+        if taken is None or reason_against(taken.tuning.model, taken.estimator):
             return
         now, begun = taken.events.t[-1] * 1e-9, taken.base.clock * 1e-9
         for episode in riddles:
@@ -95,13 +92,14 @@ class Blame:
             self._ask(episode, taken)
 
     def _ask(self, episode: Episode, taken: Window) -> None:
-        log = Log.of(self._model, capacity=len(taken.events))
+        model = taken.tuning.model
+        log = Log.of(model, capacity=len(taken.events))
         log.first, log.floor = taken.base.first, taken.base.clock
         log.extend(taken.events)
         executor = Unhurried(self._stopping)
         try:
             found = suspects(
-                taken.estimator, self._model, taken.tuning, log, episode.start, base=taken.base, executor=executor
+                taken.estimator, model, taken.tuning, log, episode.start, base=taken.base, executor=executor
             )
         except (NisusError, Stopped):
             return

@@ -10,6 +10,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from .idle_ticks import IdleTicks
 from .interface import Records
 from .outputs import Status
 from .refolder import Refolded, Refolder
+from .reload import Reloaded, merged
 from .running_fold import RunningFold
 from .stall import Stall
 from .status import status_of
@@ -92,6 +94,7 @@ class Engine(RunningFold):
         self._begin_intake()
         self._feeder = Feeder(lambda: open_source(self.notices.report), self._inbox, self.notices.report)
         self._refolder = Refolder(self._inbox.put)
+        self.reloads = 0
         self._stopping = threading.Event()
         self._finished = False
         self._idle_ticks = IdleTicks(section.tick)
@@ -132,6 +135,10 @@ class Engine(RunningFold):
     def submit(self, command: commands.Command) -> None:
         """Queue a command."""
         self._inbox.put(command)
+
+    def reload(self, twin: Twin, why: str) -> None:
+        """Queue going on with the twin as it was saved anew, of the same shape (see reload.py)."""
+        self._inbox.put(Reloaded(twin, why))
 
     @property
     def source(self) -> Source:
@@ -259,6 +266,8 @@ class Engine(RunningFold):
                 self.retune(self.estimator, self.tuning)
         elif isinstance(item, Restarted):
             self._restart()
+        elif isinstance(item, Reloaded):
+            self._reload(item)
         elif isinstance(item, Finished):
             self._put(self._intake.finish())
             with self._lock, self._stall.watched(self._fold):
@@ -281,6 +290,16 @@ class Engine(RunningFold):
         if wanted:
             self.retune(*wanted)
 
+    def _reload(self, item: Reloaded) -> None:
+        """Fold the history again with the twin as it was saved."""
+        estimator, tuning = merged(self.twin, item.twin, self.estimator, self.tuning)
+        self._options.leave(self.estimator, self.tuning)
+        self.twin, self.model, self._policy = item.twin, item.twin.model, item.twin.policy
+        self._options.begin(item.twin)
+        self.reloads += 1
+        self.revisions.why = item.why
+        self.retune(estimator, tuning)
+
     def insert(self, event: Events) -> None:
         """Put in an event of our own."""
         with self._lock, self._stall.watched(self._fold):
@@ -289,6 +308,9 @@ class Engine(RunningFold):
     def retune(self, estimator: str, tuning: Tuning) -> None:
         """Fold the history again, beside the running fold, over a copy of the log; when the filter is compiled."""
         self._options.leave(self.estimator, self.tuning)
+        if tuning.model is not self.model:
+            # Of a revision before the twin's files were saved.
+            tuning = replace(tuning, model=self.model)
         # First, so that nobody sees the new tuning without a refold that is waited for.
         ticket = self._requests.ask()
         self.estimator, self.tuning = estimator, tuning

@@ -123,6 +123,10 @@ class Remembered:
         self._twin = twin
         self._left: dict[str, Mapping[str, float]] = {}
 
+    def begin(self, twin: Twin) -> None:
+        """The YAML was saved: what it says of a filter's options counts again."""
+        self._twin, self._left = twin, {}
+
     def leave(self, estimator: str, tuning: Tuning) -> None:
         """The filter ran with this tuning."""
         self._left[estimator] = tuning.options

@@ -73,18 +73,15 @@ def window(fold: Fold, revision: int, most: int = MOST) -> Window | None:
 class IntegrityWatch:
     """Computes the bounds again and again in a thread of its own."""
 
-    def __init__(
-        self, model: StateSpaceModel, take: Callable[[], Window | None], false_alarm: float, *, every: float = EVERY
-    ) -> None:
+    def __init__(self, take: Callable[[], Window | None], false_alarm: float, *, every: float = EVERY) -> None:
         """Prepare.
 
         Args:
-            model: Of the twin.
             take: Gives a copy of the last events, or None if now is not the time.
             false_alarm: Mean time between false alarms of the tests that watch the twin, s.
             every: Seconds between two looks.
         """
-        self._model, self._take, self._false_alarm, self._every = model, take, false_alarm, every
+        self._take, self._false_alarm, self._every = take, false_alarm, every
         self._latest: Integrity | None = None
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="integrity", daemon=True)
@@ -117,7 +114,9 @@ class IntegrityWatch:
         t, known = int(taken.events.t[-1]), self._latest
         if known is not None and (known.revision, known.t) == (taken.revision, t):
             return
-        reason = reason_against(self._model, taken.estimator)
+        # That of the fold: a twin's files may have been saved anew.
+        model = taken.tuning.model
+        reason = reason_against(model, taken.estimator)
         if reason:
             self._latest = Integrity(taken.revision, t, reason)
             return
@@ -128,16 +127,17 @@ class IntegrityWatch:
         except Exception as error:  # noqa: BLE001  a user's model may raise anything; the twin goes on
             self._latest = Integrity(taken.revision, t, f"{type(error).__name__}: {error}")
             return
-        bounds = bounds_of(self._model, found)
+        bounds = bounds_of(model, found)
         self._latest = Integrity(taken.revision, t, found.reason, bounds, smallest_of(found))
 
     def _compute(self, taken: Window) -> Sensitivity:
-        log = Log.of(self._model, capacity=len(taken.events))
+        model = taken.tuning.model
+        log = Log.of(model, capacity=len(taken.events))
         log.first, log.floor = taken.base.first, taken.base.clock
         log.extend(taken.events)
         return sensitivity(
             taken.estimator,
-            self._model,
+            model,
             taken.tuning,
             log,
             base=taken.base,

@@ -31,6 +31,8 @@ class Records(Protocol):
 
     finished: list[Path]
     failure: str
+    folder: Path
+    """Where it puts what is given a name only."""
 
     @property
     def path(self) -> Path | None:

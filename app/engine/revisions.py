@@ -33,7 +33,8 @@ class Run:
 
     `began` is when it took the place of the one before, s since 1970, `changes` what differs from that. `loaded` is the
     number of the earlier revision whose tuning it took up again. `place` is one of the `MOST_PINNED` while it is
-    pinned. `track` is all that it concluded until it gave way: of the newest previous revision and of pinned ones.
+    pinned. `why` says what beside settings changed: a file that was saved. `track` is all that it concluded until it
+    gave way: of the newest previous revision and of pinned ones.
     """
 
     number: int
@@ -45,6 +46,7 @@ class Run:
     name: str = ""
     note: str = ""
     place: int | None = None
+    why: str = ""
     track: Pull | None = None
 
     @property
@@ -66,6 +68,8 @@ class Revisions:
         self.runs: tuple[Run, ...] = (Run(0, estimator, tuning, clock()),)
         self.version = 0
         """Counts up with every change, so that a page knows when to ask again."""
+        self.why = ""
+        """Why the next revision is folded, if not for another setting."""
 
     def began_with(self, estimator: str, tuning: Tuning) -> None:
         """The first fold could be had; meanwhile its settings may have been turned."""
@@ -90,13 +94,14 @@ class Revisions:
             self.restarted(pull.revision + 1, keep=True)
             return
         changes = difference(running.estimator, running.tuning, estimator, tuning)
-        dragged = bool(earlier) and not same and now - running.began < DRAG and _of_one(running, changes)
+        why, self.why = self.why, ""
+        dragged = bool(earlier) and not same and not why and now - running.began < DRAG and _of_one(running, changes)
         if dragged:
             before = earlier[-1]
             changes = difference(before.estimator, before.tuning, estimator, tuning)
         else:
             earlier = [*map(_without_track, earlier), replace(running, track=pull)]
-        begun = Run(pull.revision + 1, estimator, tuning, now, changes)
+        begun = Run(pull.revision + 1, estimator, tuning, now, changes, why=why)
         if same:
             begun = replace(begun, loaded=same[0].number, name=same[-1].name, note=same[-1].note)
             earlier = [run for run in earlier if run.pinned or all(run.number != other.number for other in same)]

@@ -30,8 +30,8 @@ class Watchers:
         self.chronicle = Chronicle(engine)
         self.alerts = Alerts(notices, lambda: self.chronicle.account.in_alarm)
         self.silence = Silence(notices, section.stale_after)
-        self.integrity = IntegrityWatch(engine.model, engine.last_events, engine.policy.false_alarm_every)
-        self.blame = Blame(engine.model, lambda: self.chronicle.account.episodes, engine.last_events, notices)
+        self.integrity = IntegrityWatch(engine.last_events, engine.policy.false_alarm_every)
+        self.blame = Blame(lambda: self.chronicle.account.episodes, engine.last_events, notices)
 
     def start(self) -> None:
         """Begin to watch."""

@@ -31,7 +31,7 @@ export class Knob {
       onchange: () => this.typed(), onfocus: () => this.field.select(),
       onkeydown: (event) => this.keyed(event),
     });
-    this.back = element("button", { type: "button", class: "back", title: `Back to the configured ${compact(what.configured)}`, "aria-label": `${label}: as configured`, onclick: () => this.set(what.configured) }, "↺");
+    this.back = element("button", { type: "button", class: "back", title: `Back to the configured ${compact(what.configured)}`, "aria-label": `${label}: as configured`, onclick: () => this.set(this.what.configured) }, "↺");
     const step = (factor, text) =>
       element("button", { type: "button", title: `${text} ${label}`, "aria-label": `${label} ${text}`, onclick: () => this.set(this.value * factor) }, text);
     this.said = element("button", { type: "button", class: "data-says", hidden: true, onclick: () => this.take() }, "◆");
@@ -46,6 +46,14 @@ export class Knob {
       this.back, this.error, this.below,
     );
     this.show(what.configured);
+  }
+
+  // Another value is the configured one.
+  configure(value) {
+    this.what.configured = value;
+    setAttribute(this.back, "title", `Back to the configured ${compact(value)}`);
+    this.edited = 0;
+    this.show(this.value);
   }
 
   // What the data say the value is: a mark on the slider that takes it. saying: {value, text, take}, or null.

@@ -2,12 +2,13 @@
 
 import { Charts } from "./charts.js";
 import { Diagnose } from "./diagnose.js";
-import { $, element, setAttribute } from "./dom.js";
+import { $, element, setAttribute, setText } from "./dom.js";
 import { Episodes } from "./episodes.js";
 import { Explore } from "./explore.js";
 import { Faults } from "./faults.js";
 import { clock } from "./format.js";
 import { keys } from "./keys.js";
+import { Leave } from "./leave.js";
 import { Link } from "./link.js";
 import { Runs } from "./runs.js";
 import { Stage } from "./stage.js";
@@ -112,6 +113,17 @@ link.addEventListener("status", (event) => {
   );
 });
 
+const leave = settings.gallery ? new Leave(model, settings.boot) : null;
+
+// Files of the twin that were saved: what is wrong with them, and other configured values.
+let reloads = null;
+link.addEventListener("status", async ({ detail: { unread, reloads: now } }) => {
+  $("unread").hidden = !unread;
+  setText($("unread"), unread ? `${unread}. What runs goes on as it was.` : "");
+  if (reloads !== null && now !== reloads) tune.configure((await (await fetch("/api/model")).json()).tuning);
+  reloads = now;
+});
+
 const drawer = () => {
   const open = document.body.classList.toggle("tuning");
   setAttribute($("drawer"), "aria-expanded", String(open));
@@ -136,6 +148,7 @@ keys([
   ["w", "what if, and back", () => turn("whatif")],
   ["d", "diagnose, and back", () => turn("diagnose")],
   ["t", "tune, where the page is narrow", drawer],
+  ...(leave?.commands ?? []),
 ]);
 
 $("clock").title = `Time since the first reading; ${clock(0)}`;

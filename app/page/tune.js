@@ -177,6 +177,11 @@ export class Tune {
     this.options.replaceChildren(...rows);
   }
 
+  // The twin's file was saved: other values are the configured ones.
+  configure(items) {
+    for (const item of items) this.knobs.get(item.key)?.configure(item.configured);
+  }
+
   // Edits. Each is kept with what undoes it.
 
   choose(name) {

@@ -2,9 +2,9 @@
 
 Beside what charts show, the file keeps under /nisus, as plain columns: `twin` (YAML, what the command line changed of
 it, base), `tuning` (each one, with the event from which it was in force), `events` (the log), `base` (where a fold of
-them starts, if that has moved) and `notices` (lines for people). The track is not among them: log and tuning give it
-again. Rows carry their absolute index; a late reading makes a recorder write the events again from where it belongs.
-`reader` reads them back.
+them starts, if that has moved), `notices` (lines for people) and `summary` (what the session was worth, for lists). The
+track is not among them: log and tuning give it again. Rows carry their absolute index; a late reading makes a recorder
+write the events again from where it belongs. `reader` reads them back.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import base64
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -152,23 +153,18 @@ class RecordingFile:
         except OSError as error:
             raise SourceError(f"recording {path}: {error.strerror}; choose a place that can be written") from None
         self.rows = 0
-        self.stream.log(
-            "/nisus/twin",
-            rr.AnyValues(
-                format=FORMAT,
-                name=name,
-                yaml=text,
-                path=str(twin_path),
-                base=base_to_json(base),
-                overrides=json.dumps(dict(overrides or {})),
-            ),  # fmt: skip
-            static=True,
-        )
+        self._header = {"name": name, "path": str(twin_path), "base": base_to_json(base)}
+        self.twin(text, overrides or {})
 
     @property
     def size(self) -> int:
         """Bytes that the file has taken."""
         return self._file.size
+
+    def twin(self, text: str, overrides: Mapping[str, str]) -> None:
+        """Write the twin's YAML, again when it was saved anew: the last one counts."""
+        more = {"yaml": text, "overrides": json.dumps(dict(overrides))}
+        self.stream.log("/nisus/twin", rr.AnyValues(format=FORMAT, **self._header, **more), static=True)
 
     def base(self, base: Base | None, index: int, revision: int) -> None:
         """Write where a fold of a revision starts, from event `index` on; None is the prior."""
@@ -185,6 +181,10 @@ class RecordingFile:
             indexes=[rr.TimeColumn(TIMELINE, sequence=[index])],
             columns=rr.AnyValues.columns(json=[tuning_to_json(tuning, estimator)], revision=[revision]),
         )
+
+    def summary(self, found: Mapping[str, Any]) -> None:
+        """Write what the session was worth when the file was closed, for lists."""
+        self.stream.log("/nisus/summary", rr.AnyValues(json=json.dumps(dict(found))), static=True)
 
     def write(self, pull: Pull) -> None:
         """Write rows of the log, and the lines for people."""

@@ -26,6 +26,7 @@ from ..rerun.rows import RerunRows
 from .disk import Disk
 from .format import RecordingFile
 from .split import NEVER, Split, part_path
+from .summary import summary_of
 
 if TYPE_CHECKING:
     from estimators.diagnostics.episodes import Episode
@@ -56,8 +57,9 @@ FINE = math.inf
 class Recorder:
     """Starts and stops recordings of one engine. `draw(stream)` gives what logs the charts' entities of a pull."""
 
-    def __init__(self, engine: Running, draw: Any, split: Split = NEVER) -> None:
+    def __init__(self, engine: Running, draw: Any, split: Split = NEVER, folder: Path = Path()) -> None:
         self._engine = engine
+        self.folder = folder
         self._draw = draw
         self._split = split
         self._wake = threading.Event()
@@ -160,7 +162,7 @@ class _Part:
 
     def __init__(self, engine: Running, asked: Path, draw: Any, *, before: _Part | None = None) -> None:
         """Begin a recording at the path that was asked for; or the part after another, from which it goes on."""
-        twin = engine.twin
+        twin = self._twin = engine.twin
         self._engine = engine
         self.asked = asked
         self.number: int
@@ -227,6 +229,9 @@ class _Part:
                 self._move(pull.first)
             if pull.revision != self._revision:
                 tuning, estimator = self._engine.folded_with()
+                if self._engine.twin is not self._twin:
+                    self._twin = self._engine.twin
+                    self.file.twin(self._twin.text, self._twin.overrides)
                 self.file.tuning(tuning, estimator, pull.first, pull.revision)
                 if begun and not pull.fresh:
                     self._edited, self._turned = True, time.monotonic()
@@ -260,6 +265,8 @@ class _Part:
                 self._drawing(replace(pull, fresh=fresh, notices=[]))
                 self.file.flush()
                 fresh = False
+        if not short:
+            self.file.summary(summary_of(self._engine))
         self.file.close()
 
     def abandon(self) -> None:

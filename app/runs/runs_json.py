@@ -48,7 +48,8 @@ def _run(run: Run, known: RunScore | None, running: bool, units: dict[str, str])
 
 def what_changed(run: Run) -> str:
     """What of a run differs from the one before, in words."""
-    words = in_words(run.changes) or ("as it began" if run.loaded is None and not run.number else "as before")
+    said = ": ".join(part for part in (run.why, in_words(run.changes)) if part)
+    words = said or ("as it began" if run.loaded is None and not run.number else "as before")
     return words if run.loaded is None else f"back to run {run.loaded}: {words}"
 
 

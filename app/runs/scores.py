@@ -84,7 +84,7 @@ class RunScores:
         begun = time.monotonic()
         if self._fresh_until[0] == running.number and begun < self._fresh_until[1]:
             return
-        pull = _everything(self._engine)
+        pull = everything(self._engine)
         if pull is None or pull.revision != running.number:
             return
         self._known[running.number] = self._scored(running, pull)
@@ -100,7 +100,7 @@ class RunScores:
         return made if np.isfinite(made.step_us) else replace(made, step_us=_step_us(self._engine, run))
 
 
-def _everything(engine: Running) -> Pull | None:
+def everything(engine: Running) -> Pull | None:
     """All rows of what runs; None while there are none, or if another revision took over meanwhile."""
     cursor = engine.cursor()
     parts: list[Pull] = []

@@ -172,6 +172,8 @@ def command_from_json(body: Any, engine: Running) -> commands.Command:
         if field not in given and item.default is dataclasses.MISSING:
             raise ConfigError(f"{name}: {field} is missing; it takes {', '.join(fields)}")
     command = kind(**{field: _converted(name, field, given[field], hints[field]) for field in given})
+    if isinstance(command, commands.Record) and command.path is not None and engine.recorder is not None:
+        command = dataclasses.replace(command, path=_placed(command.path, engine.recorder.folder))
     _check(command, engine)
     return command
 
@@ -210,9 +212,14 @@ def _recording(where: str, name: str) -> Path:
         raise ConfigError(f"{where}; it must have letters that can be shown, no control characters or half ones")
     if len(os.fsencode(name)) > LONGEST_NAME:
         raise ConfigError(f"{where}, which is too long; it may have {LONGEST_NAME} bytes")
-    if os.path.lexists(path):
-        raise ConfigError(f"{where}, which is there already; choose another name")
     return path
+
+
+def _placed(name: Path, folder: Path) -> Path:
+    """Where a recording of that name goes."""
+    if os.path.lexists(folder / name):
+        raise ConfigError(f"Record: path is {_shown(str(name))}, which is there already; choose another name")
+    return folder / name
 
 
 def _converted(command: str, name: str, value: Any, hint: Any) -> Any:

@@ -80,19 +80,19 @@ class TooLarge(ConfigError):
     """A request's body has more bytes than any command needs."""
 
 
-async def bounded_body(request: Request) -> bytes:
+async def bounded_body(request: Request, most: int = BODY) -> bytes:
     """The body of a request.
 
     Raises:
-        TooLarge: If it has more than `BODY` bytes; the rest is not read.
+        TooLarge: If it has more than `most` bytes; the rest is not read.
         ConfigError: If it never came to its end.
     """
     body = bytearray()
     try:
         async for piece in request.stream():
             body += piece
-            if len(body) > BODY:
-                raise TooLarge(f"a request's body may have {BODY // 1024} kB; send one command at a time")
+            if len(body) > most:
+                raise TooLarge(f"a request's body may have {most // 1024} kB; send one command at a time")
     except ClientDisconnect:
         raise ConfigError("the request ended before its body did; send it again") from None
     return bytes(body)

@@ -1,4 +1,4 @@
-"""The page server: one loopback port for the page, its API, its streams, recordings, and Viser behind it."""
+"""What is served of a running twin: the page, its API, its streams, recordings, and Viser behind it."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ import sys
 import threading
 import time
 import uuid
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
@@ -32,13 +31,14 @@ from ..drawing.palette import EITHER, THEMES
 from ..engine.interface import Running
 from ..rerun.feed import RerunFeed
 from ..series.series import Series
+from .answer import answered
 from .api import Json, command_from_json, episodes_json, faults_json, one_line, status_json
-from .bounds import BODY, TooLarge, bounded_body, bounds
-from .gate import Gate, session_token
+from .bounds import BODY
+from .door import Door
 from .model_json import model_json
 from .one_at_a_time import OneAtATime
+from .page_file import PAGE, page_file
 from .page_stream import PageStream
-from .port import listen
 from .runs_api import RunsApi
 from .viewer_assets import FILES, viewer_assets, viewer_version
 from .viser_proxy import ViserProxy
@@ -49,41 +49,28 @@ PERIOD = 0.2
 STATUS_PERIOD = 0.5
 """Seconds between two status messages."""
 
-PAGE = Path(__file__).parent.parent / "page"
 FOR_EVER = "public, max-age=31536000, immutable"
 KINDS = {".js": "text/javascript", ".wasm": "application/wasm"}
 
 
-def _policy(port: int, scripts: str) -> str:
-    """A content security policy under which no request leaves this server."""
-    # Not every browser takes 'self' to include the WebSockets of the same address.
-    sockets = f"ws://127.0.0.1:{port} ws://localhost:{port}"
-    return (
-        f"default-src 'self'; script-src 'self' {scripts}; style-src 'self' 'unsafe-inline'; "
-        f"img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob: {sockets}; "
-        "worker-src 'self' blob: data:; frame-src 'self'; frame-ancestors 'self'; object-src 'none'; "
-        "base-uri 'none'; form-action 'self'"
-    )
-
-
 class PageServer:
-    """Serves one engine to any number of browsers, from a thread of its own."""
+    """Serves one engine to any number of browsers, behind a door that may outlive it."""
 
     def __init__(
         self,
         engine: Running,
         *,
-        port: int,
+        port: int | Door,
         viser_port: int | None,
         secret: str,
         review: Path | None = None,
         choices: Choices | None = None,
     ) -> None:
-        """Take the port.
+        """Take the port, if it is not open yet.
 
         Args:
             engine: What to show.
-            port: On 127.0.0.1; 0 takes a free one.
+            port: On 127.0.0.1; 0 takes a free one. Or the door that is there: it shows this once it is started.
             viser_port: Where the private Viser server listens; None if there is none.
             secret: What Viser asks for.
             review: The recording that is reviewed, offered beside those that this process writes.
@@ -100,42 +87,34 @@ class PageServer:
         self._forecasts, self._diagnosis = Forecasts(engine), Diagnosis(engine)
         self._forecasting, self._diagnosing = OneAtATime("forecast"), OneAtATime("diagnosis")
         self._boot = uuid.uuid4().hex
-        self._socket = listen(port)
-        self.port: int = self._socket.getsockname()[1]
-        self._token = session_token()
+        self.unread: str | None = None
+        """What is wrong with the twin's files as they were saved last, if they are not what runs."""
+        self._own_door = not isinstance(port, Door)
+        self.door = port if isinstance(port, Door) else Door(port)
+        self.port, self.entered = self.door.port, self.door.entered
         self._assets: Future[Path] = Future()
         self._viser = ViserProxy(viser_port, secret) if viser_port is not None else None
-        gate = Gate(self._application(), self._token, self.port)
-        self.entered = gate.entered
-        config = uvicorn.Config(
-            gate, log_config=None, log_level="critical", access_log=False,
-            server_header=False, lifespan="off", ws_per_message_deflate=False, timeout_graceful_shutdown=1, **bounds(),
-        )  # fmt: skip
-        self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(
-            target=self._server.run, kwargs={"sockets": [self._socket]}, name="page server", daemon=True
-        )
+        self.application = self._application()
 
     @property
     def url(self) -> str:
         """Address of the page, with the token that it asks for."""
-        return f"http://127.0.0.1:{self.port}/?token={self._token}"
+        return self.door.url
 
-    def start(self) -> None:
+    def start(self) -> threading.Event:
         """Serve; the Rerun viewer's files are prepared meanwhile, if this machine has not got them yet."""
         threading.Thread(target=self._prepare, name="viewer assets", daemon=True).start()
-        self._thread.start()
         self._runs.start()
-        while not self._server.started and self._thread.is_alive():
-            time.sleep(0.005)
+        over = self.door.show(self.application, self._boot)
+        if self._own_door:
+            self.door.start()
+        return over
 
     def stop(self) -> None:
-        """Close all connections, and the port."""
-        self._server.should_exit = True
+        """Compute nothing any more; close all connections and the port, if it is this twin's own."""
         self._runs.stop()
-        if self._thread.is_alive():
-            self._thread.join(timeout=5.0)
-        self._socket.close()
+        if self._own_door:
+            self.door.stop()
 
     def _prepare(self) -> None:
         try:
@@ -169,23 +148,21 @@ class PageServer:
                 WebSocketRoute("/viser", self._viser.websocket),
                 Route("/viser/{path:path}", self._viser.http),
             ]
-        application = Starlette(routes=routes)
-        return _WithHeaders(application, self.port)  # type: ignore[return-value]
+        return Starlette(routes=routes)
 
     async def _page(self, request: Request) -> Response:
         name = "explore.html" if request.url.path == "/explore" else "index.html"
-        text = (PAGE / name).read_text()
         settings = {"viewer": f"/viewer/{viewer_version()}", "boot": self._boot, "viser": self._viser is not None}
-        # In an attribute, not in a script: the policy allows no inline ones.
-        quoted = json.dumps(settings).replace("&", "&amp;").replace('"', "&quot;")
-        return Response(text.replace("{{settings}}", quoted), media_type="text/html")
+        settings["gallery"] = self.door.furnished
+        return page_file(name, settings)
 
     async def _status(self, request: Request) -> Response:
         return Json(self._state())
 
     def _state(self) -> dict[str, Any]:
         scene = [] if self._choices is None else self._choices.json()
-        return {**status_json(self._engine), "recordings": sorted(self._recordings()), "scene": scene}
+        status = {**status_json(self._engine), "recordings": sorted(self._recordings()), "scene": scene}
+        return {**status, "unread": self.unread, "reloads": getattr(self._engine, "reloads", 0)}
 
     async def _model(self, request: Request) -> Response:
         return Json(await asyncio.to_thread(model_json, self._engine))
@@ -209,7 +186,7 @@ class PageServer:
             self._engine.submit(command)
             return Json({"submitted": type(command).__name__}, 202)
 
-        return await _answered(request, submit)
+        return await answered(request, submit)
 
     async def _forecast(self, request: Request) -> Response:
         if request.method == "GET":
@@ -222,7 +199,7 @@ class PageServer:
             question = question_from_json(body, self._engine.model)
             return Json(await self._forecasting.do(lambda: self._forecasts.ask(question)))
 
-        return await _answered(request, ask)
+        return await answered(request, ask)
 
     async def _diagnose(self, request: Request) -> Response:
         try:
@@ -242,7 +219,7 @@ class PageServer:
             choices.choose(str(body.get("key")), str(body.get("value")))
             return Json(choices.json())
 
-        return Json(choices.json()) if request.method != "POST" else await _answered(request, choose)
+        return Json(choices.json()) if request.method != "POST" else await answered(request, choose)
 
     async def _viewer_file(self, request: Request) -> Response:
         name = request.path_params["name"]
@@ -317,18 +294,6 @@ class PageServer:
             await asyncio.sleep(max(0.0, PERIOD - (time.monotonic() - begun)))
 
 
-async def _answered(request: Request, take: Callable[[Any], Awaitable[Response]]) -> Response:
-    """What `take` makes of a request's JSON; its refusal as one line."""
-    if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
-        return PlainTextResponse("Nisus: Content-Type must be application/json.\n", 415)
-    try:
-        return await take(json.loads(await bounded_body(request)))
-    except TooLarge as error:
-        return PlainTextResponse(f"Nisus: {error}.\n", 413)
-    except (NisusError, ValueError, RecursionError) as error:
-        return Json({"error": one_line(str(error))}, 400)
-
-
 async def _given(feed: RerunFeed) -> AsyncIterator[str | bytes]:
     """What the feed gives next, made in a thread: a long history takes a while."""
     task = asyncio.ensure_future(asyncio.to_thread(feed.next))
@@ -345,34 +310,3 @@ async def _listen_to(browser: WebSocket, drawn: asyncio.Event) -> None:
     """A word from the browser says that it has drawn what it got; whoever says anything longer is not the page."""
     while (word := (await browser.receive()).get("text")) is not None and len(word) <= BODY:
         drawn.set()
-
-
-class _WithHeaders:
-    """Adds the security headers to every answer."""
-
-    def __init__(self, application: Starlette, port: int) -> None:
-        self._application = application
-        common = [
-            (b"x-content-type-options", b"nosniff"),
-            (b"referrer-policy", b"no-referrer"),
-            (b"cross-origin-resource-policy", b"same-origin"),
-            (b"cross-origin-opener-policy", b"same-origin"),
-        ]
-        own = _policy(port, "'wasm-unsafe-eval'")
-        # Viser's client is one file of inline scripts that unpack themselves.
-        viser = _policy(port, "'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:")
-        self._own = [*common, (b"content-security-policy", own.encode())]
-        self._viser = [*common, (b"content-security-policy", viser.encode())]
-
-    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        extra = self._viser if scope.get("path", "").startswith("/viser") else self._own
-
-        async def send_more(message: Any) -> None:
-            if message["type"] == "http.response.start":
-                headers = [*message.get("headers", []), *extra]
-                if not any(name == b"cache-control" for name, _ in headers):
-                    headers.append((b"cache-control", b"no-cache"))
-                message = {**message, "headers": headers}
-            await send(message)
-
-        await self._application(scope, receive, send_more)

@@ -40,8 +40,7 @@ def find_model(loaded: Loaded, key: Key, reference: str) -> StateSpaceModel:
         raise loaded.error(key, f"is {reference!r}; no model of that name ships; {near}, or write ./file.py:Name")
     if not file or not name:
         raise loaded.error(key, f"is {reference!r}; name what to take from the file, as in ./pump.py:Pump")
-    path = Path(file).expanduser()
-    path = path if path.is_absolute() else loaded.path.absolute().parent / path
+    path = _beside(loaded, file)
     if not path.is_file():
         raise loaded.error(key, f"is {reference!r}; there is no file {shown_path(path)}; it is sought beside the YAML")
     module = _import(path)
@@ -49,6 +48,17 @@ def find_model(loaded: Loaded, key: Key, reference: str) -> StateSpaceModel:
         names = [item for item in vars(module) if not item.startswith("_")]
         raise loaded.error(key, f"is {reference!r}; {shown_path(path)} has no {name}; {nearest(name, names)}")
     return _as_model(getattr(module, name), name, path, loaded, key)
+
+
+def model_file(loaded: Loaded) -> list[Path]:
+    """The user's file that holds the model; none of a model of the catalogue."""
+    file = loaded.config.model.rpartition(":")[0]
+    return [_beside(loaded, file)] if file else []
+
+
+def _beside(loaded: Loaded, file: str) -> Path:
+    path = Path(file).expanduser()
+    return path if path.is_absolute() else loaded.path.absolute().parent / path
 
 
 def _import(path: Path) -> ModuleType:

@@ -3,7 +3,7 @@
 import pytest
 
 from app.cli.fold import read_log
-from app.cli.review import recorded_twin
+from app.cli.opener import recorded_twin
 from app.recording.reader import read_recording
 from app.recording.writer import write_recording
 from app.twin.twin import load_twin

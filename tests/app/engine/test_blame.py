@@ -35,7 +35,7 @@ def folded():
 
 def blame_of(fold, known, notices=None):
     said = notices or Notices(lambda: 0)
-    return Blame(MODEL, lambda: known, lambda: window(fold, 0), said, every=0.01), said
+    return Blame(lambda: known, lambda: window(fold, 0), said, every=0.01), said
 
 
 def test_the_sensor_that_is_off_is_named_once_and_in_the_text(folded):
@@ -62,7 +62,7 @@ def test_an_episode_older_than_the_window_is_not_guessed(folded):
     old = Episode(60.0, None, "yoke", "shifted", 1.0, 0.5, 1.5, "σ", "yoke reads high")
     taken = window(folded, 0)
     late = Window(taken.estimator, taken.tuning, taken.events, taken.base._replace(clock=70 * 10**9), 0)
-    blame = Blame(MODEL, lambda: [old], lambda: late, Notices(lambda: 0))
+    blame = Blame(lambda: [old], lambda: late, Notices(lambda: 0))
     blame.look()
     assert blame.of(old) == ""
 

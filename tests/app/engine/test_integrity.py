@@ -74,7 +74,7 @@ def test_another_revision_has_none_until_it_is_computed(engine):
 
 def test_the_thread_publishes_and_stops(engine):
     folds = threading.active_count()
-    watch = IntegrityWatch(MODEL, engine.last_events, EVERY, every=0.01)
+    watch = IntegrityWatch(engine.last_events, EVERY, every=0.01)
     watch.start()
     wait_for(lambda: watch.of(0) is not None)
     watch.stop()
@@ -103,7 +103,7 @@ def test_a_part_of_the_log_goes_on_from_what_stood_before_it():
     tuning = twin().tuning
     fold = Fold("kf", MODEL, tuning, log)
     fold.advance()
-    watch = IntegrityWatch(MODEL, lambda: window(fold, 0, most=200), EVERY)
+    watch = IntegrityWatch(lambda: window(fold, 0, most=200), EVERY)
     watch.look()
     whole = bounds_of(MODEL, sensitivity("kf", MODEL, tuning, log, most=200, false_alarm=EVERY))
     assert watch.of(0).bounds.keys() == whole.keys()
@@ -116,12 +116,12 @@ def test_nothing_is_computed_twice_nor_while_a_refold_is_waited_for():
     log.extend(readings(*series(300)))
     fold = Fold("kf", MODEL, twin().tuning, log)
     fold.advance()
-    watch = IntegrityWatch(MODEL, lambda: window(fold, 0), EVERY)
+    watch = IntegrityWatch(lambda: window(fold, 0), EVERY)
     watch.look()
     first = watch.of(0)
     watch.look()
     assert watch.of(0) is first
-    asleep = IntegrityWatch(MODEL, lambda: None, EVERY)
+    asleep = IntegrityWatch(lambda: None, EVERY)
     asleep.look()
     assert asleep.of(0) is None
 
@@ -131,7 +131,7 @@ def test_what_it_is_not_kept_for_is_said_with_the_reason():
     log.extend(readings(*series(300)))
     fold = Fold("pf", MODEL, twin().tuning, log)
     fold.advance()
-    watch = IntegrityWatch(MODEL, lambda: window(fold, 0), EVERY)
+    watch = IntegrityWatch(lambda: window(fold, 0), EVERY)
     watch.look()
     assert watch.of(0).bounds == {} and watch.of(0).reason.startswith("pf draws at random")
     assert reason_against(MODEL, "kf") == ""
@@ -144,7 +144,7 @@ def test_large_fields_say_so_and_failures_stop_nothing():
     fold = Fold("kf", MODEL, twin().tuning, Log(MODEL.width))
     base = fold.base_at(0)[1]
     taken = Window("ekf", twin().tuning, log.events, base, 0)
-    watch = IntegrityWatch(field, lambda: taken, EVERY)
+    watch = IntegrityWatch(lambda: taken, EVERY)
     watch.look()
     assert watch.of(0).bounds == {} and watch.of(0).reason
 
@@ -154,7 +154,7 @@ def test_a_twin_that_ends_is_not_waited_for():
     log.extend(readings(*series(300)))
     fold = Fold("kf", MODEL, twin().tuning, log)
     fold.advance()
-    watch = IntegrityWatch(MODEL, lambda: window(fold, 0), EVERY)
+    watch = IntegrityWatch(lambda: window(fold, 0), EVERY)
     watch.stop()
     watch.look()
     assert watch.of(0) is None

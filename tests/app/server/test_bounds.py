@@ -4,6 +4,7 @@ import json
 import math
 import random
 import socket
+from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
@@ -196,7 +197,9 @@ def seekable(page, tmp_path, monkeypatch):  # noqa: F811
         monkeypatch.setattr(page.source, name, lambda: None, raising=False)
     for name, value in (("speed", 1.0), ("paused", False), ("restarts", 0), ("span", None)):
         monkeypatch.setattr(page.source, name, value, raising=False)
-    page.engine.recorder = type("Deaf", (), {"record": lambda self, path: None, "path": None, "finished": []})()
+    page.engine.recorder = type(
+        "Deaf", (), {"record": lambda self, path: None, "path": None, "finished": [], "folder": Path()}
+    )()
     page.source.put(readings([1.0, 2.0], [40.0, 41.0]))
     wait_for(lambda: page.rows() == 2)
     yield page

@@ -178,7 +178,7 @@ def test_a_port_in_use_is_one_line(page):
 
 
 def test_it_listens_on_loopback_only(page):
-    assert page.server._socket.getsockname()[0] == "127.0.0.1"
+    assert page.server.door._socket.getsockname()[0] == "127.0.0.1"
 
 
 # What is served

@@ -1,0 +1,150 @@
+"""How a twin or a recording is opened to be run; the same for a command and for the gallery."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from config.loader import shipped
+
+from ..gallery.api import GalleryApi
+from ..gallery.gallery import Gallery, Opener, Wanted
+from ..gallery.recordings import Recordings
+from ..gallery.saved_files import SavedFiles
+from ..recording.format import tuning_from_json
+from ..recording.reader import read_recording
+from ..recording.split import NEVER, Split
+from ..running import Opening, stamp_of
+from ..session import Page, Session
+from ..twin.model import model_file
+from ..twin.twin import Twin, load_twin, restore_twin
+from .prepare import begin_to_compile, prepare, prepare_model
+from .remarks import remarking
+
+if TYPE_CHECKING:
+    from sources.source import Source
+
+    from ..recording.reader import Recorded
+
+
+def live_source(twin: Twin, speed: float) -> Callable[[Callable[[str, str], None]], Source]:
+    """How to open the twin's source so that it comes in its own time: a bus as it is, anything else paced.
+
+    The faults that were injected last when a bus is opened again.
+    """
+    faults = twin.faults()
+    return lambda report: twin.open_source(remarking(report), speed=speed, faults=faults)
+
+
+def opened_twin(
+    name: str, *, logs: Sequence[Path] = (), overrides: Mapping[str, str] | None = None, speed: float = 1.0
+) -> Opening:
+    """A twin on its source, and how to read it again when its files were changed.
+
+    Raises:
+        NisusError: If its YAML or its model is wrong.
+    """
+
+    def read() -> Twin:
+        return load_twin(name, log_files=logs or None, overrides=overrides)
+
+    twin = read()
+    files = (twin.path, *model_file(twin.loaded))
+    return Opening(twin, live_source(twin, speed), files=files, stamp=stamp_of(files), again=read)
+
+
+def recorded_twin(recorded: Recorded) -> Twin:
+    """The twin as it was when the recording ended: its YAML, with the last tuning and estimator.
+
+    What was normal of the innovations is no knob, and stands in the YAML.
+    """
+    twin = restore_twin(recorded.text, recorded.twin_path, recorded.overrides)
+    tuning, estimator = tuning_from_json(recorded.tuning, twin.model)
+    tuning = replace(tuning, baseline=twin.tuning.baseline)
+    return replace(twin, tuning=tuning, estimator=estimator, recorded=True)
+
+
+def opened_review(path: Path) -> Opening:
+    """What a recording holds, to be folded again: the same engine, the same fold. Its model is not compiled yet.
+
+    Raises:
+        NisusError: If the recording cannot be read, or its model is not there.
+    """
+    recorded = read_recording(path)
+
+    def open_source(report: Callable[[str, str], None]) -> Source:
+        from sources.memory import MemorySource
+
+        return MemorySource(recorded.events)
+
+    remarks = [("info", f"{path.name}: {recorded.rows} rows, {recorded.tunings} tuning(s), folded again")]
+    if not recorded.closed:
+        cut = f"{path.name}: was not closed, as by a kill or a full disk; it is reviewed as far as it goes"
+        remarks.append(("warn", cut))
+    return Opening(
+        recorded_twin(recorded),
+        open_source,
+        base=recorded.base,
+        horizon=np.inf,
+        review=path,
+        said=recorded.notices,
+        remarks=remarks,
+    )
+
+
+class FileOpener:
+    """Opens what the gallery asks for. `given` has twins that the command line says more of than their name."""
+
+    def __init__(self, given: Mapping[str, Callable[[], Opening]] | None = None) -> None:
+        self._given = dict(given or {})
+
+    def open(self, wanted: Wanted) -> Opening:
+        """See `Opener`. A log is folded as fast as it can be: it is there to be looked at from its beginning."""
+        if wanted.recording is not None:
+            return opened_review(wanted.recording)
+        name = wanted.twin or ""
+        if name in self._given and not wanted.logs:
+            return self._given[name]()
+        return opened_twin(name, logs=wanted.logs, speed=math.inf if wanted.logs else 1.0)
+
+    def made_ready(self, opening: Opening) -> Opening:
+        """See `Opener`."""
+        workshop = begin_to_compile(opening.twin)
+        try:
+            prepare_model(opening.twin)
+        except BaseException:
+            workshop.stop()
+            raise
+        return replace(opening, workshop=workshop)
+
+    def prepare(self, twin: Twin) -> None:
+        """See `Opener`."""
+        prepare(twin)
+
+
+def open_session(
+    opening: Opening | None,
+    wanted: Wanted | None,
+    opener: Opener,
+    *,
+    page: Page | None,
+    split: Split = NEVER,
+    recordings: Path = Path(),
+) -> Session:
+    """A session that runs what was opened, and on a page the gallery beside it.
+
+    Raises:
+        NisusError: If the source cannot be opened, or the page's port is in use.
+    """
+    session = Session(opening, page=page, split=split, recordings=recordings)
+    if page is not None:
+        own = [wanted.twin] if wanted is not None and wanted.twin is not None and wanted.twin not in shipped() else []
+        gallery = Gallery(session, opener, first=wanted, own=own)
+        GalleryApi(gallery, Recordings(recordings))
+        session.beside.append(SavedFiles(gallery))
+    return session

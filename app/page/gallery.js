@@ -1,0 +1,83 @@
+// The gallery: every twin with a picture, what it teaches and the question it answers; beside them the recordings.
+
+import { card } from "./card.js";
+import { $, element, setText } from "./dom.js";
+import { drops } from "./drop.js";
+import { keys } from "./keys.js";
+import { Recordings } from "./recordings.js";
+import { post, Session } from "./session.js";
+
+const settings = JSON.parse(document.body.dataset.settings);
+const session = new Session(settings.boot);
+
+$("theme").addEventListener("click", () => {
+  const root = document.documentElement;
+  root.dataset.theme = root.dataset.theme === "dark" ? "light" : "dark";
+  localStorage.setItem("nisus.theme", root.dataset.theme);
+});
+
+let shown = [];
+const open = () => location.assign("/");
+const start = (name) => session.tell(post("/api/gallery/start", { twin: name }));
+const stop = () => session.tell(post("/api/gallery/stop", {}));
+
+// What was said last of a file, until something else is said.
+let told = "";
+function say(text, wrong = false) {
+  told = wrong ? text : "";
+  setText($("sending"), wrong ? "" : text);
+  if (session.state) draw(session.state);
+  session.ask();
+}
+const files = drops({ twins: () => shown.filter((item) => item.log), say });
+const recordings = new Recordings($("recordings"), { open: files.open, drop: files.take, say: (text) => say(text, true) });
+
+function draw(state) {
+  for (const item of shown) item.sync(state);
+  const { running, starting, failed } = state;
+  const now = [];
+  if (starting) now.push(element("span", { class: "pill", dataset: { health: "suspect" } }, `starting ${starting.title} … ${Math.floor(starting.seconds)} s`));
+  if (running)
+    now.push(
+      element("span", { class: "pill", dataset: { health: "tracking" } }, `● ${running.title} ${running.review ? "is open" : "runs"}`),
+      element("button", { type: "button", class: "go", onclick: open }, "Back to it"),
+      element("button", { type: "button", class: "go", onclick: stop }, running.review ? "Close" : "Stop"),
+    );
+  const key = JSON.stringify([running, starting]);
+  if ($("now").dataset.key !== key) {
+    $("now").dataset.key = key;
+    $("now").replaceChildren(...now);
+  }
+  const wrong = told || (failed ? `${failed.title} did not start. ${failed.text}` : "");
+  $("failed").hidden = !wrong;
+  setText($("failed"), wrong);
+}
+session.addEventListener("state", (event) => draw(event.detail));
+
+const find = () => {
+  const wanted = $("find").value.toLowerCase().split(/\s+/);
+  let left = 0;
+  for (const item of shown) {
+    item.node.hidden = !wanted.every((word) => item.words.includes(word));
+    left += !item.node.hidden;
+  }
+  $("none").hidden = left > 0;
+};
+$("find").addEventListener("input", find);
+
+const commands = [
+  ["/", "find a twin", () => $("find").focus()],
+  ["a", "add a file to the recordings", () => recordings.choose.click()],
+  ["g", "back to the twin that runs", () => session.state?.running && open()],
+];
+keys(commands);
+
+const answer = await fetch("/api/gallery");
+if (!answer.ok) throw new Error(await answer.text());
+shown = (await answer.json()).map((item) => card(item, { start, open }));
+$("cards").replaceChildren(...shown.map((item) => item.node));
+commands.push(...shown.filter((item) => item.ready).map((item) => ["", `start ${item.short}`, () => start(item.name)]));
+if (session.state) draw(session.state);
+find();
+if (location.hash === "#recordings") $("recordings").querySelector("button").focus();
+window.nisus = { session, cards: shown.length };

@@ -1,0 +1,101 @@
+// The list of recordings and logs: open, download, delete once it was asked again, and drop a file to add one.
+
+import { element, setText } from "./dom.js";
+import { compact, spaced, span } from "./format.js";
+import { post } from "./session.js";
+
+const REST = 1500; // ms, while some file is still being looked through
+const SLOW = 5000;
+
+// `ask` has open(name, log) and say(text): what goes wrong.
+export class Recordings {
+  constructor(node, ask) {
+    Object.assign(this, { node, ask, key: null });
+    this.list = element("ol", { class: "files" });
+    this.where = element("p", { class: "faint where" });
+    this.choose = element("input", { type: "file", multiple: true, hidden: true, onchange: () => this.ask.drop([...this.choose.files]) });
+    this.node.replaceChildren(
+      element("header", { class: "panel-head" }, element("h2", {}, "Recordings"), element("span", { class: "space" }),
+        element("button", { type: "button", class: "go", onclick: () => this.choose.click(), title: "A recording (.rrd) or a log; dropping it on the page does the same" }, "Add a file"), this.choose),
+      this.list, this.where,
+    );
+    document.addEventListener("visibilitychange", () => this.refresh());
+    this.refresh();
+  }
+
+  async refresh() {
+    clearTimeout(this.timer);
+    if (document.hidden) return;
+    const answer = await fetch("/api/gallery/recordings").catch(() => null);
+    if (answer?.ok) this.draw(await answer.json());
+    clearTimeout(this.timer);
+    this.timer = setTimeout(() => this.refresh(), this.looking ? REST : SLOW);
+  }
+
+  draw({ folder, files }) {
+    this.looking = files.some((file) => file.looking);
+    const key = JSON.stringify(files);
+    if (key === this.key) return;
+    this.key = key;
+    setText(this.where, `Kept in ${folder}. Record one on a twin's page (R), or drop a recording or a log here: CSV, Parquet, MF4, BLF, ASC and others.`);
+    // What is asked of one file stays asked while the list is drawn anew.
+    const asked = this.list.querySelector("[data-asked]")?.dataset.name;
+    this.list.replaceChildren(...files.map((file) => this.item(file)));
+    if (asked) [...this.list.children].find((item) => item.dataset.name === asked)?.querySelector(".delete")?.click();
+    if (!files.length) this.list.replaceChildren(element("li", { class: "nothing" }, "None yet."));
+  }
+
+  item(file) {
+    const { summary } = file;
+    const error = summary?.error;
+    const facts = [
+      file.twin, file.seconds ? span(file.seconds) : null, summary?.estimator ?? file.estimator, size(file.bytes),
+    ].filter(Boolean).join(" · ");
+    const scores = [
+      summary?.nis ? `NIS ${compact(summary.nis, 3)} [${compact(summary.nis_low, 3)}, ${compact(summary.nis_high, 3)}]` : null,
+      error ? `RMSE ${error.name} ${compact(error.rmse, 3)}${spaced(error.unit)}${error.against === "truth" ? "" : `, ${error.against}`}` : null,
+    ].filter(Boolean).join(" · ");
+    const confirm = element("div", { class: "confirm", hidden: true });
+    const node = element(
+      "li", { class: "file", dataset: { name: file.name } },
+      element("div", { class: "row" },
+        element("button", { type: "button", class: "name", title: file.log ? `Run a twin on ${file.name}` : `Review ${file.name}`, onclick: () => this.ask.open(file.name, file.log) }, file.name),
+        element("a", { href: `/recordings/${encodeURIComponent(file.name)}`, download: file.name, title: "Download", "aria-label": `Download ${file.name}` }, "↓"),
+        element("button", { type: "button", class: "delete", title: "Delete", "aria-label": `Delete ${file.name}`, onclick: () => this.confirm(node, confirm, file.name) }, "✕")),
+      element("p", { class: "faint" }, `${when(file.modified)} · ${file.log ? "log · " : ""}${file.looking ? "looking …" : facts}`),
+      scores ? element("p", { class: "faint" }, scores) : null,
+      file.error ? element("p", { class: "faint" }, file.error) : null,
+      confirm,
+    );
+    return node;
+  }
+
+  confirm(node, place, name) {
+    node.dataset.asked = "true";
+    const back = () => {
+      place.hidden = true;
+      delete node.dataset.asked;
+      node.querySelector(".delete").focus();
+    };
+    const remove = async () => {
+      const answer = await post("/api/gallery/recordings/delete", { name });
+      delete node.dataset.asked;
+      if (answer.error) this.ask.say(answer.error);
+      this.key = null;
+      this.refresh();
+    };
+    const yes = element("button", { type: "button", class: "go danger", onclick: remove }, "Delete for good");
+    place.replaceChildren(yes, element("button", { type: "button", class: "go", onclick: back }, "Keep"));
+    place.hidden = false;
+    yes.focus();
+  }
+}
+
+const size = (bytes) => (bytes < 1e6 ? `${Math.max(1, Math.round(bytes / 1e3))} kB` : bytes < 1e9 ? `${compact(bytes / 1e6, 3)} MB` : `${compact(bytes / 1e9, 3)} GB`);
+
+function when(seconds) {
+  const date = new Date(1000 * seconds);
+  const today = date.toDateString() === new Date().toDateString();
+  const time = date.toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit" });
+  return today ? `today ${time}` : `${date.toLocaleDateString("en-GB", { day: "numeric", month: "short", year: "numeric" })} ${time}`;
+}

@@ -1,0 +1,52 @@
+"""What a session was worth when its recording was closed, in a few numbers, so that a list need not fold it again."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from estimators.diagnostics.score import Score, score
+from estimators.errors import NisusError
+
+from ..engine.interface import Running
+from ..runs.scores import everything
+
+
+def summary_of(engine: Running) -> dict[str, Any]:
+    """Estimator, mean NIS with its bounds and the first error that could be taken, of what runs; less if it cannot be.
+
+    `error` is {name, rmse, unit, coverage, against}: of the first state with a truth, else of a sensor held out.
+    """
+    try:
+        pull = everything(engine)
+        tuning, estimator = engine.folded_with()
+        if pull is None:
+            return {"estimator": estimator}
+        found = score(pull.track, pull.events, engine.model, pull.pictures, gate=tuning.gate)
+    except NisusError:
+        return {}
+    return {
+        "estimator": estimator,
+        "nis": _plain(found.nis),
+        "nis_low": _plain(found.nis_low),
+        "nis_high": _plain(found.nis_high),
+        "error": _error(found, engine),
+    }
+
+
+def _error(found: Score, engine: Running) -> dict[str, Any] | None:
+    units = {state.name: state.unit for state in engine.model.shown_states}
+    rows = [row.unit for sensor in engine.model.sensors for row in sensor.rows]
+    units |= dict(zip(engine.model.row_names, rows, strict=True))
+    fits = [("truth", found.states), ("held out", found.held_out)]
+    for against, part in fits:
+        for name, fit in part.items():
+            if math.isfinite(fit.rmse):
+                coverage = _plain(fit.coverage)
+                unit = units.get(name, "")
+                return {"name": name, "rmse": fit.rmse, "unit": unit, "coverage": coverage, "against": against}
+    return None
+
+
+def _plain(value: float) -> float | None:
+    return value if math.isfinite(value) else None

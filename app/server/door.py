@@ -1,0 +1,220 @@
+"""The one port of the page: open as long as the process, while what is behind it changes.
+
+A twin, another twin, or none: whoever was connected to what went is disconnected, comes again and finds what is there
+now. The token, the port and the rules of who may enter stay.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+import time
+import uuid
+from collections.abc import Sequence
+from typing import Any
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.responses import JSONResponse, PlainTextResponse
+from starlette.routing import BaseRoute
+from starlette.websockets import WebSocket
+
+from .bounds import bounds
+from .gate import App, Gate, Receive, Scope, Send, session_token
+from .port import listen
+
+GONE = 1012
+"""WebSocket's code for a service that starts anew."""
+
+NOTHING = "no twin runs; choose one in the gallery"
+
+
+def _policy(port: int, scripts: str) -> str:
+    """A content security policy under which no request leaves this server."""
+    # Not every browser takes 'self' to include the WebSockets of the same address.
+    sockets = f"ws://127.0.0.1:{port} ws://localhost:{port}"
+    return (
+        f"default-src 'self'; script-src 'self' {scripts}; style-src 'self' 'unsafe-inline'; "
+        f"img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob: {sockets}; "
+        "worker-src 'self' blob: data:; frame-src 'self'; frame-ancestors 'self'; object-src 'none'; "
+        "base-uri 'none'; form-action 'self'"
+    )
+
+
+class Shown:
+    """An application behind the door; `boot` tells it from what was there before."""
+
+    def __init__(self, application: App, boot: str) -> None:
+        self.application, self.boot = application, boot
+        self.left = asyncio.Event()
+        """Set when something else has taken its place, by the thread of the server."""
+        self.over = threading.Event()
+        """Set once nobody is connected to it any more either."""
+        self._open = 0
+
+    async def stream(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve a WebSocket for as long as this is shown."""
+        self._open += 1
+        try:
+            await self.application(scope, _until(receive, self.left), send)
+        finally:
+            self._open -= 1
+            self._look()
+
+    def leave(self) -> None:
+        """Something else is shown; in the thread of the server."""
+        self.left.set()
+        self._look()
+
+    def _look(self) -> None:
+        if self.left.is_set() and not self._open:
+            self.over.set()
+
+
+class Door:
+    """Serves what is shown, and its own routes before it, from a thread of its own."""
+
+    def __init__(self, port: int) -> None:
+        """Take the port; 0 takes a free one.
+
+        Raises:
+            ConfigError: If the port cannot be had.
+        """
+        self._socket = listen(port)
+        self.port: int = self._socket.getsockname()[1]
+        self._token = session_token()
+        self._shown = Shown(self._nothing, uuid.uuid4().hex)
+        self._page: App | None = None
+        self._own = Starlette()
+        self._own.router.default = self._behind
+        self._own.router.redirect_slashes = False
+        self._loop: asyncio.AbstractEventLoop | None = None
+        gate = Gate(_WithHeaders(self._enter, self.port), self._token, self.port)
+        self.entered = gate.entered
+        config = uvicorn.Config(
+            gate, log_config=None, log_level="critical", access_log=False,
+            server_header=False, lifespan="off", ws_per_message_deflate=False, timeout_graceful_shutdown=1, **bounds(),
+        )  # fmt: skip
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(
+            target=self._server.run, kwargs={"sockets": [self._socket]}, name="page server", daemon=True
+        )
+
+    @property
+    def url(self) -> str:
+        """Address of the page, with the token that it asks for."""
+        return f"http://127.0.0.1:{self.port}/?token={self._token}"
+
+    @property
+    def boot(self) -> str:
+        """What tells that which is shown from all that was: a page that knows another one loads again."""
+        return self._shown.boot
+
+    @property
+    def furnished(self) -> bool:
+        """Whether there is more than what is shown: a gallery."""
+        return bool(self._own.routes)
+
+    def furnish(self, routes: Sequence[BaseRoute], page: App) -> None:
+        """What is served whatever is shown, and which page while nothing is; before the start."""
+        self._own.router.routes.extend(routes)
+        self._page = page
+
+    def show(self, application: App | None, boot: str | None = None) -> threading.Event:
+        """Put an application behind the door in place of what is there, or nothing; from any thread.
+
+        Returns:
+            Set once nobody is connected any more to what was there.
+        """
+        before = self._shown
+        boot = uuid.uuid4().hex if boot is None else boot
+        self._shown = Shown(self._nothing if application is None else application, boot)
+        if self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(before.leave)
+        else:
+            before.over.set()
+        return before.over
+
+    def start(self) -> None:
+        """Serve."""
+        self._thread.start()
+        while not self._server.started and self._thread.is_alive():
+            time.sleep(0.005)
+
+    def stop(self) -> None:
+        """Close all connections, and the port."""
+        self._server.should_exit = True
+        if self._thread.is_alive():
+            self._thread.join(timeout=5.0)
+        self._socket.close()
+
+    async def _enter(self, scope: Scope, receive: Receive, send: Send) -> None:
+        self._loop = asyncio.get_running_loop()
+        await self._own(scope, receive, send)
+
+    async def _behind(self, scope: Scope, receive: Receive, send: Send) -> None:
+        shown = self._shown
+        scope.pop("router", None)
+        serve = shown.stream if scope["type"] == "websocket" else shown.application
+        await serve(scope, receive, send)
+
+    async def _nothing(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """No twin runs. A page that still shows one is told to load again, others the reason."""
+        if scope["type"] == "websocket":
+            browser = WebSocket(scope, receive, send)
+            await browser.accept()
+            await browser.send_text(json.dumps({"boot": self.boot}))
+            await browser.close(GONE)
+        elif scope["path"] == "/" and self._page is not None:
+            await self._page(scope, receive, send)
+        elif scope["path"].startswith("/api/"):
+            await JSONResponse({"error": NOTHING}, 409)(scope, receive, send)
+        else:
+            await PlainTextResponse(f"Nisus: {NOTHING}.\n", 404)(scope, receive, send)
+
+
+def _until(receive: Receive, left: asyncio.Event) -> Receive:
+    """What a browser says, until what it speaks to has gone."""
+
+    async def take() -> Any:
+        said, gone = asyncio.ensure_future(receive()), asyncio.ensure_future(left.wait())
+        try:
+            await asyncio.wait({said, gone}, return_when=asyncio.FIRST_COMPLETED)
+            return said.result() if said.done() else {"type": "websocket.disconnect", "code": GONE}
+        finally:
+            said.cancel()
+            gone.cancel()
+
+    return take
+
+
+class _WithHeaders:
+    """Adds the security headers to every answer."""
+
+    def __init__(self, application: App, port: int) -> None:
+        self._application = application
+        common = [
+            (b"x-content-type-options", b"nosniff"),
+            (b"referrer-policy", b"no-referrer"),
+            (b"cross-origin-resource-policy", b"same-origin"),
+            (b"cross-origin-opener-policy", b"same-origin"),
+        ]
+        own = _policy(port, "'wasm-unsafe-eval'")
+        # Viser's client is one file of inline scripts that unpack themselves.
+        viser = _policy(port, "'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:")
+        self._own = [*common, (b"content-security-policy", own.encode())]
+        self._viser = [*common, (b"content-security-policy", viser.encode())]
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        extra = self._viser if scope.get("path", "").startswith("/viser") else self._own
+
+        async def send_more(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                headers = [*message.get("headers", []), *extra]
+                if not any(name == b"cache-control" for name, _ in headers):
+                    headers.append((b"cache-control", b"no-cache"))
+                message = {**message, "headers": headers}
+            await send(message)
+
+        await self._application(scope, receive, send_more)
