@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pyarrow.parquet as pq
 
 from estimators.diagnostics.episodes import Episode, episodes
 from estimators.diagnostics.field_pictures import Picture
@@ -24,6 +23,7 @@ from estimators.track import Track
 from sources.source import Endless
 
 from ..engine.stall import interruptible
+from ..export.track_file import encoded
 from ..intake import Intake
 from ..twin.twin import Twin, load_twin
 from .arguments import settings
@@ -92,8 +92,8 @@ def fold_twin(arguments: Arguments) -> int:
     twin = load_twin(
         arguments.twin, log_files=arguments.log or None, overrides=settings(arguments.set, arguments.estimator)
     )
-    if arguments.out is not None and arguments.out.suffix not in (".parquet", ".rrd"):
-        raise ConfigError(f"--out {arguments.out}: must end in .parquet or .rrd")
+    if arguments.out is not None and arguments.out.suffix not in (".csv", ".parquet", ".rrd"):
+        raise ConfigError(f"--out {arguments.out}: must end in .csv, .parquet or .rrd")
     prepare(twin)
     log, counts = read_log(twin, arguments.duration)
     period = twin.picture if arguments.out is not None and arguments.out.suffix == ".rrd" else None
@@ -139,4 +139,5 @@ def _write(
     table = table_of(
         twin.model, log.events, track, found, tuning_version=twin.tuning.version, model_version=log.version
     )
-    pq.write_table(table, path)
+    with path.open("wb") as file:
+        file.writelines(encoded(path.suffix[1:], [table]))

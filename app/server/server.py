@@ -34,6 +34,7 @@ from ..rerun.feed import RerunFeed
 from ..series.series import Series
 from .api import Json, command_from_json, episodes_json, faults_json, one_line, status_json
 from .bounds import BODY, TooLarge, bounded_body, bounds
+from .export_api import ExportApi
 from .gate import Gate, session_token
 from .model_json import model_json
 from .one_at_a_time import OneAtATime
@@ -97,6 +98,7 @@ class PageServer:
         self._choices = choices
         self._series = Series(engine)
         self._runs = RunsApi(engine)
+        self._exports = ExportApi(engine, self._series)
         self._forecasts, self._diagnosis = Forecasts(engine), Diagnosis(engine)
         self._forecasting, self._diagnosing = OneAtATime("forecast"), OneAtATime("diagnosis")
         self._boot = uuid.uuid4().hex
@@ -151,6 +153,7 @@ class PageServer:
             Route("/api/model", self._model),
             Route("/api/episodes", self._episodes),
             *self._runs.routes(),
+            *self._exports.routes(),
             Route("/api/recordings", self._list_recordings),
             Route("/api/faults", self._faults),
             Route("/api/command", self._command, methods=["POST"]),

@@ -1,0 +1,74 @@
+"""What can be saved of a run over HTTP: its track as a table."""
+
+from __future__ import annotations
+
+import math
+import re
+
+from starlette.requests import Request
+from starlette.responses import Response, StreamingResponse
+from starlette.routing import Route
+
+from estimators.errors import ConfigError
+
+from ..engine.interface import Running
+from ..export.run_rows import RunRows, rows_of_run
+from ..export.track_file import KINDS, encoded, tables
+from ..series.series import Series
+from .api import Json, one_line
+from .one_at_a_time import OneAtATime
+
+FOLDS = 1e9
+"""Seconds that can be asked for, to either side, at most."""
+
+
+class ExportApi:
+    """The routes. A copy of the rows is taken first, by pieces; what is written of it holds nobody up."""
+
+    def __init__(self, engine: Running, series: Series) -> None:
+        self._engine, self._series = engine, series
+        self._copying = OneAtATime("export")
+
+    def routes(self) -> list[Route]:
+        """What is served."""
+        return [Route(f"/api/track.{kind}", self._track) for kind in KINDS]
+
+    async def _track(self, request: Request) -> Response:
+        """`?run=3&since=0&until=12.5`: of a run (default: what runs) the rows between two times, s of the charts."""
+        kind = request.url.path.rpartition(".")[2]
+        try:
+            number = _number(request)
+            since, until = (self._instant(request, name) for name in ("since", "until"))
+            taken = await self._copying.do(lambda: rows_of_run(self._engine, number))
+        except ConfigError as error:
+            return Json({"error": one_line(str(error))}, 409)
+        parts = encoded(kind, tables(taken, taken.between(since, until)))
+        return StreamingResponse(parts, media_type=KINDS[kind], headers=self._named(taken, kind, request))
+
+    def _instant(self, request: Request, name: str) -> int | None:
+        """A time of the charts as one of the log, ns."""
+        text = request.query_params.get(name)
+        if text is None:
+            return None
+        try:
+            seconds = float(text)
+        except ValueError:
+            seconds = math.nan
+        if not abs(seconds) < FOLDS:
+            raise ConfigError(f"track: {name} is {text[:40]!r}; it must be a number of seconds")
+        return (self._series.origin() or 0) + round(seconds * 1e9)
+
+    def _named(self, taken: RunRows, kind: str, request: Request) -> dict[str, str]:
+        ends = [request.query_params.get(name) for name in ("since", "until")]
+        span = f"-{ends[0] or ''}-to-{ends[1] or ''}s" if any(ends) else ""
+        name = re.sub(r"[^\w.-]+", "_", f"{self._engine.twin.name}-run{taken.run.number}{span}", flags=re.ASCII)
+        return {"Content-Disposition": f'attachment; filename="{name}.{kind}"'}
+
+
+def _number(request: Request) -> int | None:
+    text = request.query_params.get("run")
+    if text is None:
+        return None
+    if not re.fullmatch(r"[0-9]{1,9}", text):
+        raise ConfigError(f"track: run is {text[:40]!r}; it must be the number of a run")
+    return int(text)
