@@ -60,6 +60,8 @@ class Fold:
     """Take only this many seconds of the source."""
     out: Path | None = None
     """Write the track to this .csv or .parquet, or a recording to this .rrd."""
+    html: Path | None = None
+    """Write a report to this HTML file, which needs no other: scores, charts, checks, episodes, tuning."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print one JSON object."""
 

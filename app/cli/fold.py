@@ -23,6 +23,8 @@ from estimators.track import Track
 from sources.source import Endless
 
 from ..engine.stall import interruptible
+from ..export.html import as_html
+from ..export.report import Reported, report
 from ..export.track_file import encoded
 from ..intake import Intake
 from ..twin.twin import Twin, load_twin
@@ -121,6 +123,12 @@ def fold_twin(arguments: Arguments) -> int:
     told = blamed(fold, [*dropped(counts, fold), *episodes(fold)])
     if arguments.out is not None:
         _write(arguments.out, twin, log, fold.track, pictures, [item.episode for item in told])
+    if arguments.html is not None:
+        run = Reported(
+            twin, twin.estimator, twin.tuning, log.events, fold.track, pictures, [item.episode for item in told],
+            fold.marginal,
+        )  # fmt: skip
+        arguments.html.write_text(as_html(f"{twin.name}, {twin.estimator}", report(run)), encoding="utf-8")
     if arguments.json:
         print(json.dumps(as_dict(twin, result, found, seconds, counts, fold, told)))
     else:

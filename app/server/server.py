@@ -98,7 +98,7 @@ class PageServer:
         self._choices = choices
         self._series = Series(engine)
         self._runs = RunsApi(engine)
-        self._exports = ExportApi(engine, self._series)
+        self._exports = ExportApi(engine, self._series, self._runs.scores)
         self._forecasts, self._diagnosis = Forecasts(engine), Diagnosis(engine)
         self._forecasting, self._diagnosing = OneAtATime("forecast"), OneAtATime("diagnosis")
         self._boot = uuid.uuid4().hex

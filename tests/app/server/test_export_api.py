@@ -15,6 +15,7 @@ from app.engine.commands import Maintenance, SetTuning
 from app.export import track_file
 from app.session import Page, Session
 from app.twin.twin import load_twin
+from tests.app.cli.test_check import parsed
 from tests.app.scripted import pull_all, wait_for
 from tests.app.served import Client
 
@@ -132,3 +133,14 @@ def test_versions_of_the_model_and_runs_that_are_kept(client, session, monkeypat
     wait_for(lambda: engine.status().revision == 2)
     gone = client.get("/api/track.csv?run=0")
     assert gone.status == 409 and "its track is gone" in gone.text
+
+
+def test_the_report_of_a_run_is_that_of_the_page(client, session):
+    answer = client.get("/api/report.html?run=1")
+    page = parsed(answer.text)
+    text = " ".join(page.text)
+    assert answer.status == 200 and 'filename="motor_joint-run1.html"' in answer.headers["content-disposition"]
+    assert not page.tags & {"script", "link", "img", "iframe"} and "://" not in answer.text
+    first = session.engine.twin.tuning.get("Q.winding")
+    assert "1: Q.winding" in text and f"Changed: Q.winding {first:.6g} → 0.5." in text
+    assert "Runs of the session" in text and "as it began" in text
