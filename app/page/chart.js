@@ -8,22 +8,25 @@ export const CURSOR = "time";
 const styles = getComputedStyle(document.documentElement);
 export const colour = (name) => styles.getPropertyValue(`--${name}`).trim();
 
+// What uPlot draws, and for a file: the name of its colour, and which mark it is.
 export const line = (name, options = {}) => ({
-  stroke: () => colour(name), width: 1.5, points: { show: false }, spanGaps: false, ...options,
+  mark: "line", tone: name, stroke: () => colour(name), width: 1.5, points: { show: false }, spanGaps: false, ...options,
 });
 
 export const edge = (options = {}) => ({ stroke: () => "transparent", width: 0, points: { show: false }, ...options });
 
+export const band = (name, series) => ({ series, tone: name, fill: () => colour(name) });
+
 export const dots = (name, size = 4, ring = false) => ({
-  stroke: () => colour(name),
+  mark: "dots", tone: name, ring, stroke: () => colour(name),
   paths: () => null,
   points: { show: true, size, width: ring ? 1.5 : 0, stroke: () => colour(name), fill: () => (ring ? "transparent" : colour(name)) },
 });
 
 export class Chart {
   // what: {title, unit, note, weight, series, bands, range(self, low, high), scale, draw: [hook], values: [label of a tick],
-  // sync: charts of one name share their cursor}
-  constructor(what, { select, home, wheel }) {
+  // sync: charts of one name share their cursor, names: what a file calls its colours, extras: more lines of a file}
+  constructor(what, { select, home, wheel, save }) {
     this.what = what;
     this.reading = element("output", { class: "reading" });
     this.head = element(
@@ -31,6 +34,7 @@ export class Chart {
       element("b", {}, what.title), element("span", { class: "unit" }, what.unit ?? ""),
       what.note ? element("span", { class: "note" }, what.note) : null,
       element("span", { class: "space" }), this.reading,
+      save ? element("button", { type: "button", class: "save", title: "Save this chart", "aria-label": `Save the chart of ${what.title}`, "aria-haspopup": "menu", onclick: (event) => save(this, event.currentTarget) }, "⤓") : null,
     );
     this.canvas = element("div", { class: "plot" });
     this.node = element("article", { class: "chart", style: `--weight:${what.weight}`, "aria-label": `Chart of ${what.title}` }, this.head, this.canvas);

@@ -1,6 +1,6 @@
 // The stack of charts: one time axis, one cursor. States that nobody measures first, then the others, NIS, innovations.
 
-import { Chart, colour, dots, edge, line } from "./chart.js";
+import { Chart, band, colour, dots, edge, line } from "./chart.js";
 import { $ } from "./dom.js";
 import { bracketed, clock, compact, spaced, withDeviation, words } from "./format.js";
 import { Lane } from "./lane.js";
@@ -33,6 +33,7 @@ export class Charts {
       select: (since, until) => view.show(since, until),
       home: () => view.follow(view.configured),
       wheel: (event, plot) => this.wheel(event, plot),
+      save: (chart, button) => this.saving.chart(chart, button),
     };
     this.parts = [
       ...order.map((state) => stateChart(this, state)),
@@ -150,10 +151,11 @@ function stateChart(charts, state) {
       edge(), edge(), line("previous", { width: 1 }), ...rows.map((name) => marksOf[name.split(":")[0]]()),
       line("truth", { width: 1.5, dash: [5, 3], spanGaps: true }), line("estimate", { width: 1.75 }),
     ],
-    bands: [{ series: [1, 2], fill: () => colour("band") }],
+    bands: [band("band", [1, 2])],
     under: (plot) => marks(plot, charts.episodes),
     between: (plot, series) => series === BEFORE && charts.pins.draw(plot, state), // over the band, beneath the estimate
     over: (plot) => integrityLines(plot, charts, state),
+    extras: (chart) => [...integrityCurves(chart, charts, state), ...charts.pins.curves("lane", state)],
     data: () => {
       let [upper, lower, truth, mean] = own.map((name) => live.column(name));
       let dotted = rows.map((name) => live.column(name));
@@ -193,9 +195,10 @@ function nisChart(charts) {
     title: "NIS",
     unit: "",
     note: "mean of the last readings, in its 95 % bounds",
+    names: { estimate: "mean", bound: "" },
     weight: 1,
     series: [line("bound", { width: 1 }), line("bound", { width: 1 }), dots("quiet", 2.5), line("estimate", { width: 1.75 })],
-    bands: [{ series: [1, 2], fill: () => colour("bounds") }],
+    bands: [band("bounds", [1, 2])],
     axis: {
       splits: (self, axis, low, high) => [0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100, 300, 1000].map(Math.log10).filter((v) => low <= v && v <= high),
       values: (self, splits) => splits.map((v) => compact(10 ** v, 1)),
@@ -229,9 +232,10 @@ function innovationChart(charts, row) {
     title: words(row.name),
     unit: bracketed(row.unit),
     note: "innovation, reading − prediction",
+    names: { reading: "innovation", bound: "", bounds: "± 2σ expected" },
     weight: 0.62,
     series: [line("bound", { width: 1, spanGaps: true }), line("bound", { width: 1, spanGaps: true }), dots("reading", 3)],
-    bands: [{ series: [1, 2], fill: () => colour("bounds") }],
+    bands: [band("bounds", [1, 2])],
     under: (plot) => marks(plot, charts.episodes),
     data: () => [live.x, ...names.map((name) => live.column(name))],
     range: (chart) => {
@@ -273,6 +277,14 @@ function integrityLines(plot, charts, state) {
     ctx.stroke();
   }
   ctx.restore();
+}
+
+// The same as curves of a file.
+function integrityCurves({ data }, charts, state) {
+  const bound = charts.integrity?.[state.name]?.bound;
+  if (!Number.isFinite(bound)) return [];
+  const values = (side) => data.at(-1).map((value) => (typeof value === "number" ? value + side * bound : value));
+  return [-1, 1].map((side) => ({ tone: "integrity", dash: [2, 3], width: 1, x: data[0], values: values(side) }));
 }
 
 // An angle between -π and π, and a curve of such, which leaves the chart at one edge and comes back at the other.

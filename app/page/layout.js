@@ -51,6 +51,21 @@ export class Layout {
     return [...this.charts].sort((a, b) => own(a) - own(b));
   }
 
+  // What is shown, in its order: [key, height or null].
+  shown() {
+    return this.order.filter((chart) => !chart.node.hidden).map(({ what: { key } }) => [key, this.kept.heights?.[key] ?? null]);
+  }
+
+  // Show these and no others, as a link says; what the user has chosen is kept for the next time.
+  use(shown) {
+    const wanted = new Map(shown);
+    const others = this.charts.map((chart) => chart.what.key).filter((key) => !wanted.has(key));
+    const heights = shown.flatMap(([key, height]) => (height >= LOWEST && height <= HIGHEST ? [[key, height]] : []));
+    this.kept = { order: [...wanted.keys(), ...others], hidden: others, heights: Object.fromEntries(heights) };
+    this.apply();
+    this.offer();
+  }
+
   apply() {
     const hidden = new Set(this.kept.hidden ?? []);
     this.order.forEach((chart, k) => {

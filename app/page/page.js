@@ -2,14 +2,16 @@
 
 import { Charts } from "./charts.js";
 import { Diagnose } from "./diagnose.js";
-import { $, element, setAttribute } from "./dom.js";
+import { $, element, setAttribute, setText } from "./dom.js";
 import { Episodes } from "./episodes.js";
 import { Explore } from "./explore.js";
 import { Faults } from "./faults.js";
 import { clock } from "./format.js";
 import { keys } from "./keys.js";
 import { Link } from "./link.js";
+import { goTo } from "./moment.js";
 import { Runs } from "./runs.js";
+import { Save } from "./save.js";
 import { Stage } from "./stage.js";
 import { Tabs } from "./tabs.js";
 import { Transport } from "./transport.js";
@@ -81,6 +83,34 @@ const middle = new Tabs($("middle-tabs"), null, (shown) => {
   $("legend").hidden = shown === "diagnose" || shown === "explore";
 });
 window.nisus.panes = panes;
+const saving = new Save(model, link, view, charts);
+charts.saving = panes.whatif.saving = saving;
+$("save").addEventListener("click", () => saving.run($("save")));
+$("copy-link").addEventListener("click", () => saving.copyLink());
+saving.said = (text) => {
+  setText($("said"), text);
+  clearTimeout(saving.timer);
+  saving.timer = setTimeout(() => setText($("said"), ""), 5000);
+};
+
+// A link to a moment, once it is known from when seconds count; and when another is opened in this window.
+let arriving = false;
+function follow() {
+  arriving = true;
+  const reason = goTo(location.hash, { model, link, view, charts });
+  arriving = false;
+  if (reason) saving.said(reason);
+}
+function begun() {
+  if (!link.status.origin) return;
+  link.removeEventListener("status", begun);
+  follow();
+  window.addEventListener("hashchange", follow);
+}
+link.addEventListener("status", begun);
+// Elsewhere, or following again: the address says no longer what is shown.
+view.addEventListener("change", () => location.hash && !arriving && history.replaceState(null, "", location.pathname));
+
 const turn = (name) => middle.show(middle.chosen === name ? "charts-panel" : name);
 const xy = new XY($("xy"), model, link, view, charts);
 let stages = false;
@@ -135,6 +165,8 @@ keys([
   ["x", "explore in Rerun, and back", () => turn("explore")],
   ["w", "what if, and back", () => turn("whatif")],
   ["d", "diagnose, and back", () => turn("diagnose")],
+  ["l", "copy a link to this moment", () => saving.copyLink()],
+  ["o", "save the track, a report", () => saving.run($("save"))],
   ["t", "tune, where the page is narrow", drawer],
 ]);
 

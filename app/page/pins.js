@@ -22,6 +22,7 @@ export class Pins {
         key: "difference", title: "pinned − running", unit: bracketed(this.state.unit), weight: 1,
         series: [{ show: false }],
         data: () => [charts.range, [null, null]],
+        extras: () => this.curves("less", this.state),
         over: (plot) => this.pinned.forEach((pin) => trace(plot, pin.less, this.state, pin.place)),
         range: () => {
           const [low, high] = this.extent("less", this.state.name);
@@ -97,6 +98,15 @@ export class Pins {
   // Beneath the lines of a state's own chart.
   draw(plot, state) {
     for (const pin of this.pinned) trace(plot, pin.lane, state, pin.place);
+  }
+
+  // The same as curves of a file.
+  curves(which, state) {
+    return this.pinned.map((pin) => {
+      const [from, to] = pin[which].x.length ? within(pin[which].x, this.charts.range) : [0, -1];
+      const values = pin[which].column(`mean:${state.name}`).slice(from, to + 1);
+      return { name: `run ${pin.number}${pin.name ? ` ${pin.name}` : ""}`, tone: `pin-${pin.place}`, dash: DASHES[pin.place], x: pin[which].x.slice(from, to + 1), values };
+    });
   }
 
   // Lowest and highest that is shown of a state; of all pinned runs.

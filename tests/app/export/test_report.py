@@ -9,8 +9,13 @@ import pytest
 
 from app.cli.main import main
 from app.export.alarms import advice
+from app.export.run_charts import run_charts
 from estimators.diagnostics.episodes import CAUSES
+from estimators.fold import fold
+from estimators.log import Log
+from estimators.tuning import Tuning
 from tests.app.cli.test_check import parsed
+from tests.app.scripted import MODEL, readings
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +90,22 @@ def test_charts_hold_the_extremes(made):
     a_pixel = abs((v1 - v0) / (y1 - y0))
     assert values.max() == pytest.approx(mean.max(), abs=0.1 * a_pixel)
     assert values.min() == pytest.approx(mean.min(), abs=0.1 * a_pixel)
+
+
+def test_one_row_among_thousands_is_seen():
+    log, rows = Log.of(MODEL), 9000
+    log.extend(readings(np.arange(1.0, rows + 1.0), np.full(rows, 40.0)))
+    track = fold("kf", MODEL, Tuning.of(MODEL), log).copy()
+    track.mean[:, 0], track.std[:, 0] = 0.0, 1.0
+    track.mean[5003, 0] = 77.0
+    svg = next(chart for chart in run_charts(MODEL, log.events, track, []) if 'aria-label="temperature' in chart)
+    (curve,) = [node for node in ElementTree.fromstring(svg).find("g").iter("path") if node.get("stroke") == "#0b62c4"]
+    points = [(float(x), float(y)) for x, y in re.findall(r"[ML]([-\d.]+) ([-\d.]+)", curve.get("d"))]
+    x, y = min(points, key=lambda point: point[1])
+    others = [height for _, height in points if height > y + 1]
+    assert len(points) <= 802 and len(points) - len(others) == 1 and max(others) - y > 80
+    left, right = points[0][0], points[-1][0]
+    assert (x - left) / (right - left) == pytest.approx(5003 / rows, abs=2 / 400)
 
 
 @pytest.mark.parametrize("cause", sorted(set(CAUSES) - {"stale", "diverged"}))
