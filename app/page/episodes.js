@@ -45,7 +45,7 @@ export class Episodes {
       "li", { class: "episode", dataset: { open: String(episode.end === null), severity: episode.severity ?? "" } },
       element("button", { type: "button", title: "Show it in the charts", onclick: show }, element("time", {}, times), element("b", {}, `${words(episode.subject)}: ${episode.cause}`)),
       element("p", {}, episode.text),
-      element("small", { class: "faint" }, `more in ${episode.help}`),
+      element("a", { href: `/alarms#${episode.help.split("#")[1]}`, target: "_blank" }, `more on ${episode.cause}`),
     );
   }
 

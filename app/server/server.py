@@ -30,6 +30,8 @@ from ..analysis.forecast import Forecasts, question_from_json
 from ..drawing.choices import Choices
 from ..drawing.palette import EITHER, THEMES
 from ..engine.interface import Running
+from ..export import markdown
+from ..export.alarms import alarms_text
 from ..rerun.feed import RerunFeed
 from ..series.series import Series
 from .api import Json, command_from_json, episodes_json, faults_json, one_line, status_json
@@ -149,6 +151,7 @@ class PageServer:
         routes: list[Any] = [
             Route("/", self._page),
             Route("/explore", self._page),
+            Route("/alarms", self._alarms),
             Route("/api/status", self._status),
             Route("/api/model", self._model),
             Route("/api/episodes", self._episodes),
@@ -182,6 +185,14 @@ class PageServer:
         # In an attribute, not in a script: the policy allows no inline ones.
         quoted = json.dumps(settings).replace("&", "&amp;").replace('"', "&quot;")
         return Response(text.replace("{{settings}}", quoted), media_type="text/html")
+
+    async def _alarms(self, request: Request) -> Response:
+        """ALARMS.md, to which episodes refer."""
+        try:
+            text = markdown.as_html(alarms_text())
+        except ConfigError as error:
+            return PlainTextResponse(f"Nisus: {error}\n", 404)
+        return Response((PAGE / "alarms.html").read_text().replace("{{text}}", text), media_type="text/html")
 
     async def _status(self, request: Request) -> Response:
         return Json(self._state())
