@@ -1,6 +1,7 @@
 // One chart: a canvas of uPlot's with a line above it that says what it is and what it reads at the cursor.
 
 import { element, setText } from "./dom.js";
+import { within } from "./ranges.js";
 
 export const GAP = 52; // px for the labels of the value axis
 export const CURSOR = "time";
@@ -93,10 +94,11 @@ export class Chart {
     this.seen.observe(this.node);
   }
 
-  // span: seconds at both ends of the axis; origin-based times in data[0].
-  show(data, span) {
+  // span: seconds at both ends of the axis; moment: that which is looked at, or null; origin-based times in data[0].
+  show(data, span, moment = null) {
     this.data = data;
     this.span = span;
+    this.moment = moment;
     if (this.visible) this.draw();
     else this.waiting = true;
   }
@@ -118,10 +120,12 @@ export class Chart {
     this.actions.select(...ends);
   }
 
-  // What the line above says: at the cursor, else of the newest row.
+  // What the line above says: at the cursor, else at the moment that is looked at, else of the newest row.
   pointed(self) {
     const { left, idx } = self.cursor;
-    const at = left >= 0 && idx !== null && idx !== undefined ? idx : this.data[0].length - 1;
+    const [x] = this.data;
+    const here = this.moment === null || this.moment === undefined ? x.length - 1 : within(x, [-Infinity, this.moment])[1];
+    const at = left >= 0 && idx !== null && idx !== undefined ? idx : here;
     setText(this.reading, at < 0 ? "" : this.what.says((series) => this.at(series, at)));
   }
 

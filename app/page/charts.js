@@ -96,7 +96,7 @@ export class Charts {
     if (this.view.following) {
       this.range = followed(x[0], end, this.view.span);
     }
-    for (const chart of this.charts) if (!chart.node.hidden) chart.show(chart.what.data(), this.range);
+    for (const chart of this.charts) if (!chart.node.hidden) chart.show(chart.what.data(), this.range, this.view.at);
     this.pins.show(this.range);
     this.axis.show(this.range);
     window.nisus.drawn = (window.nisus.drawn ?? 0) + 1;
@@ -117,6 +117,10 @@ export class Charts {
   get cursor() {
     const { plot } = this.charts[0];
     return plot.cursor.left >= 0 ? plot.posToVal(plot.cursor.left, "x") : null;
+  }
+
+  get newest() {
+    return this.live.x.at(-1) ?? Infinity;
   }
 
   end() {
@@ -152,7 +156,7 @@ function stateChart(charts, state) {
       line("truth", { width: 1.5, dash: [5, 3], spanGaps: true }), line("estimate", { width: 1.75 }),
     ],
     bands: [band("band", [1, 2])],
-    under: (plot) => marks(plot, charts.episodes),
+    under: (plot) => marks(plot, charts.episodes, charts.view.at),
     between: (plot, series) => series === BEFORE && charts.pins.draw(plot, state), // over the band, beneath the estimate
     over: (plot) => integrityLines(plot, charts, state),
     extras: (chart) => [...integrityCurves(chart, charts, state), ...charts.pins.curves("lane", state)],
@@ -203,7 +207,7 @@ function nisChart(charts) {
       splits: (self, axis, low, high) => [0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100, 300, 1000].map(Math.log10).filter((v) => low <= v && v <= high),
       values: (self, splits) => splits.map((v) => compact(10 ** v, 1)),
     },
-    under: (plot) => marks(plot, charts.episodes),
+    under: (plot) => marks(plot, charts.episodes, charts.view.at),
     data: () => {
       const [low, high] = nisRange(live);
       // Readings that fit are of no interest; one that does not fit at all stands at the top.
@@ -236,7 +240,7 @@ function innovationChart(charts, row) {
     weight: 0.62,
     series: [line("bound", { width: 1, spanGaps: true }), line("bound", { width: 1, spanGaps: true }), dots("reading", 3)],
     bands: [band("bounds", [1, 2])],
-    under: (plot) => marks(plot, charts.episodes),
+    under: (plot) => marks(plot, charts.episodes, charts.view.at),
     data: () => [live.x, ...names.map((name) => live.column(name))],
     range: (chart) => {
       const [x, upper, lower, values] = chart.data;

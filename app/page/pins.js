@@ -134,7 +134,7 @@ export class Pins {
 
   // What the differences are at the cursor, else at the end: each beside its name in the legend.
   read() {
-    const at = this.chart.plot.cursor.left >= 0 ? this.chart.plot.posToVal(this.chart.plot.cursor.left, "x") : Infinity;
+    const at = this.chart.plot.cursor.left >= 0 ? this.chart.plot.posToVal(this.chart.plot.cursor.left, "x") : (this.charts.view.at ?? Infinity);
     for (const pin of this.pinned) {
       const values = pin.less.column(`mean:${this.state.name}`);
       const index = pin.less.x.findLastIndex((x, k) => x <= at && typeof values[k] === "number");

@@ -62,7 +62,7 @@ export class Save {
 
   // The time of the newest row that is shown, ns.
   get instant() {
-    return Number(this.link.status.origin ?? 0) + Math.min(this.charts.range[1], this.charts.live.x.at(-1) ?? Infinity) * 1e9;
+    return Number(this.link.status.origin ?? 0) + Math.min(this.charts.range[1], this.charts.newest) * 1e9;
   }
 
   async picture(chart, kind) {
