@@ -25,8 +25,9 @@ export class Charts {
     Object.assign(this, { node, model, link, view });
     this.live = new Lane();
     this.previous = new Lane();
+    this.overview = new Lane(); // the bar of time's, which is always there
     this.episodes = [];
-    this.shown = null;
+    this.shown = true;
     this.range = [0, model.window];
     const order = (this.states = [...model.states].sort((a, b) => (a.rows.length > 0) - (b.rows.length > 0)).slice(0, MOST));
     const actions = {
@@ -48,7 +49,7 @@ export class Charts {
     }
     this.axis = new TimeAxis($("axis"));
     this.pins = new Pins(this, model, link, actions);
-    this.layout = new Layout(this.charts, node, $("layout"), model.twin);
+    this.layout = new Layout(this.charts, node, $("layout"), model.twin, () => this.ask());
     view.addEventListener("change", () => this.ask());
     link.addEventListener("frames", () => this.draw());
     link.addEventListener("episodes", (event) => (this.episodes = event.detail));
@@ -58,31 +59,52 @@ export class Charts {
     this.ask();
   }
 
+  // What the charts that are chosen draw.
   get columns() {
-    const { model } = this;
+    const shown = new Set(this.layout.shown().map(([key]) => key));
+    const states = this.states.filter((state) => shown.has(`state:${state.name}`));
+    const rows = this.model.rows.slice(0, MOST).filter((row) => shown.has(`innovation:${row.name}`));
     return [
-      ...this.states.flatMap((state) => OF_STATE.map((kind) => `${kind}:${state.name}`)),
-      ...this.states.flatMap((state) => state.rows.flatMap((row) => OF_ROW.map((kind) => `${kind}:${row}`))),
-      ...model.rows.slice(0, MOST).flatMap((row) => ["innovation", "innovation_upper", "innovation_lower"].map((kind) => `${kind}:${row.name}`)),
+      ...states.flatMap((state) => OF_STATE.map((kind) => `${kind}:${state.name}`)),
+      ...new Set(states.flatMap((state) => state.rows.flatMap((row) => OF_ROW.map((kind) => `${kind}:${row}`)))),
+      ...rows.flatMap((row) => ["innovation", "innovation_upper", "innovation_lower"].map((kind) => `${kind}:${row.name}`)),
       "nis", "nis_mean", "nis_low", "nis_high",
     ];
   }
 
+  // Hidden behind another tab they ask for nothing.
+  visible(shown) {
+    if (shown === this.shown) return;
+    this.shown = shown;
+    this.asked = null;
+    this.ask();
+  }
+
   // Ask for what the view shows, in as many points as there are pixels for.
   ask() {
+    if (!this.layout) return; // not yet
+    if (!this.shown) return this.rest();
     const points = Math.max(50, Math.min(2000, Math.round((this.node.clientWidth - 60) / DENSITY)));
-    const wanted = JSON.stringify({ ...this.view.wanted(), points });
+    const place = { ...this.view.wanted(), points };
+    const { columns } = this;
+    const wanted = JSON.stringify([place, columns]);
     if (wanted === this.asked) return;
     this.asked = wanted;
-    const place = JSON.parse(wanted);
-    this.link.look("charts", { ...place, columns: this.columns }, (...frame) => this.live.take(...frame));
+    this.link.look("charts", { ...place, columns }, (...frame) => this.live.take(...frame));
     const before = this.states.map((state) => `mean:${state.name}`);
     this.link.look("previous", { ...place, run: "previous", columns: before }, (...frame) => this.previous.take(...frame));
     this.pins.ask(place);
-    if (!this.view.following) {
-      this.range = [this.view.since, this.view.until];
-      this.draw(); // what is there already, until the points for it come
+    if (!this.view.following) this.draw(); // what is there already, until the points for it come
+  }
+
+  rest() {
+    if (this.asked !== "nothing") {
+      this.asked = "nothing";
+      this.link.look("charts", null);
+      this.link.look("previous", null);
+      this.pins.ask(null);
     }
+    this.draw();
   }
 
   told(status) {
@@ -90,12 +112,10 @@ export class Charts {
   }
 
   draw() {
-    const { x } = this.live;
-    if (!x.length) return;
-    const end = x[x.length - 1];
-    if (this.view.following) {
-      this.range = followed(x[0], end, this.view.span);
-    }
+    const { x } = this.shown ? this.live : this.overview;
+    if (!this.view.following) this.range = [this.view.since, this.view.until];
+    else if (x.length) this.range = followed(x[0], x.at(-1), this.view.span);
+    if (!this.shown || !x.length) return;
     for (const chart of this.charts) if (!chart.node.hidden) chart.show(chart.what.data(), this.range, this.view.at);
     this.pins.show(this.range);
     this.axis.show(this.range);
@@ -120,7 +140,7 @@ export class Charts {
   }
 
   get newest() {
-    return this.live.x.at(-1) ?? Infinity;
+    return (this.shown ? this.live : this.overview).x.at(-1) ?? Infinity;
   }
 
   end() {

@@ -6,9 +6,9 @@ const LOWEST = 40; // px
 const HIGHEST = 1200;
 
 export class Layout {
-  // charts: [Chart] in the order in which they stand by themselves; each has a key
-  constructor(charts, node, menu, twin) {
-    Object.assign(this, { charts, node, menu });
+  // charts: [Chart] in the order in which they stand by themselves; each has a key. told(): others are shown
+  constructor(charts, node, menu, twin, told) {
+    Object.assign(this, { charts, node, menu, told });
     this.key = `nisus.charts.${twin}`;
     this.kept = JSON.parse(localStorage.getItem(this.key) ?? "{}");
     for (const chart of charts) this.prepare(chart);
@@ -74,6 +74,7 @@ export class Layout {
       const height = this.kept.heights?.[chart.what.key];
       chart.node.style.flex = height ? `0 0 ${height}px` : "";
     });
+    this.told();
   }
 
   keep() {

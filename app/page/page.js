@@ -79,6 +79,7 @@ const panes = { explore, whatif: new WhatIf($("whatif"), model, link), diagnose:
 const middle = new Tabs($("middle-tabs"), null, (shown) => {
   for (const [name, pane] of Object.entries(panes)) if (name !== shown) pane.hide();
   panes[shown]?.show();
+  charts.visible(shown === "charts-panel");
   $("layout").hidden = shown !== "charts-panel";
   $("legend").hidden = shown === "diagnose" || shown === "explore";
 });

@@ -67,6 +67,7 @@ export class Pins {
   }
 
   close(pin) {
+    pin.asked = null;
     this.link.look(`run ${pin.number}`, null);
     this.link.look(`less ${pin.number}`, null);
   }
@@ -77,9 +78,13 @@ export class Pins {
     this.ask(this.place);
   }
 
-  // Lanes for the same stretch of time as the charts' own; place: {since, until, span, points}
+  // Lanes for the same stretch of time as the charts' own; place: {since, until, span, points}, null for none
   ask(place) {
     this.place = place;
+    if (!place) {
+      for (const pin of this.pinned) if (pin.asked) this.close(pin);
+      return;
+    }
     const columns = this.model.states.map((state) => `mean:${state.name}`);
     const own = [`mean:${this.state.name}`];
     for (const pin of this.pinned) {

@@ -13,7 +13,7 @@ const POINTS = 400;
 export class Transport {
   constructor(model, link, view, charts) {
     Object.assign(this, { model, link, view, charts });
-    this.lane = new Lane();
+    this.lane = charts.overview = new Lane();
     this.episodes = [];
     this.canvas = $("timeline");
     const spans = [...new Set([...WINDOWS, model.window])].sort((a, b) => a - b);
