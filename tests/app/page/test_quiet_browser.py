@@ -63,6 +63,22 @@ def test_a_chart_that_is_not_chosen_is_not_sent(page, session):
     assert "mean:magnet" not in lanes(session)["charts"] and "mean:yoke" in lanes(session)["charts"]
 
 
+def test_all_of_q_is_one_command_one_revision_and_one_undo(page, session):
+    engine = session.engine
+    before, first = engine.status().tuning, engine.revisions.runs[-1].number
+    page.get_by_role("button", name="×10", exact=True).first.click()
+    wait_for(lambda: engine.revisions.runs[-1].number == first + 1 and not engine.status().refolding, PATIENCE)
+    assert engine.tuning.q.tolist() == [pytest.approx(10 * value, rel=1e-5) for value in before.q]
+    assert {change.key for change in engine.revisions.runs[-1].changes} == {f"Q.{n.name}" for n in engine.model.noises}
+    page.locator("#undo").click()
+    wait_for(lambda: engine.revisions.runs[-1].number == first + 2 and not engine.status().refolding, PATIENCE)
+    assert engine.tuning.q.tolist() == before.q.tolist()
+    page.locator("#redo").click()
+    wait_for(lambda: engine.revisions.runs[-1].number == first + 3 and not engine.status().refolding, PATIENCE)
+    assert engine.tuning.q[0] == pytest.approx(10 * before.q[0], rel=1e-5)
+    assert page.locator("#undo").is_enabled() and page.locator("#redo").is_disabled()
+
+
 def test_the_last_status_is_told_again(page):
     page.evaluate("window.told = []; window.nisus.link.addEventListener('status', (e) => window.told.push(e.detail.t))")
     until(page, "window.told.length >= 3")
