@@ -17,6 +17,7 @@ const DENSITY = 1.6; // px to a group of rows
 // The columns of a state's chart from the live lane, in the order of its series.
 const OF_STATE = ["upper", "lower", "truth", "mean"];
 const BEFORE = 3; // which of them is that of the revision before
+const ROOM = 14; // px for a label of the NIS axis
 const MOST_GROWTH = 4; // halvings of the window while there is less than that to show
 const OF_ROW = ["reading", "held", "refused", "screened"];
 
@@ -213,35 +214,42 @@ function stateChart(charts, state) {
 function nisChart(charts) {
   const { live } = charts;
   const names = ["nis_high", "nis_low", "nis", "nis_mean"];
+  const normal = charts.model.nis_normal; // times what the filter expects, of a commissioned twin
   const log = (value) => (typeof value === "number" ? Math.log10(Math.max(value, 1e-9)) : value);
   return {
     key: "nis",
     title: "NIS",
     unit: "",
-    note: "mean of the last readings, in its 95 % bounds",
+    note: normal === 1 ? "mean of the last readings, in its 95 % bounds" : `mean of the last readings; 95 % bounds as commissioned, ×${compact(normal, 2)}`,
     names: { estimate: "mean", bound: "" },
     weight: 1,
     series: [line("bound", { width: 1 }), line("bound", { width: 1 }), dots("quiet", 2.5), line("estimate", { width: 1.75 })],
     bands: [band("bounds", [1, 2])],
     axis: {
-      splits: (self, axis, low, high) => [0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100, 300, 1000].map(Math.log10).filter((v) => low <= v && v <= high),
+      splits: (self, axis, low, high) => {
+        const found = [0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100, 300, 1000].map(Math.log10).filter((v) => low <= v && v <= high);
+        const room = self.bbox.height / devicePixelRatio / ROOM; // labels
+        return found.length <= room ? found : found.filter((v) => Number.isInteger(v));
+      },
       values: (self, splits) => splits.map((v) => compact(10 ** v, 1)),
     },
     under: (plot) => marks(plot, charts.episodes, charts.view.at),
     data: () => {
-      const [low, high] = nisRange(live);
+      const [low, high] = nisRange(live, normal);
       // Readings that fit are of no interest; one that does not fit at all stands at the top.
       const clamped = (value) => (typeof value !== "number" || log(value) < low ? null : Math.min(high - 0.03, log(value)));
-      return [live.x, ...names.map((name) => live.column(name).map(name === "nis" ? clamped : log))];
+      const shift = { nis_high: Math.log10(normal), nis_low: Math.log10(normal) };
+      const shown = (name) => (value) => (typeof value === "number" ? log(value) + (shift[name] ?? 0) : value);
+      return [live.x, ...names.map((name) => live.column(name).map(name === "nis" ? clamped : shown(name)))];
     },
-    range: () => nisRange(live),
+    range: () => nisRange(live, normal),
     says: (value) => `${compact(10 ** value(4), 3)}  bounds ${compact(10 ** value(2), 3)} – ${compact(10 ** value(1), 3)}`,
   };
 }
 
 // Decades about the bounds, and more where the mean itself leaves them.
-function nisRange(live) {
-  const middle = Math.log10(Math.sqrt(live.last("nis_low") * live.last("nis_high"))) || 0;
+function nisRange(live, normal) {
+  const middle = Math.log10(normal * Math.sqrt(live.last("nis_low") * live.last("nis_high"))) || 0;
   const [low, high] = extent([live.column("nis_mean")], 0, live.x.length - 1);
   const known = Number.isFinite(low) && low > 0;
   return [known ? Math.min(middle - 1, Math.log10(low) - 0.15) : middle - 1, known ? Math.max(middle + 1, Math.log10(high) + 0.15) : middle + 1];

@@ -3,7 +3,7 @@
 import pytest
 
 from app.cli.run import live_source
-from app.engine.commands import Pin, SetTuning
+from app.engine.commands import Pin, SetTuning, UseSensor
 from app.session import Page, Session
 from app.twin.twin import load_twin
 from tests.app.page.test_page import PATIENCE, browser, until  # noqa: F401  the fixture
@@ -77,6 +77,18 @@ def test_all_of_q_is_one_command_one_revision_and_one_undo(page, session):
     wait_for(lambda: engine.revisions.runs[-1].number == first + 3 and not engine.status().refolding, PATIENCE)
     assert engine.tuning.q[0] == pytest.approx(10 * before.q[0], rel=1e-5)
     assert page.locator("#undo").is_enabled() and page.locator("#redo").is_disabled()
+
+
+def test_what_became_of_the_readings_is_told(page, session):
+    session.engine.submit(UseSensor("yoke", False))
+    wait_for(lambda: session.engine.status().counts.get("held out"), PATIENCE)
+    page.get_by_role("tab", name="Episodes").click()
+    told = page.locator(".counts")
+    wait_for(lambda: "held out" in told.inner_text(), PATIENCE)
+    counts = session.engine.status().counts
+    words = told.inner_text().split("\n")
+    assert words[:4] == ["readings", f"{counts['readings']:,}", "used", f"{counts['used']:,}"]
+    assert words[words.index("held out") + 1] == f"{counts['held out']} (33 %)"
 
 
 def test_the_last_status_is_told_again(page):
