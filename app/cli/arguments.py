@@ -61,7 +61,9 @@ class Fold:
     duration: float | None = None
     """Take only this many seconds of the source."""
     out: Path | None = None
-    """Write the track to this .parquet, or a recording to this .rrd."""
+    """Write the track to this .csv or .parquet, or a recording to this .rrd."""
+    html: Path | None = None
+    """Write a report to this HTML file, which needs no other: scores, charts, checks, episodes, tuning."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print one JSON object."""
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
+from ..export.html import as_html
 from ..twin.twin import load_twin
 from .arguments import settings
 from .check_figures import figures
-from .check_html import as_html
 from .check_tables import sections
 from .check_text import as_text
 from .checked import Checked, check

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,40 +11,15 @@ from estimators.diagnostics.sensitivity import bounds_of
 from estimators.diagnostics.sensitivity.information import directions
 from estimators.diagnostics.sensitivity.words import digits, range_text, size_text, subject_text
 
+from ..export.calibration_lines import calibration_lines
+from ..export.parts import WORSE, Bar, Part
 from .check_list import BLAME, Line, blamed, checklist, health_shares
 from .checked import Checked
-from .fold_report import calibration_lines
 
 MOST = 12
 """Rows of a table on the page; JSON has all."""
 
-WORSE = "worse than no filter"
-
 UNKNOWN = "How late readings come is not known: the log has one time for each, that at which it was measured."
-
-
-class Bar(NamedTuple):
-    """Two lengths to compare, in `unit`: 2 σ and the integrity bound, or an RMS and the open loop's."""
-
-    name: str
-    unit: str
-    first: float
-    second: float
-
-
-class Part(NamedTuple):
-    """One section: a title, what is said before the table, its head and rows; `bars` are what HTML draws of it.
-
-    `marks` are of its rows: whether the second cell says something good, partly so, or bad; "" if nothing.
-    """
-
-    title: str
-    said: tuple[str, ...]
-    head: tuple[str, ...] = ()
-    rows: tuple[tuple[str, ...], ...] = ()
-    bars: tuple[Bar, ...] = ()
-    legend: tuple[str, str] = ("", "")
-    marks: tuple[str, ...] = ()
 
 
 def sections(checked: Checked) -> list[Part]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 
-from .check_tables import Part
+from ..export.parts import Part
 
 WIDTH = 118
 

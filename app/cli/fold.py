@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pyarrow.parquet as pq
 
 from estimators.diagnostics.episodes import Episode, episodes
 from estimators.diagnostics.field_pictures import Picture
@@ -24,6 +23,9 @@ from estimators.track import Track
 from sources.source import Endless
 
 from ..engine.stall import interruptible
+from ..export.html import as_html
+from ..export.report import Reported, report
+from ..export.track_file import encoded
 from ..intake import Intake
 from ..twin.twin import Twin, load_twin
 from .arguments import settings
@@ -92,8 +94,8 @@ def fold_twin(arguments: Arguments) -> int:
     twin = load_twin(
         arguments.twin, log_files=arguments.log or None, overrides=settings(arguments.set, arguments.estimator)
     )
-    if arguments.out is not None and arguments.out.suffix not in (".parquet", ".rrd"):
-        raise ConfigError(f"--out {arguments.out}: must end in .parquet or .rrd")
+    if arguments.out is not None and arguments.out.suffix not in (".csv", ".parquet", ".rrd"):
+        raise ConfigError(f"--out {arguments.out}: must end in .csv, .parquet or .rrd")
     prepare(twin)
     log, counts = read_log(twin, arguments.duration)
     period = twin.picture if arguments.out is not None and arguments.out.suffix == ".rrd" else None
@@ -121,6 +123,12 @@ def fold_twin(arguments: Arguments) -> int:
     told = blamed(fold, [*dropped(counts, fold), *episodes(fold)])
     if arguments.out is not None:
         _write(arguments.out, twin, log, fold.track, pictures, [item.episode for item in told])
+    if arguments.html is not None:
+        run = Reported(
+            twin, twin.estimator, twin.tuning, log.events, fold.track, pictures, [item.episode for item in told],
+            fold.marginal,
+        )  # fmt: skip
+        arguments.html.write_text(as_html(f"{twin.name}, {twin.estimator}", report(run)), encoding="utf-8")
     if arguments.json:
         print(json.dumps(as_dict(twin, result, found, seconds, counts, fold, told)))
     else:
@@ -139,4 +147,5 @@ def _write(
     table = table_of(
         twin.model, log.events, track, found, tuning_version=twin.tuning.version, model_version=log.version
     )
-    pq.write_table(table, path)
+    with path.open("wb") as file:
+        file.writelines(encoded(path.suffix[1:], [table]))

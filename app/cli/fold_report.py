@@ -16,12 +16,12 @@ from estimators.fold import Fold
 from estimators.fold_failures import cause_of
 from estimators.gate.reopening import Decision
 from estimators.gate.stories import softened
-from estimators.model.state_space import StateSpaceModel
 from estimators.screen import reasons_by_sensor
 from estimators.track import FAILED, HEALTH_NAMES, REASONS, USED
 from estimators.tuning import TOGETHER
 from sources.source import WRONG_TIME
 
+from ..export.calibration_lines import calibration_lines
 from ..twin.twin import Twin
 from .fold_episodes import Told, as_json, dropped
 
@@ -243,44 +243,3 @@ def as_text(
     lines = [f"{name:<{width}}  {value}" for name, value in rows]
     said = calibration_lines(found, twin.model)
     return lines + (["calibration, 95 % intervals:", *(f"  {line}" for line in said)] if said else [])
-
-
-def calibration_lines(found: Sequence[Calibration], model: StateSpaceModel) -> list[str]:
-    """A line for what each row or state has to say; the many rows of one sensor, or many states, are one."""
-    many = {
-        model.row_names[start + k]: sensor.name
-        for sensor, start in zip(model.sensors, model.row_start, strict=True)
-        for k in range(len(sensor.rows))
-        if len(sensor.rows) >= TOGETHER
-    }
-    lines: list[str] = []
-    groups: dict[tuple[str, str], list[Calibration]] = {}
-    states = sum(entry.role == "truth" for entry in found)
-    for entry in found:
-        group = "states" if entry.role == "truth" and states >= TOGETHER else many.get(entry.subject)
-        if group is not None:
-            groups.setdefault((group, entry.role), []).append(entry)
-        elif entry.words:
-            lines += entry.words
-        else:
-            lines.append(f"{entry.subject}{', truth' if entry.role == 'truth' else ''}: {_figures(entry)}")
-    for (group, role), entries in groups.items():
-        inside = 100 * float(np.mean([entry.coverage[-1].value for entry in entries]))
-        bad = [entry for entry in entries if entry.words]
-        counted = f"{len(entries)} {'of them' if role == 'truth' else f'rows {role}'}"
-        beyond = f"beyond the limits {len(bad)}, as {bad[0].words[0]}" if bad else "none beyond the limits"
-        lines.append(f"{group}, {counted}: in the 95 % band {inside:.3g} %; {beyond}")
-    return lines
-
-
-def _figures(entry: Calibration) -> str:
-    """The figures of a row or state of which nothing need be said."""
-    shares = ", ".join(f"{100 * share.value:.3g}" for share in entry.coverage)
-    bands = ", ".join(f"{100 * band:.0f}" for band in BANDS)
-    said = [f"{shares} % in the {bands} % bands"]
-    if np.isfinite(entry.scale.value):
-        low, high = f"{entry.scale.low:.2f}", f"{entry.scale.high:.2f}"
-        said = [f"scale {entry.scale.value:.2f} ({low} to {high})", f"bias {entry.bias.value:+.2f} σ", *said]
-    if np.isfinite(entry.correlation.value):
-        said.insert(2, f"correlation {entry.correlation.value:+.2f}")
-    return ", ".join(said)

@@ -6,6 +6,7 @@ them out in order, between two events, so nothing else ever touches the estimate
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +27,13 @@ class SetTuning:
 
     key: str
     value: float | bool | str | None
+
+
+@dataclass(frozen=True)
+class SetTunings:
+    """Turn several entries of the tuning at once, by key: Q, R and parameters. One refold, one revision."""
+
+    values: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -155,7 +163,7 @@ class ClearFault:
 
 
 Command = (
-    SetEstimator | SetTuning | SetOption | UseSensor | Restore | Load | Pin | Unpin | Note | Reset | Maintenance | Pause
-    | Speed | Step | Seek | Record | InjectFault | ClearFault
+    SetEstimator | SetTuning | SetTunings | SetOption | UseSensor | Restore | Load | Pin | Unpin | Note | Reset
+    | Maintenance | Pause | Speed | Step | Seek | Record | InjectFault | ClearFault
 )  # fmt: skip
 """Any of them."""

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 
 Refolding = (
-    commands.SetEstimator | commands.SetTuning | commands.SetOption | commands.UseSensor | commands.Restore
-    | commands.Load
+    commands.SetEstimator | commands.SetTuning | commands.SetTunings | commands.SetOption | commands.UseSensor
+    | commands.Restore | commands.Load
 )  # fmt: skip
 """Commands that fold the history again."""
 
@@ -62,7 +62,12 @@ def retuned(command: Refolding, engine: Running) -> tuple[str, Tuning]:
             near = nearest(command.name, names)
             raise ConfigError(f"UseSensor: name is {quoted(command.name)}, no sensor of {engine.model.name}; {near}")
         return estimator, tuning.set(f"use.{command.name}", command.used)
-    return estimator, tuning.set(command.key, command.value)
+    values = command.values if isinstance(command, commands.SetTunings) else {command.key: command.value}
+    if not values:
+        raise ConfigError("SetTunings: values is empty; it takes the value of each key")
+    for key, value in values.items():
+        tuning = tuning.set(key, value)
+    return estimator, tuning
 
 
 def _check(entry: Estimator, engine: Running, options: Mapping[str, float]) -> None:

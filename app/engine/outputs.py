@@ -47,7 +47,7 @@ class Pull:
     absolute index of the first row; if it is below what was pulled before, a late reading rewrote the rows from there.
     `pictures` are those of a large field since the cursor; one with an index that was seen before takes its place.
     `oldest` is the absolute index of the first row that is still there, `changed` that of the first of these that is
-    new or another; those before it were asked for to be aligned.
+    new or another; those before it were asked for to be aligned. `version` is the model's at the row `oldest`.
     """
 
     revision: int
@@ -59,6 +59,7 @@ class Pull:
     pictures: list[Picture] = field(default_factory=list)
     oldest: int = 0
     changed: int = 0
+    version: int = 1
 
 
 @dataclass(frozen=True)

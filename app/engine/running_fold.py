@@ -118,6 +118,7 @@ class RunningFold:
                 pictures=_since(fold, cursor.picture, max(start, end)),
                 oldest=log.first,
                 changed=max(cursor.next, log.first),
+                version=log.version,
             )
             cursor.next = max(start, end)
             if pull.pictures:
@@ -142,7 +143,8 @@ class RunningFold:
             rows = slice(start - log.first, max(start, min(stop, log.first + fold.n)) - log.first)
             readings = log.events.select(rows)
             events = Events(*(column.copy() for column in readings))
-            return Pull(self._revision, False, start, events, fold.track.select(rows).copy(), oldest=log.first)
+            track = fold.track.select(rows).copy()
+            return Pull(self._revision, False, start, events, track, oldest=log.first, version=log.version)
 
     def index_at(self, t: int) -> int:
         """Absolute index of the first folded event at or after a time, ns; the number of events if there is none."""
@@ -283,7 +285,16 @@ class RunningFold:
             return
         events = Events(*(column[: old.n].copy() for column in log.events))
         pictures = _since(old, -1, log.first + old.n)
-        left = Pull(self._revision, False, log.first, events, old.track, pictures=pictures, oldest=log.first)
+        left = Pull(
+            self._revision,
+            False,
+            log.first,
+            events,
+            old.track,
+            pictures=pictures,
+            oldest=log.first,
+            version=log.version,
+        )
         self.revisions.left(left, fold.estimator.name, fold.tuning)
         self._fold, self._row_counts = fold, row_counts
         self._count_up()

@@ -1,6 +1,7 @@
 // One chart: a canvas of uPlot's with a line above it that says what it is and what it reads at the cursor.
 
 import { element, setText } from "./dom.js";
+import { within } from "./ranges.js";
 
 export const GAP = 52; // px for the labels of the value axis
 export const CURSOR = "time";
@@ -8,22 +9,25 @@ export const CURSOR = "time";
 const styles = getComputedStyle(document.documentElement);
 export const colour = (name) => styles.getPropertyValue(`--${name}`).trim();
 
+// What uPlot draws, and for a file: the name of its colour, and which mark it is.
 export const line = (name, options = {}) => ({
-  stroke: () => colour(name), width: 1.5, points: { show: false }, spanGaps: false, ...options,
+  mark: "line", tone: name, stroke: () => colour(name), width: 1.5, points: { show: false }, spanGaps: false, ...options,
 });
 
 export const edge = (options = {}) => ({ stroke: () => "transparent", width: 0, points: { show: false }, ...options });
 
+export const band = (name, series) => ({ series, tone: name, fill: () => colour(name) });
+
 export const dots = (name, size = 4, ring = false) => ({
-  stroke: () => colour(name),
+  mark: "dots", tone: name, ring, stroke: () => colour(name),
   paths: () => null,
   points: { show: true, size, width: ring ? 1.5 : 0, stroke: () => colour(name), fill: () => (ring ? "transparent" : colour(name)) },
 });
 
 export class Chart {
   // what: {title, unit, note, weight, series, bands, range(self, low, high), scale, draw: [hook], values: [label of a tick],
-  // sync: charts of one name share their cursor}
-  constructor(what, { select, home, wheel }) {
+  // sync: charts of one name share their cursor, names: what a file calls its colours, extras: more lines of a file}
+  constructor(what, { select, home, wheel, save }) {
     this.what = what;
     this.reading = element("output", { class: "reading" });
     this.head = element(
@@ -31,6 +35,7 @@ export class Chart {
       element("b", {}, what.title), element("span", { class: "unit" }, what.unit ?? ""),
       what.note ? element("span", { class: "note" }, what.note) : null,
       element("span", { class: "space" }), this.reading,
+      save ? element("button", { type: "button", class: "save", title: "Save this chart", "aria-label": `Save the chart of ${what.title}`, "aria-haspopup": "menu", onclick: (event) => save(this, event.currentTarget) }, "⤓") : null,
     );
     this.canvas = element("div", { class: "plot" });
     this.node = element("article", { class: "chart", style: `--weight:${what.weight}`, "aria-label": `Chart of ${what.title}` }, this.head, this.canvas);
@@ -89,10 +94,11 @@ export class Chart {
     this.seen.observe(this.node);
   }
 
-  // span: seconds at both ends of the axis; origin-based times in data[0].
-  show(data, span) {
+  // span: seconds at both ends of the axis; moment: that which is looked at, or null; origin-based times in data[0].
+  show(data, span, moment = null) {
     this.data = data;
     this.span = span;
+    this.moment = moment;
     if (this.visible) this.draw();
     else this.waiting = true;
   }
@@ -114,10 +120,12 @@ export class Chart {
     this.actions.select(...ends);
   }
 
-  // What the line above says: at the cursor, else of the newest row.
+  // What the line above says: at the cursor, else at the moment that is looked at, else of the newest row.
   pointed(self) {
     const { left, idx } = self.cursor;
-    const at = left >= 0 && idx !== null && idx !== undefined ? idx : this.data[0].length - 1;
+    const [x] = this.data;
+    const here = this.moment === null || this.moment === undefined ? x.length - 1 : within(x, [-Infinity, this.moment])[1];
+    const at = left >= 0 && idx !== null && idx !== undefined ? idx : here;
     setText(this.reading, at < 0 ? "" : this.what.says((series) => this.at(series, at)));
   }
 

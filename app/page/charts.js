@@ -1,6 +1,6 @@
 // The stack of charts: one time axis, one cursor. States that nobody measures first, then the others, NIS, innovations.
 
-import { Chart, colour, dots, edge, line } from "./chart.js";
+import { Chart, band, colour, dots, edge, line } from "./chart.js";
 import { $ } from "./dom.js";
 import { bracketed, clock, compact, spaced, withDeviation, words } from "./format.js";
 import { Lane } from "./lane.js";
@@ -17,6 +17,7 @@ const DENSITY = 1.6; // px to a group of rows
 // The columns of a state's chart from the live lane, in the order of its series.
 const OF_STATE = ["upper", "lower", "truth", "mean"];
 const BEFORE = 3; // which of them is that of the revision before
+const ROOM = 14; // px for a label of the NIS axis
 const MOST_GROWTH = 4; // halvings of the window while there is less than that to show
 const OF_ROW = ["reading", "held", "refused", "screened"];
 
@@ -25,14 +26,16 @@ export class Charts {
     Object.assign(this, { node, model, link, view });
     this.live = new Lane();
     this.previous = new Lane();
+    this.overview = new Lane(); // the bar of time's, which is always there
     this.episodes = [];
-    this.shown = null;
+    this.shown = true;
     this.range = [0, model.window];
     const order = (this.states = [...model.states].sort((a, b) => (a.rows.length > 0) - (b.rows.length > 0)).slice(0, MOST));
     const actions = {
       select: (since, until) => view.show(since, until),
       home: () => view.follow(view.configured),
       wheel: (event, plot) => this.wheel(event, plot),
+      save: (chart, button) => this.saving.chart(chart, button),
     };
     this.parts = [
       ...order.map((state) => stateChart(this, state)),
@@ -47,7 +50,7 @@ export class Charts {
     }
     this.axis = new TimeAxis($("axis"));
     this.pins = new Pins(this, model, link, actions);
-    this.layout = new Layout(this.charts, node, $("layout"), model.twin);
+    this.layout = new Layout(this.charts, node, $("layout"), model.twin, () => this.ask());
     view.addEventListener("change", () => this.ask());
     link.addEventListener("frames", () => this.draw());
     link.addEventListener("episodes", (event) => (this.episodes = event.detail));
@@ -57,31 +60,52 @@ export class Charts {
     this.ask();
   }
 
+  // What the charts that are chosen draw.
   get columns() {
-    const { model } = this;
+    const shown = new Set(this.layout.shown().map(([key]) => key));
+    const states = this.states.filter((state) => shown.has(`state:${state.name}`));
+    const rows = this.model.rows.slice(0, MOST).filter((row) => shown.has(`innovation:${row.name}`));
     return [
-      ...this.states.flatMap((state) => OF_STATE.map((kind) => `${kind}:${state.name}`)),
-      ...this.states.flatMap((state) => state.rows.flatMap((row) => OF_ROW.map((kind) => `${kind}:${row}`))),
-      ...model.rows.slice(0, MOST).flatMap((row) => ["innovation", "innovation_upper", "innovation_lower"].map((kind) => `${kind}:${row.name}`)),
+      ...states.flatMap((state) => OF_STATE.map((kind) => `${kind}:${state.name}`)),
+      ...new Set(states.flatMap((state) => state.rows.flatMap((row) => OF_ROW.map((kind) => `${kind}:${row}`)))),
+      ...rows.flatMap((row) => ["innovation", "innovation_upper", "innovation_lower"].map((kind) => `${kind}:${row.name}`)),
       "nis", "nis_mean", "nis_low", "nis_high",
     ];
   }
 
+  // Hidden behind another tab they ask for nothing.
+  visible(shown) {
+    if (shown === this.shown) return;
+    this.shown = shown;
+    this.asked = null;
+    this.ask();
+  }
+
   // Ask for what the view shows, in as many points as there are pixels for.
   ask() {
+    if (!this.layout) return; // not yet
+    if (!this.shown) return this.rest();
     const points = Math.max(50, Math.min(2000, Math.round((this.node.clientWidth - 60) / DENSITY)));
-    const wanted = JSON.stringify({ ...this.view.wanted(), points });
+    const place = { ...this.view.wanted(), points };
+    const { columns } = this;
+    const wanted = JSON.stringify([place, columns]);
     if (wanted === this.asked) return;
     this.asked = wanted;
-    const place = JSON.parse(wanted);
-    this.link.look("charts", { ...place, columns: this.columns }, (...frame) => this.live.take(...frame));
+    this.link.look("charts", { ...place, columns }, (...frame) => this.live.take(...frame));
     const before = this.states.map((state) => `mean:${state.name}`);
     this.link.look("previous", { ...place, run: "previous", columns: before }, (...frame) => this.previous.take(...frame));
     this.pins.ask(place);
-    if (!this.view.following) {
-      this.range = [this.view.since, this.view.until];
-      this.draw(); // what is there already, until the points for it come
+    if (!this.view.following) this.draw(); // what is there already, until the points for it come
+  }
+
+  rest() {
+    if (this.asked !== "nothing") {
+      this.asked = "nothing";
+      this.link.look("charts", null);
+      this.link.look("previous", null);
+      this.pins.ask(null);
     }
+    this.draw();
   }
 
   told(status) {
@@ -89,13 +113,11 @@ export class Charts {
   }
 
   draw() {
-    const { x } = this.live;
-    if (!x.length) return;
-    const end = x[x.length - 1];
-    if (this.view.following) {
-      this.range = followed(x[0], end, this.view.span);
-    }
-    for (const chart of this.charts) if (!chart.node.hidden) chart.show(chart.what.data(), this.range);
+    const { x } = this.shown ? this.live : this.overview;
+    if (!this.view.following) this.range = [this.view.since, this.view.until];
+    else if (x.length) this.range = followed(x[0], x.at(-1), this.view.span);
+    if (!this.shown || !x.length) return;
+    for (const chart of this.charts) if (!chart.node.hidden) chart.show(chart.what.data(), this.range, this.view.at);
     this.pins.show(this.range);
     this.axis.show(this.range);
     window.nisus.drawn = (window.nisus.drawn ?? 0) + 1;
@@ -116,6 +138,10 @@ export class Charts {
   get cursor() {
     const { plot } = this.charts[0];
     return plot.cursor.left >= 0 ? plot.posToVal(plot.cursor.left, "x") : null;
+  }
+
+  get newest() {
+    return (this.shown ? this.live : this.overview).x.at(-1) ?? Infinity;
   }
 
   end() {
@@ -150,10 +176,11 @@ function stateChart(charts, state) {
       edge(), edge(), line("previous", { width: 1 }), ...rows.map((name) => marksOf[name.split(":")[0]]()),
       line("truth", { width: 1.5, dash: [5, 3], spanGaps: true }), line("estimate", { width: 1.75 }),
     ],
-    bands: [{ series: [1, 2], fill: () => colour("band") }],
-    under: (plot) => marks(plot, charts.episodes),
+    bands: [band("band", [1, 2])],
+    under: (plot) => marks(plot, charts.episodes, charts.view.at),
     between: (plot, series) => series === BEFORE && charts.pins.draw(plot, state), // over the band, beneath the estimate
     over: (plot) => integrityLines(plot, charts, state),
+    extras: (chart) => [...integrityCurves(chart, charts, state), ...charts.pins.curves("lane", state)],
     data: () => {
       let [upper, lower, truth, mean] = own.map((name) => live.column(name));
       let dotted = rows.map((name) => live.column(name));
@@ -187,34 +214,42 @@ function stateChart(charts, state) {
 function nisChart(charts) {
   const { live } = charts;
   const names = ["nis_high", "nis_low", "nis", "nis_mean"];
+  const normal = charts.model.nis_normal; // times what the filter expects, of a commissioned twin
   const log = (value) => (typeof value === "number" ? Math.log10(Math.max(value, 1e-9)) : value);
   return {
     key: "nis",
     title: "NIS",
     unit: "",
-    note: "mean of the last readings, in its 95 % bounds",
+    note: normal === 1 ? "mean of the last readings, in its 95 % bounds" : `mean of the last readings; 95 % bounds as commissioned, ×${compact(normal, 2)}`,
+    names: { estimate: "mean", bound: "" },
     weight: 1,
     series: [line("bound", { width: 1 }), line("bound", { width: 1 }), dots("quiet", 2.5), line("estimate", { width: 1.75 })],
-    bands: [{ series: [1, 2], fill: () => colour("bounds") }],
+    bands: [band("bounds", [1, 2])],
     axis: {
-      splits: (self, axis, low, high) => [0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100, 300, 1000].map(Math.log10).filter((v) => low <= v && v <= high),
+      splits: (self, axis, low, high) => {
+        const found = [0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100, 300, 1000].map(Math.log10).filter((v) => low <= v && v <= high);
+        const room = self.bbox.height / devicePixelRatio / ROOM; // labels
+        return found.length <= room ? found : found.filter((v) => Number.isInteger(v));
+      },
       values: (self, splits) => splits.map((v) => compact(10 ** v, 1)),
     },
-    under: (plot) => marks(plot, charts.episodes),
+    under: (plot) => marks(plot, charts.episodes, charts.view.at),
     data: () => {
-      const [low, high] = nisRange(live);
+      const [low, high] = nisRange(live, normal);
       // Readings that fit are of no interest; one that does not fit at all stands at the top.
       const clamped = (value) => (typeof value !== "number" || log(value) < low ? null : Math.min(high - 0.03, log(value)));
-      return [live.x, ...names.map((name) => live.column(name).map(name === "nis" ? clamped : log))];
+      const shift = { nis_high: Math.log10(normal), nis_low: Math.log10(normal) };
+      const shown = (name) => (value) => (typeof value === "number" ? log(value) + (shift[name] ?? 0) : value);
+      return [live.x, ...names.map((name) => live.column(name).map(name === "nis" ? clamped : shown(name)))];
     },
-    range: () => nisRange(live),
+    range: () => nisRange(live, normal),
     says: (value) => `${compact(10 ** value(4), 3)}  bounds ${compact(10 ** value(2), 3)} – ${compact(10 ** value(1), 3)}`,
   };
 }
 
 // Decades about the bounds, and more where the mean itself leaves them.
-function nisRange(live) {
-  const middle = Math.log10(Math.sqrt(live.last("nis_low") * live.last("nis_high"))) || 0;
+function nisRange(live, normal) {
+  const middle = Math.log10(normal * Math.sqrt(live.last("nis_low") * live.last("nis_high"))) || 0;
   const [low, high] = extent([live.column("nis_mean")], 0, live.x.length - 1);
   const known = Number.isFinite(low) && low > 0;
   return [known ? Math.min(middle - 1, Math.log10(low) - 0.15) : middle - 1, known ? Math.max(middle + 1, Math.log10(high) + 0.15) : middle + 1];
@@ -229,10 +264,11 @@ function innovationChart(charts, row) {
     title: words(row.name),
     unit: bracketed(row.unit),
     note: "innovation, reading − prediction",
+    names: { reading: "innovation", bound: "", bounds: "± 2σ expected" },
     weight: 0.62,
     series: [line("bound", { width: 1, spanGaps: true }), line("bound", { width: 1, spanGaps: true }), dots("reading", 3)],
-    bands: [{ series: [1, 2], fill: () => colour("bounds") }],
-    under: (plot) => marks(plot, charts.episodes),
+    bands: [band("bounds", [1, 2])],
+    under: (plot) => marks(plot, charts.episodes, charts.view.at),
     data: () => [live.x, ...names.map((name) => live.column(name))],
     range: (chart) => {
       const [x, upper, lower, values] = chart.data;
@@ -273,6 +309,14 @@ function integrityLines(plot, charts, state) {
     ctx.stroke();
   }
   ctx.restore();
+}
+
+// The same as curves of a file.
+function integrityCurves({ data }, charts, state) {
+  const bound = charts.integrity?.[state.name]?.bound;
+  if (!Number.isFinite(bound)) return [];
+  const values = (side) => data.at(-1).map((value) => (typeof value === "number" ? value + side * bound : value));
+  return [-1, 1].map((side) => ({ tone: "integrity", dash: [2, 3], width: 1, x: data[0], values: values(side) }));
 }
 
 // An angle between -π and π, and a curve of such, which leaves the chart at one edge and comes back at the other.

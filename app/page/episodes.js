@@ -1,14 +1,23 @@
 // What was and is wrong, newest first, each with its remedy; and what else happened.
 
 import { element } from "./dom.js";
-import { clock, words } from "./format.js";
+import { clock, compact, words } from "./format.js";
 
 const MOST = 200;
+
+// What can become of a reading, by the key of its count; those of which there are none are not shown.
+const KINDS = [
+  ["used", "used"], ["gated", "refused by the gate"], ["held out", "held out"], ["screened", "screened at the edge"], ["missing", "empty"],
+  ["failed", "failed"], ["stale", "dropped: too late"], ["wrong time", "dropped: wrong time"], ["inflated", "late, with R inflated"], ["held", "waiting for their time to be believed"], ["silenced", "lost by a fault on demand"],
+];
+
+const grouped = (n) => n.toLocaleString("en");
 
 export class Episodes {
   constructor(node, link, view, charts) {
     Object.assign(this, { node, link, view, charts });
     this.notices = [];
+    this.counts = element("dl", { class: "counts", "aria-label": "What became of the readings" });
     link.addEventListener("episodes", (event) => this.show(event.detail));
     link.addEventListener("notices", (event) => {
       // After a break all are told again.
@@ -17,7 +26,21 @@ export class Episodes {
       this.notices = [...fresh, ...this.notices].slice(0, MOST);
       this.show(this.link.episodes);
     });
+    link.addEventListener("status", (event) => this.count(event.detail));
     this.show([]);
+  }
+
+  // What became of the readings; the sensors' own counts when pointed at.
+  count({ counts }) {
+    const found = KINDS.filter(([key]) => counts[key]).map(([key, name]) => [key, name, counts[key]]);
+    const text = JSON.stringify([found, counts.readings]);
+    if (text === this.counted) return;
+    this.counted = text;
+    const whose = (key) => Object.entries(counts).filter(([name]) => name.startsWith(`${key} `)).map(([name, n]) => `${words(name.slice(key.length + 1))} ${n}`).join("\n");
+    this.counts.replaceChildren(
+      element("dt", {}, "readings"), element("dd", {}, grouped(counts.readings ?? 0)),
+      ...found.flatMap(([key, name, n]) => [element("dt", { title: whose(key) }, name), element("dd", { title: whose(key) }, `${grouped(n)}${key === "used" || !counts.readings ? "" : ` (${compact((100 * n) / counts.readings, 2)} %)`}`)]),
+    );
   }
 
   show(episodes) {
@@ -29,6 +52,8 @@ export class Episodes {
       list(open, (item) => this.entry(item)),
       over.length ? element("h3", {}, `Before (${over.length})`) : "",
       list(over.slice(0, MOST), (item) => this.entry(item)),
+      element("h3", {}, "Readings"),
+      this.counts,
       element("h3", {}, "Events"),
       list(this.notices, (item) => this.event(item)),
     );
@@ -45,7 +70,7 @@ export class Episodes {
       "li", { class: "episode", dataset: { open: String(episode.end === null), severity: episode.severity ?? "" } },
       element("button", { type: "button", title: "Show it in the charts", onclick: show }, element("time", {}, times), element("b", {}, `${words(episode.subject)}: ${episode.cause}`)),
       element("p", {}, episode.text),
-      element("small", { class: "faint" }, `more in ${episode.help}`),
+      element("a", { href: `/alarms#${episode.help.split("#")[1]}`, target: "_blank" }, `more on ${episode.cause}`),
     );
   }
 

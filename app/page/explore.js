@@ -2,22 +2,32 @@
 
 import { $, setText } from "./dom.js";
 import { ExploreStream } from "./explore_stream.js";
+import { ExploreTime } from "./explore_time.js";
+import { span } from "./format.js";
 import { Viewer } from "./rerun_viewer.js";
 
+const LATE = 1; // s by which Rerun may be behind without a word
+
 export class Explore {
-  constructor(base, theme) {
-    Object.assign(this, { base, theme });
+  // page: {link, view, charts}, whose time it shares; null in a window of its own
+  constructor(base, theme, page = null) {
+    Object.assign(this, { base, theme, page });
     this.revisions = { newest: null, drawn: null };
   }
 
   async show() {
-    if (this.stream) return this.stream.wake();
+    if (this.stream) {
+      this.time?.wake();
+      return this.stream.wake();
+    }
     if (this.starting) return;
     this.starting = true;
     try {
       this.viewer = await Viewer.open($("rerun"), $("before"), this.base, this.theme);
       this.stream = new ExploreStream({ viewer: this.viewer, changed: () => {}, told: (message) => this.told(message) });
       window.nisus.viewer = this.viewer;
+      this.time = this.page && new ExploreTime(this.viewer, this.page);
+      this.time?.wake();
     } catch (error) {
       this.note(`Rerun could not be loaded: ${error.message}`);
       this.starting = false;
@@ -25,6 +35,7 @@ export class Explore {
   }
 
   hide() {
+    this.time?.sleep();
     this.stream?.sleep();
   }
 
@@ -39,8 +50,10 @@ export class Explore {
     }
     const { newest, drawn } = this.revisions;
     const late = drawn !== null && drawn !== undefined && newest !== null && drawn !== newest;
-    setText($("behind"), late ? `Rerun still shows revision ${drawn}; drawing ${newest} …` : "");
-    $("behind").hidden = !late;
+    const lag = this.time?.lag ?? 0;
+    const text = late ? `Rerun still shows revision ${drawn}; drawing ${newest} …` : lag > LATE ? `Rerun is ${span(lag)} behind` : "";
+    setText($("behind"), text);
+    $("behind").hidden = !text;
     if (message.failed) this.note(`Rerun stopped: ${message.failed}. Reload the page.`);
   }
 

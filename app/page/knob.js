@@ -113,10 +113,15 @@ export class Knob {
   }
 
   set(value) {
+    this.expect(value);
+    this.submit(value);
+  }
+
+  // Another has asked for this value.
+  expect(value) {
     this.edited = performance.now();
     this.wanted = undefined;
     this.show(value);
-    this.submit(value);
   }
 
   typed() {

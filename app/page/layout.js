@@ -6,9 +6,9 @@ const LOWEST = 40; // px
 const HIGHEST = 1200;
 
 export class Layout {
-  // charts: [Chart] in the order in which they stand by themselves; each has a key
-  constructor(charts, node, menu, twin) {
-    Object.assign(this, { charts, node, menu });
+  // charts: [Chart] in the order in which they stand by themselves; each has a key. told(): others are shown
+  constructor(charts, node, menu, twin, told) {
+    Object.assign(this, { charts, node, menu, told });
     this.key = `nisus.charts.${twin}`;
     this.kept = JSON.parse(localStorage.getItem(this.key) ?? "{}");
     for (const chart of charts) this.prepare(chart);
@@ -51,6 +51,21 @@ export class Layout {
     return [...this.charts].sort((a, b) => own(a) - own(b));
   }
 
+  // What is shown, in its order: [key, height or null].
+  shown() {
+    return this.order.filter((chart) => !chart.node.hidden).map(({ what: { key } }) => [key, this.kept.heights?.[key] ?? null]);
+  }
+
+  // Show these and no others, as a link says; what the user has chosen is kept for the next time.
+  use(shown) {
+    const wanted = new Map(shown);
+    const others = this.charts.map((chart) => chart.what.key).filter((key) => !wanted.has(key));
+    const heights = shown.flatMap(([key, height]) => (height >= LOWEST && height <= HIGHEST ? [[key, height]] : []));
+    this.kept = { order: [...wanted.keys(), ...others], hidden: others, heights: Object.fromEntries(heights) };
+    this.apply();
+    this.offer();
+  }
+
   apply() {
     const hidden = new Set(this.kept.hidden ?? []);
     this.order.forEach((chart, k) => {
@@ -59,6 +74,7 @@ export class Layout {
       const height = this.kept.heights?.[chart.what.key];
       chart.node.style.flex = height ? `0 0 ${height}px` : "";
     });
+    this.told();
   }
 
   keep() {

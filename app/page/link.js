@@ -1,6 +1,7 @@
 // The page's connection to the twin: what it says arrives here, what the user asks leaves here.
 
 const SLOWEST = 8000; // ms between two attempts to connect
+const QUIET = 1000; // ms without news after which the last status is told again
 
 // Events: "status", "episodes", "notices", "frames", "connection"; each with `detail`.
 export class Link extends EventTarget {
@@ -13,6 +14,8 @@ export class Link extends EventTarget {
     this.takers = {}; // by lane: take(header, seconds, columns)
     this.delay = 250;
     document.addEventListener("visibilitychange", () => (document.hidden ? this.close("hidden") : this.open()));
+    // A twin whose source has ended has no news, but ages and answers that are waited for go on.
+    setInterval(() => this.socket && this.told && performance.now() - this.told > QUIET && this.tell("status", this.status), QUIET);
     if (!document.hidden) this.open();
   }
 
@@ -57,6 +60,7 @@ export class Link extends EventTarget {
   }
 
   tell(type, detail) {
+    if (type === "status") this.told = performance.now();
     this.dispatchEvent(new CustomEvent(type, { detail }));
   }
 

@@ -1,8 +1,8 @@
-// Episodes as shades behind the curves of a chart, where something was wrong.
+// Behind the curves of a chart: episodes as shades, where something was wrong, and the moment that is looked at.
 
 import { colour } from "./chart.js";
 
-export function marks(plot, episodes) {
+export function marks(plot, episodes, at = null) {
   const { ctx, bbox } = plot;
   const [low, high] = [plot.scales.x.min, plot.scales.x.max];
   ctx.save();
@@ -17,5 +17,9 @@ export function marks(plot, episodes) {
     ctx.rect(left, bbox.top, right - left, bbox.height);
   }
   ctx.fill(); // once, so that several at one time are no darker
+  if (at !== null && at > low && at < high) {
+    ctx.fillStyle = colour("faint");
+    ctx.fillRect(Math.round(plot.valToPos(at, "x", true)), bbox.top, devicePixelRatio, bbox.height);
+  }
   ctx.restore();
 }

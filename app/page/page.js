@@ -10,7 +10,9 @@ import { clock } from "./format.js";
 import { keys } from "./keys.js";
 import { Leave } from "./leave.js";
 import { Link } from "./link.js";
+import { goTo } from "./moment.js";
 import { Runs } from "./runs.js";
+import { Save } from "./save.js";
 import { Stage } from "./stage.js";
 import { Tabs } from "./tabs.js";
 import { Transport } from "./transport.js";
@@ -70,18 +72,47 @@ new Faults($("faults"), model, link);
 new Episodes($("episodes"), link, view, charts);
 const runs = new Runs($("runs"), link);
 const transport = new Transport(model, link, view, charts);
-const explore = new Explore(settings.viewer, theme);
-const stage = new Stage(settings.viser, theme, link);
+const explore = new Explore(settings.viewer, theme, { link, view, charts });
+const stage = new Stage(settings.viser, theme, link, view, charts);
 
 // What is hidden neither computes nor asks.
 const panes = { explore, whatif: new WhatIf($("whatif"), model, link), diagnose: new Diagnose($("diagnose"), link) };
 const middle = new Tabs($("middle-tabs"), null, (shown) => {
   for (const [name, pane] of Object.entries(panes)) if (name !== shown) pane.hide();
   panes[shown]?.show();
+  charts.visible(shown === "charts-panel");
   $("layout").hidden = shown !== "charts-panel";
   $("legend").hidden = shown === "diagnose" || shown === "explore";
 });
 window.nisus.panes = panes;
+const saving = new Save(model, link, view, charts);
+charts.saving = panes.whatif.saving = saving;
+$("save").addEventListener("click", () => saving.run($("save")));
+$("copy-link").addEventListener("click", () => saving.copyLink());
+saving.said = (text) => {
+  setText($("said"), text);
+  clearTimeout(saving.timer);
+  saving.timer = setTimeout(() => setText($("said"), ""), 5000);
+};
+
+// A link to a moment, once it is known from when seconds count; and when another is opened in this window.
+let arriving = false;
+function follow() {
+  arriving = true;
+  const reason = goTo(location.hash, { model, link, view, charts });
+  arriving = false;
+  if (reason) saving.said(reason);
+}
+function begun() {
+  if (!link.status.origin) return;
+  link.removeEventListener("status", begun);
+  follow();
+  window.addEventListener("hashchange", follow);
+}
+link.addEventListener("status", begun);
+// Elsewhere, or following again: the address says no longer what is shown.
+view.addEventListener("change", () => location.hash && !arriving && history.replaceState(null, "", location.pathname));
+
 const turn = (name) => middle.show(middle.chosen === name ? "charts-panel" : name);
 const xy = new XY($("xy"), model, link, view, charts);
 let stages = false;
@@ -147,6 +178,8 @@ keys([
   ["x", "explore in Rerun, and back", () => turn("explore")],
   ["w", "what if, and back", () => turn("whatif")],
   ["d", "diagnose, and back", () => turn("diagnose")],
+  ["l", "copy a link to this moment", () => saving.copyLink()],
+  ["o", "save the track, a report", () => saving.run($("save"))],
   ["t", "tune, where the page is narrow", drawer],
   ...(leave?.commands ?? []),
 ]);

@@ -22,6 +22,7 @@ export class Pins {
         key: "difference", title: "pinned − running", unit: bracketed(this.state.unit), weight: 1,
         series: [{ show: false }],
         data: () => [charts.range, [null, null]],
+        extras: () => this.curves("less", this.state),
         over: (plot) => this.pinned.forEach((pin) => trace(plot, pin.less, this.state, pin.place)),
         range: () => {
           const [low, high] = this.extent("less", this.state.name);
@@ -66,6 +67,7 @@ export class Pins {
   }
 
   close(pin) {
+    pin.asked = null;
     this.link.look(`run ${pin.number}`, null);
     this.link.look(`less ${pin.number}`, null);
   }
@@ -76,9 +78,13 @@ export class Pins {
     this.ask(this.place);
   }
 
-  // Lanes for the same stretch of time as the charts' own; place: {since, until, span, points}
+  // Lanes for the same stretch of time as the charts' own; place: {since, until, span, points}, null for none
   ask(place) {
     this.place = place;
+    if (!place) {
+      for (const pin of this.pinned) if (pin.asked) this.close(pin);
+      return;
+    }
     const columns = this.model.states.map((state) => `mean:${state.name}`);
     const own = [`mean:${this.state.name}`];
     for (const pin of this.pinned) {
@@ -97,6 +103,15 @@ export class Pins {
   // Beneath the lines of a state's own chart.
   draw(plot, state) {
     for (const pin of this.pinned) trace(plot, pin.lane, state, pin.place);
+  }
+
+  // The same as curves of a file.
+  curves(which, state) {
+    return this.pinned.map((pin) => {
+      const [from, to] = pin[which].x.length ? within(pin[which].x, this.charts.range) : [0, -1];
+      const values = pin[which].column(`mean:${state.name}`).slice(from, to + 1);
+      return { name: `run ${pin.number}${pin.name ? ` ${pin.name}` : ""}`, tone: `pin-${pin.place}`, dash: DASHES[pin.place], x: pin[which].x.slice(from, to + 1), values };
+    });
   }
 
   // Lowest and highest that is shown of a state; of all pinned runs.
@@ -124,7 +139,7 @@ export class Pins {
 
   // What the differences are at the cursor, else at the end: each beside its name in the legend.
   read() {
-    const at = this.chart.plot.cursor.left >= 0 ? this.chart.plot.posToVal(this.chart.plot.cursor.left, "x") : Infinity;
+    const at = this.chart.plot.cursor.left >= 0 ? this.chart.plot.posToVal(this.chart.plot.cursor.left, "x") : (this.charts.view.at ?? Infinity);
     for (const pin of this.pinned) {
       const values = pin.less.column(`mean:${this.state.name}`);
       const index = pin.less.x.findLastIndex((x, k) => x <= at && typeof values[k] === "number");

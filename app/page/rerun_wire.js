@@ -78,7 +78,9 @@ export function closeRecordings(ids) {
   return new Uint8Array(field(1, field(1 + 2, list)));
 }
 
+// A cursor that follows has no time of its own: given one, the viewer would be paused there.
 export function setTimeCursor(id, timeline, time, play) {
-  const request = [...field(1, id), ...field(2, field(1, timeline)), ...field(3, field(1, time)), ...field(5, play)];
+  const place = play === FOLLOWING ? [] : field(3, field(1, time));
+  const request = [...field(1, id), ...field(2, field(1, timeline)), ...place, ...field(5, play)];
   return new Uint8Array(field(6, request));
 }

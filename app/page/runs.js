@@ -125,6 +125,8 @@ export class Runs {
       run.running ? null : button("load", "Load: back to this filter and tuning", () => this.ask("Load", { number })),
       button("note", "Write a note", () => ((this.noted = this.noted === number ? null : number), this.show(), this.table.querySelector(`tbody[data-number="${number}"] textarea`)?.focus())),
       button("⇄", "Compare with another", choose, { "aria-pressed": String(this.chosen.includes(number)) }),
+      run.kept ? element("a", { href: `/api/report.html?run=${number}`, download: "", title: "Save a report: scores, charts, checks, episodes and tuning in one file", "aria-label": `Save a report of run ${number}` }, "report") : null,
+      run.kept ? element("a", { href: `/api/track.csv?run=${number}`, download: "", title: "Save the track as CSV", "aria-label": `Save the track of run ${number}` }, "csv") : null,
       element("a", { href: `/api/runs/${number}.yaml`, download: "", title: "Save the tuning as lines of the twin's YAML", "aria-label": `Save run ${number} as YAML` }, "yaml"),
     ];
   }

@@ -1,12 +1,14 @@
 // The stage: Viser's scene in a frame, and what may be chosen about it. Its panel is for a window of its own; here the
 // page has all that.
 
-import { $, element, setAttribute } from "./dom.js";
+import { $, element, setAttribute, setText } from "./dom.js";
+import { span } from "./format.js";
 
+const LATE = 1; // s by which the scene may be ahead of the charts without a word
 const LARGE = "nisus.stage.large";
 
 export class Stage {
-  constructor(there, theme, link) {
+  constructor(there, theme, link, view, charts) {
     Object.assign(this, { there, theme, link });
     this.frame = $("stage");
     this.choices = {};
@@ -14,6 +16,13 @@ export class Stage {
     $("stage-large").addEventListener("click", () => this.enlarge());
     this.enlarge(localStorage.getItem(LARGE) === "1");
     link.addEventListener("status", () => this.offer(link.status.scene ?? []));
+    // The scene shows the newest row; the charts may be held elsewhere.
+    const place = () => {
+      const ahead = view.following ? 0 : charts.newest - view.at;
+      setText($("stage-time"), ahead > LATE && Number.isFinite(ahead) ? `${span(ahead)} later than the charts` : "");
+    };
+    link.addEventListener("status", place);
+    view.addEventListener("change", place);
   }
 
   // Of Viser's page. The query of the socket's address says what is shown, so that no more than that is sent.

@@ -13,7 +13,7 @@ const POINTS = 400;
 export class Transport {
   constructor(model, link, view, charts) {
     Object.assign(this, { model, link, view, charts });
-    this.lane = new Lane();
+    this.lane = charts.overview = new Lane();
     this.episodes = [];
     this.canvas = $("timeline");
     const spans = [...new Set([...WINDOWS, model.window])].sort((a, b) => a - b);
@@ -77,7 +77,7 @@ export class Transport {
 
   draw() {
     $("follow").hidden = this.view.following;
-    setText($("follow"), "follow ▸");
+    setText($("at"), this.view.at === null ? "" : `at ${clock(Math.min(this.view.at, this.now), 1)}`);
     const { canvas } = this;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
     const ratio = devicePixelRatio;
@@ -114,6 +114,7 @@ export class Transport {
     ctx.lineWidth = 1.5;
     const left = Math.max(0, place(since));
     ctx.strokeRect(left + 0.75, 11.75, Math.max(3, Math.min(width, place(until)) - left - 1.5), 14.5);
+    if (this.view.at !== null) ctx.fillRect(Math.min(width - 2, Math.max(0, place(this.view.at) - 1)), 8, 2, 22);
     ctx.fillStyle = tone("faint");
     ctx.textAlign = "left";
     ctx.fillText(clock(start), 0, 38);
@@ -130,7 +131,7 @@ export class Transport {
   // The past is looked at; the future of a recording is sought.
   press(event) {
     const time = this.time(event);
-    if (time <= this.now && !event.shiftKey) this.view.goTo(time, this.charts.range);
+    if (time <= this.now && !event.shiftKey) this.view.goTo(time, this.charts.range, this.now);
     else if (this.status?.seekable) {
       this.link.ask("Seek", { seconds: time });
       this.view.follow();

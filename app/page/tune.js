@@ -87,11 +87,17 @@ export class Tune {
     return element("div", { class: "together" }, element("span", {}, "all"), button("÷10", 0.1), button("÷2", 0.5), button("×2", 2), button("×10", 10), data);
   }
 
-  // All of a group at once; their own curves are not what is looked for then.
+  // All of a group at once: one command, one revision, one undo. Their own curves are not what is looked for then.
   scale(prefix, factor) {
-    this.scaling = true;
-    for (const [key, knob] of this.knobs) if (key.startsWith(`${prefix}.`)) knob.set(Number((knob.value * factor).toPrecision(6)));
-    this.scaling = false;
+    const before = {};
+    const values = {};
+    for (const [key, knob] of this.knobs) {
+      if (!key.startsWith(`${prefix}.`)) continue;
+      before[key] = this.status.tuning[key];
+      values[key] = Number((knob.value * factor).toPrecision(6));
+      knob.expect(values[key]);
+    }
+    return this.edit(`all of ${prefix}`, "SetTunings", { values }, { values: before });
   }
 
   gateSection() {
@@ -189,7 +195,7 @@ export class Tune {
   }
 
   turn(key, value) {
-    if (!this.scaling) this.around.show(key);
+    this.around.show(key);
     const before = { gate: this.status.gate ?? null, "gate.kind": this.status.gate_kind }[key] ?? this.status.tuning[key] ?? null;
     return this.edit(key, "SetTuning", { key, value }, { key, value: before });
   }

@@ -9,6 +9,7 @@ export class View extends EventTarget {
     this.span = span; // null: everything
     this.since = null; // of a fixed stretch
     this.until = null;
+    this.at = null; // the moment of it that is looked at, s; also in Rerun
   }
 
   get following() {
@@ -23,15 +24,17 @@ export class View extends EventTarget {
 
   follow(span = this.span) {
     this.span = span;
-    this.since = this.until = null;
+    this.since = this.until = this.at = null;
     this.changed();
   }
 
-  show(since, until) {
+  // The moment stays, if it is still in sight; else it is the last of what is shown.
+  show(since, until, at = this.at) {
     const middle = (since + until) / 2;
     const half = Math.max(NARROWEST, until - since) / 2;
     this.since = middle - half;
     this.until = middle + half;
+    this.at = at !== null && this.since <= at && at <= this.until ? at : this.until;
     this.changed();
   }
 
@@ -41,10 +44,12 @@ export class View extends EventTarget {
     else this.follow();
   }
 
-  // The same width around another time.
-  goTo(time, range) {
-    const half = (range[1] - range[0]) / 2;
-    this.show(time - half, time + half);
+  // To a moment: what is shown stays where it holds it; else the same width around it, but not beyond the newest row.
+  goTo(time, range, newest = Infinity) {
+    if (range[0] <= time && time <= range[1]) return this.show(...range, time);
+    const width = range[1] - range[0];
+    const until = Math.max(time, Math.min(time + width / 2, newest));
+    this.show(until - width, until, time);
   }
 
   zoom(factor, at, range) {

@@ -1,7 +1,7 @@
 // What if: the twin goes on from now without readings, with inputs that are chosen here. A fan for each state, and when
 // it reaches a limit. Nothing is asked while this is hidden.
 
-import { Chart, colour, dots, edge, line } from "./chart.js";
+import { Chart, band, colour, dots, edge, line } from "./chart.js";
 import { unbroken } from "./charts.js";
 import { element, setText } from "./dom.js";
 import { bracketed, compact, spaced, span, words } from "./format.js";
@@ -63,7 +63,7 @@ export class WhatIf {
     const axis = element("div", { class: "axis", "aria-hidden": "true" });
     this.node.replaceChildren(asked, this.problem, this.charts, axis, element("p", { class: "faint foot" }, "From now on without readings, by the filter that runs. Bands ± 1σ, ± 2σ. ", this.method, this.state));
     const { states } = this;
-    const actions = { select: () => {}, home: () => {}, wheel: () => {} };
+    const actions = { select: () => {}, home: () => {}, wheel: () => {}, save: (chart, button) => this.saving.chart(chart, button) };
     this.parts = states.map((state) => new Chart(fan(this, state), actions));
     this.charts.append(...this.parts.map((chart) => chart.node));
     this.parts.forEach((chart, k) => {
@@ -269,9 +269,9 @@ function fan(whatif, state) {
       edge(), edge(), edge(), edge(), line("estimate", { width: 1.75, dash: [6, 3] }),
     ],
     bands: [
-      { series: [1, 2], fill: () => colour("band") },
-      { series: [first, first + 1], fill: () => colour("band") },
-      { series: [first + 2, first + 3], fill: () => colour("band") },
+      band("band", [1, 2]),
+      band("band", [first, first + 1]),
+      band("band", [first + 2, first + 3]),
     ],
     over: (plot) => lines(plot, whatif.times?.[0], whatif.limits[state.name]),
     data: () => {

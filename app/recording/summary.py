@@ -9,7 +9,7 @@ from estimators.diagnostics.score import Score, score
 from estimators.errors import NisusError
 
 from ..engine.interface import Running
-from ..runs.scores import everything
+from ..engine.whole import whole
 
 
 def summary_of(engine: Running) -> dict[str, Any]:
@@ -18,7 +18,7 @@ def summary_of(engine: Running) -> dict[str, Any]:
     `error` is {name, rmse, unit, coverage, against}: of the first state with a truth, else of a sensor held out.
     """
     try:
-        pull = everything(engine)
+        pull = whole(engine)
         tuning, estimator = engine.folded_with()
         if pull is None:
             return {"estimator": estimator}

@@ -8,19 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.score import Score, score
 from estimators.errors import NisusError
-from estimators.log import Events
-from estimators.track import Track
 
 from ..engine.interface import Running
 from ..engine.outputs import Pull
 from ..engine.revisions import Run
+from ..engine.whole import whole
 from .window import window
-
-ROWS = 16_384
-"""Rows copied at once, so that a long history does not hold the engine's lock for long."""
 
 REST = 20.0
 """Times as long as it took that the score of the running revision stands before it is computed again."""
@@ -84,7 +79,7 @@ class RunScores:
         begun = time.monotonic()
         if self._fresh_until[0] == running.number and begun < self._fresh_until[1]:
             return
-        pull = everything(self._engine)
+        pull = whole(self._engine)
         if pull is None or pull.revision != running.number:
             return
         self._known[running.number] = self._scored(running, pull)
@@ -98,28 +93,6 @@ class RunScores:
         seconds = float(t[-1] - t[0]) * 1e-9 if t.size else 0.0
         made = RunScore(found, len(pull.events), seconds, np.nan if known is None else known.step_us)
         return made if np.isfinite(made.step_us) else replace(made, step_us=_step_us(self._engine, run))
-
-
-def everything(engine: Running) -> Pull | None:
-    """All rows of what runs; None while there are none, or if another revision took over meanwhile."""
-    cursor = engine.cursor()
-    parts: list[Pull] = []
-    pictures: dict[int, Picture] = {}
-    try:
-        while not parts or len(parts[-1].events) == ROWS:
-            pull = engine.pull(cursor, ROWS)
-            if parts and (pull.fresh or pull.first != parts[-1].first + len(parts[-1].events)):
-                return None
-            parts.append(pull)
-            pictures |= {picture.before: picture for picture in pull.pictures}
-    finally:
-        engine.release(cursor)
-    if not len(parts[0].events):
-        return None
-    events = Events.concat([part.events for part in parts], engine.model.width)
-    columns = zip(*(part.track for part in parts), strict=True)
-    track = Track(*(np.concatenate(column) for column in columns))
-    return replace(parts[0], events=events, track=track, pictures=[pictures[index] for index in sorted(pictures)])
 
 
 def _step_us(engine: Running, run: Run) -> float:

@@ -8,6 +8,7 @@ import math
 import os
 import types
 import typing
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -235,6 +236,8 @@ def _converted(command: str, name: str, value: Any, hint: Any) -> Any:
             return value
         if typing.get_origin(kind) is tuple and isinstance(value, list) and all(isinstance(v, str) for v in value):
             return tuple(value)
+        if typing.get_origin(kind) is Mapping and isinstance(value, dict):
+            return {key: _converted(command, f"{name}.{shown_name(key)}", value[key], float) for key in value}
         if kind is float and not isinstance(value, bool) and (isinstance(value, (int, float)) or value == "inf"):
             try:
                 number = float(value)
@@ -245,7 +248,8 @@ def _converted(command: str, name: str, value: Any, hint: Any) -> Any:
         if kind is Path and isinstance(value, str):
             return _recording(f"{command}: {name} is {_shown(value)}", value)
     wanted = " or ".join({"float": "a number", "int": "a whole number", "bool": "true or false", "NoneType": "null",
-                          "str": "a text", "Path": "a path", "tuple": "a list of texts"}[kind.__name__]
+                          "str": "a text", "Path": "a path", "tuple": "a list of texts",
+                          "Mapping": "an object of numbers"}[kind.__name__]
                          for kind in allowed)  # fmt: skip
     raise ConfigError(f"{command}: {name} is {_shown(value)}; it must be {wanted}")
 

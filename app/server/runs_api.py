@@ -25,7 +25,7 @@ class RunsApi:
 
     def __init__(self, engine: Running) -> None:
         self._engine = engine
-        self._scores = RunScores(engine)
+        self.scores = RunScores(engine)
         self._sweeps = Sweeps(engine)
 
     def start(self) -> None:
@@ -47,7 +47,7 @@ class RunsApi:
         ]
 
     async def _runs(self, request: Request) -> Response:
-        return Json(await asyncio.to_thread(runs_json, self._scores, self._engine))
+        return Json(await asyncio.to_thread(runs_json, self.scores, self._engine))
 
     async def _yaml(self, request: Request) -> Response:
         try:

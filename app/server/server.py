@@ -29,12 +29,15 @@ from ..analysis.forecast import Forecasts, question_from_json
 from ..drawing.choices import Choices
 from ..drawing.palette import EITHER, THEMES
 from ..engine.interface import Running
+from ..export import markdown
+from ..export.alarms import alarms_text
 from ..rerun.feed import RerunFeed
 from ..series.series import Series
 from .answer import answered
 from .api import Json, command_from_json, episodes_json, faults_json, one_line, status_json
 from .bounds import BODY
 from .door import Door
+from .export_api import ExportApi
 from .model_json import model_json
 from .one_at_a_time import OneAtATime
 from .page_file import PAGE, page_file
@@ -84,6 +87,7 @@ class PageServer:
         self._choices = choices
         self._series = Series(engine)
         self._runs = RunsApi(engine)
+        self._exports = ExportApi(engine, self._series, self._runs.scores)
         self._forecasts, self._diagnosis = Forecasts(engine), Diagnosis(engine)
         self._forecasting, self._diagnosing = OneAtATime("forecast"), OneAtATime("diagnosis")
         self._boot = uuid.uuid4().hex
@@ -126,10 +130,12 @@ class PageServer:
         routes: list[Any] = [
             Route("/", self._page),
             Route("/explore", self._page),
+            Route("/alarms", self._alarms),
             Route("/api/status", self._status),
             Route("/api/model", self._model),
             Route("/api/episodes", self._episodes),
             *self._runs.routes(),
+            *self._exports.routes(),
             Route("/api/recordings", self._list_recordings),
             Route("/api/faults", self._faults),
             Route("/api/command", self._command, methods=["POST"]),
@@ -155,6 +161,14 @@ class PageServer:
         settings = {"viewer": f"/viewer/{viewer_version()}", "boot": self._boot, "viser": self._viser is not None}
         settings["gallery"] = self.door.furnished
         return page_file(name, settings)
+
+    async def _alarms(self, request: Request) -> Response:
+        """ALARMS.md, to which episodes refer."""
+        try:
+            text = markdown.as_html(alarms_text())
+        except ConfigError as error:
+            return PlainTextResponse(f"Nisus: {error}\n", 404)
+        return Response((PAGE / "alarms.html").read_text().replace("{{text}}", text), media_type="text/html")
 
     async def _status(self, request: Request) -> Response:
         return Json(self._state())

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from app.cli.check_html import as_html
-from app.cli.check_tables import Bar, Part
 from app.cli.main import main
+from app.export.html import as_html
+from app.export.parts import Bar, Part
 from estimators.diagnostics.sensitivity.words import range_text
 
 REQUIRED = {"checklist", "observability", "smallest_visible", "integrity", "held_out", "open_loop"}

@@ -5,7 +5,8 @@ import pytest
 
 from app.engine import commands
 from app.engine.engine import Engine
-from app.runs.scores import ROWS, RunScores
+from app.engine.whole import ROWS
+from app.runs.scores import RunScores
 from estimators.fold import fold
 from estimators.log import Log
 from estimators.track import HELD_OUT, USED

@@ -1,15 +1,17 @@
-"""A check as one HTML file: no script, nothing from elsewhere, light, printable."""
+"""Sections as one HTML file: no script, nothing from elsewhere, light, printable."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from html import escape
+from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 
 from estimators.diagnostics.sensitivity.words import digits
 
-from .check_tables import WORSE, Bar, Part
+from .parts import WORSE, Bar, Part
 
 STYLE = """
 @page { size: A4; margin: 14mm }
@@ -26,6 +28,7 @@ tr, svg { break-inside: avoid }
 .short { white-space: nowrap }
 .worse { color: #b91c1c }
 svg { display: block; margin: .6em 0; max-width: 100%; height: auto }
+.small { color: #6b7280; font-size: .85em }
 @media print { body { font-size: 10.5px; max-width: none; margin: 0; padding: 0 } }
 """
 
@@ -38,16 +41,19 @@ SHORT = 24
 FIRST, SECOND = "#2563eb", "#f59e0b"
 
 
-def as_html(title: str, parts: Sequence[Part]) -> str:
-    """The whole page; the first part is its head."""
+def as_html(title: str, parts: Sequence[Part], *, now: float | None = None) -> str:
+    """The whole page; the first part is its head.
+
+    Args:
+        title: Of the file.
+        parts: From top to bottom.
+        now: When it was made, s since 1970, UTC; None is now.
+    """
     head, *others = parts
-    body = [f"<h1>{escape(head.title)}</h1>", *_said(head)]
+    body = [f"<h1>{escape(head.title)}</h1>", *_said(head), f'<p class="small">{escape(stamp(now))}</p>']
+    body += _filled(head)
     for part in others:
-        body += [f"<h2>{escape(part.title)}</h2>", *_said(part)]
-        if any(np.isfinite(bar.first) or np.isfinite(bar.second) for bar in part.bars):
-            body.append(_bars(part.bars, part.legend))
-        if part.rows:
-            body.append(_table(part))
+        body += [f"<h2>{escape(part.title)}</h2>", *_said(part), *_filled(part)]
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -55,6 +61,24 @@ def as_html(title: str, parts: Sequence[Part]) -> str:
         + "\n".join(body)
         + "\n</body>\n</html>\n"
     )
+
+
+def stamp(now: float | None = None) -> str:
+    """With which version, and when."""
+    try:
+        own = f" {version('nisus')}"
+    except PackageNotFoundError:
+        own = ""
+    return f"Nisus{own}, {time.strftime('%d %B %Y, %H:%M UTC', time.gmtime(now))}"
+
+
+def _filled(part: Part) -> list[str]:
+    body = list(part.drawn)
+    if any(np.isfinite(bar.first) or np.isfinite(bar.second) for bar in part.bars):
+        body.append(_bars(part.bars, part.legend))
+    if part.rows:
+        body.append(_table(part))
+    return body + [f'<p class="small">{escape(said)}</p>' for said in part.small]
 
 
 def _said(part: Part) -> list[str]:
@@ -85,7 +109,7 @@ def _bars(bars: Sequence[Bar], legend: tuple[str, str]) -> str:
     """Two bars a row, each row to its own scale: their units differ."""
     width, height = LEFT + LONG + 130, ROW * len(bars) + 24
     drawn = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" font-size="12" '
+        f'<svg viewBox="0 0 {width} {height}" width="{width}" font-size="12" '
         f'role="img" aria-label="{escape(legend[0])} beside {escape(legend[1])}">'
     ]
     for k, (color, text) in enumerate(zip((FIRST, SECOND), legend, strict=True)):

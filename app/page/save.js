@@ -1,0 +1,103 @@
+// What can be saved: a chart as a picture, the track as a table, a report, a link to what is shown. One menu for all,
+// which opens beside the button that was pressed.
+
+import { element } from "./dom.js";
+import { clock } from "./format.js";
+import { link as momentLink } from "./moment.js";
+import { chartSvg, heading, pngOf } from "./svg_chart.js";
+
+const CENTURY = 1e18; // ns since 1970 from which on a time has a date
+
+export class Save {
+  constructor(model, link, view, charts) {
+    Object.assign(this, { model, link, view, charts });
+    this.menu = element("div", { id: "save-menu", popover: "auto", role: "menu", "aria-label": "Save" });
+    this.menu.addEventListener("keydown", (event) => this.keyed(event));
+    document.body.append(this.menu);
+  }
+
+  // items: [text, title, run]
+  open(button, items) {
+    this.menu.replaceChildren(
+      ...items.map(([text, title, run]) =>
+        element("button", { type: "button", role: "menuitem", title, onclick: () => (this.menu.hidePopover(), button.focus(), run()) }, text)),
+    );
+    this.menu.showPopover();
+    const [box, own] = [button.getBoundingClientRect(), this.menu.getBoundingClientRect()];
+    this.menu.style.left = `${Math.max(4, Math.min(innerWidth - own.width - 4, box.right - own.width))}px`;
+    this.menu.style.top = `${box.bottom + own.height + 4 < innerHeight ? box.bottom + 2 : box.top - own.height - 2}px`;
+    this.menu.firstChild.focus();
+  }
+
+  keyed(event) {
+    const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
+    if (!step) return;
+    event.preventDefault();
+    event.stopPropagation();
+    const items = [...this.menu.children];
+    items[(items.indexOf(document.activeElement) + step + items.length) % items.length].focus();
+  }
+
+  chart(chart, button) {
+    this.open(button, [
+      ["PNG", "A picture of this chart as it is", () => this.picture(chart, "png")],
+      ["SVG", "A drawing of this chart as it is", () => this.picture(chart, "svg")],
+    ]);
+  }
+
+  run(button) {
+    const number = this.link.status.revision;
+    const [since, until] = this.charts.range.map((time) => Number(time.toFixed(6)));
+    const whole = (kind) => `/api/track.${kind}?run=${number}`;
+    const part = (kind) => `${whole(kind)}&since=${since}&until=${until}`;
+    this.open(button, [
+      ["Track, what is shown: CSV", "One line an event, the columns of nisus fold", () => fetched(part("csv"))],
+      ["Track, what is shown: Parquet", "The same, with its types", () => fetched(part("parquet"))],
+      ["Track, all of it: CSV", "One line an event, the columns of nisus fold", () => fetched(whole("csv"))],
+      ["Track, all of it: Parquet", "The same, with its types", () => fetched(whole("parquet"))],
+      ["Report: HTML", "Scores, charts, checks, episodes and tuning in one file", () => fetched(`/api/report.html?run=${number}`)],
+      ["Copy a link to this moment (L)", "Time, span and charts, for who has this session open", () => this.copyLink()],
+    ]);
+  }
+
+  // The time of the newest row that is shown, ns.
+  get instant() {
+    return Number(this.link.status.origin ?? 0) + Math.min(this.charts.range[1], this.charts.newest) * 1e9;
+  }
+
+  async picture(chart, kind) {
+    const svg = chartSvg(chart, [`${this.model.twin}: ${heading(chart.what)}`, this.about(chart)], chart.what.key ? this.link.episodes : []);
+    const blob = kind === "svg" ? new Blob([svg], { type: "image/svg+xml" }) : await pngOf(svg);
+    download(blob, `${this.model.twin}-${(chart.what.key ?? chart.what.title).replace(/^state:/, "").replace(/[^\p{L}\p{N}]+/gu, "_")}-${this.stamp()}.${kind}`);
+  }
+
+  // What filter, which run, of when.
+  about(chart) {
+    const { status } = this.link;
+    const title = this.model.estimators.find((entry) => entry.name === status.estimator)?.title ?? status.estimator;
+    const [since, until] = chart.span;
+    const origin = Number(status.origin ?? 0);
+    const date = origin > CENTURY ? `, 0:00 is ${new Date(origin / 1e6).toISOString().replace("T", " ").slice(0, 19)} UTC` : "";
+    return `${title}, run ${status.revision}, ${clock(since, 1)} to ${clock(until, 1)}${date}${chart.what.note ? `; ${chart.what.note}` : ""}`;
+  }
+
+  stamp() {
+    return this.instant > CENTURY ? new Date(this.instant / 1e6).toISOString().replace(/[-:]/g, "").slice(0, 15) : `${Math.round(this.instant / 1e9)}s`;
+  }
+
+  async copyLink() {
+    const url = momentLink(this);
+    // In the address too, for where a page may not write to the clipboard.
+    history.replaceState(null, "", url);
+    await navigator.clipboard?.writeText(url).catch(() => {});
+    this.said?.("link copied; it is in the address too");
+  }
+}
+
+function download(blob, name) {
+  const url = URL.createObjectURL(blob);
+  element("a", { href: url, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(url), 60_000);
+}
+
+const fetched = (address) => element("a", { href: address, download: "" }).click();

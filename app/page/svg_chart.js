@@ -1,0 +1,136 @@
+// A chart as an SVG file of its own, from the points that it shows: title, axes, units, legend, in the light theme.
+
+import { bracketed, clock, compact } from "./format.js";
+
+const [W, H] = [960, 330]; // px
+const [LEFT, RIGHT, TOP, BOTTOM] = [64, 16, 50, 30];
+const FONT = 'font-family="system-ui, -apple-system, \'Segoe UI\', Roboto, sans-serif"';
+const NAMES = {
+  estimate: "estimate", truth: "truth", previous: "run before", reading: "reading", "reading ring": "held out", refused: "refused",
+  "refused ring": "screened", bound: "bounds", quiet: "of a reading", band: "± 2σ", bounds: "bounds", integrity: "one unseen fault",
+};
+const STEPS = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400]; // s
+
+const escaped = (text) => text.replace(/[&<>"]/g, (sign) => ({ "&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;" })[sign]);
+const round = (value) => Math.round(10 * Math.min(1e5, Math.max(-1e5, value))) / 10;
+
+// The colours of the light theme, whatever is shown: from the page's own style, where they stand once.
+export function lightColours() {
+  for (const sheet of document.styleSheets)
+    for (const rule of sheet.cssRules) if (rule.selectorText === ":root" && rule.style.getPropertyValue("--estimate")) return (name) => rule.style.getPropertyValue(`--${name}`).trim();
+  throw new Error("the page has no style");
+}
+
+// chart: of chart.js; lines: [title, smaller line]; episodes: shades. Resolves to the text of the file.
+export function chartSvg(chart, [title, about], episodes, tone = lightColours()) {
+  const { what, data, span, plot } = chart;
+  const { min: low, max: high } = plot.scales.y;
+  const x = (value) => LEFT + ((value - span[0]) / (span[1] - span[0] || 1)) * (W - LEFT - RIGHT);
+  const y = (value) => TOP + ((high - value) / (high - low || 1)) * (H - TOP - BOTTOM);
+  const marks = [];
+  const legend = new Map();
+  const add = (key, mark, sample) => {
+    marks.push(mark);
+    const name = what.names?.[key] ?? NAMES[key] ?? key;
+    if (mark && name && !legend.has(name)) legend.set(name, sample);
+  };
+  for (const episode of episodes) {
+    const [start, end] = [Math.max(span[0], episode.from ?? span[0]), Math.min(span[1], episode.to ?? span[1])];
+    if (end >= start) marks.push(`<rect x="${round(x(start))}" y="${TOP}" width="${Math.max(2, round(x(end) - x(start)))}" height="${H - TOP - BOTTOM}" fill="${tone("episode")}"/>`);
+  }
+  const times = data[0];
+  const finite = (value) => typeof value === "number";
+  for (const { series: [over, under], tone: name } of what.bands ?? []) {
+    const rows = times.flatMap((_, k) => (finite(data[over][k]) && finite(data[under][k]) ? [k] : []));
+    const edge = (values, list) => list.map((k) => `${round(x(times[k]))} ${round(y(values[k]))}`).join("L");
+    const path = rows.length ? `<path d="M${edge(data[over], rows)}L${edge(data[under], rows.toReversed())}Z" fill="${tone(name)}"/>` : "";
+    add(name, path, (at) => `<rect x="${at}" y="-8" width="15" height="8" fill="${tone(name)}"/>`);
+  }
+  const curve = (xs, values, { tone: name, dash = [], width = 1.5, spanGaps }) => {
+    let path = "";
+    let open = false;
+    xs.forEach((time, k) => {
+      if (finite(values[k])) path += `${open ? "L" : "M"}${round(x(time))} ${round(y(values[k]))}`;
+      // What is undefined is a row of another table: the line goes on.
+      open = finite(values[k]) || (open && (spanGaps || values[k] === undefined));
+    });
+    const style = `fill="none" stroke="${tone(name)}" stroke-width="${width}"${dash.length ? ` stroke-dasharray="${dash.join(" ")}"` : ""}`;
+    return [path && `<path d="${path}" ${style}/>`, (at) => `<path d="M${at} -4h15" ${style}/>`];
+  };
+  what.series.forEach((series, k) => {
+    const values = data[k + 1] ?? [];
+    if (series.mark === "line") add(series.tone, ...curve(times, values, series));
+    if (series.mark !== "dots") return;
+    const style = series.ring ? `fill="none" stroke="${tone(series.tone)}" stroke-width="1.5"` : `fill="${tone(series.tone)}"`;
+    const radius = series.points.size / 2;
+    const dots = times.flatMap((time, i) => (finite(values[i]) && time >= span[0] && time <= span[1] ? [`<circle cx="${round(x(time))}" cy="${round(y(values[i]))}" r="${radius}"/>`] : [])).join("");
+    add(series.ring ? `${series.tone} ring` : series.tone, dots && `<g ${style}>${dots}</g>`, (at) => `<circle cx="${at + 9}" cy="-4" r="${radius}" ${style}/>`);
+  });
+  for (const extra of what.extras?.(chart) ?? []) add(extra.name ?? extra.tone, ...curve(extra.x, extra.values, extra));
+  return [
+    `<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 ${W} ${H}" width="${W}" height="${H}" font-size="12" fill="${tone("faint")}" ${FONT}>`,
+    `<title>${escaped(title)}</title><rect width="${W}" height="${H}" fill="${tone("panel")}"/>`,
+    `<text x="${LEFT}" y="19" fill="${tone("ink")}" font-size="14" font-weight="650">${escaped(title)}</text><text x="${LEFT}" y="38">${escaped(about)}</text>`,
+    ...valueAxis(what, plot, low, high, y, tone("grid")),
+    ...timeTicks(...span).map((time) => `<path d="M${round(x(time))} ${TOP}v${H - TOP - BOTTOM}" stroke="${tone("grid")}"/><text x="${round(x(time))}" y="${H - 11}" text-anchor="middle">${clock(time, span[1] - span[0] < 8 ? 2 : 0)}</text>`),
+    `<clipPath id="frame"><rect x="${LEFT}" y="${TOP}" width="${W - LEFT - RIGHT}" height="${H - TOP - BOTTOM}"/></clipPath>`,
+    `<g clip-path="url(#frame)">`, ...marks.filter(Boolean), "</g>", legendText(legend), "</svg>",
+  ].join("\n");
+}
+
+function valueAxis(what, plot, low, high, y, grid) {
+  const values = what.axis ? what.axis.splits(plot, 1, low, high) : ticks(low, high, 6);
+  const texts = what.axis ? what.axis.values(plot, values) : values.map((value) => compact(value, 6));
+  return values.map((value, k) => `<path d="M${LEFT} ${round(y(value))}h${W - LEFT - RIGHT}" stroke="${grid}"/><text x="${LEFT - 6}" y="${round(y(value) + 4)}" text-anchor="end">${escaped(texts[k])}</text>`);
+}
+
+function legendText(legend) {
+  let at = W - RIGHT;
+  const parts = [...legend].toReversed().map(([name, sample]) => {
+    at -= Math.round(6.6 * name.length) + 4;
+    const text = `<text x="${at}" y="0">${escaped(name)}</text>`;
+    at -= 20;
+    const drawn = sample(at);
+    at -= 10;
+    return text + drawn;
+  });
+  return `<g transform="translate(0 19)">${parts.join("")}</g>`;
+}
+
+// About so many round numbers in a span.
+export function ticks(low, high, about) {
+  const rough = (high - low) / about;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = [1, 2, 5, 10].map((k) => k * power).find((size) => size >= rough) ?? 10 * power;
+  const found = [];
+  for (let k = Math.ceil(low / step); k * step <= high; k++) found.push(Number((k * step).toPrecision(12)));
+  return found;
+}
+
+function timeTicks(low, high) {
+  const rough = (high - low) / 9;
+  if (rough < STEPS[0]) return ticks(low, high, 9);
+  const step = STEPS.find((size) => size >= rough) ?? 86400 * Math.ceil(rough / 86400);
+  const found = [];
+  for (let k = Math.ceil(low / step); k * step <= high; k++) found.push(k * step);
+  return found;
+}
+
+// The same as PNG, twice as fine.
+export async function pngOf(svg) {
+  const url = URL.createObjectURL(new Blob([svg], { type: "image/svg+xml" }));
+  try {
+    const image = new Image(W, H);
+    image.src = url;
+    await image.decode();
+    const canvas = document.createElement("canvas");
+    [canvas.width, canvas.height] = [2 * W, 2 * H];
+    canvas.getContext("2d").drawImage(image, 0, 0, canvas.width, canvas.height);
+    return await new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
+  } finally {
+    URL.revokeObjectURL(url);
+  }
+}
+
+// "magnet [°C]"
+export const heading = (what) => `${what.title} ${bracketed(what.unit.replace(/^\[|\]$/g, ""))}`.trim();

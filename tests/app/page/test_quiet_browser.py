@@ -1,0 +1,97 @@
+"""What nobody looks at is not sent, and what waits for news of a twin that has ended does not wait for ever."""
+
+import pytest
+
+from app.cli.run import live_source
+from app.engine.commands import Pin, SetTuning, UseSensor
+from app.session import Page, Session
+from app.twin.twin import load_twin
+from tests.app.page.test_page import PATIENCE, browser, until  # noqa: F401  the fixture
+from tests.app.scripted import wait_for
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture
+def session():
+    twin = load_twin("motor_joint", overrides={"source.duration": "300"})
+    running = Session(twin, live_source(twin, 1e9), page=Page(0, open_browser=False))
+    running.start()
+    wait_for(lambda: running.engine.status().finished, PATIENCE)
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def page(browser, session):  # noqa: F811
+    page = browser.new_context(viewport={"width": 1400, "height": 900}).new_page()
+    page.goto(session.url, timeout=PATIENCE * 1000)
+    until(page, "window.nisus?.drawn > 0")
+    yield page
+    page.context.close()
+
+
+def lanes(session):
+    """What the server is asked for: the columns of each lane."""
+    return {lane.name: set(lane.wanted.columns) for lane in session.server._series._lanes}
+
+
+def test_hidden_charts_ask_for_nothing(page, session):
+    engine = session.engine
+    engine.submit(Pin(0))
+    engine.submit(SetTuning("Q.winding", 0.5))
+    wait_for(lambda: {"overview", "charts", "previous", "run 0", "less 0"} == lanes(session).keys(), PATIENCE)
+    page.get_by_role("tab", name="Diagnose").click()
+    wait_for(lambda: lanes(session).keys() == {"overview"}, PATIENCE)
+    # The bar of time goes on, and knows what the charts would show.
+    page.evaluate("window.nisus.view.show(10, 20)")
+    assert page.evaluate("window.nisus.charts.range") == [10, 20]
+    page.locator("#follow").click()
+    assert page.evaluate("window.nisus.charts.range[1]") == pytest.approx(300, rel=0.01)
+    drawn = page.evaluate("window.nisus.drawn")
+    page.get_by_role("tab", name="Charts").click()
+    wait_for(lambda: lanes(session).keys() == {"overview", "charts", "previous", "run 0", "less 0"}, PATIENCE)
+    until(page, f"window.nisus.drawn > {drawn} && window.nisus.revision === 1")
+
+
+def test_a_chart_that_is_not_chosen_is_not_sent(page, session):
+    wait_for(lambda: "innovation:yoke" in lanes(session).get("charts", ()), PATIENCE)
+    page.get_by_text("Charts shown").click()
+    for name in ("yoke", "magnet"):
+        page.locator("#layout li", has_text=name).last.get_by_role("checkbox").uncheck()
+    wait_for(lambda: "innovation:yoke" not in lanes(session)["charts"], PATIENCE)
+    assert "mean:magnet" not in lanes(session)["charts"] and "mean:yoke" in lanes(session)["charts"]
+
+
+def test_all_of_q_is_one_command_one_revision_and_one_undo(page, session):
+    engine = session.engine
+    before, first = engine.status().tuning, engine.revisions.runs[-1].number
+    page.get_by_role("button", name="×10", exact=True).first.click()
+    wait_for(lambda: engine.revisions.runs[-1].number == first + 1 and not engine.status().refolding, PATIENCE)
+    assert engine.tuning.q.tolist() == [pytest.approx(10 * value, rel=1e-5) for value in before.q]
+    assert {change.key for change in engine.revisions.runs[-1].changes} == {f"Q.{n.name}" for n in engine.model.noises}
+    page.locator("#undo").click()
+    wait_for(lambda: engine.revisions.runs[-1].number == first + 2 and not engine.status().refolding, PATIENCE)
+    assert engine.tuning.q.tolist() == before.q.tolist()
+    page.locator("#redo").click()
+    wait_for(lambda: engine.revisions.runs[-1].number == first + 3 and not engine.status().refolding, PATIENCE)
+    assert engine.tuning.q[0] == pytest.approx(10 * before.q[0], rel=1e-5)
+    assert page.locator("#undo").is_enabled() and page.locator("#redo").is_disabled()
+
+
+def test_what_became_of_the_readings_is_told(page, session):
+    session.engine.submit(UseSensor("yoke", False))
+    wait_for(lambda: session.engine.status().counts.get("held out"), PATIENCE)
+    page.get_by_role("tab", name="Episodes").click()
+    told = page.locator(".counts")
+    wait_for(lambda: "held out" in told.inner_text(), PATIENCE)
+    counts = session.engine.status().counts
+    words = told.inner_text().split("\n")
+    assert words[:4] == ["readings", f"{counts['readings']:,}", "used", f"{counts['used']:,}"]
+    assert words[words.index("held out") + 1] == f"{counts['held out']} (33 %)"
+
+
+def test_the_last_status_is_told_again(page):
+    page.evaluate("window.told = []; window.nisus.link.addEventListener('status', (e) => window.told.push(e.detail.t))")
+    until(page, "window.told.length >= 3")
+    assert len(set(page.evaluate("window.told"))) == 1

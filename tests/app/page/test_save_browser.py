@@ -1,0 +1,158 @@
+"""What leaves the page: pictures of charts, the track, a link to a moment, read back and compared with the engine."""
+
+import csv
+import re
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from app.cli.run import live_source
+from app.session import Page, Session
+from app.twin.twin import load_twin
+from tests.app.scripted import pull_all, wait_for
+
+pytestmark = pytest.mark.browser
+
+FLAGS = "--headless=new --no-sandbox --disable-gpu --enable-unsafe-swiftshader --no-first-run".split()
+PATIENCE = 120.0
+"""Seconds for a step on a busy machine; a test that works takes a fraction."""
+
+SVG = "{http://www.w3.org/2000/svg}"
+ESTIMATE = "#0b62c4"
+"""In the light theme; the page of this test is dark."""
+
+
+@pytest.fixture(scope="module", params=["motor_winding", "motor_joint"])
+def session(request):
+    twin = load_twin(request.param)
+    running = Session(twin, live_source(twin, 1e9), page=Page(0, open_browser=False))
+    running.start()
+    wait_for(lambda: running.engine.status().finished, PATIENCE)
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def browser(chromium):
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with sync_api.sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+        yield started.new_context(viewport={"width": 1440, "height": 900}, color_scheme="dark")
+        started.close()
+
+
+def opened(browser, address):
+    page = browser.new_page()
+    page.set_default_timeout(PATIENCE * 1000)
+    page.on("pageerror", lambda error: pytest.fail(str(error)))
+    page.goto(address)
+    wait_for(lambda: page.evaluate("window.nisus?.drawn > 0 && Boolean(window.nisus.link.status.origin)"), PATIENCE)
+    return page
+
+
+@pytest.fixture
+def page(browser, session):
+    return opened(browser, session.url)
+
+
+def saved(page, button, item, folder):
+    """The file that a menu gives, by the keyboard alone."""
+    page.get_by_role("button", name=button, exact=True).focus()
+    page.keyboard.press("Enter")
+    wanted = page.get_by_role("menuitem", name=item, exact=True)
+    while not wanted.evaluate("node => node === document.activeElement"):
+        page.keyboard.press("ArrowDown")
+    with page.expect_download() as download:
+        page.keyboard.press("Enter")
+    path = folder / download.value.suggested_filename
+    download.value.save_as(path)
+    return path
+
+
+def numbers(root, anchor):
+    """Places and texts of an axis, by how its labels are anchored."""
+    labels = [node for node in root.iter(f"{SVG}text") if node.get("text-anchor") == anchor]
+    return [(float(node.get("x")), float(node.get("y")), node.text) for node in labels]
+
+
+def test_a_chart_as_svg_is_what_the_engine_says(page, session, tmp_path):
+    model, pull = session.engine.model, pull_all(session.engine)
+    state = model.shown_states[-1]
+    label = model.label(state.name).replace("_", " ")
+    path = saved(page, f"Save the chart of {label}", "SVG", tmp_path)
+    assert re.fullmatch(rf"{session.engine.twin.name}-{state.name}-\d+s\.svg", path.name)
+    text = path.read_text(encoding="utf-8")
+    assert text.count("://") == 1 and not re.search(r"href|<script|url\((?!#frame)", text)
+    root = ElementTree.fromstring(text)
+    words = " ".join(node.text for node in root.iter(f"{SVG}text"))
+    assert f"{session.engine.twin.name}: {label} [{state.unit}]" in words
+    assert "± 2σ" in words and "estimate" in words and "truth" in words and "run 0" in words
+
+    # The curve, read by the axes' own labels, is the estimate: times to a pixel, values to a pixel.
+    (curve,) = [node for node in root.find(f"{SVG}g").findall(f"{SVG}path") if node.get("stroke") == ESTIMATE
+                and node.get("stroke-dasharray") is None]  # fmt: skip
+    points = np.array([[float(v) for v in pair] for pair in re.findall(r"[ML]([-\d.]+) ([-\d.]+)", curve.get("d"))])
+    (_, y0, v0), *_, (_, y1, v1) = numbers(root, "end")
+    values = float(v0) + (points[:, 1] + 4 - y0) * (float(v1) - float(v0)) / (y1 - y0)
+    clocks = [(x, sum(60**k * float(part) for k, part in enumerate(reversed(text.split(":")))))
+              for x, _, text in numbers(root, "middle")]  # fmt: skip
+    (x0, t0), *_, (x1, t1) = clocks
+    times = t0 + (points[:, 0] - x0) * (t1 - t0) / (x1 - x0)
+    seconds = (pull.events.t - pull.events.t[0]) * 1e-9
+    mean = pull.track.mean[:, -1]
+    a_pixel, a_moment = abs((float(v1) - float(v0)) / (y1 - y0)), (t1 - t0) / (x1 - x0)
+    inside = points[(times > seconds[0]) & (times < seconds[-1])]
+    assert len(inside) > 50
+    for time, value in zip(times, values, strict=True):
+        near = mean[np.abs(seconds - time) <= max(2 * a_moment, 16 * np.median(np.diff(np.unique(seconds))))]
+        assert near.size == 0 or near.min() - a_pixel <= value <= near.max() + a_pixel
+
+
+def test_a_picture_is_as_large_as_it_says_and_light(page, tmp_path):
+    from PIL import Image
+
+    path = saved(page, "Save the chart of NIS", "PNG", tmp_path)
+    picture = Image.open(path).convert("RGB")
+    assert picture.size == (1920, 660) and picture.getpixel((3, 3)) == (255, 255, 255)
+    assert np.sum(np.abs(np.asarray(picture).astype(int) - (11, 98, 196)).sum(axis=2) < 30) > 300
+
+
+def test_the_track_that_is_shown(page, session, tmp_path):
+    page.evaluate("window.nisus.view.show(10, 25)")
+    path = saved(page, "Save", "Track, what is shown: CSV", tmp_path)
+    assert path.name == f"{session.engine.twin.name}-run0-10-to-25s.csv"
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    t = pull_all(session.engine).events.t
+    inside = t[(t >= t[0] + 10_000_000_000) & (t <= t[0] + 25_000_000_000)]
+    assert [int(row["t_ns"]) for row in rows] == inside.tolist()
+    report = saved(page, "Save", "Report: HTML", tmp_path)
+    assert report.suffix == ".html" and "What the estimate was worth" in report.read_text(encoding="utf-8")
+
+
+def test_a_link_goes_to_the_moment_and_holds_it(browser, page, session):
+    hidden = page.evaluate("window.nisus.charts.charts.at(-1).what.key")
+    page.get_by_text("Charts shown").click()
+    page.locator("#layout li").last.get_by_role("checkbox").uncheck()
+    page.keyboard.press("Escape")
+    page.evaluate("window.nisus.view.show(12.3456789, 22.5)")
+    page.locator("body").press("l")
+    wait_for(lambda: "#twin=" in page.evaluate("location.href"))
+    address = page.evaluate("location.href")
+    assert "token" not in address and f"#twin={session.engine.twin.name}&from=1970-01-01T00:00:12.3456789Z" in address
+
+    page.evaluate("localStorage.clear()")
+    other = opened(browser, address)
+    wait_for(lambda: not other.evaluate("window.nisus.view.following"), PATIENCE)
+    since, until = other.evaluate("window.nisus.charts.range")
+    assert (since, until) == (pytest.approx(12.3456789, abs=1e-9), pytest.approx(22.5, abs=1e-8))
+    assert hidden not in other.evaluate("window.nisus.charts.layout.shown().map(([key]) => key)")
+    # It is a guest's layout: the next visit has the reader's own.
+    assert other.evaluate(f"localStorage.getItem('nisus.charts.{session.engine.twin.name}')") is None
+    other.locator("#follow").click()
+    wait_for(lambda: other.evaluate("location.hash") == "")
+
+    other.evaluate("location.hash = '#twin=elsewhere&from=1970-01-01T00:00:12Z&span=3'")
+    other.get_by_text("the link is of elsewhere").wait_for()
+    assert other.evaluate("window.nisus.view.following")
