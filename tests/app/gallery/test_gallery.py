@@ -120,8 +120,12 @@ def test_one_twin_after_another_behind_one_port(tmp_path):
         assert len(set(boots)) == len(boots) and session.session.url == url
         session.post("/api/gallery/stop", {})
         assert session.state()["running"] is None and b"Gallery" in session.client.get("/").body
-        left = {thread.name for thread in threading.enumerate() if thread.name != "MainThread"}
-        assert not {name for name in left - threads if not name.startswith(("AnyIO", "asyncio"))}
+
+        def left():
+            names = {thread.name for thread in threading.enumerate() if thread.name != "MainThread"}
+            return {name for name in names - threads if not name.startswith(("AnyIO", "asyncio"))}
+
+        wait_for(lambda: not left(), PATIENCE)
 
 
 def test_a_twin_on_the_same_bus_hears_nothing_of_the_one_before(tmp_path):
