@@ -29,6 +29,9 @@ from .nudges import Given, Nudge, nudges_of
 from .responses import Start, each, refold, respond, stand_in
 from .size import reason_against
 
+RIDDLES = ("shifted", "refused")
+"""Causes of episodes that leave open who is to blame."""
+
 MOST = 4000
 """Events since the beginning of an episode that are folded again."""
 
@@ -104,9 +107,13 @@ def _start(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, bas
     return Start(name, given, refold(name, given), first, note)
 
 
-def in_words(found: Sequence[Suspect], most: int = 3) -> str:
-    """The likeliest, and those that explain as much; nothing if no single fault explains anything."""
+def likeliest(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
+    """The likeliest, and those that explain as much; none if no single fault explains anything."""
     if not found or found[0].gain < TELLING:
-        return ""
-    alike = [suspect for suspect in found if found[0].gain - suspect.gain < ALIKE][:most]
-    return " or ".join(suspect.nudge.in_words(suspect.size) for suspect in alike)
+        return ()
+    return tuple(suspect for suspect in found if found[0].gain - suspect.gain < ALIKE)
+
+
+def in_words(found: Sequence[Suspect], most: int = 3) -> str:
+    """Those of `likeliest`, at most so many."""
+    return " or ".join(suspect.nudge.in_words(suspect.size) for suspect in likeliest(found)[:most])
