@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimators.diagnostics.evidence import OUTSIDE
-from estimators.diagnostics.sensitivity.responses import SMOOTH, stand_in
+from estimators.diagnostics.sensitivity.responses import SMOOTH, astray, stand_in
 from estimators.diagnostics.sensitivity.visibility import tests_of
 from estimators.fold import Fold
 from estimators.log import READING
@@ -101,12 +101,15 @@ class Oracle:
 
 
 def shift_of(bench: Bench, mistake: Mistake, estimator: str) -> Foretold | None:
-    """By the shift of the means; None where it cannot be told so: no filter without chance, or other times.
+    """By the shift of the means; None where it cannot be told so: no filter without chance holds it, or other times.
 
     Where the twin has a gate, what this refuses goes on to be told of, so that it is looked at with and without.
     """
     name, _ = stand_in(estimator, bench.twin.model)
     if name != estimator and name not in SMOOTH:
+        return None
+    calm = bench.fold(None, name, None).fold
+    if astray(estimator, name, calm.track.select(slice(0, calm.n))):
         return None
     seen = []
     for gate in dict.fromkeys((None, bench.twin.tuning.gate)):
