@@ -3,7 +3,7 @@
 A mistake that moves the means of the innovations moves them by as much in every log: the same noise is folded with and
 without it, by a filter without chance, and the difference is put to the criterion of the smallest visible fault
 (visibility.py). One that changes their noise, or what comes when, is rehearsed: made in other logs of the asset. Of a
-recording there is only this one: a fault is made in it with other draws, a wrong belief begins later in it. What is
+recording there is only this one: a fault is made in it at other times, a wrong belief begins later in it. What is
 found in all of them, in half the time that it lasts, is visible: the time to an alarm has an exponential tail. What is
 found in none is invisible.
 """
@@ -79,11 +79,14 @@ class Oracle:
         return self._rehearsed[key]
 
     def _rehearse(self, mistake: Mistake, estimator: str) -> Foretold:
-        if mistake.fault is None and asset_of(self.twin, 0) is None:
+        recorded = asset_of(self.twin, 0) is None
+        if mistake.fault is None and recorded:
             after = self._later(mistake, estimator)
         else:
             while len(self._benches) < REHEARSALS:
-                self._benches.append(Bench(self.twin, OTHERS + len(self._benches), self.duration))
+                k = len(self._benches)
+                begin = (k + 0.5) / REHEARSALS * 2.0 / 3.0 if recorded else 1.0 / 3.0
+                self._benches.append(Bench(self.twin, OTHERS + k, self.duration, begin))
             after = [bench.found_after(mistake, estimator) for bench in self._benches]
         if not after:
             return Foretold(CHANCE)
