@@ -68,3 +68,19 @@ def test_a_change_is_heard_beyond_what_was_normal(data):
     starts = [each.start - log.t[0] * 1e-9 for each in found if each.subject == "yoke"]
     # The recording is a little rough just before, and the onset is where that begins, most likely.
     assert starts and min(starts) == pytest.approx(900.0, abs=30.0)
+
+
+@pytest.mark.parametrize("begin", [0.0, 300.0, 600.0, 900.0, 1200.0])
+def test_a_yoke_that_reads_two_degrees_too_high_is_heard_whenever_it_begins(data, begin):
+    """Twice the smallest that `nisus check` says is seen: by the yoke, or by the tooth that it contradicts."""
+    data(*RECORDINGS["motor_bench"])
+    twin = load_twin("motor_bench")
+    log, _ = read_log(twin, None)
+    s = twin.model.sensor_names.index("yoke")
+    since = log.t[0] + begin * 1e9
+    wrong = (log.kind[: log.n] == READING) & (log.channel[: log.n] == s) & (log.t[: log.n] >= since)
+    log.value[: log.n][wrong, 0] += 2.0
+    shifted = [each for each in of_sensors(twin, log, twin.tuning) if each.cause == "shifted"]
+    assert {each.subject for each in shifted} & {"yoke", "tooth"}
+    # In hindsight, an onset may come out as far before the fault as the recording was a little rough there.
+    assert min(each.start * 1e9 for each in shifted) > since - 30e9
