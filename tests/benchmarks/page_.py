@@ -258,21 +258,20 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=10.0, help="of the part `soak`")
     given = parser.parse_args()
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+    if "crowd" in given.parts:
+        crowd(given.seconds)
     with browsing() as browser:
-        alone = {"crowd": lambda: crowd(given.seconds)}
-        seen = {
+        parts = {
             "first": lambda: first_use(browser),
             "knob": lambda: knob(browser),
             "share": lambda: share(browser, given.seconds),
             "arrival": lambda: arrival(browser, given.seconds),
             "soak": lambda: soak(browser, given.minutes),
         }
-        for part in given.parts:
-            if part in alone:
-                alone[part]()
-            elif browser is not None:
-                seen[part]()
-            print(f"  load {os.getloadavg()[0]:.1f}", flush=True)
+        for part in given.parts if browser is not None else ():
+            if part in parts:
+                parts[part]()
+                print(f"  load {os.getloadavg()[0]:.1f}", flush=True)
 
 
 if __name__ == "__main__":
