@@ -219,7 +219,7 @@ class Engine(RunningFold):
         batch = batches[0] if len(batches) == 1 else Events.concat(batches, self.model.width)
         passed = self._intake.take(batch)
         self._put(passed)
-        if self._feeder.live:
+        if self._feeder.live and not self._fold.idle:
             self._watchers.arrived(batch, passed.events)
 
     def _put(self, passed: Passed) -> None:

@@ -1,7 +1,8 @@
 """How wrong each state can be with nobody noticing, kept up to date beside the running twin and never in its way.
 
 A thread of the lowest priority takes a copy of the last events now and then, folds it again for each nudge
-(estimators/diagnostics/sensitivity), rests as long as it has worked, and leaves the bounds for whoever asks.
+(estimators/diagnostics/sensitivity), rests as long as it has worked, and leaves the bounds for whoever asks. Another
+revision is looked at soon; the bounds of one that goes on change slowly, and are computed anew only now and then.
 """
 
 from __future__ import annotations
@@ -25,6 +26,9 @@ from estimators.tuning import Tuning
 
 EVERY = 15.0
 """Seconds between two looks."""
+
+SHARE = 0.01
+"""Part of a processor that the bounds of one revision may take: dearer ones are computed less often."""
 
 MOST = 4000
 """Events that are folded again for every nudge, the last of the log."""
@@ -109,8 +113,10 @@ class IntegrityWatch:
     def look(self) -> None:
         """Compute the bounds once, if events came since the last time."""
         taken = self._take()
-        if taken is None:
-            return
+        if taken is not None:
+            self._look_at(taken)
+
+    def _look_at(self, taken: Window) -> None:
         t, known = int(taken.events.t[-1]), self._latest
         if known is not None and (known.revision, known.t) == (taken.revision, t):
             return
@@ -148,8 +154,14 @@ class IntegrityWatch:
     def _run(self) -> None:
         if sys.platform == "linux":
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOWEST)
+        due = 0.0
         while not self._stopping.wait(self._every):
-            self.look()
+            taken = self._take()
+            if taken is None or (time.monotonic() < due and self.of(taken.revision) is not None):
+                continue
+            begun = time.thread_time()
+            self._look_at(taken)
+            due = time.monotonic() + (time.thread_time() - begun) / SHARE
 
 
 def reason_against(model: StateSpaceModel, estimator: str) -> str:

@@ -79,7 +79,7 @@ def status_of(
         t=int(log.t[last]) if last >= 0 else None,
         health=health,
         since=int(log.t[last_run(track.health)]) if last >= 0 else None,
-        cause=watchers.cause(leading, health) if last >= 0 else watchers.silence.cause,
+        cause=watchers.cause(leading, health) if last >= 0 else _before(fold, watchers),
         sensors=account.of_sensors(model.sensor_names, states),
         episodes_open=len(account.lasting),
         lost=watchers.alerts.lost,
@@ -107,3 +107,10 @@ def status_of(
         awaited=awaited,
         compiling=compiling,
     )
+
+
+def _before(fold: Fold, watchers: Watchers) -> str:
+    """Why there is no row."""
+    if fold.idle:
+        return f"{fold.estimator.name} is being compiled, which happens once; readings are kept meanwhile"
+    return watchers.silence.cause

@@ -84,6 +84,30 @@ def test_the_thread_publishes_and_stops(engine):
     assert not engine._watchers.integrity.running
 
 
+def test_bounds_of_one_revision_are_computed_now_and_then_and_those_of_another_soon(engine, monkeypatch):
+    """A look that took a millisecond is followed by another in days; meanwhile events come, then another revision."""
+    monkeypatch.setattr("app.engine.integrity.SHARE", 1e-9)
+    real, revision, taken, computed = engine.last_events(), [0], [], []
+
+    def take():
+        taken.append(real._replace(revision=revision[0]))
+        taken[-1].events.t[-1] += 1
+        return taken[-1]
+
+    watch = IntegrityWatch(MODEL, take, EVERY, every=0.001)
+    compute = watch._compute
+    monkeypatch.setattr(watch, "_compute", lambda window: (computed.append(window.revision), compute(window))[1])
+    watch.start()
+    wait_for(lambda: watch.of(0) is not None)
+    seen = len(taken)
+    wait_for(lambda: len(taken) > seen + 20)
+    assert computed == [0]
+    revision[0] = 1
+    wait_for(lambda: watch.of(1) is not None)
+    watch.stop()
+    assert computed == [0, 1]
+
+
 def test_a_window_starts_at_a_snapshot_and_is_a_copy():
     log = Log(MODEL.width)
     log.extend(readings(*series(3000)))

@@ -132,7 +132,7 @@ def test_before_the_first_filter_is_compiled_the_log_grows_and_nothing_is_estima
     source.put(readings(times[:150], values[:150]))
     wait_for(lambda: engine.span()[1] == round(times[149] * 1e9))
     status, belief = fresh_status(engine), engine.belief()
-    assert row_count(engine) == 0 and status.t is None and status.health == 0
+    assert row_count(engine) == 0 and status.t is None and status.health == 0 and "kf is being compiled" in status.cause
     assert status.awaited == "kf" and engine.here() is None and engine.last_events() is None
     np.testing.assert_array_equal(belief.mean, MODEL.prior_mean)
     np.testing.assert_array_equal(np.sqrt(np.diag(belief.cov)), MODEL.prior_std)
