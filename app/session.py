@@ -160,23 +160,24 @@ class Session:
             NisusError: What `make` raises.
         """
         with self._changing:
-            before, after = self.running, None
+            before, after, stopped = self.running, None, False
             try:
                 if make is not None and not stop_first:
                     after = make()
                 if before is not None:
-                    self.running = None
                     before.stop()
-                    del before
+                stopped = True
                 if make is not None and stop_first:
                     after = make()
             finally:
-                # What its browsers see until here is the twin that stands still.
-                if after is not None:
+                # What browsers see until here is the twin that stands still.
+                if stopped:
                     self.running = after
+                    del before
+                if after is not None:
                     after.start()
                     _settle(after.gone)
-                elif self.running is None and self.door is not None:
+                elif stopped and self.door is not None:
                     self.door.show(None)
 
     def start(self) -> None:

@@ -5,8 +5,9 @@ import { post } from "./session.js";
 
 const RECORDING = ".rrd";
 
-// `twins` gives the names of those that could read a log, the likeliest first; `say` tells what goes on and what not.
-export function drops({ twins, say }) {
+// `twins` gives the names of those that could read a log, the likeliest first; `say` tells what goes on and what not,
+// `follow` how it goes with what is being opened.
+export function drops({ twins, say, follow }) {
   const over = element("div", { class: "drop-here", hidden: true }, element("p", {}, "Drop it: a recording opens for review, a log is read by a twin"));
   document.body.append(over);
   let depth = 0;
@@ -44,6 +45,7 @@ export function drops({ twins, say }) {
     if (log && !reader) return;
     const answer = await post("/api/gallery/recordings/open", log ? { name, twin: reader } : { name });
     say(answer.error ?? "", Boolean(answer.error));
+    if (!answer.error) follow();
   }
   return { take, open };
 }

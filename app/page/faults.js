@@ -90,7 +90,7 @@ export class Faults {
     const key = JSON.stringify(held);
     if (key === this.shown) return;
     this.shown = key;
-    this.list.replaceChildren(
+    this.list?.replaceChildren(
       ...held.map((fault) =>
         element("li", {}, element("span", {}, fault.text ?? words(fault.kind)), element("button", { type: "button", onclick: () => this.link.ask("ClearFault", { number: fault.number }) }, "stop")),
       ),

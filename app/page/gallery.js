@@ -17,19 +17,20 @@ $("theme").addEventListener("click", () => {
 });
 
 let shown = [];
+let told = ""; // what was wrong with a file, until something else is done
 const open = () => location.assign("/");
-const start = (name) => session.tell(post("/api/gallery/start", { twin: name }));
+const start = (name) => {
+  told = "";
+  session.tell(post("/api/gallery/start", { twin: name }));
+};
 const stop = () => session.tell(post("/api/gallery/stop", {}));
 
-// What was said last of a file, until something else is said.
-let told = "";
 function say(text, wrong = false) {
   told = wrong ? text : "";
   setText($("sending"), wrong ? "" : text);
   if (session.state) draw(session.state);
-  session.ask();
 }
-const files = drops({ twins: () => shown.filter((item) => item.log), say });
+const files = drops({ twins: () => shown.filter((item) => item.log), say, follow: () => session.ask() });
 const recordings = new Recordings($("recordings"), { open: files.open, drop: files.take, say: (text) => say(text, true) });
 
 function draw(state) {

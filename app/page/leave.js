@@ -11,7 +11,7 @@ export class Leave {
     for (const id of ["gallery", "others"]) setAttribute($(id), "href", "/gallery");
     this.boot = boot;
     this.model = model;
-    drops({ twins: () => this.twins(), say: (text, wrong) => this.say(text, wrong) });
+    drops({ twins: () => this.twins(), say: (text, wrong) => this.say(text, wrong), follow: () => this.follow() });
     const go = (where) => location.assign(where);
     this.commands = [
       ["g", "gallery: another twin", () => go("/gallery")],
@@ -33,11 +33,10 @@ export class Leave {
     $("toast").dataset.wrong = String(wrong);
     clearTimeout(this.timer);
     if (wrong) this.timer = setTimeout(() => this.say(""), READ);
-    if (!text && !wrong) this.follow();
   }
 
   follow() {
-    if (this.session) return;
+    this.session?.close();
     this.session = new Session(this.boot);
     this.session.addEventListener("state", ({ detail: { starting, failed } }) => {
       if (starting) setText($("toast"), `Starting ${starting.title} … ${Math.floor(starting.seconds)} s`);

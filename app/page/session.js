@@ -23,7 +23,7 @@ export class Session extends EventTarget {
     clearTimeout(this.timer);
     if (document.hidden || this.closed) return;
     const answer = await fetch("/api/session").catch(() => null);
-    if (answer?.ok) this.take(await answer.json());
+    if (answer?.ok && !this.closed) this.take(await answer.json());
     clearTimeout(this.timer);
     if (!this.closed) this.timer = setTimeout(() => this.ask(), this.state?.starting ? HASTE : REST);
   }

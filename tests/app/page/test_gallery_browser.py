@@ -203,7 +203,7 @@ def test_record_review_drop_and_delete(visit, tmp_path):
         kept = folder / path.name.replace(".rrd", "-2.rrd")
         wait_for(lambda: session.state()["running"]["title"] == kept.name, PATIENCE)
         assert kept.read_bytes() == path.read_bytes() and read_recording(kept).name == "motor_winding"
-        until(page, "window.nisus?.link?.status.began_as === 'recorded' && window.nisus.drawn > 0")
+        until(page, f"window.nisus?.link?.boot === '{session.settled()['boot']}' && window.nisus.drawn > 0")
         drop(page, "broken.rrd", b"RRF2 and no more")
         page.locator("#toast[data-wrong=true]").wait_for()
         assert "broken.rrd" in page.locator("#toast").inner_text()
