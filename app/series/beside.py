@@ -102,7 +102,8 @@ class Beside:
                     self._stopping.wait(PERIOD)
         except Exception as error:  # noqa: BLE001  a user's model may raise anything; the kept rows stay
             self.caught_up = False
-            self._engine.notices.report("pinned", f"run {self.run.number} goes on no further: {error}")
+            text = f"page error: run {self.run.number} goes on no further: {error}"
+            self._engine.notices.report("page error", text, "error")
 
     def _follow(self) -> bool:
         """Fold what came; whether there was so much that there may be more."""
