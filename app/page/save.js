@@ -40,7 +40,7 @@ export class Save {
 
   chart(chart, button) {
     const { what } = chart;
-    const draw = () => chartSvg(chart, [`${this.model.twin}: ${heading(what)}`, this.about(chart.span, what.note)], what.key ? this.link.episodes : []);
+    const draw = () => chartSvg(chart, [`${this.model.twin}: ${heading(what)}`, this.about(chart.span, what.note)], what.under ? this.link.episodes : []);
     this.offer(button, draw, (what.key ?? what.title).replace(/^state:/, ""));
   }
 
