@@ -20,6 +20,7 @@ from estimators.track import HEALTH_NAMES, VERDICT_NAMES, Track
 from estimators.tuning import GATE_KEYS, Tuning
 
 from ..engine.changes import difference, in_words
+from ..twin.commissioned import normal_nis
 from ..twin.twin import Twin
 from .alarms import advice
 from .calibration_lines import calibration_lines
@@ -58,7 +59,7 @@ def report(run: Reported) -> list[Part]:
     """The report, from top to bottom."""
     model = run.twin.model
     found = score(run.track, run.events, model, run.pictures, gate=run.tuning.gate)
-    charts = run_charts(model, run.events, run.track, run.episodes)
+    charts = run_charts(model, run.events, run.track, run.episodes, normal_nis(run.tuning.baseline))
     said = ("Time counts from the first event. Red shades: episodes. Extremes are kept.",)
     return [
         _head(run),
@@ -95,8 +96,10 @@ def moment(t: int) -> str:
 
 def _source(twin: Twin) -> str:
     section = twin.config.source
-    files = ", ".join(path.name for path in twin.plan.log_files or ())
-    return section.type.replace("_", " ") + (f": {files}" if files else "")
+    files = [path.name for path in twin.plan.log_files or ()]
+    given = {name: getattr(section, name, None) for name in ("interface", "channel", "seed")}
+    told = files + [f"{name} {value}" for name, value in given.items() if value is not None]
+    return f"{section.type.replace('_', ' ')}, of {twin.path.name}" + (f": {', '.join(told)}" if told else "")
 
 
 def _scores(run: Reported, found: Score) -> Part:
@@ -106,14 +109,17 @@ def _scores(run: Reported, found: Score) -> Part:
     rows: list[tuple[str, str, str]] = []
     marks: list[str] = []
     if found.nis_readings:
-        inside = found.nis_low <= found.nis <= found.nis_high
-        rows.append(("mean NIS", digits(found.nis), f"95 % bounds {found.nis_low:.3g} to {found.nis_high:.3g}"))
+        normal = normal_nis(run.tuning.baseline)
+        low, high = normal * found.nis_low, normal * found.nis_high
+        said = f"95 % bounds {low:.3g} to {high:.3g}" + ("" if normal == 1.0 else f", as commissioned: ×{normal:.2g}")
+        inside = low <= found.nis <= high
+        rows.append(("mean NIS", digits(found.nis), said))
         marks.append("good" if inside else "bad")
     fits = [(f"RMSE of {name}", name, fit) for name, fit in found.states.items()]
     fits += [(f"RMSE of {name}, held out", name, fit) for name, fit in found.held_out.items()]
-    for said, name, fit in fits:
+    for title, name, fit in fits:
         unit = "" if units[name] == "1" else units[name]
-        rows.append((said, f"{digits(fit.rmse)} {unit}".rstrip(), f"{100 * fit.coverage:.3g} % in the 95 % band"))
+        rows.append((title, f"{digits(fit.rmse)} {unit}".rstrip(), f"{100 * fit.coverage:.3g} % in the 95 % band"))
     if found.field is not None:
         rows.append(("RMSE of all cells", digits(found.field.rmse), f"{100 * found.field.coverage:.3g} % in the band"))
     judged = found.nis_readings + found.gated

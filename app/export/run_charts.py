@@ -42,14 +42,18 @@ READING, REFUSED, BOUND = _hex(LIGHT.reading), _hex(LIGHT.refused), _hex(LIGHT.b
 BOUNDS, QUIET = _hex(LIGHT.bound, "22"), _hex(LIGHT.previous)
 
 
-def run_charts(model: StateSpaceModel, events: Events, track: Track, episodes: Sequence[Episode]) -> list[str]:
-    """The charts as SVG; times count from the first event."""
-    return _Charts(model, events, track, episodes).all() if len(events) else []
+def run_charts(
+    model: StateSpaceModel, events: Events, track: Track, episodes: Sequence[Episode], normal: float = 1.0
+) -> list[str]:
+    """The charts as SVG; times count from the first event. `normal`: see `normal_nis`."""
+    return _Charts(model, events, track, episodes, normal).all() if len(events) else []
 
 
 class _Charts:
-    def __init__(self, model: StateSpaceModel, events: Events, track: Track, episodes: Sequence[Episode]) -> None:
-        self._model, self._made = model, 0
+    def __init__(
+        self, model: StateSpaceModel, events: Events, track: Track, episodes: Sequence[Episode], normal: float
+    ) -> None:
+        self._model, self._normal, self._made = model, normal, 0
         size = -(-len(events) // POINTS)
         self._columns = {
             name: column
@@ -82,6 +86,10 @@ class _Charts:
     def _state(self, j: int, state: object, readers: list[str]) -> str:
         name, unit = state.name, state.unit  # type: ignore[attr-defined]
         upper, lower, mean, truth = (self._points[f"{kind}:{name}"] for kind in ("upper", "lower", "mean", "truth"))
+        if getattr(state, "circular", False):
+            turned = mean - _turn(mean)
+            upper, lower = upper - turned, lower - turned
+            mean, truth = _unbroken(_turn(mean)), _unbroken(_turn(truth))
         layers = [Layer("± 2σ", BAND, self._x, upper, lower)] if j != self._model.mode else []
         for kind, said, color, radius, ring in (
             ("reading", "reading", READING, 1.5, False),
@@ -107,6 +115,7 @@ class _Charts:
 
     def _nis(self) -> str:
         nis, mean, low, high = (_log(self._points[name]) for name in ("nis", "nis_mean", "nis_low", "nis_high"))
+        low, high = low + np.log10(self._normal), high + np.log10(self._normal)
         middle = float(np.nanmedian((low + high) / 2)) if np.isfinite(low + high).any() else 0.0
         finite = mean[np.isfinite(mean)]
         bottom = min(middle - 1.0, float(finite.min()) - 0.15) if finite.size else middle - 1.0
@@ -148,6 +157,18 @@ class _Charts:
         return chart(
             Frame(f"chart{self._made}", title, unit, note, height, self._span, extent, marks), layers, self._shades
         )
+
+
+def _turn(angles: np.ndarray) -> np.ndarray:
+    """Angles between -π and π."""
+    return angles - 2.0 * np.pi * np.round(angles / (2.0 * np.pi))
+
+
+def _unbroken(angles: np.ndarray) -> np.ndarray:
+    """A curve of angles, which leaves the chart at one edge and comes back at the other."""
+    out = angles.copy()
+    out[1:][np.abs(np.diff(angles)) > np.pi] = np.nan
+    return out
 
 
 def _log(values: np.ndarray) -> np.ndarray:

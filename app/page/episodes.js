@@ -48,12 +48,11 @@ export class Episodes {
     const over = episodes.filter((episode) => episode.end !== null).reverse();
     const list = (items, entry) => element("ol", {}, ...items.map(entry));
     this.node.replaceChildren(
+      this.counts,
       element("h3", {}, open.length ? `Now (${open.length})` : "Now: nothing is wrong"),
       list(open, (item) => this.entry(item)),
       over.length ? element("h3", {}, `Before (${over.length})`) : "",
       list(over.slice(0, MOST), (item) => this.entry(item)),
-      element("h3", {}, "Readings"),
-      this.counts,
       element("h3", {}, "Events"),
       list(this.notices, (item) => this.event(item)),
     );

@@ -115,6 +115,7 @@ view.addEventListener("change", () => location.hash && !arriving && history.repl
 
 const turn = (name) => middle.show(middle.chosen === name ? "charts-panel" : name);
 const xy = new XY($("xy"), model, link, view, charts);
+xy.saving = saving;
 let stages = false;
 middle.show("charts-panel");
 side.shown = (name) => {

@@ -2,7 +2,7 @@
 // which opens beside the button that was pressed.
 
 import { element } from "./dom.js";
-import { clock } from "./format.js";
+import { clock, words } from "./format.js";
 import { link as momentLink } from "./moment.js";
 import { chartSvg, heading, pngOf } from "./svg_chart.js";
 
@@ -39,10 +39,20 @@ export class Save {
   }
 
   chart(chart, button) {
-    this.open(button, [
-      ["PNG", "A picture of this chart as it is", () => this.picture(chart, "png")],
-      ["SVG", "A drawing of this chart as it is", () => this.picture(chart, "svg")],
-    ]);
+    const { what } = chart;
+    const draw = () => chartSvg(chart, [`${this.model.twin}: ${heading(what)}`, this.about(chart.span, what.note)], what.under ? this.link.episodes : []);
+    this.offer(button, draw, (what.key ?? what.title).replace(/^state:/, ""));
+  }
+
+  xy(xy, button) {
+    const [across, up] = xy.pair;
+    this.offer(button, () => xy.svg([`${this.model.twin}: ${words(up)} over ${words(across)}`, this.about(this.charts.range)]), `${up}-over-${across}`);
+  }
+
+  // A chart as a picture or a drawing; draw() gives the text of the SVG.
+  offer(button, draw, name) {
+    const save = (kind, title) => [kind.toUpperCase(), title, () => this.picture(draw(), name, kind)];
+    this.open(button, [save("png", "A picture of this chart as it is"), save("svg", "A drawing of this chart as it is")]);
   }
 
   run(button) {
@@ -65,20 +75,18 @@ export class Save {
     return Number(this.link.status.origin ?? 0) + Math.min(this.charts.range[1], this.charts.newest) * 1e9;
   }
 
-  async picture(chart, kind) {
-    const svg = chartSvg(chart, [`${this.model.twin}: ${heading(chart.what)}`, this.about(chart)], chart.what.key ? this.link.episodes : []);
+  async picture(svg, name, kind) {
     const blob = kind === "svg" ? new Blob([svg], { type: "image/svg+xml" }) : await pngOf(svg);
-    download(blob, `${this.model.twin}-${(chart.what.key ?? chart.what.title).replace(/^state:/, "").replace(/[^\p{L}\p{N}]+/gu, "_")}-${this.stamp()}.${kind}`);
+    download(blob, `${this.model.twin}-${name.replace(/[^\p{L}\p{N}]+/gu, "_")}-${this.stamp()}.${kind}`);
   }
 
   // What filter, which run, of when.
-  about(chart) {
+  about([since, until], note) {
     const { status } = this.link;
     const title = this.model.estimators.find((entry) => entry.name === status.estimator)?.title ?? status.estimator;
-    const [since, until] = chart.span;
     const origin = Number(status.origin ?? 0);
     const date = origin > CENTURY ? `, 0:00 is ${new Date(origin / 1e6).toISOString().replace("T", " ").slice(0, 19)} UTC` : "";
-    return `${title}, run ${status.revision}, ${clock(since, 1)} to ${clock(until, 1)}${date}${chart.what.note ? `; ${chart.what.note}` : ""}`;
+    return `${title}, run ${status.revision}, ${clock(since, 1)} to ${clock(until, 1)}${date}${note ? `; ${note}` : ""}`;
   }
 
   stamp() {

@@ -259,9 +259,11 @@ function fan(whatif, state) {
   const future = ["upper2", "lower2", "upper1", "lower1", "mean"];
   const first = past.length + 1; // series of the fan's outer edge
   return {
+    key: `whatif:${state.name}`,
     title: state.label,
     unit: bracketed(state.unit),
     note: state.rows.length ? null : "not measured",
+    names: { band: "± 1σ, ± 2σ" },
     weight: state.rows.length ? 1 : 1.4,
     sync: "future",
     series: [

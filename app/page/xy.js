@@ -1,13 +1,15 @@
 // Any two states against each other: where the estimate came from, its ellipses of 1 and 2 σ, particles or sigma points.
 
-import { colour } from "./chart.js";
 import { element } from "./dom.js";
 import { bracketed, compact, words } from "./format.js";
 import { Lane } from "./lane.js";
+import { CanvasPen, SvgPen } from "./pens.js";
 import { within } from "./ranges.js";
+import { lightColours, ticks } from "./svg_chart.js";
 
 const ROOM = { left: 46, right: 10, top: 8, bottom: 34 };
 const POINTS = 600;
+const FILE = [640, 480]; // px of a file's drawing
 
 export class XY {
   constructor(node, model, link, view, charts) {
@@ -23,10 +25,11 @@ export class XY {
       select.value = this.pair[k];
       return select;
     };
+    const save = element("button", { type: "button", class: "save", title: "Save this chart", "aria-label": "Save the chart of two states", "aria-haspopup": "menu", onclick: () => this.saving.xy(this, save) }, "⤓");
     this.canvas = element("canvas", { role: "img", "aria-label": "Two states against each other" });
     this.text = element("p", { class: "faint" });
     if (names.length < 2) return node.replaceChildren(element("p", { class: "faint" }, "This twin has one state."));
-    node.replaceChildren(element("header", {}, choice(1, "Upwards"), element("span", {}, " over "), choice(0, "To the right")), this.canvas, this.text);
+    node.replaceChildren(element("header", {}, choice(1, "Upwards"), element("span", {}, " over "), choice(0, "To the right"), save), this.canvas, this.text);
     link.addEventListener("frames", () => this.draw());
     link.addEventListener("belief", (event) => {
       this.belief = event.detail;
@@ -71,6 +74,19 @@ export class XY {
     canvas.height = height * devicePixelRatio;
     const ctx = canvas.getContext("2d");
     ctx.scale(devicePixelRatio, devicePixelRatio);
+    const belief = this.paint(new CanvasPen(ctx), width, height);
+    this.text.textContent = belief ? `correlation ${compact(belief.cov[1] / Math.sqrt(belief.cov[0] * belief.cov[2]), 2)}` : "ellipses are those of the newest row; follow to see them";
+  }
+
+  // As a file.
+  svg(lines) {
+    const pen = new SvgPen(lightColours());
+    this.paint(pen, ...FILE);
+    return pen.file(...FILE, lines);
+  }
+
+  // What is shown, with any pen; the belief that was drawn, or null.
+  paint(pen, width, height) {
     const [from, to] = within(this.lane.x, this.charts.range);
     const [mx, tx, my, ty] = this.pair.flatMap((name) => [this.lane.column(`mean:${name}`), this.lane.column(`truth:${name}`)]);
     const belief = this.view.following ? this.belief : null;
@@ -84,14 +100,14 @@ export class XY {
       if ((tx[k] !== null || ty[k] !== null) && lastX !== null && lastY !== null) truth.push([lastX, lastY]);
     }
     const ellipses = belief ? [1, 2].map((size) => ellipse(belief, size)) : [];
-    const axes = new Axes(ctx, width, height, [...places, ...truth, ...(ellipses[1] ?? [])], this.model.states, this.pair);
+    const axes = new Axes(pen, width, height, [...places, ...truth, ...(ellipses[1] ?? [])], this.model.states, this.pair);
     axes.frame();
     axes.dots(belief?.points ?? [], "quiet", 1.5);
     axes.curve(truth, "truth", 1.5, [5, 3]);
     axes.curve(places, "estimate", 1.5);
     for (const outline of ellipses) axes.curve(outline, "estimate", 1.25);
     if (belief) axes.dots([belief.mean], "estimate", 3.5);
-    this.text.textContent = belief ? `correlation ${compact(belief.cov[1] / Math.sqrt(belief.cov[0] * belief.cov[2]), 2)}` : "ellipses are those of the newest row; follow to see them";
+    return belief;
   }
 }
 
@@ -111,8 +127,8 @@ function ellipse({ mean, cov }, size) {
 }
 
 class Axes {
-  constructor(ctx, width, height, points, states, pair) {
-    Object.assign(this, { ctx, width, height });
+  constructor(pen, width, height, points, states, pair) {
+    Object.assign(this, { pen, width, height });
     this.labels = pair.map((name) => {
       const state = states.find((item) => item.name === name);
       return `${words(state.label)} ${bracketed(state.unit)}`.trim();
@@ -146,72 +162,27 @@ class Axes {
   }
 
   frame() {
-    const { ctx } = this;
-    ctx.font = "11px system-ui, sans-serif";
-    ctx.lineWidth = 1;
-    ctx.strokeStyle = colour("grid");
-    ctx.fillStyle = colour("faint");
+    const [right, bottom] = [this.width - ROOM.right, this.height - ROOM.bottom];
     for (const value of ticks(...this.spans[0], 4)) {
       const [x] = this.place([value, 0]);
-      this.segment(x, ROOM.top, x, this.height - ROOM.bottom);
-      ctx.textAlign = "center";
-      ctx.fillText(compact(value), x, this.height - ROOM.bottom + 13);
+      this.pen.curve([[x, ROOM.top], [x, bottom]], "grid");
+      this.pen.text(compact(value), [x, bottom + 13]);
     }
     for (const value of ticks(...this.spans[1], 5)) {
       const [, y] = this.place([0, value]);
-      this.segment(ROOM.left, y, this.width - ROOM.right, y);
-      ctx.textAlign = "right";
-      ctx.fillText(compact(value), ROOM.left - 5, y + 4);
+      this.pen.curve([[ROOM.left, y], [right, y]], "grid");
+      this.pen.text(compact(value), [ROOM.left - 5, y + 4], "right");
     }
-    ctx.textAlign = "center";
-    ctx.fillText(this.labels[0], (ROOM.left + this.width - ROOM.right) / 2, this.height - 5);
-    ctx.save();
-    ctx.translate(10, (ROOM.top + this.height - ROOM.bottom) / 2);
-    ctx.rotate(-Math.PI / 2);
-    ctx.fillText(this.labels[1], 0, 0);
-    ctx.restore();
+    this.pen.text(this.labels[0], [(ROOM.left + right) / 2, this.height - 5]);
+    this.pen.text(this.labels[1], [10, (ROOM.top + bottom) / 2], "center", true);
   }
 
-  segment(x0, y0, x1, y1) {
-    this.ctx.beginPath();
-    this.ctx.moveTo(x0, y0);
-    this.ctx.lineTo(x1, y1);
-    this.ctx.stroke();
+  curve(points, tone, width, dash) {
+    this.pen.curve(points.map((point) => this.place(point)), tone, width, dash);
   }
 
-  curve(points, name, width, dash = []) {
-    const { ctx } = this;
-    ctx.strokeStyle = colour(name);
-    ctx.lineWidth = width;
-    ctx.setLineDash(dash);
-    ctx.beginPath();
-    for (const point of points) ctx.lineTo(...this.place(point));
-    ctx.stroke();
-    ctx.setLineDash([]);
+  dots(points, tone, radius) {
+    const frame = [ROOM.left, ROOM.top, this.width - ROOM.left - ROOM.right, this.height - ROOM.top - ROOM.bottom];
+    this.pen.dots(points.map((point) => this.place(point)), tone, radius, frame);
   }
-
-  dots(points, name, radius) {
-    const { ctx } = this;
-    ctx.save();
-    ctx.beginPath();
-    ctx.rect(ROOM.left, ROOM.top, this.width - ROOM.left - ROOM.right, this.height - ROOM.top - ROOM.bottom);
-    ctx.clip();
-    ctx.fillStyle = colour(name);
-    for (const point of points) {
-      ctx.beginPath();
-      ctx.arc(...this.place(point), radius, 0, 2 * Math.PI);
-      ctx.fill();
-    }
-    ctx.restore();
-  }
-}
-
-// About so many round numbers in a span.
-function ticks(low, high, about) {
-  const rough = (high - low) / about;
-  const power = 10 ** Math.floor(Math.log10(rough));
-  const step = [1, 2, 5, 10].map((k) => k * power).find((size) => size >= rough) ?? 10 * power;
-  const found = [];
-  for (let value = Math.ceil(low / step) * step; value <= high; value += step) found.push(Number(value.toPrecision(12)));
-  return found;
 }

@@ -27,7 +27,7 @@ class DifferenceRun:
         """See `Run`. Another revision runs: all rows are others."""
         revision = self._engine.revisions.runs[-1].number
         if revision != self.revision:
-            self._kept = KeptRun(self._less(revision), self._columns)
+            self._kept = KeptRun(replace(less(self.of, self._engine), revision=revision), self._columns)
             self.revision = revision
             self.generation += 1
         self._kept.sync(columns)
@@ -40,18 +40,19 @@ class DifferenceRun:
         """See `Run`."""
         return self._kept.groups(size, start, stop, columns)
 
-    def _less(self, revision: int) -> Pull:
-        pull = self.of
-        mean = np.full_like(pull.track.mean, np.nan)
-        for start in range(0, len(mean), ROWS):
-            stop = min(start + ROWS, len(mean))
-            live = self._engine.rows(pull.first + start, pull.first + stop)
-            at = live.first - pull.first
-            rows = slice(at, at + len(live.events))
-            # The log may have begun again: a row of the same number at another time is another.
-            same = (live.events.t == pull.events.t[rows]) & estimated_rows(live.track)
-            mean[rows] = np.where(same[:, None], pull.track.mean[rows] - live.track.mean, np.nan)
-        for j, state in enumerate(self._engine.model.shown_states):
-            if state.circular:
-                mean[:, j] = (mean[:, j] + np.pi) % (2.0 * np.pi) - np.pi
-        return replace(pull, revision=revision, track=pull.track._replace(mean=mean))
+
+def less(pull: Pull, engine: Running) -> Pull:
+    """Rows with means less those of what runs, NaN where that has no such row."""
+    mean = np.full_like(pull.track.mean, np.nan)
+    for start in range(0, len(mean), ROWS):
+        stop = min(start + ROWS, len(mean))
+        live = engine.rows(pull.first + start, pull.first + stop)
+        at = live.first - pull.first
+        rows = slice(at, at + len(live.events))
+        # The log may have begun again: a row of the same number at another time is another.
+        same = (live.events.t == pull.events.t[rows]) & estimated_rows(live.track)
+        mean[rows] = np.where(same[:, None], pull.track.mean[rows] - live.track.mean, np.nan)
+    for j, state in enumerate(engine.model.shown_states):
+        if state.circular:
+            mean[:, j] = (mean[:, j] + np.pi) % (2.0 * np.pi) - np.pi
+    return replace(pull, track=pull.track._replace(mean=mean))

@@ -33,7 +33,7 @@ class Run(Protocol):
         """Groups of `size` rows with numbers from `start` to before `stop`."""
 
 
-class _Levels:
+class Levels:
     """The columns that somebody asked for, and their pyramid."""
 
     def __init__(self, columns: dict[str, Column]) -> None:
@@ -49,18 +49,22 @@ class _Levels:
         return bool(new)
 
     def clear(self) -> None:
+        """Forget the rows."""
         self.pyramid = Pyramid(len(self.asked))
 
     def take(self, pull: Pull) -> None:
+        """Take rows that are new or rewritten."""
         self.pyramid.update(pull.first, pull.events.t, self.values(pull, self.asked))
 
     def values(self, pull: Pull, names: list[str]) -> np.ndarray:
+        """Columns of rows, (n, columns)."""
         out = np.empty((len(pull.events), len(names)))
         for k, name in enumerate(names):
             out[:, k] = self.known[name].values(pull.events, pull.track)
         return out
 
     def part(self, size: int, start: int, stop: int, names: list[str]) -> Groups:
+        """Groups of `size` rows, with numbers from `start` to before `stop`."""
         groups = self.pyramid.level(size).part(start, stop)
         picked = [self.asked.index(name) for name in names]
         return groups._replace(low=groups.low[:, picked], high=groups.high[:, picked], rising=groups.rising[:, picked])
@@ -70,7 +74,7 @@ class LiveRun:
     """What is running now. Not for several threads at once."""
 
     def __init__(self, engine: Running, columns: dict[str, Column]) -> None:
-        self._engine, self._levels = engine, _Levels(columns)
+        self._engine, self._levels = engine, Levels(columns)
         self._cursor: Cursor = engine.cursor()
         self.revision = -1
         self.generation = 0
@@ -119,7 +123,7 @@ class KeptRun:
     """A revision that was kept whole: the previous one, or one that was pinned. Its arrays never change."""
 
     def __init__(self, pull: Pull, columns: dict[str, Column]) -> None:
-        self.of, self._levels = pull, _Levels(columns)
+        self.of, self._levels = pull, Levels(columns)
         self.revision, self.generation = pull.revision, 0
         self.end = pull.first + len(pull.events)
 

@@ -7,12 +7,16 @@ from collections.abc import Iterable
 
 from ..engine.interface import Running
 from ..engine.outputs import Pull
+from .beside import Beside, BesideRun
 from .columns import columns_of
 from .difference import DifferenceRun
 from .lane import Lane
 from .run import KeptRun, LiveRun, Run
 
 PREVIOUS = "previous"
+
+ALL = 2**62
+"""Later than every event."""
 
 LESS = "difference:"
 """Before the name of a revision: its means less those of what runs."""
@@ -26,7 +30,8 @@ class Series:
         self.columns = columns_of(engine.model)
         self._lock = threading.Lock()
         self._live: LiveRun | None = None
-        self._kept: dict[str, KeptRun | DifferenceRun] = {}
+        self._kept: dict[str, KeptRun | DifferenceRun | BesideRun] = {}
+        self._besides: dict[str, Beside] = {}
         self._lanes: set[Lane] = set()
         self._origin: int | None = None
 
@@ -52,6 +57,7 @@ class Series:
             self._lanes.discard(lane)
             if not self._lanes:
                 self._kept.clear()
+                self._leave(set())
                 if self._live is not None:
                     self._live.close()
                     self._live = None
@@ -65,6 +71,7 @@ class Series:
             asked = [lane for lane in lanes if lane in self._lanes]
             looked_at = {lane.wanted.run for lane in self._lanes}
             self._kept = {name: run for name, run in self._kept.items() if name in looked_at}
+            self._leave({name.removeprefix(LESS) for name in looked_at})
             self._sync({column for lane in asked if lane.wanted.run == "live" for column in lane.wanted.columns})
             frames = [frame for lane in asked if (frame := self._frame(lane, origin, newest)) is not None]
             return frames
@@ -86,6 +93,10 @@ class Series:
         if run is None:
             return None
         run.sync(lane.wanted.columns)
+        if isinstance(run, BesideRun):
+            for other in self._lanes:
+                if other.wanted.run == name:
+                    other.changed(run.changed)
         return lane.frame(run, origin, newest)
 
     def _find(self, name: str) -> Run | None:
@@ -95,6 +106,14 @@ class Series:
         if pull is None:
             self._kept.pop(name, None)
             return None
+        beside = self._beside(name.removeprefix(LESS), pull)
+        if beside is not None and beside.caught_up:
+            if not isinstance(kept, BesideRun) or kept.beside is not beside:
+                kept = BesideRun(beside, self.columns, self._engine if name.startswith(LESS) else None)
+                self._kept[name] = kept
+            return kept
+        if isinstance(kept, BesideRun):
+            kept = None
         if kept is None or kept.of is not pull:
             if name.startswith(LESS):
                 kept = DifferenceRun(pull, self.columns, self._engine)
@@ -102,6 +121,18 @@ class Series:
                 kept = KeptRun(pull, self.columns)
             self._kept[name] = kept
         return kept
+
+    def _beside(self, name: str, pull: Pull) -> Beside | None:
+        """The fold of a pinned run that goes on; None while there is nothing that its kept rows lack."""
+        found = self._besides.get(name)
+        if found is None and name != PREVIOUS and self._engine.index_at(ALL) > pull.first + len(pull.events):
+            found = self._besides[name] = Beside(self._engine, self._engine.revisions.find(int(name)))
+        return found
+
+    def _leave(self, looked_at: set[str]) -> None:
+        """End the folds of pinned runs at which nobody looks."""
+        for name in self._besides.keys() - looked_at:
+            self._besides.pop(name).stop()
 
     def _pulled(self, name: str) -> Pull | None:
         if name == PREVIOUS:

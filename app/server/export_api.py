@@ -74,8 +74,10 @@ class ExportApi:
         about = [("run", f"{run.number}" + (f", {run.name}" if run.name else "") + f": {what_changed(run)}")]
         if run.note:
             about.append(("note", run.note))
+        # Of what runs, with who is to blame, as the page says it.
+        episodes = engine.episodes() if run is engine.revisions.runs[-1] else taken.episodes()
         said = Reported(
-            engine.twin, run.estimator, run.tuning, pull.events, pull.track, pull.pictures, taken.episodes(),
+            engine.twin, run.estimator, run.tuning, pull.events, pull.track, pull.pictures, episodes,
             taken.marginal, tuple(about), bounds, _others(self._scores),
         )  # fmt: skip
         return taken, as_html(f"{engine.twin.name}, run {run.number}", report(said))

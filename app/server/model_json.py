@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
 from estimators.estimator import Estimator, Option
 from estimators.registry import ESTIMATORS, unfit
 
 from ..drawing.direct_readings import observed
 from ..engine.interface import Running
 from ..series.columns import columns_of, rows_of
+from ..twin.commissioned import normal_nis
 
 
 def model_json(engine: Running) -> dict[str, Any]:
@@ -77,19 +76,11 @@ def model_json(engine: Running) -> dict[str, Any]:
             }
             for name, entry in ESTIMATORS.items()
         ],
-        "nis_normal": _normal_nis(twin.tuning.baseline),
+        "nis_normal": normal_nis(twin.tuning.baseline),
         "window": view.window,
         "scene": view.scene.kind,
         "columns": list(columns_of(model)),
     }
-
-
-def _normal_nis(baseline: np.ndarray | None) -> float:
-    """How many times the NIS that the filter expects was normal when the twin was commissioned; 1 if it was not.
-
-    E e² of an innovation of bias b and scale s is b² + s², of all rows alike.
-    """
-    return 1.0 if baseline is None else float(np.mean(baseline[:, 0] ** 2 + baseline[:, 1] ** 2))
 
 
 def _option(entry: Estimator, option: Option, engine: Running) -> dict[str, Any]:

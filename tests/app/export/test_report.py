@@ -51,7 +51,7 @@ def test_it_says_who_made_it_when_and_of_what(made):
     html, _ = made
     assert re.search(r"Nisus [\d.]+, \d\d \w+ \d{4}, \d\d:\d\d UTC", html)
     text = " ".join(parsed(html).text)
-    assert "Kalman filter (kf)" in text and "simulator" in text and "Q.rate=0.002" in text
+    assert "Kalman filter (kf)" in text and "simulator, of lying.yaml: seed 5" in text and "Q.rate=0.002" in text
     assert text.count("Time counts from the first event") == 1
 
 

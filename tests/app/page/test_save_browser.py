@@ -118,6 +118,37 @@ def test_a_picture_is_as_large_as_it_says_and_light(page, tmp_path):
     assert np.sum(np.abs(np.asarray(picture).astype(int) - (11, 98, 196)).sum(axis=2) < 30) > 300
 
 
+def test_two_states_against_each_other(page, session, tmp_path):
+    """The end of the drawn curve is where the mean of the last rows is, by the labels of both axes."""
+    page.get_by_role("tab", name="XY").click()
+    wait_for(lambda: page.evaluate("document.querySelector('#xy canvas').width > 300"), PATIENCE)
+    page.evaluate("window.told = 0; window.nisus.link.addEventListener('belief', () => (window.told += 1))")
+    page.evaluate("window.nisus.view.follow(null)")
+    wait_for(lambda: page.evaluate("window.told > 0"), PATIENCE)
+    path = saved(page, "Save the chart of two states", "SVG", tmp_path)
+    root = ElementTree.fromstring(path.read_text(encoding="utf-8"))
+    curve, *outlines = [node for node in root.find(f"{SVG}g").findall(f"{SVG}path") if node.get("stroke") == ESTIMATE]
+    assert len(outlines) == 2
+    x, y = (float(v) for v in re.findall(r"[ML]([-\d.]+) ([-\d.]+)", curve.get("d"))[-1])
+    across, up = page.evaluate("[...document.querySelectorAll('#xy select')].map((s) => s.value).reverse()")
+    names = [state.name for state in session.engine.model.shown_states]
+    last = pull_all(session.engine).track.mean[-64:]  # of a group of rows the extremes are drawn
+    bottom = [(a, float(t)) for a, _, t in numbers_of(root, "middle")]
+    left = [(b - 4, float(t)) for _, b, t in numbers_of(root, "end")]
+    for place, axis, name in ((x, bottom, across), (y, left, up)):
+        (p0, v0), *_, (p1, v1) = axis
+        value, a_pixel = v0 + (place - p0) * (v1 - v0) / (p1 - p0), abs((v1 - v0) / (p1 - p0))
+        rows = last[:, names.index(name)]
+        assert rows.min() - a_pixel <= value <= rows.max() + a_pixel
+
+
+def numbers_of(root, anchor):
+    """As `numbers`, of labels that are numbers."""
+    labels = [node for node in root.iter(f"{SVG}text") if node.get("text-anchor") == anchor and node.get("x")]
+    found = [node for node in labels if re.fullmatch(r"-?[\d.e-]+", node.text)]
+    return [(float(node.get("x")), float(node.get("y")), node.text) for node in found]
+
+
 def test_the_track_that_is_shown(page, session, tmp_path):
     page.evaluate("window.nisus.view.show(10, 25)")
     path = saved(page, "Save", "Track, what is shown: CSV", tmp_path)

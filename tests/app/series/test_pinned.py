@@ -25,7 +25,7 @@ def values(n, seed=8):
 
 
 @pytest.fixture
-def engine():
+def source_and_engine():
     source = Scripted()
     running = Engine(twin(), lambda report: source)
     running.start()
@@ -33,8 +33,13 @@ def engine():
     wait_for(lambda: row_count(running) == N)
     carry_out(running, commands.Pin(0))
     carry_out(running, commands.SetTuning("Q.rate", 0.1))
-    yield running
+    yield source, running
     running.stop()
+
+
+@pytest.fixture
+def engine(source_and_engine):
+    return source_and_engine[1]
 
 
 def mean(tuning):
@@ -92,3 +97,88 @@ def test_nothing_is_held_of_a_run_that_nobody_looks_at(engine):
     assert points(series, "0") is not None and "0" in series._kept
     series.frames([live])
     assert series._kept == {}
+
+
+def longer(n):
+    """The readings of the fixture, and more of them."""
+    (t, y), (later, rest) = values(N), values(n - N, seed=9)
+    return np.concatenate((t, t[-1] + later)), np.concatenate((y, rest))
+
+
+def all_of(tuning, n, late=()):
+    log = Log(MODEL.width)
+    log.extend(readings(*longer(n)))
+    for t, value in late:
+        log.extend(readings([t], [value]))
+    return fold("kf", MODEL, tuning, log).mean[:, 0]
+
+
+def said(source, engine, n):
+    """The asset goes on, up to n readings."""
+    t, y = longer(n)
+    source.put(readings(t[N:], y[N:]))
+    wait_for(lambda: row_count(engine) == n)
+
+
+class Watched:
+    """A lane, and what its browser has."""
+
+    def __init__(self, engine, run, points=2000):
+        self.series = Series(engine)
+        self.lane = Lane("pinned", Wanted((MEAN,), run=run, points=points), self.series.columns)
+        self.browser = Browser()
+        self.series.open(self.lane)
+
+    def until(self, there):
+        """Take frames until the browser has what is asked; the values then."""
+
+        def look():
+            for frame in self.series.frames([self.lane]):
+                self.browser.take(frame)
+            return there(self.browser)
+
+        wait_for(look)
+        return np.asarray(self.browser.values[MEAN])
+
+    def close(self):
+        self.series.close(self.lane)
+        assert not self.series._besides
+
+
+@pytest.mark.parametrize("run", ["0", "difference:0"])
+def test_a_pinned_run_goes_on_with_the_asset(source_and_engine, run):
+    """Readings that come after it gave way, and a late one, are folded as its own settings say."""
+    source, engine = source_and_engine
+    n = N + 300
+
+    def expected(late=()):
+        own = all_of(FIRST, n, late)
+        return own if run == "0" else own - all_of(FIRST.set("Q.rate", 0.1), n, late)
+
+    watched = Watched(engine, run)
+    assert watched.until(lambda browser: len(browser.x)).size == N
+    said(source, engine, n)
+    shown = watched.until(lambda browser: len(browser.x) == n)
+    np.testing.assert_allclose(shown, expected(), atol=2e-5)
+    late = (float(longer(n)[0][-6]) + 0.05, 55.0)
+    source.put(readings([late[0]], [late[1]]))
+    shown = watched.until(lambda browser: len(browser.x) == n + 1)
+    np.testing.assert_allclose(shown, expected([late]), atol=2e-5)
+    watched.close()
+
+
+def test_few_points_of_one_that_goes_on_have_its_extremes(source_and_engine):
+    source, engine = source_and_engine
+    watched = Watched(engine, "0", points=50)
+    said(source, engine, N + 300)
+    shown = watched.until(lambda browser: len(browser.x) and browser.x[-1] == pytest.approx((N + 299) * 0.1))
+    expected = all_of(FIRST, N + 300)
+    assert len(shown) < 300 and np.nanmax(shown) == pytest.approx(expected.max(), abs=2e-5)
+    watched.close()
+
+
+def test_while_nothing_comes_nothing_is_folded(engine):
+    watched = Watched(engine, "0")
+    assert watched.until(lambda browser: len(browser.x)).size == N
+    assert not watched.series._besides
+    watched.close()
