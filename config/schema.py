@@ -168,9 +168,10 @@ class MaintenanceSection(Section):
 class SceneSection(Section):
     """The three-dimensional scene."""
 
-    kind: Literal["belief", "vehicle", "motor", "battery"] = "belief"
+    kind: Literal["belief", "vehicle", "motor", "battery", "gripper"] = "belief"
     """belief: the estimate as a point with its 1- and 2-sigma ellipsoids, over `axes`; every twin has it. vehicle: a
-    body on a plane. motor: one cut open, in the colours of its temperatures. battery: its cells."""
+    body on a plane. motor: one cut open, in the colours of its temperatures. battery: its cells. gripper: its fingers
+    about a part."""
     axes: Annotated[tuple[Text, ...], Field(min_length=1, max_length=3)] | None = None
     """belief: the states along x, y and z at first. Default: the first three."""
     parts: dict[Literal["winding", "tooth", "yoke", "magnet"], Text] | None = None
@@ -179,18 +180,30 @@ class SceneSection(Section):
     """battery: the state of charge of each cell, from 0 to 1."""
     temperature: Annotated[tuple[Text, ...], Field(max_length=24)] = ()
     """battery: the temperature of each cell. Default: cells have no colour."""
+    states: dict[Literal["surface", "depth", "contact"], Text] | None = None
+    """gripper: which state is where the part begins, in mm, how far the finger is past that, and whether they touch."""
     position: tuple[Text, Text] | None = None
     """vehicle: the states of the position to the east and to the north."""
     heading: Text | None = None
     """vehicle: the state of the heading, in radians from east to the left. Default: the direction of travel."""
     walls: tuple[Annotated[tuple[tuple[float, float], ...], Field(min_length=2)], ...] = ()
     """vehicle: what it moves among, as lines of points [east, north] in metres. Default: nothing."""
+    size: tuple[Positive, Positive, Positive] = (4.4, 1.8, 1.45)
+    """vehicle: its length, width and height in metres. Default: those of a car."""
+    beams: dict[Text, Annotated[tuple[Number, ...], Field(min_length=1)]] = {}
+    """vehicle: sensors that tell distances along beams, with the angle of each row's beam to the left of the heading,
+    in radians. Default: none."""
+    beacons: dict[Text, tuple[Text, Text]] = {}
+    """vehicle: sensors that tell the distance to a beacon, with the parameters, or states, that say where it stands to
+    the east and to the north. Default: none."""
 
     @model_validator(mode="after")
     def _complete(self) -> SceneSection:
-        needed = {"vehicle": "position", "motor": "parts", "battery": "charge"}.get(self.kind)
+        needed = {"vehicle": "position", "motor": "parts", "battery": "charge", "gripper": "states"}.get(self.kind)
         if needed is not None and not getattr(self, needed):
             raise PydanticCustomError("neither", "is a {kind} and has no {keys}", {"kind": self.kind, "keys": needed})
+        if self.kind == "gripper" and len(self.states or ()) < 3:
+            raise PydanticCustomError("neither", "is a gripper and has not all of surface, depth and contact", {})
         if self.temperature and len(self.temperature) != len(self.charge or ()):
             raise PydanticCustomError("neither", "has not as many temperatures as states of charge", {})
         return self

@@ -67,6 +67,13 @@ def observed(model: StateSpaceModel) -> list[Observed]:
     return found
 
 
+def expected(model: StateSpaceModel, sensor: Sensor, x: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """What a sensor should read, h(x, u, p) with the inputs' defaults, shape (ny,); NaN where that cannot be said."""
+    out = np.full(len(sensor.rows), np.nan)
+    _expect(model, sensor, x, np.array([item.default for item in model.inputs]), p, out)
+    return out
+
+
 def _expect(
     model: StateSpaceModel, sensor: Sensor, x: np.ndarray, u: np.ndarray, p: np.ndarray, out: np.ndarray
 ) -> None:

@@ -86,3 +86,11 @@ def tick_text(value: float, step: float) -> str:
         return f"{value:.4g}"
     decimals = max(0, int(-np.floor(np.log10(step) + 1e-9)))
     return f"{value + 0.0:.{decimals}f}"
+
+
+def with_deviation(value: float, deviation: float) -> str:
+    """A value with its deviation, to one decimal or two digits of the deviation, as the page writes them."""
+    if not deviation > 0 or not np.isfinite(deviation):
+        return f"{value:.4g}"
+    decimals = min(8, max(1, int(1 - np.floor(np.log10(deviation)))))
+    return f"{value + 0.0:.{decimals}f} ± {deviation:.{decimals}f}"

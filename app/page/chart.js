@@ -1,6 +1,7 @@
 // One chart: a canvas of uPlot's with a line above it that says what it is and what it reads at the cursor.
 
 import { element, setText } from "./dom.js";
+import { compact } from "./format.js";
 import { within } from "./ranges.js";
 
 export const GAP = 52; // px for the labels of the value axis
@@ -66,7 +67,7 @@ export class Chart {
         },
         axes: [
           { ...axis(), size: 3, values: (self, splits) => splits.map(() => null) }, // time stands below all charts
-          { ...axis(), size: GAP, space: 20, ...(what.axis ?? {}) },
+          { ...axis(), size: GAP, splits, values: (self, values) => values.map((value) => compact(value, 7)), ...(what.axis ?? {}) },
         ],
         series: [{}, ...what.series],
         bands: what.bands ?? [],
@@ -142,6 +143,43 @@ export class Chart {
     this.plot?.destroy();
     this.node.remove();
   }
+}
+
+const LABEL = 15; // px from one label of the value axis to the next, at least
+const ROOMY = 26; // px where there is room
+
+// Round values along the value axis: two of them at least, or a low chart would say nothing of its scale.
+function splits(self, axis, low, high) {
+  const height = self.over.clientHeight || self.bbox.height / devicePixelRatio;
+  if (!(high > low) || !(height > 0)) return [low];
+  const per = (high - low) / height;
+  const [wide, narrow] = [multiples(low, high, rounded(ROOMY * per)), multiples(low, high, rounded(LABEL * per))];
+  if (wide.length > 1) return wide;
+  if (narrow.length > 1) return narrow;
+  const fine = multiples(low, high, rounded((high - low) / 20));
+  return [fine[0], fine[fine.length - 1]];
+}
+
+const multiples = (low, high, step) => {
+  const first = Math.ceil(low / step - 1e-9);
+  const count = Math.floor(high / step + 1e-9) - first + 1;
+  return Array.from({ length: count }, (_, k) => Number(((first + k) * step).toPrecision(12)));
+};
+
+// The smallest of 1, 2, 5 · 10ⁿ that is at least so much.
+function rounded(least) {
+  const power = 10 ** Math.floor(Math.log10(least));
+  return [1, 2, 5, 10].find((factor) => factor * power >= least * (1 - 1e-9)) * power;
+}
+
+// Those of some values, in the order of their weight, whose labels do not lie on each other.
+export function apart(values, self, scale) {
+  const height = self.over.clientHeight || self.bbox.height / devicePixelRatio;
+  const { min, max } = self.scales[scale];
+  const least = (LABEL * (max - min)) / height;
+  const found = [];
+  for (const value of values) if (found.every((other) => Math.abs(other - value) >= least)) found.push(value);
+  return found.sort((a, b) => a - b);
 }
 
 export const axis = () => ({

@@ -1,8 +1,8 @@
 // The stack of charts: one time axis, one cursor. States that nobody measures first, then the others, NIS, innovations.
 
-import { Chart, band, colour, dots, edge, line } from "./chart.js";
+import { Chart, apart, band, colour, dots, edge, line } from "./chart.js";
 import { $ } from "./dom.js";
-import { bracketed, clock, compact, spaced, withDeviation, words } from "./format.js";
+import { bracketed, clock, compact, decimals, fixed, spaced, withDeviation, words } from "./format.js";
 import { Lane } from "./lane.js";
 import { Layout } from "./layout.js";
 import { marks } from "./marks.js";
@@ -17,8 +17,8 @@ const DENSITY = 1.6; // px to a group of rows
 // The columns of a state's chart from the live lane, in the order of its series.
 const OF_STATE = ["upper", "lower", "truth", "mean"];
 const BEFORE = 3; // which of them is that of the revision before
-const ROOM = 14; // px for a label of the NIS axis
 const MOST_GROWTH = 4; // halvings of the window while there is less than that to show
+const NIS_TICKS = [1, 0.1, 10, 0.01, 100, 1000, 0.3, 3, 0.03, 30, 300]; // those that matter most first
 const OF_ROW = ["reading", "held", "refused", "screened"];
 
 export class Charts {
@@ -203,9 +203,11 @@ function stateChart(charts, state) {
     says: (value) => {
       const [upper, truth, mean] = [value(1), value(4 + rows.length), value(5 + rows.length)];
       const bound = charts.integrity?.[state.name]?.bound;
+      const deviation = upper - mean;
       const unseen = Number.isFinite(bound) ? `  (${compact(bound, 2)} unseen)` : "";
-      const off = Number.isFinite(truth) ? `  truth ${compact(truth, 4)}` : "";
-      return withDeviation(mean, upper - mean, state.unit) + unseen + off;
+      const off = !Number.isFinite(truth) ? "" : `  truth ${deviation > 0 ? fixed(truth, decimals(deviation)) : compact(truth, 4)}`;
+      if (state.probability) return `${fixed(mean, 3)}${off && `  truth ${fixed(truth, 0)}`}`;
+      return withDeviation(mean, deviation, state.unit) + unseen + off;
     },
   };
 }
@@ -226,11 +228,8 @@ function nisChart(charts) {
     series: [line("bound", { width: 1 }), line("bound", { width: 1 }), dots("quiet", 2.5), line("estimate", { width: 1.75 })],
     bands: [band("bounds", [1, 2])],
     axis: {
-      splits: (self, axis, low, high) => {
-        const found = [0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100, 300, 1000].map(Math.log10).filter((v) => low <= v && v <= high);
-        const room = self.bbox.height / devicePixelRatio / ROOM; // labels
-        return found.length <= room ? found : found.filter((v) => Number.isInteger(v));
-      },
+      // One first, then as many of the others as have room.
+      splits: (self, axis, low, high) => apart(NIS_TICKS.map(Math.log10).filter((v) => low <= v && v <= high), self, "y"),
       values: (self, splits) => splits.map((v) => compact(10 ** v, 1)),
     },
     under: (plot) => marks(plot, charts.episodes, charts.view.at),
@@ -278,7 +277,7 @@ function innovationChart(charts, row) {
       const most = Math.max(Math.abs(low), Math.abs(high), over);
       return range.fit(-most, most);
     },
-    says: (value) => `${compact(value(3), 3)}${spaced(row.unit)}  ± ${compact(value(1), 3)} expected`,
+    says: (value) => (Number.isFinite(value(3)) ? `${compact(value(3), 3)}${spaced(row.unit)}  ± ${compact(value(1), 3)} expected` : "no reading"),
   };
 }
 

@@ -6,9 +6,15 @@ const EXPONENTS = { 2: "²", 3: "³", "-1": "⁻¹" };
 export function withDeviation(value, deviation, unit) {
   if (!Number.isFinite(value)) return "–";
   if (!Number.isFinite(deviation) || deviation <= 0) return `${compact(value)}${spaced(unit)}`;
-  const digits = Math.min(8, Math.max(0, 1 - Math.floor(Math.log10(deviation))));
-  return `${value.toFixed(digits)} ± ${deviation.toFixed(digits)}${spaced(unit)}`;
+  const digits = decimals(deviation);
+  return `${fixed(value, digits)} ± ${deviation.toFixed(digits)}${spaced(unit)}`;
 }
+
+// Decimals that a deviation justifies: two digits of it.
+export const decimals = (deviation) => Math.min(8, Math.max(0, 1 - Math.floor(Math.log10(deviation))));
+
+// Without a zero below zero.
+export const fixed = (value, digits) => value.toFixed(digits).replace(/^-(?=[0.]*$)/, "");
 
 // Four digits, no exponent where it can be helped.
 export function compact(value, digits = 4) {

@@ -39,9 +39,9 @@ export class Knob {
     this.below = element("div", { class: "below" });
     this.node = element(
       "div", { class: `knob${this.slides ? "" : " plain"}`, dataset: { key: what.key ?? what.label } },
-      element("label", { title: what.help ? `${label}: ${what.help}` : label }, label),
+      element("label", { title: what.help ? `${label}: ${what.help}` : label }, ...label.split(/(?<=\.)/).flatMap((part, k) => (k ? [element("wbr"), part] : [part]))),
       this.slider ? element("span", { class: "track", style: `--tick:${100 * this.place(what.configured)}%` }, this.slider, this.said) : null,
-      element("span", { class: "field" }, this.field, element("span", { class: "unit" }, what.unit && what.unit !== "1" ? what.unit : "")),
+      element("span", { class: "field" }, this.field, element("span", { class: "unit", title: what.unit }, what.unit && what.unit !== "1" ? what.unit : "")),
       this.logarithmic ? element("span", { class: "steps" }, step(0.1, "÷10"), step(10, "×10")) : null,
       this.back, this.error, this.below,
     );

@@ -4,6 +4,13 @@ import { GAP, axis } from "./chart.js";
 import { clock } from "./format.js";
 
 const HEIGHT = 24;
+const HALF = 24; // px that a label at the right end may take from the axis to its left
+
+// Steps of a clock, s: nobody counts time in quarters of ten seconds.
+const STEPS = [
+  0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800,
+  21600, 43200, 86400, 172800, 345600, 864000, 2592000, 8640000, 31536000,
+];
 
 export class TimeAxis {
   constructor(node) {
@@ -14,7 +21,7 @@ export class TimeAxis {
         width: Math.max(50, node.clientWidth), height: HEIGHT, padding: [0, 10, 0, 0],
         legend: { show: false }, cursor: { show: false },
         scales: { x: { time: false, range: () => this.span }, y: { range: () => [0, 1] } },
-        axes: [{ ...axis(), size: HEIGHT - 2, values: ticks, space: 60 }, { ...axis(), size: GAP, values: () => [], splits: () => [] }],
+        axes: [{ ...axis(), size: HEIGHT - 2, values: ticks, incrs: STEPS, space: 60 }, { ...axis(), size: GAP, values: () => [], splits: () => [] }],
         series: [{}, { show: false }],
       },
       [[], []],
@@ -33,5 +40,7 @@ export class TimeAxis {
 function ticks(self, splits) {
   const step = splits.length > 1 ? splits[1] - splits[0] : 1;
   const fraction = step >= 1 ? 0 : Math.min(3, Math.ceil(-Math.log10(step)));
-  return splits.map((value) => clock(value, fraction));
+  // One at the very end would be cut off.
+  const last = self.posToVal(self.over.clientWidth + 10 - HALF, "x");
+  return splits.map((value) => (value > last ? "" : clock(value, fraction)));
 }

@@ -17,6 +17,10 @@ from .private_viser import HEADER
 
 PASSED_ON = ("content-type", "content-encoding", "etag", "last-modified", "cache-control")
 ASKED = ("accept", "accept-encoding", "if-none-match")
+HEAD = b"<head>"
+AHEAD = b'<script src="/page/viser_labels.js"></script>'
+"""What goes into Viser's page ahead of its own script."""
+
 LARGEST = 256 * 1024 * 1024
 """Bytes of one message; a scene's first one holds all its point clouds."""
 
@@ -34,13 +38,15 @@ class ViserProxy:
     async def http(self, request: Request) -> Response:
         """Fetch a file of Viser's client."""
         path = "/" + quote(request.path_params["path"])
+        # Its page as it is, neither compressed nor from before, as something goes into it.
+        asked = {} if path == "/" else dict(request.headers)
         try:
-            status, headers, body = await asyncio.to_thread(self._fetch, path, dict(request.headers))
+            status, headers, body = await asyncio.to_thread(self._fetch, path, asked)
         except (OSError, http.client.HTTPException) as error:
             return PlainTextResponse(f"Nisus: the Viser pane does not answer ({error}).\n", 502)
-        answer = Response(body, status)
+        answer = Response(body.replace(HEAD, HEAD + AHEAD, 1) if path == "/" else body, status)
         for name, value in headers:
-            if name.lower() in PASSED_ON:
+            if name.lower() in PASSED_ON and not (path == "/" and name.lower() == "etag"):
                 answer.headers[name] = value
         return answer
 

@@ -29,6 +29,7 @@ from .commissioned import commissioned
 from .dropout import DegradedAfter, degraded_after
 from .late import Late, late_policy
 from .model import check_named, configure, find_model
+from .scene_names import check_scene
 from .source import Plan, plan_source
 
 if TYPE_CHECKING:
@@ -289,10 +290,7 @@ def _set(tuning: Tuning, key: str, text: str) -> Tuning:
 def _pairs(loaded: Loaded, model: StateSpaceModel) -> np.ndarray:
     """Indices of the pairs of states in the view; the scene's names are checked on the way."""
     view = loaded.config.view
-    for key in ("axes", "position", "heading", "parts", "charge", "temperature"):
-        value = getattr(view.scene, key) or ()
-        names = (value,) if isinstance(value, str) else tuple(value.values()) if isinstance(value, dict) else value
-        check_named(loaded, ("view", "scene", key), names, model)
+    check_scene(loaded, model)
     if view.pairs is None and model.grid is not None:
         return np.zeros((0, 2), int)
     if view.pairs is None:

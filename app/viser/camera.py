@@ -126,4 +126,7 @@ class Cameras:
             camera.fov = self._outlook.fov
             camera.position = position
             camera.look_at = np.zeros(3)
+            # Viser sends no direction that it takes to be the browser's already, and it takes one for it that a browser
+            # which came to where all of them begin has lost again: so another one first.
+            camera.up_direction = np.roll(up, 1)
             camera.up_direction = up

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import viser
 
-from ..drawing.geometry import segments
+from ..drawing.geometry import segments, with_deviation
 from ..drawing.heatmap import ESTIMATE, NOTHING, Scale, gradient
 from ..drawing.palette import RGB, Palette
 
@@ -51,7 +51,8 @@ class ScaleBar:
         self._scale.fit(np.concatenate((mean - 2 * std, mean + 2 * std)))
         for k, (label, place) in enumerate(zip(self._labels, zip(mean, std, strict=True), strict=True)):
             at, spread = place
-            text = f"{label}  {at:.1f} ± {2 * spread:.1f} {self._unit}" if np.isfinite(at + spread) else f"{label}  –"
+            known = f"{label}  {with_deviation(at, 2 * spread)} {self._unit}"
+            text = known if np.isfinite(at + spread) else f"{label}  –"
             if self._texts[k].text != text:
                 self._texts[k].text = text
         ticks = self._scale.ticks()

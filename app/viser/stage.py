@@ -19,6 +19,8 @@ from .battery_scene import BatteryScene
 from .belief_scene import BeliefScene
 from .camera import Cameras, Outlook
 from .field_scene import FieldScene
+from .field_surface_scene import FieldSurfaceScene
+from .gripper_scene import GripperScene
 from .history import History
 from .motor_scene import MotorScene
 from .vehicle_scene import VehicleScene
@@ -26,8 +28,12 @@ from .vehicle_scene import VehicleScene
 if TYPE_CHECKING:
     from config.schema import ViewSection
 
-BELIEF, FIELD, VEHICLE, MOTOR, BATTERY = "belief", "field", "vehicle", "motor", "battery"
-FOLLOW, STAY = "vehicle", "walls"
+BELIEF, FIELD, SURFACE = "belief", "field", "surface"
+VEHICLE, MOTOR, BATTERY, GRIPPER = "vehicle", "motor", "battery", "gripper"
+FOLLOW, STAY = "vehicle", "place"
+
+PICTURED = (FieldScene, FieldSurfaceScene)
+"""Scenes of a large field, which are drawn from its pictures."""
 
 AMBIENT, ABOVE = 2.5, 0.9
 """Strength of the lights: π of the first alone would show each colour as it is."""
@@ -87,7 +93,7 @@ class Stage:
             self._server.scene.set_background_image(np.full((2, 2, 3), self.palette.panel, np.uint8), format="png")
         self._late |= values != self._values
         self._values = values
-        if isinstance(self.scene, FieldScene):
+        if isinstance(self.scene, PICTURED):
             self.scene.show(values["picture"])
         elif isinstance(self.scene, VehicleScene):
             self.scene.follow = values["follow"] == FOLLOW
@@ -96,7 +102,7 @@ class Stage:
     @property
     def due(self) -> bool:
         """Whether there is something to draw though nothing new came; a field knows that itself."""
-        return self._late or isinstance(self.scene, FieldScene)
+        return self._late or isinstance(self.scene, PICTURED)
 
     def draw(self, history: History) -> None:
         """Send what has changed."""
@@ -108,12 +114,16 @@ class Stage:
             self._heavy = now
         # The moments of a large field are dear, and its pictures come with the rows.
         belief = self._engine.belief() if self.model.grid is None else None
+        if isinstance(self.scene, VehicleScene):
+            self.scene.tuning = self._engine.tuning
         self.scene.draw(history, belief, heavy)  # type: ignore[arg-type]
 
     def _build(self, show: str, values: dict[str, str]) -> Scene:
         api, model, section = self._server.scene, self.model, self._view.scene
         if show == FIELD:
             return FieldScene(api, model, self.palette, truth=self._truth)  # type: ignore[return-value]
+        if show == SURFACE:
+            return FieldSurfaceScene(api, model, self.palette, truth=self._truth)  # type: ignore[return-value]
         if show == VEHICLE:
             return VehicleScene(api, model, section, self.palette)
         if show == MOTOR:
@@ -122,6 +132,10 @@ class Stage:
             )
         if show == BATTERY:
             return BatteryScene(api, model, section.charge or (), section.temperature, self.palette)
+        if show == GRIPPER:
+            return GripperScene(
+                api, model, {str(what): name for what, name in (section.states or {}).items()}, self.palette
+            )
         chosen = [values[axis] for axis in AXES if values.get(axis, NO_AXIS) != NO_AXIS]
         return BeliefScene(api, model, [model.state_names.index(name) for name in chosen], self.palette)
 
@@ -136,13 +150,13 @@ def choices_of(model: StateSpaceModel, view: ViewSection, *, truth: bool) -> lis
     """
     if model.grid is not None:
         titles = tuple(kind.title for kind in kinds(truth))
-        return [Choice(SHOW, "Show", (FIELD,), FIELD), Choice("picture", "Picture", titles, titles[0], FIELD)]
+        return [Choice(SHOW, "Show", (FIELD, SURFACE), FIELD), Choice("picture", "Picture", titles, titles[0])]
     section = view.scene
     shows = tuple(dict.fromkeys((section.kind, BELIEF)))
     found = [Choice(SHOW, "Show", shows, shows[0])]
     if section.kind == VEHICLE:
-        middle = STAY if section.walls else FOLLOW
-        found.append(Choice("follow", "Middle", (STAY, FOLLOW) if section.walls else (FOLLOW,), middle, VEHICLE))
+        middles = (STAY, FOLLOW) if section.walls or section.beacons else (FOLLOW,)
+        found.append(Choice("follow", "Middle", middles, middles[0], VEHICLE))
     names = [state.name for state in model.shown_states]
     first = [*(section.axes or section.position or ()), *([section.heading] if section.heading else [])]
     first = [*first, *(name for name in names if name not in first)][: 3 if section.axes is None else len(section.axes)]

@@ -1,7 +1,8 @@
-"""The scene of a twin that moves on a plane: vehicle, track, walls, position readings, truth, particles, 2σ ellipse.
+"""The scene of a twin that moves on a plane: vehicle, track, walls, beams, beacons, readings, truth, particles, 2σ.
 
-An estimate with several peaks has its vehicle at the heaviest one, and a dot with its weight at each: at the mean
-between them is nobody.
+The vehicle has its true size; a pointer, as thick at any distance, says where it is in a place that is large. An
+estimate with several peaks has its vehicle at the heaviest one, and a dot with its weight at each: at the mean between
+them is nobody.
 """
 
 from __future__ import annotations
@@ -14,11 +15,14 @@ import viser
 from estimators.log import READING, truth_of
 from estimators.model.state_space import StateSpaceModel
 from estimators.track import FAILED, GATED
+from estimators.tuning import Tuning
 
 from ..drawing.direct_readings import observed
-from ..drawing.geometry import about_z, circle, disc, ellipsoid, segments
+from ..drawing.geometry import about_z, circle, disc, ellipsoid, round_step, segments
 from ..drawing.palette import Palette, mixed
 from ..engine.outputs import Belief
+from .beacons import Beacons, Places
+from .beams import Beams
 from .camera import Outlook
 from .history import History
 
@@ -41,11 +45,17 @@ SLANTED = np.array([0.0, -0.68, 0.73])
 ABOVE = np.array([0.0, -0.12, 0.99])
 """From walls to the first view of them, nearly as on a plan: a corridor would else be a line."""
 
-AROUND = 18.0
-"""Metres around the vehicle that the first view shows where there are no walls; a vehicle is some 4 m long."""
+AROUND = 4.0
+"""Lengths of the vehicle around it that the first view shows where there are no walls and no beacons."""
 
-NEAREST = 3.0
-"""Metres around the middle of walls that the first view shows at least."""
+NEAREST = 0.7
+"""Lengths of the vehicle around the middle of walls and beacons that the first view shows at least."""
+
+BESIDE = 1.2
+"""Times as far as beacons are that the first view reaches, for their names."""
+
+LARGE = 2.5
+"""Times what the first view shows from which on an ellipse has no area, which would be all that one sees."""
 
 
 class VehicleScene:
@@ -67,17 +77,28 @@ class VehicleScene:
             for other in dots
             if dot.sensor == other.sensor and (dot.state, other.state) == (self.east, self.north)
         ]
-        corners = np.array([corner for line in scene.walls for corner in line]).reshape(-1, 2)
-        # Among walls the place is what matters, all of it: two peaks may be at its two ends.
+        self.tuning = Tuning.of(model)
+        walled = np.array([corner for line in scene.walls for corner in line]).reshape(-1, 2)
+        standing = Places(model, scene.beacons.values()).at(model.prior_mean, self.tuning.p)
+        corners = np.concatenate((walled, standing))
+        # Among walls and beacons the place is what matters, all of it: two peaks may be at its two ends.
         self._home = 0.5 * (corners.min(axis=0) + corners.max(axis=0)) if corners.size else None
+        self._length = scene.size[0]
+        self._reach = AROUND * self._length
+        if self._home is not None:
+            self._reach = max(NEAREST * self._length, float(np.abs(corners - self._home).max()))
+        # Of dots, as large at any distance.
+        dot_size = self._reach / 36.0
         self.follow = self._home is None
         self._anchor: np.ndarray | None = None if self._home is None else self._home.copy()
         self._course = 0.0
         self._known = False
         self.root = api.add_frame("/scene", show_axes=False)
         self.world = api.add_frame("/scene/world", show_axes=False)
+        cell = round_step(0.4 * self._reach)
+        self._section = 5 * cell
         self._grid = api.add_grid(
-            "/scene/grid", infinite_grid=True, cell_size=10.0, section_size=50.0, fade_distance=900.0,
+            "/scene/grid", infinite_grid=True, cell_size=cell, section_size=self._section, fade_distance=90 * cell,
             cell_color=palette.grid, section_color=palette.rule, shadow_opacity=0.0,
         )  # fmt: skip
         line, world = {"thickness_units": "screen"}, "/scene/world"
@@ -87,7 +108,7 @@ class VehicleScene:
         dot = {"point_shape": "circle", "precision": "float32", "point_shading": "flat", "visible": False}
         one = np.zeros((1, 3), np.float32)
         self._readings, self._refused = (
-            api.add_point_cloud(f"{world}/{name}", one, color, point_size=0.5, **dot)
+            api.add_point_cloud(f"{world}/{name}", one, color, point_size=dot_size, **dot)
             for name, color in (("readings", palette.reading), ("refused", palette.refused))
         )
         vertices, faces = disc()
@@ -100,24 +121,30 @@ class VehicleScene:
         if walls:
             api.add_line_segments(f"{world}/walls", np.concatenate(walls), palette.faint, thickness=3, **line)
         light = mixed(palette.estimate, palette.panel, 0.2)
-        self._cloud = api.add_point_cloud(f"{world}/cloud", one, light, point_size=0.15, **dot)
+        self._cloud = api.add_point_cloud(f"{world}/cloud", one, light, point_size=0.3 * dot_size, **dot)
         self._peaks = [
             (
-                api.add_point_cloud(f"{world}/peaks/{k}/mean", one, palette.estimate, point_size=0.6, **dot),
+                api.add_point_cloud(f"{world}/peaks/{k}/mean", one, palette.estimate, point_size=0.8 * dot_size, **dot),
                 api.add_label(f"{world}/peaks/{k}/weight", " ", visible=False, anchor="bottom-left"),
             )
             for k in range(PEAKS)
         ]
         self._vehicle = api.add_frame(f"{world}/vehicle", show_axes=False)
-        dark, pale = mixed(palette.estimate, palette.ink, 0.3), mixed(palette.estimate, palette.panel, 0.5)
-        api.add_box(f"{world}/vehicle/body", dark, (4.4, 1.8, 0.7), position=(0, 0, 0.65), cast_shadow=False)
-        api.add_box(f"{world}/vehicle/cabin", pale, (2.2, 1.6, 0.6), position=(-0.3, 0, 1.3), cast_shadow=False)
+        add_body(api, f"{world}/vehicle", scene.size, palette)
+        pointer = np.array([[[0.0, 0.0, 0.02], [max(0.9 * self._length, 0.12 * self._reach), 0.0, 0.02]]], np.float32)
+        api.add_line_segments(f"{world}/vehicle/pointer", pointer, palette.estimate, thickness=5, **line)
+        self._beams = self._beacons = None
+        if scene.beams:
+            self._beams = Beams(api, f"{world}/beams", model, scene.beams, palette, dot=0.5 * dot_size)
+        if scene.beacons:
+            self._beacons = Beacons(api, f"{world}/beacons", model, scene.beacons, palette, size=2 * dot_size)
         around = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
         if self._home is None:
-            self.outlook = Outlook(AROUND * around, SLANTED, UP, FOV)
+            self.outlook = Outlook(self._reach * around, SLANTED, UP, FOV)
         else:
             outline = np.column_stack((corners - self._home, np.zeros(len(corners))))
-            self.outlook = Outlook(np.vstack((outline, NEAREST * around)), ABOVE, UP, FOV, turns=True)
+            outline[len(walled) :] *= BESIDE
+            self.outlook = Outlook(np.vstack((outline, NEAREST * self._length * around)), ABOVE, UP, FOV, turns=True)
         self._move_world()
 
     def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
@@ -136,15 +163,21 @@ class VehicleScene:
             self._draw_truth(history)
             self._draw_readings(history)
             self._draw_cloud(belief.points if known else ())
+            if self._beacons is not None:
+                self._beacons.draw(history, belief.mean, self.tuning.p)
         if known:
-            self._draw_vehicle(mean, belief)
+            peak = belief.peaks[0] if len(belief.peaks) > 1 else belief  # a mean between two peaks is nowhere
+            self._draw_vehicle(mean, peak)
+            if self._beams is not None:
+                here = peak.mean[[self.east, self.north]]
+                self._beams.draw(history, peak.mean, here, self._course, self.tuning.p)
         else:
             self._draw_ellipse(np.zeros(2), np.full((2, 2), np.nan))
+            if self._beams is not None:
+                self._beams.hide()
 
-    def _draw_vehicle(self, mean: np.ndarray, belief: Belief) -> None:
+    def _draw_vehicle(self, mean: np.ndarray, peak: Any) -> None:
         """Move the vehicle with its ellipse, and the world under the camera."""
-        # A mean between two peaks is nowhere.
-        peak = belief.peaks[0] if len(belief.peaks) > 1 else belief
         here = peak.mean[[self.east, self.north]]
         middle = here if self.follow or self._home is None else self._home
         if self._anchor is None or np.linalg.norm(middle - self._anchor) > 200.0:
@@ -163,7 +196,7 @@ class VehicleScene:
         shift = np.array([*-self._anchor, 0.0])
         self.world.position = shift
         # The grid is endless: only where its lines fall matters.
-        self._grid.position = (*np.mod(shift[:2], 50.0), 0.0)
+        self._grid.position = (*np.mod(shift[:2], self._section), 0.0)
 
     def _draw_ellipse(self, here: np.ndarray, cov: np.ndarray) -> None:
         known = bool(np.isfinite(cov).all())
@@ -174,6 +207,7 @@ class VehicleScene:
         full[:2, :2] = cov
         full[2, 2] = 2 * full.max() + 1.0  # the largest, so that the ellipse is the first two axes
         axes, turn = ellipsoid(full)
+        self._ellipse.visible = bool(axes[1] < LARGE * self._reach)
         for handle in (self._ellipse, self._rim):
             handle.position, handle.wxyz = (*here, 0.04), turn
             handle.scale = (float(axes[0]), float(axes[1]), 1.0)
@@ -222,9 +256,20 @@ class VehicleScene:
                 self._course = float(peak.mean[self.heading])
             return self._course
         step = mean[-1, [self.east, self.north]] - mean[max(0, len(mean) - 20), [self.east, self.north]]
-        if np.hypot(*step) > 1.0:  # not so if one of the two is NaN
+        if np.hypot(*step) > 0.2 * self._length:  # not so if one of the two is NaN
             self._course = float(np.arctan2(step[1], step[0]))
         return self._course
+
+
+def add_body(api: viser.SceneApi, name: str, size: tuple[float, float, float], palette: Palette) -> None:
+    """A body of that length, width and height, m, about a place on the ground, its front along x: its nose is pale."""
+    long, wide, tall = size
+    dark, pale = mixed(palette.estimate, palette.ink, 0.3), mixed(palette.estimate, palette.panel, 0.5)
+    flat = {"cast_shadow": False, "receive_shadow": False}
+    api.add_box(f"{name}/body", dark, (long, wide, 0.5 * tall), position=(0, 0, 0.4 * tall), **flat)
+    api.add_box(
+        f"{name}/cabin", pale, (0.5 * long, 0.9 * wide, 0.35 * tall), position=(-0.07 * long, 0, 0.825 * tall), **flat
+    )
 
 
 def _put(handle: Any, points: np.ndarray) -> None:

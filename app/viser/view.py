@@ -13,10 +13,9 @@ from ..engine.interface import Running
 from ..series.series import Series
 from ..server.private_viser import addresses, guarded_server, unprinted
 from .coalescer import Coalescer
-from .field_scene import FieldScene
 from .history import History
 from .panel import Panel
-from .stage import Stage
+from .stage import PICTURED, Stage
 
 FRAME = 0.1
 """Seconds between two frames, when they are cheap."""
@@ -98,7 +97,7 @@ class ViserView:
         while True:
             pull = self.engine.pull(self._cursor, self._rows)
             changed |= bool(len(pull.events)) or pull.fresh
-            if isinstance(self.stage.scene, FieldScene):
+            if isinstance(self.stage.scene, PICTURED):
                 self.stage.scene.take(pull)
             self.history.take(pull)
             self.history.trim()

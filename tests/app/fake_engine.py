@@ -44,6 +44,7 @@ class FakeEngine:
         self.fold = Fold(estimator, model, tuning, self.log)
         self.before = None
         self.revisions = Revisions(estimator, tuning)
+        self.tuning = tuning
         self.notices = []
 
     def put(self, readings):

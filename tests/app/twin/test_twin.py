@@ -173,6 +173,22 @@ def test_an_unknown_override_names_what_is_near() -> None:
             "motor.yaml:11: view.scene.axes names 'speed', no state of motor_winding; choose from temperature, rate",
         ),
         (
+            "pairs: [[rate, temperature]]",
+            "scene: {beams: {scan: [0]}}",
+            "motor.yaml:11: view.scene.beams names 'scan', no sensor of motor_winding; choose from winding",
+        ),
+        (
+            "pairs: [[rate, temperature]]",
+            "scene: {beams: {winding: [0, 1.57]}}",
+            "motor.yaml:11: view.scene.beams.winding has 2 angles; winding has 1 rows, give one for each",
+        ),
+        (
+            "pairs: [[rate, temperature]]",
+            "scene: {beacons: {winding: [rate, mast]}}",
+            "motor.yaml:11: view.scene.beacons.winding names 'mast', no state or parameter of motor_winding; choose from "
+            "temperature, rate",
+        ),
+        (
             "initial: {rate: 0.2}",
             "initial: {speed: 1}",
             "motor.yaml:15: source.initial.speed is no state of motor_winding; choose from temperature, rate",
