@@ -25,7 +25,7 @@ def test_a_port_in_use_is_told_first(command, taken, monkeypatch, capsys):
         raise AssertionError("it went on")
 
     monkeypatch.setattr(app.cli.run, "prepare", too_late)
-    monkeypatch.setattr(app.cli.review, "read_recording", too_late)
+    monkeypatch.setattr(app.cli.review, "opened_review", too_late)
     assert main([command, "motor_winding", "--port", str(taken), "--no-browser"]) == 2
     assert capsys.readouterr().err == f"nisus: port {taken}: Address already in use; choose another with --port\n"
 
@@ -33,7 +33,7 @@ def test_a_port_in_use_is_told_first(command, taken, monkeypatch, capsys):
 def test_without_a_page_the_port_does_not_matter(taken, monkeypatch):
     reached = []
     monkeypatch.setattr(app.cli.run, "prepare", reached.append)
-    monkeypatch.setattr(app.cli.run, "Session", lambda *_, **__: (_ for _ in ()).throw(ConfigError("enough")))
+    monkeypatch.setattr(app.cli.run, "open_session", lambda *_, **__: (_ for _ in ()).throw(ConfigError("enough")))
     assert main(["run", "motor_winding", "--port", str(taken), "--headless"]) == 2
     assert len(reached) == 1
 
