@@ -115,7 +115,7 @@ def test_two_browsers_start_switch_and_come_back(browser, visit, tmp_path):
         first.get_by_role("button", name="Stop").click()
         for page in (first, second):
             page.get_by_text("How do I know that my filter works?").wait_for()
-            assert page.locator("#now").inner_text() == ""
+            wait_for(lambda page=page: page.locator("#now").inner_text() == "", PATIENCE)
         assert session.state()["running"] is None
 
 
