@@ -32,7 +32,7 @@ def visit(browser):
         page.set_default_timeout(PATIENCE * 1000)
         own = (f"http://127.0.0.1:{session.session.door.port}/", "blob:", "data:")
         page.on("request", lambda request: None if request.url.startswith(own) else wrong.append(request.url))
-        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("pageerror", lambda error: wrong.append(f"{error} {error.stack}"))
         page.goto(session.session.url)
         pages.append(page)
         return page
