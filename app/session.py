@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import gc
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,16 +46,25 @@ class Page:
     open_browser: bool
 
 
-def _settle(gone: threading.Event | None = None) -> None:
+def _settle(gone: threading.Event | None = None, before: Callable[[], Engine | None] | None = None) -> None:
     """What a start has built stays: looking through it again and again would hold readings up for milliseconds.
 
-    Not so what ran before, which is garbage once nobody is connected to it any more (`gone`).
+    Not so what ran before, which is garbage once nobody is connected to it any more (`gone`) and the last request to it
+    was answered: `before` gives its engine until then.
     """
+    end = time.monotonic() + PATIENCE
     if gone is not None:
         gone.wait(PATIENCE)
     gc.unfreeze()
     gc.collect()
+    while before is not None and before() is not None and time.monotonic() < end:
+        time.sleep(0.05)
+        gc.collect()
     gc.freeze()
+    if gone is not None:
+        # What is free lies scattered over the arenas of threads that have ended; glibc keeps it unless it is asked.
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 class Beside(Protocol):
@@ -161,10 +173,12 @@ class Session:
         """
         with self._changing:
             before, after, stopped = self.running, None, False
+            left: Callable[[], Engine | None] | None = None
             try:
                 if make is not None and not stop_first:
                     after = make()
                 if before is not None:
+                    left = weakref.ref(before.engine)
                     before.stop()
                 stopped = True
                 if make is not None and stop_first:
@@ -176,7 +190,7 @@ class Session:
                     del before
                 if after is not None:
                     after.start()
-                    _settle(after.gone)
+                    _settle(after.gone, left)
                 elif stopped and self.door is not None:
                     self.door.show(None)
 

@@ -55,8 +55,9 @@ function picture(item) {
 
 // Into the page itself, so that it has the colours of the theme.
 async function draw(place, name) {
-  const answer = await fetch(`/api/gallery/picture?twin=${encodeURIComponent(name)}`);
-  if (!answer.ok) return;
+  // A page that is being left gets none.
+  const answer = await fetch(`/api/gallery/picture?twin=${encodeURIComponent(name)}`).catch(() => null);
+  if (!answer?.ok) return;
   const svg = new DOMParser().parseFromString(await answer.text(), "image/svg+xml").documentElement;
   if (svg.nodeName === "svg") place.replaceChildren(document.importNode(svg, true));
 }

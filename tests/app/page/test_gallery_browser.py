@@ -32,7 +32,7 @@ def visit(browser):
         page.set_default_timeout(PATIENCE * 1000)
         own = (f"http://127.0.0.1:{session.session.door.port}/", "blob:", "data:")
         page.on("request", lambda request: None if request.url.startswith(own) else wrong.append(request.url))
-        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("pageerror", lambda error: wrong.append(f"{error} {error.stack}"))
         page.goto(session.session.url)
         pages.append(page)
         return page
@@ -115,7 +115,7 @@ def test_two_browsers_start_switch_and_come_back(browser, visit, tmp_path):
         first.get_by_role("button", name="Stop").click()
         for page in (first, second):
             page.get_by_text("How do I know that my filter works?").wait_for()
-            assert page.locator("#now").inner_text() == ""
+            wait_for(lambda page=page: page.locator("#now").inner_text() == "", PATIENCE)
         assert session.state()["running"] is None
 
 

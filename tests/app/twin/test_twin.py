@@ -116,7 +116,7 @@ def test_an_unknown_override_names_what_is_near() -> None:
     text = message(MOTOR, overrides={"Q.temprature": "1"})
     said = "Q.temprature is not a tuning key of motor_winding; did you mean Q.temperature"
     assert text.startswith(f"--set Q.temprature=1: {said}")
-    assert "; or a key of the YAML: name, title, model" in text and "\n" not in text
+    assert "; or a key of the YAML: name, title, teaches" in text and "\n" not in text
 
 
 @pytest.mark.parametrize(
