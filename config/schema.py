@@ -88,6 +88,9 @@ class NormalSection(Section):
     """Their lag-1 correlation. Default: 0, white."""
     reached: dict[str, NotNegative] = {}
     """How high the tests of each cause rose on the accepted data, nats: {narrow: 12.5}. Default: 0."""
+    nis: NotNegative = 0.0
+    """The most that the mean NIS of the last readings was there at a reading of its sensor, as a multiple of what bias
+    and scale make of it; the estimate is lost from half as much again on, and at least at ten. Default: 0."""
 
 
 class EstimatorSection(Section):

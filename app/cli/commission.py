@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,13 +37,12 @@ what follows."""
 
 def commission_twin(arguments: Arguments) -> int:
     """Carry the command out."""
-    twin = load_twin(
-        arguments.twin, log_files=arguments.log or None, overrides=settings(arguments.set, arguments.estimator)
-    )
+    # What is normal is told from white innovations, not from what was normal before.
+    overrides = {**settings(arguments.set, arguments.estimator), "commissioned": "{}"}
+    twin = load_twin(arguments.twin, log_files=arguments.log or None, overrides=overrides)
     prepare(twin)
     log, _ = read_log(twin, arguments.duration)
-    # What is normal is told from white innovations, not from what was normal before.
-    fold = Fold(twin.estimator, twin.model, replace(twin.tuning, baseline=None), log, policy=twin.policy)
+    fold = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy)
     interruptible(fold, fold.advance)
     broken = against(fold)
     if broken and not arguments.force:
@@ -93,7 +91,9 @@ def lines(normals: Mapping[str, Normal]) -> str:
     text = "commissioned:                    # what was normal when this tuning was accepted (nisus commission)\n"
     for name, normal in normals.items():
         reached = ", ".join(f"{cause}: {peak:g}" for cause, peak in normal.reached.items())
-        text += f"  {name}: {{bias: {normal.bias:g}, scale: {normal.scale:g}, correlation: {normal.correlation:g},\n"
+        nis = f", nis: {normal.nis:g}" if normal.nis else ""
+        moments = f"bias: {normal.bias:g}, scale: {normal.scale:g}, correlation: {normal.correlation:g}{nis}"
+        text += f"  {name}: {{{moments},\n"
         text += f"    reached: {{{reached}}}}}\n"
     return text
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from estimators.diagnostics.episodes import Episode, episode_json
-from estimators.diagnostics.sensitivity.suspects import ALIKE, TELLING, Suspect, in_words, suspects
+from estimators.diagnostics.sensitivity.suspects import RIDDLES, Suspect, in_words, likeliest, suspects
 from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.log import READING
@@ -53,7 +53,7 @@ def blamed(fold: Fold, episodes: Sequence[Episode]) -> list[Told]:
     asked = 0
     for episode in episodes:
         found: tuple[Suspect, ...] = ()
-        if episode.cause in ("shifted", "refused") and asked < ASKED:
+        if episode.cause in RIDDLES and asked < ASKED:
             asked += 1
             found = _suspects(fold, episode)
         told.append(Told(episode, found))
@@ -62,12 +62,9 @@ def blamed(fold: Fold, episodes: Sequence[Episode]) -> list[Told]:
 
 def _suspects(fold: Fold, episode: Episode) -> tuple[Suspect, ...]:
     try:
-        found = suspects(fold.estimator.name, fold.model, fold.tuning, fold.log, episode.start)
+        return likeliest(suspects(fold.estimator.name, fold.model, fold.tuning, fold.log, episode.start))
     except NisusError:
         return ()
-    if not found or found[0].gain < TELLING:
-        return ()
-    return tuple(suspect for suspect in found if found[0].gain - suspect.gain < ALIKE)
 
 
 def as_json(told: Told) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Sequence
 
 from estimators.diagnostics.episodes import Episode
-from estimators.diagnostics.sensitivity.suspects import in_words, suspects
+from estimators.diagnostics.sensitivity.suspects import RIDDLES, in_words, suspects
 from estimators.errors import NisusError
 from estimators.log import Log
 from estimators.model.state_space import StateSpaceModel
@@ -23,9 +23,6 @@ from .notices import Notices
 
 EVERY = 1.0
 """Seconds between two looks at the open episodes."""
-
-RIDDLES = ("shifted", "refused")
-"""Causes that leave open who is to blame."""
 
 SOON = 3.0
 """Seconds of an episode from which on it can be asked."""

@@ -16,7 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimators.diagnostics.episodes import JOINED, Course, Episode, Found, Going, found_in
+from estimators.diagnostics.episodes import ANY, JOINED, LOSSES, Course, Episode, Found, Going, found_in
+from estimators.diagnostics.evidence import LOST
 from estimators.registry import find_estimator
 from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING, WAITING
 
@@ -42,7 +43,7 @@ KEPT = 1000
 SAID = 5
 """Episodes of one look that are said one by one."""
 
-JOINS = {"sensor": JOINED, "truth": JOINED, "range": JOINED}
+JOINS = {"sensor": JOINED, "lost": JOINED, "truth": JOINED, "range": JOINED}
 """Rows without an alarm that an episode bridges, by what is tested."""
 
 RANKS = {
@@ -53,11 +54,11 @@ RANKS = {
 
 UNRANKED = 4
 
-OF_SENSORS = ("sensor", "silence")
-"""What is tested of sensors; the second part of such a key is the sensor's name."""
+OF_READINGS = {"sensor": ANY, "lost": LOST}
+"""What is tested of a sensor's readings, with the bits of its alarms."""
 
-LOST = ("stuck", "refused", "screened")
-"""Causes that take the place of any other."""
+OF_SENSORS = (*OF_READINGS, "silence")
+"""What is tested of sensors; the second part of such a key is the sensor's name."""
 
 
 class Entry(NamedTuple):
@@ -75,11 +76,13 @@ class Entry(NamedTuple):
     def over(self, course: Course) -> Entry:
         """The same after rows that follow those that are forgotten."""
         kind, name = self.key
-        return self._replace(going=self.going.over(course, name, self.episode, self.at)) if kind == "sensor" else self
+        if kind not in OF_READINGS:
+            return self
+        return self._replace(going=self.going.over(course, name, self.episode, self.at, OF_READINGS[kind]))
 
     def likely_end(self, otherwise: float) -> float:
         """When it ended, s, if it did: of a sensor not before its first alarm."""
-        return max(self.going.end, self.at * 1e-9) if self.key[0] == "sensor" else otherwise
+        return max(self.going.end, self.at * 1e-9) if self.key[0] in OF_READINGS else otherwise
 
 
 class Account(NamedTuple):
@@ -107,7 +110,7 @@ class Account(NamedTuple):
     @property
     def in_alarm(self) -> frozenset[str]:
         """Sensors of which something is known to be wrong, so that each refused reading need not be said."""
-        return frozenset(entry.key[1] for entry in self.lasting if entry.key[0] == "sensor")
+        return frozenset(entry.key[1] for entry in self.lasting if entry.key[0] in OF_READINGS)
 
     def of_sensors(self, names: Sequence[str], states: Sequence[str]) -> dict[str, tuple[str, str]]:
         """State of each sensor, with the text of the worst that lasts of it."""
@@ -201,7 +204,9 @@ class Chronicle:
         tuning, estimator = self._engine.folded_with()
         marginal = find_estimator(estimator, tuning.model).family in ("particle", "ensemble")
         events, track = tail.events.select(rows), tail.track.select(rows)
-        return Course(self._engine.model, tuning, marginal, events, track, tail.heard)
+        known = (self._carried.get(("sensor", name)) for name in self._engine.model.sensor_names)
+        alarmed = [0 if e is None or e.episode.cause in LOSSES else e.going.readings for e in known]
+        return Course(self._engine.model, tuning, marginal, events, track, tail.heard, np.array(alarmed))
 
     def _find(self) -> None:
         """Bring the entries up to the rows that are there."""
@@ -227,12 +232,13 @@ class Chronicle:
         gone = self._tail.cut_at
         forgotten = self._course(slice(0, gone))
         first = int(self._tail.events.t[gone])
-        self._tail.cut()
         begun = [entry for entry in self._entries if entry.episode.start * 1e9 < first]
         over = [e for e in begun if e.episode.end is not None and e.episode.end * 1e9 < first]
         self._over = over[-KEPT:]
         left = [e for e in begun if e.episode.end is None or e.episode.end * 1e9 >= first]
         self._carried = {e.key: e.over(forgotten) for e in left}
+        # Last of all: what is forgotten is a view of the rows that move up now.
+        self._tail.cut()
 
     def _say(self, before: list[Entry], again: bool, passage: int) -> None:
         """Say what is new against the entries before; `again`: those of another revision, or of rows taken back.
@@ -279,7 +285,7 @@ def _continued(known: Entry, item: Found, course: Course) -> Entry:
         # All its alarms are still there, and say more than the first of them.
         return Entry(item.key, item.at, new)
     end = new.end
-    if new.cause in LOST and old.cause not in LOST:
+    if new.cause in LOSSES and old.cause not in LOSSES:
         # What shows it is all in these rows.
         old, going = new._replace(start=old.start), Going()
     elif end is not None:
@@ -291,7 +297,7 @@ def _continued(known: Entry, item: Found, course: Course) -> Entry:
 def _left(known: Entry, course: Course) -> Entry:
     """An episode that began before the rows that are kept, of which none is in alarm."""
     after = known.over(course)
-    if known.key[0] == "sensor" and after.going.quiet <= JOINED:
+    if known.key[0] in OF_READINGS and after.going.quiet <= JOINED:
         return known._replace(episode=known.episode._replace(end=None))
     # What is not seen in rows that are forgotten ended where those begin that are kept.
     end = known.episode.end or after.likely_end(float(course.events.t[0] * 1e-9))

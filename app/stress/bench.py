@@ -96,13 +96,14 @@ class Bench:
         twin: As it ships.
         seed: Of the asset, the faults and the filter.
         duration: Seconds of the log.
+        begin: Share of the log after which a fault of the source begins; it lasts a third of the log.
 
-    A fault of the source lasts from a third to two thirds of the log; an error of the belief from its start on. What
-    the twin says, it says without having been told the truth; that is for the scores alone.
+    An error of the belief holds from the log's start on. What the twin says, it says without having been told the
+    truth; that is for the scores alone.
     """
 
-    def __init__(self, twin: Twin, seed: int, duration: float) -> None:
-        self.twin, self.seed, self.duration = twin, seed, duration
+    def __init__(self, twin: Twin, seed: int, duration: float, begin: float = 1.0 / 3.0) -> None:
+        self.twin, self.seed, self.duration, self.begin = twin, seed, duration, begin
         self.events = plain_log(twin, seed, duration)
         self.origin = int(self.events.t[0])
         self.length = float(self.events.t.max() - self.events.t[0]) * 1e-9
@@ -113,8 +114,8 @@ class Bench:
 
     def window(self, mistake: Mistake) -> tuple[float, float]:
         """When a mistake lasts, seconds after the log's first event."""
-        third = round(self.length / 3.0, 3)
-        return (0.0, self.length) if mistake.fault is None else (third, 2.0 * third)
+        begin, third = (round(share * self.length, 3) for share in (self.begin, 1.0 / 3.0))
+        return (0.0, self.length) if mistake.fault is None else (begin, begin + third)
 
     def span(self, mistake: Mistake) -> tuple[int, int]:
         """The same in ns of the log."""

@@ -3,7 +3,7 @@
 A mistake that moves the means of the innovations moves them by as much in every log: the same noise is folded with and
 without it, by a filter without chance, and the difference is put to the criterion of the smallest visible fault
 (visibility.py). One that changes their noise, or what comes when, is rehearsed: made in other logs of the asset. Of a
-recording there is only this one: a fault is made in it with other draws, a wrong belief begins later in it. What is
+recording there is only this one: a fault is made in it at other times, a wrong belief begins later in it. What is
 found in all of them, in half the time that it lasts, is visible: the time to an alarm has an exponential tail. What is
 found in none is invisible.
 """
@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimators.diagnostics.evidence import OUTSIDE
-from estimators.diagnostics.sensitivity.responses import SMOOTH, stand_in
+from estimators.diagnostics.sensitivity.responses import SMOOTH, astray, stand_in
 from estimators.diagnostics.sensitivity.visibility import tests_of
 from estimators.fold import Fold
 from estimators.log import READING
@@ -79,11 +79,14 @@ class Oracle:
         return self._rehearsed[key]
 
     def _rehearse(self, mistake: Mistake, estimator: str) -> Foretold:
-        if mistake.fault is None and asset_of(self.twin, 0) is None:
+        recorded = asset_of(self.twin, 0) is None
+        if mistake.fault is None and recorded:
             after = self._later(mistake, estimator)
         else:
             while len(self._benches) < REHEARSALS:
-                self._benches.append(Bench(self.twin, OTHERS + len(self._benches), self.duration))
+                k = len(self._benches)
+                begin = (k + 0.5) / REHEARSALS * 2.0 / 3.0 if recorded else 1.0 / 3.0
+                self._benches.append(Bench(self.twin, OTHERS + k, self.duration, begin))
             after = [bench.found_after(mistake, estimator) for bench in self._benches]
         if not after:
             return Foretold(CHANCE)
@@ -101,12 +104,15 @@ class Oracle:
 
 
 def shift_of(bench: Bench, mistake: Mistake, estimator: str) -> Foretold | None:
-    """By the shift of the means; None where it cannot be told so: no filter without chance, or other times.
+    """By the shift of the means; None where it cannot be told so: no filter without chance holds it, or other times.
 
     Where the twin has a gate, what this refuses goes on to be told of, so that it is looked at with and without.
     """
     name, _ = stand_in(estimator, bench.twin.model)
     if name != estimator and name not in SMOOTH:
+        return None
+    calm = bench.fold(None, name, None).fold
+    if astray(estimator, name, calm.track.select(slice(0, calm.n))):
         return None
     seen = []
     for gate in dict.fromkeys((None, bench.twin.tuning.gate)):

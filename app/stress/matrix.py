@@ -100,7 +100,8 @@ def _of_sensors(model: StateSpaceModel, tuning: Tuning, sensors: Sequence[Sensor
     if pair is not None:
         first, second = pair
         swapped = _fault("swap", sensor=first, other=second)
-        yield Mistake(f"{first} and {second} swapped", MODEL, frozenset(pair), fault=swapped, shifts=True)
+        # With its mean each gets the noise of the other.
+        yield Mistake(f"{first} and {second} swapped", MODEL, frozenset(pair), fault=swapped)
 
 
 def _silent(model: StateSpaceModel) -> Callable[[float, float], list[Fault]]:

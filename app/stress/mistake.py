@@ -22,8 +22,8 @@ class Mistake:
 
     `belief` are factors on entries of the tuning, from the start of the log; `fault` makes the faults of the source for
     a window (start, end) in seconds of the log. An episode has the right cause if its key is among `causes`, and the
-    right subject if its subject, or the sensor whose row that is, is among `subjects`. A mistake without causes is none
-    that should be heard of.
+    right subject if whom it tells a user to look at (`told.accused`), or the sensor whose row that is, is among
+    `subjects`. A mistake without causes is none that should be heard of.
 
     `size` in `unit`: of a mistake that adds a constant to a sensor or an input, for those who compare. `shifts`:
     whether it moves the means of the innovations alone, by as much in every log; else it changes their noise, or what
@@ -44,7 +44,6 @@ class Mistake:
         """Whether the cause that an episode names is one of this mistake's."""
         return episode.cause in self.causes
 
-    def right_subject(self, episode: Episode) -> bool:
-        """Whether whom an episode names is one of this mistake's."""
-        own = episode.subject.partition(".")[0]
-        return not self.subjects or episode.subject in self.subjects or own in self.subjects
+    def right_subject(self, name: str) -> bool:
+        """Whether who is to blame by that name, a sensor or one of its rows, is one of this mistake's."""
+        return not self.subjects or not self.subjects.isdisjoint((name, name.partition(".")[0]))

@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimators.diagnostics.episodes import Episode, episodes
+from estimators.diagnostics.sensitivity.nudges import SENSOR
+from estimators.diagnostics.sensitivity.suspects import RIDDLES, likeliest, suspects
+from estimators.errors import NisusError
 from estimators.log import READING
 from estimators.track import TRACKING, WAITING
 
@@ -78,6 +81,30 @@ def heard_in(fold: Fold, calm: Fold) -> list[tuple[int, Episode]]:
         ),
         key=lambda pair: pair[0],
     )
+
+
+def accused(fold: Fold, episode: Episode, until: int) -> str:
+    """Whom a user is told to look at: the likeliest suspect where an episode leaves that open, else its subject.
+
+    A sensor row by its name alone, an input or a parameter after that word.
+
+    Args:
+        fold: In which the episode is.
+        episode: What was said.
+        until: When it is asked, ns of the log: what comes later is not known yet.
+    """
+    if episode.cause not in RIDDLES:
+        return episode.subject
+    seen = fold.log.copy()
+    seen.n = int(np.searchsorted(fold.log.t[: fold.n], until))
+    try:
+        found = likeliest(suspects(fold.estimator.name, fold.model, fold.tuning, seen, episode.start))
+    except NisusError:
+        found = ()
+    if not found:
+        return episode.subject
+    nudge = found[0].nudge
+    return nudge.name if nudge.kind == SENSOR else f"{nudge.kind} {nudge.name}"
 
 
 def green_share(fold: Fold, start: int, end: int) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 from estimators.diagnostics.episodes import episodes
 from estimators.diagnostics.score import Score, score
@@ -10,7 +11,7 @@ from estimators.diagnostics.score import Score, score
 from .bench import Bench, Folded
 from .foretold import VISIBLE, Foretold
 from .mistake import Mistake
-from .told import first_word, green_share, heard_in, recovery, said_at
+from .told import accused, first_word, green_share, heard_in, recovery, said_at
 
 GATE = 0.9973
 """Of the fold with the defence, where the twin ships without a gate."""
@@ -35,11 +36,12 @@ class Trial:
     `foretold`: visible, invisible or by chance, before it was made; `visible_from`: the multiple of its size from which
     on it would be visible, NaN where that is not known. `outcome`: one of `OUTCOMES`. `delay`: seconds from its start
     to the first episode with its cause and one of its subjects; `word`: to the first row that is not green; None is
-    never. `named`: the first episode after the start, subject and cause. What is heard of without the mistake, too,
-    does not count. `early`: episodes that were heard of before it began. `green`: share of green rows while it lasted.
-    `error` and `bare`: RMSE by state over the truth meanwhile, with a gate and without; `calm`: of the same filter over
-    the same time, without the mistake; `coverage`: share of the truth in the 95 % band, by state. `recovery`: seconds
-    from its end until green for good; None is never, or that it does not end.
+    never. `named`: the first episode after the start, subject and cause; `accused`: whom it tells a user to look at,
+    once all has been seen until the mistake's end. What is heard of without the mistake, too, does not count. `early`:
+    episodes that were heard of before it began. `green`: share of green rows while it lasted. `error` and `bare`: RMSE
+    by state over the truth meanwhile, with a gate and without; `calm`: of the same filter over the same time, without
+    the mistake; `coverage`: share of the truth in the 95 % band, by state. `recovery`: seconds from its end until green
+    for good; None is never, or that it does not end.
     """
 
     mistake: str
@@ -53,6 +55,7 @@ class Trial:
     delay: float | None
     word: float | None
     named: str | None
+    accused: str | None
     cause_right: bool
     subject_right: bool
     early: int
@@ -81,7 +84,9 @@ def make(bench: Bench, mistake: Mistake, estimator: str, foretold: Foretold) -> 
     told = heard_in(shipped, undisturbed.fold)
     since = [(at, item) for at, item in told if at >= begun]
     after = [(at, item) for at, item in since if at < ended]
-    fits = [at for at, item in after if mistake.right_cause(item) and mistake.right_subject(item)]
+    blamed = cache(lambda item: accused(shipped, item, ended))
+    fits = (at for at, item in after if mistake.right_cause(item) and mistake.right_subject(blamed(item)))
+    fit = next(fits, None)
     # That the estimate is lost is no cause, and is said sooner than one can be told.
     first = next((item for _, item in after if item.cause != "diverged"), after[0][1] if after else None)
     word = first_word(shipped, begun, undisturbed.fold)
@@ -96,12 +101,13 @@ def make(bench: Bench, mistake: Mistake, estimator: str, foretold: Foretold) -> 
         end=end,
         foretold=foretold.verdict,
         visible_from=foretold.multiple,
-        outcome=_outcome(mistake, foretold.verdict, heard, bool(fits)),
-        delay=(fits[0] - begun) / 1e9 if fits else None,
+        outcome=_outcome(mistake, foretold.verdict, heard, fit is not None),
+        delay=(fit - begun) / 1e9 if fit is not None else None,
         word=word,
         named=f"{first.subject} {first.cause}" if first is not None else None,
+        accused=blamed(first) if first is not None else None,
         cause_right=first is not None and mistake.right_cause(first),
-        subject_right=first is not None and mistake.right_subject(first),
+        subject_right=first is not None and mistake.right_subject(blamed(first)),
         early=sum(said_at(undisturbed.fold, item) < begun for item in episodes(undisturbed.fold)),
         green=green_share(shipped, begun, ended),
         error={name: fit.rmse for name, fit in scores["gated"].states.items()},

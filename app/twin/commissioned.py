@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from config.loader import Loaded
-from estimators.diagnostics.commission import Normal, baseline_of
+from estimators.diagnostics.commission import Normal
 from estimators.diagnostics.evidence import CAUSES
 from estimators.model.state_space import StateSpaceModel
 
 
-def baseline(loaded: Loaded, model: StateSpaceModel) -> np.ndarray | None:
-    """The baseline of the bank of tests, or None if nothing was commissioned.
+def commissioned(loaded: Loaded, model: StateSpaceModel) -> dict[str, Normal]:
+    """What was normal by sensor row; nothing if nothing was commissioned.
 
     Raises:
         ConfigError: With file and line, if it names what the model or the bank lacks.
@@ -26,10 +24,7 @@ def baseline(loaded: Loaded, model: StateSpaceModel) -> np.ndarray | None:
                 raise loaded.error(
                     ("commissioned", name, "reached", cause), f"is no cause; choose from {', '.join(CAUSES)}"
                 )
-    if not given:
-        return None
-    normals = {
-        name: Normal(section.bias, section.scale, section.correlation, section.reached)
+    return {
+        name: Normal(section.bias, section.scale, section.correlation, section.reached, section.nis)
         for name, section in given.items()
     }
-    return baseline_of(model, normals)

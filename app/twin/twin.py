@@ -16,6 +16,7 @@ from config.loader import Loaded, load, load_text
 from config.schema import TwinSection
 from config.source_schema import AssetSection
 from config.yaml_lines import parse
+from estimators.diagnostics.commission import baseline_of, lost_from
 from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import ConfigError, EstimatorError
 from estimators.fold_checks import check_variances
@@ -24,7 +25,7 @@ from estimators.registry import checked, find_entry, find_estimator
 from estimators.tuning import Tuning
 
 from ..intake import Planned
-from .commissioned import baseline
+from .commissioned import commissioned
 from .dropout import DegradedAfter, degraded_after
 from .late import Late, late_policy
 from .model import check_named, configure, find_model
@@ -96,8 +97,11 @@ class Twin:
     @property
     def policy(self) -> HealthPolicy:
         """When the estimate may be trusted."""
-        section = self.config.time
-        return HealthPolicy(degraded_after=self.degraded.seconds, stale_after=section.stale_after)
+        return HealthPolicy(
+            degraded_after=self.degraded.seconds,
+            stale_after=self.config.time.stale_after,
+            diverged_nis=lost_from(commissioned(self.loaded, self.model)),
+        )
 
     @cached_property
     def late(self) -> Late:
@@ -203,7 +207,9 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
     with _placed(loaded, ("estimator",)):
         entry = find_estimator(first.name, model)
     _check_options(loaded, ("estimator", "options"), first.name, first.options, model)
-    tuning = replace(Tuning.of(model), baseline=baseline(loaded, model)).with_options(_options(config, first.name))
+    normals = commissioned(loaded, model)
+    tuning = replace(Tuning.of(model), baseline=baseline_of(model, normals) if normals else None)
+    tuning = tuning.with_options(_options(config, first.name))
     if config.gate is not None:
         tuning = tuning.set("gate", config.gate.probability).set("gate.kind", config.gate.kind)
         tuning = tuning.set("gate.reopen", config.gate.seconds)

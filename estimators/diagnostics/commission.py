@@ -1,24 +1,27 @@
 """What was normal when a tuning was accepted: the null against which a change is a change.
 
 Recordings of real assets never leave white innovations. What a tuned filter leaves of data on which it was accepted
-is its normal: bias, scale and correlation of each row, and how high each test rises because of what they leave over.
+is its normal: bias, scale and correlation of each row, and how high each test, and the NIS over a window, rise because
+of what they leave over.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ..log import READING
+from ..log import READING, RESET
 from ..model.state_space import StateSpaceModel
 from ..track import FAILED, GATED, USED
 from .episodes import Folded, course_of, standardised
-from .evidence import BITS, CAUSES, chances_of, highest, no_baseline, threshold_of
+from .evidence import BITS, CAUSES, chances_of, highest, no_baseline, normal_nis, threshold_of
+from .health import FAR, FEW, HealthPolicy
 
 MARGIN = 1.5
-"""By which a test may rise above the highest that it reached, besides its own threshold: other days are other."""
+"""By which a test may rise above the highest that it reached, besides its own threshold, and the NIS over a window
+above its own: other days are other."""
 
 FEWEST = 50
 """Readings of a row from which on there is a normal."""
@@ -27,17 +30,26 @@ FEWEST = 50
 class Normal(NamedTuple):
     """What was normal of one sensor row.
 
-    `bias` and `scale` of its standardised innovations e, the lag-1 `correlation` of (e - bias) / scale, and the highest
-    W that the tests of each cause `reached`, by its name.
+    `bias` and `scale` of its standardised innovations e, the lag-1 `correlation` of (e - bias) / scale, the highest W
+    that the tests of each cause `reached`, by its name, and the most that the `nis` over the twin's window was at a
+    reading of this sensor, as a multiple of its normal mean; 0 where that is far from saying that the estimate is lost.
     """
 
     bias: float
     scale: float
     correlation: float
     reached: Mapping[str, float]
+    nis: float = 0.0
 
 
-def commission(fold: Folded, evidence: np.ndarray) -> dict[str, Normal]:
+class Judged(Folded, Protocol):
+    """A fold, and what it was judged by."""
+
+    @property
+    def policy(self) -> HealthPolicy: ...  # noqa: D102
+
+
+def commission(fold: Judged, evidence: np.ndarray) -> dict[str, Normal]:
     """What is normal in a fold whose tuning is accepted, by sensor row.
 
     Args:
@@ -76,7 +88,34 @@ def commission(fold: Folded, evidence: np.ndarray) -> dict[str, Normal]:
                 if own.size and own.max() > 1.0:
                     reached[name] = round(float(own.max()), 1)
             found[model.row_names[index]] = Normal(round(bias, 3), round(scale, 3), round(phi, 3), reached)
-    return found
+    most = _most_nis(fold, normal_nis(model, baseline_of(model, found)))
+    most[MARGIN * most <= HealthPolicy().diverged_nis] = 0.0
+    of_row = np.repeat(most, [len(sensor.rows) for sensor in model.sensors]).tolist()
+    nis = {name: round(value, 3) for name, value in zip(model.row_names, of_row, strict=True)}
+    return {name: normal._replace(nis=nis[name]) for name, normal in found.items()}
+
+
+def _most_nis(fold: Judged, normal: np.ndarray) -> np.ndarray:
+    """The most that the NIS over the window was at readings of each sensor, (sensors,).
+
+    A multiple of what was normal of the readings in it, `normal` (sensors,) times what the filter expected; the windows
+    are those of `health.assess`.
+    """
+    log, track, window = fold.log, fold.track, fold.policy.window
+    rows = np.flatnonzero(np.isin(track.verdict[: fold.n], (USED, GATED, FAILED)))
+    used, sensor = track.verdict[rows] == USED, log.channel[rows]
+    nis = np.where(used, track.nis[rows], 0.0)
+    due = np.where(used, track.dof[rows] * normal[sensor], 0.0)
+    resets = np.flatnonzero(log.kind[: fold.n] == RESET)
+    last_reset = np.append(-1, resets)[np.searchsorted(resets, rows)]
+    begin = np.searchsorted(rows, np.maximum(rows - FAR * window, last_reset), side="right")
+    begin = np.maximum(begin, np.arange(1, rows.size + 1) - window)
+    most = np.zeros(normal.size)
+    for i, first in enumerate(begin):
+        expected = due[first : i + 1].sum()
+        if i + 1 - first >= FEW and expected > 0.0:
+            most[sensor[i]] = max(most[sensor[i]], nis[first : i + 1].sum() / expected)
+    return most
 
 
 def baseline_of(model: StateSpaceModel, normals: Mapping[str, Normal]) -> np.ndarray:
@@ -88,3 +127,11 @@ def baseline_of(model: StateSpaceModel, normals: Mapping[str, Normal]) -> np.nda
         for cause, peak in normal.reached.items():
             own[3:][BITS == 1 << CAUSES.index(cause)] = MARGIN * peak
     return baseline
+
+
+def lost_from(normals: Mapping[str, Normal]) -> float:
+    """From which multiple of its normal mean on a NIS over the window says that the estimate is lost.
+
+    Where it came close on data on which it was not, from `MARGIN` times that on.
+    """
+    return max([HealthPolicy().diverged_nis, *(MARGIN * normal.nis for normal in normals.values())])

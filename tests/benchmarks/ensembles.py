@@ -17,6 +17,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.models.lorenz96 import LORENZ96
 from estimators.models.thermal_field import thermal_field
 from estimators.snapshots import Base
+from estimators.track import USED
 from estimators.tuning import Tuning
 
 from .timing import both, compare, judged
@@ -111,14 +112,17 @@ def _peak(reset: bool = False) -> float:
 def analysis(model: StateSpaceModel, name: str, options: dict[str, float], repetitions: int) -> tuple[float, ...]:
     """Seconds of the clock and of the processor for one analysis, and memory in units of the ensemble's own."""
     log = Log(model.width, 16)
-    y = model.prior_mean[0] + np.random.default_rng(0).standard_normal(model.width)
+    rng, rows = np.random.default_rng(0), len(model.sensors[0].rows)
     for _ in range(repetitions + 1):
+        # Not the same again, which would be refused as a duplicate.
+        y = model.prior_mean[0] + rng.standard_normal(rows)
         log.extend(Events.one(0, 0, READING, 0, y, model.width))
     fold = Fold(name, model, Tuning.of(model).with_options(options), log)
     fold.advance(1)
     gc.collect()
     peak = _peak(reset=True)
     times = [both(lambda: fold.advance(1)) for _ in range(repetitions)]
+    assert np.all(fold.track.verdict[: fold.n] == USED), "an analysis was not made"
     ensemble = fold._now.state.nbytes
     memory = (ensemble + fold._machine.work.nbytes + _peak() - peak) / ensemble
     return median(t for t, _ in times), median(t for _, t in times), memory

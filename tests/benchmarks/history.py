@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from app.stress.bench import plain_log
 from app.twin.twin import load_twin
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
@@ -53,31 +54,24 @@ def growing_history() -> None:
         print(f"  {size:9,d} {whole / size * 1e6:9.3f} {one * 1e6:9.1f} {after * 1e6:9.1f}")
 
 
-def recorded(twin, readings: int) -> Log:
-    """The twin's own recording, one copy after the other until there are enough readings."""
-    source = twin.open_source(lambda key, text: None, live=False)
-    once = []
-    try:
-        while (batch := source.read(1.0)) is not None:
-            once.append(batch)
-    finally:
-        source.close()
-    events = Events.concat(once, twin.model.width)
-    events = events.select(np.argsort(events.t, kind="stable"))
-    span = int(events.t[-1] - events.t[0]) + SECOND // 10
-    copies = -(-readings // int(np.sum(events.kind == READING)))
-    log = Log(twin.model.width, copies * len(events))
-    for k in range(copies):
-        log.extend(Events(events.t + k * span, events.arrival + k * span, *events[2:]))
-    enough = int(np.searchsorted(np.cumsum(log.events.kind == READING), readings)) + 1
-    log.n = min(log.n, enough)
+def told(twin, readings: int) -> Log:
+    """What the twin's asset says, without an end, until there are enough readings.
+
+    Its recording over and over would jump from its end to its beginning, and the gate would tell two stories there.
+    """
+    duration = 60.0
+    while np.count_nonzero((events := plain_log(twin, 0, duration)).kind == READING) < readings:
+        duration *= 2.0
+    enough = int(np.searchsorted(np.cumsum(events.kind == READING), readings)) + 1
+    log = Log.of(twin.model, capacity=enough)
+    log.extend(events.select(slice(0, enough)))
     return log
 
 
 def refold() -> None:
     """A slider moved: the history folded again from its start, for the default twin and every estimator that fits."""
     twin = load_twin(DEFAULT_TWIN)
-    log = recorded(twin, REFOLD_READINGS)
+    log = told(twin, REFOLD_READINGS)
     print(
         f"Refold of {REFOLD_READINGS:,} readings ({log.n:,} events with inputs and truths) of {DEFAULT_TWIN}, seconds"
     )

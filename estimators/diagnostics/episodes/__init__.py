@@ -3,11 +3,14 @@
 from .course import JOINED, Course, Folded, course_of, standardised
 from .episode import CAUSES, Episode, Found, anchor, episode_json
 from .find import episodes, found_in
-from .going import Going
+from .going import ANY, Going
+from .sensors import LOSSES
 
 __all__ = [
+    "ANY",
     "CAUSES",
     "JOINED",
+    "LOSSES",
     "Course",
     "Episode",
     "Folded",

@@ -20,7 +20,8 @@ class Course(NamedTuple):
     """Events, their rows, and with what they were folded.
 
     `marginal`: whether the predictions are not Gaussian. `heard` (sensors,): when each sensor spoke last before these
-    events, ns, 0 where it did not; None if they are the first.
+    events, ns, 0 where it did not; None if they are the first. `alarmed` (sensors,): for how many readings it had been
+    in alarm by then, and not lost.
     """
 
     model: StateSpaceModel
@@ -29,6 +30,7 @@ class Course(NamedTuple):
     events: Events
     track: Track
     heard: np.ndarray | None = None
+    alarmed: np.ndarray | None = None
 
 
 class Folded(Protocol):

@@ -18,6 +18,9 @@ from .course import Course, standardised, unusual
 from .episode import Episode
 from .sensors import OF_ALL_ROWS
 
+ANY = -1
+"""Bits of all alarms."""
+
 REFUSALS = {"refused": GATED, "screened": SCREENED}
 """Verdicts on the readings of an episode, by its cause."""
 
@@ -26,29 +29,31 @@ class Going(NamedTuple):
     """What is kept of rows that are forgotten.
 
     `sums` of its innovations since its onset, the likeliest `end` (s) with its log-likelihood ratio `gain`, and how
-    many readings were in order (`quiet`) since the last that was in alarm.
+    many readings were in order (`quiet`) since the last that was in alarm; `readings` since the onset in all.
     """
 
     sums: Sums = NOTHING
     gain: float = 0.0
     end: float = -np.inf
     quiet: int = 0
+    readings: int = 0
 
-    def over(self, course: Course, sensor: str, episode: Episode, at: int) -> Going:
-        """The same after the rows of a course, which follow; `at`: when its first alarm was, ns."""
+    def over(self, course: Course, sensor: str, episode: Episode, at: int, bits: int = ANY) -> Going:
+        """The same after the rows of a course, which follow; `at`: when its first alarm, one of `bits`, was, ns."""
         model, events = course.model, course.events
         s = model.sensor_names.index(sensor)
         mine = (events.kind == READING) & (events.channel == s)
         rows = np.flatnonzero(mine & (events.t * 1e-9 >= episode.start))
-        alarms = np.flatnonzero(course.track.alarms[rows].any(axis=1))
+        alarms = np.flatnonzero((course.track.alarms[rows] & bits != 0).any(axis=1))
         quiet = rows.size - 1 - int(alarms[-1]) if alarms.size else self.quiet + int(np.sum(events.t[rows] > at))
         e, kind = _signs(course, s, rows, episode)
         known = np.flatnonzero(np.isfinite(e))
         gain, sums = gains(e[known], kind, self.sums)
         best = int(np.argmax(gain)) if gain.size else -1
+        after = self._replace(sums=sums, quiet=quiet, readings=self.readings + rows.size)
         if best < 0 or gain[best] <= self.gain:
-            return self._replace(sums=sums, quiet=quiet)
-        return Going(sums, float(gain[best]), float(events.t[rows[known[best]]] * 1e-9), quiet)
+            return after
+        return after._replace(gain=float(gain[best]), end=float(events.t[rows[known[best]]] * 1e-9))
 
 
 def _signs(course: Course, s: int, rows: np.ndarray, episode: Episode) -> tuple[np.ndarray, str]:

@@ -49,6 +49,9 @@ TOLD_BY = {
 }  # fmt: skip
 """Which tests say so of each kind of effect."""
 
+LOSSES = ("stuck", "refused", "screened")
+"""Causes of which a sensor is lost."""
+
 OF_ALL_ROWS = ("disagreeing", "agreeing")
 """Causes that are of a sensor as a whole, not of one of its rows."""
 
@@ -83,15 +86,53 @@ def of_sensors(course: Course) -> Iterator[Found]:
     for s, sensor in enumerate(model.sensors):
         rows = np.flatnonzero((events.kind == READING) & (events.channel == s))
         masks = track.alarms[rows, : len(sensor.rows)]
+        lost = [item for bit in (STUCK, REFUSED) for item in runs((masks & bit != 0).any(axis=1), JOINED)]
         for run in runs(masks.any(axis=1), JOINED):
-            episode = _of_sensor(course, s, rows, masks, run)
-            yield Found(("sensor", sensor.name), run.begin, int(events.t[rows[run.begin]]), episode)
+            before = course.alarmed[s] if course.alarmed is not None and run.begin <= JOINED else 0
+            own = sorted(item for item in lost if run.begin <= item.begin < run.end)
+            later = [item for item in own if before + item.begin - run.begin > JOINED]
+            shown, hidden = _shown_of_both(course, s, rows, masks, run, later)
+            for kind, part, what in (("sensor", run, shown), *(("lost", *item) for item in hidden)):
+                if what is None:
+                    continue
+                episode = _episode(course, s, rows, part, what)
+                yield Found((kind, sensor.name), part.begin, int(events.t[rows[part.begin]]), episode)
 
 
-def _of_sensor(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run: Run) -> Episode:
+def _shown_of_both(
+    course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run: Run, later: list[Run]
+) -> tuple[Shown | None, list[tuple[Run, Shown]]]:
+    """What explains a run of alarms, and what it would hide: the parts of it, `later`, in which the sensor is lost.
+
+    What began so long before a sensor is lost is not explained by that. It goes on until it is seen to be over, and of
+    a sensor that is lost nothing else can be seen: None where it is from the first of these rows to the last.
+    """
+    hidden: list[tuple[Run, Shown]] = []
+    shown = None
+    for part in later:
+        what = _lost(course, s, rows, masks, part)
+        # In the course of anything a coarse sensor repeats itself for a while; for how long is not seen of one that
+        # does so from the first of these rows on.
+        if what is None or what.cause == "stuck" and part.begin > run.begin and what.over - what.begun <= JOINED:
+            continue
+        if not hidden:
+            begin, end = (run.begin, what.begun) if what.begun > run.begin else (part.end, run.end)
+            rest = Run(begin, end, run.lasts)
+            shown = _shown(course, s, rows, masks, rest) if begin < end else None
+        before = hidden[-1][1] if hidden else shown
+        if before is None or before.cause not in LOSSES or what.begun >= before.over:
+            hidden.append((part, what))
+    if not hidden:
+        return _shown(course, s, rows, masks, run), []
+    if shown is not None and shown.cause not in LOSSES and not shown.back:
+        shown = shown._replace(over=run.end)
+    return shown, hidden
+
+
+def _episode(course: Course, s: int, rows: np.ndarray, run: Run, shown: Shown) -> Episode:
     """The episode of a run of readings of a sensor, whose events are `rows`."""
     events, track, model = course.events, course.track, course.model
-    k, begun, over, cause, size, low, high, correlation, back = _shown(course, s, rows, masks, run)
+    k, begun, over, cause, size, low, high, correlation, back = shown
     nu = track.innovation[rows[begun:over], k]
     about = float(np.nanmean(nu)) if np.isfinite(nu).any() else np.nan
     reasons = ""
@@ -116,7 +157,19 @@ def _of_sensor(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run:
 
 
 def _shown(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run: Run) -> Shown:
-    """What explains a run best: what the gate and the edge did, then what the innovations show."""
+    """What explains a run best: that the sensor is lost, or else what the innovations show."""
+    lost = _lost(course, s, rows, masks, run)
+    if lost is not None:
+        return lost
+    said = np.bitwise_or.reduce(masks[run.begin : run.end])
+    if said[0] & (DISAGREEING | AGREEING) and not np.any(said & ~(DISAGREEING | AGREEING)):
+        cause = "disagreeing" if said[0] & DISAGREEING else "agreeing"
+        return _together(course, rows, run, cause)
+    return _most_telling(course, s, rows, masks, np.flatnonzero(said), run)
+
+
+def _lost(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run: Run) -> Shown | None:
+    """What the edge and the gate did in a run, or that a value repeats itself; None if the sensor is not lost."""
     begin, end, _ = run
     said = np.bitwise_or.reduce(masks[begin:end])
     verdict = course.track.verdict[rows]
@@ -133,10 +186,7 @@ def _shown(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run: Run
     until = begin + _after_last(np.any(masks[begin:end] & REFUSED, axis=1))
     if refused.size and np.mean(verdict[begin:until] == GATED) >= MOST:
         return _share(int(refused[0]), verdict, GATED, _after_last(verdict[:begin] == USED), run, cause="refused")
-    if said[0] & (DISAGREEING | AGREEING) and not np.any(said & ~(DISAGREEING | AGREEING)):
-        cause = "disagreeing" if said[0] & DISAGREEING else "agreeing"
-        return _together(course, rows, run, cause)
-    return _most_telling(course, s, rows, masks, np.flatnonzero(said), run)
+    return None
 
 
 def _share(k: int, verdict: np.ndarray, refusal: int, begun: int, run: Run, *, cause: str) -> Shown:

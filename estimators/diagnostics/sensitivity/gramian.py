@@ -28,7 +28,7 @@ from ...track import USED
 from ...tuning import Tuning
 from .information import information
 from .nudges import STEP, Given
-from .responses import Start, each, moved, refold, stand_in
+from .responses import Start, astray, each, moved, refold, stand_in
 from .size import most_events, reason_against
 
 TOLD = 1.0
@@ -116,6 +116,9 @@ def gramian(
         fold.advance(k - fold.n)
         mean, _ = fold.moments()
         bases.append(Base(mean, np.diag(model.prior_std**2), fold.clock, fold.u))
+    reason = astray(estimator, name, fold.track.select(slice(0, fold.n)))
+    if reason:
+        return Gramian(name, reason, note, None, ())
     spans = list(zip(begins, [*begins[1:], log.n], bases, strict=True))
     parts = [(begin, log.n, bases[0]), *(span for span in spans if windows and span[1] > span[0])]
     views = each(lambda part: _view(name, model, tuning, log, *part), parts, executor)

@@ -16,12 +16,15 @@ from ...log import READING, Log
 from ...model.state_space import StateSpaceModel
 from ...registry import find_entry, find_estimator, unfit
 from ...snapshots import Base
-from ...track import MISSING, NONE, USED, Track
+from ...track import DIVERGED, MISSING, NONE, USED, Track
 from ...tuning import Tuning
 from .nudges import Given, Nudge, nudged
 
 SMOOTH = ("ekf", "ukf", "kf")
 """Filters that stand in for one that draws at random, the first that applies."""
+
+ASTRAY = 0.1
+"""Share of the rows in which a filter has diverged, from which on it cannot stand in for another."""
 
 THREADS = int(numba.config.NUMBA_NUM_THREADS)
 
@@ -65,6 +68,16 @@ def stand_in(estimator: str, model: StateSpaceModel) -> tuple[str, str]:
         if unfit(find_entry(name), model) is None:
             return name, f"{estimator} draws at random; nudged in its place: {name}"
     return estimator, f"{estimator} draws at random, and no filter without chance applies: differences hold its noise"
+
+
+def astray(estimator: str, instead: str, track: Track) -> str:
+    """Why the fold of the filter `instead` tells nothing of what an estimator sees; nothing if it does.
+
+    One peak in place of two, or a linearisation where there is none: what moves a filter that is lost moves no other.
+    """
+    if instead == estimator or np.mean(track.health == DIVERGED) <= ASTRAY:
+        return ""
+    return f"{estimator} draws at random, and {instead}, which would be nudged in its place, loses this track"
 
 
 def start(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, base: Base | None, most: int) -> Start:

@@ -24,7 +24,7 @@ from .faults import fault
 from .information import Uncertainty, information, uncertainty
 from .integrity import Integrity, integrity
 from .nudges import KINDS, Nudge, nudges_of
-from .responses import Response, each, respond, start
+from .responses import Response, astray, each, respond, start
 from .size import most_events, reason_against
 from .visibility import tests_of
 
@@ -142,6 +142,9 @@ def sensitivity(
         return _nothing(estimator, reason, len(model.shown))
     count = len(model.row_names) + model.nu + len(model.parameters)
     begun = start(estimator, model, tuning, log, base, most or most_events(model, count))
+    reason = astray(estimator, begun.estimator, begun.track)
+    if reason:
+        return _nothing(estimator, reason, len(model.shown))
     nudges = nudges_of(model, tuning, begun.given.log, kinds)
     if not nudges:
         return _nothing(estimator, f"{model.name} has nothing to nudge of {', '.join(kinds)}", len(model.shown))

@@ -26,8 +26,11 @@ from ...model.state_space import StateSpaceModel
 from ...snapshots import Base
 from ...tuning import Tuning
 from .nudges import Given, Nudge, nudges_of
-from .responses import Start, each, refold, respond, stand_in
+from .responses import Start, astray, each, refold, respond, stand_in
 from .size import reason_against
+
+RIDDLES = ("shifted", "refused")
+"""Causes of episodes that leave open who is to blame."""
 
 MOST = 4000
 """Events since the beginning of an episode that are folded again."""
@@ -70,7 +73,8 @@ def suspects(
         executor: See `sensitivity`.
 
     Returns:
-        Every sensor row, input and parameter by log Λ; none where nudges do not apply (see `sensitivity`).
+        Every sensor row, input and parameter by log Λ; none where nudges do not apply (see `sensitivity`), or where a
+        filter that would stand in was lost before that time.
     """
     first = int(np.searchsorted(log.t[: log.n], round(since * 1e9)))
     cut = log.copy()
@@ -78,6 +82,8 @@ def suspects(
     if first >= cut.n or reason_against(model, cut):
         return []
     begun = _start(estimator, model, tuning, cut, base, first)
+    if begun is None:
+        return []
     seen = np.nan_to_num(begun.track.whitened)
     found = []
     for response in each(lambda nudge: respond(begun, nudge), nudges_of(model, tuning, begun.given.log), executor):
@@ -91,12 +97,16 @@ def suspects(
     return sorted(found, key=lambda suspect: -suspect.gain)
 
 
-def _start(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, base: Base | None, first: int) -> Start:
+def _start(
+    estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, base: Base | None, first: int
+) -> Start | None:
     """The fold from exactly the event `first` on, with the gate open: what it refuses tells most of all."""
     name, note = stand_in(estimator, model)
     own = tuning.with_options({}) if name != estimator else tuning
     fold = Fold(name, model, own, log, base=base)
     fold.advance(first)
+    if first and astray(estimator, name, fold.track.select(slice(0, first))):
+        return None
     here = fold.base_here()
     still = log.copy()
     still.drop_front(first)
@@ -104,9 +114,13 @@ def _start(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, bas
     return Start(name, given, refold(name, given), first, note)
 
 
-def in_words(found: Sequence[Suspect], most: int = 3) -> str:
-    """The likeliest, and those that explain as much; nothing if no single fault explains anything."""
+def likeliest(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
+    """The likeliest, and those that explain as much; none if no single fault explains anything."""
     if not found or found[0].gain < TELLING:
-        return ""
-    alike = [suspect for suspect in found if found[0].gain - suspect.gain < ALIKE][:most]
-    return " or ".join(suspect.nudge.in_words(suspect.size) for suspect in alike)
+        return ()
+    return tuple(suspect for suspect in found if found[0].gain - suspect.gain < ALIKE)
+
+
+def in_words(found: Sequence[Suspect], most: int = 3) -> str:
+    """Those of `likeliest`, at most so many."""
+    return " or ".join(suspect.nudge.in_words(suspect.size) for suspect in likeliest(found)[:most])

@@ -160,10 +160,14 @@ def test_what_does_not_apply_is_said_and_nothing_fails(name, seconds, capsys):
     # Numbers that are none are null: JSON has no NaN.
     found = json.loads(capsys.readouterr().out, parse_constant=lambda word: pytest.fail(word))
     assert set(found) == REQUIRED | MORE
-    if name == "thermal_field":
+    if name in ("agv_corridor", "thermal_field"):
         assert found["integrity"]["reason"] == found["observability"]["reason"] != ""
-        assert found["checklist"]["linearity"]["answer"] == "not told"
         assert found["smallest_visible"] == []
-        assert "temperature, all cells" in found["open_loop"]["states"]
     else:
         assert found["integrity"]["reason"] == "" and found["smallest_visible"]
+    if name == "thermal_field":
+        assert found["checklist"]["linearity"]["answer"] == "not told"
+        assert "temperature, all cells" in found["open_loop"]["states"]
+    if name == "agv_corridor":
+        # Its building looks the same after half a turn, so that a filter of one peak is lost in it.
+        assert "pf draws at random, and ekf, which would be nudged" in found["integrity"]["reason"]

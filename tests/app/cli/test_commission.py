@@ -10,7 +10,7 @@ from app.cli.arguments import Commission
 from app.cli.commission import commission_twin, lines, write
 from app.cli.fold import read_log
 from app.twin.twin import load_twin
-from estimators.diagnostics.commission import Normal, baseline_of
+from estimators.diagnostics.commission import Normal, baseline_of, lost_from
 from estimators.diagnostics.evidence import CAUSES
 from estimators.errors import ConfigError
 from estimators.fold import fold
@@ -65,9 +65,10 @@ def test_what_is_printed_is_what_is_read_again(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_every_figure_comes_back(tmp_path: Path) -> None:
-    normals = {"winding": Normal(-0.25, 1.75, -0.125, {"narrow": 12.5, "shifted up": 3.0, "stuck": 100.0})}
+    normals = {"winding": Normal(-0.25, 1.75, -0.125, {"narrow": 12.5, "shifted up": 3.0, "stuck": 100.0}, 12.5)}
     twin = load_twin(drive(tmp_path, TWIN + lines(normals)))
     np.testing.assert_array_equal(twin.tuning.baseline, baseline_of(twin.model, normals))
+    assert twin.policy.diverged_nis == lost_from(normals) == 18.75
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n"], ids=["unix", "windows"])

@@ -127,6 +127,33 @@ def test_what_began_before_the_rows_that_are_kept_is_carried_on(engine, asset):
     assert chronicle._tail.n <= 128
 
 
+@pytest.mark.parametrize("rows", [65_536, 512], ids=["all rows", "few rows"])
+def test_what_lasts_hides_no_later_loss(engine, rows):
+    """A tenth of the noise that is believed, and from the 600th reading on 500 times the same; also where the beginning
+    of both is forgotten.
+    """
+    rng = np.random.default_rng(3)
+    t = 1.0 + np.arange(N)
+    y = 40.0 + rng.normal(0.0, 0.1 * np.sqrt(MODEL.sensors[0].rows[0].variance), N)
+    y[600:1100] = y[600]
+    chronicle = Chronicle(engine, rows=rows)
+    for start in range(0, N, 20):
+        engine._accept([readings(t[start : start + 20], y[start : start + 20])])
+        chronicle.look()
+        if 800 <= start < 1000:
+            lasting = {entry.key[0]: entry.episode for entry in chronicle.account.lasting}
+            assert {kind: each.cause for kind, each in lasting.items()} == {"sensor": "wide", "lost": "stuck"}
+            assert lasting["lost"].start == pytest.approx(601.0)
+            worst = chronicle.account.leading(dict(winding="degraded"))
+            assert worst is not None and worst.cause == "stuck"
+    wide, stuck = chronicle.account.episodes
+    expected = whole(engine)
+    assert [(each.cause, each.start) for each in (wide, stuck)] == [(each.cause, each.start) for each in expected]
+    assert wide.end is None and stuck.end == pytest.approx(1100.0) == expected[1].end
+    assert chronicle._tail.n <= rows
+    assert sum(text.startswith("winding: no longer stuck") for text in said(engine)) == 1
+
+
 def test_another_revision_begins_anew_and_says_nothing_twice(asset):
     source = Scripted()
     engine = Engine(twin(), lambda report: source)

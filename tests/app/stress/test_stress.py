@@ -12,7 +12,7 @@ from app.stress.bench import Bench, without_truth
 from app.stress.foretold import CHANCE, DETECTION, INVISIBLE, VISIBLE, Foretold, Oracle
 from app.stress.matrix import matrix
 from app.stress.mistake import Mistake
-from app.stress.told import first_word, green_share, recovery, said_at
+from app.stress.told import accused, first_word, green_share, recovery, said_at
 from app.stress.trial import MISNAMED, NAMED, make
 from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import Episode
@@ -94,8 +94,9 @@ def test_the_matrix_can_be_made():
 
 def test_subject_and_cause():
     mistake = Mistake("", frozenset({"shifted"}), frozenset({"yoke"}))
-    assert mistake.right_cause(episode("tooth", "shifted")) and not mistake.right_subject(episode("tooth", "shifted"))
-    assert mistake.right_subject(episode("yoke.top", "wide")) and not mistake.right_cause(episode("yoke", "wide"))
+    assert mistake.right_cause(episode("tooth", "shifted")) and not mistake.right_subject("tooth")
+    assert mistake.right_subject("yoke.top") and mistake.right_subject("yoke")
+    assert not mistake.right_subject("input yoke") and not mistake.right_cause(episode("yoke", "wide"))
 
 
 def test_a_log_without_truth_keeps_its_rows():
@@ -148,6 +149,22 @@ def test_what_must_be_seen_is_seen_and_named(bench):
         trial = make(bench, chosen(bench, name), "kf", Foretold(VISIBLE))
         assert trial.named == named and trial.cause_right and trial.subject_right
         assert 0.0 <= trial.word <= trial.delay < 40.0 and trial.green < 0.6 and trial.early == 0
+
+
+def test_the_sensor_is_the_one_that_a_user_is_told_to_look_at(data):
+    """A heading that is off lets the position be refused, and the heading is to blame; as soon as that is asked."""
+    data("can_css_imu100_obd2", "session_00000164")
+    bench = Bench(load_twin("road_car"), 0, 600.0)
+    trial = make(bench, chosen(bench, "gnss_heading +20 σ"), "ekf", Foretold(VISIBLE))
+    assert trial.named.startswith("gnss_position.") and trial.accused == "gnss_heading"
+    assert trial.subject_right and trial.cause_right and trial.outcome == NAMED
+    # Before anything has been seen, and of a cause that leaves nothing open, it is who the episode is of.
+    begun, _ = bench.span(chosen(bench, "gnss_heading +20 σ"))
+    fold = bench.fold(chosen(bench, "gnss_heading +20 σ"), "ekf", bench.twin.tuning.gate).fold
+    early = episode("gnss_position.east", "refused", begun * 1e-9)
+    assert accused(fold, early, begun) == "gnss_position.east"
+    assert accused(fold, early._replace(cause="stuck"), begun + 100 * SECOND) == "gnss_position.east"
+    assert accused(fold, early, begun + 100 * SECOND) == "gnss_heading"
 
 
 def test_a_change_of_the_asset_is_made_in_the_asset():

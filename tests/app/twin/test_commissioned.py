@@ -1,4 +1,6 @@
-"""Recordings of real assets that ship are normal to themselves: with what was commissioned, no sensor is in alarm."""
+"""Recordings of real assets that ship are normal to themselves: with what was commissioned, no sensor is in alarm, and
+the estimate is not called lost.
+"""
 
 from dataclasses import replace
 
@@ -14,15 +16,17 @@ from estimators.log import READING, Log
 RECORDINGS = {
     "motor_bench": ("motor_pmsm_paderborn", "session60_first_30min_2hz.csv"),
     "battery_dmegc": ("battery_dmegc_18650", "Exp25_R2.mat"),
+    "motor_bench_joint": ("motor_pmsm_paderborn", "session60_first_30min_2hz.csv"),
 }
 
 
 def of_sensors(twin, log: Log, tuning) -> list:
-    """Episodes of sensors that speak, and what they say of them."""
+    """Episodes of sensors that speak, and what they say of them; and that the estimate is lost."""
     fold = Fold(twin.estimator, twin.model, tuning, log, policy=twin.policy)
     fold.advance()
     rows = {*twin.model.row_names, *twin.model.sensor_names}
-    return [each for each in episodes(fold) if each.subject in rows and each.cause not in ("silent", "never heard")]
+    told = [each for each in episodes(fold) if each.subject in rows or each.cause == "diverged"]
+    return [each for each in told if each.cause not in ("silent", "never heard")]
 
 
 @pytest.mark.parametrize("name", RECORDINGS)
@@ -34,6 +38,21 @@ def test_an_undamaged_recording_has_no_episode_of_a_sensor(data, name):
     assert twin.tuning.baseline is not None
     assert of_sensors(twin, log, twin.tuning) == []
     assert of_sensors(twin, log, replace(twin.tuning, baseline=None)) != []
+
+
+@pytest.mark.parametrize(("name", "sensor"), [("battery_dmegc", "voltage"), ("motor_bench_joint", "yoke")])
+def test_what_was_normal_hides_no_lost_estimate(data, name, sensor):
+    """A sensor that jumps to and fro by 100 of its standard deviations from the middle on."""
+    data(*RECORDINGS[name])
+    twin = load_twin(name)
+    log, _ = read_log(twin, None)
+    s = twin.model.sensor_names.index(sensor)
+    own = np.flatnonzero((log.kind[: log.n] == READING) & (log.channel[: log.n] == s))
+    own = own[own.size // 2 :]
+    std = np.sqrt(twin.tuning.r[twin.model.row_start[s]])
+    log.value[own, 0] += 100.0 * std * np.random.default_rng(2).choice([-1.0, 1.0], own.size)
+    lost = [each for each in of_sensors(twin, log, twin.tuning) if each.cause == "diverged"]
+    assert lost and lost[0].start * 1e9 >= log.t[own[0]]
 
 
 def test_a_change_is_heard_beyond_what_was_normal(data):
@@ -49,3 +68,19 @@ def test_a_change_is_heard_beyond_what_was_normal(data):
     starts = [each.start - log.t[0] * 1e-9 for each in found if each.subject == "yoke"]
     # The recording is a little rough just before, and the onset is where that begins, most likely.
     assert starts and min(starts) == pytest.approx(900.0, abs=30.0)
+
+
+@pytest.mark.parametrize("begin", [0.0, 300.0, 600.0, 900.0, 1200.0])
+def test_a_yoke_that_reads_two_degrees_too_high_is_heard_whenever_it_begins(data, begin):
+    """Twice the smallest that `nisus check` says is seen: by the yoke, or by the tooth that it contradicts."""
+    data(*RECORDINGS["motor_bench"])
+    twin = load_twin("motor_bench")
+    log, _ = read_log(twin, None)
+    s = twin.model.sensor_names.index("yoke")
+    since = log.t[0] + begin * 1e9
+    wrong = (log.kind[: log.n] == READING) & (log.channel[: log.n] == s) & (log.t[: log.n] >= since)
+    log.value[: log.n][wrong, 0] += 2.0
+    shifted = [each for each in of_sensors(twin, log, twin.tuning) if each.cause == "shifted"]
+    assert {each.subject for each in shifted} & {"yoke", "tooth"}
+    # In hindsight, an onset may come out as far before the fault as the recording was a little rough there.
+    assert min(each.start * 1e9 for each in shifted) > since - 30e9

@@ -5,11 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimators.diagnostics.commission import FEWEST, MARGIN, baseline_of, commission
-from estimators.diagnostics.evidence import BITS, CAUSES, NARROW, no_baseline
+from estimators.diagnostics.commission import FEWEST, MARGIN, Normal, baseline_of, commission, lost_from
+from estimators.diagnostics.evidence import BITS, CAUSES, NARROW, no_baseline, normal_nis
+from estimators.diagnostics.health import FAR, FEW, HealthPolicy
 from estimators.fold import Fold
-from estimators.log import READING, Events
+from estimators.log import READING, RESET, Events
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.track import DIVERGED
 from estimators.tuning import Tuning
 from tests.support import SECOND, as_log
 
@@ -59,8 +61,8 @@ def asset(seed, n=3000, *, change=None):
     return as_log(Events(t, t.copy(), np.full(2 * n, READING, np.int8), channel, value))
 
 
-def folded(log, baseline=None):
-    fold = Fold("kf", MODEL, replace(Tuning.of(MODEL), baseline=baseline), log)
+def folded(log, baseline=None, policy=None):
+    fold = Fold("kf", MODEL, replace(Tuning.of(MODEL), baseline=baseline), log, policy=policy)
     fold.advance()
     return fold
 
@@ -119,6 +121,55 @@ def test_the_baseline_is_what_was_normal(normals):
     np.testing.assert_array_equal(baseline[1:], no_baseline(MODEL)[1:])
     assert tuple(baseline[0, :3]) == part["gauge"][:3]
     assert np.all(baseline[0, 3:][BITS == NARROW] == MARGIN * part["gauge"].reached.get("narrow", 0.0))
+
+
+def lurching(n=600, at=200, until=212):
+    """The asset, of which the gauge jumps to and fro for a while, and a reset in the middle of that."""
+    rng = np.random.default_rng(3)
+    change = np.where((np.arange(n) >= at) & (np.arange(n) < until), rng.choice([-4.0, 4.0], n), 0.0)
+    events = asset(1, n, change=change).events
+    middle = Events.one((at + until) * SECOND // 2, 0, RESET, 0, (), MODEL.width)
+    return as_log(Events.concat([events, middle], MODEL.width))
+
+
+def test_the_highest_nis_over_a_window_is_by_definition():
+    """Over every reading and those before it, with a reset that begins anew: a loop over rows, as its words say."""
+    fold = folded(lurching())
+    normals = commission(fold, fold.evidence)
+    normal = normal_nis(MODEL, baseline_of(MODEL, normals))
+    log, track, most = fold.log, fold.track, [0.0, 0.0]
+    for i in np.flatnonzero(log.kind[: log.n] == READING):
+        rows = []
+        for k in range(i, max(-1, i - FAR * fold.policy.window), -1):
+            if log.kind[k] == RESET or len(rows) == fold.policy.window:
+                break
+            rows.append(k)
+        if len(rows) >= FEW:
+            ratio = track.nis[rows].sum() / (track.dof[rows] * normal[log.channel[rows]]).sum()
+            most[log.channel[i]] = max(most[log.channel[i]], ratio)
+    assert min(most) > HealthPolicy().diverged_nis
+    assert [normals[name].nis for name in normals] == pytest.approx([most[0], most[1], most[1]], abs=5.1e-4)
+
+
+def test_what_was_accepted_is_not_called_lost_and_what_is_half_as_bad_again_is():
+    log = lurching()
+    before = folded(log)
+    assert np.any(before.track.health == DIVERGED)
+    normals = commission(before, before.evidence)
+    policy = HealthPolicy(diverged_nis=lost_from(normals))
+    baseline = baseline_of(MODEL, normals)
+    again = folded(log, baseline, policy)
+    assert not np.any(again.track.health == DIVERGED)
+    # Three times as far is nine times the NIS.
+    log.value[: log.n][399:425:2, 0] *= 3.0
+    assert np.any(folded(log, baseline, policy).track.health == DIVERGED)
+
+
+def test_what_is_far_from_lost_changes_nothing(normals):
+    assert {normal.nis for normal in normals.values()} == {0.0}
+    usual = HealthPolicy().diverged_nis
+    assert lost_from({}) == lost_from(normals) == usual
+    assert lost_from({"gauge": Normal(0.0, 1.0, 0.0, {}, usual)}) == MARGIN * usual
 
 
 def test_too_few_readings_have_no_normal():

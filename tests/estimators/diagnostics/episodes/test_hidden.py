@@ -1,0 +1,87 @@
+"""What lasts of a sensor hides no later cause that asks for more: that one has an episode of its own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from estimators.diagnostics.episodes import course_of, found_in
+from estimators.fold import Fold
+from estimators.log import READING, Events
+from estimators.model.limits import Limits
+from estimators.tuning import Tuning
+from tests.support import SECOND, as_log
+
+from .test_find import MODEL, POLICY
+
+LIMITED = replace(
+    MODEL,
+    sensors=(replace(MODEL.sensors[0], limits=Limits(range=((-100.0, 100.0),))), MODEL.sensors[1]),
+)
+N, BEGIN, END = 1500, 700, 1000
+"""Readings of the gauge, one a second, and those that are changed."""
+
+
+def found(change, tuning, n=N):
+    """Episodes of the gauge, by key; `change` (readings, noise) -> readings from BEGIN to END."""
+    rng = np.random.default_rng(5)
+    level = np.cumsum(0.05 * rng.standard_normal(N))
+    y = level + 0.2 * rng.standard_normal(N)
+    y[BEGIN:END] = change(y[BEGIN:END])
+    batch = []
+    for k in range(n):
+        t = (k + 1) * SECOND
+        batch.append(Events.one(t, t, READING, 0, y[k], MODEL.width))
+        batch.append(Events.one(t, t, READING, 1, level[k] + rng.standard_normal(8), MODEL.width))
+    fold = Fold("kf", LIMITED, tuning, as_log(Events.concat(batch, MODEL.width)), policy=POLICY)
+    fold.advance()
+    items = found_in(course_of(fold))
+    return {item.key[0]: item.episode for item in items if item.episode.subject == "gauge"}, len(items)
+
+
+WIDE = Tuning.of(LIMITED).set("R.gauge", 1.0)
+"""A gauge that is believed to be five times as noisy as it is, from the first reading to the last."""
+
+GATED_WIDE = WIDE.set("gate", 0.9999).set("gate.reopen", None)
+
+CAUSES = {
+    "screened": (WIDE, lambda y: y + 500.0),
+    "refused": (GATED_WIDE, lambda y: y + 50.0),
+    "stuck": (WIDE, lambda y: np.full_like(y, y[0])),
+}
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+def test_what_asks_for_more_has_an_episode_of_its_own(cause):
+    tuning, change = CAUSES[cause]
+    told, _ = found(change, tuning)
+    assert set(told) == {"sensor", "lost"}
+    assert (told["sensor"].cause, told["lost"].cause) == ("wide", cause)
+    assert (told["lost"].start, told["lost"].end) == pytest.approx((BEGIN + 1.0, END), abs=1e-6)
+    assert told["sensor"].start < 60.0 and told["sensor"].end is None and "again" not in told["sensor"].text
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+def test_while_it_lasts_both_do(cause):
+    tuning, change = CAUSES[cause]
+    told, _ = found(change, tuning, n=BEGIN + 120)
+    assert (told["sensor"].cause, told["lost"].cause) == ("wide", cause)
+    assert told["sensor"].end is None and told["lost"].end is None
+    assert told["lost"].start == BEGIN + 1.0
+
+
+def test_what_is_of_one_cause_is_one_episode():
+    """The refusals with which it begins, and what the other tests say of the same readings."""
+    told, _ = found(CAUSES["refused"][1], Tuning.of(LIMITED).set("gate", 0.9999).set("gate.reopen", None))
+    assert [episode.cause for episode in told.values()] == ["refused"]
+
+
+def test_one_that_is_stuck_and_then_elsewhere_has_two():
+    """Equal for 150 readings, then beyond its range for 150."""
+
+    def change(y):
+        return np.where(np.arange(y.size) < 150, y[0], y + 500.0)
+
+    told, _ = found(change, Tuning.of(LIMITED))
+    assert (told["sensor"].cause, told["lost"].cause) == ("stuck", "screened")
+    assert told["lost"].start == pytest.approx(BEGIN + 151.0, abs=0.5)
