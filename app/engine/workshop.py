@@ -209,7 +209,7 @@ def _serve(connection: Connection[Any, Piece], work: Callable[[Piece], None], ni
     # Ctrl-C is for the process that shows the twin, which ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if niceness and sys.platform != "win32":
-        os.nice(niceness)
+        os.setpriority(os.PRIO_PROCESS, 0, niceness)
     # Compiling leaves few cycles behind, and looking for them takes an eighth of the time.
     gc.disable()
     while True:

@@ -95,7 +95,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         predicted[i] = x[i]
     iterations = int(options(context)[ITERATIONS])
     verdict = USED
-    m = 0
+    m = np.int64(0)  # a literal would compile all that takes it twice
     for iteration in range(iterations):
         linearise(context, sensor, x, u, P, reading, H, own.jacobian)
         m = compare(context, sensor, y, reading, H, P, places.innovation, places.innovation_std)

@@ -166,7 +166,7 @@ def gather(context, sensor, y, reading, H, P, innovation, innovation_std):
     """Fill ν and d, and move what belongs to rows that are there to the front; how many there are."""
     nu, S, C = reading.nu, reading.S, reading.C
     circular = circular_rows(context, sensor)
-    m = 0
+    m = np.int64(0)  # a literal would compile all that takes it twice
     for i in range(reading.r.size):
         if not np.isfinite(y[i]):
             continue

@@ -181,7 +181,7 @@ def triangularise_joint(d, m, Y, U, lost, A, w, v):
 def gather(context, sensor, y, own, expected, Y, lost, innovation):
     """Fill the innovation ν, in place of ŷ, and d; move what belongs to rows that are there to the front; how many."""
     circular = circular_rows(context, sensor)
-    m = 0
+    m = np.int64(0)  # a literal would compile all that takes it twice
     for i in range(expected.size):
         if np.isfinite(y[i]):
             residual = y[i] - expected[i]

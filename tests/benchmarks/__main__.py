@@ -13,7 +13,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 
 def main() -> None:
-    from . import defences, ensembles, false_alarms, filters, history, particles_, sources
+    from . import defences, ensembles, false_alarms, filters, history, page_, particles_, sources
 
     begun = perf_counter()
     load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
@@ -37,6 +37,7 @@ def main() -> None:
         defences.defences,
         sources.blf,
         false_alarms.false_alarms,
+        page_.page,
     ]
     for section in sections:
         print()

@@ -18,7 +18,7 @@ import sys
 import tempfile
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,9 @@ from .live import FLAGS
 from .timing import judged
 
 MOVES = 20
+
+HISTORY = 20_000
+"""Events that are kept in a soak: so many come in less than two minutes, after which memory must stay."""
 
 KNOB = """async (value) => {
   const box = document.querySelector('.knob[data-key^="Q."] .field input');
@@ -233,8 +236,9 @@ def arrival(browser: Any, seconds: float) -> None:
 
 
 def soak(browser: Any, minutes: float) -> None:
-    """Memory of server and page at 200 readings a second with 10,000 particles."""
-    options = ("--estimator", "pf", "--set", 'filters.pf={"particles": 10000}', "--set", "source.asset.step=0.015")
+    """Memory of server and page at 200 readings a second with 10,000 particles, and a history that is soon full."""
+    options = ("--estimator", "pf", "--set", 'filters.pf={"particles": 10000}', "--set", "source.asset.step=0.015",
+               "--set", f"history={HISTORY}")  # fmt: skip
     with running("motor_can", *options) as run:
         page, _ = opened(browser, run.url)
         drawn(page)
@@ -251,27 +255,40 @@ def soak(browser: Any, minutes: float) -> None:
             print(line, flush=True)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="*", default=["first", "knob", "share", "crowd", "arrival"])
-    parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--minutes", type=float, default=10.0, help="of the part `soak`")
-    given = parser.parse_args()
+PARTS = ("first", "knob", "share", "crowd", "arrival")
+
+
+def measure(parts: Sequence[str], seconds: float, minutes: float) -> None:
+    """Some of the above."""
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
-    if "crowd" in given.parts:
-        crowd(given.seconds)
+    if "crowd" in parts:
+        crowd(seconds)
     with browsing() as browser:
-        parts = {
+        known: dict[str, Callable[[], None]] = {
             "first": lambda: first_use(browser),
             "knob": lambda: knob(browser),
-            "share": lambda: share(browser, given.seconds),
-            "arrival": lambda: arrival(browser, given.seconds),
-            "soak": lambda: soak(browser, given.minutes),
+            "share": lambda: share(browser, seconds),
+            "arrival": lambda: arrival(browser, seconds),
+            "soak": lambda: soak(browser, minutes),
         }
-        for part in given.parts if browser is not None else ():
-            if part in parts:
-                parts[part]()
+        for part in parts if browser is not None else ():
+            if part in known:
+                known[part]()
                 print(f"  load {os.getloadavg()[0]:.1f}", flush=True)
+
+
+def page() -> None:
+    """What the page costs, and how long a person waits for it."""
+    measure(PARTS, 15.0, 0.0)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("parts", nargs="*", default=PARTS, help="among first, knob, share, crowd, arrival and soak")
+    parser.add_argument("--seconds", type=float, default=30.0, help="of each part")
+    parser.add_argument("--minutes", type=float, default=10.0, help="of the part `soak`")
+    given = parser.parse_args()
+    measure(given.parts, given.seconds, given.minutes)
 
 
 if __name__ == "__main__":

@@ -14,9 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.engine.commands import SetEstimator, SetTuning
+from app.engine.commands import Record, SetEstimator, SetTuning
 from app.engine.engine import Engine
 from app.engine.workshop import Workshop
+from app.recording.format import tuning_from_json
+from app.recording.reader import read_recording
+from app.recording.writer import Recorder
 from estimators.fold import Fold, fold
 from estimators.log import Log
 from estimators.numerics.threads import threaded
@@ -147,6 +150,30 @@ def test_before_the_first_filter_is_compiled_the_log_grows_and_nothing_is_estima
     assert_same(pull_all(engine).track, cold(times, values, "kf", Tuning.of(MODEL).set("Q.rate", 0.5)))
     (run,) = engine.revisions.runs
     assert run.number == fresh_status(engine).revision == 0 and run.tuning.get("Q.rate") == 0.5
+
+
+def test_a_recording_that_begins_before_the_first_filter_holds_all_of_it(started, tmp_path):
+    engine, source = started(kf=1)
+    recorder = engine.recorder = Recorder(engine, lambda stream: lambda pull: None)
+    recorder.start()
+    times, values = series(120)
+    source.put(readings(times[:60], values[:60]))
+    wait_for(lambda: engine.span()[1] == round(times[59] * 1e9))
+    engine.submit(Record(tmp_path / "run.rrd"))
+    wait_for(lambda: recorder.path is not None)
+    (tmp_path / "go").touch()
+    wait_for(lambda: row_count(engine) == 60)
+    source.put(readings(times[60:], values[60:]))
+    wait_for(lambda: row_count(engine) == 120)
+    engine.stop()
+    recorder.stop()
+    recorded = read_recording(tmp_path / "run.rrd")
+    np.testing.assert_array_equal(recorded.events.value[:, 0], values)
+    tuning, estimator = tuning_from_json(recorded.tuning, MODEL)
+    log = Log(1)
+    log.extend(recorded.events)
+    assert_same(fold(estimator, MODEL, tuning, log, pairs=np.array([[0, 1]])), cold(times, values, "kf"))
+    assert recorded.base is None
 
 
 def test_who_chooses_another_filter_meanwhile_gets_that(started, tmp_path):
