@@ -9,7 +9,7 @@ PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist lo
 # Tests of what is written in vector instructions, which LLVM splits where a processor's vectors are shorter.
 VECTORS := simd_rows simd_exp linalg inverse_root symmetric
 
-.PHONY: run test fast generic versions bench clean
+.PHONY: run test fast generic versions bench shots clean
 
 run: $(VENV)/.installed
 	$(BIN)/nisus run motor_can
@@ -35,6 +35,10 @@ versions: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.benchmarks
+
+# The README's pictures, from the running page.
+shots: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.shots
 
 $(VENV)/bin/python:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Nisus needs Python 3.11 or later; try: make PYTHON=python3.11")'

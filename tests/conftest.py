@@ -89,11 +89,17 @@ def data() -> Callable[..., Path]:
     return find
 
 
+def find_chromium() -> str | None:
+    """Path of a Chromium, or None."""
+    given = os.environ.get("NISUS_CHROMIUM")
+    found = given or next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    return found if found and Path(found).exists() else None
+
+
 @pytest.fixture(scope="session")
 def chromium() -> str:
     """Path of a Chromium; the test skips where there is none."""
-    given = os.environ.get("NISUS_CHROMIUM")
-    found = given or next((path for name in BROWSERS if (path := shutil.which(name))), None)
-    if not found or not Path(found).exists():
+    found = find_chromium()
+    if found is None:
         absent("no Chromium found; install one (Debian: apt install chromium) or set NISUS_CHROMIUM to its path")
     return str(found)

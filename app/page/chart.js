@@ -67,7 +67,7 @@ export class Chart {
         },
         axes: [
           { ...axis(), size: 3, values: (self, splits) => splits.map(() => null) }, // time stands below all charts
-          { ...axis(), size: GAP, splits, values: (self, values) => values.map((value) => compact(value, 7)), ...(what.axis ?? {}) },
+          { ...axis(), size: GAP, splits, values: (self, values) => (this.empty ? [] : values.map((value) => compact(value, 7))), ...(what.axis ?? {}) },
         ],
         series: [{}, ...what.series],
         bands: what.bands ?? [],
@@ -106,6 +106,7 @@ export class Chart {
 
   draw() {
     this.waiting = false;
+    this.empty = !this.data.slice(1).some((values) => values.some((value) => typeof value === "number"));
     this.plot.batch(() => {
       this.plot.setData(this.data, false);
       this.plot.setScale("x", { min: this.span[0], max: this.span[1] });

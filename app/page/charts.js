@@ -11,7 +11,7 @@ import { TimeAxis } from "./time_axis.js";
 import { Range, bandExtent, extent, within } from "./ranges.js";
 
 const MOST = 24; // charts of states or rows
-const FEW = 6; // states of which those that nobody measures have more room
+const FEW = 6; // states of which those that nobody measures have more room; rows that are charted at first
 const DENSITY = 1.6; // px to a group of rows
 
 // The columns of a state's chart from the live lane, in the order of its series.
@@ -40,7 +40,7 @@ export class Charts {
     this.parts = [
       ...order.map((state) => stateChart(this, state)),
       nisChart(this),
-      ...model.rows.slice(0, MOST).map((row) => innovationChart(this, row)),
+      ...model.rows.slice(0, MOST).map((row, k) => innovationChart(this, row, model.rows.length > FEW && k >= FEW)),
     ];
     this.charts = this.parts.map((part) => new Chart(part, actions));
     node.replaceChildren(...this.charts.map((chart) => chart.node));
@@ -254,12 +254,13 @@ function nisRange(live, normal) {
   return [known ? Math.min(middle - 1, Math.log10(low) - 0.15) : middle - 1, known ? Math.max(middle + 1, Math.log10(high) + 0.15) : middle + 1];
 }
 
-function innovationChart(charts, row) {
+function innovationChart(charts, row, further) {
   const range = new Range();
   const { live } = charts;
   const names = ["innovation_upper", "innovation_lower", "innovation"].map((kind) => `${kind}:${row.name}`);
   return {
     key: `innovation:${row.name}`,
+    further,
     title: words(row.name),
     unit: bracketed(row.unit),
     note: "innovation, reading − prediction",

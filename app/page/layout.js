@@ -67,7 +67,7 @@ export class Layout {
   }
 
   apply() {
-    const hidden = new Set(this.kept.hidden ?? []);
+    const hidden = new Set(this.hidden);
     this.order.forEach((chart, k) => {
       chart.node.style.order = k;
       chart.node.hidden = hidden.has(chart.what.key);
@@ -77,12 +77,17 @@ export class Layout {
     this.told();
   }
 
+  // Of a sensor with many rows, such as a grid of thermocouples, the first few are enough until more are asked for.
+  get hidden() {
+    return this.kept.hidden ?? this.charts.filter((chart) => chart.what.further).map((chart) => chart.what.key);
+  }
+
   keep() {
     localStorage.setItem(this.key, JSON.stringify(this.kept));
   }
 
   offer() {
-    const hidden = new Set(this.kept.hidden ?? []);
+    const hidden = new Set(this.hidden);
     const show = (chart, shown) => {
       if (shown) hidden.delete(chart.what.key);
       else hidden.add(chart.what.key);
