@@ -86,15 +86,16 @@ export class Faults {
   }
 
   show(status) {
+    if (!this.list) return; // of a recording there is none to put in
     const held = status.faults ?? [];
-    const key = JSON.stringify(held);
-    if (key === this.shown) return;
-    this.shown = key;
-    this.list?.replaceChildren(
-      ...held.map((fault) =>
-        element("li", {}, element("span", {}, fault.text ?? words(fault.kind)), element("button", { type: "button", onclick: () => this.link.ask("ClearFault", { number: fault.number }) }, "stop")),
-      ),
-    );
+    const key = JSON.stringify(held.map((fault) => fault.number));
+    if (key !== this.shown) {
+      this.shown = key;
+      const stop = ({ number }) => element("button", { type: "button", onclick: () => this.link.ask("ClearFault", { number }) }, "stop");
+      this.list.replaceChildren(...held.map((fault) => element("li", {}, element("span", {}), stop(fault))));
+    }
+    // In place: a button that is made anew with every count is hard to meet.
+    held.forEach((fault, k) => setText(this.list.children[k].firstChild, fault.text ?? words(fault.kind)));
   }
 
   maintenanceSection() {
