@@ -84,3 +84,31 @@ def test_rerun_has_a_window_of_its_own(context, session):
     assert page.evaluate("document.getElementById('notice').hidden")
     assert page.evaluate("document.getElementById('rerun').clientHeight") > 700
     assert errors == []
+
+
+def test_in_the_dark_the_scene_has_light_labels_on_dark(chromium, session):
+    """Viser draws black on white: boxes of some thousand pixels. Letters alone are a few hundred."""
+    import io
+
+    import numpy as np
+    from PIL import Image
+
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+        page = browser.new_context(viewport={"width": 1400, "height": 900}, color_scheme="dark").new_page()
+        page.goto(session.url)
+        wait_for(lambda: session.view.history.n > 0, PATIENCE)
+
+        def share(least):
+            """Of the lower half, with a scale's numbers and the temperature in words: pixels as grey and as light."""
+            box = page.locator("#stage").bounding_box()
+            clip = box | {"y": box["y"] + box["height"] / 2, "height": box["height"] / 2}
+            image = Image.open(io.BytesIO(page.screenshot(clip=clip, timeout=PATIENCE * 1000))).convert("RGB")
+            pixels = np.asarray(image).astype(int)
+            return np.mean((pixels.min(axis=2) > least) & (np.ptp(pixels, axis=2) < 40))
+
+        wait_for(lambda: share(110) > 2e-4, PATIENCE)
+        page.wait_for_timeout(2000)
+        assert share(190) < 2e-3
+        browser.close()
