@@ -81,6 +81,8 @@ def load(name: str | os.PathLike[str], overrides: Mapping[str, str] | None = Non
     path = find(name)
     shown_name = shown_path(path)
     try:
+        if not path.is_file() and not path.is_dir() and path.exists():
+            raise ConfigError(f"{shown_name}: it is a pipe or a device, which may never end; give a file")
         raw = path.read_bytes()
     except FileNotFoundError:
         raise ConfigError(f"{shown_name}: there is no such file; check the path, or see `nisus twins`") from None

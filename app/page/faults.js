@@ -1,7 +1,7 @@
 // Faults on demand and maintenance: put something wrong into what the source says, and see how soon the twin tells.
 
 import { element, setText } from "./dom.js";
-import { words } from "./format.js";
+import { spaced, words } from "./format.js";
 import { section } from "./tune.js";
 
 export class Faults {
@@ -25,7 +25,7 @@ export class Faults {
     if (!available) return section("Faults on demand", hint, false, element("p", { class: "about" }, "A recording that is reviewed holds what came, faults included."));
     this.kind = element("select", { "aria-label": "Fault", onchange: () => this.offer() }, ...kinds.map((kind) => element("option", { value: kind.name, title: kind.help }, words(kind.name))));
     this.target = element("select", { "aria-label": "Of what", onchange: () => this.offerRows() });
-    this.row = element("select", { "aria-label": "Row" });
+    this.row = element("select", { "aria-label": "Row", onchange: () => this.showUnits() });
     this.other = element("select", { "aria-label": "Swapped with" });
     this.help = element("p", { class: "about" });
     this.numbers = element("div", { class: "numbers" });
@@ -50,7 +50,7 @@ export class Faults {
     const rows = kind.parameters.map((number) => {
       const field = element("input", { type: "text", inputmode: "decimal", "aria-label": words(number.name), placeholder: number.default ?? "" });
       this.fields.set(number.name, field);
-      return element("label", { title: number.help }, element("span", {}, words(number.name)), field, element("span", { class: "unit" }, number.unit ?? ""));
+      return element("label", { title: number.help }, element("span", {}, words(number.name)), field, element("span", { class: "unit", dataset: { unit: number.unit ?? "" } }));
     });
     const duration = element("input", { type: "text", inputmode: "decimal", "aria-label": "duration", placeholder: "until stopped" });
     this.fields.set("duration", duration);
@@ -66,6 +66,20 @@ export class Faults {
     const others = kind.other ? Object.keys(this.catalogue.sensors).filter((name) => name !== this.target.value) : [];
     this.other.replaceChildren(...others.map((name) => element("option", { value: name }, words(name))));
     this.other.hidden = !others.length;
+    this.showUnits();
+  }
+
+  /* "row" in a unit is that of what is chosen; rows of several units have none in common. */
+  showUnits() {
+    const { sensors, inputs, parameters } = this.catalogue;
+    const [what, name] = this.target.value.split(/\.(.*)/s);
+    const rows = (sensors[this.target.value] ?? []).filter((row) => this.row.hidden || !this.row.value || row.name === this.row.value);
+    const units = new Set(what in { input: 1, parameter: 1 } && name ? [{ input: inputs, parameter: parameters }[what][name]] : rows.map((row) => row.unit));
+    const own = units.size === 1 ? [...units][0] : "";
+    for (const node of this.numbers.querySelectorAll("[data-unit]")) {
+      const unit = node.dataset.unit.replace("row", own);
+      setText(node, own || !node.dataset.unit.includes("row") ? spaced(unit).trim() : "");
+    }
   }
 
   async inject() {

@@ -74,11 +74,15 @@ const commands = [
 keys(commands);
 
 const answer = await fetch("/api/gallery");
-if (!answer.ok) throw new Error(await answer.text());
+if (!answer.ok) {
+  setText($("none"), "The twins could not be listed; reload the page.");
+  throw new Error(await answer.text());
+}
 shown = (await answer.json()).map((item) => card(item, { start, open }));
 $("cards").replaceChildren(...shown.map((item) => item.node));
 commands.push(...shown.filter((item) => item.ready).map((item) => ["", `start ${item.short}`, () => start(item.name)]));
 if (session.state) draw(session.state);
+setText($("none"), "No twin of that name, question or kind.");
 find();
 if (location.hash === "#recordings") $("recordings").querySelector("button").focus();
 window.nisus = { session, cards: shown.length };

@@ -2,7 +2,7 @@
 // noted, loaded, saved as YAML, and compared with another.
 
 import { element, setText } from "./dom.js";
-import { compact, span } from "./format.js";
+import { compact, spaced, span } from "./format.js";
 import { swatch } from "./pins.js";
 
 const LOOK = 300; // ms between two looks at whether there is something new
@@ -84,7 +84,7 @@ export class Runs {
     const scores = score
       ? element("tr", { class: "scores" },
           cell("nis", compact(score.nis, 3), `Bounds ${compact(score.nis_low, 3)} to ${compact(score.nis_high, 3)}; ${score.readings} readings in ${span(score.seconds)}, ${compact(100 * (score.refused ?? 0), 2)} % refused`),
-          cell("rmse", fit ? compact(fit.rmse, 3) : "–", fit ? `${fit.name}, ${fit.against}: mean error ${compact(fit.bias, 2)} ${fit.unit}` : "No truth, and no sensor is held out"),
+          cell("rmse", fit ? compact(fit.rmse, 3) : "–", fit ? `${fit.name}, ${fit.against}: mean error ${compact(fit.bias, 2)}${spaced(fit.unit)}` : "No truth, and no sensor is held out"),
           cell("coverage", fit ? `${compact(100 * fit.coverage, 3)} %` : "–"),
           cell("likelihood", compact(score.log_likelihood_reading, 4), `In all ${compact(score.log_likelihood, 6)}`),
           cell("step", compact(score.step_us, 3)))

@@ -20,7 +20,12 @@ async def answered(request: Request, take: Callable[[Any], Awaitable[Response]])
     if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
         return PlainTextResponse("Nisus: Content-Type must be application/json.\n", 415)
     try:
-        return await take(json.loads(await bounded_body(request)))
+        text = await bounded_body(request)
+        try:
+            body = json.loads(text)
+        except (ValueError, RecursionError):
+            return Json({"error": "the body is no JSON, or holds a number or a nesting that is too large"}, 400)
+        return await take(body)
     except TooLarge as error:
         return PlainTextResponse(f"Nisus: {error}.\n", 413)
     except (NisusError, ValueError, RecursionError) as error:

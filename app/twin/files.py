@@ -27,6 +27,8 @@ def find_recording(
     if log_files is not None:
         files = [file.expanduser() for file in log_files]
         for file in files:
+            if file.is_dir():
+                raise SourceError(f"--log {file}: it is a folder; name the files in it")
             if not file.is_file():
                 raise SourceError(f"--log {file}: there is no such file; check the path")
         return files

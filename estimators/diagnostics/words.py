@@ -89,11 +89,11 @@ def of_sensor(
     """
     sensor = model.sensors[s]
     row = sensor.rows[k]
-    name, unit = model.row_names[model.row_start[s] + k], row.unit
+    name, unit = model.row_names[model.row_start[s] + k], _spaced(row.unit)
     when = since(start)
     if cause == "shifted":
         side = "above" if about > 0 else "below"
-        size_in_words = f"{abs(about):.3g} {unit} ({abs(size):.1f} σ)"
+        size_in_words = f"{abs(about):.3g}{unit} ({abs(size):.1f} σ)"
         where = f"{name} reads {size_in_words} {side} the prediction {when}"
         return f"{where}: the sensor, an input or a parameter; hold {sensor.name} out to see"
     if cause == "narrow":
@@ -121,7 +121,7 @@ def of_sensor(
         what = f"{name} breaks its limits ({reasons}) {when}: {100 * size:.0f} % of its readings are not used"
         return f"{what}; {_lost(model, s)}; look at the sensor, or at sensors.{sensor.name} in the YAML"
     if cause == "stuck":
-        return f"{name} is stuck at {size:.6g} {unit} {when}: {_lost(model, s)}; hold it out until it is mended"
+        return f"{name} is stuck at {size:.6g}{unit} {when}: {_lost(model, s)}; hold it out until it is mended"
     if cause == "disagreeing":
         return f"rows of {sensor.name} contradict each other {when}: R.{sensor.name} too small, or one of them is wrong"
     return f"rows of {sensor.name} are closer to the prediction than their noise {when}: R.{sensor.name} too large"
@@ -176,9 +176,14 @@ def of_loss(start: float, off: Sequence[str], sensors: int) -> str:
     return f"{lost}, and {names} {says} and Reset when the rest agrees"
 
 
+def _spaced(unit: str) -> str:
+    """A unit as it follows a number; of what has none, nothing."""
+    return f" {unit}" if unit and unit != "1" else ""
+
+
 def of_truth(name: str, rmse: float, unit: str, size: float, start: float) -> str:
     """A state whose truth was told, and is `rmse` away, `size` standard deviations."""
-    where = f"{name} is {rmse:.3g} {unit} ({size:.1f} σ) from the truth {since(start)}"
+    where = f"{name} is {rmse:.3g}{_spaced(unit)} ({size:.1f} σ) from the truth {since(start)}"
     return f"{where}: the estimate is wrong and its band does not say so; look at what else is in alarm"
 
 
@@ -194,6 +199,6 @@ def of_range(item: State | Input, size: float, start: float) -> str:
     assert item.fitted is not None
     low, high = item.fitted
     return (
-        f"{item.name} is {size:.4g} {item.unit}, outside {low:g} to {high:g} where the model was fitted, "
+        f"{item.name} is {size:.4g}{_spaced(item.unit)}, outside {low:g} to {high:g} where the model was fitted, "
         f"{since(start)}: bands hold only inside; use a model fitted there"
     )
