@@ -94,7 +94,7 @@ def test_bounds_of_one_revision_are_computed_now_and_then_and_those_of_another_s
         taken[-1].events.t[-1] += 1
         return taken[-1]
 
-    watch = IntegrityWatch(MODEL, take, EVERY, every=0.001)
+    watch = IntegrityWatch(take, EVERY, every=0.001)
     compute = watch._compute
     monkeypatch.setattr(watch, "_compute", lambda window: (computed.append(window.revision), compute(window))[1])
     watch.start()

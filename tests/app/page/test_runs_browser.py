@@ -68,7 +68,7 @@ def test_pin_overlay_and_unpin(page, session):
     first = engine.revisions.runs[-1].number
     page.get_by_role("button", name=f"Pin run {first}", exact=True).click()
     wait_for(lambda: engine.revisions.find(first).pinned, PATIENCE)
-    assert coloured(page, "#charts") == 0
+    wait_for(lambda: coloured(page, "#charts") == 0, PATIENCE)
 
     name = page.get_by_role("textbox", name=f"Name of run {first}")
     name.fill("as it was")

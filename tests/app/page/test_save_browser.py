@@ -125,10 +125,17 @@ def test_two_states_against_each_other(page, session, tmp_path):
     page.evaluate("window.told = 0; window.nisus.link.addEventListener('belief', () => (window.told += 1))")
     page.evaluate("window.nisus.view.follow(null)")
     wait_for(lambda: page.evaluate("window.told > 0"), PATIENCE)
-    path = saved(page, "Save the chart of two states", "SVG", tmp_path)
-    root = ElementTree.fromstring(path.read_text(encoding="utf-8"))
-    curve, *outlines = [node for node in root.find(f"{SVG}g").findall(f"{SVG}path") if node.get("stroke") == ESTIMATE]
-    assert len(outlines) == 2
+    roots = []
+
+    def outlined():
+        """Whether the file has the ellipses: they are asked for anew whenever another time is shown."""
+        path = saved(page, "Save the chart of two states", "SVG", tmp_path)
+        roots.append(ElementTree.fromstring(path.read_text(encoding="utf-8")))
+        return len(curves_of(roots[-1])) == 3
+
+    wait_for(outlined, PATIENCE)
+    root = roots[-1]
+    curve = curves_of(root)[0]
     x, y = (float(v) for v in re.findall(r"[ML]([-\d.]+) ([-\d.]+)", curve.get("d"))[-1])
     across, up = page.evaluate("[...document.querySelectorAll('#xy select')].map((s) => s.value).reverse()")
     names = [state.name for state in session.engine.model.shown_states]
@@ -140,6 +147,11 @@ def test_two_states_against_each_other(page, session, tmp_path):
         value, a_pixel = v0 + (place - p0) * (v1 - v0) / (p1 - p0), abs((v1 - v0) / (p1 - p0))
         rows = last[:, names.index(name)]
         assert rows.min() - a_pixel <= value <= rows.max() + a_pixel
+
+
+def curves_of(root):
+    """The paths of the estimate's colour: where it was, then its ellipses."""
+    return [node for node in root.find(f"{SVG}g").findall(f"{SVG}path") if node.get("stroke") == ESTIMATE]
 
 
 def numbers_of(root, anchor):

@@ -28,7 +28,7 @@ OWN = ("arrival_ns", "tuning_version")
 @pytest.fixture(scope="module")
 def session():
     twin = load_twin(TWIN, overrides={"source.duration": str(SECONDS)})
-    running = Session(twin, live_source(twin, 1e9), page=Page(0, open_browser=False))
+    running = Session(twin, live_source(twin, np.inf), page=Page(0, open_browser=False))
     running.start()
     wait_for(lambda: running.engine.status().finished)
     yield running
