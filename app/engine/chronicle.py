@@ -47,12 +47,15 @@ JOINS = {"sensor": JOINED, "lost": JOINED, "truth": JOINED, "range": JOINED}
 """Rows without an alarm that an episode bridges, by what is tested."""
 
 RANKS = {
-    "diverged": 0, "stale": 1, "never heard": 2, "silent": 2, "stuck": 2, "refused": 2, "screened": 2, "missed": 3,
-    "shifted": 3,
+    "diverged": 0, "stale": 1, "never heard": 2, "silent": 2, "stuck": 2, "refused": 2, "screened": 2, "shifted": 3,
+    "missed": 4,
 }  # fmt: skip
-"""How bad causes are, the worst first; the others come last."""
+"""How bad causes are, the worst first; the others come last.
 
-UNRANKED = 4
+An estimate that misses the truth is what a shifted sensor leads to: the sensor is named, which says what to do.
+"""
+
+UNRANKED = 5
 
 OF_READINGS = {"sensor": ANY, "lost": LOST}
 """What is tested of a sensor's readings, with the bits of its alarms."""

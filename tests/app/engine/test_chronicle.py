@@ -240,6 +240,10 @@ def test_the_cause_is_that_of_a_sensor_that_is_lost_before_that_of_one_that_is_n
     silent, gone = entry("silence", "c", "silent", 3.0), entry("twin", "diverged", "diverged", 4.0)
     assert Account((), (noisy, silent)).leading({"a": "suspect", "c": "degraded"}).text == "c silent"
     assert Account((), (noisy, silent, gone)).leading({"c": "stale"}).text == "diverged diverged"
+    # What a shifted sensor leads to, a state off the truth, does not hide it.
+    shifted, missed = entry("sensor", "a", "shifted", 1.0), entry("truth", "x", "missed", 2.0)
+    assert Account((), (shifted, missed)).leading({"a": "suspect"}).text == "a shifted"
+    assert Account((), (noisy, missed)).leading({"a": "suspect"}).text == "x missed"
     # A sensor in order again has an episode that lasts until it is certain to be over: the one that is lost leads.
     assert account.leading({"a": "tracking", "b": "suspect"}).text == "b narrow"
     assert Account((), (noisy,)).leading({"a": "tracking"}) is noisy.episode
