@@ -35,7 +35,7 @@ def cursor_is(page, seconds, play):
 
 def test_page_and_rerun_show_one_time(browser):  # noqa: F811
     twin = load_twin("motor_winding")
-    session = Session(twin, live_source(twin, 1e9), page=Page(0, open_browser=False))
+    session = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
     session.start()
     page = browser.new_context(viewport={"width": 1200, "height": 800}).new_page()
     try:

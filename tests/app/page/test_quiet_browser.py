@@ -15,7 +15,7 @@ pytestmark = pytest.mark.browser
 @pytest.fixture
 def session():
     twin = load_twin("motor_joint", overrides={"source.duration": "300"})
-    running = Session(twin, live_source(twin, 1e9), page=Page(0, open_browser=False))
+    running = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
     running.start()
     wait_for(lambda: running.engine.status().finished, PATIENCE)
     yield running

@@ -26,7 +26,7 @@ PINNED = (176, 51, 143)
 @pytest.fixture(scope="module")
 def session():
     twin = load_twin("motor_winding")
-    running = Session(twin, live_source(twin, 1e9), page=Page(0, open_browser=False))
+    running = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
     running.start()
     wait_for(lambda: running.engine.status().finished, PATIENCE)
     yield running

@@ -26,7 +26,7 @@ ESTIMATE = "#0b62c4"
 @pytest.fixture(scope="module", params=["motor_winding", "motor_joint"])
 def session(request):
     twin = load_twin(request.param)
-    running = Session(twin, live_source(twin, 1e9), page=Page(0, open_browser=False))
+    running = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
     running.start()
     wait_for(lambda: running.engine.status().finished, PATIENCE)
     yield running
