@@ -42,6 +42,9 @@ TOO_LONG = 10.0
 TRIED = 32
 """Events that are folded to know how long one takes."""
 
+SETTLED = 0.3
+"""Seconds for which the tuning must rest before anything is folded around it."""
+
 CHUNK = 256
 """Events between two looks at whether anybody still wants to know."""
 
@@ -155,8 +158,13 @@ class Sweeps:
             with self._wake:
                 while not self._wanted and not self._stopping:
                     self._wake.wait()
+                turned = self._engine.tuning
+                # While a knob is dragged, the processors belong to what follows it.
+                self._wake.wait_for(lambda: self._stopping, SETTLED)
                 if self._stopping:
                     return
+                if self._engine.tuning is not turned or not self._wanted:
+                    continue
                 key = self._wanted.pop(0)
             try:
                 self.sweep(key)

@@ -23,7 +23,10 @@ PERIOD = 0.1
 """Seconds between two frames, at least."""
 
 WAITING = 0.03
-"""The same while a refold is waited for: the user has just turned something."""
+"""The same while a refold is waited for: somebody has just turned something."""
+
+HURRY = 0.5
+"""Seconds for which it is so after a command, before which the engine has taken it."""
 
 STATUS = 0.25
 """Seconds between two words on the state of the twin."""
@@ -50,6 +53,12 @@ class PageStream:
         self._notice = 0
         self._pair: tuple[int, int] | None = None
         self._believed: tuple[int, int] | None = None
+        self._hurried = -HURRY
+
+    def hurry(self) -> None:
+        """A command has come: what follows from it shall not wait for the next frame."""
+        self._hurried = time.monotonic()
+        self._asked.set()
 
     async def run(self) -> None:
         """Serve until either side ends it."""
@@ -126,7 +135,8 @@ class PageStream:
                         await self._browser.send_bytes(frame)
                     # The page says `drawn` once it has drawn all of them.
                     await self._browser.send_text('{"frames":true}')
-            rest = (WAITING if self._engine.status().refolding else PERIOD) - (time.monotonic() - begun)
+            awaited = time.monotonic() - self._hurried < HURRY or self._engine.status().refolding
+            rest = (WAITING if awaited else PERIOD) - (time.monotonic() - begun)
             with contextlib.suppress(TimeoutError):
                 # What a page asks for newly, it shall see at once.
                 await asyncio.wait_for(self._asked.wait(), max(0.001, rest))

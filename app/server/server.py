@@ -91,6 +91,7 @@ class PageServer:
         self._forecasts, self._diagnosis = Forecasts(engine), Diagnosis(engine)
         self._forecasting, self._diagnosing = OneAtATime("forecast"), OneAtATime("diagnosis")
         self._boot = uuid.uuid4().hex
+        self._streams = set[PageStream]()
         self.unread: str | None = None
         """What is wrong with the twin's files as they were saved last, if they are not what runs."""
         self._own_door = not isinstance(port, Door)
@@ -182,7 +183,12 @@ class PageServer:
         return Json(await asyncio.to_thread(model_json, self._engine))
 
     async def _page_stream(self, browser: WebSocket) -> None:
-        await PageStream(browser, self._engine, self._series, self._state, self._boot).run()
+        stream = PageStream(browser, self._engine, self._series, self._state, self._boot)
+        self._streams.add(stream)
+        try:
+            await stream.run()
+        finally:
+            self._streams.discard(stream)
 
     async def _episodes(self, request: Request) -> Response:
         return Json(episodes_json(self._engine))
@@ -198,6 +204,8 @@ class PageServer:
         async def submit(body: Any) -> Response:
             command = command_from_json(body, self._engine)
             self._engine.submit(command)
+            for stream in self._streams:
+                stream.hurry()
             return Json({"submitted": type(command).__name__}, 202)
 
         return await answered(request, submit)

@@ -26,6 +26,12 @@ SHARE = 0.08
 SLOWEST = 2.0
 """Seconds between two frames at most."""
 
+RESTED = 0.4
+"""Seconds for which a knob must rest before the page's scene follows it: it is drawn on one thread with the charts."""
+
+LATEST = 1.0
+"""Seconds between two frames of that scene while a knob is dragged."""
+
 ROWS = 16_384
 """Rows pulled at once, so that a long history does not hold the engine's lock for long."""
 
@@ -53,6 +59,7 @@ class ViserView:
         self._series = Series(engine)
         self._rows = min(ROWS, limit)
         self._cursor: Any = None
+        self._tuning, self._turned, self._drawn = engine.tuning, -RESTED, -LATEST
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="viser view", daemon=True)
 
@@ -104,12 +111,18 @@ class ViserView:
             if len(pull.events) < self._rows:
                 return changed
 
-    def _look(self, there: Sequence[str]) -> None:
+    def _waits(self, now: float, scene_alone: bool) -> bool:
+        """Whether charts come first: beside them the scene waits until the knob that is turned rests."""
+        tuning = self.engine.tuning
+        if tuning is not self._tuning:
+            self._tuning, self._turned = tuning, now
+        return scene_alone and now - self._turned < RESTED and now - self._drawn < LATEST
+
+    def _look(self, asked: Sequence[dict[str, list[str]]]) -> None:
         """Draw for the browsers that are there, whose addresses have these queries."""
-        asked = [parse_qs(query) for query in there]
         # Two browsers may differ; one scene has the colours that the last of them can see best.
         self.stage.palette = THEMES.get(asked[-1].get("theme", ["light"])[0], THEMES["light"])
-        self.frame(panel=any(query.get("part") != ["scene"] for query in asked))
+        self.frame(panel=not _scene_alone(asked))
 
     def _run(self) -> None:
         due = time.monotonic()
@@ -119,12 +132,16 @@ class ViserView:
             if not there:
                 self._rest()
                 continue
-            now = time.monotonic()
-            if now >= due:
-                begun = time.thread_time()
+            now, asked = time.monotonic(), [parse_qs(query) for query in there]
+            if now >= due and not self._waits(now, _scene_alone(asked)):
+                self._drawn, begun = now, time.thread_time()
                 try:
-                    self._look(there)
+                    self._look(asked)
                 except Exception as error:  # noqa: BLE001  a picture that cannot be drawn must not end the others
                     self.engine.notices.report("view error", f"view error: {type(error).__name__}: {error}", "error")
                 # This thread's own work counts, not the time it waited for its turn.
                 due = now + min(SLOWEST, max(FRAME, (time.thread_time() - begun) / SHARE))
+
+
+def _scene_alone(asked: Sequence[dict[str, list[str]]]) -> bool:
+    return all(query.get("part") == ["scene"] for query in asked)

@@ -42,10 +42,10 @@ def mean_nis(track: Track, gate: float | None) -> float:
         gate: That of the tuning; None where nothing is refused.
     """
     judged = (track.verdict == USED) | (track.verdict == GATED)
-    nis, dof = track.nis[judged], np.asarray(track.dof[judged], float)
-    g = _quantile(gate, dof)
-    expected = _expected(g, dof).sum()
-    return float(np.minimum(nis, g).sum() / expected) if expected > 0.0 else np.nan
+    nis, dof = track.nis[judged], track.dof[judged]
+    m, g = _gates(gate, dof)
+    expected = _expected(g, m)[dof].sum()
+    return float(np.minimum(nis, g[dof]).sum() / expected) if expected > 0.0 else np.nan
 
 
 def sensor_noise(track: Track, events: Events, tuning: Tuning) -> dict[str, SensorNoise]:
@@ -69,16 +69,18 @@ def sensor_noise(track: Track, events: Events, tuning: Tuning) -> dict[str, Sens
     judged = (events.kind == READING) & ((track.verdict == USED) | (track.verdict == GATED))
     for s, sensor in enumerate(model.sensors):
         rows = np.flatnonzero(judged & (events.channel == s))
-        g = _quantile(tuning.gate, np.asarray(track.dof[rows], float))
+        dof = track.dof[rows]
+        _, g = _gates(tuning.gate, dof)
+        expected = _expected(g, np.ones(len(g)))
         for k in range(len(sensor.rows)):
             nu, S = track.innovation[rows, k], track.innovation_std[rows, k] ** 2
             known = np.isfinite(nu) & np.isfinite(S) & (S > 0.0)
             n = int(known.sum())
             if n < FEWEST:
                 continue
-            nu, S, most = nu[known], S[known], g[known]
+            nu, S, m = nu[known], S[known], dof[known]
             R = float(tuning.r[model.row_start[s] + k])
-            square = np.minimum(nu**2, most * S) / _expected(most, np.ones(n))
+            square = np.minimum(nu**2, g[m] * S) / expected[m]
             weight = S**-2
             excess = float(np.sum(weight * (square - S)) / np.sum(weight))
             std = float(np.sqrt(2.0 / np.sum(weight)))
@@ -86,12 +88,14 @@ def sensor_noise(track: Track, events: Events, tuning: Tuning) -> dict[str, Sens
     return found
 
 
-def _quantile(gate: float | None, dof: np.ndarray) -> np.ndarray:
-    return np.full(dof.size, np.inf) if gate is None else chi_square_quantile(gate, dof)
+def _gates(gate: float | None, dof: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Every number of degrees of freedom up to the largest, and its gate: quantiles are dear, and few differ."""
+    m = np.arange(1.0 + dof.max(initial=0))
+    return m, np.full(m.size, np.inf) if gate is None else chi_square_quantile(gate, m)
 
 
-def _expected(g: np.ndarray, dof: np.ndarray) -> np.ndarray:
+def _expected(g: np.ndarray, m: np.ndarray) -> np.ndarray:
     """E min(χ²_m, g) of each; m where there is no gate."""
     finite = np.isfinite(g)
     limit = np.where(finite, g, 1.0)
-    return np.where(finite, dof * chdtr(dof + 2.0, limit) + limit * chdtrc(dof, limit), dof)
+    return np.where(finite, m * chdtr(m + 2.0, limit) + limit * chdtrc(m, limit), m)
