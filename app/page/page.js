@@ -73,7 +73,7 @@ new Episodes($("episodes"), link, view, charts);
 const runs = new Runs($("runs"), link);
 const transport = new Transport(model, link, view, charts);
 const explore = new Explore(settings.viewer, theme, { link, view, charts });
-const stage = new Stage(settings.viser, theme, link, view, charts);
+const stage = new Stage(settings.viser ? { pass: settings.stage_pass } : null, theme, link, view, charts);
 
 // What is hidden neither computes nor asks.
 const panes = { explore, whatif: new WhatIf($("whatif"), model, link), diagnose: new Diagnose($("diagnose"), link) };

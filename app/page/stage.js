@@ -12,7 +12,7 @@ export class Stage {
     Object.assign(this, { there, theme, link });
     this.frame = $("stage");
     this.choices = {};
-    $("stage-alone").href = this.address("");
+    $("stage-alone").href = this.address(false);
     $("stage-large").addEventListener("click", () => this.enlarge());
     this.enlarge(localStorage.getItem(LARGE) === "1");
     link.addEventListener("status", () => this.offer(link.status.scene ?? []));
@@ -25,29 +25,25 @@ export class Stage {
     view.addEventListener("change", place);
   }
 
-  // Of Viser's page. The query of the socket's address says what is shown, so that no more than that is sent.
-  address(part) {
-    const socket = `ws://${location.host}/viser/?theme=${this.theme}${part}`;
-    return `/viser/?websocket=${encodeURIComponent(socket)}${this.theme === "dark" ? "&darkMode" : ""}`;
+  // Of Viser's page. The query of the socket's address says what is shown, so that no more than that is sent. In the
+  // frame this machine has its other name: what is another site the browser draws in a process of its own, and charts
+  // and knobs need not wait for three.js. Cookies do not go there, so a pass does.
+  address(framed) {
+    const names = { "127.0.0.1": "localhost", localhost: "127.0.0.1" };
+    const other = framed && this.there?.pass && names[location.hostname];
+    const host = other ? `${other}:${location.port}` : location.host;
+    const query = `theme=${this.theme}${framed ? "&part=scene" : ""}${other ? `&pass=${this.there.pass}` : ""}`;
+    const socket = encodeURIComponent(`ws://${host}/viser/?${query}`);
+    const dark = this.theme === "dark" ? "&darkMode" : "";
+    return `//${host}/viser/?${framed ? "scene&" : ""}${other ? `pass=${this.there.pass}&` : ""}websocket=${socket}${dark}`;
   }
 
   // Nothing is sent for a scene that nobody sees.
   visible(seen) {
     if (!this.there) return;
     if (!seen) this.frame.removeAttribute("src");
-    else if (!this.frame.hasAttribute("src")) {
-      // After the charts: three.js takes its time.
-      this.frame.src = this.address("&part=scene");
-      this.frame.addEventListener("load", () => this.dress(), { once: true });
-    }
-  }
-
-  dress() {
-    const inside = this.frame.contentDocument;
-    if (!inside?.head) return;
-    const style = inside.createElement("style");
-    style.textContent = PANELS;
-    inside.head.append(style);
+    // After the charts: three.js takes its time.
+    else if (!this.frame.hasAttribute("src")) this.frame.src = this.address(true);
   }
 
   // Scene and charts change places.
@@ -85,8 +81,3 @@ export class Stage {
     return select;
   }
 }
-
-const PANELS = `
-  [data-dock-region], [data-dock-region-handle], [data-floating-window], .mantine-Paper-root, .mantine-Notifications-root { display: none !important; }
-  [data-dock-root] > div { inset: 0 !important; width: 100% !important; }
-`;

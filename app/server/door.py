@@ -33,11 +33,12 @@ NOTHING = "no twin runs; choose one in the gallery"
 def _policy(port: int, scripts: str) -> str:
     """A content security policy under which no request leaves this server."""
     # Not every browser takes 'self' to include the WebSockets of the same address.
-    sockets = f"ws://127.0.0.1:{port} ws://localhost:{port}"
+    names = (f"127.0.0.1:{port}", f"localhost:{port}")
+    sockets, here = (" ".join(f"{scheme}://{name}" for name in names) for scheme in ("ws", "http"))
     return (
         f"default-src 'self'; script-src 'self' {scripts}; style-src 'self' 'unsafe-inline'; "
         f"img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob: {sockets}; "
-        "worker-src 'self' blob: data:; frame-src 'self'; frame-ancestors 'self'; object-src 'none'; "
+        f"worker-src 'self' blob: data:; frame-src 'self' {here}; frame-ancestors 'self' {here}; object-src 'none'; "
         "base-uri 'none'; form-action 'self'"
     )
 
@@ -81,8 +82,8 @@ class Door:
         Raises:
             ConfigError: If the port cannot be had.
         """
-        self._socket = listen(port)
-        self.port: int = self._socket.getsockname()[1]
+        self._listening = listen(port)
+        self.port = self._listening.port
         self._token = session_token()
         self._shown = Shown(self._nothing, uuid.uuid4().hex)
         self._page: App | None = None
@@ -92,13 +93,15 @@ class Door:
         self._loop: asyncio.AbstractEventLoop | None = None
         gate = Gate(_WithHeaders(self._enter, self.port), self._token, self.port)
         self.entered = gate.entered
+        self.stage_pass = gate.stage_pass if self._listening.localhost else None
+        """What lets a frame under the other loopback name see the stage; None where that name may not be ours."""
         config = uvicorn.Config(
             gate, log_config=None, log_level="critical", access_log=False,
             server_header=False, lifespan="off", ws_per_message_deflate=False, timeout_graceful_shutdown=1, **bounds(),
         )  # fmt: skip
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(
-            target=self._server.run, kwargs={"sockets": [self._socket]}, name="page server", daemon=True
+            target=self._server.run, kwargs={"sockets": self._listening.sockets}, name="page server", daemon=True
         )
 
     @property
@@ -147,7 +150,7 @@ class Door:
         self._server.should_exit = True
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
-        self._socket.close()
+        self._listening.close()
 
     async def _enter(self, scope: Scope, receive: Receive, send: Send) -> None:
         self._loop = asyncio.get_running_loop()

@@ -3,6 +3,9 @@
 A web page anywhere can make the user's browser send requests to 127.0.0.1, and a name anywhere can be made to point
 there. So every request, WebSocket upgrades included, is refused before any work unless its Host is a loopback name, its
 Origin (if it has one) is this server, and it carries the token or the cookie that the token was exchanged for.
+
+The stage is framed under this machine's other loopback name, so that the browser draws it in a process of its own. For
+the browser that is another site, to which it sends no cookie: there a pass in the address lets in, to the stage alone.
 """
 
 from __future__ import annotations
@@ -22,6 +25,8 @@ Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 _HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?", re.IGNORECASE)
+
+STAGE = "/viser/"
 
 REFUSED_HOST = "Nisus: this Host is not served; open the page at 127.0.0.1.\n"
 REFUSED_ORIGIN = "Nisus: requests from other sites are refused.\n"
@@ -43,7 +48,16 @@ class Gate:
         """Set once a browser has come with the token."""
         self._cookie_name = f"nisus_{port}"
         # The cookie is not the token: whoever reads one cannot make the other's address of it.
-        self._cookie = hmac.new(self._token, f"cookie {port}".encode(), hashlib.sha256).hexdigest().encode()
+        self._cookie = self._derived(f"cookie {port}")
+        self._pass = self._derived(f"stage {port}")
+
+    @property
+    def stage_pass(self) -> str:
+        """What the page puts into the address of the stage that it frames."""
+        return self._pass.decode()
+
+    def _derived(self, purpose: str) -> bytes:
+        return hmac.new(self._token, purpose.encode(), hashlib.sha256).hexdigest().encode()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request (ASGI)."""
@@ -55,26 +69,27 @@ class Gate:
         if host is None or not _HOST.fullmatch(host):
             await _refuse(scope, receive, send, REFUSED_HOST)
             return
-        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [])
-        shows_token = len(given) == 1 and hmac.compare_digest(given[0].encode(), self._token)
+        query = parse_qs(scope["query_string"].decode("latin-1"))
+        shows_token = _shows(query.get("token", []), self._token)
+        framed = scope["path"] == STAGE and _shows(query.get("pass", []), self._pass)
         exchange = shows_token and scope["type"] == "http" and scope["path"] == "/" and scope["method"] == "GET"
-        if not self._from_here(headers, host, scope["type"] == "websocket", exchange):
+        if not self._from_here(headers, host, scope["type"] == "websocket", exchange or framed):
             await _refuse(scope, receive, send, REFUSED_ORIGIN)
         elif exchange:
             await self._exchange(headers, send)
-        elif shows_token or self._has_cookie(headers) or self._has_bearer(headers):
+        elif shows_token or framed or self._has_cookie(headers) or self._has_bearer(headers):
             await self._app(scope, receive, send)
         else:
             await _refuse(scope, receive, send, REFUSED_TOKEN)
 
-    def _from_here(self, headers: _Headers, host: str, upgrade: bool, exchange: bool) -> bool:
+    def _from_here(self, headers: _Headers, host: str, upgrade: bool, shown: bool) -> bool:
         origins = headers.all("origin")
         if origins or upgrade:
             # A browser always names the origin of a WebSocket.
             return origins == [f"http://{host}"]
         # Without Origin: a navigation, a request of the page itself, or no browser. Browsers say which it is.
         site = headers.one("sec-fetch-site") or "none"
-        return exchange or site in ("none", "same-origin")
+        return shown or site in ("none", "same-origin")
 
     def _has_cookie(self, headers: _Headers) -> bool:
         for line in headers.all("cookie"):
@@ -105,6 +120,10 @@ class Gate:
             body = b'<!doctype html><meta http-equiv="refresh" content="0;url=/"><title>Nisus</title>'
         await send(start)
         await send({"type": "http.response.body", "body": body})
+
+
+def _shows(given: list[str], secret: bytes) -> bool:
+    return len(given) == 1 and hmac.compare_digest(given[0].encode(), secret)
 
 
 class _Headers:

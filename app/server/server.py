@@ -160,7 +160,7 @@ class PageServer:
     async def _page(self, request: Request) -> Response:
         name = "explore.html" if request.url.path == "/explore" else "index.html"
         settings = {"viewer": f"/viewer/{viewer_version()}", "boot": self._boot, "viser": self._viser is not None}
-        settings["gallery"] = self.door.furnished
+        settings |= {"gallery": self.door.furnished, "stage_pass": self.door.stage_pass}
         return page_file(name, settings)
 
     async def _alarms(self, request: Request) -> Response:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import http.client
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, urlencode
 
 import websockets
 from starlette.requests import Request
@@ -13,13 +13,22 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from websockets.asyncio.client import ClientConnection, connect
 
+from .page_file import PAGE
 from .private_viser import HEADER
 
 PASSED_ON = ("content-type", "content-encoding", "etag", "last-modified", "cache-control")
 ASKED = ("accept", "accept-encoding", "if-none-match")
 HEAD = b"<head>"
-AHEAD = b'<script src="/page/viser_labels.js"></script>'
-"""What goes into Viser's page ahead of its own script."""
+LABELS = PAGE / "viser_labels.js"
+AHEAD = "<script>{labels}</script>"
+"""What goes into Viser's page ahead of its own script; in the text, as a frame under another name may fetch no more."""
+
+SCENE_ALONE = """<style>
+  [data-dock-region], [data-dock-region-handle], [data-floating-window], .mantine-Paper-root,
+  .mantine-Notifications-root { display: none !important; }
+  [data-dock-root] > div { inset: 0 !important; width: 100% !important; }
+</style>"""
+"""And where the page has all that Viser's panel would: the scene in all of the frame."""
 
 LARGEST = 256 * 1024 * 1024
 """Bytes of one message; a scene's first one holds all its point clouds."""
@@ -44,7 +53,10 @@ class ViserProxy:
             status, headers, body = await asyncio.to_thread(self._fetch, path, asked)
         except (OSError, http.client.HTTPException) as error:
             return PlainTextResponse(f"Nisus: the Viser pane does not answer ({error}).\n", 502)
-        answer = Response(body.replace(HEAD, HEAD + AHEAD, 1) if path == "/" else body, status)
+        if path == "/":
+            ahead = AHEAD.format(labels=LABELS.read_text()) + (SCENE_ALONE if "scene" in request.query_params else "")
+            body = body.replace(HEAD, HEAD + ahead.encode(), 1)
+        answer = Response(body, status)
         for name, value in headers:
             if name.lower() in PASSED_ON and not (path == "/" and name.lower() == "etag"):
                 answer.headers[name] = value
@@ -62,7 +74,8 @@ class ViserProxy:
 
     async def websocket(self, browser: WebSocket) -> None:
         """Couple a browser's WebSocket with one of Viser's, until either closes."""
-        query = browser.scope["query_string"].decode("latin-1")
+        # The pass has opened the gate; it is nobody else's business.
+        query = urlencode([(name, value) for name, value in browser.query_params.multi_items() if name != "pass"])
         path = quote(browser.path_params.get("path", ""))
         url = f"ws://127.0.0.1:{self._port}/{path}" + (f"?{query}" if query else "")
         offered = [websockets.Subprotocol(name) for name in browser.scope.get("subprotocols", [])]

@@ -106,5 +106,6 @@ def test_the_map_is_drawn_and_still_is_with_another_filter(page, engine):
     page.get_by_role("combobox", name="Estimator").click()
     page.get_by_role("option", name="Ensemble transform Kalman filter", exact=True).click()
     page.get_by_text("revision 1").wait_for()
-    assert not np.array_equal(estimate(engine), before[1])
+    wait_for(lambda: engine.status().estimator == "etkf" and not engine.status().refolding, PATIENCE)
+    wait_for(lambda: not np.array_equal(estimate(engine), before[1]), PATIENCE)
     wait_for(lambda: likeness(page, engine) > 0.95 and not np.array_equal(cells(page), before[0]), PATIENCE)

@@ -1,7 +1,9 @@
 """The one port of the page, as a stranger meets it: who is refused, what is served, who waits for whom."""
 
 import json
+import socket
 import time
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from websockets.sync.client import connect
 from app.drawing.choices import Choice, Choices
 from app.engine import commands
 from app.engine.engine import Engine
+from app.server.door import Door
 from app.server.server import PageServer
 from estimators.errors import ConfigError
 from tests.app.scripted import Scripted, pull_all, readings, wait_for
@@ -181,7 +184,57 @@ def test_a_port_in_use_is_one_line(page):
 
 
 def test_it_listens_on_loopback_only(page):
-    assert page.server.door._socket.getsockname()[0] == "127.0.0.1"
+    assert {listener.getsockname()[0] for listener in page.server.door._listening.sockets} <= {"127.0.0.1", "::1"}
+
+
+# The stage, framed under the other name of this machine, where the browser sends no cookie
+
+
+def framed(page, path, given, *, upgrade=False, origin="http://localhost:{port}"):
+    headers = [("Host", f"localhost:{page.client.port}"), ("Sec-Fetch-Site", "cross-site")]
+    headers += [("Origin", origin.format(port=page.client.port))] if upgrade else []
+    return page.client.raw("GET", path + (f"?pass={given}" if given is not None else ""), headers, upgrade=upgrade)
+
+
+def test_a_pass_opens_the_stage_without_a_cookie(page):
+    given = page.server.door.stage_pass
+    assert framed(page, "/viser/", given).status == 200
+    here = f"localhost:{page.client.port}"
+    with connect(
+        f"ws://{here}/viser/?pass={given}&part=scene", origin=f"http://{here}", subprotocols=["viser-test"], proxy=None
+    ) as viser:
+        viser.send("text")
+        assert viser.recv(timeout=PATIENCE) == "text"
+    assert page.viser.requests and not any(given in str(request) for request in page.viser.requests)
+
+
+@pytest.mark.parametrize("path", ["/", "/api/status", "/api/model", "/viser/assets", "/page/page.js", STREAM])
+@pytest.mark.parametrize("upgrade", [False, True])
+def test_a_pass_opens_nothing_else(page, path, upgrade):
+    refused(framed(page, path, page.server.door.stage_pass, upgrade=upgrade))
+
+
+@pytest.mark.parametrize("given", [None, "", "x", "é", "{cookie}", "{token}x"])
+@pytest.mark.parametrize("upgrade", [False, True])
+def test_without_its_pass_the_stage_is_closed(page, given, upgrade):
+    given = given and given.format(cookie=page.client.cookie, token=page.client.token)
+    refused(framed(page, "/viser/", given and quote(given), upgrade=upgrade))
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:{port}", "null"])
+def test_a_pass_does_not_let_another_site_connect(page, origin):
+    refused(framed(page, "/viser/", page.server.door.stage_pass, upgrade=True, origin=origin))
+
+
+def test_where_localhost_may_be_another_program_the_stage_stays_here():
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    with socket.create_server(("::1", port), family=socket.AF_INET6):
+        door = Door(port)
+    try:
+        assert door.stage_pass is None
+    finally:
+        door.stop()
 
 
 # What is served
@@ -212,7 +265,9 @@ def test_every_answer_forbids_to_leave_the_machine(page):
         for name, sources in rules.items():
             allowed = {"'self'", "'none'", "data:", "blob:", "'unsafe-inline'", "'unsafe-eval'", "'wasm-unsafe-eval'"}
             allowed |= {f"ws://127.0.0.1:{page.server.port}", f"ws://localhost:{page.server.port}"}
-            assert set(sources.split()) <= allowed, name
+            own = {f"http://127.0.0.1:{page.server.port}", f"http://localhost:{page.server.port}"}
+            framing = own if name in ("frame-src", "frame-ancestors") else set()
+            assert set(sources.split()) <= allowed | framing, name
         assert {"default-src", "connect-src", "script-src", "frame-ancestors"} <= rules.keys()
 
 
