@@ -111,18 +111,18 @@ class ViserView:
             if len(pull.events) < self._rows:
                 return changed
 
-    def _waits(self, now: float, scene_alone: bool) -> bool:
+    def _waits(self, now: float, there: Sequence[str]) -> bool:
         """Whether charts come first: beside them the scene waits until the knob that is turned rests."""
         tuning = self.engine.tuning
         if tuning is not self._tuning:
             self._tuning, self._turned = tuning, now
-        return scene_alone and now - self._turned < RESTED and now - self._drawn < LATEST
+        return _scene_alone(there) and now - self._turned < RESTED and now - self._drawn < LATEST
 
-    def _look(self, asked: Sequence[dict[str, list[str]]]) -> None:
+    def _look(self, there: Sequence[str]) -> None:
         """Draw for the browsers that are there, whose addresses have these queries."""
         # Two browsers may differ; one scene has the colours that the last of them can see best.
-        self.stage.palette = THEMES.get(asked[-1].get("theme", ["light"])[0], THEMES["light"])
-        self.frame(panel=not _scene_alone(asked))
+        self.stage.palette = THEMES.get(parse_qs(there[-1]).get("theme", ["light"])[0], THEMES["light"])
+        self.frame(panel=not _scene_alone(there))
 
     def _run(self) -> None:
         due = time.monotonic()
@@ -132,16 +132,17 @@ class ViserView:
             if not there:
                 self._rest()
                 continue
-            now, asked = time.monotonic(), [parse_qs(query) for query in there]
-            if now >= due and not self._waits(now, _scene_alone(asked)):
+            now = time.monotonic()
+            if now >= due and not self._waits(now, there):
                 self._drawn, begun = now, time.thread_time()
                 try:
-                    self._look(asked)
+                    self._look(there)
                 except Exception as error:  # noqa: BLE001  a picture that cannot be drawn must not end the others
                     self.engine.notices.report("view error", f"view error: {type(error).__name__}: {error}", "error")
                 # This thread's own work counts, not the time it waited for its turn.
                 due = now + min(SLOWEST, max(FRAME, (time.thread_time() - begun) / SHARE))
 
 
-def _scene_alone(asked: Sequence[dict[str, list[str]]]) -> bool:
-    return all(query.get("part") == ["scene"] for query in asked)
+def _scene_alone(there: Sequence[str]) -> bool:
+    """Whether no browser, by the query of its address, shows the panel as well."""
+    return all(parse_qs(query).get("part") == ["scene"] for query in there)

@@ -22,7 +22,7 @@ from app.viser.coalescer import DRAG_INTERVAL, TYPING_PAUSE
 from app.viser.history import History
 from app.viser.rows import PATIENCE
 from app.viser.vehicle_scene import VehicleScene
-from app.viser.view import ViserView
+from app.viser.view import RESTED, ViserView
 from config.schema import SceneSection, ViewSection
 from estimators.log import READING, TRUTH, Events
 from estimators.models import MODELS
@@ -261,6 +261,24 @@ def test_only_what_is_seen_is_kept_up(view, engine):
     view._look(["part=scene&theme=dark", "theme=light"])
     assert view.panel.status.content != shown and view.stage.palette is LIGHT
     assert "89.0 s" in view.panel.status.content
+
+
+def test_the_scene_waits_until_a_knob_rests_but_not_for_ever(view, engine):
+    scene, both = ["part=scene"], ["part=scene", "theme=light"]
+    view._drawn = 100.0
+    assert not view._waits(100.0, scene)
+    engine.tuning = engine.tuning.set("R.winding", 2.0)
+    assert not view._waits(100.1, both)
+    assert view._waits(100.1, scene) and view._waits(100.0 + 0.9 * RESTED, scene)
+    assert not view._waits(100.1 + RESTED, scene)
+    # A drag: something new ten times a second.
+    turned = []
+    for k in range(1, 30):
+        engine.tuning = engine.tuning.set("R.winding", 2.0 + k)
+        turned.append(view._waits(101.0 + 0.1 * k, scene))
+        if not turned[-1]:
+            view._drawn = 101.0 + 0.1 * k
+    assert 2 <= turned.count(False) <= 4
 
 
 def test_nobody_there_nothing_pulled(engine, monkeypatch):
