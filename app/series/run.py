@@ -58,7 +58,8 @@ class Levels:
 
     def values(self, pull: Pull, names: list[str]) -> np.ndarray:
         """Columns of rows, (n, columns)."""
-        out = np.empty((len(pull.events), len(names)))
+        # Each column in one piece: they are filled, and grouped, one after the other.
+        out = np.empty((len(pull.events), len(names)), order="F")
         for k, name in enumerate(names):
             out[:, k] = self.known[name].values(pull.events, pull.track)
         return out
