@@ -20,7 +20,6 @@ from estimators.track import HEALTH_NAMES, VERDICT_NAMES, Track
 from estimators.tuning import GATE_KEYS, Tuning
 
 from ..engine.changes import difference, in_words
-from ..twin.commissioned import normal_nis
 from ..twin.twin import Twin
 from .alarms import advice
 from .calibration_lines import calibration_lines
@@ -58,8 +57,8 @@ class Reported(NamedTuple):
 def report(run: Reported) -> list[Part]:
     """The report, from top to bottom."""
     model = run.twin.model
-    found = score(run.track, run.events, model, run.pictures, gate=run.tuning.gate)
-    charts = run_charts(model, run.events, run.track, run.episodes, normal_nis(run.tuning.baseline))
+    found = score(run.track, run.events, model, run.pictures, gate=run.tuning.gate, baseline=run.tuning.baseline)
+    charts = run_charts(model, run.events, run.track, run.episodes)
     said = ("Time counts from the first event. Red shades: episodes. Extremes are kept.",)
     return [
         _head(run),
@@ -109,12 +108,9 @@ def _scores(run: Reported, found: Score) -> Part:
     rows: list[tuple[str, str, str]] = []
     marks: list[str] = []
     if found.nis_readings:
-        normal = normal_nis(run.tuning.baseline)
-        low, high = normal * found.nis_low, normal * found.nis_high
-        said = f"95 % bounds {low:.3g} to {high:.3g}" + ("" if normal == 1.0 else f", as commissioned: ×{normal:.2g}")
-        inside = low <= found.nis <= high
-        rows.append(("mean NIS", digits(found.nis), said))
-        marks.append("good" if inside else "bad")
+        verdict = found.nis_verdict
+        rows.append(("mean NIS", digits(found.nis), f"{verdict.place} {verdict.expected}"))
+        marks.append("good" if verdict.place == "inside" else "bad")
     fits = [(f"RMSE of {name}", name, fit) for name, fit in found.states.items()]
     fits += [(f"RMSE of {name}, held out", name, fit) for name, fit in found.held_out.items()]
     for title, name, fit in fits:

@@ -54,7 +54,7 @@ export class Diagnose {
     const open = (row) => this.turned.get(row.name) ?? (found.rows.length <= FEW || row.tone === "bad");
     const cost = found.cost === null ? "" : ` An event costs ${compact(found.cost, 3)} µs.`;
     this.node.replaceChildren(
-      element("p", { class: "summary" }, element("b", {}, `${good} of ${found.rows.length} sensor rows${left} are consistent. `), `Last ${found.events.toLocaleString("en")} events, ${span(found.span)}, ${found.estimator}.${cost}`),
+      element("p", { class: "summary" }, element("b", {}, `${good} of ${found.rows.length} sensor rows${left} are as they should be. `), `Last ${found.events.toLocaleString("en")} events, ${span(found.span)}, ${found.estimator}: ${found.nis}.${cost}`),
       ...rows.map((row) => rowCard(row, found.marginal, open(row), (now) => this.turned.set(row.name, now))),
       element("div", { class: "cards" }, ...[ranksCard(found), particlesCard(found), correlationCard(found), ...unseenCards(found)].filter(Boolean)),
     );

@@ -8,6 +8,7 @@ import { swatch } from "./pins.js";
 const LOOK = 300; // ms between two looks at whether there is something new
 const AGAIN = 5000; // ms between two looks at the scores while the log grows
 const COVERED = 0.95; // share of errors that their 95 % band should hold
+const BEYOND = { above: " ▲", below: " ▼" }; // of a mean NIS outside its bounds
 const ALIKE = 0.8; // share of the longest time from which on scores can be compared
 
 export class Runs {
@@ -70,7 +71,7 @@ export class Runs {
       : null;
     const cell = (title, ...text) => element("th", { scope: "col", title }, ...text);
     return element("thead", {}, element("tr", {},
-      cell("Mean NIS of the readings that were used; bold: nearest to what it should be", "NIS"),
+      cell("Mean NIS of the readings that were used; ▲ above, ▼ below its 95 % bounds; bold: nearest to what it should be", "NIS"),
       cell("Root mean square error against the truth, or of predictions of a sensor held out", "RMSE ", select ?? "–"),
       cell("Share of errors inside their 95 % band", "in 95 %"),
       cell("Log-likelihood of a reading, refused ones priced", "log L"),
@@ -83,7 +84,7 @@ export class Runs {
     const cell = (key, text, title) => element("td", { class: best[key] === number ? "best" : null, title: best[key] === number ? `Best. ${title ?? ""}` : title }, text);
     const scores = score
       ? element("tr", { class: "scores" },
-          cell("nis", compact(score.nis, 3), `Bounds ${compact(score.nis_low, 3)} to ${compact(score.nis_high, 3)}; ${score.readings} readings in ${span(score.seconds)}, ${compact(100 * (score.refused ?? 0), 2)} % refused`),
+          cell("nis", `${compact(score.nis, 3)}${BEYOND[score.nis_place] ?? ""}`, `Of the whole run: ${score.nis_words}; ${score.readings} readings in ${span(score.seconds)}, ${compact(100 * (score.refused ?? 0), 2)} % refused`),
           cell("rmse", fit ? compact(fit.rmse, 3) : "–", fit ? `${fit.name}, ${fit.against}: mean error ${compact(fit.bias, 2)}${spaced(fit.unit)}` : "No truth, and no sensor is held out"),
           cell("coverage", fit ? `${compact(100 * fit.coverage, 3)} %` : "–"),
           cell("likelihood", compact(score.log_likelihood_reading, 4), `In all ${compact(score.log_likelihood, 6)}`),

@@ -14,6 +14,7 @@ from typing import Any
 
 from starlette.responses import JSONResponse
 
+from estimators.diagnostics.consistency import NisVerdict
 from estimators.diagnostics.episodes import anchor, episode_json
 from estimators.errors import ConfigError, nearest, printable, quoted, shown_name
 from estimators.track import HEALTH_NAMES
@@ -51,6 +52,8 @@ def one_line(text: str) -> str:
 def status_json(engine: Running) -> dict[str, Any]:
     """What the page's header shows, and more for whoever asks."""
     status = engine.status()
+    commissioned = status.tuning.baseline is not None
+    judged = NisVerdict(status.nis, status.nis_low, status.nis_high, commissioned)
     return {
         "twin": engine.twin.name,
         "title": engine.twin.title,
@@ -77,6 +80,8 @@ def status_json(engine: Running) -> dict[str, Any]:
         "nis": _plain(status.nis),
         "nis_low": _plain(status.nis_low),
         "nis_high": _plain(status.nis_high),
+        "nis_place": judged.place,
+        "nis_words": judged.words,
         "late": {"inflate": engine.twin.late.inflate, "reason": engine.twin.late.reason},
         "degraded_after": {"seconds": engine.twin.degraded.seconds, "reason": engine.twin.degraded.reason},
         "model_version": status.model_version,
