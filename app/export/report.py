@@ -11,6 +11,7 @@ import numpy as np
 from estimators.diagnostics.calibration import calibrations, truth_calibration
 from estimators.diagnostics.episodes import Episode
 from estimators.diagnostics.field_pictures import Picture
+from estimators.diagnostics.held_out import Offset, offsets
 from estimators.diagnostics.score import Score, score
 from estimators.diagnostics.sensitivity import Bound
 from estimators.diagnostics.sensitivity.words import digits
@@ -38,7 +39,8 @@ class Reported(NamedTuple):
     """A run to be reported: with what it was folded, its rows, and what was wrong in it.
 
     `about` are more lines of its head, by name; `bounds` the integrity bounds of its states, where they are known;
-    `others` the runs before and after it: number, what was changed, scores in words.
+    `others` the runs before and after it: number, what was changed, scores in words; `before` the episodes of each
+    earlier run that had any, by its number and what it was.
     """
 
     twin: Twin
@@ -52,6 +54,7 @@ class Reported(NamedTuple):
     about: tuple[tuple[str, str], ...] = ()
     bounds: Mapping[str, Bound] | None = None
     others: tuple[tuple[str, ...], ...] = ()
+    before: tuple[tuple[str, Sequence[Episode]], ...] = ()
 
 
 def report(run: Reported) -> list[Part]:
@@ -64,6 +67,7 @@ def report(run: Reported) -> list[Part]:
         _head(run),
         _scores(run, found),
         _episodes(run),
+        *_before(run),
         Part("Charts", said, drawn=tuple(charts)),
         *_checks(run),
         _tuning(run),
@@ -143,25 +147,38 @@ def _cut(rows: Sequence[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
 
 
 def _episodes(run: Reported) -> Part:
+    shown = tuple(f"{offset.words[0].upper()}{offset.words[1:]}." for offset in _offsets(run))
     if not run.episodes:
-        return Part("Episodes", ("Nothing that the tests could see was wrong.",))
-    start = float(run.events.t[0]) * 1e-9
-    rows = [
-        (
-            f"{clock(round(item.start - start, 1))} to "
-            + ("the end" if item.end is None else clock(round(item.end - start, 1))),
-            item.subject.replace("_", " "),
-            item.cause,
-            item.text,
-        )
-        for item in run.episodes
-    ]
+        of = " of the sensors in use" if shown else ""
+        return Part("Episodes", (f"Nothing that the tests could see was wrong{of}.", *shown))
+    rows = [_told(item, run) for item in run.episodes]
     causes = [cause for cause in dict.fromkeys(item.cause for item in run.episodes) if advice(cause, "Response")]
     small = tuple(
         f"{cause.capitalize()}. Usual cause: {advice(cause, 'Usual cause')} Response: {advice(cause, 'Response')}"
         for cause in causes
     )
-    return Part("Episodes", (), ("when", "who", "what", "what was said, and what to do"), _cut(rows), small=small)
+    return Part("Episodes", shown, ("when", "who", "what", "what was said, and what to do"), _cut(rows), small=small)
+
+
+def _told(item: Episode, run: Reported) -> tuple[str, str, str, str]:
+    start = float(run.events.t[0]) * 1e-9
+    end = "the end" if item.end is None else clock(round(item.end - start, 1))
+    when = f"{clock(round(item.start - start, 1))} to {end}"
+    return when, item.subject.replace("_", " "), item.cause, item.text
+
+
+def _offsets(run: Reported) -> list[Offset]:
+    """What the sensors show that are held out."""
+    return offsets(run.events, run.track, run.tuning)
+
+
+def _before(run: Reported) -> list[Part]:
+    """What was wrong under the settings of earlier runs: what made somebody change them, and may hide now."""
+    rows = [(name, *_told(item, run)) for name, episodes in run.before for item in episodes]
+    if not rows:
+        return []
+    said = "Over the same log, with the settings of then; what a setting hides was there all the same."
+    return [Part("Episodes of the runs before", (said,), ("run", "when", "who", "what", "what was said"), _cut(rows))]
 
 
 def _checks(run: Reported) -> list[Part]:
