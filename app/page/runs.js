@@ -4,6 +4,7 @@
 import { element, setText } from "./dom.js";
 import { compact, spaced, span } from "./format.js";
 import { swatch } from "./pins.js";
+import { gone } from "./save.js";
 
 const LOOK = 300; // ms between two looks at whether there is something new
 const AGAIN = 5000; // ms between two looks at the scores while the log grows
@@ -126,10 +127,16 @@ export class Runs {
       run.running ? null : button("load", "Load: back to this filter and tuning", () => this.ask("Load", { number })),
       button("note", "Write a note", () => ((this.noted = this.noted === number ? null : number), this.show(), this.table.querySelector(`tbody[data-number="${number}"] textarea`)?.focus())),
       button("⇄", "Compare with another", choose, { "aria-pressed": String(this.chosen.includes(number)) }),
-      run.kept ? element("a", { href: `/api/report.html?run=${number}`, download: "", title: "Save a report: scores, charts, checks, episodes and tuning in one file", "aria-label": `Save a report of run ${number}` }, "report") : null,
-      run.kept ? element("a", { href: `/api/track.csv?run=${number}`, download: "", title: "Save the track as CSV", "aria-label": `Save the track of run ${number}` }, "csv") : null,
+      this.download(run, "report", `/api/report.html?run=${number}`, "Save a report: scores, charts, checks, episodes and tuning in one file", `Save a report of run ${number}`),
+      this.download(run, "csv", `/api/track.csv?run=${number}`, "Save the track as CSV", `Save the track of run ${number}`),
       element("a", { href: `/api/runs/${number}.yaml`, download: "", title: "Save the tuning as lines of the twin's YAML", "aria-label": `Save run ${number} as YAML` }, "yaml"),
     ];
+  }
+
+  // Of a run whose track is gone there is nothing to save, and it says why.
+  download(run, text, href, title, label) {
+    if (run.kept) return element("a", { href, download: "", title, "aria-label": label }, text);
+    return element("button", { type: "button", class: "gone", disabled: true, title: gone(run.number), "aria-label": `${label}: ${gone(run.number)}` }, text);
   }
 
   note(run) {

@@ -104,11 +104,12 @@ def status_json(engine: Running) -> dict[str, Any]:
 
 
 def _runs(revisions: Revisions) -> dict[str, Any]:
-    """When to ask /api/runs again (`version`), the run before the running one, and the pinned ones."""
+    """When to ask /api/runs again (`version`), the run before the running one, those with a track, the pinned ones."""
     runs = revisions.runs
     return {
         "version": revisions.version,
         "last": runs[-2].number if len(runs) > 1 else None,
+        "kept": [run.number for run in runs if run.track is not None or run is runs[-1]],
         "pinned": [
             {"number": run.number, "place": run.place, "name": run.name, "running": run is runs[-1]}
             for run in runs
