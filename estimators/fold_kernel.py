@@ -12,6 +12,7 @@ from .compiled.context import context_type, prior, sensor_rows
 from .compiled.verdict import limit_of
 from .diagnostics.evidence import watch_rows
 from .diagnostics.health import assess, bounds_type, policy_type
+from .diagnostics.normal_nis import NORMALS
 from .estimator import call_describe, call_predict, call_start, call_update, code_type
 from .gate.doubt import forget, note, rule_type
 from .gate.soften import soften
@@ -193,7 +194,7 @@ def begin(code, context, mean, cov, state):
 @jit
 def judge(start, end, t, kind, channel, value, context, policy, bounds, evidence, track):
     """What the rows `start` to `end`, which are folded, say of the estimate: windowed NIS, alarms, health."""
-    normal = floats(context.normal, context.n_sensors)
+    normal = floats(context.normal, NORMALS * context.n_sensors)
     assess(start, end, t, kind, channel, track, normal, policy, bounds)
     watch_rows(start, end, t, kind, channel, value, context, policy, evidence, track)
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from estimators.diagnostics.innovations import flat_range
+from estimators.diagnostics.score import nis_verdict
 from estimators.log import Events
 from estimators.model.state_space import LARGE
 from estimators.registry import find_entry
@@ -47,7 +48,8 @@ class Diagnosis:
 
         `rows` are the first of the sensors' rows (row_figures.py), `rows_in_all` how many there are, `ranks` counts of
         an ensemble's histogram, `particles` what is left of a cloud over time, `correlation` a map of the present
-        covariance, `observability`, `faults` and `integrity` what could be wrong unnoticed, `cost` microseconds of an
+        covariance, `nis` how the mean NIS is judged,
+        `observability`, `faults` and `integrity` what could be wrong unnoticed, `cost` microseconds of an
         event.
         """
         known = self._known
@@ -75,6 +77,7 @@ class Diagnosis:
             "particles": _particles(status, events, track),
             "correlation": _correlation(engine),
             "observability": _observability(engine, slow),
+            "nis": nis_verdict(track, events, engine.model, tuning.baseline).words,
             "cost": None if slow is None else number(slow.cost, 3),
             **_unseen(status),
         }

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from estimators.diagnostics.calibration import Calibration, calibrations, standardised
+from estimators.diagnostics.calibration import LIMITS, Calibration, calibrations, standardised
+from estimators.diagnostics.calibration_words import reading_words
 from estimators.diagnostics.innovations import (
     Autocorrelation,
     autocorrelation,
@@ -54,6 +55,7 @@ def rows_json(
     """
     found = calibrations(model, events, track, gate=tuning.gate, marginal=marginal) if len(events) else []
     known = {item.subject: item for item in found}
+    rows = dict(zip(model.row_names, () if tuning.baseline is None else tuning.baseline, strict=False))
     said = []
     for name, s, k in rows_of(model)[:MOST_ROWS]:
         own = (events.kind == READING) & (events.channel == s)
@@ -69,7 +71,7 @@ def rows_json(
         times = events.t[judged]
         period = float(times[-1] - times[0]) * 1e-9 / (times.size - 1) if times.size > 1 else np.nan
         calibration = known.get(name)
-        words, tone = verdict(name, calibration, correlated, n, period)
+        words, tone = verdict(name, calibration, correlated, n, period, rows.get(name))
         said.append(
             {
                 "name": name,
@@ -93,11 +95,17 @@ def rows_json(
 
 
 def verdict(
-    name: str, calibration: Calibration | None, correlated: Autocorrelation, n: int, period: float
+    name: str,
+    calibration: Calibration | None,
+    correlated: Autocorrelation,
+    n: int,
+    period: float,
+    normal: np.ndarray | None = None,
 ) -> tuple[str, str]:
     """One sentence, and whether it is good, bad or not known.
 
-    What is said is what calibration.py finds to matter; of a correlation also for how long it lasts.
+    What is said is what calibration.py finds to matter; of a correlation also for how long it lasts. A row of a twin
+    that was commissioned is measured by what was normal then, as its NIS is.
 
     Args:
         name: Of the row.
@@ -105,16 +113,26 @@ def verdict(
         correlated: Their autocorrelation.
         n: How many readings.
         period: Between two, s.
+        normal: Its bias, scale and correlation when the twin was commissioned, first; None if it was not.
     """
     if calibration is None or not n:
         return f"{name}: no reading among the last rows", "unknown"
+    then = ""
+    if normal is not None and calibration.role == "used":
+        changed = _since(calibration, normal)
+        if not changed:
+            if n < FEW:
+                return f"{name}: {n} readings are too few to say", "unknown"
+            then = "; ".join(word.removeprefix(f"{name}: ") for word in calibration.words)
+            return f"{name}: as commissioned, as far as {n:,} readings tell{then and f' ({then})'}", "good"
+        then, calibration = "not as commissioned: ", calibration._replace(words=changed)
     if calibration.words:
         parts = [word.removeprefix(f"{name}: ") for word in calibration.words]
         lag = memory(correlated.r)
         if calibration.correlation.value > 0.0 and any("correlated" in part for part in parts) and lag > 1:
             longer = "over " if lag == correlated.r.size else ""
             parts.append(f"what is missing lasts {longer}{lag * period:.3g} s")
-        return f"{name}: {'; '.join(parts)}", "bad"
+        return f"{name}: {then}{'; '.join(parts)}", "bad"
     r = correlated.r[:SLOW]
     mean = float(np.mean(r)) if np.isfinite(r).all() else 0.0
     # Of a white series the mean of K correlations has a variance of 1 / (n K), nearly.
@@ -125,6 +143,19 @@ def verdict(
     if calibration.role == "held out":
         return f"{name}: held out, and as the others predict it, within their bands ({n:,} readings)", "good"
     return f"{name}: consistent, as far as {n:,} readings tell", "good"
+
+
+def _since(calibration: Calibration, normal: np.ndarray) -> tuple[str, ...]:
+    """What has changed since a row was commissioned: words on its figures against those of then."""
+    bias, scale, correlation = normal[:3].tolist()
+    return reading_words(
+        calibration.subject,
+        Interval(*(value / np.hypot(bias, scale) for value in calibration.scale)),  # root mean square
+        Interval(*((value - bias) / scale for value in calibration.bias)),
+        Interval(*(value - correlation for value in calibration.correlation)),
+        calibration.refused,
+        LIMITS,
+    )
 
 
 def _share(track: Track, own: np.ndarray, verdicts: tuple[int, ...]) -> float | None:

@@ -118,7 +118,7 @@ def fold_twin(arguments: Arguments) -> int:
     interruptible(fold, work)
     seconds = (time.perf_counter() - begun) / log.n
     pictures = fold.pictures.taken if fold.pictures is not None else []
-    result = score(fold.track, log.events, twin.model, pictures, gate=twin.tuning.gate)
+    result = score(fold.track, log.events, twin.model, pictures, gate=twin.tuning.gate, baseline=twin.tuning.baseline)
     found = calibration_of(twin, fold)
     told = blamed(fold, [*dropped(counts, fold), *episodes(fold)])
     if arguments.out is not None:

@@ -184,9 +184,9 @@ def as_text(
         for k, (name, fit) in enumerate(result.states.items())
     ]
     if result.nis_readings:
-        inside = "inside" if result.nis_low <= result.nis <= result.nis_high else "OUTSIDE"
-        bounds = f"{result.nis_low:.4f} to {result.nis_high:.4f} of {result.nis_readings} readings"
-        rows.append(("mean NIS", f"{_decimals(result.nis)}   {inside} its 95 % bounds {bounds}"))
+        verdict = result.nis_verdict
+        bounds = f"{verdict.place} {verdict.expected}; {result.nis_readings} readings"
+        rows.append(("mean NIS", f"{_decimals(result.nis)}   {bounds}"))
     # The many rows of one sensor are one line.
     together = {}
     for sensor, start in zip(twin.model.sensors, twin.model.row_start, strict=True):

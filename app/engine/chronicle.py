@@ -18,6 +18,7 @@ import numpy as np
 
 from estimators.diagnostics.episodes import ANY, JOINED, LOSSES, Course, Episode, Found, Going, found_in
 from estimators.diagnostics.evidence import LOST
+from estimators.diagnostics.held_out import Offset, offsets
 from estimators.registry import find_estimator
 from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING, WAITING
 
@@ -89,10 +90,15 @@ class Entry(NamedTuple):
 
 
 class Account(NamedTuple):
-    """What the chronicle says, all of one moment: episodes in the order of their start, and those that last."""
+    """What the chronicle says, all of one moment: episodes in the order of their start, and those that last.
+
+    `offsets` are what the sensors show that are held out; `revision` is that of the rows.
+    """
 
     episodes: tuple[Episode, ...] = ()
     lasting: tuple[Entry, ...] = ()
+    offsets: tuple[Offset, ...] = ()
+    revision: int = -1
 
     def leading(self, states: Mapping[str, str]) -> Episode | None:
         """The worst of those that last, the newest of them.
@@ -122,6 +128,9 @@ class Account(NamedTuple):
             kind, name = entry.key
             if kind in OF_SENSORS and found[name][0] not in ("waiting", "tracking"):
                 found[name] = (found[name][0], entry.episode.text)
+        for offset in sorted(self.offsets, key=lambda offset: offset.beyond):
+            if found[offset.sensor][0] == "held out":
+                found[offset.sensor] = "held out", offset.words
         return found
 
 
@@ -228,7 +237,9 @@ class Chronicle:
         ended = [_left(entry, course) for entry in left.values() if entry.at < first]
         self._entries = sorted([*self._over, *ended, *entries], key=lambda e: (e.episode.start, e.episode.subject))
         lasting = tuple(e for e in self._entries if e.episode.end is None)
-        self.account = Account(tuple(e.episode for e in self._entries), lasting)
+        episodes = tuple(e.episode for e in self._entries)
+        shown = tuple(offsets(course.events, course.track, course.tuning))
+        self.account = Account(episodes, lasting, shown, self._cursor.revision)
 
     def _cut(self) -> None:
         """Cut the older rows off, and keep what was found there."""

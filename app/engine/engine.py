@@ -99,6 +99,7 @@ class Engine(RunningFold):
         self._finished = False
         self._idle_ticks = IdleTicks(section.tick)
         self._watchers = Watchers(self)
+        self.revisions.said = self._watchers.episodes_of
         self._status: tuple[float, Status] | None = None
         self.recorder: Records | None = None
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from estimators.diagnostics.episodes import Episode
 from estimators.errors import ConfigError, printable
 from estimators.tuning import Tuning
 
@@ -34,7 +35,8 @@ class Run:
     `began` is when it took the place of the one before, s since 1970, `changes` what differs from that. `loaded` is the
     number of the earlier revision whose tuning it took up again. `place` is one of the `MOST_PINNED` while it is
     pinned. `why` says what beside settings changed: a file that was saved. `track` is all that it concluded until it
-    gave way: of the newest previous revision and of pinned ones.
+    gave way: of the newest previous revision and of pinned ones. `episodes` are what was wrong until then, which the
+    settings of the next one may hide.
     """
 
     number: int
@@ -48,6 +50,7 @@ class Run:
     place: int | None = None
     why: str = ""
     track: Pull | None = None
+    episodes: tuple[Episode, ...] = ()
 
     @property
     def pinned(self) -> bool:
@@ -70,6 +73,8 @@ class Revisions:
         """Counts up with every change, so that a page knows when to ask again."""
         self.why = ""
         """Why the next revision is folded, if not for another setting."""
+        self.said: Callable[[int], tuple[Episode, ...]] = lambda number: ()
+        """Gives the episodes of the revision that runs."""
 
     def began_with(self, estimator: str, tuning: Tuning) -> None:
         """The first fold could be had; meanwhile its settings may have been turned."""
@@ -100,7 +105,7 @@ class Revisions:
             before = earlier[-1]
             changes = difference(before.estimator, before.tuning, estimator, tuning)
         else:
-            earlier = [*map(_without_track, earlier), replace(running, track=pull)]
+            earlier = [*map(_without_track, earlier), replace(running, track=pull, episodes=self.said(running.number))]
         begun = Run(pull.revision + 1, estimator, tuning, now, changes, why=why)
         if same:
             begun = replace(begun, loaded=same[0].number, name=same[-1].name, note=same[-1].note)
@@ -115,7 +120,7 @@ class Revisions:
             keep: Whether the log is still the same, so that the previous track can be compared with.
         """
         *earlier, running = self.runs
-        kept = earlier if keep else list(map(_without_track, earlier))
+        kept = earlier if keep else [replace(_without_track(run), episodes=()) for run in earlier]
         self._become([*kept, replace(running, number=number)])
 
     def previous(self) -> Pull | None:

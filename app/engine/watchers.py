@@ -55,7 +55,12 @@ class Watchers:
 
     def episodes(self) -> list[Episode]:
         """What was and is wrong, in the order of its start, with who is most likely off."""
-        return [self.blame.told(episode) for episode in self.chronicle.account.episodes]
+        return list(map(self.blame.told, self.chronicle.account.episodes))
+
+    def episodes_of(self, revision: int) -> tuple[Episode, ...]:
+        """The same, if they are those of a revision; else none."""
+        account = self.chronicle.account
+        return tuple(map(self.blame.told, account.episodes)) if account.revision == revision else ()
 
     def cause(self, leading: Episode | None, health: int) -> str:
         """Why the twin is not to be trusted now, by the episode that leads."""

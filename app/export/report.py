@@ -11,6 +11,7 @@ import numpy as np
 from estimators.diagnostics.calibration import calibrations, truth_calibration
 from estimators.diagnostics.episodes import Episode
 from estimators.diagnostics.field_pictures import Picture
+from estimators.diagnostics.held_out import Offset, offsets
 from estimators.diagnostics.score import Score, score
 from estimators.diagnostics.sensitivity import Bound
 from estimators.diagnostics.sensitivity.words import digits
@@ -20,7 +21,6 @@ from estimators.track import HEALTH_NAMES, VERDICT_NAMES, Track
 from estimators.tuning import GATE_KEYS, Tuning
 
 from ..engine.changes import difference, in_words
-from ..twin.commissioned import normal_nis
 from ..twin.twin import Twin
 from .alarms import advice
 from .calibration_lines import calibration_lines
@@ -39,7 +39,8 @@ class Reported(NamedTuple):
     """A run to be reported: with what it was folded, its rows, and what was wrong in it.
 
     `about` are more lines of its head, by name; `bounds` the integrity bounds of its states, where they are known;
-    `others` the runs before and after it: number, what was changed, scores in words.
+    `others` the runs before and after it: number, what was changed, scores in words; `before` the episodes of each
+    earlier run that had any, by its number and what it was.
     """
 
     twin: Twin
@@ -53,18 +54,20 @@ class Reported(NamedTuple):
     about: tuple[tuple[str, str], ...] = ()
     bounds: Mapping[str, Bound] | None = None
     others: tuple[tuple[str, ...], ...] = ()
+    before: tuple[tuple[str, Sequence[Episode]], ...] = ()
 
 
 def report(run: Reported) -> list[Part]:
     """The report, from top to bottom."""
     model = run.twin.model
-    found = score(run.track, run.events, model, run.pictures, gate=run.tuning.gate)
-    charts = run_charts(model, run.events, run.track, run.episodes, normal_nis(run.tuning.baseline))
+    found = score(run.track, run.events, model, run.pictures, gate=run.tuning.gate, baseline=run.tuning.baseline)
+    charts = run_charts(model, run.events, run.track, run.episodes)
     said = ("Time counts from the first event. Red shades: episodes. Extremes are kept.",)
     return [
         _head(run),
         _scores(run, found),
         _episodes(run),
+        *_before(run),
         Part("Charts", said, drawn=tuple(charts)),
         *_checks(run),
         _tuning(run),
@@ -109,12 +112,9 @@ def _scores(run: Reported, found: Score) -> Part:
     rows: list[tuple[str, str, str]] = []
     marks: list[str] = []
     if found.nis_readings:
-        normal = normal_nis(run.tuning.baseline)
-        low, high = normal * found.nis_low, normal * found.nis_high
-        said = f"95 % bounds {low:.3g} to {high:.3g}" + ("" if normal == 1.0 else f", as commissioned: ×{normal:.2g}")
-        inside = low <= found.nis <= high
-        rows.append(("mean NIS", digits(found.nis), said))
-        marks.append("good" if inside else "bad")
+        verdict = found.nis_verdict
+        rows.append(("mean NIS", digits(found.nis), f"{verdict.place} {verdict.expected}"))
+        marks.append("good" if verdict.place == "inside" else "bad")
     fits = [(f"RMSE of {name}", name, fit) for name, fit in found.states.items()]
     fits += [(f"RMSE of {name}, held out", name, fit) for name, fit in found.held_out.items()]
     for title, name, fit in fits:
@@ -147,25 +147,38 @@ def _cut(rows: Sequence[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
 
 
 def _episodes(run: Reported) -> Part:
+    shown = tuple(f"{offset.words[0].upper()}{offset.words[1:]}." for offset in _offsets(run))
     if not run.episodes:
-        return Part("Episodes", ("Nothing that the tests could see was wrong.",))
-    start = float(run.events.t[0]) * 1e-9
-    rows = [
-        (
-            f"{clock(round(item.start - start, 1))} to "
-            + ("the end" if item.end is None else clock(round(item.end - start, 1))),
-            item.subject.replace("_", " "),
-            item.cause,
-            item.text,
-        )
-        for item in run.episodes
-    ]
+        of = " of the sensors in use" if shown else ""
+        return Part("Episodes", (f"Nothing that the tests could see was wrong{of}.", *shown))
+    rows = [_told(item, run) for item in run.episodes]
     causes = [cause for cause in dict.fromkeys(item.cause for item in run.episodes) if advice(cause, "Response")]
     small = tuple(
         f"{cause.capitalize()}. Usual cause: {advice(cause, 'Usual cause')} Response: {advice(cause, 'Response')}"
         for cause in causes
     )
-    return Part("Episodes", (), ("when", "who", "what", "what was said, and what to do"), _cut(rows), small=small)
+    return Part("Episodes", shown, ("when", "who", "what", "what was said, and what to do"), _cut(rows), small=small)
+
+
+def _told(item: Episode, run: Reported) -> tuple[str, str, str, str]:
+    start = float(run.events.t[0]) * 1e-9
+    end = "the end" if item.end is None else clock(round(item.end - start, 1))
+    when = f"{clock(round(item.start - start, 1))} to {end}"
+    return when, item.subject.replace("_", " "), item.cause, item.text
+
+
+def _offsets(run: Reported) -> list[Offset]:
+    """What the sensors show that are held out."""
+    return offsets(run.events, run.track, run.tuning)
+
+
+def _before(run: Reported) -> list[Part]:
+    """What was wrong under the settings of earlier runs: what made somebody change them, and may hide now."""
+    rows = [(name, *_told(item, run)) for name, episodes in run.before for item in episodes]
+    if not rows:
+        return []
+    said = "Over the same log, with the settings of then; what a setting hides was there all the same."
+    return [Part("Episodes of the runs before", (said,), ("run", "when", "who", "what", "what was said"), _cut(rows))]
 
 
 def _checks(run: Reported) -> list[Part]:

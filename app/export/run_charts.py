@@ -42,18 +42,14 @@ READING, REFUSED, BOUND = _hex(LIGHT.reading), _hex(LIGHT.refused), _hex(LIGHT.b
 BOUNDS, QUIET = _hex(LIGHT.bound, "22"), _hex(LIGHT.previous)
 
 
-def run_charts(
-    model: StateSpaceModel, events: Events, track: Track, episodes: Sequence[Episode], normal: float = 1.0
-) -> list[str]:
-    """The charts as SVG; times count from the first event. `normal`: see `normal_nis`."""
-    return _Charts(model, events, track, episodes, normal).all() if len(events) else []
+def run_charts(model: StateSpaceModel, events: Events, track: Track, episodes: Sequence[Episode]) -> list[str]:
+    """The charts as SVG; times count from the first event."""
+    return _Charts(model, events, track, episodes).all() if len(events) else []
 
 
 class _Charts:
-    def __init__(
-        self, model: StateSpaceModel, events: Events, track: Track, episodes: Sequence[Episode], normal: float
-    ) -> None:
-        self._model, self._normal, self._made = model, normal, 0
+    def __init__(self, model: StateSpaceModel, events: Events, track: Track, episodes: Sequence[Episode]) -> None:
+        self._model, self._made = model, 0
         size = -(-len(events) // POINTS)
         self._columns = {
             name: column
@@ -115,7 +111,6 @@ class _Charts:
 
     def _nis(self) -> str:
         nis, mean, low, high = (_log(self._points[name]) for name in ("nis", "nis_mean", "nis_low", "nis_high"))
-        low, high = low + np.log10(self._normal), high + np.log10(self._normal)
         middle = float(np.nanmedian((low + high) / 2)) if np.isfinite(low + high).any() else 0.0
         finite = mean[np.isfinite(mean)]
         bottom = min(middle - 1.0, float(finite.min()) - 0.15) if finite.size else middle - 1.0

@@ -85,10 +85,12 @@ export class Around {
     if (key.startsWith("Q.")) {
       const level = this.said.Q?.level;
       if (!level || !(knob.value > 0)) return null;
+      if (this.said.Q.doubt) return { value: null, text: this.said.Q.doubt };
       return { value: Number((knob.value * level).toPrecision(3)), text: `the innovations are as large as the filter says with all of Q ×${compact(level, 3)}`, take: () => this.tune.scale("Q", level) };
     }
     const found = this.said.R[key];
     if (!found) return null;
+    if (found.doubt) return { value: null, text: found.doubt };
     if (found.value === null) return { value: null, text: "innovations are smaller than Q alone explains: no R is left" };
     return { value: Number(found.value.toPrecision(3)), text: `the innovations say ${compact(found.value, 3)} ± ${compact(found.std, 2)}${spaced(knob.what.unit)}` };
   }
@@ -96,14 +98,15 @@ export class Around {
   mark() {
     for (const [key, knob] of this.tune.knobs) knob.say(key[1] === "." && key[0] !== "p" ? this.saying(key) : null);
     for (const curve of this.open.values()) curve.write();
-    const level = this.said.Q?.level;
+    const doubt = this.said.Q?.doubt;
+    const level = doubt ? null : this.said.Q?.level;
     const scale = $("scale-Q");
     if (!scale) return;
     scale.disabled = !level;
     setText(scale, level ? `data ×${compact(level, 2)}` : "data –");
     setAttribute(scale, "title", level
       ? `All of Q ×${compact(level, 3)}: there the innovations are as large as the filter says. Take it`
-      : this.said.Q?.done ? "Between ×0.1 and ×10 no level of Q makes the innovations as large as the filter says" : "Being folded in the background …");
+      : doubt ? `Not to be taken: ${doubt}` : this.said.Q?.done ? "Between ×0.1 and ×10 no level of Q makes the innovations as large as the filter says" : "Being folded in the background …");
     scale.dataset.level = level ?? "";
   }
 }
@@ -181,7 +184,9 @@ class Curve {
     const last = swept.points.length > 1 && best && (best === swept.points[0] || best === swept.points.at(-1)) ? ", or beyond" : "";
     setText(this.line, swept.reason || (best ? `likeliest at ${compact(best.value, 3)}${last}, NIS ${compact(best.nis, 3)}${swept.done ? "" : " …"}` : swept.done ? "no value can be folded" : "folding …"));
     const said = this.key.startsWith("R.") ? this.around.saying(this.key) : null;
-    const offers = [best && best.factor !== 1 ? [best.value, "likeliest of those that were folded"] : null, said?.value ? [said.value, said.text] : null].filter(Boolean);
+    // The likelihood, too, is that of white innovations.
+    const doubted = Boolean(this.around.said.R[this.key]?.doubt);
+    const offers = [best && best.factor !== 1 && !doubted ? [best.value, "likeliest of those that were folded"] : null, said?.value ? [said.value, said.text] : null].filter(Boolean);
     this.takes.replaceChildren(
       ...offers.map(([value, title], k) => element("button", { type: "button", class: "go", title: `Take it: ${title}`, onclick: () => this.knob.set(value) }, `${k || !best || best.factor === 1 ? "data say" : "take"} ${compact(value, 3)}`)),
       said && !said.value ? element("span", { class: "faint" }, said.text) : "",

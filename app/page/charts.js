@@ -216,13 +216,12 @@ function stateChart(charts, state) {
 function nisChart(charts) {
   const { live } = charts;
   const names = ["nis_high", "nis_low", "nis", "nis_mean"];
-  const normal = charts.model.nis_normal; // times what the filter expects, of a commissioned twin
   const log = (value) => (typeof value === "number" ? Math.log10(Math.max(value, 1e-9)) : value);
   return {
     key: "nis",
     title: "NIS",
     unit: "",
-    note: normal === 1 ? "mean of the last readings, in its 95 % bounds" : `mean of the last readings; 95 % bounds as commissioned, ×${compact(normal, 2)}`,
+    note: `mean of the last readings, in its 95 % bounds${charts.model.commissioned ? " as commissioned" : ""}`,
     names: { estimate: "mean", bound: "" },
     weight: 1,
     series: [line("bound", { width: 1 }), line("bound", { width: 1 }), dots("quiet", 2.5), line("estimate", { width: 1.75 })],
@@ -234,21 +233,19 @@ function nisChart(charts) {
     },
     under: (plot) => marks(plot, charts.episodes, charts.view.at),
     data: () => {
-      const [low, high] = nisRange(live, normal);
+      const [low, high] = nisRange(live);
       // Readings that fit are of no interest; one that does not fit at all stands at the top.
       const clamped = (value) => (typeof value !== "number" || log(value) < low ? null : Math.min(high - 0.03, log(value)));
-      const shift = { nis_high: Math.log10(normal), nis_low: Math.log10(normal) };
-      const shown = (name) => (value) => (typeof value === "number" ? log(value) + (shift[name] ?? 0) : value);
-      return [live.x, ...names.map((name) => live.column(name).map(name === "nis" ? clamped : shown(name)))];
+      return [live.x, ...names.map((name) => live.column(name).map(name === "nis" ? clamped : log))];
     },
-    range: () => nisRange(live, normal),
+    range: () => nisRange(live),
     says: (value) => `${compact(10 ** value(4), 3)}  bounds ${compact(10 ** value(2), 3)} – ${compact(10 ** value(1), 3)}`,
   };
 }
 
 // Decades about the bounds, and more where the mean itself leaves them.
-function nisRange(live, normal) {
-  const middle = Math.log10(normal * Math.sqrt(live.last("nis_low") * live.last("nis_high"))) || 0;
+function nisRange(live) {
+  const middle = Math.log10(Math.sqrt(live.last("nis_low") * live.last("nis_high"))) || 0;
   const [low, high] = extent([live.column("nis_mean")], 0, live.x.length - 1);
   const known = Number.isFinite(low) && low > 0;
   return [known ? Math.min(middle - 1, Math.log10(low) - 0.15) : middle - 1, known ? Math.max(middle + 1, Math.log10(high) + 0.15) : middle + 1];

@@ -14,8 +14,9 @@ const SIGNS = { good: "●", bad: "◐", unknown: "○" };
 const HEALTH = { good: "tracking", bad: "suspect", unknown: "waiting" };
 
 export class Diagnose {
-  constructor(node, link) {
-    Object.assign(this, { node, link });
+  // save(plot, button, events): of a plot that is to be kept
+  constructor(node, link, save) {
+    Object.assign(this, { node, link, save });
     this.shown = false;
     this.drawn = null;
     this.turned = new Map(); // rows that the user has opened or closed, by name
@@ -52,13 +53,25 @@ export class Diagnose {
     const left = found.rows_in_all > found.rows.length ? ` (the first of ${found.rows_in_all})` : "";
     const rows = [...found.rows].sort((a, b) => ORDER.indexOf(a.tone) - ORDER.indexOf(b.tone));
     const open = (row) => this.turned.get(row.name) ?? (found.rows.length <= FEW || row.tone === "bad");
+    const focused = this.node.contains(document.activeElement) ? document.activeElement.getAttribute("aria-label") : null;
     const cost = found.cost === null ? "" : ` An event costs ${compact(found.cost, 3)} µs.`;
     this.node.replaceChildren(
-      element("p", { class: "summary" }, element("b", {}, `${good} of ${found.rows.length} sensor rows${left} are consistent. `), `Last ${found.events.toLocaleString("en")} events, ${span(found.span)}, ${found.estimator}.${cost}`),
+      element("p", { class: "summary" }, element("b", {}, `${good} of ${found.rows.length} sensor rows${left} are as they should be. `), `Last ${found.events.toLocaleString("en")} events, ${span(found.span)}, ${found.estimator}: ${found.nis}.${cost}`),
       ...rows.map((row) => rowCard(row, found.marginal, open(row), (now) => this.turned.set(row.name, now))),
       element("div", { class: "cards" }, ...[ranksCard(found), particlesCard(found), correlationCard(found), ...unseenCards(found)].filter(Boolean)),
     );
+    this.savable(found.events);
+    if (focused) this.node.querySelector(`[aria-label="${CSS.escape(focused)}"]`)?.focus();
     window.nisus.diagnosed = (window.nisus.diagnosed ?? 0) + 1;
+  }
+
+  // Each plot has its own button.
+  savable(events) {
+    for (const plot of this.node.querySelectorAll("svg[aria-label]")) {
+      const label = plot.getAttribute("aria-label");
+      const button = element("button", { type: "button", class: "save", title: "Save this plot", "aria-label": `Save the plot: ${label}`, "aria-haspopup": "menu", onclick: () => this.save(plot, button, events) }, "⤓");
+      (plot.closest("figure")?.querySelector("figcaption") ?? plot.closest("article").querySelector("header")).append(button);
+    }
   }
 }
 

@@ -17,6 +17,7 @@ export class Episodes {
   constructor(node, link, view, charts) {
     Object.assign(this, { node, link, view, charts });
     this.notices = [];
+    this.held = []; // what sensors show that are held out, in words
     this.counts = element("dl", { class: "counts", "aria-label": "What became of the readings" });
     link.addEventListener("episodes", (event) => this.show(event.detail));
     link.addEventListener("notices", (event) => {
@@ -26,7 +27,10 @@ export class Episodes {
       this.notices = [...fresh, ...this.notices].slice(0, MOST);
       this.show(this.link.episodes);
     });
-    link.addEventListener("status", (event) => this.count(event.detail));
+    link.addEventListener("status", ({ detail }) => {
+      this.count(detail);
+      this.holds(detail.sensors);
+    });
     this.show([]);
   }
 
@@ -43,14 +47,24 @@ export class Episodes {
     );
   }
 
+  // Nothing of a sensor that is held out is tested; what it reads is shown all the same.
+  holds(sensors) {
+    const held = Object.values(sensors).filter(({ state, text }) => state === "held out" && text).map(({ text }) => text);
+    if (held.join() === this.held.join()) return;
+    this.held = held;
+    this.show(this.link.episodes);
+  }
+
   show(episodes) {
     const open = episodes.filter((episode) => episode.end === null).reverse();
     const over = episodes.filter((episode) => episode.end !== null).reverse();
     const list = (items, entry) => element("ol", {}, ...items.map(entry));
     this.node.replaceChildren(
       this.counts,
-      element("h3", {}, open.length ? `Now (${open.length})` : "Now: nothing is wrong"),
+      element("h3", {}, open.length ? `Now (${open.length})` : `Now: nothing is wrong${this.held.length ? " with the sensors in use" : ""}`),
       list(open, (item) => this.entry(item)),
+      this.held.length ? element("h3", {}, "Held out") : "",
+      list(this.held, (text) => element("li", { class: "event held-out" }, element("span", {}, text))),
       over.length ? element("h3", {}, `Before (${over.length})`) : "",
       list(over.slice(0, MOST), (item) => this.entry(item)),
       element("h3", {}, "Events"),

@@ -56,11 +56,20 @@ export class Knob {
     this.show(this.value);
   }
 
-  // What the data say the value is: a mark on the slider that takes it. saying: {value, text, take}, or null.
+  // What the data say the value is: a mark on the slider that takes it, or a hollow one at its end that
+  // says why none is to be taken. saying: {value, text, take}, or null.
   say(saying) {
-    this.take = saying?.take ?? (() => this.set(saying.value));
-    this.said.hidden = !saying?.value;
+    this.take = saying?.take ?? (() => saying.value && this.set(saying.value));
+    this.said.hidden = !saying;
     if (this.said.hidden) return;
+    setText(this.said, saying.value ? "◆" : "◇");
+    setAttribute(this.said, "aria-disabled", String(!saying.value));
+    if (!saying.value) {
+      this.said.style.setProperty("--place", 1);
+      setAttribute(this.said, "title", `No value from the data: ${saying.text}`);
+      setAttribute(this.said, "aria-label", `${words(this.what.label)}: no value from the data, ${saying.text}`);
+      return;
+    }
     this.said.style.setProperty("--place", this.place(saying.value));
     setAttribute(this.said, "title", `Data: ${saying.text}. Take ${compact(saying.value, 3)}`);
     setAttribute(this.said, "aria-label", `${words(this.what.label)}: take ${compact(saying.value, 3)}, as the data say`);

@@ -76,7 +76,7 @@ const explore = new Explore(settings.viewer, theme, { link, view, charts });
 const stage = new Stage(settings.viser ? { pass: settings.stage_pass } : null, theme, link, view, charts);
 
 // What is hidden neither computes nor asks.
-const panes = { explore, whatif: new WhatIf($("whatif"), model, link), diagnose: new Diagnose($("diagnose"), link) };
+const panes = { explore, whatif: new WhatIf($("whatif"), model, link), diagnose: new Diagnose($("diagnose"), link, (...plot) => saving.plot(...plot)) };
 const middle = new Tabs($("middle-tabs"), null, (shown) => {
   for (const [name, pane] of Object.entries(panes)) if (name !== shown) pane.hide();
   panes[shown]?.show();
@@ -86,7 +86,7 @@ const middle = new Tabs($("middle-tabs"), null, (shown) => {
 });
 window.nisus.panes = panes;
 const saving = new Save(model, link, view, charts);
-charts.saving = panes.whatif.saving = saving;
+charts.saving = panes.whatif.saving = window.nisus.saving = saving;
 $("save").addEventListener("click", () => saving.run($("save")));
 $("copy-link").addEventListener("click", () => saving.copyLink());
 saving.said = (text) => {

@@ -4,10 +4,12 @@
 import { element, setText } from "./dom.js";
 import { compact, spaced, span } from "./format.js";
 import { swatch } from "./pins.js";
+import { gone } from "./save.js";
 
 const LOOK = 300; // ms between two looks at whether there is something new
 const AGAIN = 5000; // ms between two looks at the scores while the log grows
 const COVERED = 0.95; // share of errors that their 95 % band should hold
+const BEYOND = { above: " ▲", below: " ▼" }; // of a mean NIS outside its bounds
 const ALIKE = 0.8; // share of the longest time from which on scores can be compared
 
 export class Runs {
@@ -70,7 +72,7 @@ export class Runs {
       : null;
     const cell = (title, ...text) => element("th", { scope: "col", title }, ...text);
     return element("thead", {}, element("tr", {},
-      cell("Mean NIS of the readings that were used; bold: nearest to what it should be", "NIS"),
+      cell("Mean NIS of the readings that were used; ▲ above, ▼ below its 95 % bounds; bold: nearest to what it should be", "NIS"),
       cell("Root mean square error against the truth, or of predictions of a sensor held out", "RMSE ", select ?? "–"),
       cell("Share of errors inside their 95 % band", "in 95 %"),
       cell("Log-likelihood of a reading, refused ones priced", "log L"),
@@ -83,7 +85,7 @@ export class Runs {
     const cell = (key, text, title) => element("td", { class: best[key] === number ? "best" : null, title: best[key] === number ? `Best. ${title ?? ""}` : title }, text);
     const scores = score
       ? element("tr", { class: "scores" },
-          cell("nis", compact(score.nis, 3), `Bounds ${compact(score.nis_low, 3)} to ${compact(score.nis_high, 3)}; ${score.readings} readings in ${span(score.seconds)}, ${compact(100 * (score.refused ?? 0), 2)} % refused`),
+          cell("nis", `${compact(score.nis, 3)}${BEYOND[score.nis_place] ?? ""}`, `Of the whole run: ${score.nis_words}; ${score.readings} readings in ${span(score.seconds)}, ${compact(100 * (score.refused ?? 0), 2)} % refused`),
           cell("rmse", fit ? compact(fit.rmse, 3) : "–", fit ? `${fit.name}, ${fit.against}: mean error ${compact(fit.bias, 2)}${spaced(fit.unit)}` : "No truth, and no sensor is held out"),
           cell("coverage", fit ? `${compact(100 * fit.coverage, 3)} %` : "–"),
           cell("likelihood", compact(score.log_likelihood_reading, 4), `In all ${compact(score.log_likelihood, 6)}`),
@@ -125,10 +127,16 @@ export class Runs {
       run.running ? null : button("load", "Load: back to this filter and tuning", () => this.ask("Load", { number })),
       button("note", "Write a note", () => ((this.noted = this.noted === number ? null : number), this.show(), this.table.querySelector(`tbody[data-number="${number}"] textarea`)?.focus())),
       button("⇄", "Compare with another", choose, { "aria-pressed": String(this.chosen.includes(number)) }),
-      run.kept ? element("a", { href: `/api/report.html?run=${number}`, download: "", title: "Save a report: scores, charts, checks, episodes and tuning in one file", "aria-label": `Save a report of run ${number}` }, "report") : null,
-      run.kept ? element("a", { href: `/api/track.csv?run=${number}`, download: "", title: "Save the track as CSV", "aria-label": `Save the track of run ${number}` }, "csv") : null,
+      this.download(run, "report", `/api/report.html?run=${number}`, "Save a report: scores, charts, checks, episodes and tuning in one file", `Save a report of run ${number}`),
+      this.download(run, "csv", `/api/track.csv?run=${number}`, "Save the track as CSV", `Save the track of run ${number}`),
       element("a", { href: `/api/runs/${number}.yaml`, download: "", title: "Save the tuning as lines of the twin's YAML", "aria-label": `Save run ${number} as YAML` }, "yaml"),
     ];
+  }
+
+  // Of a run whose track is gone there is nothing to save, and it says why.
+  download(run, text, href, title, label) {
+    if (run.kept) return element("a", { href, download: "", title, "aria-label": label }, text);
+    return element("button", { type: "button", class: "gone", disabled: true, title: gone(run.number), "aria-label": `${label}: ${gone(run.number)}` }, text);
   }
 
   note(run) {

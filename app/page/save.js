@@ -5,6 +5,10 @@ import { element } from "./dom.js";
 import { clock, words } from "./format.js";
 import { link as momentLink } from "./moment.js";
 import { chartSvg, heading, pngOf } from "./svg_chart.js";
+import { plotSvg } from "./svg_plot.js";
+
+// Why there is nothing to save of a run.
+export const gone = (number) => `the track of run ${number} is gone: load it, and it is folded again`;
 
 const CENTURY = 1e18; // ns since 1970 from which on a time has a date
 
@@ -16,11 +20,11 @@ export class Save {
     document.body.append(this.menu);
   }
 
-  // items: [text, title, run]
+  // items: [text, title, run, reason]; with a reason why not it is greyed, and says so
   open(button, items) {
     this.menu.replaceChildren(
-      ...items.map(([text, title, run]) =>
-        element("button", { type: "button", role: "menuitem", title, onclick: () => (this.menu.hidePopover(), button.focus(), run()) }, text)),
+      ...items.map(([text, title, run, reason]) =>
+        element("button", { type: "button", role: "menuitem", title: reason || title, "aria-disabled": reason ? "true" : null, onclick: () => reason || (this.menu.hidePopover(), button.focus(), run()) }, text, reason ? element("small", {}, reason) : null)),
     );
     this.menu.showPopover();
     const [box, own] = [button.getBoundingClientRect(), this.menu.getBoundingClientRect()];
@@ -49,6 +53,15 @@ export class Save {
     this.offer(button, () => xy.svg([`${this.model.twin}: ${words(up)} over ${words(across)}`, this.about(this.charts.range)]), `${up}-over-${across}`);
   }
 
+  // A plot of Diagnose, over the last `events` of a run.
+  plot(node, button, events) {
+    const label = node.getAttribute("aria-label");
+    const title = this.model.estimators.find((entry) => entry.name === this.link.status.estimator)?.title;
+    const about = `${title}, run ${this.link.status.revision}, the last ${events.toLocaleString("en")} events until ${clock(this.charts.newest, 1)}`;
+    const text = plotSvg(node, [`${this.model.twin}: ${label}`, about]);
+    this.offer(button, () => text, label);
+  }
+
   // A chart as a picture or a drawing; draw() gives the text of the SVG.
   offer(button, draw, name) {
     const save = (kind, title) => [kind.toUpperCase(), title, () => this.picture(draw(), name, kind)];
@@ -57,17 +70,26 @@ export class Save {
 
   run(button) {
     const number = this.link.status.revision;
+    const fetched = (address) => this.fetched(number, address);
     const [since, until] = this.charts.range.map((time) => Number(time.toFixed(6)));
     const whole = (kind) => `/api/track.${kind}?run=${number}`;
     const part = (kind) => `${whole(kind)}&since=${since}&until=${until}`;
+    const reason = this.link.status.t === null ? "no reading has come yet" : null;
     this.open(button, [
-      ["Track, what is shown: CSV", "One line an event, the columns of nisus fold", () => fetched(part("csv"))],
-      ["Track, what is shown: Parquet", "The same, with its types", () => fetched(part("parquet"))],
-      ["Track, all of it: CSV", "One line an event, the columns of nisus fold", () => fetched(whole("csv"))],
-      ["Track, all of it: Parquet", "The same, with its types", () => fetched(whole("parquet"))],
-      ["Report: HTML", "Scores, charts, checks, episodes and tuning in one file", () => fetched(`/api/report.html?run=${number}`)],
+      ["Track, what is shown: CSV", "One line an event, the columns of nisus fold", () => fetched(part("csv")), reason],
+      ["Track, what is shown: Parquet", "The same, with its types", () => fetched(part("parquet")), reason],
+      ["Track, all of it: CSV", "One line an event, the columns of nisus fold", () => fetched(whole("csv")), reason],
+      ["Track, all of it: Parquet", "The same, with its types", () => fetched(whole("parquet")), reason],
+      ["Report: HTML", "Scores, charts, checks, episodes and tuning in one file", () => fetched(`/api/report.html?run=${number}`), reason],
       ["Copy a link to this moment (L)", "Time, span and charts, for who has this session open", () => this.copyLink()],
     ]);
+  }
+
+  // A run may have given way since the menu was opened, and its track be gone: then that is said.
+  fetched(number, address) {
+    const { runs } = this.link.status;
+    if (runs.kept.includes(number)) element("a", { href: address, download: "" }).click();
+    else this.said?.(`${gone(number)}; nothing is saved`);
   }
 
   // The time of the newest row that is shown, ns.
@@ -108,4 +130,3 @@ function download(blob, name) {
   setTimeout(() => URL.revokeObjectURL(url), 60_000);
 }
 
-const fetched = (address) => element("a", { href: address, download: "" }).click();

@@ -15,10 +15,17 @@ const escaped = (text) => text.replace(/[&<>"]/g, (sign) => ({ "&": "&amp;", "<"
 const round = (value) => Math.round(10 * Math.min(1e5, Math.max(-1e5, value))) / 10;
 
 // The colours of the light theme, whatever is shown: from the page's own style, where they stand once.
-export function lightColours() {
+export function lightPalette() {
   for (const sheet of document.styleSheets)
-    for (const rule of sheet.cssRules) if (rule.selectorText === ":root" && rule.style.getPropertyValue("--estimate")) return (name) => rule.style.getPropertyValue(`--${name}`).trim();
+    for (const rule of sheet.cssRules)
+      if (rule.selectorText === ":root" && rule.style.getPropertyValue("--estimate"))
+        return new Map([...rule.style].filter((name) => name.startsWith("--")).map((name) => [name, rule.style.getPropertyValue(name).trim()]));
   throw new Error("the page has no style");
+}
+
+export function lightColours() {
+  const palette = lightPalette();
+  return (name) => palette.get(`--${name}`);
 }
 
 // chart: of chart.js; lines: [title, smaller line]; episodes: shades. Resolves to the text of the file.

@@ -63,11 +63,7 @@ export class Trust {
   }
 
   // NIS on a logarithmic scale of two decades about its bounds.
-  gauge(status) {
-    // Of a commissioned twin what was normal then, not what the filter expects.
-    const normal = this.model.nis_normal;
-    const { nis } = status;
-    const [low, high] = [status.nis_low, status.nis_high].map((bound) => (typeof bound === "number" ? normal * bound : bound));
+  gauge({ nis, nis_low: low, nis_high: high, nis_place: where, nis_words: said }) {
     const known = [nis, low, high].every((value) => typeof value === "number" && value > 0);
     setText($("nis"), known ? compact(nis, 3) : "–");
     $("gauge").hidden = !known;
@@ -77,8 +73,8 @@ export class Trust {
     $("gauge").style.setProperty("--low", place(low));
     $("gauge").style.setProperty("--high", place(high));
     $("gauge").style.setProperty("--nis", place(nis));
-    $("gauge").dataset.inside = String(low <= nis && nis <= high);
-    setAttribute($("gauge"), "title", `Mean NIS ${compact(nis, 3)}; its 95 % bounds are ${compact(low, 3)} to ${compact(high, 3)}${normal === 1 ? "" : `, ${compact(normal, 2)} times what the filter expects: as commissioned`}`);
+    $("gauge").dataset.inside = String(where === "inside");
+    setAttribute($("gauge"), "title", `Of the last readings: ${said}`);
   }
 
   connection(state) {

@@ -13,7 +13,7 @@ from ..engine.whole import whole
 
 
 def summary_of(engine: Running) -> dict[str, Any]:
-    """Estimator, mean NIS with its bounds and the first error that could be taken, of what runs; less if it cannot be.
+    """Estimator, mean NIS and how it is judged, and the first error that could be taken, of what runs; or less.
 
     `error` is {name, rmse, unit, coverage, against}: of the first state with a truth, else of a sensor held out.
     """
@@ -22,7 +22,7 @@ def summary_of(engine: Running) -> dict[str, Any]:
         tuning, estimator = engine.folded_with()
         if pull is None:
             return {"estimator": estimator}
-        found = score(pull.track, pull.events, engine.model, pull.pictures, gate=tuning.gate)
+        found = score(pull.track, pull.events, engine.model, pull.pictures, gate=tuning.gate, baseline=tuning.baseline)
     except NisusError:
         return {}
     return {
@@ -30,6 +30,7 @@ def summary_of(engine: Running) -> dict[str, Any]:
         "nis": _plain(found.nis),
         "nis_low": _plain(found.nis_low),
         "nis_high": _plain(found.nis_high),
+        "nis_words": found.nis_verdict.words,
         "error": _error(found, engine),
     }
 

@@ -71,12 +71,18 @@ def swept_json(swept: Swept) -> dict[str, Any]:
 
 
 def noise_json(noise: Noise) -> dict[str, Any]:
-    """What the innovations say of each R, and by what all of Q would have to be scaled."""
+    """What the innovations say of each R, and by what all of Q would have to be scaled; `doubt` is why not to do so."""
     estimates = {
-        key: {"value": _plain(found.variance) if found.variance > 0.0 else None, "std": _plain(found.std), "n": found.n}
+        key: {
+            "value": _plain(found.variance) if found.variance > 0.0 else None,
+            "std": _plain(found.std),
+            "n": found.n,
+            "doubt": noise.doubts.get(key, ""),
+        }
         for key, found in noise.sensors.items()
     }
-    return {"revision": noise.revision, "R": estimates, "reason": noise.reason, "Q": swept_json(noise.q)}
+    q = swept_json(noise.q) | {"doubt": noise.doubts.get("Q", "")}
+    return {"revision": noise.revision, "R": estimates, "reason": noise.reason, "Q": q}
 
 
 def _score(known: RunScore, units: dict[str, str]) -> dict[str, Any]:
@@ -91,6 +97,8 @@ def _score(known: RunScore, units: dict[str, str]) -> dict[str, Any]:
         "nis": _plain(found.nis),
         "nis_low": _plain(found.nis_low),
         "nis_high": _plain(found.nis_high),
+        "nis_place": found.nis_verdict.place,
+        "nis_words": found.nis_verdict.words,
         "log_likelihood": _plain(found.log_likelihood),
         "log_likelihood_reading": _plain(known.log_likelihood_reading),
         "readings": found.readings,

@@ -87,8 +87,8 @@ class RunScores:
         self._fresh_until = (running.number, begun + took + max(LEAST, REST * took))
 
     def _scored(self, run: Run, pull: Pull) -> RunScore:
-        gate, model = run.tuning.gate, self._engine.model
-        found = score(pull.track, pull.events, model, pull.pictures, gate=gate)
+        gate, baseline, model = run.tuning.gate, run.tuning.baseline, self._engine.model
+        found = score(pull.track, pull.events, model, pull.pictures, gate=gate, baseline=baseline)
         t, known = pull.events.t, self._known.get(run.number)
         seconds = float(t[-1] - t[0]) * 1e-9 if t.size else 0.0
         made = RunScore(found, len(pull.events), seconds, np.nan if known is None else known.step_us)

@@ -10,12 +10,12 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimators.diagnostics.innovation_size import mean_nis
+from estimators.diagnostics.innovation_size import SensorNoise, mean_nis, sensor_noise
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError, NisusError
 from estimators.track import FAILED, Track
@@ -50,6 +50,15 @@ CHUNK = 256
 
 GROWN = 1.5
 """Times as many events as were folded from which on a sweep is out of date."""
+
+MATCHED = "R, matched"
+"""What is folded for `matched`, among the keys."""
+
+TURNS = 5
+"""Folds after which R has come to rest, or does not."""
+
+AT_REST = 0.05
+"""Share by which R may still move then."""
 
 KEPT = 32
 GROUPS = ("Q", "R")
@@ -109,6 +118,15 @@ class Swept:
         return None
 
 
+@dataclass(frozen=True)
+class Matched:
+    """What the innovations say of the noise of each sensor row once R is what they say, for a revision."""
+
+    revision: int
+    events: int
+    rows: dict[str, SensorNoise]
+
+
 class Sweeps:
     """Folds what was asked for last, in a thread of its own."""
 
@@ -117,6 +135,7 @@ class Sweeps:
         self._wake = threading.Condition()
         self._wanted: list[str] = []
         self._known: dict[str, Swept] = {}
+        self._matched: Matched | None = None
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="sweep", daemon=True)
 
@@ -142,11 +161,25 @@ class Sweeps:
         known, revision = self._known.get(key), self._engine.revisions.runs[-1].number
         if known is not None and known.revision == revision and not self._outdated(known):
             return known
+        self._want(key)
+        # While there is another, older or of fewer events, it says more than nothing.
+        return known if known is not None and known.revision == revision else Swept(key, revision, value, 0)
+
+    def matched(self) -> Matched | None:
+        """R taken from the innovations again and again, all at once, until it rests; None as long as it is not known.
+
+        Where R alone was wrong, the innovations are white then; what else is wrong leaves them correlated.
+        """
+        known, revision = self._matched, self._engine.revisions.runs[-1].number
+        current = known is not None and known.revision == revision
+        if not current or (known is not None and known.events < self._engine.index_at(ALL) / GROWN < MOST):
+            self._want(MATCHED)
+        return known if current else None
+
+    def _want(self, key: str) -> None:
         with self._wake:
             self._wanted = [key, *(other for other in self._wanted if other != key)][:KEPT]
             self._wake.notify()
-        # While there is another, older or of fewer events, it says more than nothing.
-        return known if known is not None and known.revision == revision else Swept(key, revision, value, 0)
 
     def _outdated(self, known: Swept) -> bool:
         return known.done and known.events < min(MOST - FEWEST, self._engine.index_at(ALL) / GROWN)
@@ -181,6 +214,10 @@ class Sweeps:
             taken = window(self._engine, most)
             if taken is None:
                 return
+        if key == MATCHED:
+            if not reason:
+                self._match(taken)
+            return
         value, revision = value_of(taken.tuning, key), taken.pull.revision
         swept = Swept(key, revision, value, len(taken.pull.events))
         values = values_around(taken.tuning, key)
@@ -197,6 +234,29 @@ class Sweeps:
             done = k + 1 == len(values)
             self._known[key] = Swept(key, revision, value, swept.events, tuple(points), done)
         self._known = dict(list(self._known.items())[-KEPT:])
+
+    def _match(self, taken: Window) -> None:
+        """Fold with the R that the innovations of the fold before say, until it rests."""
+        tuning, track = taken.tuning, taken.track
+        for _ in range(TURNS):
+            said = sensor_noise(track, taken.pull.events, tuning)
+            following = _with(tuning, said)
+            moved = np.abs(np.log(following.r[following.r > 0.0] / tuning.r[following.r > 0.0]))
+            if not moved.size or moved.max() < AT_REST:
+                break
+            tuning = following
+            try:
+                fold = taken.fold(self._engine, taken.estimator, tuning)
+                while self._goes_on(taken) and fold.advance(CHUNK):
+                    pass
+            except NisusError:
+                return
+            if not self._goes_on(taken):
+                return
+            track = fold.track
+        self._matched = Matched(
+            taken.pull.revision, len(taken.pull.events), sensor_noise(track, taken.pull.events, tuning)
+        )
 
     def _point(self, taken: Window, key: str, factor: float, tuning: Tuning) -> Point | None:
         """One value, folded; None if nobody wants it any more."""
@@ -270,6 +330,15 @@ def scaled(tuning: Tuning, key: str, factor: float) -> Tuning:
     if key not in GROUPS:
         return tuning.set(key, value_of(tuning, key) * factor)
     return replace(tuning, q=tuning.q * factor) if key == "Q" else replace(tuning, r=tuning.r * factor)
+
+
+def _with(tuning: Tuning, said: Mapping[str, SensorNoise]) -> Tuning:
+    """A tuning with the R that is said of each row, where any is left."""
+    r = tuning.r.copy()
+    for name, noise in said.items():
+        if noise.variance > 0.0:
+            r[tuning.model.row_names.index(name)] = noise.variance
+    return replace(tuning, r=r)
 
 
 def _failures(track: Track) -> int:

@@ -14,6 +14,7 @@ from typing import Any
 
 from starlette.responses import JSONResponse
 
+from estimators.diagnostics.consistency import NisVerdict
 from estimators.diagnostics.episodes import anchor, episode_json
 from estimators.errors import ConfigError, nearest, printable, quoted, shown_name
 from estimators.track import HEALTH_NAMES
@@ -51,6 +52,8 @@ def one_line(text: str) -> str:
 def status_json(engine: Running) -> dict[str, Any]:
     """What the page's header shows, and more for whoever asks."""
     status = engine.status()
+    commissioned = status.tuning.baseline is not None
+    judged = NisVerdict(status.nis, status.nis_low, status.nis_high, commissioned)
     return {
         "twin": engine.twin.name,
         "title": engine.twin.title,
@@ -77,6 +80,8 @@ def status_json(engine: Running) -> dict[str, Any]:
         "nis": _plain(status.nis),
         "nis_low": _plain(status.nis_low),
         "nis_high": _plain(status.nis_high),
+        "nis_place": judged.place,
+        "nis_words": judged.words,
         "late": {"inflate": engine.twin.late.inflate, "reason": engine.twin.late.reason},
         "degraded_after": {"seconds": engine.twin.degraded.seconds, "reason": engine.twin.degraded.reason},
         "model_version": status.model_version,
@@ -99,11 +104,12 @@ def status_json(engine: Running) -> dict[str, Any]:
 
 
 def _runs(revisions: Revisions) -> dict[str, Any]:
-    """When to ask /api/runs again (`version`), the run before the running one, and the pinned ones."""
+    """When to ask /api/runs again (`version`), the run before the running one, those with a track, the pinned ones."""
     runs = revisions.runs
     return {
         "version": revisions.version,
         "last": runs[-2].number if len(runs) > 1 else None,
+        "kept": [run.number for run in runs if run.track is not None or run is runs[-1]],
         "pinned": [
             {"number": run.number, "place": run.place, "name": run.name, "running": run is runs[-1]}
             for run in runs

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response, StreamingResponse
 from starlette.routing import Route
 
+from estimators.diagnostics.episodes import Episode
 from estimators.diagnostics.sensitivity.words import digits
 from estimators.errors import ConfigError
 
@@ -78,9 +80,19 @@ class ExportApi:
         episodes = engine.episodes() if run is engine.revisions.runs[-1] else taken.episodes()
         said = Reported(
             engine.twin, run.estimator, run.tuning, pull.events, pull.track, pull.pictures, episodes,
-            taken.marginal, tuple(about), bounds, _others(self._scores),
+            taken.marginal, tuple(about), bounds, _others(self._scores), self._before(run, episodes),
         )  # fmt: skip
         return taken, as_html(f"{engine.twin.name}, run {run.number}", report(said))
+
+    def _before(self, run: Run, now: Sequence[Episode]) -> tuple[tuple[str, Sequence[Episode]], ...]:
+        """The episodes of earlier runs that this one, or a later of them, does not have as well, newest run first."""
+        known, found = {_who(item) for item in now}, []
+        for other in reversed(self._engine.revisions.runs):
+            new = [item for item in other.episodes if other.number < run.number and _who(item) not in known]
+            if new:
+                known |= {_who(item) for item in new}
+                found.append((f"{other.number} {other.name}".rstrip() + f": {what_changed(other)}", new))
+        return tuple(found)
 
     def _instant(self, request: Request, name: str) -> int | None:
         """A time of the charts as one of the log, ns."""
@@ -100,6 +112,10 @@ class ExportApi:
         span = f"-{ends[0] or ''}-to-{ends[1] or ''}s" if any(ends) else ""
         name = re.sub(r"[^\w.-]+", "_", f"{self._engine.twin.name}-run{taken.run.number}{span}", flags=re.ASCII)
         return {"Content-Disposition": f'attachment; filename="{name}.{kind}"'}
+
+
+def _who(episode: Episode) -> tuple[str, str]:
+    return episode.subject, episode.cause
 
 
 def _others(scores: RunScores) -> tuple[tuple[str, ...], ...]:

@@ -11,7 +11,6 @@ from estimators.registry import ESTIMATORS, unfit
 from ..drawing.direct_readings import observed
 from ..engine.interface import Running
 from ..series.columns import columns_of, rows_of
-from ..twin.commissioned import normal_nis
 
 
 def model_json(engine: Running) -> dict[str, Any]:
@@ -76,7 +75,7 @@ def model_json(engine: Running) -> dict[str, Any]:
             }
             for name, entry in ESTIMATORS.items()
         ],
-        "nis_normal": normal_nis(twin.tuning.baseline),
+        "commissioned": twin.tuning.baseline is not None,
         "window": view.window,
         "scene": view.scene.kind,
         "columns": list(columns_of(model)),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from config.loader import Loaded
 from estimators.diagnostics.commission import Normal
 from estimators.diagnostics.evidence import CAUSES
@@ -30,11 +28,3 @@ def commissioned(loaded: Loaded, model: StateSpaceModel) -> dict[str, Normal]:
         name: Normal(section.bias, section.scale, section.correlation, section.reached, section.nis)
         for name, section in given.items()
     }
-
-
-def normal_nis(baseline: np.ndarray | None) -> float:
-    """How many times the NIS that the filter expects was normal when the twin was commissioned; 1 if it was not.
-
-    E e² of an innovation of bias b and scale s is b² + s², of all rows alike.
-    """
-    return 1.0 if baseline is None else float(np.mean(baseline[:, 0] ** 2 + baseline[:, 1] ** 2))

@@ -16,8 +16,9 @@ from ..log import READING, RESET
 from ..model.state_space import StateSpaceModel
 from ..track import FAILED, GATED, USED
 from .episodes import Folded, course_of, standardised
-from .evidence import BITS, CAUSES, chances_of, highest, no_baseline, normal_nis, threshold_of
+from .evidence import BITS, CAUSES, chances_of, highest, no_baseline, threshold_of
 from .health import FAR, FEW, HealthPolicy
+from .normal_nis import LEAST, normal_nis
 
 MARGIN = 1.5
 """By which a test may rise above the highest that it reached, besides its own threshold, and the NIS over a window
@@ -88,7 +89,7 @@ def commission(fold: Judged, evidence: np.ndarray) -> dict[str, Normal]:
                 if own.size and own.max() > 1.0:
                     reached[name] = round(float(own.max()), 1)
             found[model.row_names[index]] = Normal(round(bias, 3), round(scale, 3), round(phi, 3), reached)
-    most = _most_nis(fold, normal_nis(model, baseline_of(model, found)))
+    most = _most_nis(fold, normal_nis(model, baseline_of(model, found))[:, LEAST])
     most[MARGIN * most <= HealthPolicy().diverged_nis] = 0.0
     of_row = np.repeat(most, [len(sensor.rows) for sensor in model.sensors]).tolist()
     nis = {name: round(value, 3) for name, value in zip(model.row_names, of_row, strict=True)}

@@ -12,10 +12,7 @@ from ..numerics.jit import F1, f64, i64, inlined, jit
 from ..numerics.quantiles import chi_square_quantile
 from ..numerics.simd import total as sum_of
 from ..track import DIVERGED, FAILED, GATED, TRACKING, USED
-
-PROBABILITY = 0.95
-"""Of the bounds that charts and reports show."""
-
+from .normal_nis import LEAST, MEAN, NORMALS, PROBABILITY, VARIANCE, free_degrees
 
 FEW = 10
 """Events in a window below which it says nothing of health."""
@@ -65,15 +62,6 @@ def chi_square_bounds(most: int) -> Bounds:
     return Bounds(chi_square_quantile(tail, dof), chi_square_quantile(1.0 - tail, dof))
 
 
-def nis_bounds(dof: int, readings: int) -> tuple[float, float]:
-    """95 % bounds of the mean NIS of `readings` readings with `dof` degrees of freedom in all.
-
-    Source: Bar-Shalom, Li & Kirubarajan (2001), 5.4.2.
-    """
-    tail = (1.0 - PROBABILITY) / 2.0
-    return float(chi_square_quantile(tail, dof) / readings), float(chi_square_quantile(1.0 - tail, dof) / readings)
-
-
 @inlined
 def judges(verdict):
     """Whether a reading of this verdict says something of the estimate."""
@@ -81,22 +69,32 @@ def judges(verdict):
 
 
 @inlined
-def _keep(k, row, track, channel, normal, rows, nis, dofs, due):
+def _keep(k, row, track, channel, normal, rows, dofs, terms):
     """Write a reading into place k of the window."""
     used = track.verdict[row] == USED
     rows[k] = row
-    nis[k] = track.nis[row] if used else 0.0
     dofs[k] = track.dof[row] if used else -1
-    due[k] = track.dof[row] * normal[channel[row]] if used else 0.0
+    terms[0, k] = track.nis[row] if used else 0.0
+    for j in range(NORMALS):
+        terms[1 + j, k] = track.dof[row] * normal[NORMALS * channel[row] + j] if used else 0.0
 
 
 @inlined
-def _judge(i, total, due, dof, used, refused, track, policy, bounds):
+def _quantile(table, dof):
+    """A quantile of chi-square with `dof` degrees of freedom, 1 at least, from those of whole numbers."""
+    whole = int(dof)
+    share = dof - whole
+    return table[whole] if share == 0.0 else (1.0 - share) * table[whole] + share * table[whole + 1]
+
+
+@inlined
+def _judge(i, total, due, mean, variance, dof, used, refused, track, policy, bounds):
     """Mean NIS of the window that ends at row i, its bounds, and what it alone says of the estimate."""
     if used > 0:
+        free = free_degrees(mean, variance, dof)
         track.nis_mean[i] = total / used
-        track.nis_low[i] = bounds.low[dof] / used
-        track.nis_high[i] = bounds.high[dof] / used
+        track.nis_low[i] = mean / free * _quantile(bounds.low, free) / used
+        track.nis_high[i] = mean / free * _quantile(bounds.high, free) / used
     else:
         track.nis_mean[i] = np.nan
         track.nis_low[i] = np.nan
@@ -113,24 +111,23 @@ def assess(first, last, t, kind, channel, track, normal, policy, bounds):
 
     A row looks only at rows before it, so the outcome does not depend on how a fold was cut into pieces. The window
     changes with a reading that is used, gated or failed; the other rows have that of the row before. A reset empties
-    it: what the readings said of the estimate before, they do not say of the new one. `normal` (sensors,) is how many
-    times the expected NIS was normal of each sensor, see evidence/bank.py.
+    it: what the readings said of the estimate before, they do not say of the new one. `normal` (sensors · NORMALS,) is
+    what was normal of the NIS of each sensor, see normal_nis.py.
     """
     window = policy.window
-    # The window's readings, the oldest first, lie at `begin` to `end`: row, NIS (0 if it was refused), degrees of
-    # freedom (-1 if it was refused), NIS that was normal (0 if it was refused). It moves up, and back to the
-    # start when it has reached the end.
+    # The window's readings, the oldest first, lie at `begin` to `end`: row, degrees of freedom (-1 if it was refused),
+    # and `terms`, 0 if it was refused: NIS, then `NORMALS`. It moves up, and back to the start when it has reached the
+    # end.
     rows = np.empty(2 * window, np.int64)
-    nis = np.empty(2 * window)
     dofs = np.empty(2 * window, np.int64)
-    dues = np.empty(2 * window)
+    terms = np.empty((1 + NORMALS, 2 * window))
     begin = window
     end = window
     row = first - 1
     while row >= 0 and kind[row] != RESET and end - begin < window and first - row < FAR * window:
         if judges(track.verdict[row]):
             begin -= 1
-            _keep(begin, row, track, channel, normal, rows, nis, dofs, dues)
+            _keep(begin, row, track, channel, normal, rows, dofs, terms)
         row -= 1
     dof = 0
     used = 0
@@ -146,13 +143,13 @@ def assess(first, last, t, kind, channel, track, normal, policy, bounds):
             if judged and end == 2 * window:
                 for k in range(begin, end):
                     rows[k - begin] = rows[k]
-                    nis[k - begin] = nis[k]
                     dofs[k - begin] = dofs[k]
-                    dues[k - begin] = dues[k]
+                    for j in range(1 + NORMALS):
+                        terms[j, k - begin] = terms[j, k]
                 end -= begin
                 begin = 0
             if judged:
-                _keep(end, i, track, channel, normal, rows, nis, dofs, dues)
+                _keep(end, i, track, channel, normal, rows, dofs, terms)
                 if dofs[end] >= 0:
                     dof += dofs[end]
                     used += 1
@@ -164,9 +161,11 @@ def assess(first, last, t, kind, channel, track, normal, policy, bounds):
                     used -= 1
                 begin += 1
             # Summed anew each time: a running sum would keep the rounding of an outlier.
-            total = sum_of(end - begin, nis[begin:].ctypes.data)
-            due = sum_of(end - begin, dues[begin:].ctypes.data)
-            _judge(i, total, due, dof, used, end - begin - used, track, policy, bounds)
+            total = sum_of(end - begin, terms[0, begin:].ctypes.data)
+            due = sum_of(end - begin, terms[1 + LEAST, begin:].ctypes.data)
+            mean = sum_of(end - begin, terms[1 + MEAN, begin:].ctypes.data)
+            variance = sum_of(end - begin, terms[1 + VARIANCE, begin:].ctypes.data)
+            _judge(i, total, due, mean, variance, dof, used, end - begin - used, track, policy, bounds)
         else:
             track.age[i] = track.age[i - 1] + (t[i] - t[i - 1]) * 1e-9
             track.nis_mean[i] = track.nis_mean[i - 1]

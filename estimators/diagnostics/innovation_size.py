@@ -17,6 +17,8 @@ from ..log import READING, Events
 from ..numerics.quantiles import chi_square_quantile
 from ..track import GATED, USED, Track
 from ..tuning import Tuning
+from .intervals import correlation_interval
+from .whiteness import ljung_box
 
 FEWEST = 50
 """Readings of a row from which on its noise is estimated."""
@@ -26,12 +28,16 @@ class SensorNoise(NamedTuple):
     """Variance of the noise of one sensor row as its innovations have it, in the square of the row's unit.
 
     `variance` is not positive where the innovations are smaller than the process noise and the model alone explain;
-    `std` is its standard deviation, were the innovations white and normal, `n` how many there are.
+    `std` is its standard deviation, were the innovations white and normal, `n` how many there are. `correlation` is
+    that of each with the next, and `chance` that of innovations as correlated as these in a filter that is right (a
+    Ljung-Box test): where it is small, the innovations are no noise, and the variance of none.
     """
 
     variance: float
     std: float
     n: int
+    correlation: float = 0.0
+    chance: float = 1.0
 
 
 def mean_nis(track: Track, gate: float | None) -> float:
@@ -54,7 +60,8 @@ def sensor_noise(track: Track, events: Events, tuning: Tuning) -> dict[str, Sens
     R̂ = mean ν² - (S - R), the innovations' covariance less what of it the filter lays to its own prediction, H P⁻ Hᵀ.
     Each reading counts by 1 / S², the inverse of the variance of ν²: where S is settled, as in the source, all count
     alike, and the first ones, predicted from a wide prior, do not spoil it. All that the innovations have too much or
-    too little is laid to R, so it means something only where Q is right: with a Q too small it is too large. P⁻
+    too little is laid to R, so it means something only where they are white: with a Q too small it is too large, and
+    an error that lasts, of the model or of the sensor, is taken for one that the next reading averages away. P⁻
     follows from R; taken again and again the estimate comes to rest.
 
     Args:
@@ -84,7 +91,10 @@ def sensor_noise(track: Track, events: Events, tuning: Tuning) -> dict[str, Sens
             weight = S**-2
             excess = float(np.sum(weight * (square - S)) / np.sum(weight))
             std = float(np.sqrt(2.0 / np.sum(weight)))
-            found[model.row_names[model.row_start[s] + k]] = SensorNoise(R + excess, std, n)
+            e = np.where(known, track.innovation[rows, k], np.nan) / track.innovation_std[rows, k]
+            e = np.clip(e, -np.sqrt(g), np.sqrt(g))
+            correlation, chance = correlation_interval(e[known]).value, ljung_box(e).p_value
+            found[model.row_names[model.row_start[s] + k]] = SensorNoise(R + excess, std, n, correlation, chance)
     return found
 
 

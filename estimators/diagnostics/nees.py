@@ -12,7 +12,7 @@ from ..errors import EstimatorError
 from ..events.batch import TRUTH, Events
 from ..model.state_space import StateSpaceModel
 from ..numerics.quantiles import chi_square_quantile
-from .health import PROBABILITY
+from .normal_nis import PROBABILITY
 
 
 class Nees(NamedTuple):

@@ -15,8 +15,9 @@ from ..log import READING, Events, truth_of
 from ..model.state_space import StateSpaceModel
 from ..numerics.quantiles import normal_quantile
 from ..track import GATED, HELD_OUT, MISSING, USED, VERDICT_NAMES, Track
+from .consistency import NisVerdict
 from .field_pictures import Picture
-from .health import PROBABILITY, nis_bounds
+from .normal_nis import PROBABILITY, nis_bounds, normal_nis
 from .refusals import log_density
 
 
@@ -40,6 +41,7 @@ class Score(NamedTuple):
 
     `states` are fits against the truth, by state; `held_out` fits of the readings of sensors held out, by sensor row.
     `field` is that of all cells of a large field, over the times at which they were told; None without such.
+    `commissioned` is whether the bounds are of what was normal when the tuning was accepted.
     """
 
     nis: float
@@ -55,6 +57,12 @@ class Score(NamedTuple):
     states: dict[str, Fit]
     held_out: dict[str, Fit]
     field: Fit | None = None
+    commissioned: bool = False
+
+    @property
+    def nis_verdict(self) -> NisVerdict:
+        """Whether the mean NIS is what it should be."""
+        return NisVerdict(self.nis, self.nis_low, self.nis_high, self.commissioned)
 
 
 def score(
@@ -64,6 +72,7 @@ def score(
     pictures: Sequence[Picture] = (),
     *,
     gate: float | None = None,
+    baseline: np.ndarray | None = None,
 ) -> Score:
     """Sum a track up. Errors are taken at the truth events, whose rows hold the estimate at that time.
 
@@ -74,15 +83,15 @@ def score(
         pictures: Of a large field, which are summed up too; the track knows a few cells only.
         gate: That of the tuning, the probability that a good reading passes: it sets the price of a refusal. Where
             readings were refused and it is not given, the log-likelihood is NaN.
+        baseline: That of the tuning: what was normal when it was accepted, by which the NIS is judged.
     """
     used = track.verdict == USED
-    dof, count = int(track.dof[used].sum()), int(used.sum())
-    low, high = nis_bounds(dof, count) if count else (np.nan, np.nan)
-    verdicts = np.bincount(track.verdict, minlength=len(VERDICT_NAMES))
+    nis, low, high, commissioned = nis_verdict(track, events, model, baseline)
+    count, verdicts = int(used.sum()), np.bincount(track.verdict, minlength=len(VERDICT_NAMES))
     gated = int(verdicts[GATED])
     likelihood = float(track.log_likelihood[used].sum())
     return Score(
-        nis=float(track.nis[used].mean()) if count else np.nan,
+        nis=nis,
         nis_low=low,
         nis_high=high,
         nis_readings=count,
@@ -95,7 +104,18 @@ def score(
         states=_against_truth(track, events, model),
         held_out=_held_out(track, events, model),
         field=_over_field(pictures),
+        commissioned=commissioned,
     )
+
+
+def nis_verdict(track: Track, events: Events, model: StateSpaceModel, baseline: np.ndarray | None = None) -> NisVerdict:
+    """The mean NIS of the used readings of a track, judged; args as of `score`."""
+    used = track.verdict == USED
+    count = int(used.sum())
+    dof = np.bincount(events.channel[used], track.dof[used], len(model.sensors))
+    normal = None if baseline is None else normal_nis(model, baseline)
+    nis = float(track.nis[used].mean()) if count else np.nan
+    return NisVerdict(nis, *nis_bounds(dof, count, normal), baseline is not None)
 
 
 def _over_field(pictures: Sequence[Picture]) -> Fit | None:

@@ -105,7 +105,7 @@ class Estimates:
 
     def score(self) -> Score:
         """NIS and its bounds, errors against the truth, predictions of sensors held out."""
-        return score(self.track, self.events, self.model, gate=self.tuning.gate)
+        return score(self.track, self.events, self.model, gate=self.tuning.gate, baseline=self.tuning.baseline)
 
     def nees(self) -> Nees:
         """Normalised estimation error squared wherever the truth is known.

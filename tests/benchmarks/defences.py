@@ -12,6 +12,7 @@ from app.cli.fold import read_log
 from app.twin.twin import load_twin
 from estimators import fold_kernel
 from estimators.diagnostics.health import assess
+from estimators.diagnostics.normal_nis import NORMALS
 from estimators.fold import Fold
 from estimators.log import Log
 from estimators.models import MODELS
@@ -57,7 +58,7 @@ def bare_kernel() -> Any:
             code, context, rule, first, start, end, t, kind, channel, value, width,
             clock, u, state, doubt, edge, spare, work, score, track,
         )  # fmt: skip
-        normal = floats(context.normal, context.n_sensors)
+        normal = floats(context.normal, NORMALS * context.n_sensors)
         assess(start, end, t, kind, channel, track, normal, policy, bounds)
         return -1
 

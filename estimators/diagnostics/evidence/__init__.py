@@ -20,7 +20,7 @@ from .alarms import (
     TRUTH_MISSED,
     WIDE,
 )
-from .bank import causes_now, chances_of, fresh, heard_last, no_baseline, normal_nis, threshold_of, watched
+from .bank import causes_now, chances_of, fresh, heard_last, no_baseline, threshold_of, watched
 from .hypotheses import BITS, FURTHEST, RATIOS, SHIFTS, TESTS
 from .row_tests import highest
 from .watch import PATIENCE, watch_rows
@@ -56,7 +56,6 @@ __all__ = [
     "heard_last",
     "highest",
     "no_baseline",
-    "normal_nis",
     "threshold_of",
     "watch_rows",
     "watched",

@@ -8,6 +8,7 @@ import numpy as np
 
 from ...model.state_space import StateSpaceModel
 from ...numerics.jit import floats, inlined, jit
+from ..normal_nis import normal_nis
 from .hypotheses import GAINS, JOINT, REFUSED_SHARE, TESTS
 
 # The twin's part of the state: rows in alarm and lost; when the next sensor will be silent; when the log began, whether
@@ -41,17 +42,6 @@ def no_baseline(model: StateSpaceModel) -> np.ndarray:
     return baseline
 
 
-def normal_nis(model: StateSpaceModel, baseline: np.ndarray) -> np.ndarray:
-    """How many times the NIS that the filter expects of each sensor was normal, (sensors,), 1 at least.
-
-    E eᵀe / n of innovations e whose n rows have biases b and scales s is mean(b² + s²).
-    """
-    each = baseline[:, 0] ** 2 + baseline[:, 1] ** 2
-    counts = [len(sensor.rows) for sensor in model.sensors]
-    means = [each[start : start + n].mean() for start, n in zip(model.row_start, counts, strict=True)]
-    return np.maximum(np.array(means, float), 1.0)
-
-
 def watched(
     model: StateSpaceModel,
     gate: float | None,
@@ -69,8 +59,8 @@ def watched(
         expected: Sensors that must speak, (sensors,); None for those that have spoken.
 
     Returns:
-        `baseline` (rows, 3 + TESTS); `normal` (sensors,), see `normal_nis`; `ranges` (shown + inputs, 2) in which the
-        model was fitted, and `fitted`, 1 if there is any; `column` (nx,) of a state in the track, or -1; `expected`
+        `baseline` (rows, 3 + TESTS); `normal` (sensors, 3), see normal_nis.py; `ranges` (shown + inputs, 2) in which
+        the model was fitted, and `fitted`, 1 if there is any; `column` (nx,) of a state in the track, or -1; `expected`
         (sensors,); `chances` (2,), log Λ of a refused and of an accepted reading; `marginal`; `n_tests` in all.
     """
     shown = model.shown

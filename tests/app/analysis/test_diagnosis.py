@@ -1,20 +1,25 @@
 """The figures of a running twin against NumPy's over the same rows, and what is said of them."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import norm
 
 from app.analysis.diagnosis import Diagnosis, _agreed, last_rows
-from app.analysis.row_figures import LAGS, verdict
+from app.analysis.row_figures import LAGS, rows_json, verdict
 from app.engine.commands import SetEstimator
 from app.engine.engine import Engine
 from app.engine.execute import execute
+from estimators.diagnostics.evidence import no_baseline
 from estimators.diagnostics.innovations import autocorrelation
-from estimators.log import READING
-from tests.app.scripted import Scripted, pull_all, readings, twin, wait_for
+from estimators.log import READING, Events
+from estimators.track import USED, Track
+from estimators.tuning import Tuning
+from tests.app.scripted import MODEL, Scripted, pull_all, readings, twin, wait_for
 from tests.app.served import shown_twin
 
 
@@ -86,6 +91,34 @@ def test_a_small_error_that_stays_is_said_though_no_two_neighbours_tell_it():
     # A square wave of ± 0.4 in readings of deviation √(1 + 0.16), of which 25 lags of 125 keep four fifths and more.
     size = float(words.split("about ")[1].split(" ")[0])
     assert tone == "bad" and 0.28 < size < 0.40
+
+
+def test_a_row_of_a_commissioned_twin_is_measured_by_what_was_normal():
+    """Innovations of bias 0.5, scale 0.4 and correlation 0.7: to be mended, unless they were accepted as they are."""
+    rng = np.random.default_rng(7)
+    z = lfilter([np.sqrt(1 - 0.49)], [1.0, -0.7], rng.standard_normal(20_000))
+    track, t = Track.allocate(z.size, 2, 0, 1), np.arange(z.size, dtype=np.int64) * 10**9
+    track.verdict[:], track.dof[:] = USED, 1
+    track.innovation[:, 0], track.innovation_std[:, 0] = 0.5 + 0.4 * z, 1.0
+    events = Events(t, t, np.full(z.size, READING, np.int8), np.zeros(z.size, np.int32), np.zeros((z.size, 1)))
+
+    def said(*normal):
+        tuning = Tuning.of(MODEL).set("gate", None)
+        if normal:
+            baseline = no_baseline(MODEL)
+            baseline[:, :3] = normal
+            tuning = replace(tuning, baseline=baseline)
+        (row,) = rows_json(MODEL, events, track, tuning, marginal=False)
+        return row["verdict"], row["tone"]
+
+    words, tone = said()
+    assert tone == "bad" and "too wide" in words and "above the prediction" in words and "correlated" in words
+    words, tone = said(0.5, 0.4, 0.7)
+    assert tone == "good" and words.startswith("winding: as commissioned, as far as 20,000 readings tell (bands")
+    words, tone = said(0.25, 0.2, 0.7)
+    assert tone == "bad" and words.startswith("winding: not as commissioned: bands too narrow by a factor of 2 (")
+    words, tone = said(0.5, 0.4, 0.0)
+    assert tone == "bad" and words.startswith("winding: not as commissioned: innovations are correlated")
 
 
 def test_a_sensor_in_doubt_is_not_called_consistent():

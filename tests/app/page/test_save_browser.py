@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from app.cli.run import live_source
+from app.engine.commands import SetTuning
 from app.session import Page, Session
 from app.twin.twin import load_twin
 from tests.app.scripted import pull_all, wait_for
@@ -199,3 +200,46 @@ def test_a_link_goes_to_the_moment_and_holds_it(browser, page, session):
     other.evaluate("location.hash = '#twin=elsewhere&from=1970-01-01T00:00:12Z&span=3'")
     other.get_by_text("the link is of elsewhere").wait_for()
     assert other.evaluate("window.nisus.view.following")
+
+
+def test_a_plot_of_diagnose_as_a_drawing_of_its_own(page, session, tmp_path):
+    """The stems of the file are the autocorrelation that the server gives, on the scale of its own labels."""
+    page.get_by_role("tab", name="Diagnose").click()
+    wait_for(lambda: page.evaluate("window.nisus.diagnosed > 0"), PATIENCE)
+    row = page.evaluate("fetch('/api/diagnose').then((answer) => answer.json())")["rows"][0]
+    label = f"Autocorrelation of the innovations of {row['name']}"
+    path = saved(page, f"Save the plot: {label}", "SVG", tmp_path)
+    assert path.suffix == ".svg" and "Autocorrelation" in path.name
+    root = ElementTree.fromstring(path.read_text(encoding="utf-8"))
+    assert root.find(f"{SVG}title").text == f"{session.engine.twin.name}: {label}"
+    stems = [node for node in root.iter(f"{SVG}line") if node.get("x1") == node.get("x2")]
+    assert len(stems) == len(row["autocorrelation"]["r"])
+    labels = [(float(b) - 3.5, float(text)) for _, b, text in numbers_of(root, "end")]
+    (b0, v0), *_, (b1, v1) = sorted(labels)
+    drawn = [v0 + (float(node.get("y2")) - b0) * (v1 - v0) / (b1 - b0) for node in stems]
+    # Places are rounded to a tenth of a pixel, labels to two figures.
+    assert np.allclose(drawn, row["autocorrelation"]["r"], atol=0.02)
+    # In the light theme, with the page's style in the file.
+    assert {node.get("stroke") for node in stems} == {"rgb(196, 123, 0)"}
+    assert not re.search(r"class=|var\(|url\(|https?://(?!www\.w3\.org)", path.read_text(encoding="utf-8"))
+    picture = saved(page, f"Save the plot: {label}", "PNG", tmp_path)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_of_a_run_whose_track_is_gone_nothing_is_offered_and_it_says_why(page, session):
+    engine = session.engine
+    first = engine.revisions.runs[-1].number
+    key = f"Q.{engine.model.noises[0].name}"
+    # More than the two seconds apart within which edits of one entry are one.
+    for revision, entry in enumerate((key, f"R.{engine.model.row_names[0]}"), start=first + 1):
+        engine.submit(SetTuning(entry, 1.5 * engine.tuning.get(entry)))
+        wait_for(lambda n=revision: engine.status().revision == n and not engine.status().refolding, PATIENCE)
+    reason = f"the track of run {first} is gone: load it, and it is folded again"
+    page.get_by_role("tab", name="Runs").click()
+    for what in ("a report of", "the track of"):
+        button = page.get_by_role("button", name=f"Save {what} run {first}: {reason}")
+        button.wait_for()
+        assert button.is_disabled() and button.get_attribute("title") == reason
+    # The menu was opened while the run was there, and what is chosen there is no broken download.
+    page.evaluate(f"window.nisus.saving.fetched({first}, '/api/track.csv?run={first}')")
+    page.get_by_text(f"{reason}; nothing is saved").wait_for()

@@ -5,7 +5,7 @@ import pytest
 
 from app.engine.engine import Engine
 from app.runs.noise import noise
-from app.runs.sweep import FACTORS, Point, Sweeps, Swept, scaled, value_of, values_around
+from app.runs.sweep import AT_REST, FACTORS, MATCHED, Point, Sweeps, Swept, scaled, value_of, values_around
 from app.runs.window import window
 from estimators.errors import ConfigError
 from estimators.fold import Fold, fold
@@ -161,3 +161,26 @@ def test_what_the_innovations_say_of_r_is_given_by_key(started):
     excess = np.sum(weight * (track.innovation[:, 0] ** 2 - track.innovation_std[:, 0] ** 2)) / np.sum(weight)
     assert found.reason == "" and estimate.n == 1500
     assert estimate.variance == pytest.approx(FIRST.get("R.winding") + excess, rel=1e-9)
+
+
+@pytest.mark.parametrize(("r", "q", "doubted"), [(1.0, 1.0, False), (25.0, 1.0, False), (1.0, 1e-4, True)])
+def test_an_r_that_is_wrong_alone_is_mended_and_a_wrong_q_is_not_laid_to_r(r, q, doubted):
+    """Readings as the model says, of noise of variance 1, folded with `r` and a factor `q` of all of Q."""
+    engine = Engine(twin(), lambda report: Scripted())
+    engine.twin.tuning = scaled(FIRST.set("R.winding", r), "Q", q)
+    engine = Engine(engine.twin, lambda report: Scripted())
+    rng = np.random.default_rng(3)
+    n, dt, x, values = 4000, 0.1, np.array([40.0, 0.0]), []
+    for _ in range(n):
+        x = np.array([[1.0, dt], [0.0, 1.0]]) @ x + rng.normal(size=2) * np.sqrt(FIRST.q * dt)
+        values.append(x[0] + rng.normal())
+    engine._accept([readings(dt * np.arange(1, n + 1), np.array(values))])
+    sweeps = Sweeps(engine)
+    as_it_is = noise(engine, sweeps)
+    assert bool(as_it_is.doubts) == (r > 1.0 or doubted)  # a gain that is wrong leaves a correlation
+    sweeps.sweep(MATCHED)
+    found = noise(engine, sweeps)
+    assert bool(found.doubts) == doubted
+    if not doubted:
+        # Four standard errors of the mean square of 4,000 innovations, and what is left at rest.
+        assert found.sensors["R.winding"].variance == pytest.approx(1.0, abs=4 * np.sqrt(2 / n) * 1.2 + AT_REST)

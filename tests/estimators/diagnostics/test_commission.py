@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from estimators.diagnostics.commission import FEWEST, MARGIN, Normal, baseline_of, commission, lost_from
-from estimators.diagnostics.evidence import BITS, CAUSES, NARROW, no_baseline, normal_nis
+from estimators.diagnostics.evidence import BITS, CAUSES, NARROW, no_baseline
 from estimators.diagnostics.health import FAR, FEW, HealthPolicy
+from estimators.diagnostics.normal_nis import LEAST, normal_nis
 from estimators.fold import Fold
 from estimators.log import READING, RESET, Events
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
@@ -136,7 +137,7 @@ def test_the_highest_nis_over_a_window_is_by_definition():
     """Over every reading and those before it, with a reset that begins anew: a loop over rows, as its words say."""
     fold = folded(lurching())
     normals = commission(fold, fold.evidence)
-    normal = normal_nis(MODEL, baseline_of(MODEL, normals))
+    normal = normal_nis(MODEL, baseline_of(MODEL, normals))[:, LEAST]
     log, track, most = fold.log, fold.track, [0.0, 0.0]
     for i in np.flatnonzero(log.kind[: log.n] == READING):
         rows = []

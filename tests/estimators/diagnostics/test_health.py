@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from estimators.diagnostics.health import FAR, FEW, HealthPolicy, assess, chi_square_bounds, nis_bounds
+from estimators.diagnostics.health import FAR, FEW, HealthPolicy, assess, chi_square_bounds
+from estimators.diagnostics.normal_nis import nis_bounds
 from estimators.diagnostics.score import score
 from estimators.fold import Fold, fold
 from estimators.log import READING, RESET, TICK, TRUTH, Events, Log
@@ -98,9 +99,9 @@ def test_a_biased_sensor_is_seen_where_the_truth_is_known():
 
 def test_bounds_are_the_published_quantiles():
     """Chi-square 95 %: 0.0010 to 5.0239 for one degree of freedom, 74.222 to 129.561 for a hundred (tables)."""
-    low, high = nis_bounds(1, 1)
+    low, high = nis_bounds(np.array([1]), 1)
     assert (round(low, 4), round(high, 4)) == (0.0010, 5.0239)
-    low, high = nis_bounds(100, 50)
+    low, high = nis_bounds(np.array([60, 40]), 50)
     assert (round(low * 50, 3), round(high * 50, 3)) == (74.222, 129.561)
     table = chi_square_bounds(100)
     assert (round(table.low[100], 3), round(table.high[100], 3)) == (74.222, 129.561)
@@ -325,7 +326,8 @@ def events_of(rng, n):
 def by_definition(t, kind, channel, track, normal, policy):
     """Each row's age, NIS of the window, bounds and consistency, from the words of `HealthPolicy` and of `assess`."""
     judged = np.isin(track.verdict, (USED, GATED, FAILED))
-    quantiles = {q: chi2.ppf(q, np.arange(3 * policy.window + 1)) for q in (0.025, 0.975)}
+    whole = np.arange(1, 3 * policy.window + 1)
+    quantiles = [chi2.ppf(q, whole) for q in (0.025, 0.975)]
     resets = np.flatnonzero(kind == RESET)
     for i in range(len(t)):
         # The row that last changed the window.
@@ -334,10 +336,13 @@ def by_definition(t, kind, channel, track, normal, policy):
         rows = [k for k in range(max(after + 1, e - FAR * policy.window + 1, 0), e + 1) if judged[k]][-policy.window :]
         used = [k for k in rows if track.verdict[k] == USED]
         total, dof = float(np.sum(track.nis[used])), int(np.sum(track.dof[used], dtype=int))
-        due = float(np.sum(track.dof[used] * normal[channel[used]]))
+        due, mean, variance = track.dof[used] @ normal[channel[used]]
         values = [np.nan] * 3
         if used:
-            values = [total / len(used), *(quantiles[q][dof] / len(used) for q in (0.025, 0.975))]
+            # A chi-square times a factor that has this mean and variance, between those of whole degrees of freedom.
+            free = max(1.0, min(2.0 * mean**2 / variance, dof))
+            bounds = (mean / free * np.interp(free, whole, quantile) / len(used) for quantile in quantiles)
+            values = [total / len(used), *bounds]
         refused = len(rows) - len(used)
         lost = refused > policy.diverged_gated * len(rows) or total > policy.diverged_nis * due
         yield (t[i] - t[e]) / SECOND, *values, DIVERGED if len(rows) >= FEW and lost else TRACKING
@@ -350,11 +355,12 @@ def test_the_window_is_its_definition_in_any_pieces(seed):
     policy = HealthPolicy(window=12, degraded_after=2.0, stale_after=6.0, diverged_nis=2.5, diverged_gated=0.25)
     t, kind, track = events_of(rng, 3000)
     # With few digits, so that their sum is exact in any order.
-    channel, normal = rng.integers(0, 3, 3000).astype(np.int32), np.array([1.0, 1.5, 4.0])
+    channel = rng.integers(0, 3, 3000).astype(np.int32)
+    normal = np.array([[1.0, 1.0, 2.0], [1.5, 1.5, 9.0], [1.0, 0.25, 0.5]])
     at = 0
     while at < len(t):
         end = min(len(t), at + int(rng.choice([1, 7, 40, 500])))
-        assess(at, end, t, kind, channel, track, normal, policy, chi_square_bounds(3 * policy.window))
+        assess(at, end, t, kind, channel, track, normal.ravel(), policy, chi_square_bounds(3 * policy.window))
         at = end
     age, mean, low, high, consistency = map(
         np.array, zip(*by_definition(t, kind, channel, track, normal, policy), strict=True)

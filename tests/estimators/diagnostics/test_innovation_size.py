@@ -92,3 +92,19 @@ def test_few_readings_say_nothing():
     log.extend(walked(40, 1.0, seed=1))
     tuning = Tuning.of(MODEL)
     assert sensor_noise(fold("kf", MODEL, tuning, log), log.events, tuning) == {}
+
+
+def test_innovations_of_a_right_filter_are_as_white_as_chance_has_it_and_of_a_wrong_one_are_not():
+    """Of ten right filters the chances are spread over 0 to 1; with Q a hundred times too small none has any."""
+    right, wrong = [], []
+    for seed in range(10):
+        log = Log(MODEL.width)
+        log.extend(walked(2000, 1.0, seed=100 + seed))
+        for tuning, chances in (
+            (Tuning.of(MODEL).set("R.winding", 1.0), right),
+            (Tuning.of(MODEL).set("R.winding", 1.0).set("Q.temperature", 5e-5).set("Q.rate", 5e-6), wrong),
+        ):
+            chances.append(sensor_noise(fold("kf", MODEL, tuning, log), log.events, tuning)["winding"])
+    # Ten uniform draws lie all above 1e-3 with 99 %, and not all above a half with 99.9 %.
+    assert min(noise.chance for noise in right) > 1e-3 and min(noise.chance for noise in right) < 0.5
+    assert max(noise.chance for noise in wrong) < 1e-6 and min(noise.correlation for noise in wrong) > 0.1

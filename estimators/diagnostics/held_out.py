@@ -1,0 +1,86 @@
+"""What a sensor that is held out shows: whether it reads as the others say it should.
+
+The mean of its last innovations ν, and what they allow it. Of the variance S of an innovation, R is noise, which a mean
+of n of them leaves R/n of; the rest, H P Hᵀ, is an error of the estimate that all of them share:
+
+    |mean ν| ≤ z √(S - R + R/n)
+
+Nothing of a sensor that is held out enters the estimate, so what it reads is evidence of its own.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..events.batch import READING, Events
+from ..numerics.quantiles import normal_quantile
+from ..track import HELD_OUT, Track
+from ..tuning import Tuning
+from .normal_nis import PROBABILITY
+
+LAST = 200
+"""Readings of a row that are looked at, the last."""
+
+FEWEST = 10
+"""Below which nothing is said."""
+
+
+class Offset(NamedTuple):
+    """How far a row of a sensor that is held out reads from its prediction, and how far the others allow, `unit`."""
+
+    sensor: str
+    row: str
+    offset: float
+    allowed: float
+    unit: str
+    alone: bool = False
+
+    @property
+    def beyond(self) -> bool:
+        """Whether it is further off than the others allow."""
+        return abs(self.offset) > self.allowed
+
+    @property
+    def words(self) -> str:
+        """In one sentence; `alone`: where no other sensor is in use."""
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        whom = "the model alone predicts" if self.alone else "the others say"
+        side = "above" if self.offset > 0 else "below"
+        if self.beyond:
+            return (
+                f"{self.row}, held out, reads {abs(self.offset):.2g}{unit} {side} what {whom}, "
+                f"beyond the ±{self.allowed:.2g}{unit} that they leave open"
+            )
+        where = f"{abs(self.offset):.2g}{unit} {side}, where they leave ±{self.allowed:.2g}{unit} open"
+        return f"{self.row}, held out, reads as {whom}: {where}"
+
+
+def offsets(events: Events, track: Track, tuning: Tuning) -> list[Offset]:
+    """Of every row of the sensors that are held out at the end of a stretch of events, what its last readings show.
+
+    Args:
+        events: A stretch.
+        track: What was concluded of it.
+        tuning: Under which.
+    """
+    model, found = tuning.model, []
+    if bool(np.all(tuning.used)):
+        return []
+    held = (events.kind == READING) & (track.verdict == HELD_OUT)
+    for s in np.flatnonzero(~tuning.used.astype(bool)):
+        rows = np.flatnonzero(held & (events.channel == s))[-LAST:]
+        for k, row in enumerate(model.sensors[s].rows):
+            nu, std = track.innovation[rows, k], track.innovation_std[rows, k]
+            known = np.isfinite(nu) & np.isfinite(std)
+            n = int(known.sum())
+            if n < FEWEST:
+                continue
+            S = float(np.mean(std[known] ** 2))
+            R = min(float(tuning.r[model.row_start[s] + k]), S)
+            allowed = normal_quantile(0.5 + 0.5 * PROBABILITY) * float(np.sqrt(S - R + R / n))
+            name = model.row_names[model.row_start[s] + k]
+            alone = not bool(np.any(tuning.used))
+            found.append(Offset(model.sensor_names[s], name, float(np.mean(nu[known])), allowed, row.unit, alone))
+    return found

@@ -1,0 +1,98 @@
+"""By what a mean NIS is judged, against innovations that are drawn as a commissioned twin's are."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from estimators.diagnostics.consistency import NisVerdict
+from estimators.diagnostics.normal_nis import LEAST, MEAN, VARIANCE, nis_bounds, normal_nis
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+
+
+def still(x, u, p, dt, out):
+    out[:] = x
+
+
+def one(x, u, p, out):
+    out[0] = x[0]
+
+
+def two(x, u, p, out):
+    out[0] = x[0]
+    out[1] = x[0]
+
+
+MODEL = StateSpaceModel(
+    name="level",
+    title="level",
+    states=(State("level", "m", 0.0, 1.0),),
+    noises=(Noise("level", "m²/s", 0.1),),
+    sensors=(
+        Sensor("float", (Row("float", "m", 1.0),), h=one),
+        Sensor("sonar", (Row("near", "m", 1.0), Row("far", "m", 1.0)), h=two),
+    ),
+    f=still,
+)
+BASELINE = np.array([[0.3, 0.5, 0.7], [0.0, 1.0, 0.0], [-0.5, 2.0, -0.4]])  # bias, scale, correlation of each row
+N = 400
+RUNS = 4000
+
+
+def drawn(rng, b, s, phi):
+    """Stationary AR(1) innovations of N readings, RUNS times."""
+    e = np.empty((RUNS, N))
+    e[:, 0] = rng.standard_normal(RUNS)
+    for k in range(1, N):
+        e[:, k] = phi * e[:, k - 1] + np.sqrt(1 - phi**2) * rng.standard_normal(RUNS)
+    return b + s * e
+
+
+def test_bounds_hold_95_of_100_means_of_correlated_innovations():
+    """Four thousand runs of 400 readings of each sensor, drawn as their baseline says."""
+    rng = np.random.default_rng(1)
+    squares = [drawn(rng, *row) ** 2 for row in BASELINE]
+    normal = normal_nis(MODEL, BASELINE)
+    total = sum(squares).sum(axis=1)
+    expected = N * (normal[0, MEAN] + 2 * normal[1, MEAN])
+    # Standard error of a mean of 4,000.
+    assert abs(total.mean() - expected) < 4 * total.std() / np.sqrt(RUNS)
+    variance = N * (normal[0, VARIANCE] + 2 * normal[1, VARIANCE])
+    # A variance of 4,000 values is known to sqrt(2 / 4000), 2.2 %; the sum's own formula leaves out the ends, 1 %.
+    assert total.var() == pytest.approx(variance, rel=0.1)
+    low, high = nis_bounds(np.array([N, 2 * N]), 2 * N, normal)
+    inside = np.mean((low <= total / (2 * N)) & (total / (2 * N) <= high))
+    assert inside == pytest.approx(0.95, abs=4 * np.sqrt(0.05 * 0.95 / RUNS))
+    # The bounds of white innovations of this mean would hold fewer.
+    free = 3 * N
+    narrow = [expected / free * chi2.ppf(q, free) / (2 * N) for q in (0.025, 0.975)]
+    assert np.mean((narrow[0] <= total / (2 * N)) & (total / (2 * N) <= narrow[1])) < 0.8
+
+
+def test_white_innovations_leave_the_chi_square():
+    normal = normal_nis(MODEL, np.array([[0.0, 1.0, 0.0]] * 3))
+    assert normal.tolist() == [[1.0, 1.0, 2.0]] * 2
+    bounds = nis_bounds(np.array([30, 20]), 40, normal)
+    assert bounds == nis_bounds(np.array([30, 20]), 40)
+    assert bounds == pytest.approx([chi2.ppf(q, 50) / 40 for q in (0.025, 0.975)], rel=1e-12)
+
+
+def test_a_smaller_normal_does_not_make_divergence_earlier():
+    assert normal_nis(MODEL, BASELINE)[0, LEAST] == 1.0
+    assert normal_nis(MODEL, BASELINE)[0, MEAN] == pytest.approx(0.34, rel=1e-12)
+
+
+def test_no_readings_have_no_bounds():
+    assert np.isnan(nis_bounds(np.array([0, 0]), 0)).all()
+    assert NisVerdict(np.nan, np.nan, np.nan, False).words == "no reading to judge"
+
+
+@pytest.mark.parametrize(
+    ("nis", "commissioned", "words"),
+    [
+        (1.0, False, "mean NIS 1, inside its 95 % bounds 0.9 to 1.1"),
+        (1.2, False, "mean NIS 1.2, above its 95 % bounds 0.9 to 1.1"),
+        (0.571, True, "mean NIS 0.571, below its 95 % bounds 0.9 to 1.1, as commissioned"),
+    ],
+)
+def test_it_says_where_a_mean_lies_and_by_what(nis, commissioned, words):
+    assert NisVerdict(nis, 0.9, 1.1, commissioned).words == words
