@@ -71,9 +71,16 @@ class Pacer:
         return None if self._first is None or self._last is None else (self._first, self._last)
 
     def now(self) -> int | None:
-        """The playhead, ns, or None before the first event and after the last."""
+        """The playhead, ns, or None before the first event and after the last.
+
+        At a high speed it runs ahead of a source that is slower; what was not read yet may have happened before.
+        """
         with self._changed:
-            return None if self._ended and self._pending is None else self._position()
+            position = self._position()
+            if position is None or (self._ended and self._pending is None):
+                return None
+            known = self._last if self._pending is None else int(self._reach[0])
+            return position if known is None else min(position, known)
 
     def _position(self) -> int | None:
         if self._playhead is None or not np.isfinite(self.speed):

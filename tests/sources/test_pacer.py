@@ -70,10 +70,23 @@ def test_a_change_of_speed_holds_from_then_on():
     pacer, clock = player()
     due(pacer)
     clock.advance(1.5)
+    assert due(pacer) == [1]
     pacer.set_speed(3.0)
     assert pacer.now() == round(101.5 * SECOND)
     clock.advance(0.5)
-    assert due(pacer) == [1, 2, 3] and pacer.now() == 103 * SECOND
+    assert due(pacer) == [2, 3] and pacer.now() == 103 * SECOND
+
+
+def test_the_present_does_not_run_ahead_of_what_was_read():
+    """A night at a thousand million times: a tick years ahead would make all that follows stale."""
+    pacer, clock = player(speed=1e9)
+    due(pacer)
+    clock.advance(0.5)
+    assert pacer.now() == 101 * SECOND
+    assert pacer.read(0.0).value[:, 0].tolist() == [1]
+    clock.advance(0.5)
+    # The next batch is not read yet, so nothing is known after the last.
+    assert pacer.now() == 101 * SECOND
 
 
 def test_as_fast_as_possible_is_everything_in_breaths():
