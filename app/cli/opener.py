@@ -146,6 +146,6 @@ def open_session(
     if page is not None:
         own = [wanted.twin] if wanted is not None and wanted.twin is not None and wanted.twin not in shipped() else []
         gallery = Gallery(session, opener, first=wanted, own=own)
-        GalleryApi(gallery, Recordings(recordings))
+        GalleryApi(gallery, Recordings(recordings, lambda: session.recorded))
         session.beside.append(SavedFiles(gallery))
     return session
