@@ -164,7 +164,8 @@ class VehicleScene:
         several = known and len(belief.peaks) > 1
         self._way.look(t, plane, belief.peaks[0].mean[[self.east, self.north]] if several else None)
         if heavy:
-            self._trail.points = segments(self._plane(*self._way.of(t, plane).T, 0.06))
+            east, north = self._way.of(t, plane).T
+            self._trail.points = segments(self._plane(east, north, 0.06))
             self._draw_truth(history)
             self._draw_readings(history)
             self._draw_cloud(belief.points if known else ())
