@@ -109,6 +109,7 @@ class Session:
         self.door: Door | None = None
         self.running: RunningTwin | None = None
         self._changing = threading.RLock()
+        self._recorded: list[Path] = []
         self.beside: list[Beside] = []
         """What starts and stops with the session."""
         if page is not None:
@@ -153,6 +154,12 @@ class Session:
         """Address of the page, with its token."""
         return self.door.url if self.door is not None else None
 
+    @property
+    def recorded(self) -> list[Path]:
+        """Files that this session has recorded, wherever they are."""
+        running = self.running
+        return [*self._recorded, *([] if running is None else running.recorder.written)]
+
     def prepared(self, opening: Opening) -> RunningTwin:
         """A twin put together, for `change`.
 
@@ -180,6 +187,7 @@ class Session:
                 if before is not None:
                     left = weakref.ref(before.engine)
                     before.stop()
+                    self._recorded += before.recorder.written
                 stopped = True
                 if make is not None and stop_first:
                     after = make()

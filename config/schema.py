@@ -217,6 +217,8 @@ class ViewSection(Section):
     none."""
     window: Seconds = 60.0
     """Seconds that the charts show at first."""
+    speed: Annotated[float, Field(strict=True, gt=0, le=1e9)] = 1.0
+    """How many times real time a replay or a simulation runs at first; --speed says otherwise."""
     cells: Annotated[tuple[Text, ...], Field(min_length=1)] | None = None
     """Cells of a large field whose estimate is kept at every event and charted. Default: 16 spread over it."""
     picture: Seconds | None = None

@@ -11,6 +11,7 @@ import numpy as np
 
 from .errors import LARGEST, ConfigError, nearest, quoted, shown_name
 from .model.state_space import StateSpaceModel
+from .model.units import squared
 
 _versions = count(1)
 
@@ -89,11 +90,11 @@ class Tuning:
         ]
         for sensor, start in zip(model.sensors, model.row_start, strict=True):
             own = slice(start, start + len(sensor.rows))
-            names, values, unit = model.row_names[own], self.r[own], _squared(sensor.rows[0].unit)
+            names, values, unit = model.row_names[own], self.r[own], squared(sensor.rows[0].unit)
             if len(values) >= TOGETHER and len({row.unit for row in sensor.rows}) == 1:
                 items.append(Item(f"R.{sensor.name}", _mean(values), unit, 0.0, np.inf))
             else:
-                units = [_squared(row.unit) for row in sensor.rows]
+                units = [squared(row.unit) for row in sensor.rows]
                 items += [
                     Item(f"R.{name}", float(value), unit, 0.0, np.inf)
                     for name, value, unit in zip(names, values, units, strict=True)
@@ -219,10 +220,3 @@ def _mean(values: Any) -> float:
     """Their mean; exactly the value that they share."""
     first = np.ravel(values)[0]
     return float(first if np.all(values == first) else np.mean(values))
-
-
-def _squared(unit: str) -> str:
-    """The unit of a variance: °C → °C², m/s → (m/s)²."""
-    if not unit or unit == "1":
-        return unit
-    return f"({unit})²" if "/" in unit or " " in unit or "·" in unit else f"{unit}²"

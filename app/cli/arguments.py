@@ -32,8 +32,8 @@ class Run:
     """Record into this .rrd file from the start."""
     record_split: str | None = None
     """Go on in another file, run-2.rrd after run.rrd, when one has grown so large or so long: 1GB, 10min."""
-    speed: float = 1.0
-    """Speed of replays and simulations, as a multiple of real time; inf is as fast as possible."""
+    speed: float | None = None
+    """Speed of replays and simulations, as a multiple of real time; inf is as fast as possible. Default: the twin's."""
     duration: float | None = None
     """Stop after this many seconds."""
     port: int = 9900

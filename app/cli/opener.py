@@ -32,17 +32,18 @@ if TYPE_CHECKING:
     from ..recording.reader import Recorded
 
 
-def live_source(twin: Twin, speed: float) -> Callable[[Callable[[str, str], None]], Source]:
+def live_source(twin: Twin, speed: float | None = None) -> Callable[[Callable[[str, str], None]], Source]:
     """How to open the twin's source so that it comes in its own time: a bus as it is, anything else paced.
 
-    The faults that were injected last when a bus is opened again.
+    The faults that were injected last when a bus is opened again. `speed` is that which the twin's YAML says unless it
+    is given.
     """
-    faults = twin.faults()
-    return lambda report: twin.open_source(remarking(report), speed=speed, faults=faults)
+    faults, times = twin.faults(), twin.config.view.speed if speed is None else speed
+    return lambda report: twin.open_source(remarking(report), speed=times, faults=faults)
 
 
 def opened_twin(
-    name: str, *, logs: Sequence[Path] = (), overrides: Mapping[str, str] | None = None, speed: float = 1.0
+    name: str, *, logs: Sequence[Path] = (), overrides: Mapping[str, str] | None = None, speed: float | None = None
 ) -> Opening:
     """A twin on its source, and how to read it again when its files were changed.
 
@@ -110,7 +111,7 @@ class FileOpener:
         name = wanted.twin or ""
         if name in self._given and not wanted.logs:
             return self._given[name]()
-        return opened_twin(name, logs=wanted.logs, speed=math.inf if wanted.logs else 1.0)
+        return opened_twin(name, logs=wanted.logs, speed=math.inf if wanted.logs else None)
 
     def made_ready(self, opening: Opening) -> Opening:
         """See `Opener`."""
@@ -145,6 +146,6 @@ def open_session(
     if page is not None:
         own = [wanted.twin] if wanted is not None and wanted.twin is not None and wanted.twin not in shipped() else []
         gallery = Gallery(session, opener, first=wanted, own=own)
-        GalleryApi(gallery, Recordings(recordings))
+        GalleryApi(gallery, Recordings(recordings, lambda: session.recorded))
         session.beside.append(SavedFiles(gallery))
     return session

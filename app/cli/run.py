@@ -32,9 +32,10 @@ SAID = 5
 
 def run_twin(arguments: Run) -> int:
     """Carry the command out."""
-    if not (0.0 < arguments.speed <= FASTEST or arguments.speed == math.inf):
+    speed = arguments.speed
+    if speed is not None and not (0.0 < speed <= FASTEST or speed == math.inf):
         raise ConfigError(
-            f"--speed {arguments.speed:g}: must be positive and at most {FASTEST:g}, or inf for as fast as possible"
+            f"--speed {speed:g}: must be positive and at most {FASTEST:g}, or inf for as fast as possible"
         )
     if arguments.record is not None and arguments.record.suffix != ".rrd":
         raise ConfigError(f"--record {arguments.record}: must end in .rrd")
@@ -50,7 +51,7 @@ def run_twin(arguments: Run) -> int:
             arguments.twin,
             logs=arguments.log,
             overrides=settings(arguments.set, arguments.estimator),
-            speed=arguments.speed,
+            speed=speed,
         )
         opening, opener = read(), FileOpener({arguments.twin: read})
     elif page is None or arguments.record or arguments.log or arguments.set or arguments.estimator:

@@ -1,10 +1,13 @@
-"""The folder of recordings and of logs that were dropped on the page: list, receive, delete, and nothing outside it."""
+"""The folder of recordings and of logs that were dropped on the page: list, receive, delete.
+
+Outside it are only the files that this session itself has recorded, wherever the command line said.
+"""
 
 from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +34,7 @@ LONGEST_NAME = 200
 
 @dataclass(frozen=True)
 class Entry:
-    """One file of the folder. `facts` are those of a recording, `error` says why there are none."""
+    """One file, in a `folder` if it is elsewhere. `facts` are those of a recording, `error` says why there are none."""
 
     name: str
     bytes: int
@@ -40,6 +43,7 @@ class Entry:
     facts: Facts | None = None
     error: str | None = None
     looking: bool = False
+    folder: str | None = None
 
     def json(self) -> dict[str, Any]:
         """As the page gets it."""
@@ -55,15 +59,19 @@ class Entry:
             "log": self.log,
             "error": self.error,
             "looking": self.looking,
+            "folder": self.folder,
             **told,
         }
 
 
 class Recordings:
-    """One folder. Names come from a browser, so each is checked before a file is touched."""
+    """One folder. Names come from a browser, so each is checked before a file is touched.
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    `recorded` gives the files that the session has recorded; those outside the folder are listed by their names, too.
+    """
+
+    def __init__(self, folder: Path, recorded: Callable[[], Sequence[Path]] = lambda: ()) -> None:
+        self.folder, self._recorded = folder, recorded
         self._known: dict[tuple[str, int, int], Facts | str] = {}
         self._lock = threading.Lock()
         self._looking = False
@@ -76,14 +84,15 @@ class Recordings:
         """
         found: list[Entry] = []
         unknown: list[tuple[Path, tuple[str, int, int]]] = []
-        for path in sorted(self.folder.iterdir()) if self.folder.is_dir() else []:
+        inside = sorted(self.folder.iterdir()) if self.folder.is_dir() else []
+        for path in [*inside, *self._elsewhere().values()]:
             suffix = path.suffix.lower()
             if path.is_symlink() or not path.is_file() or path.name.startswith("."):
                 continue
             if suffix != RECORDING and not _is_log(path.name):
                 continue
             stat = path.stat()
-            key = (path.name, stat.st_mtime_ns, stat.st_size)
+            key = (str(path), stat.st_mtime_ns, stat.st_size)
             known = self._known.get(key)
             log = suffix != RECORDING
             if busy(path):
@@ -101,6 +110,7 @@ class Recordings:
                     facts=known if isinstance(known, Facts) else None,
                     error=known if isinstance(known, str) else None,
                     looking=known is None and not log,
+                    folder=None if path in inside else str(path.parent),
                 )  # fmt: skip
             )
         self._look(unknown)
@@ -124,13 +134,20 @@ class Recordings:
 
         threading.Thread(target=look, name="recordings", daemon=True).start()
 
+    def _elsewhere(self) -> dict[str, Path]:
+        """Recordings of this session that are not in the folder, by name; what is in the folder goes before."""
+        home = self.folder.absolute()
+        found = {path.name: path.absolute() for path in self._recorded() if path.absolute().parent != home}
+        return {name: path for name, path in found.items() if not (self.folder / name).exists()}
+
     def find(self, name: Any) -> Path:
         """The file of that name.
 
         Raises:
-            ConfigError: If the name is none of a file of this folder.
+            ConfigError: If the name is none of a file of this folder, or that this session has recorded.
         """
-        path = self.folder / _checked(name)
+        path = self._elsewhere().get(name) if isinstance(name, str) else None
+        path = path or self.folder / _checked(name)
         if path.is_symlink() or not path.is_file():
             raise ConfigError(f"{quoted(name)}: there is no such recording")
         return path

@@ -40,13 +40,8 @@ class RecordingsApi:
 
     def _busy(self, path: Path) -> bool:
         running = self._gallery.session.running
-        if running is None or running.recorder.path is None:
-            return False
-        # Of a recording that is split, the part that is written is the one that began last.
-        asked = running.recorder.path
-        return (
-            path.parent == asked.parent and path.stem.startswith(asked.stem) and path not in running.recorder.finished
-        )
+        writing = None if running is None else running.recorder.writing
+        return writing is not None and path.absolute() == writing.absolute()
 
     async def _list(self, request: Request) -> Response:
         found = await asyncio.to_thread(self._recordings.entries, self._busy)

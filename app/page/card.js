@@ -4,9 +4,14 @@ import { element, setAttribute, setText } from "./dom.js";
 
 const many = (count, word) => `${count.toLocaleString("en")} ${word}${count === 1 ? "" : "s"}`;
 
+// The name of a twin without folder and ending, as its page and its links have it; and the card of that name that can
+// be started, if there is one.
+const brief = (name) => name.split(/[\\/]/).pop().replace(/\.ya?ml$/, "");
+export const named = (items, short) => items.find((item) => brief(item.name) === short && !item.missing && !item.error);
+
 // `item` is a card of /api/gallery; `act` has start(name) and open().
 export function card(item, act) {
-  const short = item.name.split(/[\\/]/).pop().replace(/\.ya?ml$/, "");
+  const short = brief(item.name);
   const ready = !item.missing && !item.error;
   const button = element("button", { type: "button", class: "start", onclick: () => (button.dataset.runs === "true" ? act.open() : act.start(item.name)) }, "Start");
   const facts = item.error ? "" : [item.source, many(item.states, "state"), many(item.rows, "row"), item.estimator].join(" · ");
@@ -15,7 +20,7 @@ export function card(item, act) {
     picture(item),
     element("div", { class: "words" },
       item.question ? element("p", { class: "question" }, item.question) : null,
-      element("h2", {}, short), element("p", { class: "title" }, item.title),
+      element("h2", {}, ready ? element("button", { type: "button", class: "name", onclick: () => button.click() }, short) : short), element("p", { class: "title" }, item.title),
       item.teaches ? element("p", { class: "teaches" }, item.teaches) : null,
       reason(item),
     ),

@@ -3,6 +3,7 @@
 import { Chart, apart, band, colour, dots, edge, line } from "./chart.js";
 import { $ } from "./dom.js";
 import { bracketed, clock, compact, decimals, fixed, spaced, withDeviation, words } from "./format.js";
+import { groupChart, groupsOf } from "./groups.js";
 import { Lane } from "./lane.js";
 import { Layout } from "./layout.js";
 import { marks } from "./marks.js";
@@ -17,6 +18,7 @@ const DENSITY = 1.6; // px to a group of rows
 // The columns of a state's chart from the live lane, in the order of its series.
 const OF_STATE = ["upper", "lower", "truth", "mean"];
 const BEFORE = 3; // which of them is that of the revision before
+const UNBOUNDED = 100; // times the band, or the value itself, from which on a bound says that nothing bounds it
 const MOST_GROWTH = 4; // halvings of the window while there is less than that to show
 const NIS_TICKS = [1, 0.1, 10, 0.01, 100, 1000, 0.3, 3, 0.03, 30, 300]; // those that matter most first
 const OF_ROW = ["reading", "held", "refused", "screened"];
@@ -37,8 +39,12 @@ export class Charts {
       wheel: (event, plot) => this.wheel(event, plot),
       save: (chart, button) => this.saving.chart(chart, button),
     };
+    const groups = groupsOf(model.states);
+    const grouped = new Set(groups.flatMap(({ members }) => members.map((state) => state.name)));
+    this.groups = groups.map((group) => groupChart(this, group));
     this.parts = [
-      ...order.map((state) => stateChart(this, state)),
+      ...this.groups,
+      ...order.map((state) => ({ ...stateChart(this, state), further: grouped.has(state.name) })),
       nisChart(this),
       ...model.rows.slice(0, MOST).map((row, k) => innovationChart(this, row, model.rows.length > FEW && k >= FEW)),
     ];
@@ -65,8 +71,9 @@ export class Charts {
     const shown = new Set(this.layout.shown().map(([key]) => key));
     const states = this.states.filter((state) => shown.has(`state:${state.name}`));
     const rows = this.model.rows.slice(0, MOST).filter((row) => shown.has(`innovation:${row.name}`));
+    const groups = this.groups.filter((group) => shown.has(group.key)).flatMap((group) => group.columns);
     return [
-      ...states.flatMap((state) => OF_STATE.map((kind) => `${kind}:${state.name}`)),
+      ...new Set([...groups, ...states.flatMap((state) => OF_STATE.map((kind) => `${kind}:${state.name}`))]),
       ...new Set(states.flatMap((state) => state.rows.flatMap((row) => OF_ROW.map((kind) => `${kind}:${row}`)))),
       ...rows.flatMap((row) => ["innovation", "innovation_upper", "innovation_lower"].map((kind) => `${kind}:${row.name}`)),
       "nis", "nis_mean", "nis_low", "nis_high",
@@ -204,7 +211,7 @@ function stateChart(charts, state) {
       const [upper, truth, mean] = [value(1), value(4 + rows.length), value(5 + rows.length)];
       const bound = charts.integrity?.[state.name]?.bound;
       const deviation = upper - mean;
-      const unseen = Number.isFinite(bound) ? `  (${compact(bound, 2)} unseen)` : "";
+      const unseen = Number.isFinite(bound) ? `  (${bound > UNBOUNDED * Math.max(deviation, Math.abs(mean)) ? "no bound" : `${compact(bound, 2)} unseen`})` : "";
       const off = !Number.isFinite(truth) ? "" : `  truth ${deviation > 0 ? fixed(truth, decimals(deviation)) : compact(truth, 4)}`;
       if (state.probability) return `${fixed(mean, 3)}${off && `  truth ${fixed(truth, 0)}`}`;
       return withDeviation(mean, deviation, state.unit) + unseen + off;

@@ -17,8 +17,10 @@ $("theme").addEventListener("click", () => {
 });
 
 let shown = [];
+// A link to a moment of a twin that does not run: the address keeps it for the twin's page.
+const linked = new URLSearchParams(location.hash.slice(1)).get("twin");
 let told = ""; // what was wrong with a file, until something else is done
-const open = () => location.assign("/");
+const open = () => location.assign(linked ? `/${location.hash}` : "/");
 const start = (name) => {
   told = "";
   session.tell(post("/api/gallery/start", { twin: name }));
@@ -84,5 +86,11 @@ commands.push(...shown.filter((item) => item.ready).map((item) => ["", `start ${
 if (session.state) draw(session.state);
 setText($("none"), "No twin of that name, question or kind.");
 find();
+const asked = shown.find((item) => item.short === linked && item.ready);
+if (asked) {
+  say(`The link is of ${linked}: start it to go there`);
+  asked.node.scrollIntoView({ block: "center" });
+  asked.node.querySelector(".start").focus();
+} else if (linked) say(`The link is of ${linked}; there is no such twin here that can be started`, true);
 if (location.hash === "#recordings") $("recordings").querySelector("button").focus();
 window.nisus = { session, cards: shown.length };

@@ -15,11 +15,14 @@ export function link({ model, link, charts }) {
   return `${location.origin}/#${text.join("&")}`;
 }
 
+// The twin that an address is of, or null.
+export const twinOf = (hash) => new URLSearchParams(hash.replace(/^#/, "")).get("twin");
+
 // Go to the moment of the address, if it has one. Resolves to a reason why not, or null.
 export function goTo(hash, { model, link, view, charts }) {
   const asked = new URLSearchParams(hash.replace(/^#/, ""));
   if (!asked.has("from")) return null;
-  if (asked.get("twin") !== model.twin) return `the link is of ${asked.get("twin")}; ${model.twin} runs here`;
+  if (asked.get("twin") !== model.twin) return `the link is of ${asked.get("twin")}; ${model.twin} runs here`; // see `twinOf`
   const [from, span] = [read(asked.get("from")), Number(asked.get("span"))];
   if (from === null || !(span > 0)) return "the link is damaged: it has no time or no span";
   const since = Number(from - BigInt(link.status.origin)) / 1e9;

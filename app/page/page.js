@@ -10,7 +10,7 @@ import { clock } from "./format.js";
 import { keys } from "./keys.js";
 import { Leave } from "./leave.js";
 import { Link } from "./link.js";
-import { goTo } from "./moment.js";
+import { goTo, twinOf } from "./moment.js";
 import { Runs } from "./runs.js";
 import { Save } from "./save.js";
 import { Stage } from "./stage.js";
@@ -101,7 +101,9 @@ function follow() {
   arriving = true;
   const reason = goTo(location.hash, { model, link, view, charts });
   arriving = false;
-  if (reason) saving.said(reason);
+  if (!reason) return;
+  saving.said(reason);
+  if (twinOf(location.hash) !== model.twin) leave?.offer(twinOf(location.hash), reason);
 }
 function begun() {
   if (!link.status.origin) return;

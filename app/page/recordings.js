@@ -49,7 +49,7 @@ export class Recordings {
     const { summary } = file;
     const error = summary?.error;
     const facts = [
-      file.twin, file.seconds ? span(file.seconds) : null, summary?.estimator ?? file.estimator, size(file.bytes),
+      file.folder ? `in ${file.folder}` : null, file.twin, file.seconds ? span(file.seconds) : null, summary?.estimator ?? file.estimator, size(file.bytes),
     ].filter(Boolean).join(" · ");
     const scores = [
       summary?.nis ? `NIS ${compact(summary.nis, 3)} [${compact(summary.nis_low, 3)}, ${compact(summary.nis_high, 3)}]` : null,

@@ -30,7 +30,7 @@ export class Session extends EventTarget {
 
   take(state) {
     // Something else runs than when this page was opened: whoever looks goes there.
-    if (state.boot !== this.boot) location.replace("/");
+    if (state.boot !== this.boot) leave();
     this.state = state;
     this.dispatchEvent(new CustomEvent("state", { detail: state }));
   }
@@ -42,6 +42,12 @@ export class Session extends EventTarget {
     else this.dispatchEvent(new CustomEvent("state", { detail: { ...this.state, failed: { title: "It", text: answer.error } } }));
     this.ask();
   }
+}
+
+// To what runs now; a link to a moment of it goes along.
+function leave() {
+  if (location.pathname === "/") location.reload();
+  else location.replace(location.hash.includes("twin=") ? `/${location.hash}` : "/");
 }
 
 // Resolves to the answer, or {error} with the reason.

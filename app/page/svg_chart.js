@@ -73,6 +73,8 @@ export function chartSvg(chart, [title, about], episodes, tone = lightColours())
     const dots = times.flatMap((time, i) => (finite(values[i]) && time >= span[0] && time <= span[1] ? [`<circle cx="${round(x(time))}" cy="${round(y(values[i]))}" r="${radius}"/>`] : [])).join("");
     add(series.ring ? `${series.tone} ring` : series.tone, dots && `<g ${style}>${dots}</g>`, (at) => `<circle cx="${at + 9}" cy="-4" r="${radius}" ${style}/>`);
   });
+  const image = what.image?.(chart);
+  if (image) marks.push(`<image x="${round(x(image.from))}" y="${TOP}" width="${round(x(image.to) - x(image.from))}" height="${H - TOP - BOTTOM}" preserveAspectRatio="none" style="image-rendering:pixelated" href="${image.url}"/>`);
   for (const extra of what.extras?.(chart) ?? []) add(extra.name ?? extra.tone, ...curve(extra.x, extra.values, extra));
   return [
     `<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 ${W} ${H}" width="${W}" height="${H}" font-size="12" fill="${tone("faint")}" ${FONT}>`,

@@ -57,7 +57,12 @@ export class Trust {
     }
     setText($("folding"), refolding(status));
     setAttribute($("record"), "aria-pressed", String(status.recording !== null));
-    setAttribute($("record"), "title", status.recording === null ? "Record into a new .rrd file (R)" : `Recording ${status.recording}: end it (R)`);
+    const file = status.recording?.split(/[\\/]/).pop() ?? "";
+    const where = `Recording ${file} into ${status.recording_folder}`;
+    setAttribute($("record"), "title", file ? `${where}: end it (R)` : "Record into a new .rrd file (R)");
+    $("recording").hidden = !file;
+    setText($("recording"), file);
+    setAttribute($("recording"), "title", where);
     const latency = typeof status.latency_ms === "number" ? `${compact(status.latency_ms, 2)} ms` : "";
     setText($("latency"), latency);
   }

@@ -70,7 +70,7 @@ def read_recording(path: Path) -> Recorded:
                 content.read(whole)
             except Exception as error:  # noqa: BLE001  as above
                 if not (content.header and content.events):
-                    text = _cut_short(path) or f"cannot be read ({_line(error)}); is it an .rrd file?"
+                    text = _cut_short(path) or f"cannot be read ({_line(error, whole, path)}); is it an .rrd file?"
                     raise SourceError(f"{path}: {text}") from None
     header, tunings, notices = content.header, content.tunings, content.notices
     if not header or not tunings:
@@ -181,8 +181,10 @@ def _flat(column: Any) -> np.ndarray:
     return column.flatten().to_numpy(zero_copy_only=False)
 
 
-def _line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+def _line(error: Exception, copy: Path, path: Path) -> str:
+    """What an error says, of the file itself where it says it of a copy."""
+    text = str(error).strip()
+    return text.splitlines()[0].replace(str(copy), path.name) if text else type(error).__name__
 
 
 def _latest(chunks: list[tuple[np.ndarray, dict[str, np.ndarray]]]) -> tuple[int, dict[str, np.ndarray]]:

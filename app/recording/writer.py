@@ -76,6 +76,18 @@ class Recorder:
         """The recording that is being written; its first part, if it is split."""
         return self._wanted
 
+    @property
+    def writing(self) -> Path | None:
+        """The file that is being written: of a recording that is split, the part that began last."""
+        part = self._open
+        return self._wanted if part is None else part.file.path
+
+    @property
+    def written(self) -> list[Path]:
+        """All files so far, that which is being written last."""
+        writing = self.writing
+        return [*self.finished, *([] if writing is None or writing in self.finished else [writing])]
+
     def start(self) -> None:
         """Wait for `record`."""
         self._thread.start()

@@ -96,6 +96,7 @@ def status_json(engine: Running) -> dict[str, Any]:
         "seekable": status.seekable,
         "length": None if status.span is None else (status.span[1] - status.span[0]) * 1e-9,
         "recording": str(status.recording) if status.recording is not None else None,
+        "recording_folder": None if status.recording is None else str(status.recording.absolute().parent),
         "latency_ms": _plain(status.latency_ms),
         "faults": faults.status_json(status.faults, engine.model),
         "runs": _runs(engine.revisions),

@@ -25,6 +25,7 @@ from .beacons import Beacons, Places
 from .beams import Beams
 from .camera import Outlook
 from .history import History
+from .peak_trail import PeakTrail
 
 TRAIL = 300
 """Points of a line where something was, at most."""
@@ -104,6 +105,7 @@ class VehicleScene:
         line, world = {"thickness_units": "screen"}, "/scene/world"
         nothing = np.zeros((1, 2, 3), np.float32)
         self._trail = api.add_line_segments(f"{world}/trail", nothing, palette.estimate, thickness=3, **line)
+        self._way = PeakTrail()
         self._truth = api.add_line_segments(f"{world}/truth", nothing, palette.truth, thickness=2, **line)
         dot = {"point_shape": "circle", "precision": "float32", "point_shading": "flat", "visible": False}
         one = np.zeros((1, 3), np.float32)
@@ -158,8 +160,12 @@ class VehicleScene:
         self._known = known
         self._vehicle.visible = known
         self._mark(belief.peaks if known else ())
+        plane, t = mean[:, [self.east, self.north]], history.column("t")
+        several = known and len(belief.peaks) > 1
+        self._way.look(t, plane, belief.peaks[0].mean[[self.east, self.north]] if several else None)
         if heavy:
-            self._trail.points = segments(self._plane(mean[:, self.east], mean[:, self.north], 0.06))
+            east, north = self._way.of(t, plane).T
+            self._trail.points = segments(self._plane(east, north, 0.06))
             self._draw_truth(history)
             self._draw_readings(history)
             self._draw_cloud(belief.points if known else ())
@@ -247,7 +253,8 @@ class VehicleScene:
             if shown:
                 dot.points = np.array([(*place, 1.2)], np.float32)
                 label.position = (*(place + 0.6), 1.2)
-                label.text = f"{100 * several[k].weight:.0f} %"
+                # At the heaviest stand the vehicle and the end of its trail.
+                label.text = f"{100 * several[k].weight:.0f} %{' drawn' if k == 0 else ''}"
             dot.visible = label.visible = shown
 
     def _direction(self, peak: Any, mean: np.ndarray) -> float:

@@ -27,6 +27,7 @@ from ..errors import ModelError
 from ..numerics.helpers import with_helpers
 from ..numerics.jit import jit, plain
 from .state_space import Noise, State, StateSpaceModel
+from .units import squared
 
 
 class Unknown(NamedTuple):
@@ -62,7 +63,7 @@ def joint(model: StateSpaceModel, unknowns: Mapping[str, Unknown]) -> StateSpace
     low, high = (tuple(float(getattr(item, end)) for item in moved) for end in ("low", "high"))
     layout = (model.nx, place, low, high)
     noises = model.noises + tuple(
-        Noise(item.name, f"({item.unit})²/s", unknowns[item.name].drift ** 2) for item in moved
+        Noise(item.name, f"{squared(item.unit)}/s", unknowns[item.name].drift ** 2) for item in moved
     )
     return replace(
         model,

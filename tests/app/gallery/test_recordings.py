@@ -223,3 +223,48 @@ def recorded_bytes(tmp_path):
         wait_for(lambda: session.session.recorder.finished, PATIENCE)
     assert read_recording(tmp_path / "given.rrd").name == "motor_winding"
     return (tmp_path / "given.rrd").read_bytes()
+
+
+def test_what_the_session_recorded_elsewhere_is_listed_as_well_and_nothing_else_there(tmp_path):
+    """Two recordings outside the folder whose names begin alike, of two twins one after the other."""
+    folder, elsewhere = tmp_path / "recordings", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "private.rrd").write_bytes(b"private")
+
+    def files():
+        return {item["name"]: item for item in session.get("/api/gallery/recordings")["files"]}
+
+    with opened(folder, "motor_winding", speed=1e6) as session:
+        wait_for(lambda: session.engine.status().finished, PATIENCE)
+        assert files() == {}
+        for name in ("run.rrd", "run2.rrd"):
+            session.engine.submit(Record(elsewhere / name))
+            wait_for(lambda n=name: n in files(), PATIENCE)
+            assert files()[name]["error"] == "is being recorded" and files()[name]["folder"] == str(elsewhere)
+        # The first is finished, whatever the second is called.
+        wait_for(lambda: files()["run.rrd"]["error"] is None, PATIENCE)
+        wait_for(lambda: session.get("/api/status")["recording_folder"] == str(elsewhere), PATIENCE)
+        session.engine.submit(Record(None))
+        wait_for(lambda: files()["run2.rrd"]["error"] is None, PATIENCE)
+        assert session.start("lorenz63")["failed"] is None
+        assert set(files()) == {"run.rrd", "run2.rrd"}
+        assert session.client.get("/recordings/run.rrd").body == (elsewhere / "run.rrd").read_bytes()
+        for name in ("private.rrd", "../elsewhere/private.rrd"):
+            assert session.post("/api/gallery/recordings/delete", {"name": name})[0] == 400
+        assert session.post("/api/gallery/recordings/open", {"name": "run2.rrd"})[0] == 202
+        assert session.settled()["running"]["title"] == "run2.rrd"
+        # What is in the folder goes before what has its name elsewhere.
+        folder.mkdir(exist_ok=True)
+        (folder / "run.rrd").write_bytes(b"RRF2 another")
+        assert files()["run.rrd"]["folder"] is None and files()["run.rrd"]["bytes"] == 12
+        assert session.post("/api/gallery/recordings/delete", {"name": "run2.rrd"})[0] == 200
+        assert sorted(path.name for path in elsewhere.iterdir()) == ["private.rrd", "run.rrd"]
+
+
+def test_a_file_that_is_no_recording_is_named_as_it_is_and_not_as_its_copy(folder):
+    (folder / "bad.rrd").write_bytes(os.urandom(3000))
+    with pytest.raises(SourceError) as refusal:
+        read_recording(folder / "bad.rrd")
+    text = str(refusal.value)
+    assert text.startswith(f"{folder / 'bad.rrd'}: cannot be read (") and "file at bad.rrd: " in text
+    assert text.count("/") == str(folder / "bad.rrd").count("/")

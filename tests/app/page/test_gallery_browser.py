@@ -5,6 +5,7 @@ import base64
 import numpy as np
 import pytest
 
+from app.engine.commands import Record
 from app.recording.reader import read_recording
 from tests.app.gallery.opened import opened
 from tests.app.page.test_page import FLAGS, PATIENCE, drawn
@@ -228,3 +229,46 @@ def test_record_review_drop_and_delete(visit, tmp_path):
         page.get_by_role("button", name="Delete for good").click()
         row.wait_for(state="detached")
         assert not (folder / "drive.csv").exists() and (folder / "other.csv").exists() and path.exists()
+
+
+def test_a_link_of_another_twin_offers_to_start_it_and_goes_to_its_moment(visit, tmp_path):
+    moment = "#twin=motor_joint&from=1970-01-01T00:00:05Z&span=10"
+    with opened(tmp_path / "recordings", "motor_winding") as session:
+        page = visit(session)
+        shows(page, "motor_winding")
+        page.evaluate(f"location.hash = '{moment}'")
+        page.locator("#toast").get_by_text("the link is of motor_joint; motor_winding runs here").wait_for()
+        page.get_by_role("button", name="Stay with motor_winding").click()
+        until(page, "document.getElementById('toast').hidden && location.hash === ''")
+        page.evaluate(f"location.hash = '{moment}'")
+        page.get_by_role("button", name="Start motor_joint").click()
+        shows(page, "motor_joint")
+        assert session.state()["running"]["name"] == "motor_joint"
+        until(page, "window.nisus.charts.range[0] === 5 && window.nisus.charts.range[1] === 15")
+        # One that is unknown here is no offer.
+        page.evaluate("location.hash = '#twin=elsewhere&from=1970-01-01T00:00:05Z&span=10'")
+        page.locator("#toast").get_by_text("No twin of that name can be started here").wait_for()
+        assert page.locator("#toast button").count() == 0
+
+        # Where nothing runs the gallery has the offer; the name of a card starts it, too.
+        session.post("/api/gallery/stop", {})
+        until(page, "window.nisus?.cards > 0")
+        page.goto(f"{page.url.split('#')[0].rstrip('/')}/gallery{moment}")
+        page.get_by_text("The link is of motor_joint: start it to go there").wait_for()
+        card(page, "motor_joint").get_by_role("button", name="motor_joint", exact=True).click()
+        shows(page, "motor_joint")
+        until(page, "window.nisus.charts.range[0] === 5")
+
+
+def test_what_is_recorded_is_named_in_the_bar(visit, tmp_path):
+    with opened(tmp_path / "recordings", "motor_winding") as session:
+        page = visit(session)
+        shows(page, "motor_winding")
+        assert page.locator("#recording").is_hidden()
+        session.engine.submit(Record(tmp_path / "evidence.rrd"))
+        page.locator("#recording").get_by_text("evidence.rrd").wait_for()
+        title = f"Recording evidence.rrd into {tmp_path}"
+        assert page.locator("#recording").get_attribute("title") == title
+        assert page.locator("#record").get_attribute("title") == f"{title}: end it (R)"
+        session.engine.submit(Record(None))
+        until(page, "document.getElementById('recording').hidden")
