@@ -140,9 +140,9 @@ class ErrorSection(Section):
         return self
 
     @property
-    def stds(self) -> tuple[float, ...]:
-        """The standard deviations, one for all rows or one a row."""
-        return self.std if self.std is not None else tuple(variance**0.5 for variance in self.variance or ())
+    def variances(self) -> tuple[float, ...]:
+        """The variances, one for all rows or one a row."""
+        return self.variance if self.variance is not None else tuple(std**2 for std in self.std or ())
 
 
 class SpreadSection(Section):

@@ -39,8 +39,8 @@ def with_lasting_errors(model: StateSpaceModel, loaded: Loaded) -> StateSpaceMod
     for name, error in errors.items():
         rows = [row.name for row in model.sensors[model.sensor_names.index(name)].rows]
         key = ("sensors", name, "error")
-        std = one_each(loaded, (*key, "std" if error.std is not None else "variance"), error.stds, rows)
-        lasting[name] = Lasting(std, error.over)
+        variances = one_each(loaded, (*key, "std" if error.std is not None else "variance"), error.variances, rows)
+        lasting[name] = Lasting(variances, error.over)
         with _placed(loaded, key):
             coloured(model, errors={name: lasting[name]})
     return coloured(model, times, lasting)

@@ -33,17 +33,33 @@ import numpy as np
 
 from ..errors import ModelError
 from .ornstein_uhlenbeck import Layout, functions
-from .state_space import Field, Noise, Parameter, State, StateSpaceModel
+from .state_space import Field, Noise, Parameter, Sensor, State, StateSpaceModel
 
 REACH = 100.0
 """How many times shorter or longer than given a correlation time may be turned."""
 
 
 class Lasting(NamedTuple):
-    """An error of a sensor that lasts: its `std`, one a row, and the correlation time `over` in seconds."""
+    """An error of a sensor that lasts: its `variance`, one a row, and the correlation time `over` in seconds."""
 
-    std: tuple[float, ...]
+    variance: tuple[float, ...]
     over: float
+
+
+def disturbance_time(noise: str) -> str:
+    """The parameter that says how long a noise lasts."""
+    return f"{noise}_disturbance_time"
+
+
+def error_time(sensor: str) -> str:
+    """The parameter that says how long the error of a sensor lasts."""
+    return f"{sensor}_error_time"
+
+
+def errors_of(sensor: Sensor) -> list[str]:
+    """The states, and the noises, that carry the error of a sensor, one a row."""
+    one = len(sensor.rows) == 1
+    return [f"{sensor.name}_error" if one else f"{sensor.name}_{row.name}_error" for row in sensor.rows]
 
 
 def coloured(
@@ -86,19 +102,18 @@ def coloured(
             states.append(State(name, _rate(driven.unit), 0.0, std, position=driven.position))
             place.append((len(model.parameters) + len(parameters), k, share))
             along.append(b)
-        parameters.append(_time(f"{noise.name}_disturbance_time", over))
+        parameters.append(_time(disturbance_time(noise.name), over))
     first = {}
     for sensor in model.sensors:
         if sensor.name not in errors:
             continue
         lasting = errors[sensor.name]
         first[sensor.name] = model.nx + len(states)
-        for row, deviation in zip(sensor.rows, lasting.std, strict=True):
-            name = f"{sensor.name}_error" if len(sensor.rows) == 1 else f"{sensor.name}_{row.name}_error"
-            states.append(State(name, row.unit, 0.0, deviation, position=row.position))
+        for name, row, variance in zip(errors_of(sensor), sensor.rows, lasting.variance, strict=True):
+            states.append(State(name, row.unit, 0.0, float(np.sqrt(variance)), position=row.position))
             place.append((len(model.parameters) + len(parameters), len(model.noises) + len(added), 1.0))
-            added.append(Noise(name, _squared(row.unit), deviation**2))
-        parameters.append(_time(f"{sensor.name}_error_time", lasting.over))
+            added.append(Noise(name, _squared(row.unit), variance))
+        parameters.append(_time(error_time(sensor.name), lasting.over))
     layout = Layout(
         n=model.nx,
         k=len(model.parameters),
@@ -156,7 +171,8 @@ def _rate_of_noise(model: StateSpaceModel, index: int) -> np.ndarray:
         spread = float(trial > 0)
         x = model.prior_mean + spread * model.prior_std * rng.standard_normal(model.nx)
         u = np.array([item.default + spread * rng.standard_normal() for item in model.inputs], float)
-        p = np.array([item.value for item in model.parameters], float)
+        turned = [item.value * (1.0 + 0.1 * spread * rng.standard_normal()) for item in model.parameters]
+        p = np.array([np.clip(t, item.low, item.high) for t, item in zip(turned, model.parameters, strict=True)], float)
         dt = min(1.0, model.max_step) / (1.0 + trial)
         q = rng.uniform(0.5, 1.5, len(model.noises))
         more = q.copy()
@@ -191,8 +207,12 @@ def _check(model: StateSpaceModel, noises: Mapping[str, float], errors: Mapping[
     for name, lasting in errors.items():
         if name not in rows:
             raise ModelError(f"model {model.name} has no sensor {name!r}; it has {', '.join(rows)}")
-        if len(lasting.std) != rows[name] or not all(std > 0.0 for std in lasting.std):
-            raise ModelError(f"model {model.name}: the error of {name} needs {rows[name]} positive std, one a row")
+        if len(lasting.variance) != rows[name] or not all(variance > 0.0 for variance in lasting.variance):
+            given = ", ".join(f"{variance:g}" for variance in lasting.variance)
+            raise ModelError(
+                f"model {model.name}: the error of {name} has variance {given}; it must be positive, one for each of "
+                f"{rows[name]} rows"
+            )
     for name, over in [*noises.items(), *((name, lasting.over) for name, lasting in errors.items())]:
         if not 0.0 < over < np.inf:
             raise ModelError(f"model {model.name}: {name} lasts over {over:g} s; it must be a positive time")
