@@ -293,10 +293,10 @@ def test_bench_magnet_is_found_without_its_thermometer(data: Callable[..., Path]
     estimate = result.track.mean[rows, 3]
     late = np.arange(truth.size) >= 2400  # the parameters were fitted on what is before
     assert truth.size == 3600 and truth[late].max() - truth[late].min() > 5.0
-    # 0.93 K was measured; the margin is for other libraries' rounding, not for other tunings.
-    assert np.sqrt(np.mean((estimate - truth) ** 2)) < 1.0
-    assert np.sqrt(np.mean((estimate - truth)[late] ** 2)) < 1.0
-    assert np.mean(np.abs(estimate - truth) < 1.96 * result.track.std[rows, 3]) > 0.8
+    # 0.79 and 0.75 K were measured; the margin is for other libraries' rounding, not for other tunings.
+    assert np.sqrt(np.mean((estimate - truth) ** 2)) < 0.85
+    assert np.sqrt(np.mean((estimate - truth)[late] ** 2)) < 0.8
+    assert np.mean(np.abs(estimate - truth) < 1.96 * result.track.std[rows, 3]) > 0.88
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "ukf"])
