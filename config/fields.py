@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -20,6 +21,23 @@ Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=LAR
 NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=LARGEST)]
 Seconds = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=LONGEST)]
 SomeSeconds = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=LONGEST)]
+TIME_UNITS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+"""Units in which a duration may be given, in seconds."""
+
+
+def as_seconds(value: Any) -> Any:
+    """A duration as its seconds: `5 min` is 300; a number is seconds already."""
+    if not isinstance(value, str):
+        return value
+    number, unit = re.fullmatch(r"\s*([-+.\deE]*)\s*(.*?)\s*", value).groups()  # type: ignore[union-attr]
+    try:
+        return float(number) * TIME_UNITS[unit]
+    except (ValueError, KeyError):
+        rule = f"give seconds, or a number with one of {', '.join(TIME_UNITS)}, as in 5 min"
+        raise PydanticCustomError("duration", "{rule}", {"rule": rule}) from None
+
+
+Duration = Annotated[Seconds, BeforeValidator(as_seconds, json_schema_input_type=Seconds | str)]
 Time = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LATEST, le=LATEST)]
 Count = Annotated[int, Field(strict=True, ge=1)]
 Option = Number | Annotated[str, Field(min_length=1)]
@@ -38,6 +56,9 @@ Texts = Annotated[
 ]
 Numbers = Annotated[
     tuple[Number, ...], Field(min_length=1), BeforeValidator(as_list, json_schema_input_type=float | list[float])
+]
+Positives = Annotated[
+    tuple[Positive, ...], Field(min_length=1), BeforeValidator(as_list, json_schema_input_type=float | list[float])
 ]
 NotNegatives = Annotated[
     tuple[NotNegative, ...], Field(min_length=1), BeforeValidator(as_list, json_schema_input_type=float | list[float])
@@ -92,6 +113,36 @@ class LevelSection(Section):
     def value(self) -> float:
         """The variance."""
         return self.variance if self.variance is not None else float(self.std or 0.0) ** 2
+
+
+class NoiseSection(LevelSection):
+    """How strongly one disturbance drives the state, and for how long it lasts."""
+
+    over: Duration | None = None
+    """Correlation time of the disturbance, in seconds or with a unit: 120, 2 min. A state is appended that carries it,
+    NAME_disturbance, and the parameter NAME_disturbance_time; what it adds in the long run stays the `variance` a
+    second. Default: none, white noise."""
+
+
+class ErrorSection(Section):
+    """An error of a sensor that lasts, beside its white noise."""
+
+    variance: Positives | None = None
+    """Variance of the error, in the square of the sensor's unit; a list gives one a row."""
+    std: Positives | None = None
+    """Its square root: standard deviation, in the sensor's unit; a list gives one a row."""
+    over: Duration
+    """Correlation time of the error, in seconds or with a unit: 300, 5 min."""
+
+    @model_validator(mode="after")
+    def _one(self) -> ErrorSection:
+        one_of(self, "variance", "std", required=True)
+        return self
+
+    @property
+    def variances(self) -> tuple[float, ...]:
+        """The variances, one for all rows or one a row."""
+        return self.variance if self.variance is not None else tuple(std**2 for std in self.std or ())
 
 
 class SpreadSection(Section):

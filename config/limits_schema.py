@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from .fields import Number, Positive, Seconds, Section, SomeSeconds, as_list, one_of
+from .fields import Number, Positives, Seconds, Section, SomeSeconds, one_of
 from .source_schema import RangeSection
 
 Pair = tuple[Number | None, Number | None]
@@ -45,9 +45,6 @@ Ranges = Annotated[
     AfterValidator(_rising),
 ]
 Validity = Annotated[RangeSection, AfterValidator(_holds_something)]
-Positives = Annotated[
-    tuple[Positive, ...], Field(min_length=1), BeforeValidator(as_list, json_schema_input_type=float | list[float])
-]
 
 
 def bounds(pair: Pair) -> tuple[float, float]:

@@ -14,12 +14,14 @@ from .fault_schema import FaultSection
 from .fields import (
     LONGEST,
     Count,
+    ErrorSection,
     Flag,
-    LevelSection,
+    NoiseSection,
     NotNegative,
     Number,
     Option,
     Positive,
+    Positives,
     Seconds,
     Section,
     SomeSeconds,
@@ -27,7 +29,7 @@ from .fields import (
     Text,
     Time,
 )
-from .limits_schema import DuplicatesSection, Positives, Ranges, StuckSection, Validity
+from .limits_schema import DuplicatesSection, Ranges, StuckSection, Validity
 from .source_schema import SourceSection
 
 GateProbability = Annotated[float, Field(strict=True, ge=0.5, lt=1)]
@@ -55,6 +57,9 @@ class UnknownSection(Section):
 class SensorSection(SpreadSection):
     """The noise of one sensor as the estimator assumes it, what it can say, and whether the estimate uses it."""
 
+    error: ErrorSection | None = None
+    """An error that lasts, beside the white noise: {std: 3, over: 5 min}. A state is appended for each row,
+    SENSOR_error (SENSOR_ROW_error of several rows), and the parameter SENSOR_error_time. Default: none."""
     correlation: tuple[tuple[Number, ...], ...] | None = None
     """Correlation of the noise of its rows, for example [[1, 0.5], [0.5, 1]], with R_ij = correlation_ij √(R_ii R_jj):
     it stays while the variances are tuned. Particle and ensemble filters take independent rows, [[1, 0], [0, 1]].
@@ -256,8 +261,9 @@ class TwinSection(Section):
     states, which may be named wherever a state may. Default: none."""
     prior: dict[str, PriorSection] = {}
     """The belief before the first reading, by state, or of a whole field under its name. Default: the model's."""
-    noise: dict[str, LevelSection] = {}
-    """Process noise Q by name: how much the model is distrusted. Default: the model's."""
+    noise: dict[str, NoiseSection] = {}
+    """Process noise Q by name: how much the model is distrusted, and for how long an error of it lasts. Default: the
+    model's, white."""
     sensors: dict[str, SensorSection] = {}
     """Sensor noise R by sensor: how much each is distrusted. Default: the model's."""
     valid: dict[str, Validity] = {}

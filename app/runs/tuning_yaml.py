@@ -9,6 +9,7 @@ from typing import Any
 
 from config.schema import TwinSection
 from estimators.estimator import Estimator
+from estimators.model.coloured import disturbance_time, error_time, errors_of
 from estimators.registry import find_entry
 from estimators.tuning import REOPEN, Tuning
 
@@ -35,29 +36,50 @@ def tuning_yaml(config: TwinSection, estimator: str, tuning: Tuning) -> str:
     lines += _section("filters", others)
     model = tuning.model
     values = dict(zip((item.name for item in model.parameters), map(float, tuning.p), strict=True))
+    noises = dict(zip((noise.name for noise in model.noises), map(float, tuning.q), strict=True))
     known = {item.name: item.value for item in model.parameters}
-    # Of those that are estimated the tuning has none.
+    # How long errors last stands beside their size. Of parameters that are estimated the tuning has none.
+    lasting = {name: section.over for name, section in config.noise.items() if section.over is not None}
+    erring = [sensor for sensor in model.sensors if _errs(config, sensor.name)]
+    times = {*map(disturbance_time, lasting), *(error_time(sensor.name) for sensor in erring)}
     turned = {name: value for name, value in values.items() if name in config.parameters or value != known[name]}
-    lines += _section("parameters", {**config.parameters, **turned})
-    noises = zip((noise.name for noise in model.noises), map(float, tuning.q), strict=True)
-    lines += _section("noise", {name: {"variance": variance} for name, variance in noises})
-    lines += _section("sensors", _sensors(config, tuning))
+    rest = {name: value for name, value in turned.items() if name not in times}
+    lines += _section("parameters", {**config.parameters, **rest})
+    errors = {sensor.name: [noises.pop(name) for name in errors_of(sensor)] for sensor in erring}
+    over = {name: {"over": values.get(disturbance_time(name), seconds)} for name, seconds in lasting.items()}
+    lines += _section("noise", {name: {"variance": value, **over.get(name, {})} for name, value in noises.items()})
+    lines += _section("sensors", _sensors(config, tuning, errors, values))
     lines.append(f"gate: {_flow(_gate(tuning))}")
     return "\n".join(lines) + "\n"
 
 
-def _sensors(config: TwinSection, tuning: Tuning) -> dict[str, Any]:
+def _errs(config: TwinSection, sensor: str) -> bool:
+    """Whether a sensor has an error that lasts."""
+    return sensor in config.sensors and config.sensors[sensor].error is not None
+
+
+def _sensors(
+    config: TwinSection, tuning: Tuning, errors: Mapping[str, list[float]], values: Mapping[str, float]
+) -> dict[str, Any]:
+    """The section `sensors`: with the variances of the errors that last, by sensor, and parameters by name."""
     found = {}
     for sensor, start in zip(tuning.model.sensors, tuning.model.row_start, strict=True):
         given = config.sensors.get(sensor.name)
         own = given.model_dump(mode="json", exclude_unset=True, exclude_none=True) if given is not None else {}
         variances = [float(value) for value in tuning.r[start : start + len(sensor.rows)]]
         rest = {key: value for key, value in own.items() if key not in ("std", "variance", "use")}
-        same = all(value == variances[0] for value in variances)
-        found[sensor.name] = {"variance": variances[0] if same else variances, **rest}
+        if sensor.name in errors:
+            over = values.get(error_time(sensor.name), rest["error"]["over"])
+            rest["error"] = {"variance": _one_or_all(errors[sensor.name]), "over": over}
+        found[sensor.name] = {"variance": _one_or_all(variances), **rest}
         if not tuning.get(f"use.{sensor.name}"):
             found[sensor.name]["use"] = False
     return found
+
+
+def _one_or_all(values: list[float]) -> float | list[float]:
+    """The value that all rows share, or one a row."""
+    return values[0] if all(value == values[0] for value in values) else values
 
 
 def _gate(tuning: Tuning) -> Any:

@@ -12,7 +12,7 @@ from config.yaml_lines import Key
 from estimators.log import INPUT, READING, TRUTH
 from estimators.model.state_space import Field, StateSpaceModel
 
-from .model import check_names
+from .names import check_names
 
 if TYPE_CHECKING:
     from sources.source import Channel, Condition

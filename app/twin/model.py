@@ -22,7 +22,9 @@ from estimators.model.state_space import Field, State, StateSpaceModel
 from estimators.model.user_file import run_file
 from estimators.models import MODELS
 
+from .lasting import with_lasting_errors
 from .limits import limits_of
+from .names import check_named, check_names, one_each
 
 
 def find_model(loaded: Loaded, key: Key, reference: str) -> StateSpaceModel:
@@ -108,7 +110,6 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     config = loaded.config
     names = [item.name for item in model.parameters]
     check_names(loaded, ("parameters",), config.parameters, names, "parameter", model)
-    check_names(loaded, ("estimate",), config.estimate, names, "parameter", model)
     for item in model.parameters:
         value = config.parameters.get(item.name, item.value)
         if not item.low <= value <= item.high:
@@ -117,8 +118,11 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
                 f"is {value:g} {item.unit}; it must lie between {item.low:g} and {item.high:g}",
             )
     parameters = tuple(replace(p, value=config.parameters.get(p.name, p.value)) for p in model.parameters)
+    model = with_lasting_errors(replace(model, parameters=parameters), loaded)
+    names = [item.name for item in model.parameters]
+    check_names(loaded, ("estimate",), config.estimate, names, "parameter", model)
     unknowns = {name: Unknown(section.std, section.drift) for name, section in config.estimate.items()}
-    model = joint(replace(model, parameters=parameters), unknowns)
+    model = joint(model, unknowns)
     places = [*(() if isinstance(model.states, Field) else model.state_names), *(item.name for item in model.inputs)]
     check_names(loaded, ("valid",), config.valid, places, "state or input", model)
     field = isinstance(model.states, Field)
@@ -195,34 +199,3 @@ def _correlation(sensor: Any, given: Correlation, loaded: Loaded) -> Correlation
     if wrong:
         raise loaded.error(("sensors", sensor.name, "correlation"), wrong)
     return None if np.array_equal(given, np.eye(len(given))) else given
-
-
-def one_each(loaded: Loaded, key: Key, values: tuple, rows: list[str]) -> tuple:
-    """A value for each row, from one for all or one each."""
-    if len(values) == 1:
-        return values * len(rows)
-    if len(values) != len(rows):
-        raise loaded.error(key, f"has {len(values)} entries; give one, or {len(rows)}: {', '.join(rows)}")
-    return values
-
-
-def check_names(loaded: Loaded, key: Key, given: Any, known: Any, kind: str, model: StateSpaceModel) -> None:
-    """Refuse a name under `key` that the model does not have.
-
-    Raises:
-        ConfigError: With file and line, and the near names.
-    """
-    for name in given:
-        if name not in known:
-            raise loaded.error((*key, name), f"is no {kind} of {model.name}; {nearest(name, known)}")
-
-
-def check_named(loaded: Loaded, key: Key, names: Any, model: StateSpaceModel) -> None:
-    """Refuse a state that the value at `key` names and the model does not have.
-
-    Raises:
-        ConfigError: With file and line, and the near names.
-    """
-    for name in names:
-        if name not in model.state_names:
-            raise loaded.error(key, f"names {name!r}, no state of {model.name}; {nearest(name, model.state_names)}")

@@ -6,7 +6,7 @@ from config.loader import Loaded
 from estimators.errors import nearest
 from estimators.model.state_space import StateSpaceModel
 
-from .model import check_named
+from .names import check_named
 
 
 def check_scene(loaded: Loaded, model: StateSpaceModel) -> None:

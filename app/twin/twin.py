@@ -28,7 +28,8 @@ from ..intake import Planned
 from .commissioned import commissioned
 from .dropout import DegradedAfter, degraded_after
 from .late import Late, late_policy
-from .model import check_named, configure, find_model
+from .model import configure, find_model
+from .names import check_named
 from .scene_names import check_scene
 from .source import Plan, plan_source
 

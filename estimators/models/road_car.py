@@ -6,14 +6,11 @@
 Forward acceleration and yaw rate are inputs, as is usual in inertial navigation: their noise is process noise, and
 their slowly moving errors (road grade and mounting are in the first) are states. Heading ψ is counted from east to the
 left, as in ISO 8855; a compass heading χ is ψ = 90° - χ. A wheel sensor says wheel_scale·v. A GNSS receiver tells
-where the car was `gnss_delay` seconds ago, with an error that wanders slowly,
-
-    e' = -e / gnss_error_time + w,              variance of e = Q.gnss_error · gnss_error_time / 2
-
-beside white noise: without it a thousand fixes with a common error would count as a thousand independent ones.
+where the car was `gnss_delay` seconds ago. Its error wanders slowly: a twin says so with the sensor's `error`, or a
+thousand fixes with a common error would count as a thousand independent ones.
 
 Source: Groves (2013), Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd edition, for
-inertial errors and correlated noise as states.
+inertial errors as states.
 """
 
 from __future__ import annotations
@@ -22,9 +19,9 @@ import numpy as np
 
 from ..model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 
-EAST, NORTH, HEADING, SPEED, ACCEL_BIAS, YAW_RATE_BIAS, WHEEL_SCALE, EAST_ERROR, NORTH_ERROR = range(9)
+EAST, NORTH, HEADING, SPEED, ACCEL_BIAS, YAW_RATE_BIAS, WHEEL_SCALE = range(7)
 ACCEL, YAW_RATE = range(2)
-GNSS_DELAY, GNSS_ERROR_TIME = range(2)
+GNSS_DELAY = 0
 
 
 def f(x, u, p, dt, out):
@@ -40,9 +37,6 @@ def f(x, u, p, dt, out):
     out[ACCEL_BIAS] = x[ACCEL_BIAS]
     out[YAW_RATE_BIAS] = x[YAW_RATE_BIAS]
     out[WHEEL_SCALE] = x[WHEEL_SCALE]
-    kept = np.exp(-dt / p[GNSS_ERROR_TIME])
-    out[EAST_ERROR] = kept * x[EAST_ERROR]
-    out[NORTH_ERROR] = kept * x[NORTH_ERROR]
 
 
 def Q(x, u, p, q, dt, out):
@@ -54,17 +48,13 @@ def Q(x, u, p, q, dt, out):
     out[ACCEL_BIAS, ACCEL_BIAS] = q[3] * dt
     out[YAW_RATE_BIAS, YAW_RATE_BIAS] = q[4] * dt
     out[WHEEL_SCALE, WHEEL_SCALE] = q[5] * dt
-    time = p[GNSS_ERROR_TIME]
-    wandered = 0.5 * q[6] * time * (1.0 - np.exp(-2.0 * dt / time))
-    out[EAST_ERROR, EAST_ERROR] = wandered
-    out[NORTH_ERROR, NORTH_ERROR] = wandered
 
 
 def gnss_position(x, u, p, out):
     """Where the receiver thinks that the car was when it measured."""
     back = p[GNSS_DELAY] * x[SPEED]
-    out[0] = x[EAST] + x[EAST_ERROR] - back * np.cos(x[HEADING])
-    out[1] = x[NORTH] + x[NORTH_ERROR] - back * np.sin(x[HEADING])
+    out[0] = x[EAST] - back * np.cos(x[HEADING])
+    out[1] = x[NORTH] - back * np.sin(x[HEADING])
 
 
 def gnss_heading(x, u, p, out):
@@ -99,14 +89,9 @@ ROAD_CAR = StateSpaceModel(
         State("accel_bias", "m/s²", std=0.5),
         State("yaw_rate_bias", "rad/s", std=0.01),
         State("wheel_scale", "1", mean=1.0, std=0.02),
-        State("gnss_east_error", "m", std=1.5),
-        State("gnss_north_error", "m", std=1.5),
     ),
     inputs=(Input("accel", "m/s²"), Input("yaw_rate", "rad/s")),
-    parameters=(
-        Parameter("gnss_delay", "s", 0.0, 0.0, 2.0),
-        Parameter("gnss_error_time", "s", 100.0, 1.0, 10e3),
-    ),
+    parameters=(Parameter("gnss_delay", "s", 0.0, 0.0, 2.0),),
     noises=(
         Noise("position", "m²/s", variance=0.01),
         Noise("heading", "rad²/s", variance=1e-5),
@@ -114,7 +99,6 @@ ROAD_CAR = StateSpaceModel(
         Noise("accel_bias", "(m/s²)²/s", variance=0.01),
         Noise("yaw_rate_bias", "(rad/s)²/s", variance=1e-8),
         Noise("wheel_scale", "1/s", variance=1e-9),
-        Noise("gnss_error", "m²/s", variance=0.045),
     ),
     sensors=(
         Sensor(

@@ -10,7 +10,8 @@ from config.yaml_lines import Key, dotted
 from estimators.model.state_space import StateSpaceModel
 
 from ..faults import read_faults
-from ..model import check_names, find_model, one_each
+from ..model import find_model
+from ..names import check_names, one_each
 
 if TYPE_CHECKING:
     from sources.simulation.profile import Profile

@@ -70,3 +70,16 @@ def test_no_gate_is_said():
     twin = load_twin("motor_can")
     back = pasted(twin, tuning_yaml(twin.config, "ekf", twin.tuning.set("gate", None)))
     assert back.tuning.gate is None
+
+
+def test_how_long_errors_last_stands_beside_their_size():
+    given = {"noise.winding": "{variance: 0.01, over: 2 min}", "sensors.yoke.error": "{std: 0.7, over: 40}"}
+    twin = load_twin("motor_can", overrides=given)
+    assert same(pasted(twin, tuning_yaml(twin.config, "ekf", twin.tuning)).tuning, twin.tuning)
+    tuning = twin.tuning.set("p.winding_disturbance_time", 33.3).set("p.yoke_error_time", 11.0)
+    tuning = tuning.set("Q.yoke_error", 0.1 + 0.2).set("Q.winding", 0.003)
+    text = tuning_yaml(twin.config, "ekf", tuning)
+    assert same(pasted(twin, text).tuning, tuning) and "_time" not in text
+    # A correlation time that is estimated has no place in the tuning: the file's stays.
+    twin = load_twin("motor_can", overrides={**given, "estimate.winding_disturbance_time": "{std: 30}"})
+    assert "over: 120}" in tuning_yaml(twin.config, "ekf", twin.tuning)

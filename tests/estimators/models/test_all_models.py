@@ -15,6 +15,7 @@ from estimators.diagnostics.score import score
 from estimators.errors import ModelError
 from estimators.fold import fold
 from estimators.log import INPUT, READING, Events, Log, truth_of
+from estimators.model.coloured import Lasting, coloured
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.models.motor_drive import COPPER, MOTOR_DRIVE
@@ -23,6 +24,9 @@ from estimators.track import HELD_OUT, Track
 from tests.support import as_log, read_all
 
 P = {item.name: k for k, item in enumerate(MOTOR_DRIVE.parameters)}
+
+CAR = coloured(ROAD_CAR, errors={"gnss_position": Lasting((1.0, 1.0), 100.0)})
+"""As its twins have it: the error of a fix lasts."""
 
 
 def defaults(model: StateSpaceModel, **changed: float) -> np.ndarray:
@@ -175,16 +179,16 @@ def test_motor_is_stable_at_the_worst_that_the_sliders_allow() -> None:
 
 def car(heading: float = 0.0, speed: float = 0.0, **other: float) -> np.ndarray:
     values = {"heading": heading, "speed": speed, "wheel_scale": 1.0, **other}
-    return np.array([values.get(name, 0.0) for name in ROAD_CAR.state_names])
+    return np.array([values.get(name, 0.0) for name in CAR.state_names])
 
 
 def test_car_drives_a_circle_to_the_left() -> None:
     speed, turn, dt = 15.0, 2.0 * np.pi / 60.0, 0.1
-    p = defaults(ROAD_CAR)
+    p = defaults(CAR)
     u = np.array([0.3, turn + 0.02])  # the biases take off what is too much
     radius = speed / turn
     for steps in (150, 300, 600):  # a quarter, half, all of it
-        x = stepped(ROAD_CAR, car(speed=speed, accel_bias=0.3, yaw_rate_bias=0.02), u, p, dt, steps)
+        x = stepped(CAR, car(speed=speed, accel_bias=0.3, yaw_rate_bias=0.02), u, p, dt, steps)
         angle = turn * dt * steps
         # Each step is a chord in the right direction, too long by (ω dt)² / 24.
         bound = 1.01 * speed * dt * steps * (turn * dt) ** 2 / 24.0
@@ -193,18 +197,20 @@ def test_car_drives_a_circle_to_the_left() -> None:
 
 
 def test_car_gains_speed_as_a_falling_stone_does() -> None:
-    x = stepped(ROAD_CAR, car(heading=np.pi / 2, speed=3.0), np.array([2.0, 0.0]), defaults(ROAD_CAR), 0.1, 50)
+    x = stepped(CAR, car(heading=np.pi / 2, speed=3.0), np.array([2.0, 0.0]), defaults(CAR), 0.1, 50)
     np.testing.assert_allclose(x[:4], [0.0, 3.0 * 5.0 + 0.5 * 2.0 * 5.0**2, np.pi / 2, 13.0], atol=1e-12)
 
 
 def test_car_sensors_say_where_it_was() -> None:
-    compiled = compile_model(ROAD_CAR)
-    p = defaults(ROAD_CAR, gnss_delay=0.4)
+    compiled = compile_model(CAR)
+    p = defaults(CAR, gnss_delay=0.4)
     u = np.array([1.5, 0.0])
-    before = car(heading=0.7, speed=12.0, wheel_scale=1.02, gnss_east_error=2.0, gnss_north_error=-1.0)
-    now = stepped(ROAD_CAR, before, np.array([0.0, 0.0]), p, 0.1, 4)
+    before = car(
+        heading=0.7, speed=12.0, wheel_scale=1.02, gnss_position_east_error=2.0, gnss_position_north_error=-1.0
+    )
+    now = stepped(CAR, before, np.array([0.0, 0.0]), p, 0.1, 4)
     readings = {}
-    for h, sensor in zip(compiled.h, ROAD_CAR.sensors, strict=True):
+    for h, sensor in zip(compiled.h, CAR.sensors, strict=True):
         readings[sensor.name] = np.empty(len(sensor.rows))
         h(now, u, p, readings[sensor.name])
     kept = np.exp(-0.4 / 100.0)
@@ -216,23 +222,22 @@ def test_car_sensors_say_where_it_was() -> None:
 
 
 def test_car_noise_does_not_depend_on_how_time_is_cut() -> None:
-    compiled = compile_model(ROAD_CAR)
-    p, u, x = defaults(ROAD_CAR), np.zeros(2), car()
-    q = np.array([noise.variance for noise in ROAD_CAR.noises])
+    compiled = compile_model(CAR)
+    p, u, x = defaults(CAR), np.zeros(2), car()
+    q = np.array([noise.variance for noise in CAR.noises])
 
     def after(dt: float, steps: int) -> np.ndarray:
-        variance = np.zeros(ROAD_CAR.nx)
+        variance = np.zeros(CAR.nx)
         for _ in range(steps):
-            Q = np.zeros((ROAD_CAR.nx, ROAD_CAR.nx))
+            Q = np.zeros((CAR.nx, CAR.nx))
             compiled.Q(x, u, p, q, dt, Q)
-            kept = np.ones(ROAD_CAR.nx)
+            kept = np.ones(CAR.nx)
             kept[-2:] = np.exp(-dt / 100.0)
             variance = kept**2 * variance + np.diag(Q)
         return variance
 
     np.testing.assert_allclose(after(0.1, 50), after(0.01, 500), rtol=1e-10)
-    # In the long run the wandering error has the variance q τ / 2.
-    np.testing.assert_allclose(after(0.1, 20_000)[-2:], q[-1] * 100.0 / 2.0, rtol=1e-9)
+    np.testing.assert_allclose(after(0.1, 20_000)[-2:], q[-2:], rtol=1e-9)
 
 
 # The recordings
@@ -288,10 +293,10 @@ def test_bench_magnet_is_found_without_its_thermometer(data: Callable[..., Path]
     estimate = result.track.mean[rows, 3]
     late = np.arange(truth.size) >= 2400  # the parameters were fitted on what is before
     assert truth.size == 3600 and truth[late].max() - truth[late].min() > 5.0
-    # 0.93 K was measured; the margin is for other libraries' rounding, not for other tunings.
-    assert np.sqrt(np.mean((estimate - truth) ** 2)) < 1.0
-    assert np.sqrt(np.mean((estimate - truth)[late] ** 2)) < 1.0
-    assert np.mean(np.abs(estimate - truth) < 1.96 * result.track.std[rows, 3]) > 0.8
+    # 0.79 and 0.75 K were measured; the margin is for other libraries' rounding, not for other tunings.
+    assert np.sqrt(np.mean((estimate - truth) ** 2)) < 0.85
+    assert np.sqrt(np.mean((estimate - truth)[late] ** 2)) < 0.8
+    assert np.mean(np.abs(estimate - truth) < 1.96 * result.track.std[rows, 3]) > 0.88
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "ukf"])
