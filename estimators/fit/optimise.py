@@ -52,7 +52,7 @@ def maximise(objective: Objective, x: np.ndarray, *, rounds: int = ROUNDS) -> tu
             jac=True,
             method="L-BFGS-B",
             bounds=list(zip((low - x) / unit, (high - x) / unit, strict=True)),
-            options={"maxiter": STEPS, "gtol": GRADIENT, "ftol": 1e-12},
+            options={"maxiter": STEPS, "maxfun": 2 * STEPS, "gtol": GRADIENT, "ftol": 1e-12},
         )
         gained, value = -found.fun - value, float(-found.fun)
         x = np.clip(x + unit * found.x, low, high)
