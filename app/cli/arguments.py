@@ -147,6 +147,38 @@ class Commission:
 
 
 @dataclass(frozen=True)
+class Tune:
+    """Fit noises, parameters and options to recordings, and propose what predicts better what it was not fitted to.
+
+    Each recording is cut into blocks of time: every third is held out, and judges. So does each sensor in turn,
+    predicted by the others, and the true state where it is known. Exit status: 0 if something is proposed, 1 if not.
+    """
+
+    twin: Twin
+    """Name of a twin that ships, or path of a YAML file."""
+    fit: str = "Q,R"
+    """What to fit: groups (Q, R, p, options, prior) and single entries, as Q.winding, R.yoke, p.NAME, options.alpha,
+    prior.STATE.std, with commas."""
+    estimator: str | None = None
+    """Estimator to use instead of the twin's own; `nisus filters` lists all of them."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable, as for `run`: where the fit starts, and what is weakly believed."""
+    log: Files = ()
+    """Recording to fit to instead of the twin's own, repeatable: each is folded by itself; FILE,FILE are parts of one,
+    and FILE@0.5 weighs half."""
+    logs: int = 1
+    """Number of logs of a simulated twin, with consecutive seeds."""
+    duration: float | None = None
+    """Take only this many seconds of each."""
+    blocks: int = 9
+    """Blocks of time, of as many readings each; every third is held out."""
+    save: Path | None = None
+    """Write what is proposed to this .yaml, as sections that stand in place of the twin's own; else nothing."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print one JSON object."""
+
+
+@dataclass(frozen=True)
 class Stress:
     """Make mistakes with a twin on purpose, and print how soon, and how rightly, it says so.
 
@@ -271,7 +303,9 @@ class New:
     """Its unit: s, ms, us, ns, min or h."""
 
 
-Command = Run | Fold | Check | Compare | Stress | Commission | Filters | Review | Bus | Twins | Schema | Log | New
+Command = (
+    Run | Fold | Check | Compare | Tune | Stress | Commission | Filters | Review | Bus | Twins | Schema | Log | New
+)
 COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in get_args(Command)}
 
 

@@ -28,6 +28,7 @@ from .arguments import (
     Run,
     Schema,
     Stress,
+    Tune,
     Twins,
 )
 
@@ -54,6 +55,10 @@ def carry_out(command: Command) -> int:
         from .commission import commission_twin
 
         return commission_twin(command)
+    if isinstance(command, Tune):
+        from .tune import tune_twin
+
+        return tune_twin(command)
     if isinstance(command, Stress):
         from .stress import stress_twin
 

@@ -1,0 +1,98 @@
+"""`nisus tune`: fit a twin's tuning to recordings, and say whether what was found is better."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from config.source_schema import SimulatorSection
+from estimators.errors import ConfigError
+from estimators.fit.fit import Fitted, Given, fit
+from estimators.log import Log
+
+from ..runs.fit_json import fit_json
+from ..runs.tuning_yaml import tuning_yaml
+from ..twin.twin import Twin, load_twin
+from .arguments import settings
+from .check_text import as_text
+from .fold import read_log
+from .prepare import attend, prepare
+from .tune_text import heading, sections
+
+if TYPE_CHECKING:
+    from .arguments import Tune as Arguments
+
+FEWEST = 3
+"""Blocks, with which one is held out."""
+
+
+def tune_twin(arguments: Arguments) -> int:
+    """Carry the command out."""
+    wanted = [key.strip() for key in arguments.fit.split(",") if key.strip()]
+    if not wanted:
+        raise ConfigError("--fit names nothing; write for example --fit Q,R")
+    if arguments.blocks < FEWEST:
+        raise ConfigError(f"--blocks {arguments.blocks}: must be {FEWEST} or more, or nothing is held out")
+    twin, recordings = _recordings(arguments)
+
+    def work() -> Fitted:
+        return fit(twin.estimator, twin.tuning, recordings, wanted=wanted, blocks=arguments.blocks)
+
+    found: Fitted = attend(twin.model, work, "fitting")
+    if arguments.json:
+        print(json.dumps({"twin": twin.name, **fit_json(found)}, allow_nan=False))
+    else:
+        print("\n".join(as_text(sections(twin, found))))
+    if arguments.save is not None and found.proposed:
+        text = heading(twin, found) + tuning_yaml(twin.config, twin.estimator, found.setting.tuning)
+        arguments.save.write_text(text, encoding="utf-8")
+    return 0 if found.proposed else 1
+
+
+def _recordings(arguments: Arguments) -> tuple[Twin, list[Given]]:
+    """The twin, and what it is fitted to: recordings, logs of its simulator, or its own log."""
+    overrides = settings(arguments.set, arguments.estimator)
+    if not arguments.log:
+        twin = load_twin(arguments.twin, overrides=overrides)
+        prepare(twin)
+        return twin, [Given(log) for log in _own(twin, arguments, overrides)]
+    if arguments.logs != 1:
+        raise ConfigError("--logs: is for a simulated twin; a recording is named by --log, once each")
+    named = [_named(text) for text in arguments.log]
+    twins = [load_twin(arguments.twin, log_files=files, overrides=overrides) for files, _ in named]
+    prepare(twins[0])
+    logs = [read_log(twin, arguments.duration)[0] for twin in twins]
+    return twins[0], [Given(log, weight) for log, (_, weight) in zip(logs, named, strict=True)]
+
+
+def _named(text: str) -> tuple[list[Path], float]:
+    """Files and weight of `FILE,FILE@WEIGHT`.
+
+    Raises:
+        ConfigError: If the weight is no positive number.
+    """
+    files, at, weight = text.rpartition("@")
+    if not at:
+        return [Path(part) for part in text.split(",")], 1.0
+    try:
+        number = float(weight)
+    except ValueError:
+        # A file may have such a name.
+        return [Path(part) for part in text.split(",")], 1.0
+    if not 0.0 < number < float("inf"):
+        raise ConfigError(f"--log {text}: the weight is {weight}; it must be positive")
+    return [Path(part) for part in files.split(",")], number
+
+
+def _own(twin: Twin, arguments: Arguments, overrides: dict[str, str]) -> list[Log]:
+    if arguments.logs == 1:
+        return [read_log(twin, arguments.duration)[0]]
+    source = twin.config.source
+    if arguments.logs < 1:
+        raise ConfigError(f"--logs {arguments.logs}: must be 1 or more")
+    if not isinstance(source, SimulatorSection):
+        raise ConfigError(f"--logs {arguments.logs}: {twin.name} is not simulated; name recordings by --log")
+    seeds = range(source.seed, source.seed + arguments.logs)
+    twins = (load_twin(arguments.twin, overrides={**overrides, "source.seed": str(seed)}) for seed in seeds)
+    return [read_log(other, arguments.duration)[0] for other in twins]

@@ -1,0 +1,104 @@
+"""What a fit found, as sections of tables."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimators.diagnostics.sensitivity.words import digits
+from estimators.fit.fit import Fitted, Line
+from estimators.fit.judge import Part, Prediction, Worth
+
+from ..export.parts import Part as Section
+from ..runs.fit_json import correlated
+from ..twin.twin import Twin
+
+ALONE = "left alone: the data cannot tell"
+BOUND = "only a bound: the data cannot tell it from none"
+
+
+def sections(twin: Twin, fitted: Fitted) -> list[Section]:
+    """From top to bottom."""
+    return [_entries(twin, fitted), _scores(fitted), _held_out(fitted), _verdict(fitted)]
+
+
+def heading(twin: Twin, fitted: Fitted) -> str:
+    """Comment above the lines of a tuning that is proposed: what it is, and why it is proposed."""
+    gained = f"{fitted.verdict.gain:+.3g} ± {fitted.verdict.error:.2g} nats a reading on blocks held out"
+    return f"# Fitted by `nisus tune {twin.name}`: {gained}.\n# These sections stand in place of the twin's own.\n"
+
+
+def _number(value: float) -> str:
+    return digits(value) if np.isfinite(value) else "-"
+
+
+def _entries(twin: Twin, fitted: Fitted) -> Section:
+    rows = [
+        (
+            line.key,
+            _number(line.before),
+            _number(line.after),
+            "" if line.alone else f"{_number(line.low)} to {_number(line.high)}",
+            line.unit,
+            _remark(line),
+        )
+        for line in fitted.lines
+    ]
+    rows += [(item.key, "", "", "", "", f"not fitted: {item.reason}") for item in fitted.skipped]
+    pairs = [
+        f"{pair['entries'][0]} with {pair['entries'][1]} ({pair['correlation']:+.2f})" for pair in correlated(fitted)
+    ]
+    said = (f"Hardly told apart: {', '.join(pairs)}.",) if pairs else ()
+    head = ("entry", "before", "after", "95 % interval", "unit", "")
+    return Section(f"{twin.name}: {fitted.estimator}, {fitted.folds} folds", said, head, tuple(rows))
+
+
+def _remark(line: Line) -> str:
+    if line.alone:
+        return ALONE
+    return BOUND if not line.told else ""
+
+
+def _scores(fitted: Fitted) -> Section:
+    def row(what: str, before: Part, after: Part) -> tuple[str, ...]:
+        return (
+            what,
+            f"{before.n:,}",
+            f"{before.log_density:.4f} -> {after.log_density:.4f}",
+            f"{before.nis:.3f} -> {after.nis:.3f}",
+            f"{100 * before.coverage:.1f} -> {100 * after.coverage:.1f} %",
+        )
+
+    rows = [row("fitted", fitted.before.fitted, fitted.after.fitted)]
+    if fitted.before.held_out.n:
+        rows.append(row("held out", fitted.before.held_out, fitted.after.held_out))
+    head = ("blocks", "readings", "log density of a reading, nats", "NIS / dof", "in the 95 % band")
+    return Section("Predictions of the next reading, before and after", (), head, tuple(rows))
+
+
+def _held_out(fitted: Fitted) -> Section:
+    rows: list[tuple[str, ...]] = []
+    for kind, group in (("sensor", "sensors"), ("truth", "states")):
+        rows += _rows(kind, group, fitted.before, fitted.after)
+    head = ("", "", "unit", "RMS", "in the 95 % band", "RMS, blocks held out", "in the 95 % band")
+    return Section("Sensors held out in turn, and what is known to be true, before and after", (), head, tuple(rows))
+
+
+def _rows(kind: str, group: str, before: Worth, after: Worth) -> list[tuple[str, ...]]:
+    def pair(name: str, worths: tuple[Part, Part]) -> tuple[str, str]:
+        old, new = (getattr(part, group).get(name) for part in worths)
+        if not isinstance(old, Prediction) or not isinstance(new, Prediction):
+            return "", ""
+        return f"{_number(old.rms)} -> {_number(new.rms)}", f"{100 * old.coverage:.0f} -> {100 * new.coverage:.0f} %"
+
+    parts = (before.fitted, after.fitted), (before.held_out, after.held_out)
+    names = dict.fromkeys(name for part in parts for name in getattr(part[0], group))
+    units = {name: item.unit for part in parts for name, item in getattr(part[0], group).items()}
+    return [(kind, name, units[name], *pair(name, parts[0]), *pair(name, parts[1])) for name in names]
+
+
+def _verdict(fitted: Fitted) -> Section:
+    verdict = fitted.verdict
+    if verdict.proposed:
+        said = f"Proposed: {verdict.gain:+.3g} ± {verdict.error:.2g} nats a reading on the blocks held out."
+        return Section("Verdict", (said,))
+    return Section("Verdict", ("Not proposed:", *verdict.reasons))

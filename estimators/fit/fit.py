@@ -1,0 +1,236 @@
+"""A fit, from the recordings to what is proposed of it.
+
+The maximum is sought on blocks of time; entries that the data cannot tell go back to what the twin says, and the others
+are fitted again without them; intervals follow from the curvature there. Then blocks and sensors that were held out
+decide whether the result is better than what was: if not, that is what is said, and nothing is proposed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import EstimatorError
+from ..log import READING, Log
+from ..registry import find_estimator
+from ..snapshots import Base
+from ..tuning import Tuning
+from .blocks import BLOCKS, held_out_rows
+from .entries import Entry, Setting, Skipped, entries_of, setting
+from .judge import Worth, worths
+from .laplace import Curvature, curvature
+from .objective import ALONE, Cancelled, Go, Objective, Recording, only_told
+from .optimise import maximise, search
+from .profile import intervals
+from .verdict import Verdict, verdict
+
+TOLD = 0.25
+"""Share of the weak belief's deviation, up to which an entry counts as told by the data: of a variance a factor of 3 in
+its standard deviation."""
+
+CHEAP = 2.0
+"""Nats that it may cost to leave an entry alone which the data cannot tell: what chance gives."""
+
+PASSES = 3
+"""Times that entries are left alone and the others fitted again."""
+
+__all__ = ["Cancelled", "Fitted", "Given", "Line", "Verdict", "fit"]
+
+
+class Given(NamedTuple):
+    """A recording to fit to: its log, how much its readings weigh, and where it starts (None: the prior)."""
+
+    log: Log
+    weight: float = 1.0
+    base: Base | None = None
+
+
+class Line(NamedTuple):
+    """One entry of the result, in its unit: before and after, and the 95 % interval.
+
+    `told` is whether the data tell it; an entry that they do not tell is left alone where that costs nothing, and then
+    `after` is `before`; else only a bound of it is known. `deviation` is that of the estimate, on the logarithm where
+    `log` is true. `profile` says that the interval is by profile likelihood.
+    """
+
+    key: str
+    unit: str
+    before: float
+    after: float
+    low: float
+    high: float
+    deviation: float
+    log: bool
+    told: bool
+    alone: bool
+    profile: bool
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What came of a fit.
+
+    `setting` is the tuning that was found (and the prior, where that was fitted); whether it is proposed says
+    `verdict`. correlation (k, k) is that of the estimates of `lines`, NaN for those left alone.
+    """
+
+    estimator: str
+    setting: Setting
+    lines: tuple[Line, ...]
+    skipped: tuple[Skipped, ...]
+    correlation: np.ndarray
+    before: Worth
+    after: Worth
+    verdict: Verdict
+    folds: int
+
+    @property
+    def proposed(self) -> bool:
+        """Whether it won on what was held out."""
+        return self.verdict.proposed
+
+
+def fit(
+    estimator: str,
+    tuning: Tuning,
+    recordings: Sequence[Given],
+    *,
+    wanted: Sequence[str] = ("Q", "R"),
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    blocks: int = BLOCKS,
+    go: Go = lambda folds: True,
+) -> Fitted:
+    """Fit entries of a tuning to recordings.
+
+    Args:
+        estimator: The filter.
+        tuning: Where it starts, and what is weakly believed.
+        recordings: They must not grow meanwhile (give copies).
+        wanted: Keys and groups, see `entries_of`.
+        bounds: Least and greatest value by key.
+        blocks: Blocks of time into which each recording is cut; every third is held out. 0 holds none out: then nothing
+            is judged, and nothing proposed.
+        go: Called from any thread with the number of folds that were done more; says whether to go on.
+
+    Raises:
+        Cancelled: If `go` says so.
+        ConfigError: If nothing that was asked for can be fitted.
+        EstimatorError: As `Fold`; if there is nothing to fit to.
+    """
+    done = [0]
+
+    def count(folds: int) -> bool:
+        done[0] += folds
+        return go(folds)
+
+    for given in recordings:
+        if not np.any(given.log.kind[: given.log.n] == READING):
+            raise EstimatorError("a recording has no reading; there is nothing to fit to")
+    entries, skipped = entries_of(estimator, tuning, [given.log for given in recordings], wanted, bounds)
+    whole = [Recording(g.log, g.weight, held_out_rows(g.log, blocks), g.base) for g in recordings]
+    lean = [Recording(log, g.weight, held_out_rows(log, blocks), g.base) for g, log in _lean(recordings)]
+    objective = Objective(estimator, tuning, tuple(entries), tuple(lean), go=count)
+    draws = find_estimator(estimator, tuning.model).family in ALONE
+    best = search if draws else maximise
+    x, value = best(objective, objective.start)
+    shape = curvature(objective, x)
+    kept = objective
+    told = _told(kept, shape)
+    alone: list[Entry] = []
+    for _ in range(PASSES):
+        leave = _leave(kept, x, value, shape, told)
+        if not leave:
+            break
+        alone += [kept.entries[i] for i in leave]
+        if len(leave) == x.size:
+            x = np.zeros(0)
+            kept = kept.pinned(leave, kept.start)
+            break
+        start = np.where(np.isin(np.arange(x.size), leave), kept.start, x)
+        kept = kept.pinned(leave, start)
+        x, value = best(kept, np.delete(start, leave))
+        shape = curvature(kept, x)
+        told = _told(kept, shape)
+    lines, correlation = _lines(objective, kept, x, value, shape, told, alone)
+    after = setting(tuning, kept.entries, x)
+    one, other = worths(estimator, [Setting(tuning, None), after], whole, count)
+    return Fitted(
+        estimator=estimator,
+        setting=after,
+        lines=lines,
+        skipped=tuple(skipped),
+        correlation=correlation,
+        before=one,
+        after=other,
+        verdict=verdict(one, other, changed=x.size > 0),
+        folds=done[0],
+    )
+
+
+def _lean(recordings: Sequence[Given]) -> list[tuple[Given, Log]]:
+    return [(given, only_told(given.log)) for given in recordings]
+
+
+def _told(objective: Objective, shape: Curvature) -> np.ndarray:
+    deviations = np.array([item.deviation for item in objective.entries])
+    found: np.ndarray = shape.deviation <= TOLD * deviations
+    return found
+
+
+def _leave(objective: Objective, x: np.ndarray, value: float, shape: Curvature, told: np.ndarray) -> list[int]:
+    """Entries that the data do not tell, and which can go back to where they were at no cost."""
+    loose = np.flatnonzero(~told)
+    if not loose.size:
+        return []
+    low, high = np.array(objective.limits).T
+    # All others follow, as far as the parabola holds; then what it costs is known for certain, from above.
+    lines = shape.cov / np.diag(shape.cov)[:, None]
+    points = [np.clip(x + (objective.start[i] - x[i]) * lines[i], low, high) for i in loose]
+    found = objective.all_terms(points)
+    costs = [value - terms.sum() + objective.penalty(p) for p, terms in zip(points, found, strict=True)]
+    return [int(i) for i, cost in zip(loose, costs, strict=True) if cost <= CHEAP * shape.widened[i] ** 2]
+
+
+def _lines(
+    whole: Objective, kept: Objective, x: np.ndarray, value: float, shape: Curvature, told: np.ndarray,
+    alone: Sequence[Entry],
+) -> tuple[tuple[Line, ...], np.ndarray]:  # fmt: skip
+    """Of every entry that was asked for, those left alone too, in the order in which they were; and correlations."""
+    ends, profiled = intervals(kept, x, value, shape) if x.size else (np.zeros((0, 2)), np.zeros(0, bool))
+    place = {item.key: i for i, item in enumerate(kept.entries)} if x.size else {}
+    lines = []
+    for item in whole.entries:
+        i = place.get(item.key)
+        line = Line(
+            key=item.key,
+            unit=item.unit,
+            before=item.start,
+            after=item.start,
+            low=np.nan,
+            high=np.nan,
+            deviation=np.nan,
+            log=item.log,
+            told=False,
+            alone=True,
+            profile=False,
+        )
+        if i is not None:
+            line = line._replace(
+                after=item.outward(float(x[i])),
+                low=item.outward(float(ends[i, 0])),
+                high=item.outward(float(ends[i, 1])),
+                deviation=float(shape.deviation[i]),
+                told=bool(told[i]),
+                alone=False,
+                profile=bool(profiled[i]),
+            )
+        lines.append(line)
+    correlation = np.full((len(lines), len(lines)), np.nan)
+    rows = [k for k, item in enumerate(whole.entries) if item.key in place]
+    if rows:
+        order = [place[whole.entries[k].key] for k in rows]
+        correlation[np.ix_(rows, rows)] = shape.correlation[np.ix_(order, order)]
+    return tuple(lines), correlation

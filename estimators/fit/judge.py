@@ -1,0 +1,209 @@
+"""What a tuning is worth, on the readings that it was fitted to and on those that were held out.
+
+Four judges, none of which the fit has seen: the density of the readings of blocks held out, the readings of each sensor
+in turn predicted by the others, the coverage of the predictions, and, where a recording knows it, the true state. A
+prediction that is held out is judged by the continuous ranked probability score, which is proper, in its unit, and not
+carried away by a single reading:
+
+    CRPS(N(m, s²), y) = s (z (2 Φ(z) - 1) + 2 φ(z) - 1/√π),    z = (y - m) / s
+
+Source: Gneiting & Raftery (2007), doi:10.1198/016214506000001437, (21).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import ndtr
+
+from ..diagnostics.innovation_size import mean_nis
+from ..diagnostics.sensitivity.responses import each
+from ..fold import Fold
+from ..log import READING, truth_of
+from ..model.state_space import StateSpaceModel
+from ..registry import find_estimator
+from ..track import HELD_OUT, USED, Track
+from .entries import Setting
+from .objective import ALONE, Cancelled, Go, Recording, densities
+
+Z = 1.959963984540054
+
+BATCHES = 20
+"""Batches of time over which a difference is averaged, to know how much of it is chance."""
+
+
+class Prediction(NamedTuple):
+    """How something that was not used was predicted, n times.
+
+    Root mean square error and mean CRPS are in `unit`, coverage is the share of errors inside the 95 % band; `scores`
+    (n,) are the single CRPS.
+    """
+
+    unit: str
+    n: int
+    rms: float
+    coverage: float
+    crps: float
+    scores: np.ndarray
+
+
+class Part(NamedTuple):
+    """What the readings of one part of the recordings say.
+
+    How many they are, mean log density of one, mean NIS a degree of freedom, share of innovations inside their 95 %
+    band. `terms` (n,) are the single log densities. `sensors` are those held out in turn, `states` those whose truth is
+    known, by name.
+    """
+
+    n: int
+    log_density: float
+    nis: float
+    coverage: float
+    terms: np.ndarray
+    sensors: dict[str, Prediction]
+    states: dict[str, Prediction]
+
+
+class Worth(NamedTuple):
+    """The part that was fitted to, and the part that was held out."""
+
+    fitted: Part
+    held_out: Part
+
+
+def crps(error: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Continuous ranked probability score of a Gaussian, (n,), of its error and standard deviation."""
+    z = error / std
+    density = np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
+    found: np.ndarray = std * (z * (2.0 * ndtr(z) - 1.0) + 2.0 * density - 1.0 / np.sqrt(np.pi))
+    return found
+
+
+def worths(estimator: str, settings: Sequence[Setting], recordings: Sequence[Recording], go: Go) -> list[Worth]:
+    """What each setting is worth.
+
+    Args:
+        estimator: Of all.
+        settings: Tunings and priors.
+        recordings: With the truth, where it is known.
+        go: Told of each fold.
+
+    Raises:
+        Cancelled: If `go` says so.
+    """
+    model = settings[0].tuning.model
+    sensors = _in_turn(settings[0], recordings)
+    jobs = [(setting, record, s) for setting in settings for record in recordings for s in (None, *sensors)]
+
+    def run(job: tuple[Setting, Recording, int | None]) -> Track:
+        (tuning, prior), record, s = job
+        if s is not None:
+            tuning = tuning.set(f"use.{model.sensor_names[s]}", False)
+        fold = Fold(estimator, model, tuning, record.log, base=record.base, prior=prior)
+        fold.advance()
+        if not go(1):
+            raise Cancelled
+        return fold.track
+
+    alone = find_estimator(estimator, model).family in ALONE
+    tracks = iter(each(run, jobs, None if alone else "threads"))
+    found = []
+    for setting in settings:
+        taken = [(record, [next(tracks) for _ in (None, *sensors)]) for record in recordings]
+        fitted, held = (_part(model, setting, sensors, taken, wanted) for wanted in (False, True))
+        found.append(Worth(fitted, held))
+    return found
+
+
+def gain(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
+    """Mean of after less before (n,), and its standard error from batches of time."""
+    difference = after - before
+    n = difference.size
+    if n < 2 * BATCHES:
+        return float(difference.mean()) if n else 0.0, float(difference.std() / np.sqrt(max(1, n - 1)))
+    means = np.array([batch.mean() for batch in np.array_split(difference, BATCHES)])
+    return float(difference.mean()), float(means.std(ddof=1) / np.sqrt(BATCHES))
+
+
+def _in_turn(setting: Setting, recordings: Sequence[Recording]) -> list[int]:
+    """Sensors that are used and speak; none if there is only one, without which nothing is told."""
+    speak: set[int] = set()
+    for record in recordings:
+        log = record.log
+        speak |= set(np.unique(log.channel[: log.n][log.kind[: log.n] == READING]).tolist())
+    sensors = sorted(int(s) for s in speak if setting.tuning.used[s])
+    return sensors if len(sensors) > 1 else []
+
+
+def _part(
+    model: StateSpaceModel, setting: Setting, sensors: list[int], taken: list[tuple[Recording, list[Track]]],
+    held_out: bool,
+) -> Part:  # fmt: skip
+    terms, normal, nis = [], [], []
+    errors: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+    truths: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+    for record, (track, *others) in taken:
+        log = record.log
+        wanted = record.held_out == held_out
+        reading = wanted & (log.kind[: log.n] == READING)
+        values = densities(track, setting.tuning.gate)
+        terms.append(values[reading])
+        used = wanted & (track.verdict == USED)
+        normal.append((track.innovation[used] / track.innovation_std[used]).ravel())
+        nis.append(track.select(wanted))
+        for s, other in zip(sensors, others, strict=True):
+            own = reading & (log.channel[: log.n] == s) & (other.verdict == HELD_OUT)
+            for k in range(len(model.sensors[s].rows)):
+                name = model.row_names[model.row_start[s] + k]
+                _collect(errors, name, other.innovation[own, k], other.innovation_std[own, k])
+        for column, (j, state) in enumerate(zip(model.shown, model.shown_states, strict=True)):
+            rows, true = truth_of(log.events, int(j))
+            kept = wanted[rows]
+            if kept.any():
+                error = true[kept] - track.mean[rows[kept], column]
+                if state.circular:
+                    error = (error + np.pi) % (2.0 * np.pi) - np.pi
+                _collect(truths, state.name, error, track.std[rows[kept], column])
+    every, inside = np.concatenate(terms), np.concatenate(normal)
+    inside = inside[np.isfinite(inside)]
+    weights = [len(track) for track in nis]
+    units = dict(zip(model.row_names, (row.unit for sensor in model.sensors for row in sensor.rows), strict=True))
+    units_of = {state.name: state.unit for state in model.shown_states}
+    return Part(
+        n=every.size,
+        log_density=float(every.mean()) if every.size else np.nan,
+        nis=_mean_nis(nis, weights, setting.tuning.gate),
+        coverage=float(np.mean(np.abs(inside) <= Z)) if inside.size else np.nan,
+        terms=every,
+        sensors={name: _prediction(units[name], pairs) for name, pairs in errors.items()},
+        states={name: _prediction(units_of[name], pairs) for name, pairs in truths.items()},
+    )
+
+
+def _mean_nis(tracks: list[Track], weights: list[int], gate: float | None) -> float:
+    values = np.array([mean_nis(track, gate) for track in tracks])
+    kept = np.isfinite(values)
+    return float(np.average(values[kept], weights=np.array(weights)[kept])) if kept.any() else np.nan
+
+
+def _collect(
+    into: dict[str, list[tuple[np.ndarray, np.ndarray]]], name: str, error: np.ndarray, std: np.ndarray
+) -> None:
+    finite = np.isfinite(error) & (std > 0.0)
+    if finite.any():
+        into.setdefault(name, []).append((error[finite], std[finite]))
+
+
+def _prediction(unit: str, pairs: list[tuple[np.ndarray, np.ndarray]]) -> Prediction:
+    error, std = (np.concatenate([pair[k] for pair in pairs]) for k in (0, 1))
+    scores = crps(error, std)
+    return Prediction(
+        unit,
+        error.size,
+        float(np.sqrt(np.mean(error**2))),
+        float(np.mean(np.abs(error) <= Z * std)),
+        float(scores.mean()),
+        scores,
+    )

@@ -1,0 +1,66 @@
+"""Whether a fit is proposed: what was held out decides, not what it was fitted to."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from .judge import Prediction, Worth, gain
+
+SURE = 2.0
+"""Standard errors that a gain must exceed, and a loss before it counts."""
+
+WORSE = 0.05
+"""Share by which the score of a held-out prediction may grow before it counts."""
+
+COVERED = 0.9
+"""Coverage of a 95 % band from which on it is not too narrow."""
+
+NARROWER = 0.05
+"""Coverage that may be lost before it counts, where it is below `COVERED`."""
+
+
+class Verdict(NamedTuple):
+    """Whether the fit is proposed.
+
+    With the gain in nats a reading on the blocks held out, its standard error, and the reasons against it.
+    """
+
+    proposed: bool
+    gain: float
+    error: float
+    reasons: tuple[str, ...]
+
+
+def verdict(before: Worth, after: Worth, *, changed: bool = True) -> Verdict:
+    """Judge by the part that was held out."""
+    one, other = before.held_out, after.held_out
+    if not changed:
+        return Verdict(False, 0.0, 0.0, ("the data tell none of the entries",))
+    if not one.n:
+        return Verdict(False, np.nan, np.nan, ("nothing was held out, so nothing judges it",))
+    mean, error = gain(one.terms, other.terms)
+    reasons = []
+    if not mean > SURE * error:
+        reasons.append(f"it does not predict the blocks held out better: {mean:+.3g} ± {error:.2g} nats a reading")
+    for kind, olds, news in (
+        ("sensor", one.sensors, other.sensors), ("true state", one.states, other.states)
+    ):  # fmt: skip
+        for name, old in olds.items():
+            if name in news:
+                reasons += _against(f"{kind} {name}, held out,", old, news[name])
+    return Verdict(not reasons, mean, error, tuple(reasons))
+
+
+def _against(what: str, old: Prediction, new: Prediction) -> list[str]:
+    """What speaks against the new prediction."""
+    if old.n != new.n:
+        return [f"{what} could not be predicted at {abs(old.n - new.n)} readings"]
+    mean, error = gain(old.scores, new.scores)
+    found = []
+    if mean > WORSE * old.crps and mean > SURE * error:
+        found.append(f"{what} is predicted worse: RMS {new.rms:.3g} {new.unit} after {old.rms:.3g}".replace(" .", "."))
+    if new.coverage < COVERED and new.coverage < old.coverage - NARROWER:
+        found.append(f"{what} leaves its band: {100 * new.coverage:.0f} % inside after {100 * old.coverage:.0f} %")
+    return found

@@ -1,0 +1,192 @@
+"""`python -m tests.benchmarks.recovery`: are the values that made simulated logs found again, in their 95 % intervals?
+
+Each twin's simulator is given other noises and parameters than its YAML believes, and an initial state drawn from the
+prior. Every log is fitted from what the YAML says, and counts whether each true value lies in its interval; an entry
+that a fit leaves alone has none, and is counted apart. With the next log's readings, to which it was not fitted, the
+fitted tuning must have its NIS and coverage in their bounds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from app.cli.fold import read_log
+from app.twin.twin import Twin, load_twin
+from estimators.diagnostics.score import score
+from estimators.fit.fit import Given, fit
+from estimators.fold import Fold
+from estimators.log import Log
+
+Z = 1.959963984540054
+
+
+@dataclass(frozen=True)
+class Case:
+    """A twin, how its simulator differs from what the YAML believes, and what is fitted.
+
+    `truth` has the true values by key; `more` are further overrides of the YAML.
+    """
+
+    twin: str
+    estimator: str
+    truth: Mapping[str, float]
+    duration: float
+    more: Mapping[str, str] = field(default_factory=dict)
+    rows: Mapping[str, int] = field(default_factory=dict)
+
+    def overrides(self, seed: int) -> dict[str, str]:
+        """Of the YAML."""
+        noise = {key[2:]: {"variance": value} for key, value in self.truth.items() if key.startswith("Q.")}
+        parameters = {key[2:]: value for key, value in self.truth.items() if key.startswith("p.")}
+        sensors = {key[2:]: float(np.sqrt(value)) for key, value in self.truth.items() if key.startswith("R.")}
+        found = {
+            **self.more,
+            "estimator": json.dumps(self.estimator),
+            "source.seed": str(1000 + seed),
+            "source.duration": str(self.duration),
+            "source.truth.noise": json.dumps(noise),
+        }
+        if parameters:
+            found["source.truth.parameters"] = json.dumps(parameters)
+        return found | {f"source.sensors.{name}.std": str(std) for name, std in sensors.items()}
+
+
+CASES = (
+    Case(
+        "motor_winding",
+        "kf",
+        {"Q.temperature": 0.2, "Q.rate": 3e-4, "R.winding": 2.0},
+        1500.0,
+    ),
+    Case(
+        "motor_joint",
+        "ukf",
+        {
+            "Q.winding": 0.02, "Q.tooth": 0.004, "Q.yoke": 0.003, "Q.magnet": 0.004,
+            "R.winding": 0.1, "R.tooth": 0.4, "R.yoke": 0.15,
+            "p.copper_resistance": 0.0115, "p.yoke_coolant": 0.036,
+        },
+        900.0,
+        {"estimate": "{}", "source.initial": "{}", "view.pairs": "[[winding, magnet]]"},
+    ),
+    Case(
+        "lorenz63",
+        "ekf",
+        {"Q.x": 0.4, "Q.y": 0.9, "Q.z": 0.5, "R.position": 1.0, "p.sigma": 9.6, "p.rho": 28.4, "p.beta": 2.72},
+        60.0,
+        {"source.sensors": "{position: {every: 1}}", "noise": "{x: {variance: 0.2}, y: {variance: 0.2}, z: {variance: 0.2}}"},
+    ),
+    Case(
+        "battery_pack",
+        "ekf",
+        {"Q.v1": 4e-6, "Q.temperature": 4e-4, "R.voltage": 2e-5, "R.temperature": 0.04, "p.r0_5": 0.046, "p.r0_1": 0.033},
+        600.0,
+        {"noise.soc": "{variance: 1e-9}"},
+    ),
+    Case(
+        "lorenz96",
+        "ekf",
+        {"Q.x": 0.02, "R.stations": 0.5, "p.forcing": 8.2},
+        30.0,
+        {"noise.x": "{variance: 0.01}"},
+    ),
+)  # fmt: skip
+
+
+def logs_of(case: Case, count: int) -> tuple[Twin, list[Log]]:
+    """The twin, and so many logs of its simulator, each from an initial state that is drawn from the prior."""
+    twin = load_twin(case.twin, overrides=case.overrides(0))
+    logs = []
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        model = twin.model
+        initial = {
+            name: float(value)
+            for name, value in zip(model.state_names, rng.normal(model.prior_mean, model.prior_std), strict=True)
+        }
+        overrides = {**case.overrides(seed), "source.initial": json.dumps(initial)}
+        logs.append(read_log(load_twin(case.twin, overrides=overrides), None)[0])
+    return twin, logs
+
+
+@dataclass
+class Recovered:
+    """Counts of one case: by key how often an interval held the truth, how often there was one, and its widths."""
+
+    inside: dict[str, int] = field(default_factory=dict)
+    told: dict[str, int] = field(default_factory=dict)
+    width: dict[str, list[float]] = field(default_factory=dict)
+    middle: dict[str, list[float]] = field(default_factory=dict)
+    consistent: int = 0
+    coverage: list[float] = field(default_factory=list)
+    folds: int = 0
+    logs: int = 0
+
+    def share(self) -> float:
+        """Of all intervals, those that hold the truth."""
+        return sum(self.inside.values()) / max(1, sum(self.told.values()))
+
+
+def recover(case: Case, count: int) -> Recovered:
+    """Fit every log, and look where the truth lies."""
+    twin, logs = logs_of(case, count)
+    found = Recovered(logs=count)
+    for k, log in enumerate(logs):
+        fitted = fit(twin.estimator, twin.tuning, [Given(log)], wanted=list(case.truth), blocks=0)
+        found.folds += fitted.folds
+        for line in fitted.lines:
+            truth = case.truth[line.key]
+            if line.alone:
+                continue
+            found.told[line.key] = found.told.get(line.key, 0) + 1
+            found.inside[line.key] = found.inside.get(line.key, 0) + (line.low <= truth <= line.high)
+            found.width.setdefault(line.key, []).append(line.high / line.low)
+            found.middle.setdefault(line.key, []).append(line.after)
+        other = logs[(k + 1) % count]
+        fold = Fold(twin.estimator, twin.model, fitted.setting.tuning, other)
+        fold.advance()
+        result = score(fold.track, other.events, twin.model, gate=twin.tuning.gate)
+        # Bounds of 99 %, since a fit has chance of its own.
+        half = 2.576 / 1.96 * 0.5 * (result.nis_high - result.nis_low)
+        found.consistent += abs(result.nis - 0.5 * (result.nis_high + result.nis_low)) <= half
+        found.coverage.append(float(np.mean([item.coverage for item in result.states.values()])))
+    return found
+
+
+def lines(case: Case, found: Recovered) -> list[str]:
+    """What is printed of a case."""
+    text = [
+        f"{case.twin}, {case.estimator}: {found.logs} logs, {found.folds / found.logs:.0f} folds each; "
+        f"{100 * found.share():.1f} % of the intervals hold the truth; on the next log NIS in its 99 % bounds "
+        f"{found.consistent} of {found.logs}, states in their 95 % band {100 * np.mean(found.coverage):.1f} %",
+        f"  {'entry':22} {'truth':>10} {'median':>10} {'inside':>8} {'told':>5}  high/low",
+    ]
+    for key, truth in case.truth.items():
+        if key in found.told:
+            text.append(
+                f"  {key:22} {truth:10.4g} {np.median(found.middle[key]):10.4g} "
+                f"{found.inside[key]:4d}/{found.told[key]:<3d} {found.told[key]:5d}  {np.median(found.width[key]):.3g}"
+            )
+        else:
+            text.append(f"  {key:22} {truth:10.4g} {'':>10} {'':>8} {0:5d}")
+    return text
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("twins", nargs="*", help="only these")
+    parser.add_argument("--logs", type=int, default=50)
+    arguments = parser.parse_args()
+    for case in CASES:
+        if not arguments.twins or case.twin in arguments.twins:
+            print("\n".join(lines(case, recover(case, arguments.logs))), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,198 @@
+"""A fit against the dense joint Gaussian of a random walk, maximised by another route; what is left alone; what judges.
+
+The walk x_k = a x_k-1 + w, y_k = x_k + v has y ~ N(H m, H P Hᵀ + R) as a whole, with no filter anywhere.
+"""
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_triangular
+from scipy.optimize import brentq, minimize
+
+from estimators.errors import ConfigError
+from estimators.fit.blocks import held_out_rows
+from estimators.fit.entries import entries_of
+from estimators.fit.fit import Cancelled, Given, fit
+from estimators.fit.objective import Objective, Recording, only_told
+from estimators.log import READING, Log
+from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from estimators.tuning import Tuning
+
+DECADES = 2.0 * np.log(10.0)
+"""Deviation of the weak belief in a variance."""
+
+
+def walk(x, u, p, dt, out):
+    out[0] = x[0] * (1.0 - dt * p[0])
+
+
+def level(x, u, p, out):
+    out[0] = x[0] + p[1]
+
+
+MODEL = StateSpaceModel(
+    name="walk",
+    title="a walk that returns",
+    states=(State("level", "m", 0.0, 2.0),),
+    parameters=(Parameter("rate", "1/s", 0.1, 0.0, 1.0), Parameter("offset", "m", 0.0, -5.0, 5.0)),
+    noises=(Noise("level", "m²/s", 0.5),),
+    sensors=(
+        Sensor("float", (Row("float", "m", 1.0),), h=level),
+        Sensor("silent", (Row("silent", "m", 1.0),), h=level),
+    ),
+    f=walk,
+    linear=True,
+)
+
+
+def simulated(seed: int, n: int, q: float = 0.2, r: float = 0.5, rate: float = 0.1) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    x, ys = rng.normal(0.0, 2.0), np.empty(n)
+    for k in range(n):
+        if k:
+            x = (1.0 - rate) * x + rng.normal(0.0, np.sqrt(q))
+        ys[k] = x + rng.normal(0.0, np.sqrt(r))
+    return ys
+
+
+def log_of(ys: np.ndarray) -> Log:
+    log = Log.of(MODEL)
+    log.add("float", np.arange(ys.size, dtype=float), ys)
+    return log
+
+
+def dense(ys: np.ndarray, q: float, r: float, rate: float = 0.1) -> float:
+    """Log density of all readings at once."""
+    n, a = ys.size, 1.0 - rate
+    variance = np.empty(n)
+    variance[0] = 4.0
+    for k in range(1, n):
+        variance[k] = a * a * variance[k - 1] + q
+    i, j = np.indices((n, n))
+    factor = np.linalg.cholesky(a ** np.abs(i - j) * variance[np.minimum(i, j)] + r * np.eye(n))
+    z = solve_triangular(factor, ys, lower=True)
+    return float(-0.5 * z @ z - np.log(np.diag(factor)).sum() - 0.5 * n * np.log(2.0 * np.pi))
+
+
+def penalised(ys: np.ndarray, x: np.ndarray) -> float:
+    """As the fit has it, of the logarithms of q and r, which start at 0.5 and 1."""
+    start = np.log([0.5, 1.0])
+    return dense(ys, *np.exp(x)) - 0.5 * float(np.sum(((x - start) / DECADES) ** 2))
+
+
+@pytest.fixture(scope="module")
+def ys():
+    return simulated(1, 150)
+
+
+@pytest.fixture(scope="module")
+def best(ys):
+    return minimize(lambda x: -penalised(ys, x), np.log([0.3, 0.4]), method="Nelder-Mead", options={"xatol": 1e-6}).x
+
+
+@pytest.fixture(scope="module")
+def fitted(ys):
+    return fit("kf", Tuning.of(MODEL), [Given(log_of(ys))], wanted=("Q", "R"), blocks=0)
+
+
+def test_the_objective_is_the_joint_density(ys):
+    tuning, log = Tuning.of(MODEL), log_of(ys)
+    entries, _ = entries_of("kf", tuning, [log], ("Q", "R"))
+    objective = Objective("kf", tuning, tuple(entries), (Recording(log, 1.0, np.zeros(log.n, bool)),))
+    for x in (np.log([0.5, 1.0]), np.log([0.01, 3.0])):
+        # Rounding of 150 terms, each exact to 1e-12.
+        assert objective.value(x) == pytest.approx(penalised(ys, x), abs=1e-8)
+
+
+def test_the_maximum_is_that_of_the_joint_density(fitted, best):
+    after = np.log([line.after for line in fitted.lines])
+    # The optimiser stops within 0.02 deviations of the maximum; the other one is exact to 1e-4.
+    deviation = np.array([line.deviation for line in fitted.lines])
+    assert np.all(np.abs(after - best) < 0.05 * deviation)
+
+
+def test_intervals_are_where_the_profile_of_the_joint_density_has_dropped(fitted, best, ys):
+    top = penalised(ys, best)
+
+    def dropped(t, i):
+        other = minimize(lambda z: -penalised(ys, np.insert(z, i, t)), best[1 - i : 2 - i], method="Nelder-Mead")
+        return 2.0 * (top + other.fun) - 1.96**2
+
+    for i, line in enumerate(fitted.lines):
+        for end, far in ((line.low, -3.0), (line.high, 3.0)):
+            exact = brentq(dropped, best[i], best[i] + far, args=(i,), xtol=1e-3)
+            # A parabola is believed where its root is right to 20 %.
+            assert abs(np.log(end) - exact) < 0.2 * abs(exact - best[i])
+
+
+def test_a_sensor_that_says_nothing_is_not_fitted(fitted):
+    assert [item.key for item in fitted.skipped] == ["R.silent"]
+    assert "says nothing" in fitted.skipped[0].reason
+
+
+def test_what_the_data_cannot_tell_is_left_alone(ys):
+    # Twelve readings of a walk say next to nothing of the rate at which it returns.
+    found = fit("kf", Tuning.of(MODEL), [Given(log_of(ys[:12]))], wanted=("Q", "p.rate"), blocks=0)
+    line = {line.key: line for line in found.lines}["p.rate"]
+    assert line.alone and not line.told and line.after == line.before
+
+
+def test_without_blocks_held_out_nothing_is_proposed(fitted):
+    assert not fitted.proposed and "nothing was held out" in fitted.verdict.reasons[0]
+
+
+def test_a_tuning_that_is_wrong_is_replaced():
+    wrong = Tuning.of(MODEL).set("Q.level", 0.005).set("R.float", 8.0)
+    found = fit("kf", wrong, [Given(log_of(simulated(2, 600)))], wanted=("Q", "R"))
+    assert found.proposed
+    assert found.after.held_out.log_density > found.before.held_out.log_density
+    for line, truth in zip(found.lines, (0.2, 0.5), strict=True):
+        assert line.low < truth < line.high
+
+
+def test_a_tuning_that_is_right_stays():
+    right = Tuning.of(MODEL).set("Q.level", 0.2).set("R.float", 0.5)
+    proposed = [fit("kf", right, [Given(log_of(simulated(seed, 300)))]).proposed for seed in range(10)]
+    # Two standard errors are exceeded by chance once in 40.
+    assert sum(proposed) <= 1
+
+
+def test_several_logs_weigh_as_they_should(ys):
+    one = fit("kf", Tuning.of(MODEL), [Given(log_of(ys), 2.0)], blocks=0)
+    two = fit("kf", Tuning.of(MODEL), [Given(log_of(ys)), Given(log_of(ys))], blocks=0)
+    for line, other in zip(one.lines, two.lines, strict=True):
+        # Each is within 0.02 deviations of the one maximum.
+        assert abs(np.log(line.after / other.after)) < 0.05 * line.deviation
+
+
+def test_a_fit_can_be_cancelled(ys):
+    told = []
+
+    def go(folds):
+        told.append(folds)
+        return len(told) < 5
+
+    with pytest.raises(Cancelled):
+        fit("kf", Tuning.of(MODEL), [Given(log_of(ys))], go=go)
+    # Those under way on other threads may still say so.
+    assert len(told) < 15
+
+
+def test_blocks_are_of_one_length_and_the_last_is_held_out(ys):
+    log = log_of(ys)
+    log.add_truth([500.0], level=1.0)
+    held = held_out_rows(log, 9)
+    # 150 readings in 9 blocks are 16 or 17 each; every third of them.
+    lengths = np.diff(np.flatnonzero(np.diff(held[:-1], prepend=False, append=False)))[::2]
+    assert lengths.size == 3 and set(lengths.tolist()) <= {16, 17} and held[-1] and not held[0]
+
+
+def test_queries_are_no_part_of_what_is_folded_again(ys):
+    log = log_of(ys)
+    log.add_truth(np.arange(150.0) + 0.5, level=ys)
+    lean = only_told(log)
+    assert lean.n == 150 and np.all(lean.kind[:150] == READING) and log.n == 300
+
+
+def test_an_entry_that_is_none_is_refused(ys):
+    with pytest.raises(ConfigError, match="R.flot is no entry that can be fitted; did you mean R.float"):
+        fit("kf", Tuning.of(MODEL), [Given(log_of(ys))], wanted=("R.flot",))
