@@ -28,6 +28,7 @@ from .arguments import (
     Run,
     Schema,
     Stress,
+    Tunings,
     Twins,
 )
 
@@ -74,6 +75,10 @@ def carry_out(command: Command) -> int:
         from .twins import show_twins
 
         return show_twins(command)
+    if isinstance(command, Tunings):
+        from .tunings import tunings_of
+
+        return tunings_of(command)
     if isinstance(command, Schema):
         from config.json_schema import json_schema_text
 
