@@ -13,8 +13,10 @@ from pydantic import ValidationError
 
 from estimators.errors import ConfigError, nearest
 
+from .files import read_text, shown_path
 from .problems import report, shown
 from .schema import TwinSection
+from .tunings import Version, find_version, keep_options, overlay
 from .yaml_lines import Key, Places, dotted, parse
 
 TWINS = Path(str(resources.files("config"))) / "twins"
@@ -23,12 +25,18 @@ TWINS = Path(str(resources.files("config"))) / "twins"
 
 @dataclass(frozen=True)
 class Loaded:
-    """A twin's checked configuration, the text it came from, and the place of each of its values."""
+    """A twin's checked configuration, the text it came from, and the place of each of its values.
+
+    `version` is the tuning version whose values stand in place of the text's, and `without` the same file without them:
+    an asset that is simulated by what the twin believes is no other one for what its estimator assumes. None for none.
+    """
 
     config: TwinSection
     path: Path
     text: str
     places: Places
+    version: Version | None = None
+    without: Loaded | None = None
 
     def error(self, key: Key, text: str) -> ConfigError:
         """An error about the value at `key`, which `text` goes on to describe."""
@@ -60,46 +68,31 @@ def find(name: str | os.PathLike[str]) -> Path:
     return path
 
 
-def shown_path(path: Path) -> str:
-    """A path as messages show it: relative to the working directory where it lies inside."""
-    try:
-        return str(path.absolute().relative_to(Path.cwd()))
-    except (ValueError, OSError):
-        return str(path)
-
-
 def load(name: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> Loaded:
     """Read and check a twin's YAML.
 
     Args:
         name: Name of a twin that ships, or path of a YAML file.
-        overrides: Values by dotted key path (source.interface), as YAML text, which replace the file's.
+        overrides: Values by dotted key path (source.interface), as YAML text, which replace the file's; under `tuning`
+            the name or path of a tuning version, whose values they replace too.
 
     Raises:
         ConfigError: With a line for each of the first problems.
     """
     path = find(name)
-    shown_name = shown_path(path)
-    try:
-        if not path.is_file() and not path.is_dir() and path.exists():
-            raise ConfigError(f"{shown_name}: it is a pipe or a device, which may never end; give a file")
-        raw = path.read_bytes()
-    except FileNotFoundError:
-        raise ConfigError(f"{shown_name}: there is no such file; check the path, or see `nisus twins`") from None
-    except IsADirectoryError:
-        raise ConfigError(f"{shown_name}: it is a folder; give the YAML file in it") from None
-    except OSError as error:
-        raise ConfigError(f"{shown_name}: it cannot be read: {error.strerror}; check its permissions") from None
-    try:
-        text = raw.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = raw.count(b"\n", 0, error.start) + 1
-        raise ConfigError(f"{shown_name}:{line}: it is not UTF-8 text; is this the YAML file?") from None
-    return load_text(text, path, overrides)
+    text = read_text(path, "nisus twins")
+    given = dict(overrides or {})
+    reference = given.pop("tuning", None)
+    version = None if reference is None else find_version(path, reference)
+    return load_text(text, path, given, version)
 
 
-def load_text(text: str, path: Path, overrides: Mapping[str, str] | None = None) -> Loaded:
+def load_text(
+    text: str, path: Path, overrides: Mapping[str, str] | None = None, version: Version | None = None
+) -> Loaded:
     """Check a twin's YAML that has been read already; relative paths in it start at the folder of `path`.
+
+    The values of a tuning version are put in place of its own, and the overrides in place of both.
 
     Raises:
         ConfigError: With a line for each of the first problems.
@@ -110,6 +103,8 @@ def load_text(text: str, path: Path, overrides: Mapping[str, str] | None = None)
         raise ConfigError(f"{file}:1: the file is empty; a twin needs at least model and source")
     if not isinstance(data, dict):
         raise ConfigError(f"{file}:1: the file is {shown(data)}; it must be a mapping of keys and values")
+    if version is not None:
+        overlay(data, places, version)
     # First what is named as a whole, then what is in it: a filter, then its options.
     for key, value in sorted((overrides or {}).items(), key=lambda item: item[0].count(".")):
         _override(data, places, key, value)
@@ -119,7 +114,8 @@ def load_text(text: str, path: Path, overrides: Mapping[str, str] | None = None)
         raise report(error, data, places) from None
     if config.name is None:
         config = config.model_copy(update={"name": _name(path)})
-    return Loaded(config, path, text, places)
+    without = None if version is None else load_text(text, path, overrides)
+    return Loaded(config, path, text, places, version, without)
 
 
 def _name(path: Path) -> str:
@@ -137,7 +133,7 @@ def _override(data: dict[str, Any], places: Places, dotted_key: str, text: str) 
     if parts[0] == "estimator" and len(parts) > 1 and isinstance(data.get("estimator"), str):
         data["estimator"] = {"name": data["estimator"]}
     if parts in (["estimator"], ["estimator", "name"]):
-        _keep_options(data, places)
+        keep_options(data, places)
     if not all(parts):
         raise ConfigError(f"{option}: the key has an empty part; write it like source.interface")
     key: list[str | int] = []
@@ -160,21 +156,3 @@ def _override(data: dict[str, Any], places: Places, dotted_key: str, text: str) 
             places.options[tuple(key)] = option
         here = here[key[-1]]
     places.options[tuple(key)] = option
-
-
-def _keep_options(data: dict[str, Any], places: Places) -> None:
-    """Move the options of the YAML's own filter to `filters`, before another name takes its place.
-
-    So they are there when that filter runs after all: named on the command line, chosen on the page, or compared.
-    """
-    own, filters = data.get("estimator"), data.get("filters") or {}
-    if not isinstance(own, dict) or not isinstance(filters, dict):
-        return
-    name, options = own.get("name"), own.get("options")
-    given = filters.get(name) if isinstance(name, str) else None
-    if not isinstance(name, str) or not isinstance(options, dict) or not isinstance(given, dict | None):
-        return
-    data["filters"] = {**filters, name: {**(given or {}), **options}}
-    data["estimator"] = {key: value for key, value in own.items() if key != "options"}
-    for key, line in [(key, line) for key, line in places.lines.items() if key[:2] == ("estimator", "options")]:
-        places.lines[("filters", name, *key[2:])] = line

@@ -232,11 +232,13 @@ class ViewSection(Section):
     """The three-dimensional scene. Default: the belief over the first three states."""
 
 
-def _estimator(value: Any) -> Any:
+def as_estimator(value: Any) -> Any:
+    """A name stands for a filter without options."""
     return {"name": value} if isinstance(value, str) else value
 
 
-def _gate(value: Any) -> Any:
+def as_gate(value: Any) -> Any:
+    """A number stands for a hard gate."""
     return value if value is None or isinstance(value, (dict, GateSection)) else {"probability": value}
 
 
@@ -270,14 +272,14 @@ class TwinSection(Section):
     """Range over which the model was fitted or checked, by state or input, in its unit, for example
     {temperature: {min: 20, max: 38}}. Outside it the twin is suspect. Default: the model's."""
     estimator: Annotated[
-        EstimatorSection, BeforeValidator(_estimator, json_schema_input_type=str | EstimatorSection)
+        EstimatorSection, BeforeValidator(as_estimator, json_schema_input_type=str | EstimatorSection)
     ] = EstimatorSection(name="ekf")
     """The filter that runs first: a name, or {name, options}. Default: ekf."""
     filters: dict[str, dict[str, Option]] = {}
     """Options of other filters, by name, for when one is chosen on the page or compared, for example
     {letkf: {radius: 4}}. Default: the catalogue's."""
     gate: Annotated[
-        GateSection | None, BeforeValidator(_gate, json_schema_input_type=GateProbability | GateSection | None)
+        GateSection | None, BeforeValidator(as_gate, json_schema_input_type=GateProbability | GateSection | None)
     ] = None
     """Probability with which a good reading passes the gate, for example 0.9973; readings outside are not used. Or
     {probability, kind, reopen}. Default: null, no gate."""

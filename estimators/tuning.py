@@ -30,6 +30,9 @@ LONGEST = 1e9
 GATE_KEYS = {"gate": "gate", "gate.kind": "gate_kind", "gate.reopen": "reopen"}
 """Keys of the gate, and the fields that they turn."""
 
+TURNED = "*"
+"""Behind the name of a tuning of which an entry was turned since."""
+
 TOGETHER = 16
 """Rows of a sensor from which on they share one entry, `R.<sensor>`, in what a panel shows."""
 
@@ -48,13 +51,14 @@ class Item(NamedTuple):
 class Tuning:
     """Noise variances, parameters, sensors in use, gate and options of one fold.
 
-    q (nw,) is the variance that each process noise adds in one second; r (rows,) the variance of each sensor row;
-    p (np,) the model's parameters; `used` (sensors,) is False where a sensor is held out: predicted and scored, never
+    q (nw,) is the variance that each process noise adds in one second; r (rows,) the variance of each sensor row; p
+    (np,) the model's parameters; `used` (sensors,) is False where a sensor is held out: predicted and scored, never
     used. `gate` is the probability that a good reading passes, or None; a reading beyond it is refused, or, where
     `gate_kind` is "soft", counts with its noise inflated (gate/soften.py). A sensor that stays refused is judged
     (gate/reopening.py); if nothing tells whether it or the twin is wrong, the asset is believed after `reopen` seconds,
     None for never. `options` are the estimator's own. `baseline` (rows, ...) is what was normal of the innovations when
-    it was accepted (diagnostics/evidence/), or None for white ones.
+    it was accepted (diagnostics/evidence/), or None for white ones. `name` is that of the version that was loaded, with
+    a `*` behind it once an entry was turned; empty if nobody gave one. `version` counts in this process.
     """
 
     model: StateSpaceModel
@@ -68,6 +72,7 @@ class Tuning:
     options: Mapping[str, float] = field(default_factory=dict)
     seed: int = 0
     baseline: np.ndarray | None = None
+    name: str = ""
     version: int = field(default_factory=lambda: next(_versions))
 
     @staticmethod
@@ -131,11 +136,11 @@ class Tuning:
                 raise ConfigError(
                     f"gate is {_shown(value)}; it must lie between {LEAST_GATE:g} and 1, or be null for no gate"
                 )
-            return replace(self, gate=None if value is None else number, version=next(_versions))
+            return self._turned(gate=None if value is None else number)
         if key == "gate.kind":
             if value not in GATE_KINDS:
                 raise ConfigError(f"gate.kind is {_shown(value)}; it must be hard or soft")
-            return replace(self, gate_kind=str(value), version=next(_versions))
+            return self._turned(gate_kind=str(value))
         if key == "gate.reopen":
             number = _number(value)
             if value is not None and not 0.0 < number <= LONGEST:
@@ -143,7 +148,7 @@ class Tuning:
                     f"gate.reopen is {_shown(value)}; it must be a positive number of seconds, {LONGEST:g} at most, or "
                     "null for never"
                 )
-            return replace(self, reopen=None if value is None else number, version=next(_versions))
+            return self._turned(reopen=None if value is None else number)
         group, index = self._locate(key)
         if group == "used":
             if not isinstance(value, (bool, np.bool_)):
@@ -173,11 +178,15 @@ class Tuning:
             changed = getattr(self, group).copy()
             changed[index] = number
         entry: dict[str, Any] = {group: changed}
-        return replace(self, version=next(_versions), **entry)
+        return self._turned(**entry)
 
     def with_options(self, options: Mapping[str, float]) -> Tuning:
         """A new tuning with other estimator options."""
-        return replace(self, options=dict(options), version=next(_versions))
+        return self._turned(options=dict(options))
+
+    def _turned(self, **entries: Any) -> Tuning:
+        name = self.name if self.name.endswith(TURNED) else self.name and self.name + TURNED
+        return replace(self, version=next(_versions), name=name, **entries)
 
     def _without_noise(self, rows: Any) -> bool:
         """Whether the model declares these rows to be without noise; only then are filters chosen that bear it."""

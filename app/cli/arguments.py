@@ -26,6 +26,8 @@ class Run:
     """Estimator to use instead of the twin's own; `nisus filters` lists all of them."""
     set: Settings = ()
     """KEY=VALUE, repeatable: Q.temperature=0.02, R.winding=9, p.NAME, use.SENSOR=false, gate, or a dotted YAML key."""
+    tuning: str | None = None
+    """Tuning version to begin with, by name; `nisus tunings TWIN` lists them. Default: what the twin's file says."""
     log: tuple[Path, ...] = ()
     """Recordings to read instead of the twin's own."""
     record: Path | None = None
@@ -56,6 +58,8 @@ class Fold:
     """Estimator to use instead of the twin's own; `nisus filters` lists all of them."""
     set: Settings = ()
     """KEY=VALUE, repeatable, as for `run`."""
+    tuning: str | None = None
+    """Tuning version to begin with, by name; `nisus tunings TWIN` lists them. Default: what the twin's file says."""
     log: tuple[Path, ...] = ()
     """Recordings to read instead of the twin's own."""
     duration: float | None = None
@@ -83,6 +87,8 @@ class Check:
     """Estimator to use instead of the twin's own; `nisus filters` lists all of them."""
     set: Settings = ()
     """KEY=VALUE, repeatable, as for `run`."""
+    tuning: str | None = None
+    """Tuning version to begin with, by name; `nisus tunings TWIN` lists them. Default: what the twin's file says."""
     log: tuple[Path, ...] = ()
     """Recordings to read instead of the twin's own."""
     duration: float | None = None
@@ -107,6 +113,8 @@ class Compare:
     """Compare only these filters."""
     set: Settings = ()
     """KEY=VALUE, repeatable, as for `run`."""
+    tuning: str | None = None
+    """Tuning version to begin with, by name; `nisus tunings TWIN` lists them. Default: what the twin's file says."""
     log: tuple[Path, ...] = ()
     """Recordings to read instead of the twin's own."""
     duration: float | None = None
@@ -136,6 +144,8 @@ class Commission:
     """Estimator to use instead of the twin's own."""
     set: Settings = ()
     """KEY=VALUE, repeatable, as for `run`."""
+    tuning: str | None = None
+    """Tuning version to begin with, by name; `nisus tunings TWIN` lists them. Default: what the twin's file says."""
     log: tuple[Path, ...] = ()
     """Recordings to read instead of the twin's own."""
     duration: float | None = None
@@ -200,6 +210,8 @@ class Stress:
     """Seconds of the log."""
     set: Settings = ()
     """KEY=VALUE, repeatable, as for `run`."""
+    tuning: str | None = None
+    """Tuning version to begin with, by name; `nisus tunings TWIN` lists them. Default: what the twin's file says."""
     log: tuple[Path, ...] = ()
     """Recordings to read instead of the twin's own."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -260,6 +272,38 @@ class Twins:
 
 
 @dataclass(frozen=True)
+class Tunings:
+    """List the tuning versions of a twin, compare two of them, keep one or accept one.
+
+    They are kept beside the twin, FILE.tunings/NAME.yaml of FILE.yaml; those of a twin that ships in the user's data
+    folder. `own` is what the twin's file says.
+    """
+
+    twin: Twin
+    """Name of a twin that ships, or path of a YAML file."""
+    names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Two versions: the entries in which they differ, and their scores."""
+    save: str | None = None
+    """Keep what --tuning, --estimator and --set make of the twin as a version of this name, with its scores."""
+    accept: str | None = None
+    """Accept the version of this name: from then on it is the one that `nisus guard` folds with."""
+    note: str = ""
+    """Why, or what was tried; of --save and --accept."""
+    estimator: str | None = None
+    """Of --save: estimator to use instead of the twin's own."""
+    set: Settings = ()
+    """Of --save: KEY=VALUE, repeatable, as for `run`."""
+    tuning: str | None = None
+    """Of --save: version to begin with. Default: what the twin's file says."""
+    log: tuple[Path, ...] = ()
+    """Of --save: recordings to score it on instead of the twin's own."""
+    duration: float | None = None
+    """Of --save: take only this many seconds of the source."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print JSON."""
+
+
+@dataclass(frozen=True)
 class Schema:
     """Write the JSON Schema of a twin's YAML, for editors that complete and check."""
 
@@ -304,13 +348,27 @@ class New:
 
 
 Command = (
-    Run | Fold | Check | Compare | Tune | Stress | Commission | Filters | Review | Bus | Twins | Schema | Log | New
+    Run
+    | Fold
+    | Check
+    | Compare
+    | Tune
+    | Stress
+    | Commission
+    | Filters
+    | Review
+    | Bus
+    | Twins
+    | Tunings
+    | Schema
+    | Log
+    | New
 )
 COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in get_args(Command)}
 
 
-def settings(given: Sequence[str], estimator: str | None = None) -> dict[str, str]:
-    """The KEY=VALUE pairs of `--set`, and `--estimator` as one more.
+def settings(given: Sequence[str], estimator: str | None = None, tuning: str | None = None) -> dict[str, str]:
+    """The KEY=VALUE pairs of `--set`, with `--estimator` and `--tuning` as two more.
 
     Raises:
         ConfigError: If one has no `=`, or no key before it.
@@ -324,4 +382,6 @@ def settings(given: Sequence[str], estimator: str | None = None) -> dict[str, st
         pairs[key.strip()] = value.strip()
     if estimator is not None:
         pairs["estimator"] = estimator
+    if tuning is not None:
+        pairs["tuning"] = tuning
     return pairs

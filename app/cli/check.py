@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 def check_twin(arguments: Arguments) -> int:
     """Carry the command out."""
     twin = load_twin(
-        arguments.twin, log_files=arguments.log or None, overrides=settings(arguments.set, arguments.estimator)
+        arguments.twin,
+        log_files=arguments.log or None,
+        overrides=settings(arguments.set, arguments.estimator, arguments.tuning),
     )
     prepare(twin)
     log, counts = read_log(twin, arguments.duration)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +14,7 @@ from estimators.log import READING
 from estimators.track import DIVERGED, FAILED, GATED, SCREENED, STALE
 
 from ..engine.stall import interruptible
+from ..tunings.section_text import write_section
 from ..twin.twin import load_twin
 from .arguments import settings
 from .fold import read_log
@@ -30,15 +29,11 @@ MOST = 0.1
 LONGEST = 50
 """Equal readings in a row that are never too many."""
 
-SECTION = re.compile(r"^commissioned:.*(?:\n|\Z)(?:(?:[ \t]*(?:#.*)?\r?\n)*[ \t]+[^\s#].*(?:\n|\Z))*", re.MULTILINE)
-"""The section in a YAML: its key and the lines under it, to the last that is indented; a comment after that belongs to
-what follows."""
-
 
 def commission_twin(arguments: Arguments) -> int:
     """Carry the command out."""
     # What is normal is told from white innovations, not from what was normal before.
-    overrides = {**settings(arguments.set, arguments.estimator), "commissioned": "{}"}
+    overrides = {**settings(arguments.set, arguments.estimator, arguments.tuning), "commissioned": "{}"}
     twin = load_twin(arguments.twin, log_files=arguments.log or None, overrides=overrides)
     prepare(twin)
     log, _ = read_log(twin, arguments.duration)
@@ -53,8 +48,9 @@ def commission_twin(arguments: Arguments) -> int:
     if not arguments.write:
         print(text, end="")
         return 0
-    write(twin.path, text)
-    print(f"{twin.path}: commissioned on {log.n} events of {twin.name}, {twin.estimator}")
+    path = twin.path if twin.version is None else twin.version.path
+    write_section(path, "commissioned", text)
+    print(f"{path}: commissioned on {log.n} events of {twin.name}, {twin.estimator}")
     return 0
 
 
@@ -96,20 +92,3 @@ def lines(normals: Mapping[str, Normal]) -> str:
         text += f"  {name}: {{{moments},\n"
         text += f"    reached: {{{reached}}}}}\n"
     return text
-
-
-def write(path: Path, section: str) -> None:
-    """Put the section into a YAML file, in place of the one that is there, or at its end.
-
-    Raises:
-        ConfigError: If the file cannot be written.
-    """
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            text = file.read()
-        end = "\r\n" if "\r\n" in text else "\n"
-        section = section.replace("\n", end)
-        kept, found = SECTION.subn(lambda _: section, text, count=1)
-        path.write_text(kept if found else text.rstrip("\r\n") + 2 * end + section, encoding="utf-8", newline="")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written ({error.strerror})") from None

@@ -56,9 +56,16 @@ def compare_twin(arguments: Arguments) -> int:
 
 
 def _compare(arguments: Arguments, name: str) -> None:
-    overrides = settings(arguments.set)
+    overrides = settings(arguments.set, tuning=arguments.tuning)
     twin = load_twin(name, log_files=arguments.log or None, overrides=overrides)
-    changed = arguments.estimators or arguments.set or arguments.log or arguments.duration or arguments.logs > 1
+    changed = (
+        arguments.estimators
+        or arguments.set
+        or arguments.tuning
+        or arguments.log
+        or arguments.duration
+        or arguments.logs > 1
+    )
     if arguments.write and changed:
         raise ConfigError(
             "--write: a twin's table is that of all its filters over its own log; leave the other options out"

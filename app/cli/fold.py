@@ -92,7 +92,9 @@ def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
 def fold_twin(arguments: Arguments) -> int:
     """Carry the command out."""
     twin = load_twin(
-        arguments.twin, log_files=arguments.log or None, overrides=settings(arguments.set, arguments.estimator)
+        arguments.twin,
+        log_files=arguments.log or None,
+        overrides=settings(arguments.set, arguments.estimator, arguments.tuning),
     )
     if arguments.out is not None and arguments.out.suffix not in (".csv", ".parquet", ".rrd"):
         raise ConfigError(f"--out {arguments.out}: must end in .csv, .parquet or .rrd")
@@ -145,7 +147,8 @@ def _write(
         write_recording(path, twin, log, track, pictures, found)
         return
     table = table_of(
-        twin.model, log.events, track, found, tuning_version=twin.tuning.version, model_version=log.version
-    )
+        twin.model, log.events, track, found,
+        tuning_version=twin.tuning.version, tuning=twin.tuning.name, model_version=log.version,
+    )  # fmt: skip
     with path.open("wb") as file:
         file.writelines(encoded(path.suffix[1:], [table]))

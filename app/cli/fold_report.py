@@ -82,6 +82,7 @@ def as_dict(
     return {
         "twin": twin.name,
         "estimator": twin.estimator,
+        "tuning": twin.tuning.name,
         "readings": result.readings,
         **({"field": {"rmse": result.field.rmse, "coverage": result.field.coverage}} if result.field else {}),
         "rmse": {name: number(fit.rmse) for name, fit in result.states.items()},
@@ -170,6 +171,7 @@ def as_text(
     rows = [
         ("twin", f"{twin.name}: {twin.title}"),
         ("estimator", twin.estimator),
+        ("tuning", twin.tuning.name),
         ("readings", f"{result.readings}"),
     ]
     model = twin.model

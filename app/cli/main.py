@@ -29,6 +29,7 @@ from .arguments import (
     Schema,
     Stress,
     Tune,
+    Tunings,
     Twins,
 )
 
@@ -79,6 +80,10 @@ def carry_out(command: Command) -> int:
         from .twins import show_twins
 
         return show_twins(command)
+    if isinstance(command, Tunings):
+        from .tunings import tunings_of
+
+        return tunings_of(command)
     if isinstance(command, Schema):
         from config.json_schema import json_schema_text
 

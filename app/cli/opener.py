@@ -55,7 +55,8 @@ def opened_twin(
         return load_twin(name, log_files=logs or None, overrides=overrides)
 
     twin = read()
-    files = (twin.path, *model_file(twin.loaded))
+    version = () if twin.version is None else (twin.version.path,)
+    files = (twin.path, *version, *model_file(twin.loaded))
     return Opening(twin, live_source(twin, speed), files=files, stamp=stamp_of(files), again=read)
 
 
@@ -64,7 +65,7 @@ def recorded_twin(recorded: Recorded) -> Twin:
 
     What was normal of the innovations is no knob, and stands in the YAML.
     """
-    twin = restore_twin(recorded.text, recorded.twin_path, recorded.overrides)
+    twin = restore_twin(recorded.text, recorded.twin_path, recorded.overrides, recorded.version)
     tuning, estimator = tuning_from_json(recorded.tuning, twin.model)
     tuning = replace(tuning, baseline=twin.tuning.baseline)
     return replace(twin, tuning=tuning, estimator=estimator, recorded=True)

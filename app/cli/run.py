@@ -50,11 +50,11 @@ def run_twin(arguments: Run) -> int:
             opened_twin,
             arguments.twin,
             logs=arguments.log,
-            overrides=settings(arguments.set, arguments.estimator),
+            overrides=settings(arguments.set, arguments.estimator, arguments.tuning),
             speed=speed,
         )
         opening, opener = read(), FileOpener({arguments.twin: read})
-    elif page is None or arguments.record or arguments.log or arguments.set or arguments.estimator:
+    elif page is None or arguments.record or arguments.log or arguments.set or arguments.estimator or arguments.tuning:
         raise ConfigError("run: the twin is missing; name one (`nisus twins` lists those that ship)")
     if page is not None:
         check_port(page.port)

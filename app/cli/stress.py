@@ -35,7 +35,9 @@ WIDTH = 220
 
 def stress_twin(arguments: Arguments) -> int:
     """Carry the command out."""
-    twin = load_twin(arguments.twin, log_files=arguments.log or None, overrides=settings(arguments.set))
+    twin = load_twin(
+        arguments.twin, log_files=arguments.log or None, overrides=settings(arguments.set, tuning=arguments.tuning)
+    )
     if arguments.seeds < 1:
         raise ConfigError(f"--seeds {arguments.seeds}: must be 1 or more")
     if not arguments.duration > 0:

@@ -11,6 +11,8 @@ import numpy as np
 from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import Tuning
 
+from .changes import difference
+
 if TYPE_CHECKING:
     from ..twin.twin import Twin
 
@@ -69,7 +71,7 @@ def merged(before: Twin, after: Twin, estimator: str, tuning: Tuning) -> tuple[s
             if given.get(name) != was.get(name):
                 options.pop(name, None)
                 options |= {name: given[name]} if name in given else {}
-    return chosen, replace(
+    found = replace(
         new,
         q=taken("q"),
         r=taken("r"),
@@ -80,3 +82,5 @@ def merged(before: Twin, after: Twin, estimator: str, tuning: Tuning) -> tuple[s
         reopen=(new if new.reopen != old.reopen else tuning).reopen,
         seed=tuning.seed,
     ).with_options(options)
+    same = not difference(after.estimator, new, chosen, found)
+    return chosen, replace(found, name=new.name) if same else found

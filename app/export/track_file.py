@@ -30,7 +30,8 @@ def tables(rows: RunRows, part: slice) -> Iterator[Any]:
         before = int(versions[start]) - begun if len(events) else pull.version
         yield table_of(
             model, events, pull.track.select(piece), found,
-            tuning_version=run.tuning.version, model_version=before,
+            tuning_version=run.tuning.version, tuning=run.tuning.name,
+            model_version=before,
         )  # fmt: skip
 
 

@@ -1,10 +1,10 @@
 """The recording: an .rrd file that Rerun opens, and that holds all it takes to fold again, to the bit.
 
-Beside what charts show, the file keeps under /nisus, as plain columns: `twin` (YAML, what the command line changed of
-it, base), `tuning` (each one, with the event from which it was in force), `events` (the log), `base` (where a fold of
-them starts, if that has moved), `notices` (lines for people) and `summary` (what the session was worth, for lists). The
-track is not among them: log and tuning give it again. Rows carry their absolute index; a late reading makes a recorder
-write the events again from where it belongs. `reader` reads them back.
+Beside what charts show, the file keeps under /nisus, as plain columns: `twin` (YAML, tuning version, what the command
+line changed, base), `tuning` (each one, with the event from which it was in force), `events` (the log), `base` (where a
+fold of them starts, if that has moved), `notices` (lines for people) and `summary` (what the session was worth, for
+lists). The track is not among them: log and tuning give it again. Rows carry their absolute index; a late reading makes
+a recorder write the events again from where it belongs. `reader` reads them back.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
+from config.tunings import Version, version_of
 from estimators.errors import SourceError
 from estimators.gate.doubt import REMEMBERED
 from estimators.model.state_space import StateSpaceModel
@@ -50,6 +51,7 @@ def tuning_to_json(tuning: Tuning, estimator: str) -> str:
             "reopen": tuning.reopen,
             "options": dict(tuning.options),
             "seed": tuning.seed,
+            "name": tuning.name,
         }
     )
 
@@ -69,8 +71,20 @@ def tuning_from_json(text: str, model: StateSpaceModel) -> tuple[Tuning, str]:
         reopen=values.get("reopen"),
         options=values["options"],
         seed=values["seed"],
+        name=values.get("name", ""),
     )
     return tuning, values["estimator"]
+
+
+def version_to_json(version: Version | None) -> str:
+    """A tuning version as text: its file, whole."""
+    return json.dumps(version and {"name": version.name, "path": str(version.path), "text": version.text})
+
+
+def version_from_json(text: str) -> Version | None:
+    """The version that `version_to_json` wrote."""
+    values = json.loads(text)
+    return values and version_of(values["name"], values["text"], Path(values["path"]))
 
 
 def base_to_json(base: Base | None) -> str:
@@ -129,6 +143,7 @@ class RecordingFile:
         twin_path: Path,
         base: Base | None,
         overrides: Mapping[str, str] | None = None,
+        version: Version | None = None,
     ) -> None:
         """Begin a file.
 
@@ -139,6 +154,7 @@ class RecordingFile:
             twin_path: Where the YAML was, for the model's file beside it.
             base: Where the fold of the first event starts, if older events were dropped before.
             overrides: What the command line changed of the YAML, by key.
+            version: The tuning version whose values stand in place of the YAML's.
 
         Raises:
             SourceError: If the file cannot be written.
@@ -154,16 +170,16 @@ class RecordingFile:
             raise SourceError(f"recording {path}: {error.strerror}; choose a place that can be written") from None
         self.rows = 0
         self._header = {"name": name, "path": str(twin_path), "base": base_to_json(base)}
-        self.twin(text, overrides or {})
+        self.twin(text, overrides or {}, version)
 
     @property
     def size(self) -> int:
         """Bytes that the file has taken."""
         return self._file.size
 
-    def twin(self, text: str, overrides: Mapping[str, str]) -> None:
-        """Write the twin's YAML, again when it was saved anew: the last one counts."""
-        more = {"yaml": text, "overrides": json.dumps(dict(overrides))}
+    def twin(self, text: str, overrides: Mapping[str, str], version: Version | None) -> None:
+        """Write the twin's YAML and its tuning version, again when one was saved anew: the last ones count."""
+        more = {"yaml": text, "overrides": json.dumps(dict(overrides)), "version": version_to_json(version)}
         self.stream.log("/nisus/twin", rr.AnyValues(format=FORMAT, **self._header, **more), static=True)
 
     def base(self, base: Base | None, index: int, revision: int) -> None:

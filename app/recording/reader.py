@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 from rerun.chunk import RrdReader
 
+from config.tunings import Version
 from estimators.errors import SourceError
 from estimators.log import Events
 from estimators.snapshots import Base
 
-from .format import FORMAT, PREFIX, READABLE, TIMELINE, base_from_json
+from .format import FORMAT, PREFIX, READABLE, TIMELINE, base_from_json, version_from_json
 from .rrd import BEGIN, MESSAGE_HEADER, STREAM_HEADER, whole_until
 
 
@@ -29,7 +30,8 @@ from .rrd import BEGIN, MESSAGE_HEADER, STREAM_HEADER, whole_until
 class Recorded:
     """What a recording holds: twin, the last tuning, the log as it was at the end, lines (t, level, text).
 
-    `text` is the twin's YAML, `overrides` what the command line changed of it, which older recordings do not tell.
+    `text` is the twin's YAML, `version` the tuning version that it ran with, `overrides` what the command line changed,
+    which older recordings do not tell.
     A fold of `events` starts at `base` (None: the prior). `first` is the index of their first event in the session,
     `rows` how many there are, and `closed` whether the recording was finished when it ended.
     """
@@ -39,6 +41,7 @@ class Recorded:
     text: str
     twin_path: Path
     overrides: Mapping[str, str]
+    version: Version | None
     base: Base | None
     tuning: str
     tunings: int
@@ -89,6 +92,7 @@ def read_recording(path: Path) -> Recorded:
         text=str(header["yaml"]),
         twin_path=Path(str(header["path"])),
         overrides=json.loads(str(header.get("overrides", "{}"))),
+        version=version_from_json(str(header.get("version", "null"))),
         base=None if base is None else base._replace(first=start),
         tuning=str(tunings[-1]),
         tunings=len(tunings),

@@ -195,7 +195,13 @@ class _Part:
         self._turned: float | None = None
         try:
             self.file = RecordingFile(
-                path, name=twin.name, text=twin.text, twin_path=twin.path, base=self._base, overrides=twin.overrides
+                path,
+                name=twin.name,
+                text=twin.text,
+                twin_path=twin.path,
+                base=self._base,
+                overrides=twin.overrides,
+                version=twin.version,
             )
             self._drawing = draw(self.file.stream)
         except BaseException:
@@ -243,7 +249,7 @@ class _Part:
                 tuning, estimator = self._engine.folded_with()
                 if self._engine.twin is not self._twin:
                     self._twin = self._engine.twin
-                    self.file.twin(self._twin.text, self._twin.overrides)
+                    self.file.twin(self._twin.text, self._twin.overrides, self._twin.version)
                 self.file.tuning(tuning, estimator, pull.first, pull.revision)
                 if begun and not pull.fresh:
                     self._edited, self._turned = True, time.monotonic()
@@ -320,8 +326,9 @@ def write_recording(
     try:
         path.unlink(missing_ok=True)
         file = RecordingFile(
-            path, name=twin.name, text=twin.text, twin_path=twin.path, base=None, overrides=twin.overrides
-        )
+            path, name=twin.name, text=twin.text, twin_path=twin.path, base=None, overrides=twin.overrides,
+            version=twin.version,
+        )  # fmt: skip
         drawing = RerunRows(file.stream, SimpleNamespace(model=twin.model, pairs=twin.pairs, twin=twin), series=None)
         file.tuning(twin.tuning, twin.estimator, 0, 0)
         for start in range(0, log.n, ROWS):

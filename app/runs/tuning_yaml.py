@@ -17,23 +17,25 @@ PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
 RESERVED = {"null", "true", "false"}
 
 
-def tuning_yaml(config: TwinSection, estimator: str, tuning: Tuning) -> str:
-    """The sections `estimator`, `filters`, `parameters`, `noise`, `sensors` and `gate`, whole.
+def tuning_yaml(config: TwinSection, estimator: str, tuning: Tuning, *, whole: bool = True) -> str:
+    """The sections `estimator`, `filters`, `parameters`, `noise`, `sensors` and `gate`.
 
     A twin whose file has these in place of its own starts with the same settings. What else a section of the file says
-    (limits of a sensor, options of other filters) is in them as it was; its comments are not.
+    (limits of a sensor, options of other filters) is in them as it was; its comments are not. If not `whole`, they are
+    what is tuned and no more, every parameter among it: what stays as the file says is left out.
 
     Args:
         config: What the twin's file says.
         estimator: Of the run.
         tuning: The same.
+        whole: See above.
     """
     entry, first = find_entry(estimator), config.estimator
     options = {name: _option(entry, name, value) for name, value in tuning.options.items()}
     filters = {**config.filters, first.name: {**config.filters.get(first.name, {}), **first.options}}
     others = {name: dict(given) for name, given in filters.items() if given and name != estimator}
     lines = [f"estimator: {_flow({'name': estimator, 'options': options} if options else estimator)}"]
-    lines += _section("filters", others)
+    lines += as_section("filters", others) if whole else []
     model = tuning.model
     values = dict(zip((item.name for item in model.parameters), map(float, tuning.p), strict=True))
     noises = dict(zip((noise.name for noise in model.noises), map(float, tuning.q), strict=True))
@@ -43,12 +45,12 @@ def tuning_yaml(config: TwinSection, estimator: str, tuning: Tuning) -> str:
     erring = [sensor for sensor in model.sensors if _errs(config, sensor.name)]
     times = {*map(disturbance_time, lasting), *(error_time(sensor.name) for sensor in erring)}
     turned = {name: value for name, value in values.items() if name in config.parameters or value != known[name]}
-    rest = {name: value for name, value in turned.items() if name not in times}
-    lines += _section("parameters", {**config.parameters, **rest})
+    turned = {**config.parameters, **turned} if whole else values
+    lines += as_section("parameters", {name: value for name, value in turned.items() if name not in times})
     errors = {sensor.name: [noises.pop(name) for name in errors_of(sensor)] for sensor in erring}
     over = {name: {"over": values.get(disturbance_time(name), seconds)} for name, seconds in lasting.items()}
-    lines += _section("noise", {name: {"variance": value, **over.get(name, {})} for name, value in noises.items()})
-    lines += _section("sensors", _sensors(config, tuning, errors, values))
+    lines += as_section("noise", {name: {"variance": value, **over.get(name, {})} for name, value in noises.items()})
+    lines += as_section("sensors", _sensors(config, tuning, errors, values, whole))
     lines.append(f"gate: {_flow(_gate(tuning))}")
     return "\n".join(lines) + "\n"
 
@@ -59,7 +61,11 @@ def _errs(config: TwinSection, sensor: str) -> bool:
 
 
 def _sensors(
-    config: TwinSection, tuning: Tuning, errors: Mapping[str, list[float]], values: Mapping[str, float]
+    config: TwinSection,
+    tuning: Tuning,
+    errors: Mapping[str, list[float]],
+    values: Mapping[str, float],
+    whole: bool,
 ) -> dict[str, Any]:
     """The section `sensors`: with the variances of the errors that last, by sensor, and parameters by name."""
     found = {}
@@ -67,13 +73,14 @@ def _sensors(
         given = config.sensors.get(sensor.name)
         own = given.model_dump(mode="json", exclude_unset=True, exclude_none=True) if given is not None else {}
         variances = [float(value) for value in tuning.r[start : start + len(sensor.rows)]]
-        rest = {key: value for key, value in own.items() if key not in ("std", "variance", "use")}
+        rest = {key: value for key, value in own.items() if whole and key not in ("std", "variance", "use")}
         if sensor.name in errors:
-            over = values.get(error_time(sensor.name), rest["error"]["over"])
+            over = values.get(error_time(sensor.name), own["error"]["over"])
             rest["error"] = {"variance": _one_or_all(errors[sensor.name]), "over": over}
         found[sensor.name] = {"variance": _one_or_all(variances), **rest}
-        if not tuning.get(f"use.{sensor.name}"):
-            found[sensor.name]["use"] = False
+        used = bool(tuning.get(f"use.{sensor.name}"))
+        if not (whole and used):
+            found[sensor.name]["use"] = used
     return found
 
 
@@ -97,12 +104,13 @@ def _option(entry: Estimator, name: str, value: float) -> float | str:
     return choices[round(value)] if choices else float(value)
 
 
-def _section(name: str, items: Mapping[str, Any]) -> list[str]:
+def as_section(name: str, items: Mapping[str, Any]) -> list[str]:
+    """A section as lines, an entry each; none if it is empty."""
     return [f"{name}:", *(f"  {_key(key)}: {_flow(value)}" for key, value in items.items())] if items else []
 
 
 def _key(name: str) -> str:
-    return name if PLAIN.fullmatch(name) and name.lower() not in RESERVED else json.dumps(name)
+    return name if PLAIN.fullmatch(name) and name.lower() not in RESERVED else json.dumps(name, ensure_ascii=False)
 
 
 def _flow(value: Any) -> str:

@@ -60,6 +60,7 @@ def status_json(engine: Running) -> dict[str, Any]:
         "estimator": status.estimator,
         "options": _plain(dict(status.options)),
         "tuning": {key: _plain(value) for key, value, *_ in status.tuning.items()},
+        "tuning_name": status.tuning.name,
         "gate": _plain(status.tuning.gate),
         "gate_kind": status.tuning.gate_kind,
         "gate_reopen": _plain(status.tuning.reopen),

@@ -15,6 +15,8 @@ import numpy as np
 from config.loader import Loaded, load, load_text
 from config.schema import TwinSection
 from config.source_schema import AssetSection
+from config.tuning_schema import TuningSection
+from config.tunings import OWN, Version
 from config.yaml_lines import parse
 from estimators.diagnostics.commission import baseline_of, lost_from
 from estimators.diagnostics.health import HealthPolicy
@@ -22,7 +24,7 @@ from estimators.errors import ConfigError, EstimatorError
 from estimators.fold_checks import check_variances
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_entry, find_estimator
-from estimators.tuning import Tuning
+from estimators.tuning import TURNED, Tuning
 
 from ..intake import Planned
 from .commissioned import commissioned
@@ -37,6 +39,9 @@ if TYPE_CHECKING:
     from sources.can.player import Player
     from sources.faults.layer import Faults
     from sources.source import Report, Source
+
+VERSION = "tuning"
+"""The key among the overrides that names a tuning version."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +75,11 @@ class Twin:
     def text(self) -> str:
         """The YAML as it was read."""
         return self.loaded.text
+
+    @property
+    def version(self) -> Version | None:
+        """The tuning version whose values stand in place of the YAML's; None for none."""
+        return self.loaded.version
 
     @property
     def name(self) -> str:
@@ -174,25 +184,34 @@ def load_twin(
     Args:
         name_or_path: Name of a twin that ships, or path of a YAML file.
         log_files: Recordings to read instead of the twin's own.
-        overrides: The command line's `--set KEY=VALUE`: a tuning key (Q.temperature), or a dotted key of the YAML.
+        overrides: The command line's `--set KEY=VALUE`: a tuning key (Q.temperature), or a dotted key of the YAML; and
+            under `tuning` the name of a tuning version.
 
     Raises:
-        ConfigError: If the YAML or an override breaks a rule.
+        ConfigError: If the YAML, the version or an override breaks a rule.
         ModelError: If the model's file fails.
     """
     overrides = dict(overrides or {})
-    return _assemble(load(name_or_path, _of_yaml(overrides)), overrides, log_files)
+    named = {key: value for key, value in overrides.items() if key == VERSION}
+    return _assemble(load(name_or_path, _of_yaml(overrides) | named), overrides, log_files)
 
 
-def restore_twin(text: str, base_path: str | os.PathLike[str], overrides: Mapping[str, str] | None = None) -> Twin:
+def restore_twin(
+    text: str,
+    base_path: str | os.PathLike[str],
+    overrides: Mapping[str, str] | None = None,
+    version: Version | None = None,
+) -> Twin:
     """Put a twin together from the YAML text that a recording holds; `base_path` is where its file was.
+
+    `version` is the tuning version that it holds; what `overrides` say of one is not looked for again.
 
     Raises:
         ConfigError: If the YAML breaks a rule.
         ModelError: If the model's file fails, or is no longer there.
     """
     overrides = dict(overrides or {})
-    return _assemble(load_text(text, Path(base_path), _of_yaml(overrides)), overrides, None)
+    return _assemble(load_text(text, Path(base_path), _of_yaml(overrides), version), overrides, None)
 
 
 def _of_yaml(overrides: Mapping[str, str]) -> dict[str, str]:
@@ -202,7 +221,9 @@ def _of_yaml(overrides: Mapping[str, str]) -> dict[str, str]:
 
 def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[str | os.PathLike[str]] | None) -> Twin:
     config = loaded.config
-    model = configure(find_model(loaded, ("model",), config.model), loaded)
+    found = find_model(loaded, ("model",), config.model)
+    _check_version(loaded, found)
+    model = configure(found, loaded)
     for name, given in config.filters.items():
         _check_options(loaded, ("filters", name), name, given, model)
     first = config.estimator
@@ -218,14 +239,19 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
     for name, section in config.sensors.items():
         if not section.use:
             tuning = tuning.set(f"use.{name}", False)
-    for key, value in overrides.items():
-        if key not in _of_yaml(overrides):
-            tuning = _set(tuning, key, value)
+    turned = {key: value for key, value in overrides.items() if key not in _of_yaml(overrides) and key != VERSION}
+    for key, value in turned.items():
+        tuning = _set(tuning, key, value)
+    name = OWN if loaded.version is None else loaded.version.name
+    changed = bool(turned) or any(key.split(".")[0] in TuningSection.model_fields for key in overrides)
+    tuning = replace(tuning, name=name + (TURNED if changed else ""))
     for k, item in enumerate(config.maintenance):
         check_named(loaded, ("maintenance", k, "states"), item.states, model)
         if len(set(item.states)) != len(item.states):
             raise loaded.error(("maintenance", k, "states"), "names a state twice; name each once")
-    plan = plan_source(loaded, model, [Path(file) for file in log_files] if log_files else None)
+    asset = loaded.without
+    believed = (loaded, model) if asset is None else (asset, configure(found, asset))
+    plan = plan_source(*believed, [Path(file) for file in log_files] if log_files else None)
     if plan.brings_variances:
         with _placed(loaded, ("estimator",)):
             check_variances(entry, entry.complete(tuning.options))
@@ -241,6 +267,16 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
         overrides=overrides,
         plan=plan,
     )
+
+
+def _check_version(loaded: Loaded, model: StateSpaceModel) -> None:
+    """Refuse a tuning version of another model."""
+    version = loaded.version
+    if version is not None and version.head.model != model.name:
+        raise ConfigError(
+            f"{version.places.at(('version', 'model'))}: version.model is {version.head.model!r}; the model of "
+            f"{loaded.path.stem} is {model.name!r}, to which its values mean nothing; choose another version"
+        )
 
 
 def _options(config: TwinSection, estimator: str) -> dict[str, float]:

@@ -23,18 +23,19 @@ def table_of(
     episodes: Sequence[Episode] = (),
     *,
     tuning_version: int = 1,
+    tuning: str = "",
     model_version: int = 1,
 ) -> Any:
     """A pyarrow.Table of events and track.
 
     Columns: `t_ns` and `arrival_ns`; `seconds`; `event`, `channel`, and `sensor` (null unless it is a reading);
     `value_k` and, where a reading brought its own, `variance_k`; for each state `NAME_true` (NaN where it is not
-    known), `NAME` and `NAME_std`; `innovation_k` and `innovation_std_k`; NIS with its windowed mean and bounds,
-    log-likelihood; verdict and health in words; `screened`: why the edge refused rows of the reading, null if it did
-    not; `model_version`, which counts up with each maintenance from that at the first event, and `tuning_version`, of
-    the tuning that the track was folded with; `alarms`, the causes that are in alarm after a reading or a
-    truth, and `flags`, what else is wrong, both joined by commas, null where there is none. The schema's metadata have
-    `episodes`, as JSON.
+    known), `NAME` and `NAME_std`; `innovation_k` and `innovation_std_k`; NIS with its windowed mean and bounds, log-
+    likelihood; verdict and health in words; `screened`: why the edge refused rows of the reading, null if it did not;
+    `model_version`, which counts up with each maintenance from that at the first event, and `tuning_version`, of the
+    tuning that the track was folded with, which `tuning` names (null if nobody did); `alarms`, the causes that are in
+    alarm after a reading or a truth, and `flags`, what else is wrong, both joined by commas, null where there is none.
+    The schema's metadata have `episodes`, as JSON.
     """
     import pyarrow as pa
 
@@ -67,6 +68,7 @@ def table_of(
     columns["health"] = np.array(HEALTH_NAMES)[track.health]
     columns["model_version"] = model_versions(events, model_version)
     columns["tuning_version"] = np.full(len(events), tuning_version, np.int64)
+    columns["tuning"] = pa.array([tuning or None] * len(events), pa.string())
     columns["alarms"] = pa.array(
         _words(np.bitwise_or.reduce(track.alarms, axis=1, dtype=np.int64), _CAUSES), pa.string()
     )

@@ -1,0 +1,79 @@
+"""The schema of a tuning version: a YAML of its own beside the twin's.
+
+The docstring under each field is its documentation.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BeforeValidator, Field
+
+from .fields import ErrorSection, NoiseSection, Number, Option, Section, SpreadSection, Text, as_list
+from .schema import EstimatorSection, GateProbability, GateSection, NormalSection, PriorSection, as_estimator, as_gate
+
+
+class TunedSensorSection(SpreadSection):
+    """The noise of one sensor, and whether the estimate uses it. Its limits stay the twin's."""
+
+    error: ErrorSection | None = None
+    """Its error that lasts, where the twin's sensor has one."""
+    use: Annotated[bool, Field(strict=True)] = True
+    """false holds the sensor out. Default: true."""
+
+
+class AcceptedSection(Section):
+    """That this version is the one that guards and lists go by."""
+
+    at: Text
+    """When, as 2026-11-22T10:30:00Z."""
+    note: str = ""
+    """Why."""
+
+
+class VersionSection(Section):
+    """What a tuning version is of, and what it was worth."""
+
+    twin: Text
+    """Name of the twin that it was made for."""
+    model: Text
+    """Name of its model: values mean nothing to another."""
+    model_version: Annotated[int, Field(strict=True, ge=0)] = 1
+    """Which version of the model it was made for: each maintenance begins another."""
+    saved: Text
+    """When, as 2026-11-22T10:30:00Z."""
+    note: str = ""
+    """What was tried, and what came of it."""
+    fitted_on: Annotated[tuple[Text, ...], BeforeValidator(as_list, json_schema_input_type=str | list[str])] = ()
+    """The recordings that it was fitted on, or where else it is from."""
+    scores: dict[str, Number] = {}
+    """What it was worth there: nis, log_likelihood (of a reading), rmse.NAME, coverage.NAME, ..."""
+    accepted: AcceptedSection | None = None
+    """Default: not accepted. Of several that are, the last counts."""
+
+
+class TuningSection(Section):
+    """A tuning version: what of a twin was tuned. What it does not say is as the twin's file says."""
+
+    version: VersionSection
+    """What it is of."""
+    estimator: Annotated[
+        EstimatorSection | None, BeforeValidator(as_estimator, json_schema_input_type=str | EstimatorSection)
+    ] = None
+    """The filter, with all of its options that are not the catalogue's."""
+    filters: dict[str, dict[str, Option]] = {}
+    """Options of other filters, by name."""
+    parameters: dict[str, Number] = {}
+    """Parameters of the model."""
+    prior: dict[str, PriorSection] = {}
+    """The belief before the first reading."""
+    noise: dict[str, NoiseSection] = {}
+    """Process noise Q by name."""
+    sensors: dict[str, TunedSensorSection] = {}
+    """Sensor noise R by sensor."""
+    gate: Annotated[
+        GateSection | None, BeforeValidator(as_gate, json_schema_input_type=GateProbability | GateSection | None)
+    ] = None
+    """The gate; null for none."""
+    commissioned: dict[str, NormalSection] = {}
+    """What was normal when it was accepted, by sensor row."""

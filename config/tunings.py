@@ -1,0 +1,199 @@
+"""Tuning versions: YAML files beside a twin's, each with the values under a name, and what they were worth."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from estimators.errors import ConfigError, nearest
+
+from .files import read_text, shown_path
+from .problems import report, shown
+from .tuning_schema import TuningSection, VersionSection
+from .yaml_lines import Key, Places, parse
+
+OWN = "own"
+"""The name under which what the twin's file itself says is listed."""
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,59}")
+
+SPREADS = ("variance", "std")
+"""Two ways to say the same: one takes the other's place."""
+
+_CONFIG = Path(str(resources.files("config")))
+SHIPPED = _CONFIG / "tunings"
+"""Folder of the versions that ship, a folder for each twin."""
+
+
+@dataclass(frozen=True)
+class Version:
+    """One tuning version, checked against its schema: its name, the file, its text, and the values as YAML has them."""
+
+    name: str
+    path: Path
+    text: str
+    data: Mapping[str, Any]
+    section: TuningSection
+    places: Places
+
+    @property
+    def head(self) -> VersionSection:
+        """What it is of, and what it was worth."""
+        return self.section.version
+
+
+def ships(twin: Path) -> bool:
+    """Whether a twin's YAML is one of those that ship."""
+    return twin.resolve().parent == (_CONFIG / "twins").resolve()
+
+
+def folders(twin: Path) -> tuple[Path, ...]:
+    """Where the versions of a twin's YAML are kept; the first is where new ones go.
+
+    Of a twin that ships in the user's data folder, and those that ship with the program; of any other beside its file.
+    """
+    if not ships(twin):
+        return (twin.with_name(f"{twin.stem}.tunings"),)
+    base = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
+    return (base / "nisus" / "tunings" / twin.stem, SHIPPED / twin.stem)
+
+
+def version_files(twin: Path) -> dict[str, Path]:
+    """The file of each version of a twin's YAML by name; the user's own hides one of its name that ships."""
+    found: dict[str, Path] = {}
+    for folder in folders(twin):
+        for path in sorted(folder.glob("*.yaml")):
+            found.setdefault(path.stem, path)
+    return found
+
+
+def find_version(twin: Path, reference: str) -> Version | None:
+    """The version that a name, or the path of its file, means; None for what the twin's own file says.
+
+    Raises:
+        ConfigError: If there is none, or its file is wrong.
+    """
+    if reference == OWN:
+        return None
+    if os.sep in reference or reference.endswith((".yaml", ".yml")):
+        return load_version(Path(reference).expanduser())
+    files = version_files(twin)
+    if reference not in files:
+        shown_twin = twin.stem if ships(twin) else shown_path(twin)
+        near = nearest(reference, [OWN, *files]).rstrip("?")
+        raise ConfigError(
+            f"--tuning {reference}: {twin.stem} has no such version; {near}; see `nisus tunings {shown_twin}`"
+        )
+    return load_version(files[reference])
+
+
+def accepted_version(twin: Path) -> Version | None:
+    """The version that was accepted last; None if none was, and the twin's own file holds."""
+    found = [load_version(path) for path in version_files(twin).values()]
+    accepted = [version for version in found if version.head.accepted is not None]
+    return max(accepted, key=lambda version: version.head.accepted.at, default=None)  # type: ignore[union-attr]
+
+
+def load_version(path: Path) -> Version:
+    """Read and check a version's file.
+
+    Raises:
+        ConfigError: With a line for each of the first problems.
+    """
+    return version_of(path.stem, read_text(path, "nisus tunings TWIN"), path)
+
+
+def version_of(name: str, text: str, path: Path) -> Version:
+    """Check a version that has been read already; raises as `load_version`."""
+    file = shown_path(path)
+    data, places = parse(text, file)
+    if not isinstance(data, dict):
+        what = "empty" if data is None else shown(data)
+        raise ConfigError(f"{file}:1: the file is {what}; a tuning version is a mapping that begins with `version:`")
+    try:
+        section = TuningSection.model_validate(data)
+    except ValidationError as error:
+        raise report(error, data, places) from None
+    return Version(name, path, text, data, section, places)
+
+
+def check_name(name: str) -> str:
+    """A name under which a version can be kept.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    if not NAME.fullmatch(name) or name == OWN or name.endswith((".yaml", ".yml")):
+        raise ConfigError(
+            f"the version's name is {name!r}; use letters, digits, _, - and ., 60 at most, begin with a letter or "
+            f"digit, and neither `{OWN}` nor an ending"
+        )
+    return name
+
+
+def overlay(data: dict[str, Any], places: Places, version: Version) -> None:
+    """Put a version's values in place of a twin's; errors about them name the version's file and line.
+
+    Entries are replaced one by one, so that what a version does not say (limits of a sensor, another filter's options)
+    stays; estimator, gate and what was normal are replaced whole.
+    """
+    given = {key: value for key, value in version.data.items() if key != "version"}
+    if "estimator" in given and given["estimator"] is not None:
+        keep_options(data, places)
+        filters, name = data.get("filters"), version.section.estimator
+        if isinstance(filters, dict) and name is not None:
+            data["filters"] = {key: value for key, value in filters.items() if key != name.name}
+    for key, value in given.items():
+        if key in ("estimator", "gate", "commissioned") or not isinstance(value, dict):
+            if value is not None or key == "gate":
+                data[key] = value
+                _placed(places, (key,), version)
+        else:
+            _merge(data, (key,), value, places, version)
+
+
+def _merge(data: dict[str, Any], key: Key, value: dict[str, Any], places: Places, version: Version) -> None:
+    own = data.get(str(key[-1]))
+    if not isinstance(own, dict):
+        own = {}
+        places.options[key] = version.places.at(key)
+    own = {name: item for name, item in own.items() if name not in SPREADS} if set(value) & set(SPREADS) else dict(own)
+    data[str(key[-1])] = own
+    for name, item in value.items():
+        if isinstance(item, dict):
+            _merge(own, (*key, name), item, places, version)
+        else:
+            own[name] = item
+            _placed(places, (*key, name), version)
+
+
+def _placed(places: Places, key: Key, version: Version) -> None:
+    for inner in [inner for inner in version.places.lines if inner[: len(key)] == key]:
+        places.options[inner] = version.places.at(inner)
+
+
+def keep_options(data: dict[str, Any], places: Places) -> None:
+    """Move the options of the YAML's own filter to `filters`, before another name takes its place.
+
+    So they are there when that filter runs after all: named on the command line, chosen on the page, or compared.
+    """
+    own, filters = data.get("estimator"), data.get("filters") or {}
+    if not isinstance(own, dict) or not isinstance(filters, dict):
+        return
+    name, options = own.get("name"), own.get("options")
+    given = filters.get(name) if isinstance(name, str) else None
+    if not isinstance(name, str) or not isinstance(options, dict) or not isinstance(given, dict | None):
+        return
+    data["filters"] = {**filters, name: {**(given or {}), **options}}
+    data["estimator"] = {key: value for key, value in own.items() if key != "options"}
+    moved: Any
+    for moved in (places.lines, places.options):
+        for key in [key for key in moved if key[:2] == ("estimator", "options")]:
+            moved[("filters", name, *key[2:])] = moved[key]
