@@ -92,7 +92,8 @@ def sensor_noise(track: Track, events: Events, tuning: Tuning) -> dict[str, Sens
             excess = float(np.sum(weight * (square - S)) / np.sum(weight))
             std = float(np.sqrt(2.0 / np.sum(weight)))
             e = np.where(known, track.innovation[rows, k], np.nan) / track.innovation_std[rows, k]
-            e = np.clip(e, -np.sqrt(g), np.sqrt(g))
+            limit = np.sqrt(g[dof])
+            e = np.clip(e, -limit, limit)
             correlation, chance = correlation_interval(e[known]).value, ljung_box(e).p_value
             found[model.row_names[model.row_start[s] + k]] = SensorNoise(R + excess, std, n, correlation, chance)
     return found
