@@ -53,7 +53,7 @@ export class Recordings {
     ].filter(Boolean).join(" · ");
     const scores = [
       summary?.nis ? `NIS ${compact(summary.nis, 3)} [${compact(summary.nis_low, 3)}, ${compact(summary.nis_high, 3)}]` : null,
-      error ? `RMSE ${error.name} ${compact(error.rmse, 3)}${spaced(error.unit)}${error.against === "truth" ? "" : `, ${error.against}`}` : null,
+      error ? `RMSE ${error.name} ${compact(error.rmse, 3)}${spaced(error.unit)}${error.against === "truth" ? "" : `, ${error.against}`}${typeof error.coverage === "number" ? `, ${compact(100 * error.coverage, 3)} % in band` : ""}` : null,
     ].filter(Boolean).join(" · ");
     const confirm = element("div", { class: "confirm", hidden: true });
     const node = element(
@@ -63,7 +63,7 @@ export class Recordings {
         element("a", { href: `/recordings/${encodeURIComponent(file.name)}`, download: file.name, title: "Download", "aria-label": `Download ${file.name}` }, "↓"),
         element("button", { type: "button", class: "delete", title: "Delete", "aria-label": `Delete ${file.name}`, onclick: () => this.confirm(node, confirm, file.name) }, "✕")),
       element("p", { class: "faint" }, `${when(file.modified)} · ${file.log ? "log · " : ""}${file.looking ? "looking …" : facts}`),
-      scores ? element("p", { class: "faint" }, scores) : null,
+      scores ? element("p", { class: "faint", title: summary.nis_words }, scores) : null,
       file.error ? element("p", { class: "faint" }, file.error) : null,
       confirm,
     );

@@ -3,6 +3,7 @@
 import { lightPalette } from "./svg_chart.js";
 
 const HEAD = 34; // of the viewBox, for two lines
+const [TITLE, BOLD] = [8.5, 0.62]; // its size, and the width of a letter as a share of it
 const WIDE = 2.5; // px of the file for one of the viewBox
 const OWN = ["fill", "fill-opacity", "stroke", "stroke-width", "stroke-dasharray", "font-size"];
 
@@ -22,7 +23,7 @@ export function plotSvg(node, [title, about]) {
   }
   copy.remove();
   const root = document.createElementNS("http://www.w3.org/2000/svg", "svg");
-  const wide = Math.max(width, 6.2 * title.length * 0.62);
+  const wide = Math.max(width, 12 + BOLD * TITLE * title.length);
   const size = { viewBox: `0 0 ${wide} ${height + HEAD}`, width: Math.round(WIDE * wide), height: Math.round(WIDE * (height + HEAD)) };
   for (const [name, value] of Object.entries(size)) root.setAttribute(name, value);
   root.setAttribute("font-family", "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif");
@@ -35,7 +36,7 @@ export function plotSvg(node, [title, about]) {
   };
   put("title", {}, title);
   put("rect", { width: wide, height: height + HEAD, fill: palette.get("--panel") });
-  put("text", { x: 6, y: 13, "font-size": 8.5, "font-weight": 650, fill: palette.get("--ink") }, title);
+  put("text", { x: 6, y: 13, "font-size": TITLE, "font-weight": 650, fill: palette.get("--ink") }, title);
   put("text", { x: 6, y: 25, "font-size": 6.5, fill: palette.get("--faint") }, about);
   put("g", { transform: `translate(0 ${HEAD})` }).append(...copy.childNodes);
   return new XMLSerializer().serializeToString(root);

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
+from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.score import Score, score
 from estimators.errors import NisusError
+from estimators.log import Events
+from estimators.model.state_space import StateSpaceModel
+from estimators.track import Track
+from estimators.tuning import Tuning
 
 from ..engine.interface import Running
 from ..engine.whole import whole
@@ -22,23 +28,30 @@ def summary_of(engine: Running) -> dict[str, Any]:
         tuning, estimator = engine.folded_with()
         if pull is None:
             return {"estimator": estimator}
-        found = score(pull.track, pull.events, engine.model, pull.pictures, gate=tuning.gate, baseline=tuning.baseline)
+        return summary(estimator, tuning, pull.events, pull.track, pull.pictures)
     except NisusError:
         return {}
+
+
+def summary(
+    estimator: str, tuning: Tuning, events: Events, track: Track, pictures: Sequence[Picture] = ()
+) -> dict[str, Any]:
+    """The same of a track, with what it was folded, and of what."""
+    found = score(track, events, tuning.model, pictures, gate=tuning.gate, baseline=tuning.baseline)
     return {
         "estimator": estimator,
         "nis": _plain(found.nis),
         "nis_low": _plain(found.nis_low),
         "nis_high": _plain(found.nis_high),
         "nis_words": found.nis_verdict.words,
-        "error": _error(found, engine),
+        "error": _error(found, tuning.model),
     }
 
 
-def _error(found: Score, engine: Running) -> dict[str, Any] | None:
-    units = {state.name: state.unit for state in engine.model.shown_states}
-    rows = [row.unit for sensor in engine.model.sensors for row in sensor.rows]
-    units |= dict(zip(engine.model.row_names, rows, strict=True))
+def _error(found: Score, model: StateSpaceModel) -> dict[str, Any] | None:
+    units = {state.name: state.unit for state in model.shown_states}
+    rows = [row.unit for sensor in model.sensors for row in sensor.rows]
+    units |= dict(zip(model.row_names, rows, strict=True))
     fits = [("truth", found.states), ("held out", found.held_out)]
     for against, part in fits:
         for name, fit in part.items():

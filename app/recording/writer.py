@@ -26,7 +26,7 @@ from ..rerun.rows import RerunRows
 from .disk import Disk
 from .format import RecordingFile
 from .split import NEVER, Split, part_path
-from .summary import summary_of
+from .summary import summary, summary_of
 
 if TYPE_CHECKING:
     from estimators.diagnostics.episodes import Episode
@@ -339,6 +339,7 @@ def write_recording(
             file.write(pull)
             drawing(pull)
             file.flush()
+        file.summary(summary(twin.estimator, twin.tuning, log.events, track, pictures))
         file.close()
     except OSError as error:
         raise SourceError(f"recording {path}: {error.strerror}; choose a place that can be written") from None

@@ -2,10 +2,12 @@
 
 import json
 import os
+import re
 
 import numpy as np
 import pytest
 
+from app.cli.main import main
 from app.engine.commands import Record
 from app.gallery.recordings import Recordings
 from app.recording.facts import facts_of
@@ -268,3 +270,16 @@ def test_a_file_that_is_no_recording_is_named_as_it_is_and_not_as_its_copy(folde
     text = str(refusal.value)
     assert text.startswith(f"{folder / 'bad.rrd'}: cannot be read (") and "file at bad.rrd: " in text
     assert text.count("/") == str(folder / "bad.rrd").count("/")
+
+
+def test_what_a_fold_wrote_is_listed_with_the_same_scores_as_it_printed(tmp_path, capsys):
+    assert main(["fold", "motor_winding", "--out", str(tmp_path / "folded.rrd")]) == 0
+    printed = capsys.readouterr().out
+    facts = facts_of(tmp_path / "folded.rrd")
+    assert (facts.twin, facts.estimator) == ("motor_winding", "kf")
+    assert float(re.search(r"mean NIS\s+([\d.]+)", printed)[1]) == pytest.approx(facts.summary["nis"], rel=1e-3)
+    where = re.search(r"mean NIS\s+[\d.]+\s+(.*); \d+ readings", printed)[1]
+    assert facts.summary["nis_words"] == f"mean NIS {facts.summary['nis']:.3g}, {where}"
+    rmse, band = re.search(r"RMSE temperature\s+([\d.]+) °C\s+in the 95 % band: ([\d.]+) %", printed).groups()
+    assert float(rmse) == pytest.approx(facts.summary["error"]["rmse"], rel=1e-4)
+    assert float(band) == pytest.approx(100 * facts.summary["error"]["coverage"], abs=0.05)
