@@ -33,6 +33,7 @@ from ..twin.twin import Twin, load_twin
 from .arguments import settings
 from .fold_episodes import blamed, dropped, episode_lines
 from .fold_report import as_dict, as_text, calibration_of
+from .fold_smoothed import Better
 from .prepare import attend, prepare
 from .remarks import remarking
 
@@ -99,7 +100,7 @@ def fold_twin(arguments: Arguments) -> int:
     if arguments.out is not None and arguments.out.suffix not in (".csv", ".parquet", ".rrd"):
         raise ConfigError(f"--out {arguments.out}: must end in .csv, .parquet or .rrd")
     if arguments.smooth:
-        check_smooth(find_estimator(twin.estimator, twin.model))
+        check_smooth(find_estimator(twin.estimator, twin.model), twin.model, twin.tuning.options)
     prepare(twin)
     log, counts = read_log(twin, arguments.duration)
     period = twin.picture if arguments.out is not None and arguments.out.suffix == ".rrd" else None
@@ -124,9 +125,7 @@ def fold_twin(arguments: Arguments) -> int:
     pictures = fold.pictures.taken if fold.pictures is not None else []
     result = score(fold.track, log.events, twin.model, pictures, gate=twin.tuning.gate)
     smoothed = attend(twin.model, lambda: smooth(fold), "smoothing") if arguments.smooth else None
-    better = None
-    if smoothed is not None:
-        better = score(smoothed.instead_of(fold.track), log.events, twin.model, gate=twin.tuning.gate).states
+    better = Better.of(fold, smoothed) if smoothed is not None else None
     found = calibration_of(twin, fold)
     told = blamed(fold, [*dropped(counts, fold), *episodes(fold)])
     if arguments.out is not None:

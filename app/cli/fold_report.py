@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from estimators.diagnostics.calibration import BANDS, Calibration, calibrations, truth_calibration
 from estimators.diagnostics.failure_cause import failures
 from estimators.diagnostics.intervals import Interval
-from estimators.diagnostics.score import Fit, Score
+from estimators.diagnostics.score import Score
 from estimators.fold import Fold
 from estimators.fold_failures import cause_of
 from estimators.gate.reopening import Decision
@@ -24,6 +24,7 @@ from sources.source import WRONG_TIME
 from ..export.calibration_lines import calibration_lines
 from ..twin.twin import Twin
 from .fold_episodes import Told, as_json, dropped
+from .fold_smoothed import Better, errors_dict, number
 
 DECISIONS = 10
 """On sensors that stayed refused, that are printed at most: the last ones; --json has all."""
@@ -34,11 +35,6 @@ def calibration_of(twin: Twin, fold: Fold) -> list[Calibration]:
     events, track = fold.log.events, fold.track
     rows = calibrations(twin.model, events, track, gate=twin.tuning.gate, marginal=fold.marginal)
     return rows + truth_calibration(twin.model, events, track)
-
-
-def number(value: float) -> float | None:
-    """As JSON has it: null where there is none."""
-    return float(value) if np.isfinite(value) else None
 
 
 def _softened(fold: Fold) -> int:
@@ -64,7 +60,7 @@ def as_dict(
     counts: Counter[str],
     fold: Fold,
     told: Sequence[Told],
-    smoothed: Mapping[str, Fit] | None = None,
+    smoothed: Better | None = None,
 ) -> dict[str, Any]:
     """What a script needs of a fold.
 
@@ -78,15 +74,16 @@ def as_dict(
     is their share. `calibration` has an entry for each sensor row, used or held out, and each state whose truth is
     told: see estimators/diagnostics/calibration.py. `episodes` have start and end in seconds of the log (end null while
     one lasts), and `suspects`, the faults that explain them best: see estimators/diagnostics/episodes/ and
-    sensitivity/suspects.py. `smoothed` has `rmse` and `coverage` of the smoothed states, where that was asked for.
+    sensitivity/suspects.py. `smoothed`, where that was asked for, has `rmse` and `coverage` of the smoothed states, and
+    `consistency` with the filter: see estimators/smoothing/consistency.py.
     """
     return {
         "twin": twin.name,
         "estimator": twin.estimator,
         "readings": result.readings,
         **({"field": {"rmse": result.field.rmse, "coverage": result.field.coverage}} if result.field else {}),
-        **_errors(result.states),
-        **({"smoothed": _errors(smoothed)} if smoothed is not None else {}),
+        **errors_dict(result.states),
+        **({"smoothed": smoothed.as_dict()} if smoothed is not None else {}),
         "held_out": {
             name: {"rmse": number(fit.rmse), "bias": number(fit.bias), "coverage": number(fit.coverage)}
             for name, fit in result.held_out.items()
@@ -161,14 +158,6 @@ def _why(fold: Fold) -> str | None:
     return cause_of(fold, int(rows[0])) if rows.size else None
 
 
-def _errors(states: Mapping[str, Fit]) -> dict[str, dict[str, float | None]]:
-    """Root mean square errors of states, and how many of them lie in the 95 % band."""
-    return {
-        "rmse": {name: number(fit.rmse) for name, fit in states.items()},
-        "coverage": {name: number(fit.coverage) for name, fit in states.items()},
-    }
-
-
 def as_text(
     twin: Twin,
     result: Score,
@@ -176,7 +165,7 @@ def as_text(
     seconds: float,
     counts: Counter[str],
     fold: Fold,
-    smoothed: Mapping[str, Fit] | None = None,
+    smoothed: Better | None = None,
 ) -> list[str]:
     """Lines: names and values, then the calibration."""
     track = fold.track
@@ -198,9 +187,8 @@ def as_text(
         else (f"RMSE {name}", f"{fit.rmse:.5g} {units[name]}   in the 95 % band: {100 * fit.coverage:.1f} %")
         for k, (name, fit) in enumerate(result.states.items())
     ]
-    for name, fit in (smoothed or {}).items():
-        inside = f"in the 95 % band: {100 * fit.coverage:.1f} %"
-        rows.append((f"RMSE {name}, smoothed", f"{fit.rmse:.5g} {units[name]}   {inside}"))
+    if smoothed is not None:
+        rows += smoothed.as_rows(units)
     if result.nis_readings:
         inside = "inside" if result.nis_low <= result.nis <= result.nis_high else "OUTSIDE"
         bounds = f"{result.nis_low:.4f} to {result.nis_high:.4f} of {result.nis_readings} readings"

@@ -96,7 +96,7 @@ def fold(
     _check_named(log, model)
     pairs = all_pairs(model) if covariance else None
     if smoothed:
-        check_smooth(find_estimator(estimator, model))
+        check_smooth(find_estimator(estimator, model), model, tuned.options)
         folded = Fold(estimator, model, tuned, log, pairs=pairs, policy=policy, prior=prior)
         folded.advance()
         track = smooth(folded).instead_of(folded.track)

@@ -39,7 +39,7 @@ class Moments(NamedTuple):
 
 
 @inlined
-def note_query(code, context, row, t, clock, following, u, rooted, state, work, tape, own):
+def note_query(code, context, row, t, clock, following, u, holds, state, work, tape, own):
     """Note how the answer to a query goes on to the time of the event after it."""
     n = context.nx
     note = step_at(tape, row, n, own)
@@ -47,7 +47,7 @@ def note_query(code, context, row, t, clock, following, u, rooted, state, work, 
         note.kind[0] = HERE
     elif following == NOWHERE:
         x, P = np.empty(n), np.empty((n, n))
-        covariance_of(note.state, n, rooted, x, P)
+        covariance_of(context, note.state, holds, x, P)
         cut(note, x, P)
     else:
         note.kind[0] = STAYED
@@ -60,7 +60,7 @@ def note_query(code, context, row, t, clock, following, u, rooted, state, work, 
 
 
 @jit
-def note_queries(code, context, first, t, kind, value, clock, u, after, rooted, state, work, tape, own):
+def note_queries(code, context, first, t, kind, value, clock, u, after, holds, state, work, tape, own):
     """Note for each query among events how its answer goes on to the next event that is none.
 
     Args:
@@ -73,7 +73,7 @@ def note_queries(code, context, first, t, kind, value, clock, u, after, rooted, 
         clock: Time of the state before the first, ns.
         u: Inputs before the first (nu,); changed.
         after: Time of the first event behind these that is no query, or NOWHERE.
-        rooted: Whether the filter's state holds a factor of P.
+        holds: What the filter's state holds: COVARIANCE, FACTOR, MEMBERS.
         state: A recorder's state; changed.
         work: Scratch of the filter.
         tape: Address of the tape.
@@ -93,7 +93,7 @@ def note_queries(code, context, first, t, kind, value, clock, u, after, rooted, 
                 following = after
                 if ahead < n:
                     following = t[ahead] if kind[ahead] != RESET else NOWHERE
-            note_query(code, context, first + i, t[i], clock, following, u, rooted, state, work, tape, own)
+            note_query(code, context, first + i, t[i], clock, following, u, holds, state, work, tape, own)
             continue
         clock = t[i]
         if kind[i] == INPUT:

@@ -1,4 +1,4 @@
-"""A filter that notes what it does: around the four functions of any Gaussian filter, for the fold's own loop.
+"""A filter that notes what it does: around the four functions of a Gaussian or ensemble filter, for the fold's loop.
 
 For each event it notes how the state that the event found hangs together with what came of it. If x is the state
 before and x⁻ its prediction, then given all readings up to x
@@ -19,6 +19,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..compiled.context import options
+from ..ensemble.shared import SIZE, column_mean, ensemble
 from ..estimator import (
     Code,
     call_describe,
@@ -39,9 +41,12 @@ from .cross_covariance import POINTS, Crossing, by_points, by_tangent, crossing,
 STAYED, MOVED, CUT = range(3)
 """What an event did to the state before any update: nothing; it was predicted; it began anew, or came to nothing."""
 
-START, PREDICT, UPDATE, DESCRIBE, OWN, RULE, ROOTED, ROW, TAPE, SCRATCH, HEAD = range(11)
+START, PREDICT, UPDATE, DESCRIBE, OWN, RULE, HELD, ROW, TAPE, SCRATCH, HEAD = range(11)
 """Positions in the head: the addresses of the filter's functions, how many numbers its state has, how it predicts,
-whether its state holds a factor of P, the row of the tape that is written, and where tape and scratch are."""
+what its state holds, the row of the tape that is written, and where tape and scratch are."""
+
+COVARIANCE, FACTOR, MEMBERS = range(3)
+"""What the state of a filter holds beside or in place of the mean: P, a factor of it, or the members of an ensemble."""
 
 
 class Step(NamedTuple):
@@ -91,13 +96,17 @@ class Noting(NamedTuple):
     """(n, n): U⁻ᵀ Cᵀ, for U of P⁻."""
     T: Any
     """(n, n): scratch of a product."""
+    after: Any
+    """(n,): m⁻."""
+    X: Any
+    """(N, n): the members before the step, of an ensemble."""
     crossing: Crossing
     end: int
 
 
 @layout
-def noting(at, n):
-    """The layout of it."""
+def noting(at, n, N):
+    """The layout of it, for N members."""
     x, at = take_vector(at, n)
     P, at = take_matrix(at, n, n)
     P_found, at = take_matrix(at, n, n)
@@ -105,8 +114,10 @@ def noting(at, n):
     C, at = take_matrix(at, n, n)
     W, at = take_matrix(at, n, n)
     T, at = take_matrix(at, n, n)
+    after, at = take_vector(at, n)
+    X, at = take_matrix(at, N, n)
     own = crossing(at, n)
-    return Noting(x, P, P_found, ahead, C, W, T, own, own.end)
+    return Noting(x, P, P_found, ahead, C, W, T, after, X, own, own.end)
 
 
 @inlined
@@ -129,13 +140,41 @@ def step_at(tape, row, n, own):
 
 
 @inlined
-def covariance_of(state, n, rooted, x, P):
-    """Fill x and P with the moments of a Gaussian filter's state."""
+def count_of(context, holds):
+    """How many members the state has."""
+    return int(options(context)[SIZE]) if holds == MEMBERS else 0
+
+
+@jit
+def members_covariance(X, x, Y, y, C):
+    """x, y (n,) ← means of the members X, Y (N, n), which belong together;  C ← (X - x)ᵀ (Y - y) / (N - 1)."""
+    N, n = X.shape
+    for j in range(n):
+        x[j] = column_mean(X, j)
+        y[j] = column_mean(Y, j)
+    for i in range(n):
+        for j in range(n):
+            C[i, j] = 0.0
+    for k in range(N):
+        for i in range(n):
+            a = (X[k, i] - x[i]) / (N - 1)
+            for j in range(n):
+                C[i, j] += a * (Y[k, j] - y[j])
+
+
+@jit
+def covariance_of(context, state, holds, x, P):
+    """Fill x and P with the moments of a filter's state."""
+    n = context.nx
+    if holds == MEMBERS:
+        X = ensemble(context, state)
+        members_covariance(X, x, X, x, P)
+        return
     mean, held = moments_of(state, n)
     for i in range(n):
         x[i] = mean[i]
         for j in range(n):
-            if rooted:
+            if holds == FACTOR:
                 s = 0.0
                 for k in range(min(i, j) + 1):
                     s += held[k, i] * held[k, j]
@@ -255,8 +294,8 @@ def start(context, mean, cov, state):
     """As the filter's; the state that is given up is noted, and that it was."""
     head = head_of(state)
     own = own_of(head, state)
-    places = noting(head[SCRATCH], context.nx)
-    covariance_of(own, context.nx, head[ROOTED] != 0, places.x, places.P)
+    places = noting(head[SCRATCH], context.nx, count_of(context, head[HELD]))
+    covariance_of(context, own, head[HELD], places.x, places.P)
     cut(step_at(head[TAPE], head[ROW], context.nx, own.size), places.x, places.P)
     call_start(head[START], context, mean, cov, own)
 
@@ -271,27 +310,30 @@ def predict(context, u, dt, index, state, work):
     if row.kind[0] == CUT:
         call_predict(head[PREDICT], context, u, dt, index, own, work)
         return
-    places = noting(head[SCRATCH], n)
-    rooted = head[ROOTED] != 0
+    holds = head[HELD]
+    places = noting(head[SCRATCH], n, count_of(context, holds))
     x, P, C = places.x, places.P, places.C
-    covariance_of(own, n, rooted, x, P)
+    covariance_of(context, own, holds, x, P)
     if row.kind[0] == STAYED:
         copy(P, places.P_found)
     good = True
-    if head[RULE] == POINTS:
+    if holds == MEMBERS:
+        copy(ensemble(context, own), places.X)
+    elif head[RULE] == POINTS:
         _, held = moments_of(own, n)
-        good = take_factor(P, held, rooted, places.crossing)
+        good = take_factor(P, held, holds == FACTOR, places.crossing)
         if good:
             by_points(context, x, u, dt, places.crossing, C)
     else:
         by_tangent(context, head[RULE], x, u, dt, P, places.crossing, C)
     call_predict(head[PREDICT], context, u, dt, index, own, work)
-    after, ahead = moments_of(own, n)
-    covariance_of(own, n, rooted, places.crossing.mean, places.ahead)
+    covariance_of(context, own, holds, places.after, places.ahead)
+    if holds == MEMBERS:
+        members_covariance(places.X, x, ensemble(context, own), places.after, C)
     good = good and root(places.ahead, places.ahead, n)
     if good:
         solve_semidefinite(places.ahead, C, places.W)
-        join(row, x, P, after, C, places.W, places.T)
+        join(row, x, P, places.after, C, places.W, places.T)
         good = finite(row)
     if not good:
         cut(row, x if row.kind[0] == STAYED else row.before, places.P_found)
@@ -319,17 +361,24 @@ def describe(context, state, mean, std, cross):
     call_describe(head[DESCRIBE], context, own, mean, std, cross)
 
 
+class Kind(NamedTuple):
+    """How a filter predicts (CONSTANT, TANGENT, POINTS; of an ensemble all one), and what its state holds."""
+
+    rule: int
+    holds: int
+
+
 class Recorder:
     """The functions that note, and room for the notes of so many events."""
 
-    def __init__(self, code: Code, rule: int, rooted: bool, own: int, nx: int, rows: int) -> None:
-        """`code` is the filter's, `own` how many numbers its state has."""
+    def __init__(self, code: Code, kind: Kind, own: int, nx: int, members: int, rows: int) -> None:
+        """`code` is the filter's, `own` how many numbers its state has; `members` is 0 unless it is an ensemble."""
         self._each = size_of(step, nx, own)
         self._tape = np.zeros((rows + 1) * self._each)
-        self._scratch = np.full(size_of(noting, nx), np.nan)
+        self._scratch = np.full(size_of(noting, nx, members), np.nan)
         self._head = np.zeros(HEAD, np.int64)
         self._head[[START, PREDICT, UPDATE, DESCRIBE]] = code
-        self._head[[OWN, RULE, ROOTED]] = own, rule, rooted
+        self._head[[OWN, RULE, HELD]] = own, *kind
         self._head[[TAPE, SCRATCH]] = self._tape.ctypes.data, self._scratch.ctypes.data
         self._nx, self._own = nx, own
         self.code = Code(

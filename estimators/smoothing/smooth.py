@@ -6,6 +6,7 @@ the fold's snapshots and the notes of one stretch, whatever the log's length.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -15,13 +16,14 @@ from ..estimator import Estimator
 from ..fold import Fold
 from ..gate.stories import BELIEVED, REOPENED
 from ..log import MAINTENANCE, MARK, RESET, TICK, TRUTH
+from ..model.state_space import StateSpaceModel
 from ..numerics.workspace import size_of
 from ..snapshots import Snapshot
 from ..track import Track
 from .backward import NOWHERE, Moments, backward, note_queries, step_back, tell
 from .cross_covariance import CONSTANT, POINTS, TANGENT
 from .jumps import changed, widened
-from .recorder import Recorder, Step, step
+from .recorder import COVARIANCE, FACTOR, MEMBERS, Kind, Recorder, Step, step
 
 NOTES = 32 * 2**20
 """Bytes that the notes of one stretch may take; at least one event is noted at a time."""
@@ -31,18 +33,19 @@ FEWEST = 512
 
 QUERIES = (TRUTH, TICK, MARK)
 
-RULES = {
-    "kf": (CONSTANT, False),
-    "kf-steady": (CONSTANT, False),
-    "ekf": (TANGENT, False),
-    "iekf": (TANGENT, False),
-    "ukf": (POINTS, False),
-    "ckf": (POINTS, False),
-    "sr-kf": (CONSTANT, True),
-    "sr-ekf": (TANGENT, True),
-    "sr-ukf": (POINTS, True),
+KINDS = {
+    "kf": Kind(CONSTANT, COVARIANCE),
+    "kf-steady": Kind(CONSTANT, COVARIANCE),
+    "ekf": Kind(TANGENT, COVARIANCE),
+    "iekf": Kind(TANGENT, COVARIANCE),
+    "ukf": Kind(POINTS, COVARIANCE),
+    "ckf": Kind(POINTS, COVARIANCE),
+    "sr-kf": Kind(CONSTANT, FACTOR),
+    "sr-ekf": Kind(TANGENT, FACTOR),
+    "sr-ukf": Kind(POINTS, FACTOR),
+    **dict.fromkeys(("enkf", "etkf", "ensrf", "letkf"), Kind(TANGENT, MEMBERS)),
 }
-"""By filter: how it predicts, and whether its state holds a factor of P."""
+"""By filter."""
 
 
 class Smoothed(NamedTuple):
@@ -72,14 +75,23 @@ class Stretch(NamedTuple):
     state: int = -1
 
 
-def check_smooth(estimator: Estimator) -> None:
-    """Refuse a filter whose estimates cannot be smoothed.
+def check_smooth(estimator: Estimator, model: StateSpaceModel, options: Mapping[str, float | str]) -> None:
+    """Refuse a filter whose estimates of a model cannot be smoothed.
 
     Raises:
         EstimatorError: With the reason.
     """
-    if estimator.name not in RULES:
-        raise EstimatorError(f"{estimator.name} cannot be smoothed; use {', '.join(RULES)}")
+    if estimator.name not in KINDS:
+        raise EstimatorError(f"{estimator.name} cannot be smoothed; use {', '.join(KINDS)}")
+    if model.black_box:
+        raise EstimatorError(f"{estimator.name} cannot be smoothed: {model.name} is a black box, which is not compiled")
+    if KINDS[estimator.name].holds == MEMBERS:
+        members = int(estimator.complete(options)["members"])
+        if members < model.nx + 2:
+            raise EstimatorError(
+                f"{estimator.name} cannot be smoothed: the covariance of {members} members of {model.name} with its "
+                f"{model.nx:,} states has no inverse; give at least {model.nx + 2:,} members, better several times that"
+            )
 
 
 def smooth(fold: Fold) -> Smoothed:
@@ -88,7 +100,7 @@ def smooth(fold: Fold) -> Smoothed:
     Raises:
         EstimatorError: If there is no smoother for its filter.
     """
-    check_smooth(fold.estimator)
+    check_smooth(fold.estimator, fold.model, fold.options)
     return _Smoother(fold).smoothed()
 
 
@@ -98,14 +110,17 @@ class _Smoother:
     def __init__(self, fold: Fold) -> None:
         self._fold, self._machine, self._log = fold, fold.machine, fold.log
         n, own = fold.model.nx, fold.machine.fresh().state.size
-        rule, self._rooted = RULES[fold.estimator.name]
+        kind = KINDS[fold.estimator.name]
+        self._holds, members = kind.holds, 0
+        if kind.holds == MEMBERS:
+            members = int(fold.options["members"])
         first, names = fold.log.first, fold.model.sensor_names
         told = [decision for decision in fold.decisions if decision.outcome in (REOPENED, BELIEVED)]
         self._stories = [Stretch(d.first - first, d.row - first + 1, sensor=names.index(d.sensor)) for d in told]
         self._most = max(1, NOTES // (8 * size_of(step, n, own)))
         room = min(self._most, fold.n)
         longest = max((story.stop - story.start for story in self._stories), default=1)
-        self._recorder = Recorder(self._machine.code, rule, self._rooted, own, n, max(room, longest))
+        self._recorder = Recorder(self._machine.code, kind, own, n, members, max(room, longest))
         self._scratch = np.empty((3, n, n))
         self._earlier = Moments(*fold.moments())
         self._later = Moments(np.empty(n), np.empty((n, n)))
@@ -156,14 +171,22 @@ class _Smoother:
                 batches[-1].append(part)
             else:
                 batches.append([part])
-        now = self._fold.snapshots[self._log.first + start].copy()
+        self._batches(batches, self._fold.snapshots[self._log.first + start].copy())
+
+    def _batches(self, batches: list[list[Stretch]], now: Snapshot) -> None:
+        """Smooth batches from the last to the first; of the states before them no more are kept than there is room."""
+        if len(batches) == 1:
+            self._batch(batches[0], now)
+            return
+        each = -(-len(batches) // max(2, NOTES // now.state.nbytes))
+        groups = [batches[k : k + each] for k in range(0, len(batches), each)]
         begins = [now.copy()]
-        for batch in batches[:-1]:
-            for part in batch:
+        for group in groups[:-1]:
+            for part in [part for batch in group for part in batch]:
                 self._fold_on(part, now)
             begins.append(now.copy())
-        for batch, begin in zip(reversed(batches), reversed(begins), strict=True):
-            self._batch(batch, begin)
+        for group, begin in zip(reversed(groups), reversed(begins), strict=True):
+            self._batches(group, begin)
 
     def _batch(self, parts: list[Stretch], now: Snapshot) -> None:
         """Smooth stretches: forward with notes, then back."""
@@ -214,7 +237,7 @@ class _Smoother:
         elif np.isin(kind, QUERIES).any():
             note_queries(
                 recorder.code, context, row, log.t[rows], kind, log.value[rows], int(before.clock[0]), before.u.copy(),
-                self._after, self._rooted, recorder.around(before.state, row), self._machine.work, recorder.tape,
+                self._after, self._holds, recorder.around(before.state, row), self._machine.work, recorder.tape,
                 before.state.size,
             )  # fmt: skip
         backward(

@@ -13,7 +13,7 @@ from ..estimators.smoothing.test_textbook import CAR
 from ..support import SECOND
 from .timing import judged, medians
 
-STEPS, SHORT, BOUND = 100_000, 1_000, 0.3
+STEPS, SHORT, BOUND = 100_000, 10_000, 0.3
 FILTERS = ("kf", "ekf", "iekf", "ukf", "ckf", "sr-kf", "sr-ekf", "sr-ukf")
 F = np.kron(np.array([[1.0, 0.1], [0.0, 1.0]]), np.eye(2))
 Q = np.kron(np.array([[0.1**3 / 3, 0.1**2 / 2], [0.1**2 / 2, 0.1]]), np.eye(2))

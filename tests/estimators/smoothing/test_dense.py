@@ -16,13 +16,13 @@ from estimators.log import READING, RESET, TICK, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.registry import ESTIMATORS
 from estimators.smoothing import smooth as module
-from estimators.smoothing.smooth import RULES, smooth
+from estimators.smoothing.smooth import KINDS, smooth
 from estimators.track import GATED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import JointGaussian, random_linear, random_log
 from tests.support import SECOND
 
-GAUSSIAN = [name for name in RULES if name != "kf-steady"]
+GAUSSIAN = [name for name in KINDS if ESTIMATORS[name].family == "Gaussian" and name != "kf-steady"]
 CASES = [(nx, nu, seed) for nx, nu in ((1, 0), (3, 2), (5, 1)) for seed in range(3)]
 CORRELATED = 2
 """The seed of a case whose sensors' rows are correlated."""
@@ -240,8 +240,9 @@ def long_log(n=3000, seed=3, jump=0.0):
     return log
 
 
+@pytest.mark.parametrize("notes", [10_000, 1])
 @pytest.mark.parametrize("estimator", ["kf", "sr-ukf"])
-def test_the_memory_is_bounded_and_the_bits_are_the_same(estimator, monkeypatch):
+def test_the_memory_is_bounded_and_the_bits_are_the_same(estimator, notes, monkeypatch):
     log = long_log()
     whole = smooth_with_pairs(estimator, log)
     rooms = []
@@ -252,7 +253,7 @@ def test_the_memory_is_bounded_and_the_bits_are_the_same(estimator, monkeypatch)
         return made(*given)
 
     monkeypatch.setattr(module, "Recorder", noting)
-    monkeypatch.setattr(module, "NOTES", 10_000)
+    monkeypatch.setattr(module, "NOTES", notes)
     for one, other in zip(whole, smooth_with_pairs(estimator, log), strict=True):
         np.testing.assert_array_equal(one, other)
     assert rooms[0] < 100

@@ -1,13 +1,13 @@
-"""Other people's smoothers on the same data: statsmodels' Kalman smoother, FilterPy's RTS for linear and sigma points."""
+"""Other people's smoothers on the same data: statsmodels' and FilterPy's, of linear models and by sigma points."""
 
 import numpy as np
 import pytest
 from filterpy.kalman import JulierSigmaPoints, KalmanFilter, UnscentedKalmanFilter
 from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
 
-from estimators import Log, fold
+from estimators import ESTIMATORS, Log, fold
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
-from estimators.smoothing.smooth import RULES
+from estimators.smoothing.smooth import KINDS
 from tests.estimators.smoothing.test_dense import BODY, START, VARIANCE, moved
 
 DT, N = 0.3, 300
@@ -29,7 +29,9 @@ def smoothed(estimator, model, ys, **settings):
     return fold(estimator, model, log, covariance=True, smoothed=True, **settings)
 
 
-@pytest.mark.parametrize("estimator", [name for name in RULES if name != "kf-steady"])
+@pytest.mark.parametrize(
+    "estimator", [name for name in KINDS if name.endswith("kf") and ESTIMATORS[name].family == "Gaussian"]
+)
 def test_statsmodels_on_a_linear_model(estimator):
     ys = drive()
     ys[40:60] = np.nan
