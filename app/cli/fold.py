@@ -20,7 +20,8 @@ from estimators.interface.table import table_of
 from estimators.late import inflated
 from estimators.log import Log
 from estimators.registry import find_estimator
-from estimators.smoothing.smooth import Smoothed, check_smooth, smooth
+from estimators.smoothing.smooth import check_smooth, smooth
+from estimators.smoothing.smoothed import Smoothed
 from estimators.track import Track
 from sources.source import Endless
 

@@ -13,7 +13,7 @@ from ..diagnostics.evidence import CAUSES, IMPOVERISHED, OUTSIDE, SENSORS, TRUTH
 from ..events.batch import KIND_NAMES, READING, Events, truth_of
 from ..events.maintenance import model_versions
 from ..model.state_space import StateSpaceModel
-from ..smoothing.smooth import Smoothed
+from ..smoothing.smoothed import Smoothed
 from ..track import HEALTH_NAMES, REASONS, VERDICT_NAMES, Track
 
 

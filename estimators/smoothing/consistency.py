@@ -11,7 +11,7 @@ import numpy as np
 
 from ..model.state_space import StateSpaceModel
 from ..track import Track
-from .smooth import Smoothed
+from .smoothed import Smoothed
 
 LEAST = 1e-3
 """Share of a variance that later readings must take; of less, rounding makes the most."""

@@ -393,13 +393,12 @@ class Recorder:
         """The address of the rows."""
         return self._tape.ctypes.data
 
-    def around(self, state: np.ndarray, row: int) -> np.ndarray:
-        """A recorder's state around that of a filter; the next event is noted in this row."""
-        self.go_to(row)
+    def around(self, state: np.ndarray) -> np.ndarray:
+        """A recorder's state around that of a filter."""
         # An address is less than 2^53, and so the same as a float64.
         return np.append(state, float(self._head.ctypes.data))
 
-    def go_to(self, row: int) -> None:
-        """Let the next note stand in a row."""
+    def begin(self, row: int) -> None:
+        """Note the next event in a row of the tape."""
         self._head[ROW] = row
         self._tape[row * self._each] = STAYED

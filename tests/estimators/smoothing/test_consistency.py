@@ -5,7 +5,7 @@ import pytest
 
 from estimators import fold
 from estimators.smoothing.consistency import consistency
-from estimators.smoothing.smooth import Smoothed
+from estimators.smoothing.smoothed import Smoothed
 from tests.estimators.smoothing.test_textbook import CAR, car
 
 

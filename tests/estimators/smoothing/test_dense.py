@@ -15,7 +15,7 @@ from estimators.fold import Fold
 from estimators.log import READING, RESET, TICK, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.registry import ESTIMATORS
-from estimators.smoothing import smooth as module
+from estimators.smoothing import moments_back, walk
 from estimators.smoothing.smooth import KINDS, smooth
 from estimators.track import GATED
 from estimators.tuning import Tuning
@@ -236,7 +236,11 @@ def long_log(n=3000, seed=3, jump=0.0):
     t = np.cumsum(rng.integers(1, 40, n)) * (SECOND // 100)
     y = np.cumsum(rng.normal(0, 0.3, n)) + np.where(np.arange(n) < n // 2, 0.0, jump)
     log = Log.of(BODY)
-    log.extend(Events(t, t, np.full(n, READING, np.int8), np.zeros(n, np.int32), y.reshape(n, 1)))
+    readings = Events(t, t, np.full(n, READING, np.int8), np.zeros(n, np.int32), y.reshape(n, 1))
+    asked = readings.select(np.arange(0, n, 3))
+    between = asked._replace(t=asked.t + SECOND // 300, kind=np.full(asked.t.size, TICK, np.int8))
+    at = asked._replace(kind=np.full(asked.t.size, TICK, np.int8))
+    log.extend(Events.concat([readings, between, at], 1))
     return log
 
 
@@ -246,14 +250,14 @@ def test_the_memory_is_bounded_and_the_bits_are_the_same(estimator, notes, monke
     log = long_log()
     whole = smooth_with_pairs(estimator, log)
     rooms = []
-    made = module.Recorder
+    made = moments_back.Recorder
 
     def noting(*given):
         rooms.append(given[-1])
         return made(*given)
 
-    monkeypatch.setattr(module, "Recorder", noting)
-    monkeypatch.setattr(module, "NOTES", notes)
+    monkeypatch.setattr(moments_back, "Recorder", noting)
+    monkeypatch.setattr(walk, "ROOM", notes)
     for one, other in zip(whole, smooth_with_pairs(estimator, log), strict=True):
         np.testing.assert_array_equal(one, other)
     assert rooms[0] < 100
@@ -293,7 +297,7 @@ def test_a_twin_that_was_found_wrong(estimator):
         if i == decision.first:
             noise = noise + F @ np.diag(story.widened**2) @ F.T
         chain.go_on(F, noise)
-        if i not in refused or decision.first <= i <= decision.row:
+        if log.kind[i] == READING and (i not in refused or decision.first <= i <= decision.row):
             chain.read(log.value[i, 0])
         clock = t
     expected_mean, expected_cov = chain.solved()
