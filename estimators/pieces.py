@@ -18,13 +18,17 @@ from .fold_kernel import (
 )
 from .numerics.threads import threaded
 from .registry import ESTIMATORS
+from .smoothing.pieces import PIECES
 
 LOOP = "loop"
 """In place of a filter's name: the loop over the events, which serves all of them."""
 
+SMOOTHER = "smoother"
+"""The same: what goes back over a fold, of all filters."""
+
 
 class Piece(NamedTuple):
-    """A function that is compiled by itself: of the loop or a filter, by name, and its place among the pieces of that.
+    """A function that is compiled by itself: of the loop, the smoother or a filter, by name, and its place in that.
 
     `after` are the places of those that it contains; with them in the cache it takes a tenth of the time.
     """
@@ -35,7 +39,9 @@ class Piece(NamedTuple):
 
 
 def pieces_of(name: str) -> list[Piece]:
-    """The pieces of a filter or of the `LOOP`, what takes longest first."""
+    """The pieces of a filter, of the `LOOP` or the `SMOOTHER`, what takes longest first."""
+    if name == SMOOTHER:
+        return [Piece(SMOOTHER, place) for place in range(len(PIECES))]
     if name == LOOP:
         return [Piece(LOOP, 0), Piece(LOOP, 1), Piece(LOOP, 2, (0, 1)), Piece(LOOP, 3), Piece(LOOP, 4)]
     return [] if ESTIMATORS[name].interpreted else [Piece(name, place) for place in range(4)]
@@ -43,6 +49,8 @@ def pieces_of(name: str) -> list[Piece]:
 
 def _function(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
     """The function of a piece, and the types of its arguments."""
+    if piece.of == SMOOTHER:
+        return PIECES[piece.place]
     if piece.of == LOOP:
         inner = run_signature.args[: -len(("policy", "bounds", "evidence"))]
         return (

@@ -68,6 +68,8 @@ class Fold:
     """Write the track to this .csv or .parquet, or a recording to this .rrd."""
     html: Path | None = None
     """Write a report to this HTML file, which needs no other: scores, charts, checks, episodes, tuning."""
+    smooth: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Smooth too: what the readings before and after each moment say of it; a .csv or .parquet has it beside."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print one JSON object."""
 
