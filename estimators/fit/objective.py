@@ -1,4 +1,6 @@
-"""What a fit maximises: what it aims at (aims.py), and a weak belief in what the twin says. Usually that is
+"""What a fit maximises: what it aims at (aims.py), and a weak belief in what the twin says.
+
+Usually that is
 
     log p(y_1..n) = Σ log p(y_t | y_1..t-1),    - ½ Σ ((θ - θ_0) / d)²
 
