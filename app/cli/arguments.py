@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated, Literal, get_args
 
 import tyro
 
@@ -170,7 +170,12 @@ class Tune:
     """Name of a twin that ships, or path of a YAML file."""
     fit: str = "Q,R"
     """What to fit: groups (Q, R, p, options, prior) and single entries, as Q.winding, R.yoke, p.NAME, options.alpha,
-    prior.STATE.std, with commas."""
+    prior.STATE.std, with commas. scale: one factor for all of Q and R."""
+    aim: Literal["likelihood", "crps", "error"] = "likelihood"
+    """What is maximised: the likelihood of every reading before it was seen; or how well sensors held out are
+    predicted, by continuous ranked probability score or by squared error."""
+    predict: tuple[str, ...] = ()
+    """The sensors that those hold out. Default: each in turn."""
     estimator: str | None = None
     """Estimator to use instead of the twin's own; `nisus filters` lists all of them."""
     set: Settings = ()

@@ -37,7 +37,15 @@ def tune_twin(arguments: Arguments) -> int:
     twin, recordings = _recordings(arguments)
 
     def work() -> Fitted:
-        return fit(twin.estimator, twin.tuning, recordings, wanted=wanted, blocks=arguments.blocks)
+        return fit(
+            twin.estimator,
+            twin.tuning,
+            recordings,
+            wanted=wanted,
+            blocks=arguments.blocks,
+            aim=arguments.aim,
+            predict=arguments.predict,
+        )
 
     found: Fitted = attend(twin.model, work, "fitting")
     if arguments.json:

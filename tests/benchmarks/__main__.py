@@ -13,7 +13,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 
 def main() -> None:
-    from . import defences, ensembles, false_alarms, filters, history, page_, particles_, smoothing, sources
+    from . import defences, ensembles, false_alarms, filters, history, page_, particles_, smoothing, sources, tuning
 
     begun = perf_counter()
     load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
@@ -35,6 +35,7 @@ def main() -> None:
         history.growing_history,
         history.refold,
         smoothing.smoothing,
+        tuning.tuning,
         defences.defences,
         sources.blf,
         false_alarms.false_alarms,
