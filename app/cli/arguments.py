@@ -196,6 +196,31 @@ class Tune:
 
 
 @dataclass(frozen=True)
+class Guard:
+    """Fold archived recordings with the accepted tunings of their twins, and say what got worse than recorded.
+
+    Without a name: the twins that ship, with the logs that ship or lie under NISUS_DATA. What got worse by more than
+    chance, or by so much that it says something of the asset, is a line of a table. Exit status: 0 if nothing did, 1 if
+    something did, 2 if something could not be folded. What is absent is said; with CI=true it is an error.
+    """
+
+    twins: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Names of twins that ship, or paths of YAML files."""
+    archive: Path | None = None
+    """Folder of recordings (.rrd) and of twins (.yaml) to guard."""
+    junit: Path | None = None
+    """Also write the verdict to this file, as JUnit XML for CI."""
+    accept: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Record the scores as they are now: what guards compare with from then on."""
+    note: str = ""
+    """Why; of --accept, which keeps it with the scores."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable, as for `run`: what becomes of the scores under another setting."""
+    jobs: int | None = None
+    """Number of processes; default: one for each processor."""
+
+
+@dataclass(frozen=True)
 class Stress:
     """Make mistakes with a twin on purpose, and print how soon, and how rightly, it says so.
 
@@ -360,6 +385,7 @@ Command = (
     | Check
     | Compare
     | Tune
+    | Guard
     | Stress
     | Commission
     | Filters

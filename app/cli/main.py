@@ -23,6 +23,7 @@ from .arguments import (
     Compare,
     Filters,
     Fold,
+    Guard,
     Log,
     Review,
     Run,
@@ -52,6 +53,10 @@ def carry_out(command: Command) -> int:
         from .compare import compare_twin
 
         return compare_twin(command)
+    if isinstance(command, Guard):
+        from .guard import guard
+
+        return guard(command)
     if isinstance(command, Commission):
         from .commission import commission_twin
 

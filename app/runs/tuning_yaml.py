@@ -34,7 +34,7 @@ def tuning_yaml(config: TwinSection, estimator: str, tuning: Tuning, *, whole: b
     options = {name: _option(entry, name, value) for name, value in tuning.options.items()}
     filters = {**config.filters, first.name: {**config.filters.get(first.name, {}), **first.options}}
     others = {name: dict(given) for name, given in filters.items() if given and name != estimator}
-    lines = [f"estimator: {_flow({'name': estimator, 'options': options} if options else estimator)}"]
+    lines = [f"estimator: {as_flow({'name': estimator, 'options': options} if options else estimator)}"]
     lines += as_section("filters", others) if whole else []
     model = tuning.model
     values = dict(zip((item.name for item in model.parameters), map(float, tuning.p), strict=True))
@@ -51,7 +51,7 @@ def tuning_yaml(config: TwinSection, estimator: str, tuning: Tuning, *, whole: b
     over = {name: {"over": values.get(disturbance_time(name), seconds)} for name, seconds in lasting.items()}
     lines += as_section("noise", {name: {"variance": value, **over.get(name, {})} for name, value in noises.items()})
     lines += as_section("sensors", _sensors(config, tuning, errors, values, whole))
-    lines.append(f"gate: {_flow(_gate(tuning))}")
+    lines.append(f"gate: {as_flow(_gate(tuning))}")
     return "\n".join(lines) + "\n"
 
 
@@ -106,18 +106,19 @@ def _option(entry: Estimator, name: str, value: float) -> float | str:
 
 def as_section(name: str, items: Mapping[str, Any]) -> list[str]:
     """A section as lines, an entry each; none if it is empty."""
-    return [f"{name}:", *(f"  {_key(key)}: {_flow(value)}" for key, value in items.items())] if items else []
+    return [f"{name}:", *(f"  {_key(key)}: {as_flow(value)}" for key, value in items.items())] if items else []
 
 
 def _key(name: str) -> str:
     return name if PLAIN.fullmatch(name) and name.lower() not in RESERVED else json.dumps(name, ensure_ascii=False)
 
 
-def _flow(value: Any) -> str:
+def as_flow(value: Any) -> str:
+    """A value in one line of YAML."""
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_key(key)}: {_flow(item)}" for key, item in value.items()) + "}"
+        return "{" + ", ".join(f"{_key(key)}: {as_flow(item)}" for key, item in value.items()) + "}"
     if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(map(_flow, value)) + "]"
+        return "[" + ", ".join(map(as_flow, value)) + "]"
     if isinstance(value, str):
         return _key(value)
     if isinstance(value, float) and value == round(value) and abs(value) < 1e15:
