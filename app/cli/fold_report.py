@@ -193,7 +193,7 @@ def as_text(
         rows += smoothed.as_rows(units)
     if result.nis_readings:
         verdict = result.nis_verdict
-        bounds = f"{verdict.place} {verdict.expected}; {result.nis_readings} readings"
+        bounds = f"{verdict.said}; {result.nis_readings} readings"
         rows.append(("mean NIS", f"{_decimals(result.nis)}   {bounds}"))
     # The many rows of one sensor are one line.
     together = {}

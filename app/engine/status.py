@@ -8,9 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimators.diagnostics.health import FAR
+from estimators.diagnostics.score import nis_verdict
 from estimators.diagnostics.sensor_states import sensor_states
 from estimators.fold import Fold
+from estimators.log import RESET
 from estimators.registry import find_estimator
+from estimators.track import FAILED, GATED, USED
 from estimators.versions import model_version_at
 from sources.source import Source
 
@@ -97,6 +101,7 @@ def status_of(
         nis=float(track.nis_mean[last]) if last >= 0 else np.nan,
         nis_low=float(track.nis_low[last]) if last >= 0 else np.nan,
         nis_high=float(track.nis_high[last]) if last >= 0 else np.nan,
+        nis_judged=_judged(fold),
         **playback_status(source),
         finished=finished,
         recording=recording,
@@ -107,6 +112,19 @@ def status_of(
         awaited=awaited,
         compiling=compiling,
     )
+
+
+def _judged(fold: Fold) -> float:
+    """Of a commissioned twin the NIS of the readings in the window, as it is compared with what was normal."""
+    baseline, n, window = fold.tuning.baseline, fold.n, fold.policy.window
+    if baseline is None:
+        return np.nan
+    rows = slice(max(0, n - FAR * window), n)
+    resets = np.flatnonzero(fold.log.kind[rows] == RESET)
+    begun = rows.start + (int(resets[-1]) + 1 if resets.size else 0)
+    judged = begun + np.flatnonzero(np.isin(fold.track.verdict[begun:n], (USED, GATED, FAILED)))[-window:]
+    events, track = fold.log.events.select(judged), fold.track.select(judged)
+    return nis_verdict(track, events, fold.model, baseline).judged
 
 
 def _before(fold: Fold, watchers: Watchers) -> str:

@@ -177,7 +177,7 @@ function bests(runs, subject) {
     return known.length > 1 && winners.length < known.length ? winners.at(-1)[1] : null;
   };
   return {
-    nis: least((score) => score.nis > 0 && Math.abs(Math.log(score.nis / Math.sqrt(score.nis_low * score.nis_high)))),
+    nis: least((score) => score.nis_judged > 0 && Math.abs(Math.log(score.nis_judged / Math.sqrt(score.nis_low * score.nis_high)))),
     rmse: least((score, fit) => fit?.rmse),
     coverage: least((score, fit) => fit && Math.abs(fit.coverage - COVERED)),
     likelihood: least((score) => (score.log_likelihood_reading === null ? NaN : -score.log_likelihood_reading)),
