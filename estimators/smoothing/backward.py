@@ -22,7 +22,7 @@ from ..interpreted.fold_loop import UNSET
 from ..log import INPUT, RESET
 from ..numerics.jit import inlined, ints, jit
 from ..numerics.linalg import wrap
-from .recorder import CUT, ROW, STAYED, copy, covariance_of, cut, head_of, step_at, turn
+from .recorder import CUT, MOVED, ROW, STAYED, copy, covariance_of, cut, head_of, step_at, turn
 
 HERE = 3
 """Of a query: it was asked at the time of the state before it. STAYED: at that of the next event, whose state it is."""
@@ -131,6 +131,24 @@ def step_back(context, note, x, P, T, S):
 
 
 @jit
+def join_moments(note, P, out):
+    """out ← Cov(x, x⁺ | y) = G P, of the smoothed states before and behind a step, P that behind it.
+
+    Source: Särkkä, Bayesian Filtering and Smoothing (2013), theorem 12.4 and (12.49).
+    """
+    n = P.shape[0]
+    for i in range(n):
+        for j in range(n):
+            if note.kind[0] == MOVED:
+                s = 0.0
+                for k in range(n):
+                    s += note.G[i, k] * P[k, j]
+                out[i, j] = s
+            else:
+                out[i, j] = P[i, j] if note.kind[0] == STAYED else np.nan
+
+
+@jit
 def tell(context, x, P, mean, std, cross):
     """Mean, standard deviation and the configured covariances, as the track has them."""
     shown = shown_states(context)
@@ -144,7 +162,7 @@ def tell(context, x, P, mean, std, cross):
 
 
 @jit
-def backward(context, first, kind, tape, own, earlier, later, work, mean, std, cross):
+def backward(context, first, kind, tape, own, earlier, later, work, mean, std, cross, lag):
     """Fill the rows of N events from the last to the first.
 
     Args:
@@ -159,6 +177,8 @@ def backward(context, first, kind, tape, own, earlier, later, work, mean, std, c
         mean: (N, shown).
         std: (N, shown).
         cross: (N, pairs).
+        lag: (N, nx, nx), or (0, nx, nx) for none: of each event that is no query the covariance of the state that it
+            found and the state behind it, both smoothed; NaN where nothing joins them.
     """
     n = context.nx
     T, S, Q = work[0], work[1], work[2]
@@ -179,4 +199,6 @@ def backward(context, first, kind, tape, own, earlier, later, work, mean, std, c
         for j in range(n):
             later.x[j] = earlier.x[j]
         copy(earlier.P, later.P)
+        if lag.shape[0] > 0:
+            join_moments(note, earlier.P, lag[i])
         step_back(context, note, earlier.x, earlier.P, T, S)

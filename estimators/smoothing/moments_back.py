@@ -18,7 +18,8 @@ from .walk import QUERIES, Jump, Stretch
 class MomentsBack:
     """Fills `out` on its way; see `Notes`."""
 
-    def __init__(self, fold: Fold, kind: Kind, out: Smoothed) -> None:
+    def __init__(self, fold: Fold, kind: Kind, out: Smoothed, lag: np.ndarray | None = None) -> None:
+        """`lag` (N, nx, nx) takes the covariances of neighbours, see `backward`."""
         n = fold.model.nx
         self._log, self._machine, self._kind, self._out = fold.log, fold.machine, kind, out
         self._members = int(fold.options["members"]) if kind.holds == MEMBERS else 0
@@ -28,6 +29,7 @@ class MomentsBack:
         self._earlier = Moments(*fold.moments())
         self._later = Moments(np.empty(n), np.empty((n, n)))
         self._after = NOWHERE
+        self._lag = np.empty((0, n, n)) if lag is None else lag
 
     def room(self, events: int) -> None:
         """See `Notes`."""
@@ -59,7 +61,8 @@ class MomentsBack:
                 self._after, self._kind.holds, recorder.around(before.state), machine.work, recorder.tape,
                 self._own,
             )  # fmt: skip
-        backward(context, row, kind, recorder.tape, self._own, self._earlier, self._later, self._scratch, *columns)
+        moments = self._earlier, self._later, self._scratch
+        backward(context, row, kind, recorder.tape, self._own, *moments, *columns, self._lag[rows])
         told = np.flatnonzero(~np.isin(log.kind[rows], QUERIES))
         if told.size:
             ahead = part.start + int(told[0])

@@ -21,7 +21,7 @@ PIECES: tuple[tuple[Any, tuple[Any, ...]], ...] = (
     (start, start_signature.args),
     (update, update_signature.args),
     (describe, describe_signature.args),
-    (backward, (context_type, i64, B1, i64, i64, _moments, _moments, _F3, F2, F2, F2)),
+    (backward, (context_type, i64, B1, i64, i64, _moments, _moments, _F3, F2, F2, F2, _F3)),
     (note_queries, (code_type, context_type, i64, I1, B1, F2, i64, F1, i64, i64, F1, F1, i64, i64)),
     (step_back, (context_type, _step, F1, F2, F2, F2)),
     (tell, (context_type, F1, F2, F1, F1, F1)),
