@@ -13,6 +13,7 @@ from estimators.log import Log
 
 from ..runs.fit_json import fit_json
 from ..runs.tuning_yaml import tuning_yaml
+from ..twin.bounds import bounds_of
 from ..twin.twin import Twin, load_twin
 from .arguments import settings
 from .check_text import as_text
@@ -42,6 +43,7 @@ def tune_twin(arguments: Arguments) -> int:
             twin.tuning,
             recordings,
             wanted=wanted,
+            bounds=bounds_of(twin.config, twin.model),
             blocks=arguments.blocks,
             aim=arguments.aim,
             predict=arguments.predict,

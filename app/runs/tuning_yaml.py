@@ -8,9 +8,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from config.schema import TwinSection
+from estimators.errors import LARGEST
 from estimators.estimator import Estimator
 from estimators.registry import find_entry
 from estimators.tuning import REOPEN, Tuning
+
+from ..twin.bounds import bounds_of
 
 PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
 RESERVED = {"null", "true", "false"}
@@ -39,8 +42,9 @@ def tuning_yaml(config: TwinSection, estimator: str, tuning: Tuning) -> str:
     # Of those that are estimated the tuning has none.
     turned = {name: value for name, value in values.items() if name in config.parameters or value != known[name]}
     lines += _section("parameters", {**config.parameters, **turned})
+    ranges = bounds_of(config, model)
     noises = zip((noise.name for noise in model.noises), map(float, tuning.q), strict=True)
-    lines += _section("noise", {name: {"variance": variance} for name, variance in noises})
+    lines += _section("noise", {name: {"variance": _within(q, ranges.get(f"Q.{name}"))} for name, q in noises})
     lines += _section("sensors", _sensors(config, tuning))
     lines.append(f"gate: {_flow(_gate(tuning))}")
     return "\n".join(lines) + "\n"
@@ -48,16 +52,26 @@ def tuning_yaml(config: TwinSection, estimator: str, tuning: Tuning) -> str:
 
 def _sensors(config: TwinSection, tuning: Tuning) -> dict[str, Any]:
     found = {}
+    ranges = bounds_of(config, tuning.model)
     for sensor, start in zip(tuning.model.sensors, tuning.model.row_start, strict=True):
         given = config.sensors.get(sensor.name)
         own = given.model_dump(mode="json", exclude_unset=True, exclude_none=True) if given is not None else {}
         variances = [float(value) for value in tuning.r[start : start + len(sensor.rows)]]
         rest = {key: value for key, value in own.items() if key not in ("std", "variance", "use")}
         same = all(value == variances[0] for value in variances)
-        found[sensor.name] = {"variance": variances[0] if same else variances, **rest}
+        variance = _within(variances[0] if same else variances, ranges.get(f"R.{sensor.name}"))
+        found[sensor.name] = {"variance": variance, **rest}
         if not tuning.get(f"use.{sensor.name}"):
             found[sensor.name]["use"] = False
     return found
+
+
+def _within(value: float | list[float], bounds: tuple[float, float] | None) -> Any:
+    """A variance with the range of its data sheet, unless it was turned beyond that."""
+    values = value if isinstance(value, list) else [value]
+    if bounds is None or not all(bounds[0] <= item <= bounds[1] for item in values):
+        return value
+    return {"value": value, "from": bounds[0], **({"to": bounds[1]} if bounds[1] < LARGEST else {})}
 
 
 def _gate(tuning: Tuning) -> Any:
