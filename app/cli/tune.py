@@ -55,7 +55,7 @@ def tune_twin(arguments: Arguments) -> int:
     else:
         print("\n".join(as_text(sections(twin, found))))
     if arguments.save is not None and found.proposed:
-        text = heading(twin, found) + tuning_yaml(twin.config, twin.estimator, found.setting.tuning)
+        text = heading(twin, found) + tuning_yaml(twin.config, twin.estimator, *found.setting)
         arguments.save.write_text(text, encoding="utf-8")
     return 0 if found.proposed else 1
 

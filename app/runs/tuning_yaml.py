@@ -7,6 +7,8 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from config.schema import TwinSection
 from estimators.errors import LARGEST
 from estimators.estimator import Estimator
@@ -19,7 +21,9 @@ PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
 RESERVED = {"null", "true", "false"}
 
 
-def tuning_yaml(config: TwinSection, estimator: str, tuning: Tuning) -> str:
+def tuning_yaml(
+    config: TwinSection, estimator: str, tuning: Tuning, prior: tuple[np.ndarray, np.ndarray] | None = None
+) -> str:
     """The sections `estimator`, `filters`, `parameters`, `noise`, `sensors` and `gate`, whole.
 
     A twin whose file has these in place of its own starts with the same settings. What else a section of the file says
@@ -29,6 +33,7 @@ def tuning_yaml(config: TwinSection, estimator: str, tuning: Tuning) -> str:
         config: What the twin's file says.
         estimator: Of the run.
         tuning: The same.
+        prior: Mean (nx,) and covariance (nx, nx), diagonal, where they are not the file's: a section `prior` too.
     """
     entry, first = find_entry(estimator), config.estimator
     options = {name: _option(entry, name, value) for name, value in tuning.options.items()}
@@ -43,6 +48,9 @@ def tuning_yaml(config: TwinSection, estimator: str, tuning: Tuning) -> str:
     turned = {name: value for name, value in values.items() if name in config.parameters or value != known[name]}
     lines += _section("parameters", {**config.parameters, **turned})
     ranges = bounds_of(config, model)
+    if prior is not None:
+        beliefs = zip(model.state_names, prior[0].tolist(), np.sqrt(np.diag(prior[1])).tolist(), strict=True)
+        lines += _section("prior", {name: {"mean": mean, "std": std} for name, mean, std in beliefs})
     noises = zip((noise.name for noise in model.noises), map(float, tuning.q), strict=True)
     lines += _section("noise", {name: {"variance": _within(q, ranges.get(f"Q.{name}"))} for name, q in noises})
     lines += _section("sensors", _sensors(config, tuning))

@@ -161,9 +161,8 @@ def fit(
         shape = curvature(kept, x)
         told = _told(kept, shape)
     lines, correlation = _lines(objective, kept, x, value, shape, told, alone)
-    after = with_values(
-        tuning, kept.entries, [item.written(v) for item, v in zip(kept.entries, x.tolist(), strict=True)]
-    )
+    values = [item.written(value) for item, value in zip(kept.entries, x.tolist(), strict=True)]
+    after = with_values(tuning, kept.entries, values)
     one, other = worths(estimator, [Setting(tuning, None), after], whole, count)
     return Fitted(
         estimator=estimator,

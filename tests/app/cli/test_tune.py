@@ -51,7 +51,8 @@ def test_json_has_all_of_it(capsys):
 
 def test_a_fit_stays_within_the_data_sheet(capsys):
     bounds = "sensors.winding={std: {value: 1, from: 0.5, to: 1.5}}"
-    _, out = printed(capsys, "--set", "source.duration=300", "--set", bounds, "--fit", "R", "--json")
+    asset = "source.sensors.winding.std=2"
+    _, out = printed(capsys, "--set", asset, "--set", "source.duration=300", "--set", bounds, "--fit", "R", "--json")
     (entry,) = json.loads(out)["entries"]
     # 4, which made the log, lies beyond.
     assert entry["after"] == 2.25 and entry["high"] == 2.25
