@@ -39,6 +39,9 @@ SPREAD = {
 }
 """Deviation of the weak belief in what the twin says, in logarithms: two decades of a variance is one of a std."""
 
+DIGITS = 4
+"""Of a value that is proposed: finer than any interval."""
+
 FURTHEST = 1e4
 """Factor by which a value may leave that of the twin where nothing else bounds it."""
 
@@ -65,6 +68,10 @@ class Entry:
     def outward(self, x: float) -> float:
         """The value that a point of the scale stands for, never out of its range by rounding."""
         return float(np.clip(np.exp(x) if self.log else x, self.low, self.high))
+
+    def written(self, x: float) -> float:
+        """The value at a point, with as many digits as a file should have."""
+        return float(np.clip(float(f"{self.outward(x):.{DIGITS}g}"), self.low, self.high))
 
     @property
     def group(self) -> str:
@@ -132,10 +139,14 @@ def entries_of(
 
 def setting(tuning: Tuning, entries: Sequence[Entry], x: np.ndarray) -> Setting:
     """The tuning, and the prior where that is fitted, at a point (k,) of the fit's scales."""
+    return with_values(tuning, entries, [item.outward(float(value)) for item, value in zip(entries, x, strict=True)])
+
+
+def with_values(tuning: Tuning, entries: Sequence[Entry], values: Sequence[float]) -> Setting:
+    """The same with values of the entries, in their units."""
     mean: np.ndarray | None = None
     options, factor = dict(tuning.options), 1.0
-    for item, value in zip(entries, x, strict=True):
-        number = item.outward(float(value))
+    for item, number in zip(entries, values, strict=True):
         if item.group == "options":
             options[item.key.partition(".")[2]] = number
         elif item.key == SCALE:

@@ -20,7 +20,7 @@ from ..snapshots import Base
 from ..tuning import Tuning
 from .aims import LIKELIHOOD, Recording, aim_of
 from .blocks import BLOCKS, held_out_rows
-from .entries import Entry, Setting, Skipped, entries_of, setting
+from .entries import Entry, Setting, Skipped, entries_of, with_values
 from .judge import Worth, worths
 from .laplace import Curvature, curvature
 from .objective import ALONE, Cancelled, Go, Objective, only_told
@@ -161,7 +161,8 @@ def fit(
         shape = curvature(kept, x)
         told = _told(kept, shape)
     lines, correlation = _lines(objective, kept, x, value, shape, told, alone)
-    after = setting(tuning, kept.entries, x)
+    values = [item.written(value) for item, value in zip(kept.entries, x.tolist(), strict=True)]
+    after = with_values(tuning, kept.entries, values)
     one, other = worths(estimator, [Setting(tuning, None), after], whole, count)
     return Fitted(
         estimator=estimator,
@@ -225,7 +226,7 @@ def _lines(
         )
         if i is not None:
             line = line._replace(
-                after=item.outward(float(x[i])),
+                after=item.written(float(x[i])),
                 low=item.outward(float(ends[i, 0])),
                 high=item.outward(float(ends[i, 1])),
                 deviation=float(shape.deviation[i]),

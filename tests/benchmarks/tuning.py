@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from time import perf_counter
+from time import process_time
 
 import numpy as np
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
@@ -98,6 +98,6 @@ def _theirs(twin: Twin, log: Log) -> tuple[float, int]:
         return -total
 
     start = np.log(np.concatenate([twin.tuning.q, twin.tuning.r]))
-    begun = perf_counter()
+    begun = process_time()
     found = minimize(negative, start, method="L-BFGS-B", bounds=[(value - 9.0, value + 9.0) for value in start])
-    return perf_counter() - begun, int(found.nfev)
+    return process_time() - begun, int(found.nfev)
