@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...model.state_space import StateSpaceModel
-from ...numerics.jit import floats, inlined, jit
+from ...numerics.jit import floats, inlined, part
 from .hypotheses import GAINS, JOINT, REFUSED_SHARE, TESTS
 
 # The twin's part of the state: rows in alarm and lost; when the next sensor will be silent; when the log began, whether
@@ -154,7 +154,7 @@ def row_part(state, sensors, row):
     return floats(state.ctypes.data + 8 * (TWIN + sensors * SENSOR + row * ROW), ROW)
 
 
-@jit
+@part
 def forget(state, sensors, rows, states):
     """A reset: what the readings said of the estimate before, they do not say of the new one."""
     for s in range(sensors):
