@@ -2,7 +2,7 @@
 
 import { $, setAttribute, setText } from "./dom.js";
 import { drops } from "./drop.js";
-import { Session } from "./session.js";
+import { Session, progress } from "./session.js";
 
 const READ = 8000; // ms that a line stays
 
@@ -39,7 +39,7 @@ export class Leave {
     this.session?.close();
     this.session = new Session(this.boot);
     this.session.addEventListener("state", ({ detail: { starting, failed } }) => {
-      if (starting) setText($("toast"), `Starting ${starting.title} … ${Math.floor(starting.seconds)} s`);
+      if (starting) setText($("toast"), `${starting.title}: ${progress(starting)}`);
       $("toast").hidden = !starting;
       if (starting) return;
       this.session.close();

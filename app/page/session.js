@@ -44,6 +44,9 @@ export class Session extends EventTarget {
   }
 }
 
+// How far what is being started has come.
+export const progress = ({ doing, seconds }) => `${doing || "starting"} … ${Math.floor(seconds)} s`;
+
 // Resolves to the answer, or {error} with the reason.
 export async function post(path, body, method = "POST") {
   try {
