@@ -77,7 +77,7 @@ class GalleryApi:
                 "name": starting[0].twin,
                 "title": starting[0].name,
                 "seconds": round(time.monotonic() - starting[1], 1),
-                "doing": "compiling its model, once" if compiling else "",
+                "doing": "compiling" if compiling else "",
             },
             "failed": None if failed is None else {"title": failed.name, "text": one_line(failed.text)},
         }
