@@ -53,6 +53,9 @@ jit_brief = partial(njit, cache=True, error_model="numpy", no_cfunc_wrapper=True
 """The same with the GIL, for calls of microseconds that run none of a model's functions: giving the GIL up would mean
 to wait for it again, after other threads."""
 
+by_address = partial(jit, no_cpython_wrapper=True)
+"""The same for what is called through its address alone: to call it from Python would end the program."""
+
 part: Callable[[Callable[..., Any]], Any] = register_jitable(cache=True, nogil=True, error_model="numpy")
 """The same for what only compiled functions call. A wrapper for Python would take a third of the time of compiling;
 from Python it is the function as it is written, in Python."""
