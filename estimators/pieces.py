@@ -47,7 +47,7 @@ def pieces_of(name: str) -> list[Piece]:
     return [] if ESTIMATORS[name].interpreted else [Piece(name, place) for place in range(4)]
 
 
-def _function(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
+def function_of(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
     """The function of a piece, and the types of its arguments."""
     if piece.of == SMOOTHER:
         return PIECES[piece.place]
@@ -69,17 +69,25 @@ def _function(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
     )[piece.place]
 
 
-def make(piece: Piece) -> None:
-    """Compile a piece into the cache, if it is not there."""
+def compile_into_cache(function: Any, types: tuple[Any, ...]) -> None:
+    """Compile a function for these arguments, if it is not in the cache."""
     # Code from the cache may call for threads.
     threaded()
-    function, types = _function(piece)
     function.compile(types)
 
 
-def is_made(piece: Piece) -> bool:
-    """Whether a piece is in the cache; asked of its index, which takes a tenth of a millisecond."""
-    function, types = _function(piece)
+def is_cached(function: Any, types: tuple[Any, ...]) -> bool:
+    """Whether a function is in the cache; asked of its index, which takes a tenth of a millisecond."""
     cache = function._cache
     key = cache._index_key(types, function.targetctx.codegen())
     return types in function.overloads or key in cache._cache_file._load_index()
+
+
+def make(piece: Piece) -> None:
+    """Compile a piece into the cache, if it is not there."""
+    compile_into_cache(*function_of(piece))
+
+
+def is_made(piece: Piece) -> bool:
+    """Whether a piece is in the cache."""
+    return is_cached(*function_of(piece))

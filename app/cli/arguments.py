@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal, get_args, get_type_hints
 
 import tyro
 
-from estimators.errors import ConfigError
+from estimators.errors import ConfigError, quoted
 
 Twin = Annotated[str, tyro.conf.Positional]
 Settings = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
@@ -418,3 +418,24 @@ def settings(given: Sequence[str], estimator: str | None = None, tuning: str | N
     if tuning is not None:
         pairs["tuning"] = tuning
     return pairs
+
+
+def check_numbers(command: type, words: Sequence[str]) -> None:
+    """Refuse what is no number where an option takes one; tyro would tell what Python said of it, in a frame.
+
+    Raises:
+        ConfigError: With the option and the value.
+    """
+    hints = get_type_hints(command)
+    for word, after in zip(words, [*words[1:], ""], strict=True):
+        option, equals, given = word.partition("=")
+        value = given if equals else after
+        hint = hints.get(option.removeprefix("--").replace("-", "_")) if option.startswith("--") else None
+        number = next((kind for kind in (hint, *get_args(hint)) if kind in (int, float)), None)
+        if number is None or value in ("", "None") or value.startswith("--"):
+            continue
+        try:
+            number(value)
+        except ValueError:
+            what = "a whole number" if number is int else "a number"
+            raise ConfigError(f"{option} {quoted(value)}: must be {what}") from None

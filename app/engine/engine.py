@@ -91,6 +91,7 @@ class Engine(RunningFold):
         self._first_base = base
         self._tick = section.tick
         self._options = Remembered(twin)
+        self._workshop.report = lambda text: self.notices.say(text, level="warn")
         self._begin_intake()
         self._feeder = Feeder(lambda: open_source(self.notices.report), self._inbox, self.notices.report)
         self._refolder = Refolder(self._inbox.put)

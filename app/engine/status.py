@@ -83,7 +83,7 @@ def status_of(
         t=int(log.t[last]) if last >= 0 else None,
         health=health,
         since=int(log.t[last_run(track.health)]) if last >= 0 else None,
-        cause=watchers.cause(leading, health) if last >= 0 else _before(fold, watchers),
+        cause=watchers.cause(leading, health) if last >= 0 else _before(fold, watchers, awaited, compiling),
         sensors=account.of_sensors(model.sensor_names, states),
         episodes_open=len(account.lasting),
         lost=watchers.alerts.lost,
@@ -127,8 +127,12 @@ def _judged(fold: Fold) -> float:
     return nis_verdict(track, events, fold.model, baseline).judged
 
 
-def _before(fold: Fold, watchers: Watchers) -> str:
+def _before(fold: Fold, watchers: Watchers, awaited: str | None, compiling: Mapping[str, float | None]) -> str:
     """Why there is no row."""
+    if fold.idle and awaited is not None:
+        begun = compiling.get(awaited)
+        since = f" ({begun:.0f} s so far)" if begun else ""
+        return f"{awaited} is being compiled, which happens once{since}; readings are kept meanwhile"
     if fold.idle:
-        return f"{fold.estimator.name} is being compiled, which happens once; readings are kept meanwhile"
+        return "the readings that came so far are being folded"
     return watchers.silence.cause

@@ -140,6 +140,20 @@ class Twin:
             return source.truth.every is not None
         return any(grid.name in getattr(part, "truth", {}) for part in getattr(source, "parts", (source,)))
 
+    @property
+    def kernels(self) -> tuple[str, ...]:
+        """What its source compiles (`sources/pieces.py`); a recording that is reviewed is no source."""
+        return () if self.recorded else self.plan.kernels
+
+    def check_files(self) -> None:
+        """Open the files of its source, and close them, before anything is compiled for it.
+
+        Raises:
+            SourceError: If one is absent or does not fit.
+        """
+        if not self.recorded:
+            self.plan.check_files()
+
     def options_of(self, estimator: str) -> Mapping[str, float]:
         """The options that the YAML gives for an estimator; of a choice its number."""
         return _options(self.config, estimator)
