@@ -94,6 +94,31 @@ class Check:
 
 
 @dataclass(frozen=True)
+class Advise:
+    """Say which estimator a twin needs, by what its log shows, each claim with the figure that made it.
+
+    The simplest one whose assumptions the recorded data pass, with the lines for the YAML.
+    """
+
+    twin: Twin
+    """Name of a twin that ships, or path of a YAML file."""
+    estimator: str | None = None
+    """Estimator to start from instead of the twin's own."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable, as for `run`."""
+    log: tuple[Path, ...] = ()
+    """Recordings to read instead of the twin's own."""
+    duration: float | None = None
+    """Take only this many seconds of the source."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print one JSON object."""
+    apply: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Put the lines into the twin's YAML; the file as it was is kept beside it."""
+    out: Path | None = None
+    """Write the YAML with the lines in it to this file instead, in the same folder if it names files beside it."""
+
+
+@dataclass(frozen=True)
 class Compare:
     """Fold every filter that applies over the same log, in parallel, and print what each estimate was worth.
 
@@ -271,7 +296,9 @@ class New:
     """Its unit: s, ms, us, ns, min or h."""
 
 
-Command = Run | Fold | Check | Compare | Stress | Commission | Filters | Review | Bus | Twins | Schema | Log | New
+Command = (
+    Run | Fold | Check | Advise | Compare | Stress | Commission | Filters | Review | Bus | Twins | Schema | Log | New
+)
 COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in get_args(Command)}
 
 
