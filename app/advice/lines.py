@@ -11,7 +11,7 @@ from estimators.registry import find_entry
 
 from .verdict import Advice
 
-ESTIMATOR = re.compile(r"^estimator[ \t]*:[^\n]*\n(?:(?:[ \t][^\n]*)?\n(?=[ \t]))*(?:[ \t][^\n]*\n)*", re.MULTILINE)
+ESTIMATOR = re.compile(r"^estimator[ \t]*:[^\n]*\n(?:(?:[ \t]*\n)*[ \t]+\S[^\n]*\n)*", re.MULTILINE)
 """The section of the YAML: its line, and the indented ones below."""
 
 

@@ -6,12 +6,12 @@
           curved over the spread? -no-> EKF, -yes-> square-root UKF
             heavy tails? -yes-> the same, with Student's t
 
-Whether the readings see every state at all is asked before, and whether the result is consistent and fast enough after.
+Whether the readings see every state at all is asked where there is one peak; whether the result is consistent and fast
+enough, at the end.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from estimators.errors import NisusError
@@ -27,7 +27,7 @@ from .measured import Measured
 from .observed import observed
 from .shape import several
 from .size import small
-from .tails import heavy
+from .tails import heavy, with_weights
 from .words import digits
 
 STATEMENTS = {
@@ -37,7 +37,7 @@ STATEMENTS = {
     ("linear", NO): "f or h is not linear",
     ("linear", UNTOLD): "whether f and h are linear could not be measured",
     ("steady", YES): "nothing varies in time, and readings come regularly",
-    ("steady", NO): "the gain has to vary in time",
+    ("steady", NO): "one fixed gain will not do",
     ("steady", UNTOLD): "whether one gain would do could not be measured",
     ("peaks", YES): "the posterior has several peaks",
     ("peaks", NO): "the posterior has one peak",
@@ -100,8 +100,6 @@ def advise(measured: Measured) -> Advice:
     if size.answer == NO:
         _of_ensemble(told, measured)
     else:
-        if _ask(told, observed(measured)).answer == NO:
-            told.because = ("observed",)
         _of_small(told, measured)
     _ask(told, consistent(measured, told.estimator, told.options))
     _ask(told, affordable(measured, told.estimator, told.options))
@@ -132,25 +130,25 @@ def _of_ensemble(told: Advice, measured: Measured) -> None:
 
 
 def _of_small(told: Advice, measured: Measured) -> None:
-    straight = _ask(told, linear(measured))
-    if straight.answer == YES and measured.twin.model.linear:
-        _of_linear(told, measured)
-    elif _ask(told, several(measured)).answer == YES:
+    straight = _ask(told, linear(measured)).answer
+    if _ask(told, several(measured)).answer == YES:
+        # What the readings tell is asked of a filter with one peak, so it is not asked here.
         _choose(told, measured, ("rbpf", "pf"), ("linear", "peaks"))
         return
-    elif straight.answer == YES:
-        _choose(told, measured, ("ekf", "sr-ukf", "ukf", "ckf", "enkf"), ("linear", "peaks"))
-    elif _ask(told, curvature(measured)).answer == NO:
-        _choose(told, measured, ("ekf", "sr-ukf", "enkf"), ("linear", "peaks", "curvature"))
-    else:
+    if _ask(told, observed(measured)).answer == NO:
+        told.because = ("observed",)
+    if straight == YES and measured.twin.model.linear:
+        _of_linear(told, measured)
+    elif straight == YES:
+        _choose(told, measured, ("ekf", "sr-ukf", "ukf", "enkf"), ("linear", "peaks"))
+    elif _ask(told, curvature(measured)).answer == YES:
         _choose(told, measured, ("sr-ukf", "ukf", "enkf"), ("linear", "peaks", "curvature"))
+    else:
+        _choose(told, measured, ("ekf", "sr-ukf", "enkf"), ("linear", "peaks", "curvature"))
     _of_tails(told, measured)
 
 
 def _of_linear(told: Advice, measured: Measured) -> None:
-    if _ask(told, several(measured)).answer == YES:
-        _choose(told, measured, ("rbpf", "pf"), ("peaks",))
-        return
     if told.because:
         # What nothing tells of has no steady state.
         _choose(told, measured, ("kf",), ("linear",))
@@ -164,14 +162,9 @@ def _of_linear(told: Advice, measured: Measured) -> None:
 
 
 def _of_tails(told: Advice, measured: Measured) -> None:
-    """Student's t where tails are heavy; a fixed gain cannot weigh, so it gives way to the one that follows."""
+    """Student's t where tails are heavy."""
     claim, dof = heavy(measured, told.estimator, told.options)
-    if _ask(told, claim).answer != YES:
-        return
-    if told.estimator == STEADY:
-        told.estimator, told.options = "kf", {}
-    entry = find_entry(told.estimator)
-    weighted: Mapping[str, float | str] = {"robust": "student-t", "dof": dof}
-    if any(option.name == "robust" for option in entry.options):
-        told.options = {name: value for name, value in entry.complete(weighted).items() if name in weighted}
-        told.because = (*told.because, "tails")
+    if _ask(told, claim).answer == YES:
+        name, weighted = with_weights(told.estimator, dof)
+        if weighted:
+            told.estimator, told.options, told.because = name, weighted, (*told.because, "tails")

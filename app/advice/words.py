@@ -31,5 +31,9 @@ def seconds_text(seconds: float) -> str:
 
 
 def percent(share: float) -> str:
-    """A share in percent, to two digits."""
-    return f"{100.0 * share:.2g} %" if math.isfinite(share) else "unknown"
+    """A share in percent: whole from ten on, two digits below; what is nearly all is not said to be all."""
+    if not math.isfinite(share):
+        return "unknown"
+    if 0.995 <= share < 1.0:
+        return f"{math.floor(10_000.0 * share) / 100.0:.2f} %"
+    return f"{100.0 * share:.0f} %" if share >= 0.1 else f"{100.0 * share:.2g} %"

@@ -95,13 +95,14 @@ class Check:
 
 @dataclass(frozen=True)
 class Advise:
-    """Say which estimator a twin needs, by what its log shows, each claim with the figure that made it.
+    """Say which estimator a twin needs, by what its log shows; or draft a twin of a recording that has none.
 
-    The simplest one whose assumptions the recorded data pass, with the lines for the YAML.
+    Of a twin: the simplest estimator whose assumptions the recorded data pass, each claim with the figure that made it,
+    and the lines for its YAML. Of a recording: rates, holes, noise, which signals say the same, what drives what.
     """
 
-    twin: Twin
-    """Name of a twin that ships, or path of a YAML file."""
+    what: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """A twin that ships, or the path of a YAML file; or recordings."""
     estimator: str | None = None
     """Estimator to start from instead of the twin's own."""
     set: Settings = ()
@@ -109,13 +110,22 @@ class Advise:
     log: tuple[Path, ...] = ()
     """Recordings to read instead of the twin's own."""
     duration: float | None = None
-    """Take only this many seconds of the source."""
+    """Take only this many seconds of the twin's source."""
+    dbc: Files = ()
+    """Of recordings: DBC file of their frames, repeatable; FILE@BUS where it holds on one bus only."""
+    signals: str = ""
+    """Of recordings: A,B, the signals to take, as for `new`."""
+    time: str | None = None
+    """Of recordings: column of a table that holds the time; default: the one of such a name."""
+    time_unit: str = "s"
+    """Of recordings: its unit: s, ms, us, ns, min or h."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print one JSON object."""
     apply: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Put the lines into the twin's YAML; the file as it was is kept beside it."""
     out: Path | None = None
-    """Write the YAML with the lines in it to this file instead, in the same folder if it names files beside it."""
+    """Write the YAML with the lines in it to this file, in the same folder if it names files beside it; of recordings
+    write the draft, NAME.yaml and NAME.py."""
 
 
 @dataclass(frozen=True)

@@ -48,9 +48,9 @@ def carry_out(command: Command) -> int:
 
         return check_twin(command)
     if isinstance(command, Advise):
-        from .advise import advise_twin
+        from .advise import advise
 
-        return advise_twin(command)
+        return advise(command)
     if isinstance(command, Compare):
         from .compare import compare_twin
 
