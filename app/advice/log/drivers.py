@@ -35,7 +35,7 @@ class Driven(NamedTuple):
     """A first-order lag, tau · y' = offset + Σ gain · u - y, of a signal y behind others.
 
     `explained` is the share of the variance of the second half that is simulated, without any reading, with what was
-    fitted to the first.
+    fitted to the first. `start` is how far above the lag the signal began; that decays with tau.
     """
 
     signal: int
@@ -44,6 +44,7 @@ class Driven(NamedTuple):
     offset: float
     tau: float
     explained: float
+    start: float = 0.0
 
 
 def driven(found: Sequence[Signal], target: int, candidates: Sequence[int]) -> Driven | None:
@@ -85,17 +86,14 @@ def driven(found: Sequence[Signal], target: int, candidates: Sequence[int]) -> D
     _, error, weights = _lag(t, y, own, half, tau)
     gains = tuple(float(w) for w in weights[2:])
     explained = 1.0 - error / float(np.nanvar(y[half:]))
-    return best._replace(tau=tau, gains=gains, offset=float(weights[0]), explained=explained)
+    return best._replace(tau=tau, gains=gains, offset=float(weights[0]), explained=explained, start=float(weights[1]))
 
 
 def simulated(found: Sequence[Signal], lag: Driven) -> Series:
     """What the drivers leave of a signal: its values less the driven lag, which is simulated without any reading."""
     t, values = common([found[lag.signal].series, *(found[k].series for k in lag.drivers)])
-    step = float(t[1] - t[0])
-    a = np.exp(-step / lag.tau)
-    u = _held(values[:, 1:])
-    lagged = lfilter([1.0 - a], [1.0, -a], u, axis=0, zi=(a * u[:1]))[0]
-    course = lag.offset + lagged @ np.array(lag.gains)
+    weights = np.array([lag.offset, lag.start, *lag.gains])
+    course = _columns(t, _held(values[:, 1:]), lag.tau) @ weights
     own = found[lag.signal].series
     begin = max(int(found[k].series.t[0]) for k in (lag.signal, *lag.drivers))
     at = np.interp((own.t - begin) * 1e-9, t, course)
@@ -126,12 +124,17 @@ def _fitted(t: np.ndarray, y: np.ndarray, u: np.ndarray, half: int) -> tuple[flo
 
 def _lag(t: np.ndarray, y: np.ndarray, u: np.ndarray, half: int, tau: float) -> tuple[float, float, np.ndarray]:
     """Mean square errors of one time constant on the first and the second half, and weights, fitted to the first."""
-    a = np.exp(-float(t[1] - t[0]) / tau)
-    lagged = lfilter([1.0 - a], [1.0, -a], u, axis=0, zi=(a * u[:1]))[0]
-    columns = np.column_stack([np.ones(t.size), np.exp(-t / tau), lagged])
+    columns = _columns(t, u, tau)
     early = np.isfinite(y) & (np.arange(t.size) < half)
     late = np.isfinite(y) & (np.arange(t.size) >= half)
     scale = np.maximum(np.abs(columns[early]).max(axis=0), 1e-300)
     weights = np.linalg.lstsq(columns[early] / scale, y[early], rcond=1e-8)[0] / scale
     error = (y - columns @ weights) ** 2
     return float(np.mean(error[early])), float(np.mean(error[late])), weights
+
+
+def _columns(t: np.ndarray, u: np.ndarray, tau: float) -> np.ndarray:
+    """What a lag is made of: offset, start, and each input lagged, which holds from its time to the next."""
+    a = np.exp(-float(t[1] - t[0]) / tau)
+    lagged = lfilter([0.0, 1.0 - a], [1.0, -a], u, axis=0, zi=u[:1])[0]
+    return np.column_stack([np.ones(t.size), np.exp(-t / tau), lagged])

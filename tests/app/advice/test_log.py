@@ -115,7 +115,7 @@ def test_a_draft_of_a_recording_runs_and_is_consistent(table, capsys):
     assert main(["advise", str(out)]) == 0
     page = capsys.readouterr().out
     assert "Use kf, Kalman filter (it has it)" in page and "\n  estimator: kf  #" in page
-    assert "every band is right within a quarter, and no correlation is beyond 0.2 (3 rows)" in page
+    assert "every band is right within a quarter, and no correlation is beyond 0.2 (3 rows)" in " ".join(page.split())
 
 
 def test_the_page_of_a_recording_says_what_was_found(table, capsys):
