@@ -102,6 +102,41 @@ class Check:
 
 
 @dataclass(frozen=True)
+class Advise:
+    """Say which estimator a twin needs, by what its log shows; or draft a twin of a recording that has none.
+
+    Of a twin: the simplest estimator whose assumptions the recorded data pass, each claim with the figure that made it,
+    and the lines for its YAML. Of a recording: rates, holes, noise, which signals say the same, what drives what.
+    """
+
+    what: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """A twin that ships, or the path of a YAML file; or recordings."""
+    estimator: str | None = None
+    """Estimator to start from instead of the twin's own."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable, as for `run`."""
+    log: tuple[Path, ...] = ()
+    """Recordings to read instead of the twin's own."""
+    duration: float | None = None
+    """Take only this many seconds of the twin's source."""
+    dbc: Files = ()
+    """Of recordings: DBC file of their frames, repeatable; FILE@BUS where it holds on one bus only."""
+    signals: str = ""
+    """Of recordings: A,B, the signals to take, as for `new`."""
+    time: str | None = None
+    """Of recordings: column of a table that holds the time; default: the one of such a name."""
+    time_unit: str = "s"
+    """Of recordings: its unit: s, ms, us, ns, min or h."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print one JSON object."""
+    apply: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Put the lines into the twin's YAML; the file as it was is kept beside it."""
+    out: Path | None = None
+    """Write the YAML with the lines in it to this file, in the same folder if it names files beside it; of recordings
+    write the draft, NAME.yaml and NAME.py."""
+
+
+@dataclass(frozen=True)
 class Compare:
     """Fold every filter that applies over the same log, in parallel, and print what each estimate was worth.
 
@@ -383,6 +418,7 @@ Command = (
     Run
     | Fold
     | Check
+    | Advise
     | Compare
     | Tune
     | Guard

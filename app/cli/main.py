@@ -16,6 +16,7 @@ from estimators.errors import NisusError
 from ..stderr import complain
 from .arguments import (
     COMMANDS,
+    Advise,
     Bus,
     Check,
     Command,
@@ -53,6 +54,10 @@ def carry_out(command: Command) -> int:
         from .check import check_twin
 
         return check_twin(command)
+    if isinstance(command, Advise):
+        from .advise import advise
+
+        return advise(command)
     if isinstance(command, Compare):
         from .compare import compare_twin
 
