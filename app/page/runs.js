@@ -4,6 +4,7 @@
 import { element, setText } from "./dom.js";
 import { compact, spaced, span } from "./format.js";
 import { swatch } from "./pins.js";
+import { Versions } from "./versions.js";
 
 const LOOK = 300; // ms between two looks at whether there is something new
 const AGAIN = 5000; // ms between two looks at the scores while the log grows
@@ -20,7 +21,8 @@ export class Runs {
     this.error = element("p", { class: "error", role: "alert", hidden: true });
     this.compared = element("section", { class: "compared", "aria-label": "Two runs compared", hidden: true });
     this.table = element("table", { class: "runs" });
-    node.replaceChildren(this.error, this.table, this.compared);
+    this.versions = new Versions(link);
+    node.replaceChildren(this.versions.node, this.error, this.table, this.compared);
     // Not by the status: a twin whose source has ended says no more.
     setInterval(() => link.socket && link.status.runs && this.heard(link.status), LOOK);
   }
@@ -36,6 +38,7 @@ export class Runs {
     this.asking = false;
     if (!answer?.ok) return;
     [this.key, this.when, this.runs] = [key, performance.now(), await answer.json()];
+    this.versions.list();
     this.show();
   }
 
@@ -127,6 +130,7 @@ export class Runs {
       button("⇄", "Compare with another", choose, { "aria-pressed": String(this.chosen.includes(number)) }),
       run.kept ? element("a", { href: `/api/report.html?run=${number}`, download: "", title: "Save a report: scores, charts, checks, episodes and tuning in one file", "aria-label": `Save a report of run ${number}` }, "report") : null,
       run.kept ? element("a", { href: `/api/track.csv?run=${number}`, download: "", title: "Save the track as CSV", "aria-label": `Save the track of run ${number}` }, "csv") : null,
+      button("keep", run.name ? `Keep as version ${run.name}, beside the twin` : "Keep as a version beside the twin, under the run's name: give it one", () => this.versions.keep(run), { disabled: !run.name }),
       element("a", { href: `/api/runs/${number}.yaml`, download: "", title: "Save the tuning as lines of the twin's YAML", "aria-label": `Save run ${number} as YAML` }, "yaml"),
     ];
   }
