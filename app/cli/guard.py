@@ -90,7 +90,7 @@ def _parts(found: Sequence[Guarded], must: bool) -> list[Part]:
                 (
                     each.name,
                     each.version,
-                    judged.figure if judged.fold in (None, 0) else f"{judged.figure} (log {judged.fold})",
+                    judged.figure if not judged.log else f"{judged.figure} (log {judged.log})",
                     f"{judged.before:.6g}",
                     f"{judged.now:.6g}",
                     f"{judged.change:+.3g}",

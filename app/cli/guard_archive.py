@@ -21,11 +21,11 @@ from ..twin.twin import Twin, load_twin, restore_twin
 from .compare_fold import draws
 from .fold import read_log
 
-SEEDS = 8
-"""Folds of a filter that draws; of a simulated asset another log each."""
-
 LOGS = 3
-"""Logs of a simulated asset that a filter folds which does not draw."""
+"""Logs of a simulated asset, with consecutive seeds."""
+
+SEEDS, SEEDS_EACH = 8, 4
+"""Folds of a log by a filter that draws, with other seeds; the second of each of several logs."""
 
 GUARD = ".guard.yaml"
 """The end of the name of a file of recorded scores."""
@@ -114,15 +114,16 @@ def is_simulated(archived: Archived, twin: Twin) -> bool:
     return archived.recording is None and isinstance(twin.config.source, SimulatorSection)
 
 
-def folds_of(archived: Archived, twin: Twin) -> int:
-    """How many folds there are: of a filter that draws several, of a simulated asset another log each."""
-    if draws(find_entry(twin.estimator)):
-        return SEEDS
-    return LOGS if is_simulated(archived, twin) else 1
+def folds_of(archived: Archived, twin: Twin) -> tuple[int, int]:
+    """How many logs there are, and how many folds of each."""
+    logs = LOGS if is_simulated(archived, twin) else 1
+    if not draws(find_entry(twin.estimator)):
+        return logs, 1
+    return logs, SEEDS if logs == 1 else SEEDS_EACH
 
 
-def logs_of(archived: Archived, twin: Twin, span: float | None) -> Iterator[tuple[int, Log, Base | None]]:
-    """Each log with the filter's seed and where its fold starts.
+def logs_of(archived: Archived, twin: Twin, span: float | None) -> Iterator[tuple[Log, Base | None]]:
+    """Each log, and where its folds start.
 
     Args:
         archived: The recording.
@@ -132,24 +133,19 @@ def logs_of(archived: Archived, twin: Twin, span: float | None) -> Iterator[tupl
     Raises:
         SourceError: If it is not there, or cannot be read.
     """
-    folds = folds_of(archived, twin)
     if archived.recording is not None:
         recorded = read_recording(archived.recording)
         log = Log.of(twin.model, capacity=max(1, recorded.rows))
         log.extend(recorded.events)
         _cut(log, span)
-        for seed in range(folds):
-            yield seed, log, recorded.base
+        yield log, recorded.base
         return
     source = twin.config.source
-    if isinstance(source, SimulatorSection):
-        for k in range(folds):
-            other = twin_of(archived, {"source.seed": str(source.seed + k)})
-            yield k, read_log(other, span)[0], None
+    if not isinstance(source, SimulatorSection):
+        yield read_log(twin, span)[0], None
         return
-    log, _ = read_log(twin, span)
-    for seed in range(folds):
-        yield seed, log, None
+    for k in range(LOGS):
+        yield read_log(twin_of(archived, {"source.seed": str(source.seed + k)}), span)[0], None
 
 
 def _cut(log: Log, span: float | None) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from config.guard_schema import FigureSection, ReferenceSection
@@ -11,23 +11,24 @@ from config.tuning_schema import AcceptedSection
 from estimators.errors import NisusError, SourceError
 from estimators.fold import Fold
 from estimators.log import Log
-from estimators.registry import find_entry
 from estimators.snapshots import Base
-from estimators.track import HELD_OUT
 from estimators.tuning import Tuning
 
-from ..guard.figures import measured
+from ..guard.figures import allowances, measured
 from ..guard.junit import Guarded
 from ..guard.reference import fingerprint, read_reference, write_reference
 from ..guard.verdict import judge
 from ..tunings.figures import COVERAGE, RMSE
 from ..tunings.keep import now
 from ..twin.twin import Twin
-from .compare_fold import draws, tidy
+from .compare_fold import tidy
 from .guard_archive import Archived, folds_of, is_simulated, logs_of, twin_of
 
 BUDGET = 3.0
 """Seconds of one processor for all folds of a recording; of one that would take longer a shorter span is guarded."""
+
+FIRST = 10.0
+"""Seconds of the first part that is timed."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +50,10 @@ def guarded(archived: Archived, wanted: Wanted) -> Guarded:
         if known is None and wanted.note is None:
             text = f"no scores are recorded; `nisus guard {archived.name} --accept --note ...` records them"
             return replace(found, absent=text)
-        span = known.span if known is not None and wanted.note is None else None
-        measures = measure(archived, twin, span, budget=None if wanted.note is None else BUDGET, wanted=wanted)
+        span = known.span if known is not None else _span(archived, twin)
+        measures = measure(archived, twin, span, wanted.note)
         if wanted.note is not None:
             write_reference(archived.writes, archived.name, measures)
-            known = known if known is not None and known.span == measures.span else None
         if known is not None:
             found = replace(found, judged=judge(known, measures, simulated=is_simulated(archived, twin)))
     except SourceError as error:
@@ -64,60 +64,60 @@ def guarded(archived: Archived, wanted: Wanted) -> Guarded:
     return replace(found, seconds=time.monotonic() - begun)
 
 
-def measure(
-    archived: Archived, twin: Twin, span: float | None, *, budget: float | None, wanted: Wanted
-) -> ReferenceSection:
+def measure(archived: Archived, twin: Twin, span: float | None, note: str | None) -> ReferenceSection:
     """All figures of a recording.
 
     Args:
         archived: The recording.
         twin: As it is folded.
         span: Seconds that are folded; None for all.
-        budget: Seconds for all folds, by which a shorter span is chosen; None for as long as it takes.
-        wanted: What is asked for.
+        note: Why they are recorded; None if they are not, and what is allowed of them is not asked for.
 
     Raises:
         NisusError: If it cannot be folded.
     """
-    if budget is not None:
-        span = _span(archived, twin, budget)
-    figures: dict[str, tuple[list[float], list[float]]] = {}
-    logs = []
-    for seed, log, base in logs_of(archived, twin, span):
+    logs, values, allowed = [], [], []
+    _, seeds = folds_of(archived, twin)
+    for log, base in logs_of(archived, twin, span):
         logs.append(fingerprint(log))
-        for name, (value, allowed) in _figures(twin, log, base, seed).items():
-            values, all_allowed = figures.setdefault(name, ([], []))
-            values.append(value)
-            all_allowed.append(allowed)
+        for seed in range(seeds):
+            folds = _folds(twin, log, base, seed)
+            values.append(_together(folds, measured))
+            allowed.append(_together(folds, allowances) if note is not None else dict.fromkeys(values[-1], 0.0))
     return ReferenceSection(
-        accepted=AcceptedSection(at=now(), note=wanted.note or ""),
+        accepted=AcceptedSection(at=now(), note=note or ""),
         version=twin.tuning.name,
         estimator=twin.estimator,
-        draws=draws(find_entry(twin.estimator)),
+        seeds=seeds,
         span=span,
         events=tuple(count for count, _ in logs),
         sums=tuple(total for _, total in logs),
         # What one of the logs does not tell is no figure of all.
         figures={
-            name: FigureSection(values=tuple(values), allowed=tuple(allowed))
-            for name, (values, allowed) in figures.items()
-            if len(values) == len(logs)
+            name: FigureSection(
+                values=tuple(each[name] for each in values), allowed=tuple(each[name] for each in allowed)
+            )
+            for name in values[0]
+            if all(name in each for each in values)
         },
     )
 
 
-def _figures(twin: Twin, log: Log, base: Base | None, seed: int) -> dict[str, tuple[float, float]]:
-    """Those of one log; where nothing is known to compare with, each sensor in turn is held out and predicted."""
-    found = measured(_folded(twin, twin.tuning, log, base, seed))
-    if not any(name.startswith(f"{RMSE}.") for name in found):
-        names = [twin.model.sensor_names[k] for k in twin.plan.fed]
-        for name in names if len(names) > 1 else []:
-            fold = _folded(twin, twin.tuning.set(f"use.{name}", False), log, base, seed)
-            if (fold.track.verdict == HELD_OUT).any():
-                found |= {
-                    key: each for key, each in measured(fold).items() if key.startswith((f"{RMSE}.", f"{COVERAGE}."))
-                }
-    return found
+def _folds(twin: Twin, log: Log, base: Base | None, seed: int) -> list[Fold]:
+    """That of a log; where nothing is known to compare with, also with each sensor in turn held out and predicted."""
+    found = [_folded(twin, twin.tuning, log, base, seed)]
+    if any(name.startswith(f"{RMSE}.") for name in measured(found[0])):
+        return found
+    names = [twin.model.sensor_names[k] for k in twin.plan.fed]
+    without = [twin.tuning.set(f"use.{name}", False) for name in names if len(names) > 1]
+    return found + [_folded(twin, tuning, log, base, seed) for tuning in without]
+
+
+def _together(folds: Sequence[Fold], figures: Callable[[Fold], dict[str, float]]) -> dict[str, float]:
+    """The figures of the first fold, and the errors of the sensors that the others hold out."""
+    first, *others = map(figures, folds)
+    kinds = (f"{RMSE}.", f"{COVERAGE}.")
+    return first | {name: value for each in others for name, value in each.items() if name.startswith(kinds)}
 
 
 def _folded(twin: Twin, tuning: Tuning, log: Log, base: Base | None, seed: int) -> Fold:
@@ -141,16 +141,23 @@ def _fold(twin: Twin, tuning: Tuning, log: Log, base: Base | None, seed: int) ->
     )
 
 
-def _span(archived: Archived, twin: Twin, budget: float) -> float | None:
-    """Seconds of a recording that can be folded as often as it is within a budget; None for all."""
-    seed, log, base = next(logs_of(archived, twin, None))
-    fold = _fold(twin, twin.tuning, log, base, seed)
-    # The first call loads what is compiled.
-    fold.advance(1)
-    share = budget / folds_of(archived, twin)
-    begun = time.process_time()
-    while fold.n < log.n and time.process_time() - begun < share:
-        fold.advance(max(1, log.n // 200))
-    if fold.n >= log.n:
-        return None
-    return tidy(float(log.t[fold.n - 1] - log.t[0]) * 1e-9)
+def _span(archived: Archived, twin: Twin) -> float | None:
+    """Seconds of a recording that can be folded as often as it is within the budget; None for all.
+
+    Of longer and longer parts: to simulate all of a large asset may take much longer than the budget.
+    """
+    logs, seeds = folds_of(archived, twin)
+    share, part = BUDGET / (logs * seeds), FIRST
+    while True:
+        log, base = next(logs_of(archived, twin, part))
+        fold = _fold(twin, twin.tuning, log, base, 0)
+        # The first call loads what is compiled.
+        fold.advance(1)
+        begun = time.process_time()
+        while fold.n < log.n and time.process_time() - begun < share:
+            fold.advance(max(1, log.n // 200))
+        if fold.n < log.n:
+            return tidy(float(log.t[fold.n - 1] - log.t[0]) * 1e-9)
+        if log.t[log.n - 1] - log.t[0] < 0.5e9 * part:
+            return None
+        part *= 10.0

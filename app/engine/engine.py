@@ -138,9 +138,9 @@ class Engine(RunningFold):
         """Queue a command."""
         self._inbox.put(command)
 
-    def reload(self, twin: Twin, why: str) -> None:
+    def reload(self, twin: Twin, why: str, *, exact: bool = False) -> None:
         """Queue going on with the twin as it was saved anew, of the same shape (see reload.py)."""
-        self._inbox.put(Reloaded(twin, why))
+        self._inbox.put(Reloaded(twin, why, exact))
 
     @property
     def source(self) -> Source:
@@ -294,7 +294,9 @@ class Engine(RunningFold):
 
     def _reload(self, item: Reloaded) -> None:
         """Fold the history again with the twin as it was saved."""
-        estimator, tuning = merged(self.twin, item.twin, self.estimator, self.tuning)
+        estimator, tuning = item.twin.estimator, item.twin.tuning
+        if not item.exact:
+            estimator, tuning = merged(self.twin, item.twin, self.estimator, self.tuning)
         self._options.leave(self.estimator, self.tuning)
         self.twin, self.model, self._policy = item.twin, item.twin.model, item.twin.policy
         self._options.begin(item.twin)

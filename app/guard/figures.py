@@ -61,16 +61,20 @@ def badness(name: str, value: float) -> float:
     return -value if kind == LIKELIHOOD else value
 
 
-def measured(fold: Fold) -> dict[str, tuple[float, float]]:
-    """Every figure of a finished fold, and by how much it may get worse (see above)."""
+def measured(fold: Fold) -> dict[str, float]:
+    """Every figure of a finished fold; the NIS as a multiple of what it should be."""
+    return _figures(fold, np.ones(fold.n, bool))
+
+
+def allowances(fold: Fold) -> dict[str, float]:
+    """By how much each of these figures may get worse (see above)."""
     n = fold.n
-    whole = _figures(fold, np.ones(n, bool))
     block = np.arange(n) * BLOCKS // max(n, 1)
     parts = [_figures(fold, block != b) for b in range(BLOCKS)]
     counts = {LOST: n, **{f"{COVERAGE}.{name}": count for name, count in _errors(fold).items()}}
     return {
-        name: (value, _allowed([badness(name, part[name]) for part in parts if name in part], counts.get(name)))
-        for name, value in whole.items()
+        name: _allowed([badness(name, part[name]) for part in parts if name in part], counts.get(name))
+        for name in measured(fold)
     }
 
 
@@ -97,7 +101,7 @@ def _errors(fold: Fold) -> dict[str, int]:
 
 
 def _figures(fold: Fold, rows: np.ndarray) -> dict[str, float]:
-    """Those of some rows of a fold; the NIS as a multiple of what it should be."""
+    """Those of some rows of a fold."""
     track, events = fold.track.select(rows), fold.log.events.select(slice(0, fold.n)).select(rows)
     taken: Sequence[Picture] = () if fold.pictures is None else fold.pictures.taken
     # A picture shows what held before its event.

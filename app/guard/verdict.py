@@ -1,18 +1,20 @@
 """What got worse: a new fold's figures against the recorded ones, and how much could be chance.
 
-A filter that does not draw is judged fold by fold: on the same log nothing is chance, and more than the recorded
-allowance (figures.py) is worse. Of one that draws, and of simulated logs that are no longer the same, the mean over m
-folds is judged, and more than chance makes of it is allowed: with d the differences of badness, fold by fold,
+A filter that does not draw is judged log by log: on the same log nothing is chance, and more than the recorded
+allowance (figures.py) is worse. Of one that draws, the mean over L logs of K folds each is judged, and more is allowed
+where chance makes more of it: with s the deviation of a fold's badness about the mean of its log, pooled over the logs,
+and s(d) the same of the differences of badness, fold by fold,
 
-    t(m - 1) · s(d) / √m        where both have the same draws, which then cancel,
-    t(2 m - 2) · √(s² / m + s'² / m)        where they have not,
+    t(L (K - 1)) · s(d) / √(L K)                    where both have the same draws, which then cancel,
+    t(2 L (K - 1)) · √((s² + s'²) / (L K))           where they have not,
 
-t being Student's quantile of 1 - `CHANCE`, and the smaller of the two, as each is right by itself.
+t being Student's quantile of 1 - `CHANCE`, and the smaller of the two, as each is right by itself. Where the simulated
+logs are others, as another processor's rounding makes them of a chaotic asset, the means of the logs are compared as if
+they were folds of one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -29,16 +31,18 @@ CHANCE = 1e-4
 
 
 class Judged(NamedTuple):
-    """A figure before and now (means over folds, where it is judged by them), its change for the worse, and what of it
-    is allowed; `now` is NaN if it is no longer there. `fold` is the one that is worst; None where means are judged.
-    """  # noqa: D205
+    """A figure before and now, its change for the worse, and what of that is allowed.
+
+    Means over all folds; where logs are judged one by one, of the worst `log`, counted from 0. `now` is NaN if there is
+    no such figure any more.
+    """
 
     figure: str
     before: float
     now: float
     change: float
     allowed: float
-    fold: int | None = None
+    log: int | None = None
 
     @property
     def worse(self) -> bool:
@@ -57,7 +61,7 @@ def judge(known: ReferenceSection, found: ReferenceSection, *, simulated: bool) 
     Args:
         known: What was recorded.
         found: What was measured.
-        simulated: Whether the logs are drawn anew, so that others may stand in their place.
+        simulated: Whether the logs are simulated anew, so that others may stand in their place.
 
     Raises:
         ConfigError: If a recording is another one.
@@ -69,34 +73,61 @@ def judge(known: ReferenceSection, found: ReferenceSection, *, simulated: bool) 
             f"its log is another one: {known.events[0]} events were folded, {found.events[0]} are now; if that is "
             "meant, record its scores with --accept"
         )
-    exact = same and not known.draws and not found.draws
-    return [_judged(name, section, found.figures, exact, same) for name, section in known.figures.items()]
+    judged = []
+    for name, section in known.figures.items():
+        before, after = _folds(name, section, known.seeds), None
+        if name in found.figures:
+            after = _folds(name, found.figures[name], found.seeds)
+        if after is None:
+            judged.append(Judged(name, float(np.mean(section.values)), np.nan, np.inf, float(np.mean(section.allowed))))
+        elif same and known.seeds == found.seeds == 1:
+            judged.append(_of_logs(name, section, found.figures[name], (after - before)[:, 0]))
+        else:
+            judged.append(_of_means(name, section, found.figures[name], before, after, same=same))
+    return judged
 
 
-def _judged(name: str, known: FigureSection, found: Mapping[str, FigureSection], exact: bool, paired: bool) -> Judged:
-    if name not in found:
-        return Judged(name, float(np.mean(known.values)), np.nan, np.inf, float(np.mean(known.allowed)))
-    now = found[name].values
-    bad, worse = (np.array([badness(name, value) for value in each]) for each in (known.values, now))
-    if exact:
-        change = worse - bad
-        k = int(np.argmax(change / known.allowed))
-        if change[k] <= known.allowed[k]:
-            # None is worse; if any is better, it is the one to tell of.
-            k = int(np.argmin(change / known.allowed))
-        return Judged(name, known.values[k], now[k], float(change[k]), known.allowed[k], k)
-    change = float(worse.mean() - bad.mean())
-    allowed = max(float(np.mean(known.allowed)), _chance(bad, worse, paired))
-    return Judged(name, float(np.mean(known.values)), float(np.mean(now)), change, allowed)
+def _folds(name: str, section: FigureSection, seeds: int) -> np.ndarray:
+    """Badness of every fold, (logs, seeds)."""
+    return np.array([badness(name, value) for value in section.values]).reshape(-1, seeds)
 
 
-def _chance(bad: np.ndarray, worse: np.ndarray, paired: bool) -> float:
-    """What chance makes of the difference of two means."""
-    m, n = bad.size, worse.size
-    if min(m, n) < 2:
-        return np.inf
-    apart = np.sqrt(bad.var(ddof=1) / m + worse.var(ddof=1) / n) * student.ppf(1.0 - CHANCE, m + n - 2)
-    if not paired:
-        return float(apart)
-    together = np.std(worse - bad, ddof=1) / np.sqrt(m) * student.ppf(1.0 - CHANCE, m - 1)
-    return float(min(apart, together))
+def _of_logs(name: str, known: FigureSection, found: FigureSection, change: np.ndarray) -> Judged:
+    """The log that got worst, as what it is allowed has it; if none got worse than that, the one that got best."""
+    ratio = change / np.array(known.allowed)
+    k = int(np.argmax(ratio))
+    k = k if ratio[k] > 1.0 else int(np.argmin(ratio))
+    return Judged(name, known.values[k], found.values[k], float(change[k]), known.allowed[k], k)
+
+
+def _of_means(
+    name: str, known: FigureSection, found: FigureSection, before: np.ndarray, after: np.ndarray, *, same: bool
+) -> Judged:
+    if not same:
+        before, after = (each.mean(axis=1)[None, :] for each in (before, after))
+    change = float(after.mean() - before.mean())
+    chance = _apart(before, after)
+    if same and before.shape == after.shape:
+        chance = min(chance, _deviation(after - before) / np.sqrt(before.size) * _quantile(_freedom(before)))
+    allowed = max(float(np.mean(known.allowed)), chance)
+    return Judged(name, float(np.mean(known.values)), float(np.mean(found.values)), change, allowed)
+
+
+def _apart(before: np.ndarray, after: np.ndarray) -> float:
+    variance = sum(_deviation(each) ** 2 / each.size for each in (before, after))
+    return float(np.sqrt(variance) * _quantile(_freedom(before) + _freedom(after)))
+
+
+def _freedom(folds: np.ndarray) -> int:
+    return folds.shape[0] * (folds.shape[1] - 1)
+
+
+def _deviation(folds: np.ndarray) -> float:
+    """Of a fold about the mean of its log."""
+    within = folds - folds.mean(axis=1, keepdims=True)
+    return float(np.sqrt(np.sum(within**2) / max(_freedom(folds), 1)))
+
+
+def _quantile(freedom: int) -> float:
+    # Without a second fold nobody knows what chance makes.
+    return float(student.ppf(1.0 - CHANCE, freedom)) if freedom else np.inf

@@ -43,6 +43,7 @@ from .one_at_a_time import OneAtATime
 from .page_file import PAGE, page_file
 from .page_stream import PageStream
 from .runs_api import RunsApi
+from .tunings_api import TuningsApi
 from .viewer_assets import FILES, viewer_assets, viewer_version
 from .viser_proxy import ViserProxy
 
@@ -142,6 +143,7 @@ class PageServer:
             Route("/api/model", self._model),
             Route("/api/episodes", self._episodes),
             *self._runs.routes(),
+            *TuningsApi(self._engine, self._runs.scores).routes(),
             *self._exports.routes(),
             Route("/api/recordings", self._list_recordings),
             Route("/api/faults", self._faults),
