@@ -7,7 +7,8 @@ With w = x' - f(x) of each step between events and all moments those of the smoo
     r ← mean of (y - h(x))² + H P Hᵀ
 
 Of a linear model each round raises the likelihood of the readings, until it is at a maximum. Rounds are many where a
-noise hides behind another. It is a second way to the values that maximise the likelihood.
+noise hides behind another, so that each pair of them is followed further than it led. It is a second way to the values
+that maximise the likelihood.
 
 Sources: Shumway & Stoffer (1982), doi:10.1111/j.1467-9892.1982.tb00349.x; Särkkä, Bayesian Filtering and Smoothing
 (2013), 12.3.
@@ -15,6 +16,7 @@ Sources: Shumway & Stoffer (1982), doi:10.1111/j.1467-9892.1982.tb00349.x; Särk
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -45,9 +47,12 @@ from .smooth import KINDS, check_smooth
 from .smoothed import Smoothed
 from .walk import Walk
 
+FURTHEST = 5.0
+"""By how much a logarithm of a variance may be guessed ahead."""
+
 
 class Fitted(NamedTuple):
-    """The tuning that was found; the log-likelihood before each round and after the last; whether it had settled."""
+    """The tuning that was found; the log-likelihood at first and after each pair of rounds; whether it had settled."""
 
     tuning: Tuning
     log_likelihood: np.ndarray
@@ -61,7 +66,7 @@ def em(
     log: Log,
     *,
     noises: tuple[str, ...] | None = None,
-    rounds: int = 500,
+    rounds: int = 200,
     tolerance: float = 1e-5,
 ) -> Fitted:
     """Fit the process noises and the variances of the sensors' rows to a log.
@@ -72,7 +77,7 @@ def em(
         tuning: Where to begin. A noise or a variance of zero stays zero; so does one of a sensor that is not used.
         log: What the asset said.
         noises: Process noises that are fitted; None for all. The variances of rows always are.
-        rounds: At most.
+        rounds: Pairs of rounds, at most.
         tolerance: Largest relative change of a variance in a round after which it has settled.
 
     Raises:
@@ -80,23 +85,51 @@ def em(
     """
     fold = _folded(estimator, model, tuning, log)
     _check(fold)
-    names = [noise.name for noise in model.noises]
-    fitted = np.array([noises is None or name in noises for name in names], bool)
-    told, settled = [], False
-    for _ in range(rounds):
+    chosen = [noises is None or noise.name in noises for noise in model.noises]
+    begin = np.concatenate((tuning.q, tuning.r))
+    moving = np.concatenate((np.array(chosen, bool), np.ones(tuning.r.size, bool))) & (begin > 0.0)
+
+    def at(logs: np.ndarray) -> Fold:
+        values = begin.copy()
+        values[moving] = np.exp(logs)
+        tuned = replace(tuning, q=values[: tuning.q.size], r=values[tuning.q.size :])
+        return _folded(estimator, model, tuned, log)
+
+    def onward(fold: Fold, logs: np.ndarray) -> np.ndarray:
+        found = np.concatenate(_round(fold))[moving]
+        return np.where(found > 0.0, np.log(np.where(found > 0.0, found, 1.0)), logs)
+
+    logs = np.log(begin[moving])
+    told, settled = [_likelihood(fold)], False
+    while not settled and len(told) <= rounds:
+        first = onward(fold, logs)
+        second = onward(at(first), first)
+        settled = bool(np.all(np.abs(second - first) < tolerance))
+        logs, fold = _better(logs, first, second, at)
         told.append(_likelihood(fold))
-        q, r = _round(fold)
-        q, r = np.where(fitted, q, tuning.q), np.where(np.isfinite(r), r, tuning.r)
-        before = np.concatenate((tuning.q, tuning.r))
-        after = np.concatenate((q, r))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            change = np.nanmax(np.abs(after / before - 1.0), initial=0.0)
-        tuning = replace(tuning, q=q, r=r)
-        fold = _folded(estimator, model, tuning, log)
-        settled = bool(change < tolerance)
-        if settled:
-            break
-    return Fitted(tuning, np.array([*told, _likelihood(fold)]), settled)
+    return Fitted(fold.tuning, np.array(told), settled)
+
+
+def _better(
+    logs: np.ndarray, first: np.ndarray, second: np.ndarray, at: Callable[[np.ndarray], Fold]
+) -> tuple[np.ndarray, Fold]:
+    """Where two rounds lead if they go on so, unless that is worse than where they have led.
+
+    Source: Varadhan & Roland (2008), doi:10.1111/j.1467-9469.2007.00585.x, SqS3.
+    """
+    fold = at(second)
+    by, bend = first - logs, (second - first) - (first - logs)
+    if not np.linalg.norm(bend) > 0.0:
+        return second, fold
+    length = np.linalg.norm(by) / np.linalg.norm(bend)
+    if length <= 1.0:
+        return second, fold
+    guess = logs + 2.0 * length * by + length**2 * bend
+    if np.all(np.abs(guess - second) < FURTHEST):
+        beyond = at(guess)
+        if _likelihood(beyond) >= _likelihood(fold):
+            return guess, beyond
+    return second, fold
 
 
 def _folded(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log) -> Fold:

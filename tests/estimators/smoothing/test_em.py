@@ -37,9 +37,9 @@ def test_it_agrees_with_the_maximum():
         return -float(fold("kf", BODY, tuning, log).log_likelihood.sum())
 
     best = minimize(negative, np.log([0.3, 0.25]), method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-10})
-    found = em("kf", BODY, begin, log, tolerance=1e-7, rounds=2000)
+    found = em("kf", BODY, begin, log, tolerance=1e-7)
     assert found.settled
-    # A round changes less than 1e-7, and the rounds that would follow, with a rate of 0.97 at most, thirty times that.
+    # The last round changed less than 1e-7, and those that would follow, with a rate of 0.97, thirty times that.
     np.testing.assert_allclose([found.tuning.q[0], found.tuning.r[0]], np.exp(best.x), rtol=1e-5)
     assert np.all(np.diff(found.log_likelihood) > -1e-9)
     assert abs(found.log_likelihood[-1] + best.fun) < 1e-6
