@@ -226,6 +226,10 @@ class Tune:
     """Blocks of time, of as many readings each; every third is held out."""
     save: Path | None = None
     """Write what is proposed to this .yaml, as sections that stand in place of the twin's own; else nothing."""
+    keep: str | None = None
+    """Keep what is proposed beside the twin, as a tuning version of this name; see `nisus tunings`."""
+    note: str = ""
+    """What was tried; of --keep."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print one JSON object."""
 

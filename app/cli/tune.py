@@ -6,13 +6,18 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from config.files import shown_path
 from config.source_schema import SimulatorSection
-from estimators.errors import ConfigError
+from config.tunings import check_name
+from estimators.errors import ConfigError, printable
 from estimators.fit.fit import Fitted, Given, fit
 from estimators.log import Log
 
 from ..runs.fit_json import fit_json
 from ..runs.tuning_yaml import tuning_yaml
+from ..stderr import complain
+from ..tunings.fitted import settings_of
+from ..tunings.keep import keep, version_text
 from ..twin.bounds import bounds_of
 from ..twin.twin import Twin, load_twin
 from .arguments import settings
@@ -35,6 +40,8 @@ def tune_twin(arguments: Arguments) -> int:
         raise ConfigError("--fit names nothing; write for example --fit Q,R")
     if arguments.blocks < FEWEST:
         raise ConfigError(f"--blocks {arguments.blocks}: must be {FEWEST} or more, or nothing is held out")
+    if arguments.keep is not None:
+        check_name(arguments.keep)
     twin, recordings = _recordings(arguments)
 
     def work() -> Fitted:
@@ -57,6 +64,10 @@ def tune_twin(arguments: Arguments) -> int:
     if arguments.save is not None and found.proposed:
         text = heading(twin, found) + tuning_yaml(twin.config, twin.estimator, *found.setting)
         arguments.save.write_text(text, encoding="utf-8")
+    if arguments.keep is not None and found.proposed:
+        fitted_on = arguments.log or (f"{twin.name}, its own log",)
+        given = settings_of(found, [str(name) for name in fitted_on], printable(arguments.note))
+        complain(f"{shown_path(keep(twin, arguments.keep, version_text(twin, given)))}: kept")
     return 0 if found.proposed else 1
 
 

@@ -68,8 +68,8 @@ def line(name: str, part: Part) -> str:
 
     return (
         f"  {name:12} NIS/dof {part.nis:8.3g}  in band {100 * part.coverage:5.1f} %  "
-        f"log density {part.log_density:8.3g}\n      sensors held out: {predictions('sensors')}\n"
-        f"      truth: {predictions('states')}"
+        f"log density {part.log_density:8.3g}\n"
+        f"      sensors held out: {predictions('sensors')}\n      truth: {predictions('states')}"
     )
 
 

@@ -1,12 +1,14 @@
 """`nisus tune`: what it prints, what it saves, and its exit status, on a simulated motor winding."""
 
 import json
+import shutil
 
 import pytest
 import yaml
 
 from app.cli.main import main
 from app.twin.twin import load_twin
+from config.loader import TWINS
 from tests.app.runs.test_tuning_yaml import pasted
 
 WRONG = ["--set", "R.winding=0.2", "--set", "source.duration=300"]
@@ -76,3 +78,23 @@ def test_bad_input_is_one_line(capsys, arguments, said):
     assert main(["tune", "motor_winding", *arguments]) == 2
     complaint = capsys.readouterr().err
     assert said in complaint and complaint.count("\n") == 1
+
+
+def test_what_is_proposed_is_kept_as_a_version(capsys, tmp_path):
+    """With what it was fitted on and what it was worth on the blocks held out; a twin begins with it by name."""
+    file = tmp_path / "winding.yaml"
+    shutil.copy(TWINS / "motor_winding.yaml", file)
+    status = main(["tune", str(file), *WRONG, "--fit", "R", "--keep", "fitted", "--note", "R alone", "--json"])
+    out = capsys.readouterr()
+    assert status == 0 and out.err.rstrip().endswith("fitted.yaml: kept")
+    found = json.loads(out.out)
+    version = load_twin(file, overrides={"tuning": "fitted"}).version
+    assert version.head.note == "R alone" and version.head.fitted_on == (f"{file.stem}, its own log",)
+    assert version.head.scores["log_likelihood"] == pytest.approx(found["after"]["held_out"]["log_density"], rel=1e-6)
+    assert version.head.scores["rmse.temperature"] > 0.0
+    assert load_twin(file, overrides={"tuning": "fitted"}).tuning.r[0] == found["entries"][0]["after"]
+
+
+def test_a_name_that_is_none_is_told_before_the_fit(capsys):
+    assert main(["tune", "motor_winding", "--keep", "../x"]) == 2
+    assert "the version's name is" in capsys.readouterr().err
