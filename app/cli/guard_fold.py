@@ -24,7 +24,7 @@ from ..twin.twin import Twin
 from .compare_fold import tidy
 from .guard_archive import Archived, folds_of, is_simulated, logs_of, twin_of
 
-BUDGET = 3.0
+BUDGET = 15.0
 """Seconds of one processor for all folds of a recording; of one that would take longer a shorter span is guarded."""
 
 FIRST = 10.0
