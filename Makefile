@@ -19,6 +19,7 @@ test: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m tests.warm
+	$(BIN)/nisus guard --junit guard.xml
 	$(PYTEST)
 
 # The quickest tests, so many that they take 100 s of a processor by the runs before; all, if there was none.

@@ -89,11 +89,11 @@ def _of_recording(path: Path) -> Archived:
 
 
 def chosen(names: Sequence[str], folder: Path | None) -> list[Archived]:
-    """What the command line means: the twins that it names, a folder, or all that ships."""
+    """What the command line means: the twins that it names, a folder, or all that ship and have recorded scores."""
     found = [of_twin(name) for name in names]
     if folder is not None:
         found += of_folder(folder)
-    return found or [of_twin(name) for name in shipped()]
+    return found or [archived for archived in map(of_twin, shipped()) if archived.reference.is_file()]
 
 
 def twin_of(archived: Archived, overrides: dict[str, str] | None = None) -> Twin:

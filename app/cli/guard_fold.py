@@ -24,11 +24,11 @@ from ..twin.twin import Twin
 from .compare_fold import tidy
 from .guard_archive import Archived, folds_of, is_simulated, logs_of, twin_of
 
-BUDGET = 3.0
+BUDGET = 15.0
 """Seconds of one processor for all folds of a recording; of one that would take longer a shorter span is guarded."""
 
 FIRST = 10.0
-"""Seconds of the first part that is timed."""
+"""Seconds of the first part of a recording that is timed."""
 
 
 @dataclass(frozen=True)
@@ -142,22 +142,26 @@ def _fold(twin: Twin, tuning: Tuning, log: Log, base: Base | None, seed: int) ->
 
 
 def _span(archived: Archived, twin: Twin) -> float | None:
-    """Seconds of a recording that can be folded as often as it is within the budget; None for all.
+    """Seconds of a recording that can be simulated, and folded as often as it is, within the budget; None for all.
 
-    Of longer and longer parts: to simulate all of a large asset may take much longer than the budget.
+    Of longer and longer parts, as all of a large asset would take much longer than that.
     """
     logs, seeds = folds_of(archived, twin)
-    share, part = BUDGET / (logs * seeds), FIRST
+    part = FIRST
     while True:
+        begun = time.process_time()
         log, base = next(logs_of(archived, twin, part))
+        # To read a recording takes as long for any part of it.
+        read = time.process_time() - begun if is_simulated(archived, twin) else 0.0
         fold = _fold(twin, twin.tuning, log, base, 0)
         # The first call loads what is compiled.
         fold.advance(1)
         begun = time.process_time()
-        while fold.n < log.n and time.process_time() - begun < share:
-            fold.advance(max(1, log.n // 200))
-        if fold.n < log.n:
-            return tidy(float(log.t[fold.n - 1] - log.t[0]) * 1e-9)
-        if log.t[log.n - 1] - log.t[0] < 0.5e9 * part:
+        fold.advance()
+        needed = logs * (read + seeds * (time.process_time() - begun))
+        seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9
+        if needed > BUDGET:
+            return tidy(seconds * BUDGET / needed)
+        if seconds < 0.5 * part:
             return None
-        part *= 10.0
+        part *= 4.0

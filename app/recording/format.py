@@ -76,15 +76,15 @@ def tuning_from_json(text: str, model: StateSpaceModel) -> tuple[Tuning, str]:
     return tuning, values["estimator"]
 
 
-def version_to_json(version: Version | None) -> str:
+def version_to_json(version: Version) -> str:
     """A tuning version as text: its file, whole."""
-    return json.dumps(version and {"name": version.name, "path": str(version.path), "text": version.text})
+    return json.dumps({"name": version.name, "path": str(version.path), "text": version.text})
 
 
-def version_from_json(text: str) -> Version | None:
+def version_from_json(text: str) -> Version:
     """The version that `version_to_json` wrote."""
     values = json.loads(text)
-    return values and version_of(values["name"], values["text"], Path(values["path"]))
+    return version_of(values["name"], values["text"], Path(values["path"]))
 
 
 def base_to_json(base: Base | None) -> str:
@@ -179,7 +179,9 @@ class RecordingFile:
 
     def twin(self, text: str, overrides: Mapping[str, str], version: Version | None) -> None:
         """Write the twin's YAML and its tuning version, again when one was saved anew: the last ones count."""
-        more = {"yaml": text, "overrides": json.dumps(dict(overrides)), "version": version_to_json(version)}
+        more = {"yaml": text, "overrides": json.dumps(dict(overrides))}
+        if version is not None:
+            more["version"] = version_to_json(version)
         self.stream.log("/nisus/twin", rr.AnyValues(format=FORMAT, **self._header, **more), static=True)
 
     def base(self, base: Base | None, index: int, revision: int) -> None:

@@ -92,7 +92,7 @@ def read_recording(path: Path) -> Recorded:
         text=str(header["yaml"]),
         twin_path=Path(str(header["path"])),
         overrides=json.loads(str(header.get("overrides", "{}"))),
-        version=version_from_json(str(header.get("version", "null"))),
+        version=version_from_json(str(header["version"])) if "version" in header else None,
         base=None if base is None else base._replace(first=start),
         tuning=str(tunings[-1]),
         tunings=len(tunings),

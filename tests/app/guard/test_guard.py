@@ -22,7 +22,7 @@ from app.guard.reference import read_reference
 from app.guard.verdict import judge
 from app.tunings.keep import Settings, accept, keep, version_text
 from app.twin.twin import load_twin
-from config.loader import TWINS
+from config.loader import TWINS, shipped
 from config.tunings import load_version
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
@@ -330,3 +330,13 @@ def test_a_figure_that_is_gone_is_worse(archive):
     fewer = known.model_copy(update={"figures": {k: v for k, v in known.figures.items() if k != "rmse.rate"}})
     judged = {each.figure: each for each in judge(known, fewer, simulated=True)}
     assert judged["rmse.rate"].worse and not any(each.worse for name, each in judged.items() if name != "rmse.rate")
+
+
+def test_what_ships_is_guarded():
+    """All but the field of a million cells, of which to begin alone takes longer than the others together."""
+    missing = {name for name in shipped() if not of_twin(name).reference.is_file()}
+    assert missing == {"thermal_field_large"}
+    for name in set(shipped()) - missing:
+        known = read_reference(of_twin(name).reference)
+        assert known.version == "own" and known.estimator == load_twin(name).estimator
+        assert any(figure.startswith("rmse.") for figure in known.figures)
