@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 from pydantic_core import PydanticCustomError
 
 from estimators.errors import LARGEST
@@ -75,12 +75,13 @@ class Section(BaseModel):
     def _known_keys(cls, data: Any) -> Any:
         # Before pydantic's own check, which knows the stray key but not its neighbours.
         if isinstance(data, dict):
-            known = list(cls.model_fields)
+            # `from` is a word of Python, and so the name of no field.
+            fields = {field.alias or name: field for name, field in cls.model_fields.items()}
+            known = list(fields)
             for key in data:
                 if key not in known:
                     raise PydanticCustomError("unknown_key", "unknown key", {"key": key, "known": known})
             # `time:` with every key under it commented out means the defaults.
-            fields = cls.model_fields
             return {key: value for key, value in data.items() if value is not None or fields[key].is_required()}
         return data
 
@@ -96,23 +97,69 @@ def one_of(section: Section, *keys: str, required: bool) -> None:
         raise PydanticCustomError("neither", "gives neither {keys}", {"keys": " nor ".join(keys)})
 
 
+class BoundedSection(Section):
+    """A value, and the range that a data sheet leaves it: a fit (nisus tune) stays inside."""
+
+    value: NotNegatives
+    """The value; a list gives one a row."""
+    low: NotNegative = Field(0.0, alias="from")
+    """The least that it can be. Default: 0."""
+    to: Positive = LARGEST
+    """The most. Default: no bound."""
+
+    @model_validator(mode="after")
+    def _inside(self) -> BoundedSection:
+        for value in self.value:
+            if not self.low <= value <= self.to:
+                raise PydanticCustomError(
+                    "order",
+                    "is {value}; it must lie between from ({low}) and to ({high})",
+                    {"value": f"{value:g}", "low": f"{self.low:g}", "high": f"{self.to:g}", "key": "value"},
+                )
+        return self
+
+
+def _kind(given: Any) -> str:
+    return "bounded" if isinstance(given, (dict, BoundedSection)) else "plain"
+
+
+Level = Annotated[
+    Annotated[NotNegative, Tag("plain")] | Annotated[BoundedSection, Tag("bounded")], Discriminator(_kind)
+]
+Spread = Annotated[
+    Annotated[NotNegatives, Tag("plain")] | Annotated[BoundedSection, Tag("bounded")], Discriminator(_kind)
+]
+
+
 class LevelSection(Section):
     """How strongly one disturbance drives the state: what it adds in one second. Give one of the two."""
 
-    variance: NotNegative | None = None
-    """Variance added in one second, in the square of the state's unit for the usual additive noise."""
-    std: NotNegative | None = None
-    """Its square root: the standard deviation after one second."""
+    variance: Level | None = None
+    """Variance added in one second, in the square of the state's unit for the usual additive noise. {value, from, to}
+    also gives the range within which a fit stays."""
+    std: Level | None = None
+    """Its square root: the standard deviation after one second. As `variance`."""
 
     @model_validator(mode="after")
     def _one(self) -> LevelSection:
         one_of(self, "variance", "std", required=True)
+        for key in ("variance", "std"):
+            given = getattr(self, key)
+            if isinstance(given, BoundedSection) and len(given.value) > 1:
+                raise PydanticCustomError("length", "has several values; give one", {"key": key})
         return self
 
     @property
     def value(self) -> float:
         """The variance."""
-        return self.variance if self.variance is not None else float(self.std or 0.0) ** 2
+        if self.variance is not None:
+            return _values(self.variance)[0]
+        return float(_values(self.std or 0.0)[0] ** 2)
+
+    @property
+    def bounds(self) -> tuple[float, float] | None:
+        """The least and the greatest variance, if they are given."""
+        return _bounds(self.variance, self.std)
 
 
 class NoiseSection(LevelSection):
@@ -148,11 +195,13 @@ class ErrorSection(Section):
 class SpreadSection(Section):
     """The noise of one sensor."""
 
-    variance: NotNegatives | None = None
+    variance: Spread | None = None
     """Variance of the noise, in the square of the sensor's unit; a list gives one a row. 0 is a sensor without noise,
-    which kf, ekf, iekf and the square-root filters take. Default: the model's."""
-    std: NotNegatives | None = None
-    """Its square root: standard deviation, in the sensor's unit; a list gives one a row. Default: the model's."""
+    which kf, ekf, iekf and the square-root filters take. {value, from, to} also gives the range of the data sheet,
+    within which a fit stays. Default: the model's."""
+    std: Spread | None = None
+    """Its square root: standard deviation, in the sensor's unit, as {value: 0.5, from: 0.3, to: 0.8}; a list gives one
+    a row. As `variance`. Default: the model's."""
 
     @model_validator(mode="after")
     def _one(self) -> SpreadSection:
@@ -163,5 +212,22 @@ class SpreadSection(Section):
     def variances(self) -> tuple[float, ...] | None:
         """The variances, one for all rows or one a row; None leaves the model's."""
         if self.variance is not None:
-            return self.variance
-        return tuple(std**2 for std in self.std) if self.std is not None else None
+            return _values(self.variance)
+        return tuple(std**2 for std in _values(self.std)) if self.std is not None else None
+
+    @property
+    def bounds(self) -> tuple[float, float] | None:
+        """The least and the greatest variance of every row, if they are given."""
+        return _bounds(self.variance, self.std)
+
+
+def _values(given: float | tuple[float, ...] | BoundedSection) -> tuple[float, ...]:
+    if isinstance(given, BoundedSection):
+        return given.value
+    return given if isinstance(given, tuple) else (given,)
+
+
+def _bounds(variance: Any, std: Any) -> tuple[float, float] | None:
+    if isinstance(variance, BoundedSection):
+        return variance.low, variance.to
+    return (std.low**2, min(std.to**2, LARGEST)) if isinstance(std, BoundedSection) else None

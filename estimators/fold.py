@@ -16,7 +16,7 @@ from .diagnostics.field_pictures import Pictures
 from .diagnostics.health import HealthPolicy
 from .errors import EstimatorError, ModelError
 from .estimator import Estimator
-from .events.maintenance import versions_dropped, without
+from .events.maintenance import versions_dropped
 from .fold_checks import check_base, check_log, check_pairs, check_prior, check_soft, check_tuning
 from .fold_machine import Machine, Moments, variances_of
 from .gate.reopening import Decision, decide
@@ -122,6 +122,16 @@ class Fold:
     def compiled(self) -> CompiledModel:
         """The model's functions as the filter sees them."""
         return self._machine.compiled
+
+    @property
+    def machine(self) -> Machine:
+        """What it folds with."""
+        return self._machine
+
+    @property
+    def snapshots(self) -> Snapshots:
+        """Where it can go back to."""
+        return self._snapshots
 
     @property
     def clock(self) -> int:
@@ -275,10 +285,7 @@ class Fold:
         """
         self._run_events(i, i + 1)
         mean, cov = self._machine.moments(self._spare)
-        cov = without(cov, self.prior[1], int(self.log.channel[i]))
-        if np.all(np.isfinite(mean)) and np.all(np.isfinite(cov)):
-            self._machine.begin(mean, cov, self._now.state)
-            self._now.clock[0] = self.log.t[i]
+        if self._machine.maintain(mean, cov, int(self.log.channel[i]), int(self.log.t[i]), self._now):
             self._run_events(i, i + 1)
 
     def finish(self) -> None:

@@ -18,13 +18,13 @@ from .gate.doubt import forget, note, rule_type
 from .gate.soften import soften
 from .interpreted.fold_loop import LONGEST, UNSET
 from .log import INPUT, MARK, READING, RESET, TICK, TRUTH
-from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, inlined, jit
+from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, inlined, jit, part
 from .numerics.steps import steps_of
 from .screen import pass_on, screen_reading, screen_signature
 from .track import ANCESTORS, EFFECTIVE, GATED, MISSING, NONE, SCREENED, USED, WHITENED, track_type
 
 
-@jit
+@part
 def advance_to(code, context, u, clock, t, index, state, work):
     """Predict from the clock to time t, in steps no longer than the model allows.
 
@@ -48,7 +48,7 @@ def asks(kind):
     return kind == TRUTH or kind == TICK or kind == MARK
 
 
-@jit
+@part
 def exchange(r, own, kept):
     """r (ny,) ← what a reading brought of its own, where it brought any; `kept` (ny,) gets what stood there."""
     for k in range(r.size):

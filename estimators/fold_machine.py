@@ -16,6 +16,7 @@ from .diagnostics.evidence import fresh, no_baseline, watched
 from .diagnostics.health import Bounds, HealthPolicy, chi_square_bounds
 from .errors import ModelError
 from .estimator import Code, Estimator, Options
+from .events.maintenance import without
 from .fold_kernel import compiled
 from .gate import doubt
 from .gate.stories import widening
@@ -192,22 +193,36 @@ class Machine:
         columns = log.t, log.kind, log.channel, log.value, log.width
         return self._call(self.rule, log.first, start, stop, *columns, now, spare, track)
 
-    def _run_apart(self, log: Log, start: int, stop: int, now: Snapshot) -> Track:
-        """Fold events into a track of their own; nothing is decided of sensors."""
+    def run_apart(
+        self, log: Log, start: int, stop: int, now: Snapshot, code: Code | None = None
+    ) -> tuple[Track, np.ndarray]:
+        """Fold events into a track of their own; nothing is decided of sensors.
+
+        Args:
+            log: The log.
+            start: The first event.
+            stop: The event after the last.
+            now: Where the fold stands; changed.
+            code: In place of the filter's.
+
+        Returns:
+            The track, and the state from which the last query was answered.
+        """
         track = self.rows(stop - start)
         within = slice(start, stop)
         columns = log.t[within], log.kind[within], log.channel[within], log.value[within], log.width
         spare, rule = np.empty_like(now.state), self.rule._replace(most=0)
-        self._call(rule, log.first + start, 0, stop - start, *columns, now, spare, track)
-        return track
+        self._call(rule, log.first + start, 0, stop - start, *columns, now, spare, track, code)
+        return track, spare
 
     def _call(
         self, rule: doubt.Rule, first: int, start: int, stop: int, t: np.ndarray, kind: np.ndarray,
         channel: np.ndarray, value: np.ndarray, width: int, now: Snapshot, spare: np.ndarray, track: Track,
+        code: Code | None = None,
     ) -> int:  # fmt: skip
         """See `fold_kernel.run_and_judge`."""
         asking = self._run(
-            self.code, self.context, rule, first, start, stop, t, kind, channel, value, width,
+            code or self.code, self.context, rule, first, start, stop, t, kind, channel, value, width,
             now.clock, now.u, now.state, now.doubt, now.edge, spare, self.work, self.score, track,
             self.policy, self._bounds, now.evidence,
         )  # fmt: skip
@@ -229,15 +244,28 @@ class Machine:
         """
         # No doubt is carried over: in this story no sensor is wrong.
         end = snapshot.copy()._replace(doubt=doubt.fresh(len(self.model.sensors)))
-        self._run_apart(log, at, start, end)
-        mean, cov = self.moments(end.state)
-        H = self._slope(sensor, mean, end.u)
-        added = widening(variances_of(cov), variances_of(self.prior[1]), H, innovation[: len(H)])
-        self.begin(mean, cov + (added if len(cov) == 1 else np.diag(added)), end.state)
-        end.doubt[:] = doubt.fresh(len(self.model.sensors))
-        with self._open(sensor):
-            track = self._run_apart(log, start, stop, end)
+        self.run_apart(log, at, start, end)
+        added = self.widen(end, sensor, innovation)
+        with self.open(sensor):
+            track, _ = self.run_apart(log, start, stop, end)
         return Story(track, end, np.sqrt(added))
+
+    def widen(self, now: Snapshot, sensor: int, innovation: np.ndarray) -> np.ndarray:
+        """Widen the covariance so that an innovation (ny,) of a sensor is none to refuse; what was added, (nx,)."""
+        mean, cov = self.moments(now.state)
+        H = self._slope(sensor, mean, now.u)
+        added = widening(variances_of(cov), variances_of(self.prior[1]), H, innovation[: len(H)])
+        self.begin(mean, cov + (added if len(cov) == 1 else np.diag(added)), now.state)
+        now.doubt[:] = doubt.fresh(len(self.model.sensors))
+        return added
+
+    def maintain(self, mean: np.ndarray, cov: np.ndarray, state: int, t: int, now: Snapshot) -> bool:
+        """Let a state of N(mean, cov) at time t begin again as in the prior; False if these are no numbers."""
+        if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(cov))):
+            return False
+        self.begin(mean, without(cov, self.prior[1], state), now.state)
+        now.clock[0] = t
+        return True
 
     def _slope(self, sensor: int, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """dh/dx (ny, nx) of a sensor; nothing depends on a mode."""
@@ -252,7 +280,7 @@ class Machine:
         return H
 
     @contextmanager
-    def _open(self, sensor: int) -> Iterator[None]:
+    def open(self, sensor: int) -> Iterator[None]:
         """Meanwhile the sensor has no gate."""
         self.held["gate"][sensor] = np.inf
         try:

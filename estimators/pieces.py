@@ -18,13 +18,17 @@ from .fold_kernel import (
 )
 from .numerics.threads import threaded
 from .registry import ESTIMATORS
+from .smoothing.pieces import PIECES
 
 LOOP = "loop"
 """In place of a filter's name: the loop over the events, which serves all of them."""
 
+SMOOTHER = "smoother"
+"""The same: what goes back over a fold, of all filters."""
+
 
 class Piece(NamedTuple):
-    """A function that is compiled by itself: of the loop or a filter, by name, and its place among the pieces of that.
+    """A function that is compiled by itself: of the loop, the smoother or a filter, by name, and its place in that.
 
     `after` are the places of those that it contains; with them in the cache it takes a tenth of the time.
     """
@@ -35,14 +39,18 @@ class Piece(NamedTuple):
 
 
 def pieces_of(name: str) -> list[Piece]:
-    """The pieces of a filter or of the `LOOP`, what takes longest first."""
+    """The pieces of a filter, of the `LOOP` or the `SMOOTHER`, what takes longest first."""
+    if name == SMOOTHER:
+        return [Piece(SMOOTHER, place) for place in range(len(PIECES))]
     if name == LOOP:
         return [Piece(LOOP, 0), Piece(LOOP, 1), Piece(LOOP, 2, (0, 1)), Piece(LOOP, 3), Piece(LOOP, 4)]
     return [] if ESTIMATORS[name].interpreted else [Piece(name, place) for place in range(4)]
 
 
-def _function(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
+def function_of(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
     """The function of a piece, and the types of its arguments."""
+    if piece.of == SMOOTHER:
+        return PIECES[piece.place]
     if piece.of == LOOP:
         inner = run_signature.args[: -len(("policy", "bounds", "evidence"))]
         return (
@@ -61,17 +69,25 @@ def _function(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
     )[piece.place]
 
 
-def make(piece: Piece) -> None:
-    """Compile a piece into the cache, if it is not there."""
+def compile_into_cache(function: Any, types: tuple[Any, ...]) -> None:
+    """Compile a function for these arguments, if it is not in the cache."""
     # Code from the cache may call for threads.
     threaded()
-    function, types = _function(piece)
     function.compile(types)
 
 
-def is_made(piece: Piece) -> bool:
-    """Whether a piece is in the cache; asked of its index, which takes a tenth of a millisecond."""
-    function, types = _function(piece)
+def is_cached(function: Any, types: tuple[Any, ...]) -> bool:
+    """Whether a function is in the cache; asked of its index, which takes a tenth of a millisecond."""
     cache = function._cache
     key = cache._index_key(types, function.targetctx.codegen())
     return types in function.overloads or key in cache._cache_file._load_index()
+
+
+def make(piece: Piece) -> None:
+    """Compile a piece into the cache, if it is not there."""
+    compile_into_cache(*function_of(piece))
+
+
+def is_made(piece: Piece) -> bool:
+    """Whether a piece is in the cache."""
+    return is_cached(*function_of(piece))

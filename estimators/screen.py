@@ -19,7 +19,7 @@ from numba import types
 from .compiled.context import circular_rows, context_type, sensor_rows
 from .model.limits import NOISES, Stuck
 from .model.state_space import StateSpaceModel
-from .numerics.jit import F1, floats, i64, inlined, ints, jit
+from .numerics.jit import F1, floats, i64, inlined, ints, jit, part
 from .numerics.linalg import wrap
 from .track import DUPLICATE, RANGE, RATE, REASONS, REPEATED, SATURATED
 
@@ -120,7 +120,7 @@ def _is_duplicate(now, y, s, first, count, within, begin, state, times):
     return True
 
 
-@jit
+@part
 def _repeats(now, y, at, a_day, limit, state, times):
     """Whether a row has said the same for too long."""
     if not np.isfinite(state[at + _RUN]) or abs(y - state[at + _RUN]) > limit[_HALF]:
@@ -134,7 +134,7 @@ def _repeats(now, y, at, a_day, limit, state, times):
     return limit[_SURPRISE] > 0.0 and length * limit[_SURPRISE] >= math.log(max(a_day, math.e))
 
 
-@jit
+@part
 def _reasons(now, y, circular, at, a_day, limit, state, times):
     """Bits of the limits that a row of a reading breaks."""
     bits = 0

@@ -96,6 +96,11 @@ class Snapshots:
         """Events between two recent ones: how far a late reading takes a fold back at least, at worst."""
         return self._every
 
+    @property
+    def places(self) -> list[int]:
+        """The absolute indices of the events before which they were taken, in order."""
+        return sorted(self._kept)
+
     def __contains__(self, at: int) -> bool:
         """Whether there is one before the event at an absolute index."""
         return at in self._kept

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, counts, flag_rows, flags, ints, jit, masks
+from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, counts, flag_rows, flags, ints, masks, part
 
 NONE, USED, GATED, HELD_OUT, MISSING, FAILED, SCREENED = range(7)
 """Verdict on an event: not a reading; used; refused by the gate; held out and scored; no finite row; not usable,
@@ -109,7 +109,7 @@ track_type = types.NamedTuple(
 )
 
 
-@jit
+@part
 def borrowed_columns(track):
     """The same columns, not reference-counted."""
     n, width = track.alarms.shape

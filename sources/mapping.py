@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numba import types
 
 from estimators.errors import LARGEST, SourceError
 from estimators.log import INPUT, READING, TRUTH, Events
-from estimators.numerics.jit import jit
+from estimators.numerics.jit import B1, F1, F2, I1, i64, jit
 
 from .geodesy import east_north
 from .source import Accuracy, Channel, Report
@@ -19,7 +20,7 @@ PRESENT, ABSENT, SHORT = range(3)
 """A value is there; the frame does not carry the signal (multiplexing); the frame ends before it."""
 
 
-class _Tables(NamedTuple):
+class Tables(NamedTuple):
     """Channels of all groups (messages, or one table), one a row; see `Mapping`.
 
     `own_slot` is where a row's own spread is, -1 where it has none.
@@ -44,6 +45,15 @@ class _Tables(NamedTuple):
     high: np.ndarray
 
 
+WHOLE = ("group", "kind", "target", "row", "slot", "own_slot", "own_squared", "where", "where_slot", "selects")
+"""Columns of `Tables` that are int64; the others are float64."""
+
+tables_type = types.NamedTuple([I1 if name in WHOLE else F1 for name in Tables._fields], Tables)
+emit_signature = i64(
+    tables_type, I1, B1, F2, types.Array(types.int8, 2, "C"), i64, I1, B1, types.int32[::1], F2, I1, I1, I1
+)
+
+
 @jit
 def _own_variance(tables, r, values, state, i):
     """The variance that frame i tells of row r's noise; NaN if what it tells is none."""
@@ -57,7 +67,7 @@ def _own_variance(tables, r, values, state, i):
 
 
 @jit
-def _emit(tables, plan, skip, values, state, width, source, kind, channel, value, refused, cut, unsaid):
+def emit(tables, plan, skip, values, state, width, source, kind, channel, value, refused, cut, unsaid):
     """Write the events of each frame: its inputs as one event, then readings, then true states in blocks.
 
     Returns how many. A block begins with a state that is known, and takes what follows as far as it reaches. Columns of
@@ -184,7 +194,7 @@ class Mapping:
                 where.append(len(where_slot))
             group.append(len(self._channels))
         whole, real = np.int64, np.float64
-        self._tables = _Tables(
+        self._tables = Tables(
             group=np.array(group, whole),
             kind=np.array(kind, whole),
             target=np.array(index, whole),
@@ -208,9 +218,6 @@ class Mapping:
         # By sensor: a message that comes under two ids has its channels twice here.
         self._positions = {c.index: c for c in self._channels if c.convert == "east_north"}
         self._origins = {index: channel.origin for index, channel in self._positions.items()}
-        empty, none = np.zeros(0, np.int64), np.zeros(0, np.int8)
-        # Compiles now, not when the first event waits.
-        self.events(empty, empty, empty, np.zeros((0, 1)), none.reshape(0, 1), none)
 
     @staticmethod
     def _factor(channel: Channel, name: str, unit: str | None, wanted: str) -> tuple[float, float]:
@@ -249,7 +256,7 @@ class Mapping:
         kind, channel = np.empty(room, np.int8), np.empty(room, np.int32)
         value = np.empty((room, self._columns))
         counts = refused, cut, unsaid = np.zeros((3, len(self._channels)), np.int64)
-        n = _emit(
+        n = emit(
             self._tables, plan, skip, values, state, self._width, source, kind, channel, value, refused, cut, unsaid
         )
         source = source[:n]

@@ -16,7 +16,8 @@ MAY_IMPORT = {
 IMPURE = {"os", "io", "time", "datetime", "logging", "socket", "subprocess", "threading", "asyncio", "random"}
 """What the numerics may not touch: files, clocks, logs, threads."""
 IMPURE_HERE = {
-    "numerics/jit.py": {"os"},  # where the compile cache is
+    "numerics/cache.py": {"os"},  # where the compile cache is
+    "numerics/jit.py": {"os"},  # whether the user says where, and how threads wait
     "numerics/threads.py": {"os"},  # how many processors there are
     "compiled/orphan.py": {"os", "threading"},  # a worker that ends with its parent
 }

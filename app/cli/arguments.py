@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated, Literal, get_args, get_type_hints
 
 import tyro
 
-from estimators.errors import ConfigError
+from estimators.errors import ConfigError, quoted
 
 Twin = Annotated[str, tyro.conf.Positional]
 Settings = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
@@ -68,6 +68,8 @@ class Fold:
     """Write the track to this .csv or .parquet, or a recording to this .rrd."""
     html: Path | None = None
     """Write a report to this HTML file, which needs no other: scores, charts, checks, episodes, tuning."""
+    smooth: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Smooth too: what the readings before and after each moment say of it; a .csv or .parquet has it beside."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print one JSON object."""
 
@@ -97,6 +99,41 @@ class Check:
     """Print one JSON object."""
     html: Path | None = None
     """Also write the page to this HTML file, which needs no other."""
+
+
+@dataclass(frozen=True)
+class Advise:
+    """Say which estimator a twin needs, by what its log shows; or draft a twin of a recording that has none.
+
+    Of a twin: the simplest estimator whose assumptions the recorded data pass, each claim with the figure that made it,
+    and the lines for its YAML. Of a recording: rates, holes, noise, which signals say the same, what drives what.
+    """
+
+    what: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """A twin that ships, or the path of a YAML file; or recordings."""
+    estimator: str | None = None
+    """Estimator to start from instead of the twin's own."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable, as for `run`."""
+    log: tuple[Path, ...] = ()
+    """Recordings to read instead of the twin's own."""
+    duration: float | None = None
+    """Take only this many seconds of the twin's source."""
+    dbc: Files = ()
+    """Of recordings: DBC file of their frames, repeatable; FILE@BUS where it holds on one bus only."""
+    signals: str = ""
+    """Of recordings: A,B, the signals to take, as for `new`."""
+    time: str | None = None
+    """Of recordings: column of a table that holds the time; default: the one of such a name."""
+    time_unit: str = "s"
+    """Of recordings: its unit: s, ms, us, ns, min or h."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print one JSON object."""
+    apply: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Put the lines into the twin's YAML; the file as it was is kept beside it."""
+    out: Path | None = None
+    """Write the YAML with the lines in it to this file, in the same folder if it names files beside it; of recordings
+    write the draft, NAME.yaml and NAME.py."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +205,12 @@ class Tune:
     """Name of a twin that ships, or path of a YAML file."""
     fit: str = "Q,R"
     """What to fit: groups (Q, R, p, options, prior) and single entries, as Q.winding, R.yoke, p.NAME, options.alpha,
-    prior.STATE.std, with commas."""
+    prior.STATE.std, with commas. scale: one factor for all of Q and R."""
+    aim: Literal["likelihood", "crps", "error"] = "likelihood"
+    """What is maximised: the likelihood of every reading before it was seen; or how well sensors held out are
+    predicted, by continuous ranked probability score or by squared error."""
+    predict: tuple[str, ...] = ()
+    """The sensors that those hold out. Default: each in turn."""
     estimator: str | None = None
     """Estimator to use instead of the twin's own; `nisus filters` lists all of them."""
     set: Settings = ()
@@ -186,6 +228,31 @@ class Tune:
     """Write what is proposed to this .yaml, as sections that stand in place of the twin's own; else nothing."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print one JSON object."""
+
+
+@dataclass(frozen=True)
+class Guard:
+    """Fold archived recordings with the accepted tunings of their twins, and say what got worse than recorded.
+
+    Without a name: the twins that ship, with the logs that ship or lie under NISUS_DATA. What got worse by more than
+    chance, or by so much that it says something of the asset, is a line of a table. Exit status: 0 if nothing did, 1 if
+    something did, 2 if something could not be folded. What is absent is said; with CI=true it is an error.
+    """
+
+    twins: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Names of twins that ship, or paths of YAML files."""
+    archive: Path | None = None
+    """Folder of recordings (.rrd) and of twins (.yaml) to guard."""
+    junit: Path | None = None
+    """Also write the verdict to this file, as JUnit XML for CI."""
+    accept: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Record the scores as they are now: what guards compare with from then on."""
+    note: str = ""
+    """Why; of --accept, which keeps it with the scores."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable, as for `run`: what becomes of the scores under another setting."""
+    jobs: int | None = None
+    """Number of processes; default: one for each processor."""
 
 
 @dataclass(frozen=True)
@@ -351,8 +418,10 @@ Command = (
     Run
     | Fold
     | Check
+    | Advise
     | Compare
     | Tune
+    | Guard
     | Stress
     | Commission
     | Filters
@@ -385,3 +454,24 @@ def settings(given: Sequence[str], estimator: str | None = None, tuning: str | N
     if tuning is not None:
         pairs["tuning"] = tuning
     return pairs
+
+
+def check_numbers(command: type, words: Sequence[str]) -> None:
+    """Refuse what is no number where an option takes one; tyro would tell what Python said of it, in a frame.
+
+    Raises:
+        ConfigError: With the option and the value.
+    """
+    hints = get_type_hints(command)
+    for word, after in zip(words, [*words[1:], ""], strict=True):
+        option, equals, given = word.partition("=")
+        value = given if equals else after
+        hint = hints.get(option.removeprefix("--").replace("-", "_")) if option.startswith("--") else None
+        number = next((kind for kind in (hint, *get_args(hint)) if kind in (int, float)), None)
+        if number is None or value in ("", "None") or value.startswith("--"):
+            continue
+        try:
+            number(value)
+        except ValueError:
+            what = "a whole number" if number is int else "a number"
+            raise ConfigError(f"{option} {quoted(value)}: must be {what}") from None

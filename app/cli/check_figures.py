@@ -13,7 +13,8 @@ from estimators.track import HEALTH_NAMES
 
 from .check_list import blamed, checklist, stamps
 from .checked import Checked
-from .fold_report import calibration_dict, number
+from .fold_report import calibration_dict
+from .fold_smoothed import number
 
 
 def figures(checked: Checked) -> dict[str, Any]:

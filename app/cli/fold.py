@@ -19,6 +19,9 @@ from estimators.fold import Fold
 from estimators.interface.table import table_of
 from estimators.late import inflated
 from estimators.log import Log
+from estimators.registry import find_estimator
+from estimators.smoothing.smooth import check_smooth, smooth
+from estimators.smoothing.smoothed import Smoothed
 from estimators.track import Track
 from sources.source import Endless
 
@@ -31,7 +34,8 @@ from ..twin.twin import Twin, load_twin
 from .arguments import settings
 from .fold_episodes import blamed, dropped, episode_lines
 from .fold_report import as_dict, as_text, calibration_of
-from .prepare import prepare
+from .fold_smoothed import Better
+from .prepare import attend, prepare
 from .remarks import remarking
 
 if TYPE_CHECKING:
@@ -98,6 +102,8 @@ def fold_twin(arguments: Arguments) -> int:
     )
     if arguments.out is not None and arguments.out.suffix not in (".csv", ".parquet", ".rrd"):
         raise ConfigError(f"--out {arguments.out}: must end in .csv, .parquet or .rrd")
+    if arguments.smooth:
+        check_smooth(find_estimator(twin.estimator, twin.model), twin.model, twin.tuning.options)
     prepare(twin)
     log, counts = read_log(twin, arguments.duration)
     period = twin.picture if arguments.out is not None and arguments.out.suffix == ".rrd" else None
@@ -121,10 +127,12 @@ def fold_twin(arguments: Arguments) -> int:
     seconds = (time.perf_counter() - begun) / log.n
     pictures = fold.pictures.taken if fold.pictures is not None else []
     result = score(fold.track, log.events, twin.model, pictures, gate=twin.tuning.gate, baseline=twin.tuning.baseline)
+    smoothed = attend(twin.model, lambda: smooth(fold), "smoothing") if arguments.smooth else None
+    better = Better.of(fold, smoothed) if smoothed is not None else None
     found = calibration_of(twin, fold)
     told = blamed(fold, [*dropped(counts, fold), *episodes(fold)])
     if arguments.out is not None:
-        _write(arguments.out, twin, log, fold.track, pictures, [item.episode for item in told])
+        _write(arguments.out, twin, log, fold.track, pictures, [item.episode for item in told], smoothed)
     if arguments.html is not None:
         run = Reported(
             twin, twin.estimator, twin.tuning, log.events, fold.track, pictures, [item.episode for item in told],
@@ -132,14 +140,20 @@ def fold_twin(arguments: Arguments) -> int:
         )  # fmt: skip
         arguments.html.write_text(as_html(f"{twin.name}, {twin.estimator}", report(run)), encoding="utf-8")
     if arguments.json:
-        print(json.dumps(as_dict(twin, result, found, seconds, counts, fold, told)))
+        print(json.dumps(as_dict(twin, result, found, seconds, counts, fold, told, better)))
     else:
-        print("\n".join([*as_text(twin, result, found, seconds, counts, fold), *episode_lines(told)]))
+        print("\n".join([*as_text(twin, result, found, seconds, counts, fold, better), *episode_lines(told)]))
     return 0
 
 
 def _write(
-    path: Path, twin: Twin, log: Log, track: Track, pictures: Sequence[Picture], found: Sequence[Episode]
+    path: Path,
+    twin: Twin,
+    log: Log,
+    track: Track,
+    pictures: Sequence[Picture],
+    found: Sequence[Episode],
+    smoothed: Smoothed | None,
 ) -> None:
     if path.suffix == ".rrd":
         from ..recording.writer import write_recording
@@ -147,7 +161,7 @@ def _write(
         write_recording(path, twin, log, track, pictures, found)
         return
     table = table_of(
-        twin.model, log.events, track, found,
+        twin.model, log.events, track, found, smoothed=smoothed,
         tuning_version=twin.tuning.version, tuning=twin.tuning.name, model_version=log.version,
     )  # fmt: skip
     with path.open("wb") as file:

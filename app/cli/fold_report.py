@@ -24,6 +24,7 @@ from sources.source import WRONG_TIME
 from ..export.calibration_lines import calibration_lines
 from ..twin.twin import Twin
 from .fold_episodes import Told, as_json, dropped
+from .fold_smoothed import Better, errors_dict, number
 
 DECISIONS = 10
 """On sensors that stayed refused, that are printed at most: the last ones; --json has all."""
@@ -34,11 +35,6 @@ def calibration_of(twin: Twin, fold: Fold) -> list[Calibration]:
     events, track = fold.log.events, fold.track
     rows = calibrations(twin.model, events, track, gate=twin.tuning.gate, marginal=fold.marginal)
     return rows + truth_calibration(twin.model, events, track)
-
-
-def number(value: float) -> float | None:
-    """As JSON has it: null where there is none."""
-    return float(value) if np.isfinite(value) else None
 
 
 def _softened(fold: Fold) -> int:
@@ -64,6 +60,7 @@ def as_dict(
     counts: Counter[str],
     fold: Fold,
     told: Sequence[Told],
+    smoothed: Better | None = None,
 ) -> dict[str, Any]:
     """What a script needs of a fold.
 
@@ -77,7 +74,8 @@ def as_dict(
     is their share. `calibration` has an entry for each sensor row, used or held out, and each state whose truth is
     told: see estimators/diagnostics/calibration.py. `episodes` have start and end in seconds of the log (end null while
     one lasts), and `suspects`, the faults that explain them best: see estimators/diagnostics/episodes/ and
-    sensitivity/suspects.py.
+    sensitivity/suspects.py. `smoothed`, where that was asked for, has `rmse` and `coverage` of the smoothed states, and
+    `consistency` with the filter: see estimators/smoothing/consistency.py.
     """
     return {
         "twin": twin.name,
@@ -85,8 +83,8 @@ def as_dict(
         "tuning": twin.tuning.name,
         "readings": result.readings,
         **({"field": {"rmse": result.field.rmse, "coverage": result.field.coverage}} if result.field else {}),
-        "rmse": {name: number(fit.rmse) for name, fit in result.states.items()},
-        "coverage": {name: number(fit.coverage) for name, fit in result.states.items()},
+        **errors_dict(result.states),
+        **({"smoothed": smoothed.as_dict()} if smoothed is not None else {}),
         "held_out": {
             name: {"rmse": number(fit.rmse), "bias": number(fit.bias), "coverage": number(fit.coverage)}
             for name, fit in result.held_out.items()
@@ -162,7 +160,13 @@ def _why(fold: Fold) -> str | None:
 
 
 def as_text(
-    twin: Twin, result: Score, found: Sequence[Calibration], seconds: float, counts: Counter[str], fold: Fold
+    twin: Twin,
+    result: Score,
+    found: Sequence[Calibration],
+    seconds: float,
+    counts: Counter[str],
+    fold: Fold,
+    smoothed: Better | None = None,
 ) -> list[str]:
     """Lines: names and values, then the calibration."""
     track = fold.track
@@ -185,9 +189,11 @@ def as_text(
         else (f"RMSE {name}", f"{fit.rmse:.5g} {units[name]}   in the 95 % band: {100 * fit.coverage:.1f} %")
         for k, (name, fit) in enumerate(result.states.items())
     ]
+    if smoothed is not None:
+        rows += smoothed.as_rows(units)
     if result.nis_readings:
         verdict = result.nis_verdict
-        bounds = f"{verdict.place} {verdict.expected}; {result.nis_readings} readings"
+        bounds = f"{verdict.said}; {result.nis_readings} readings"
         rows.append(("mean NIS", f"{_decimals(result.nis)}   {bounds}"))
     # The many rows of one sensor are one line.
     together = {}

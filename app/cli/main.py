@@ -16,6 +16,7 @@ from estimators.errors import NisusError
 from ..stderr import complain
 from .arguments import (
     COMMANDS,
+    Advise,
     Bus,
     Check,
     Command,
@@ -23,6 +24,7 @@ from .arguments import (
     Compare,
     Filters,
     Fold,
+    Guard,
     Log,
     Review,
     Run,
@@ -31,15 +33,19 @@ from .arguments import (
     Tune,
     Tunings,
     Twins,
+    check_numbers,
 )
 
 
 def carry_out(command: Command) -> int:
     """Run one command; imports only what it needs, so that `nisus twins` answers at once."""
     if isinstance(command, Run):
+        from ..engine.compilers import first_workers
+
+        workers = first_workers() if command.twin is not None and not command.headless else ()
         from .run import run_twin
 
-        return run_twin(command)
+        return run_twin(command, workers)
     if isinstance(command, Fold):
         from .fold import fold_twin
 
@@ -48,10 +54,18 @@ def carry_out(command: Command) -> int:
         from .check import check_twin
 
         return check_twin(command)
+    if isinstance(command, Advise):
+        from .advise import advise
+
+        return advise(command)
     if isinstance(command, Compare):
         from .compare import compare_twin
 
         return compare_twin(command)
+    if isinstance(command, Guard):
+        from .guard import guard
+
+        return guard(command)
     if isinstance(command, Commission):
         from .commission import commission_twin
 
@@ -111,6 +125,7 @@ def parse(arguments: Sequence[str]) -> Command:
     """
     if arguments and arguments[0] in COMMANDS:
         name = arguments[0]
+        check_numbers(COMMANDS[name], arguments[1:])
         return tyro.cli(COMMANDS[name], args=arguments[1:], prog=f"nisus {name}")  # type: ignore[no-any-return]
     named = [Annotated[command, tyro.conf.subcommand(name)] for name, command in COMMANDS.items()]
     union: Any = functools.reduce(operator.or_, named)

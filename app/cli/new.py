@@ -137,19 +137,20 @@ def new_twin(arguments: Arguments) -> tuple[Path, Path]:
         if wanted or arguments.dbc:
             raise ConfigError("--signals and --dbc say what to take from a recording; name it with --log FILE")
         return write_twin(name, folder)
+    from ..advice.log.draft import python_text, yaml_text
+    from ..advice.log.plan import plan
     from .log import database_of, look
-    from .new_log import choose, python_text, yaml_text
 
     check_new(name, folder)
     found = look(arguments.log, arguments.dbc, arguments.time, arguments.time_unit)
-    chosen = choose(found, wanted)
+    drafted = plan(found, wanted)
     databases = [database_of(text) for text in arguments.dbc]
     model = model_of(name)
     return write_pair(
         name,
         folder,
-        yaml_text(name, model, chosen, found, databases, arguments.time_unit, folder),
-        python_text(name, model, chosen),
+        yaml_text(name, model, drafted, found, databases, arguments.time_unit, folder),
+        python_text(name, model, drafted),
     )
 
 

@@ -23,12 +23,13 @@ from ..running import Opening, stamp_of
 from ..session import Page, Session
 from ..twin.model import model_file
 from ..twin.twin import Twin, load_twin, restore_twin
-from .prepare import begin_to_compile, prepare, prepare_model
+from .prepare import begin_to_compile, compile_for, prepare_model
 from .remarks import remarking
 
 if TYPE_CHECKING:
     from sources.source import Source
 
+    from ..engine.compilers import Worker
     from ..recording.reader import Recorded
 
 
@@ -100,10 +101,16 @@ def opened_review(path: Path) -> Opening:
 
 
 class FileOpener:
-    """Opens what the gallery asks for. `given` has twins that the command line says more of than their name."""
+    """Opens what the gallery asks for.
 
-    def __init__(self, given: Mapping[str, Callable[[], Opening]] | None = None) -> None:
+    `given` has twins that the command line says more of than their name; `workers` compile for the first.
+    """
+
+    def __init__(
+        self, given: Mapping[str, Callable[[], Opening]] | None = None, workers: Sequence[Worker] = ()
+    ) -> None:
         self._given = dict(given or {})
+        self._workers = workers
 
     def open(self, wanted: Wanted) -> Opening:
         """See `Opener`. A log is folded as fast as it can be: it is there to be looked at from its beginning."""
@@ -116,9 +123,11 @@ class FileOpener:
 
     def made_ready(self, opening: Opening) -> Opening:
         """See `Opener`."""
-        workshop = begin_to_compile(opening.twin)
+        workers, self._workers = self._workers, ()
+        workshop = begin_to_compile(opening.twin, workers)
         try:
-            prepare_model(opening.twin)
+            opening.twin.check_files()
+            prepare_model(opening.twin, workshop)
         except BaseException:
             workshop.stop()
             raise
@@ -126,7 +135,7 @@ class FileOpener:
 
     def prepare(self, twin: Twin) -> None:
         """See `Opener`."""
-        prepare(twin)
+        compile_for(twin)
 
 
 def open_session(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -14,8 +14,10 @@ from estimators.fold import Fold
 from estimators.log import Log
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import ESTIMATORS, unfit
+from sources.pieces import make, pieces_of
 
 from ..engine.call_watch import CallWatch
+from ..engine.compilers import Worker
 from ..engine.workshop import Workshop
 from ..twin.twin import Twin
 
@@ -24,7 +26,17 @@ PATIENCE = 1.0
 
 
 def prepare(twin: Twin) -> None:
-    """Compile the twin's model and estimator, or load them from the cache.
+    """Compile what a twin needs, once its source's files are known to fit.
+
+    Raises:
+        NisusError: If one does not, the model does not compile, or the estimator does not apply.
+    """
+    twin.check_files()
+    compile_for(twin)
+
+
+def compile_for(twin: Twin) -> None:
+    """Compile the twin's model and estimator, and what its source needs, or load them from the cache.
 
     Raises:
         NisusError: If the model does not compile, or the estimator does not apply.
@@ -32,20 +44,28 @@ def prepare(twin: Twin) -> None:
 
     def work() -> None:
         Fold(twin.estimator, twin.model, twin.tuning, Log.of(twin.model), pairs=twin.pairs)
+        for name in twin.kernels:
+            for piece in pieces_of(name):
+                make(piece)
 
     attend(twin.model, work, "compiling filters, once", "compiled filters, once")
 
 
-def begin_to_compile(twin: Twin) -> Workshop:
-    """Let other processes compile what is not in the cache: the twin's filter, then all others that apply to it."""
-    workshop = Workshop([name for name, entry in ESTIMATORS.items() if unfit(entry, twin.model) is None])
-    workshop.ask(twin.estimator)
+def begin_to_compile(twin: Twin, workers: Sequence[Worker] = ()) -> Workshop:
+    """Let other processes compile what is not in the cache: what the twin's source needs, its filter, then all others.
+
+    Those that do not apply to the twin are left out. `workers` are processes that were started before.
+    """
+    filters = [name for name, entry in ESTIMATORS.items() if unfit(entry, twin.model) is None]
+    workshop = Workshop([*twin.kernels, *filters], workers=workers)
+    for name in (*twin.kernels, twin.estimator):
+        workshop.ask(name)
     workshop.start()
     return workshop
 
 
-def prepare_model(twin: Twin) -> None:
-    """Compile the twin's model alone, or load it from the cache.
+def prepare_model(twin: Twin, workshop: Workshop) -> None:
+    """Compile the twin's model alone, or load it from the cache, while the workshop compiles what its source needs.
 
     Raises:
         ModelError: If it does not compile.
@@ -53,6 +73,8 @@ def prepare_model(twin: Twin) -> None:
 
     def work() -> None:
         Fold(twin.estimator, twin.model, twin.tuning, Log.of(twin.model), pairs=twin.pairs, idle=True)
+        for name in twin.kernels:
+            workshop.wait(name)
 
     attend(twin.model, work, "compiling the model, once", "compiled the model, once")
 

@@ -21,6 +21,9 @@ from .opener import FileOpener, live_source, open_session, opened_twin
 from .prepare import prepare
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ..engine.compilers import Worker
     from .arguments import Run
 
 
@@ -30,8 +33,8 @@ SAID = 5
 """Failures that a run without a page prints at its end, since it has no list of events."""
 
 
-def run_twin(arguments: Run) -> int:
-    """Carry the command out."""
+def run_twin(arguments: Run, workers: Sequence[Worker] = ()) -> int:
+    """Carry the command out; `workers` are processes that wait for something to compile."""
     speed = arguments.speed
     if speed is not None and not (0.0 < speed <= FASTEST or speed == math.inf):
         raise ConfigError(
@@ -53,7 +56,7 @@ def run_twin(arguments: Run) -> int:
             overrides=settings(arguments.set, arguments.estimator, arguments.tuning),
             speed=speed,
         )
-        opening, opener = read(), FileOpener({arguments.twin: read})
+        opening, opener = read(), FileOpener({arguments.twin: read}, workers)
     elif page is None or arguments.record or arguments.log or arguments.set or arguments.estimator or arguments.tuning:
         raise ConfigError("run: the twin is missing; name one (`nisus twins` lists those that ship)")
     if page is not None:

@@ -13,6 +13,7 @@ from estimators.log import Log
 
 from ..runs.fit_json import fit_json
 from ..runs.tuning_yaml import tuning_yaml
+from ..twin.bounds import bounds_of
 from ..twin.twin import Twin, load_twin
 from .arguments import settings
 from .check_text import as_text
@@ -37,7 +38,16 @@ def tune_twin(arguments: Arguments) -> int:
     twin, recordings = _recordings(arguments)
 
     def work() -> Fitted:
-        return fit(twin.estimator, twin.tuning, recordings, wanted=wanted, blocks=arguments.blocks)
+        return fit(
+            twin.estimator,
+            twin.tuning,
+            recordings,
+            wanted=wanted,
+            bounds=bounds_of(twin.config, twin.model),
+            blocks=arguments.blocks,
+            aim=arguments.aim,
+            predict=arguments.predict,
+        )
 
     found: Fitted = attend(twin.model, work, "fitting")
     if arguments.json:
@@ -45,7 +55,7 @@ def tune_twin(arguments: Arguments) -> int:
     else:
         print("\n".join(as_text(sections(twin, found))))
     if arguments.save is not None and found.proposed:
-        text = heading(twin, found) + tuning_yaml(twin.config, twin.estimator, found.setting.tuning)
+        text = heading(twin, found) + tuning_yaml(twin.config, twin.estimator, *found.setting)
         arguments.save.write_text(text, encoding="utf-8")
     return 0 if found.proposed else 1
 

@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from config.files import shown_path
-from config.tunings import OWN, load_version, version_files
+from config.tunings import OWN
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError, printable
 from estimators.fold import Fold
@@ -16,7 +16,8 @@ from ..engine.stall import interruptible
 from ..export.parts import Part
 from ..tunings.figures import COVERAGE, figures
 from ..tunings.keep import Settings, accept, keep, version_text
-from ..twin.twin import Twin, load_twin
+from ..tunings.listing import listing
+from ..twin.twin import load_twin
 from .arguments import settings
 from .check_text import as_text
 from .fold import read_log
@@ -74,38 +75,24 @@ def _accept(arguments: Arguments, name: str) -> None:
 
 def _list(arguments: Arguments) -> None:
     twin = load_twin(arguments.twin)
-    versions = [load_version(path) for path in version_files(twin.path).values()]
-    versions.sort(key=lambda version: version.head.saved)
-    accepted = max((v.head.accepted.at for v in versions if v.head.accepted is not None), default=None)
-
-    def plain(name: str, head: Any, estimator: str) -> dict[str, Any]:
-        given = head.model_dump(mode="json") if head is not None else {}
-        holds = given["accepted"] is not None and given["accepted"]["at"] == accepted if head else accepted is None
-        return {"name": name, "estimator": estimator, **given, "holds": holds}
-
-    own = plain(OWN, None, twin.estimator)
-    listed = [own, *(plain(v.name, v.head, _estimator(v.section, twin)) for v in versions)]
+    listed = listing(twin)
     if arguments.json:
         print(json.dumps(listed))
         return
     rows = tuple(
         (
-            item["name"] + (" *" if item["holds"] else ""),
+            item["name"] + (" *" if item.get("holds") else ""),
             item.get("saved", "-")[:16].replace("T", " "),
-            item["estimator"],
+            item.get("estimator", "-"),
             *_scored(item.get("scores", {})),
             ", ".join(item.get("fitted_on", ())) or "-",
-            _noted(item) if item is not own else "what the twin's file says",
+            _noted(item),
         )
         for item in listed
     )
     head = ("version", "saved", "filter", "NIS", "log L", "in 95 %", "fitted on", "note")
     said = ("*: holds; `nisus guard` folds with it.",)
     print("\n".join(as_text([Part(f"Tuning versions of {twin.name}", said, head, rows)])))
-
-
-def _estimator(section: Any, twin: Twin) -> str:
-    return section.estimator.name if section.estimator is not None else twin.estimator
 
 
 def _scored(scores: dict[str, float]) -> tuple[str, str, str]:
@@ -116,6 +103,10 @@ def _scored(scores: dict[str, float]) -> tuple[str, str, str]:
 
 
 def _noted(item: dict[str, Any]) -> str:
+    if item["name"] == OWN:
+        return "what the twin's file says"
+    if "error" in item:
+        return str(item["error"])
     accepted = item["accepted"]
     said = [item["note"], f"accepted: {accepted['note']}" if accepted and accepted["note"] else ""]
     return "; ".join(filter(None, said))

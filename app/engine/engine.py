@@ -91,6 +91,7 @@ class Engine(RunningFold):
         self._first_base = base
         self._tick = section.tick
         self._options = Remembered(twin)
+        self._workshop.report = lambda text: self.notices.say(text, level="warn")
         self._begin_intake()
         self._feeder = Feeder(lambda: open_source(self.notices.report), self._inbox, self.notices.report)
         self._refolder = Refolder(self._inbox.put)
@@ -137,9 +138,9 @@ class Engine(RunningFold):
         """Queue a command."""
         self._inbox.put(command)
 
-    def reload(self, twin: Twin, why: str) -> None:
+    def reload(self, twin: Twin, why: str, *, exact: bool = False) -> None:
         """Queue going on with the twin as it was saved anew, of the same shape (see reload.py)."""
-        self._inbox.put(Reloaded(twin, why))
+        self._inbox.put(Reloaded(twin, why, exact))
 
     @property
     def source(self) -> Source:
@@ -293,7 +294,9 @@ class Engine(RunningFold):
 
     def _reload(self, item: Reloaded) -> None:
         """Fold the history again with the twin as it was saved."""
-        estimator, tuning = merged(self.twin, item.twin, self.estimator, self.tuning)
+        estimator, tuning = item.twin.estimator, item.twin.tuning
+        if not item.exact:
+            estimator, tuning = merged(self.twin, item.twin, self.estimator, self.tuning)
         self._options.leave(self.estimator, self.tuning)
         self.twin, self.model, self._policy = item.twin, item.twin.model, item.twin.policy
         self._options.begin(item.twin)

@@ -62,6 +62,9 @@ class Running(Protocol):
     def policy(self) -> HealthPolicy:
         """When the estimate may be trusted."""
 
+    def reload(self, twin: Twin, why: str, *, exact: bool = False) -> None:
+        """Queue going on with another twin of the same shape, or the same one as it was saved anew; see reload.py."""
+
     def submit(self, command: Command) -> None:
         """Queue a command."""
 

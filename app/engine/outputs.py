@@ -101,7 +101,8 @@ class Status:
     `Fold.account`). `latency_ms` is the 99th percentile from a reading's arrival to its row. `faults` are those that
     were put into the source, and hold or will. `integrity` bounds what could be wrong with each state unnoticed; None
     until it is known. `compiling` are the filters that are not compiled yet: for how many seconds each has been, None
-    of one that waits; for `awaited` the running fold waits to give way.
+    of one that waits; for `awaited` the running fold waits to give way. `nis_judged` is what of a commissioned twin
+    is compared with the bounds of the NIS (diagnostics/consistency.py).
     """
 
     estimator: str
@@ -135,3 +136,4 @@ class Status:
     integrity: Integrity | None = None
     awaited: str | None = None
     compiling: Mapping[str, float | None] = field(default_factory=dict)
+    nis_judged: float = np.nan

@@ -22,10 +22,14 @@ ANEW = ("name", "source", "faults", "time", "maintenance", "history", "view")
 
 @dataclass(frozen=True)
 class Reloaded:
-    """In the engine's inbox: go on with this twin, of the same shape; `why` says what was saved."""
+    """In the engine's inbox: go on with this twin, of the same shape; `why` says what was saved or loaded.
+
+    If not `exact`, what was turned since stays turned, where the twin does not say something new.
+    """
 
     twin: Twin
     why: str
+    exact: bool = False
 
 
 def obstacle(before: Twin, after: Twin) -> str | None:

@@ -8,9 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimators.diagnostics.health import FAR
+from estimators.diagnostics.score import nis_verdict
 from estimators.diagnostics.sensor_states import sensor_states
 from estimators.fold import Fold
+from estimators.log import RESET
 from estimators.registry import find_estimator
+from estimators.track import FAILED, GATED, USED
 from estimators.versions import model_version_at
 from sources.source import Source
 
@@ -79,7 +83,7 @@ def status_of(
         t=int(log.t[last]) if last >= 0 else None,
         health=health,
         since=int(log.t[last_run(track.health)]) if last >= 0 else None,
-        cause=watchers.cause(leading, health) if last >= 0 else _before(fold, watchers),
+        cause=watchers.cause(leading, health) if last >= 0 else _before(fold, watchers, awaited, compiling),
         sensors=account.of_sensors(model.sensor_names, states),
         episodes_open=len(account.lasting),
         lost=watchers.alerts.lost,
@@ -97,6 +101,7 @@ def status_of(
         nis=float(track.nis_mean[last]) if last >= 0 else np.nan,
         nis_low=float(track.nis_low[last]) if last >= 0 else np.nan,
         nis_high=float(track.nis_high[last]) if last >= 0 else np.nan,
+        nis_judged=_judged(fold),
         **playback_status(source),
         finished=finished,
         recording=recording,
@@ -109,8 +114,25 @@ def status_of(
     )
 
 
-def _before(fold: Fold, watchers: Watchers) -> str:
+def _judged(fold: Fold) -> float:
+    """Of a commissioned twin the NIS of the readings in the window, as it is compared with what was normal."""
+    baseline, n, window = fold.tuning.baseline, fold.n, fold.policy.window
+    if baseline is None:
+        return np.nan
+    rows = slice(max(0, n - FAR * window), n)
+    resets = np.flatnonzero(fold.log.kind[rows] == RESET)
+    begun = rows.start + (int(resets[-1]) + 1 if resets.size else 0)
+    judged = begun + np.flatnonzero(np.isin(fold.track.verdict[begun:n], (USED, GATED, FAILED)))[-window:]
+    events, track = fold.log.events.select(judged), fold.track.select(judged)
+    return nis_verdict(track, events, fold.model, baseline).judged
+
+
+def _before(fold: Fold, watchers: Watchers, awaited: str | None, compiling: Mapping[str, float | None]) -> str:
     """Why there is no row."""
+    if fold.idle and awaited is not None:
+        begun = compiling.get(awaited)
+        since = f" ({begun:.0f} s so far)" if begun else ""
+        return f"{awaited} is being compiled, which happens once{since}; readings are kept meanwhile"
     if fold.idle:
-        return f"{fold.estimator.name} is being compiled, which happens once; readings are kept meanwhile"
+        return "the readings that came so far are being folded"
     return watchers.silence.cause

@@ -7,32 +7,23 @@ after another, at the lowest priority, in the order of the catalogue.
 
 from __future__ import annotations
 
-import contextlib
-import gc
-import multiprocessing
-import os
-import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from multiprocessing.connection import Connection, wait
-from typing import Any
+from multiprocessing.connection import wait
 
-from estimators.compiled.orphan import leave_with_parent
-from estimators.pieces import LOOP, Piece, is_made, make, pieces_of
+from estimators.pieces import LOOP, Piece
+from sources.pieces import KERNELS, is_made, make, needs, pieces_of
 
+from .compilers import MOST, Worker
 from .integrity import LOWEST
-
-HURRY = 3
-"""Processes at most that compile what is asked for; more have no more pieces to take."""
 
 LOOK = 0.2
 """Seconds between two looks at whether something else was asked for."""
 
 
 class Workshop:
-    """Compiles the filters of one twin."""
+    """Compiles the filters of one twin, and what its source needs."""
 
     def __init__(
         self,
@@ -41,24 +32,30 @@ class Workshop:
         pieces: Callable[[str], list[Piece]] = pieces_of,
         work: Callable[[Piece], None] = make,
         is_done: Callable[[Piece], bool] = is_made,
+        workers: Sequence[Worker] = (),
     ) -> None:
         """Look at what is in the cache; nothing is compiled yet.
 
         Args:
-            names: Filters that are compiled here; any other is compiled where it is used, and counts as ready.
-            pieces: Of a filter or of `LOOP`.
+            names: Filters that are compiled here, and what a source needs (`KERNELS`); anything else is compiled where
+                it is used, and counts as ready.
+            pieces: Of one of these, or of `LOOP`.
             work: Compiles a piece, in another process.
             is_done: Whether a piece needs no work.
+            workers: Processes that were started before.
         """
-        self._work = work
+        self._work, self._workers = work, list(workers)
         self._left: dict[str, list[Piece]] = {}
-        for name in (LOOP, *names) if names else ():
+        for name in dict.fromkeys(part for each in names for part in needs(each)):
             left = [piece for piece in pieces(name) if not is_done(piece)]
             if left:
                 self._left[name] = left
         self._asked: dict[str, float] = {}
         self._told: list[tuple[str, Callable[[str], None]]] = []
         self._under_way: dict[Worker, Piece] = {}
+        self._lost: list[Piece] = []
+        self.report: Callable[[str], None] = lambda text: None
+        """Told of what went wrong, in another thread."""
         self._wake = threading.Condition()
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="workshop", daemon=True)
@@ -67,6 +64,9 @@ class Workshop:
         """Begin; with nothing left to do there is no thread, and no process."""
         if self._left:
             self._thread.start()
+            return
+        for worker in self._workers:
+            worker.stop()
 
     def stop(self) -> None:
         """Give up what is under way."""
@@ -77,11 +77,11 @@ class Workshop:
             self._thread.join(timeout=2.0)
 
     def ready(self, name: str) -> bool:
-        """Whether a filter can be had from the cache."""
-        return LOOP not in self._left and name not in self._left
+        """Whether a filter, or what a source needs, can be had from the cache."""
+        return not any(part in self._left for part in needs(name))
 
     def ask(self, name: str, done: Callable[[str], None] = lambda name: None) -> None:
-        """Compile a filter at once, before any other; `done` is told its name when it is ready, in another thread."""
+        """Compile something at once, before any other; `done` is told its name when it is ready, in another thread."""
         with self._wake:
             if not self.ready(name):
                 self._asked.setdefault(name, time.monotonic())
@@ -89,23 +89,26 @@ class Workshop:
             self._tell()
             self._wake.notify()
 
+    def wait(self, name: str) -> None:
+        """Until something is ready, or the workshop ends."""
+        ready = threading.Event()
+        self.ask(name, lambda name: ready.set())
+        ready.wait()
+
     def states(self) -> dict[str, float | None]:
         """Filters that are not ready: for how many seconds each has been compiled, None of one that waits."""
         with self._wake:
-            left = dict.fromkeys(self._left)
+            left = [name for name in self._left if name != LOOP and name not in KERNELS]
             now = time.monotonic()
             begun: dict[str, float | None] = {
                 name: min((now - worker.begun for worker, piece in self._under_way.items() if piece.of == name),
                           default=None)
                 for name in left
             }  # fmt: skip
-            for name, since in self._asked.items():
-                begun[name] = now - since
-            begun.pop(LOOP, None)
-            return begun
+            return begun | {name: now - since for name, since in self._asked.items() if name not in KERNELS}
 
     def _run(self) -> None:
-        hurried: list[Worker] = []
+        hurried = self._workers
         quiet: Worker | None = None
         try:
             while True:
@@ -114,11 +117,13 @@ class Workshop:
                     self._tell()
                     if self._stopping or not self._left:
                         return
-                    wanted = [LOOP, *self._asked] if self._asked else []
+                    hurried = [worker for worker in hurried if not worker.ended]
+                    quiet = None if quiet is not None and quiet.ended else quiet
+                    wanted = list(dict.fromkeys(part for name in self._asked for part in needs(name)))
                     while (piece := self._next(wanted)) is not None:
                         worker = next((each for each in hurried if each not in self._under_way), None)
                         if worker is None:
-                            if len(hurried) == min(HURRY, max(2, os.cpu_count() or 1)):
+                            if len(hurried) == MOST:
                                 break
                             worker = Worker(self._work, 0)
                             hurried.append(worker)
@@ -134,7 +139,10 @@ class Workshop:
                     answers = [worker.connection for worker in self._under_way]
                 wait(answers, LOOK)
         finally:
-            for worker in (*hurried, *([quiet] if quiet else [])):
+            workers = [*hurried, *([quiet] if quiet else [])]
+            for worker in workers:
+                worker.end()
+            for worker in workers:
                 worker.stop()
             with self._wake:
                 self._left.clear()
@@ -145,21 +153,33 @@ class Workshop:
         self._under_way[worker] = piece
 
     def _next(self, names: Sequence[str]) -> Piece | None:
-        """A piece that can be begun now; what takes longest comes first."""
+        """A piece that can be begun now: what a source needs, which is waited for first, then what takes longest."""
         busy = self._under_way.values()
         left = [piece for name in names for piece in self._left.get(name, ()) if piece not in busy]
         able = [
             piece for piece in left if all(Piece(piece.of, place) not in self._left[piece.of] for place in piece.after)
         ]
-        return min(able, key=lambda piece: piece.place, default=None)
+        return min(able, key=lambda piece: (piece.of not in KERNELS, piece.place), default=None)
 
     def _next_quiet(self) -> Piece | None:
         return next((piece for name in self._left if (piece := self._next([name])) is not None), None)
 
     def _take_answers(self) -> None:
-        """A piece that failed counts as done: who uses it compiles it, and says what is wrong."""
+        """A piece that failed counts as done: who uses it compiles it, and says what is wrong.
+
+        So does one with which two processes were ended from outside; with the first it was perhaps the memory that was
+        short.
+        """
         for worker in [each for each in self._under_way if each.answered()]:
             piece = self._under_way.pop(worker)
+            if worker.ended:
+                again = piece not in self._lost
+                self._lost.append(piece)
+                what = "what a source or any filter needs" if piece.of == LOOP or piece.of in KERNELS else piece.of
+                then = "another one begins anew" if again else "it is compiled where it is used, slowing all else"
+                self.report(f"a process that compiled {what} was ended, as where memory is short; {then}")
+                if again:
+                    continue
             left = self._left[piece.of]
             left.remove(piece)
             if not left:
@@ -170,53 +190,3 @@ class Workshop:
             self._told.remove((name, done))
             self._asked.pop(name, None)
             done(name)
-
-
-class Worker:
-    """A process that compiles one piece after another."""
-
-    def __init__(self, work: Callable[[Piece], None], niceness: int) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.connection, its_end = context.Pipe()
-        self._process = context.Process(target=_serve, args=(its_end, work, niceness), name="compile", daemon=True)
-        self._process.start()
-        its_end.close()
-        self.begun = 0.0
-
-    def give(self, piece: Piece) -> None:
-        """Begin a piece."""
-        self.begun = time.monotonic()
-        with contextlib.suppress(OSError):  # a process that has ended answers so, below
-            self.connection.send(piece)
-
-    def answered(self) -> bool:
-        """Whether the piece is done, or the process has ended."""
-        try:
-            return self.connection.poll() and (self.connection.recv(), True)[1]
-        except (EOFError, OSError):
-            return True
-
-    def stop(self) -> None:
-        """End the process."""
-        self._process.terminate()
-        self._process.join(1.0)
-        self.connection.close()
-
-
-def _serve(connection: Connection[Any, Piece], work: Callable[[Piece], None], niceness: int) -> None:
-    """In a process of its own: do what is sent, and answer."""
-    leave_with_parent()
-    # Ctrl-C is for the process that shows the twin, which ends this one.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if niceness and sys.platform != "win32":
-        os.setpriority(os.PRIO_PROCESS, 0, niceness)
-    # Compiling leaves few cycles behind, and looking for them takes an eighth of the time.
-    gc.disable()
-    while True:
-        try:
-            piece = connection.recv()
-        except EOFError:
-            return
-        with contextlib.suppress(Exception):
-            work(piece)
-        connection.send(None)

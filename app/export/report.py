@@ -113,7 +113,7 @@ def _scores(run: Reported, found: Score) -> Part:
     marks: list[str] = []
     if found.nis_readings:
         verdict = found.nis_verdict
-        rows.append(("mean NIS", digits(found.nis), f"{verdict.place} {verdict.expected}"))
+        rows.append(("mean NIS", digits(found.nis), verdict.said))
         marks.append("good" if verdict.place == "inside" else "bad")
     fits = [(f"RMSE of {name}", name, fit) for name, fit in found.states.items()]
     fits += [(f"RMSE of {name}, held out", name, fit) for name, fit in found.held_out.items()]

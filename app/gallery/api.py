@@ -25,6 +25,9 @@ from .recordings import Recordings
 from .recordings_api import RecordingsApi
 from .shelf import shelf
 
+PATIENCE = 1.0
+"""Seconds after which it is said that a model is compiled; loading it from the cache takes less."""
+
 
 class GalleryApi:
     """Serves the gallery at the session's door, whatever else is shown there."""
@@ -57,6 +60,8 @@ class GalleryApi:
         """What runs, what is being started, and what could not be."""
         gallery, running = self._gallery, self._gallery.session.running
         starting, failed, wanted = gallery.starting, gallery.failed, gallery.running
+        begun = gallery.compiling
+        compiling = begun is not None and time.monotonic() - begun > PATIENCE
         return {
             "boot": self._door.boot,
             "running": None
@@ -72,6 +77,7 @@ class GalleryApi:
                 "name": starting[0].twin,
                 "title": starting[0].name,
                 "seconds": round(time.monotonic() - starting[1], 1),
+                "doing": "compiling" if compiling else "",
             },
             "failed": None if failed is None else {"title": failed.name, "text": one_line(failed.text)},
         }

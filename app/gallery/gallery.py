@@ -83,6 +83,8 @@ class Gallery:
         self.own = tuple(own)
         self.running: Wanted | None = first
         self.starting: tuple[Wanted, float] | None = None
+        self.compiling: float | None = None
+        """Since when what is being started is made ready; None while it is not."""
         self.failed: Failed | None = None
         self._opener = opener
         self._lock = threading.Lock()
@@ -146,7 +148,12 @@ class Gallery:
         opening = self._opener.open(wanted)
         if remark is not None:
             opening = replace(opening, remarks=[*opening.remarks, ("warn", remark)])
-        self._put(wanted, self._opener.made_ready(opening))
+        self.compiling = time.monotonic()
+        try:
+            opening = self._opener.made_ready(opening)
+        finally:
+            self.compiling = None
+        self._put(wanted, opening)
 
     def _put(self, wanted: Wanted, opening: Opening) -> None:
         """Run it in place of what runs."""

@@ -12,11 +12,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from config.loader import shown_path
+from config.tunings import OWN
 from estimators.errors import NisusError
 
 from ..engine.reload import obstacle
 from ..running import RunningTwin, Stamp, stamp_of
-from ..twin.twin import Twin
+from ..twin.twin import VERSION, Twin, with_version
 from .gallery import Gallery
 
 EVERY = 0.4
@@ -66,6 +67,10 @@ class SavedFiles:
         engine = running.engine
         try:
             twin = again()
+            chosen = engine.twin.overrides.get(VERSION, OWN)
+            if chosen != twin.overrides.get(VERSION, OWN):
+                # Loaded on the page.
+                twin = with_version(twin, chosen)
             reason = obstacle(engine.twin, twin)
             if reason is None:
                 self._gallery.prepare(twin)

@@ -1,6 +1,7 @@
 // One twin of the gallery: picture, question, what it teaches, and a button to start it, or why it cannot.
 
 import { element, setAttribute, setText } from "./dom.js";
+import { progress } from "./session.js";
 
 const many = (count, word) => `${count.toLocaleString("en")} ${word}${count === 1 ? "" : "s"}`;
 
@@ -32,7 +33,7 @@ export function card(item, act) {
     setAttribute(node, "data-runs", runs ? "true" : null);
     button.dataset.runs = String(runs);
     button.disabled = Boolean(starting);
-    setText(button, runs ? "Back to it" : begins ? `starting … ${Math.floor(starting.seconds)} s` : "Start");
+    setText(button, runs ? "Back to it" : begins ? progress(starting) : "Start");
     setAttribute(button, "aria-label", `${runs ? "Back to" : "Start"} ${short}`);
   };
   const words = [item.name, item.title, item.question, item.teaches, facts].join(" ").toLowerCase();

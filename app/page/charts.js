@@ -8,6 +8,7 @@ import { Lane } from "./lane.js";
 import { Layout } from "./layout.js";
 import { marks } from "./marks.js";
 import { Pins } from "./pins.js";
+import { Smoothed } from "./smoothed.js";
 import { TimeAxis } from "./time_axis.js";
 import { Range, bandExtent, extent, within } from "./ranges.js";
 
@@ -56,6 +57,8 @@ export class Charts {
     }
     this.axis = new TimeAxis($("axis"));
     this.pins = new Pins(this, model, link, actions);
+    this.smoothed = new Smoothed(this, link);
+    $("layout").after(this.smoothed.button);
     this.layout = new Layout(this.charts, node, $("layout"), model.twin, () => this.ask());
     view.addEventListener("change", () => this.ask());
     link.addEventListener("frames", () => this.draw());
@@ -102,6 +105,7 @@ export class Charts {
     const before = this.states.map((state) => `mean:${state.name}`);
     this.link.look("previous", { ...place, run: "previous", columns: before }, (...frame) => this.previous.take(...frame));
     this.pins.ask(place);
+    this.smoothed.ask(place);
     if (!this.view.following) this.draw(); // what is there already, until the points for it come
   }
 
@@ -111,6 +115,7 @@ export class Charts {
       this.link.look("charts", null);
       this.link.look("previous", null);
       this.pins.ask(null);
+      this.smoothed.ask(null);
     }
     this.draw();
   }
@@ -153,6 +158,7 @@ export class Charts {
 
   end() {
     this.width.disconnect();
+    this.smoothed.button.remove();
     this.charts.forEach((chart) => chart.end());
   }
 }
@@ -185,9 +191,9 @@ function stateChart(charts, state) {
     ],
     bands: [band("band", [1, 2])],
     under: (plot) => marks(plot, charts.episodes, charts.view.at),
-    between: (plot, series) => series === BEFORE && charts.pins.draw(plot, state), // over the band, beneath the estimate
+    between: (plot, series) => series === BEFORE && (charts.smoothed.draw(plot, state), charts.pins.draw(plot, state)), // over the band, beneath the estimate
     over: (plot) => integrityLines(plot, charts, state),
-    extras: (chart) => [...integrityCurves(chart, charts, state), ...charts.pins.curves("lane", state)],
+    extras: (chart) => [...integrityCurves(chart, charts, state), ...charts.smoothed.curves(state), ...charts.pins.curves("lane", state)],
     data: () => {
       let [upper, lower, truth, mean] = own.map((name) => live.column(name));
       let dotted = rows.map((name) => live.column(name));

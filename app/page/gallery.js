@@ -5,7 +5,7 @@ import { $, element, setText } from "./dom.js";
 import { drops } from "./drop.js";
 import { keys } from "./keys.js";
 import { Recordings } from "./recordings.js";
-import { post, Session } from "./session.js";
+import { post, progress, Session } from "./session.js";
 
 const settings = JSON.parse(document.body.dataset.settings);
 const session = new Session(settings.boot);
@@ -39,7 +39,7 @@ function draw(state) {
   for (const item of shown) item.sync(state);
   const { running, starting, failed } = state;
   const now = [];
-  if (starting) now.push(element("span", { class: "pill", dataset: { health: "suspect" } }, `starting ${starting.title} … ${Math.floor(starting.seconds)} s`));
+  if (starting) now.push(element("span", { class: "pill", dataset: { health: "suspect" } }, `${starting.title}: ${progress(starting)}`));
   if (running)
     now.push(
       element("span", { class: "pill", dataset: { health: "tracking" } }, `● ${running.title} ${running.review ? "is open" : "runs"}`),

@@ -3,7 +3,7 @@
 import { named } from "./card.js";
 import { $, element, setAttribute, setText } from "./dom.js";
 import { drops } from "./drop.js";
-import { post, Session } from "./session.js";
+import { post, progress, Session } from "./session.js";
 
 const READ = 8000; // ms that a line stays
 
@@ -58,7 +58,7 @@ export class Leave {
     this.session?.close();
     this.session = new Session(this.boot);
     this.session.addEventListener("state", ({ detail: { starting, failed } }) => {
-      if (starting) setText($("toast"), `Starting ${starting.title} … ${Math.floor(starting.seconds)} s`);
+      if (starting) setText($("toast"), `${starting.title}: ${progress(starting)}`);
       $("toast").hidden = !starting;
       if (starting) return;
       this.session.close();

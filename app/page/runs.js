@@ -5,6 +5,7 @@ import { element, setText } from "./dom.js";
 import { compact, spaced, span } from "./format.js";
 import { swatch } from "./pins.js";
 import { gone } from "./save.js";
+import { Versions } from "./versions.js";
 
 const LOOK = 300; // ms between two looks at whether there is something new
 const AGAIN = 5000; // ms between two looks at the scores while the log grows
@@ -22,7 +23,8 @@ export class Runs {
     this.error = element("p", { class: "error", role: "alert", hidden: true });
     this.compared = element("section", { class: "compared", "aria-label": "Two runs compared", hidden: true });
     this.table = element("table", { class: "runs" });
-    node.replaceChildren(this.error, this.table, this.compared);
+    this.versions = new Versions(link);
+    node.replaceChildren(this.versions.node, this.error, this.table, this.compared);
     // Not by the status: a twin whose source has ended says no more.
     setInterval(() => link.socket && link.status.runs && this.heard(link.status), LOOK);
   }
@@ -38,6 +40,7 @@ export class Runs {
     this.asking = false;
     if (!answer?.ok) return;
     [this.key, this.when, this.runs] = [key, performance.now(), await answer.json()];
+    this.versions.list();
     this.show();
   }
 
@@ -129,6 +132,7 @@ export class Runs {
       button("⇄", "Compare with another", choose, { "aria-pressed": String(this.chosen.includes(number)) }),
       this.download(run, "report", `/api/report.html?run=${number}`, "Save a report: scores, charts, checks, episodes and tuning in one file", `Save a report of run ${number}`),
       this.download(run, "csv", `/api/track.csv?run=${number}`, "Save the track as CSV", `Save the track of run ${number}`),
+      button("keep", run.name ? `Keep as version ${run.name}, beside the twin` : "Keep as a version beside the twin, under the run's name: give it one", () => this.versions.keep(run), { disabled: !run.name }),
       element("a", { href: `/api/runs/${number}.yaml`, download: "", title: "Save the tuning as lines of the twin's YAML", "aria-label": `Save run ${number} as YAML` }, "yaml"),
     ];
   }
@@ -177,7 +181,7 @@ function bests(runs, subject) {
     return known.length > 1 && winners.length < known.length ? winners.at(-1)[1] : null;
   };
   return {
-    nis: least((score) => score.nis > 0 && Math.abs(Math.log(score.nis / Math.sqrt(score.nis_low * score.nis_high)))),
+    nis: least((score) => score.nis_judged > 0 && Math.abs(Math.log(score.nis_judged / Math.sqrt(score.nis_low * score.nis_high)))),
     rmse: least((score, fit) => fit?.rmse),
     coverage: least((score, fit) => fit && Math.abs(fit.coverage - COVERED)),
     likelihood: least((score) => (score.log_likelihood_reading === null ? NaN : -score.log_likelihood_reading)),

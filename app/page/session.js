@@ -50,6 +50,9 @@ function leave() {
   else location.replace(location.hash.includes("twin=") ? `/${location.hash}` : "/");
 }
 
+// How far what is being started has come.
+export const progress = ({ doing, seconds }) => `${doing || "starting"} … ${Math.floor(seconds)} s`;
+
 // Resolves to the answer, or {error} with the reason.
 export async function post(path, body, method = "POST") {
   try {

@@ -68,8 +68,8 @@ export class Trust {
   }
 
   // NIS on a logarithmic scale of two decades about its bounds.
-  gauge({ nis, nis_low: low, nis_high: high, nis_place: where, nis_words: said }) {
-    const known = [nis, low, high].every((value) => typeof value === "number" && value > 0);
+  gauge({ nis, nis_judged: judged, nis_low: low, nis_high: high, nis_place: where, nis_words: said }) {
+    const known = [nis, judged, low, high].every((value) => typeof value === "number" && value > 0);
     setText($("nis"), known ? compact(nis, 3) : "–");
     $("gauge").hidden = !known;
     if (!known) return;
@@ -77,7 +77,7 @@ export class Trust {
     const place = (value) => `${Math.min(98, Math.max(2, 50 + 50 * (Math.log10(value) - middle)))}%`;
     $("gauge").style.setProperty("--low", place(low));
     $("gauge").style.setProperty("--high", place(high));
-    $("gauge").style.setProperty("--nis", place(nis));
+    $("gauge").style.setProperty("--nis", place(judged));
     $("gauge").dataset.inside = String(where === "inside");
     setAttribute($("gauge"), "title", `Of the last readings: ${said}`);
   }

@@ -97,6 +97,7 @@ def _score(known: RunScore, units: dict[str, str]) -> dict[str, Any]:
         "nis": _plain(found.nis),
         "nis_low": _plain(found.nis_low),
         "nis_high": _plain(found.nis_high),
+        "nis_judged": _plain(found.nis_verdict.measure),
         "nis_place": found.nis_verdict.place,
         "nis_words": found.nis_verdict.words,
         "log_likelihood": _plain(found.log_likelihood),

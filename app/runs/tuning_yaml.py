@@ -7,17 +7,29 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from config.schema import TwinSection
+from estimators.errors import LARGEST
 from estimators.estimator import Estimator
 from estimators.model.coloured import disturbance_time, error_time, errors_of
 from estimators.registry import find_entry
 from estimators.tuning import REOPEN, Tuning
 
+from ..twin.bounds import bounds_of
+
 PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
 RESERVED = {"null", "true", "false"}
 
 
-def tuning_yaml(config: TwinSection, estimator: str, tuning: Tuning, *, whole: bool = True) -> str:
+def tuning_yaml(
+    config: TwinSection,
+    estimator: str,
+    tuning: Tuning,
+    prior: tuple[np.ndarray, np.ndarray] | None = None,
+    *,
+    whole: bool = True,
+) -> str:
     """The sections `estimator`, `filters`, `parameters`, `noise`, `sensors` and `gate`.
 
     A twin whose file has these in place of its own starts with the same settings. What else a section of the file says
@@ -28,13 +40,14 @@ def tuning_yaml(config: TwinSection, estimator: str, tuning: Tuning, *, whole: b
         config: What the twin's file says.
         estimator: Of the run.
         tuning: The same.
+        prior: Mean (nx,) and covariance (nx, nx), diagonal, where they are not the file's: a section `prior` too.
         whole: See above.
     """
     entry, first = find_entry(estimator), config.estimator
     options = {name: _option(entry, name, value) for name, value in tuning.options.items()}
     filters = {**config.filters, first.name: {**config.filters.get(first.name, {}), **first.options}}
     others = {name: dict(given) for name, given in filters.items() if given and name != estimator}
-    lines = [f"estimator: {_flow({'name': estimator, 'options': options} if options else estimator)}"]
+    lines = [f"estimator: {as_flow({'name': estimator, 'options': options} if options else estimator)}"]
     lines += as_section("filters", others) if whole else []
     model = tuning.model
     values = dict(zip((item.name for item in model.parameters), map(float, tuning.p), strict=True))
@@ -47,11 +60,18 @@ def tuning_yaml(config: TwinSection, estimator: str, tuning: Tuning, *, whole: b
     turned = {name: value for name, value in values.items() if name in config.parameters or value != known[name]}
     turned = {**config.parameters, **turned} if whole else values
     lines += as_section("parameters", {name: value for name, value in turned.items() if name not in times})
+    if prior is not None:
+        beliefs = zip(model.state_names, prior[0].tolist(), np.sqrt(np.diag(prior[1])).tolist(), strict=True)
+        lines += as_section("prior", {name: {"mean": mean, "std": std} for name, mean, std in beliefs})
     errors = {sensor.name: [noises.pop(name) for name in errors_of(sensor)] for sensor in erring}
     over = {name: {"over": values.get(disturbance_time(name), seconds)} for name, seconds in lasting.items()}
-    lines += as_section("noise", {name: {"variance": value, **over.get(name, {})} for name, value in noises.items()})
+    ranges = bounds_of(config, model)
+    lines += as_section(
+        "noise",
+        {name: {"variance": _within(q, ranges.get(f"Q.{name}")), **over.get(name, {})} for name, q in noises.items()},
+    )
     lines += as_section("sensors", _sensors(config, tuning, errors, values, whole))
-    lines.append(f"gate: {_flow(_gate(tuning))}")
+    lines.append(f"gate: {as_flow(_gate(tuning))}")
     return "\n".join(lines) + "\n"
 
 
@@ -69,6 +89,7 @@ def _sensors(
 ) -> dict[str, Any]:
     """The section `sensors`: with the variances of the errors that last, by sensor, and parameters by name."""
     found = {}
+    ranges = bounds_of(config, tuning.model)
     for sensor, start in zip(tuning.model.sensors, tuning.model.row_start, strict=True):
         given = config.sensors.get(sensor.name)
         own = given.model_dump(mode="json", exclude_unset=True, exclude_none=True) if given is not None else {}
@@ -77,7 +98,8 @@ def _sensors(
         if sensor.name in errors:
             over = values.get(error_time(sensor.name), own["error"]["over"])
             rest["error"] = {"variance": _one_or_all(errors[sensor.name]), "over": over}
-        found[sensor.name] = {"variance": _one_or_all(variances), **rest}
+        variance = _within(_one_or_all(variances), ranges.get(f"R.{sensor.name}"))
+        found[sensor.name] = {"variance": variance, **rest}
         used = bool(tuning.get(f"use.{sensor.name}"))
         if not (whole and used):
             found[sensor.name]["use"] = used
@@ -87,6 +109,14 @@ def _sensors(
 def _one_or_all(values: list[float]) -> float | list[float]:
     """The value that all rows share, or one a row."""
     return values[0] if all(value == values[0] for value in values) else values
+
+
+def _within(value: float | list[float], bounds: tuple[float, float] | None) -> Any:
+    """A variance with the range of its data sheet, unless it was turned beyond that."""
+    values = value if isinstance(value, list) else [value]
+    if bounds is None or not all(bounds[0] <= item <= bounds[1] for item in values):
+        return value
+    return {"value": value, "from": bounds[0], **({"to": bounds[1]} if bounds[1] < LARGEST else {})}
 
 
 def _gate(tuning: Tuning) -> Any:
@@ -106,18 +136,19 @@ def _option(entry: Estimator, name: str, value: float) -> float | str:
 
 def as_section(name: str, items: Mapping[str, Any]) -> list[str]:
     """A section as lines, an entry each; none if it is empty."""
-    return [f"{name}:", *(f"  {_key(key)}: {_flow(value)}" for key, value in items.items())] if items else []
+    return [f"{name}:", *(f"  {_key(key)}: {as_flow(value)}" for key, value in items.items())] if items else []
 
 
 def _key(name: str) -> str:
     return name if PLAIN.fullmatch(name) and name.lower() not in RESERVED else json.dumps(name, ensure_ascii=False)
 
 
-def _flow(value: Any) -> str:
+def as_flow(value: Any) -> str:
+    """A value in one line of YAML."""
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_key(key)}: {_flow(item)}" for key, item in value.items()) + "}"
+        return "{" + ", ".join(f"{_key(key)}: {as_flow(item)}" for key, item in value.items()) + "}"
     if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(map(_flow, value)) + "]"
+        return "[" + ", ".join(map(as_flow, value)) + "]"
     if isinstance(value, str):
         return _key(value)
     if isinstance(value, float) and value == round(value) and abs(value) < 1e15:

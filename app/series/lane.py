@@ -30,7 +30,7 @@ FOREVER = 2**62
 class Wanted:
     """What a browser asks of a lane.
 
-    `run` is "live", "previous", the number of a pinned revision, or "difference:" and such a number (see
+    `run` is "live", "previous", "smoothed", the number of a pinned revision, or "difference:" and such a number (see
     difference.py). Times are seconds since the first event; `since` None is the first, `until` None the newest, and
     with `span` the last seconds are followed. `points` is how many groups there are at most.
     """
@@ -70,7 +70,7 @@ def wanted_from_json(body: Any, columns: dict[str, Column]) -> Wanted:
         raise ConfigError(f"lane: points is {points!r}; it must be a whole number from 2 to {MOST_POINTS}")
     run = body.get("run", "live")
     if not isinstance(run, str):
-        raise ConfigError(f"lane: run is {run!r}; it must be live, previous, a number, or difference:NUMBER")
+        raise ConfigError(f"lane: run is {run!r}; it must be live, previous, smoothed, a number, or difference:NUMBER")
     return Wanted(tuple(names), run, points=points, **numbers)
 
 

@@ -12,8 +12,9 @@ from .columns import columns_of
 from .difference import DifferenceRun
 from .lane import Lane
 from .run import KeptRun, LiveRun, Run
+from .smoothed import Smoothing
 
-PREVIOUS = "previous"
+PREVIOUS, SMOOTHED = "previous", "smoothed"
 
 ALL = 2**62
 """Later than every event."""
@@ -32,6 +33,7 @@ class Series:
         self._live: LiveRun | None = None
         self._kept: dict[str, KeptRun | DifferenceRun | BesideRun] = {}
         self._besides: dict[str, Beside] = {}
+        self._smoothing: Smoothing | None = None
         self._lanes: set[Lane] = set()
         self._origin: int | None = None
 
@@ -100,7 +102,7 @@ class Series:
         return lane.frame(run, origin, newest)
 
     def _find(self, name: str) -> Run | None:
-        """The previous revision, a pinned one, or one less what runs; None if there is none of that name."""
+        """The previous revision, what is smoothed, a pinned one, or one less what runs; None if there is none."""
         pull = self._pulled(name.removeprefix(LESS))
         kept = self._kept.get(name)
         if pull is None:
@@ -125,16 +127,27 @@ class Series:
     def _beside(self, name: str, pull: Pull) -> Beside | None:
         """The fold of a pinned run that goes on; None while there is nothing that its kept rows lack."""
         found = self._besides.get(name)
-        if found is None and name != PREVIOUS and self._engine.index_at(ALL) > pull.first + len(pull.events):
+        if (
+            found is None
+            and name not in (PREVIOUS, SMOOTHED)
+            and self._engine.index_at(ALL) > pull.first + len(pull.events)
+        ):
             found = self._besides[name] = Beside(self._engine, self._engine.revisions.find(int(name)))
         return found
 
     def _leave(self, looked_at: set[str]) -> None:
-        """End the folds of pinned runs at which nobody looks."""
+        """End the folds of pinned runs at which nobody looks, and the smoother."""
+        if self._smoothing is not None and SMOOTHED not in looked_at:
+            self._smoothing.stop()
+            self._smoothing = None
         for name in self._besides.keys() - looked_at:
             self._besides.pop(name).stop()
 
     def _pulled(self, name: str) -> Pull | None:
+        if name == SMOOTHED:
+            if self._smoothing is None:
+                self._smoothing = Smoothing(self._engine)
+            return self._smoothing.latest
         if name == PREVIOUS:
             return self._engine.previous()
         pinned = {str(run.number): run.track for run in self._engine.revisions.runs if run.pinned}

@@ -53,7 +53,7 @@ def status_json(engine: Running) -> dict[str, Any]:
     """What the page's header shows, and more for whoever asks."""
     status = engine.status()
     commissioned = status.tuning.baseline is not None
-    judged = NisVerdict(status.nis, status.nis_low, status.nis_high, commissioned)
+    judged = NisVerdict(status.nis, status.nis_low, status.nis_high, commissioned, status.nis_judged)
     return {
         "twin": engine.twin.name,
         "title": engine.twin.title,
@@ -81,6 +81,7 @@ def status_json(engine: Running) -> dict[str, Any]:
         "nis": _plain(status.nis),
         "nis_low": _plain(status.nis_low),
         "nis_high": _plain(status.nis_high),
+        "nis_judged": _plain(judged.measure),
         "nis_place": judged.place,
         "nis_words": judged.words,
         "late": {"inflate": engine.twin.late.inflate, "reason": engine.twin.late.reason},

@@ -44,6 +44,7 @@ from .one_at_a_time import OneAtATime
 from .page_file import PAGE, page_file
 from .page_stream import PageStream
 from .runs_api import RunsApi
+from .tunings_api import TuningsApi
 from .viewer_assets import FILES, viewer_assets, viewer_version
 from .viser_proxy import ViserProxy
 
@@ -100,6 +101,7 @@ class PageServer:
         self.door = port if isinstance(port, Door) else Door(port)
         self.port, self.entered = self.door.port, self.door.entered
         self._assets: Future[Path] = Future()
+        self._explored, self._stopping = threading.Event(), threading.Event()
         self._viser = ViserProxy(viser_port, secret) if viser_port is not None else None
         self.application = self._application()
 
@@ -109,7 +111,7 @@ class PageServer:
         return self.door.url
 
     def start(self) -> threading.Event:
-        """Serve; the Rerun viewer's files are prepared meanwhile, if this machine has not got them yet."""
+        """Serve; the Rerun viewer's files are prepared later, if this machine has not got them yet."""
         threading.Thread(target=self._prepare, name="viewer assets", daemon=True).start()
         self._runs.start()
         over = self.door.show(self.application, self._boot)
@@ -119,12 +121,17 @@ class PageServer:
 
     def stop(self) -> None:
         """Compute nothing any more; close all connections and the port, if it is this twin's own."""
+        self._stopping.set()
         self._runs.stop()
         self._fit.stop()
         if self._own_door:
             self.door.stop()
 
     def _prepare(self) -> None:
+        # What every page waits for comes first, unless somebody looks at Explore already: both take all processors.
+        while self._engine.status().awaited is not None and not self._explored.is_set():
+            if self._stopping.wait(STATUS_PERIOD):
+                return
         try:
             self._assets.set_result(viewer_assets(lambda line: print(line, file=sys.stderr, flush=True)))
         except NisusError as error:
@@ -140,6 +147,7 @@ class PageServer:
             Route("/api/episodes", self._episodes),
             *self._runs.routes(),
             *self._fit.routes(),
+            *TuningsApi(self._engine, self._runs.scores).routes(),
             *self._exports.routes(),
             Route("/api/recordings", self._list_recordings),
             Route("/api/faults", self._faults),
@@ -251,6 +259,7 @@ class PageServer:
         name = request.path_params["name"]
         if name not in FILES:
             return PlainTextResponse("Nisus: there is no such file.\n", 404)
+        self._explored.set()
         try:
             folder = await asyncio.wrap_future(self._assets)
         except NisusError as error:

@@ -29,8 +29,10 @@ def find_recording(
         for file in files:
             if file.is_dir():
                 raise SourceError(f"--log {file}: it is a folder; name the files in it")
-            if not file.is_file():
+            if not file.exists():
                 raise SourceError(f"--log {file}: there is no such file; check the path")
+            if not file.is_file():
+                raise SourceError(f"--log {file}: it is a device or a pipe; name a file, which can be read again")
         return files
     if isinstance(section, RecordingSection):
         patterns, where = section.files, (*key, "files")

@@ -43,6 +43,21 @@ class Plan:
     fed: tuple[int, ...] = ()
     """The sensors that the source feeds."""
 
+    @property
+    def kernels(self) -> tuple[str, ...]:
+        """What the source compiles; see `sources/pieces.py`."""
+        return SOURCES[self.loaded.config.source.type].kernels
+
+    def check_files(self) -> None:
+        """Open the files of the source, and close them: it takes milliseconds, while its twin takes seconds to compile.
+
+        Raises:
+            SourceError: If one is absent or does not fit, with the remedy.
+        """
+        section = self.loaded.config.source
+        opening = Opening(self.loaded, self.model, section, KEY, lambda *_: None, log_files=self.log_files)
+        SOURCES[section.type].files(opening)
+
     def faults(self) -> Faults:
         """A new layer of faults, with those of the YAML."""
         from sources.faults.layer import Faults

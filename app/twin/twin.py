@@ -16,7 +16,7 @@ from config.loader import Loaded, load, load_text
 from config.schema import TwinSection
 from config.source_schema import AssetSection
 from config.tuning_schema import TuningSection
-from config.tunings import OWN, Version
+from config.tunings import OWN, Version, find_version
 from config.yaml_lines import parse
 from estimators.diagnostics.commission import baseline_of, lost_from
 from estimators.diagnostics.health import HealthPolicy
@@ -140,6 +140,20 @@ class Twin:
             return source.truth.every is not None
         return any(grid.name in getattr(part, "truth", {}) for part in getattr(source, "parts", (source,)))
 
+    @property
+    def kernels(self) -> tuple[str, ...]:
+        """What its source compiles (`sources/pieces.py`); a recording that is reviewed is no source."""
+        return () if self.recorded else self.plan.kernels
+
+    def check_files(self) -> None:
+        """Open the files of its source, and close them, before anything is compiled for it.
+
+        Raises:
+            SourceError: If one is absent or does not fit.
+        """
+        if not self.recorded:
+            self.plan.check_files()
+
     def options_of(self, estimator: str) -> Mapping[str, float]:
         """The options that the YAML gives for an estimator; of a choice its number."""
         return _options(self.config, estimator)
@@ -212,6 +226,21 @@ def restore_twin(
     """
     overrides = dict(overrides or {})
     return _assemble(load_text(text, Path(base_path), _of_yaml(overrides), version), overrides, None)
+
+
+def with_version(twin: Twin, reference: str) -> Twin:
+    """The same twin under another tuning version, or under what its file says (`own`).
+
+    What the command line changed of the tuning is left behind, as what was turned on the page is; the rest stays.
+
+    Raises:
+        ConfigError: If there is no such version, or it breaks a rule.
+    """
+    known = _of_yaml(twin.overrides)
+    kept = {key: value for key, value in known.items() if key.split(".")[0] not in TuningSection.model_fields}
+    version = find_version(twin.path, reference)
+    named = {} if version is None else {VERSION: reference}
+    return _assemble(load_text(twin.text, twin.path, kept, version), kept | named, twin.plan.log_files)
 
 
 def _of_yaml(overrides: Mapping[str, str]) -> dict[str, str]:

@@ -9,7 +9,7 @@ from llvmlite import ir
 from numba import from_dtype, types
 from numba.extending import intrinsic
 
-from ..numerics.jit import C1, F1, F2, caller, f64, flags, floats, i64, inlined, ints, jit, matrix
+from ..numerics.jit import C1, F1, F2, caller, f64, flags, floats, i64, inlined, ints, jit, matrix, part
 from .row_loops import call_f_rows, call_h_rows
 
 f_signature = types.void(F1, F1, F1, f64, F1)
@@ -87,57 +87,57 @@ def with_parameters(context: np.void, p: np.ndarray) -> np.void:
     return changed[0]
 
 
-@jit
+@part
 def parameters(context):
     """The model's parameters p."""
     return floats(context.p, context.n_parameters)
 
 
-@jit
+@part
 def process_variances(context):
     """q (nw,): the variance that each process noise adds in a second."""
     return floats(context.q, context.n_noises)
 
 
-@jit
+@part
 def sensor_rows(context, sensor):
     """A sensor's first row among all rows, and how many it has."""
     return ints(context.row_start, context.n_sensors)[sensor], ints(context.row_count, context.n_sensors)[sensor]
 
 
-@jit
+@part
 def row_count(context, sensor):
     """How many rows a sensor has."""
     return ints(context.row_count, context.n_sensors)[sensor]
 
 
-@jit
+@part
 def sensor_variances(context, sensor):
     """r (ny,): the variances of one sensor's rows."""
     first, count = sensor_rows(context, sensor)
     return floats(context.r, context.n_rows)[first : first + count]
 
 
-@jit
+@part
 def circular_states(context):
     """For each state, whether it is an angle (int8)."""
     return flags(context.circular_x, context.nx)
 
 
-@jit
+@part
 def circular_rows(context, sensor):
     """For each row of a sensor, whether it is an angle (int8)."""
     first, count = sensor_rows(context, sensor)
     return flags(context.circular_y, context.n_rows)[first : first + count]
 
 
-@jit
+@part
 def options(context):
     """The numbers that the estimator's `tune` made of its options."""
     return floats(context.options, context.n_options)
 
 
-@jit
+@part
 def transition(context, x, u, dt, out):
     """out = f(x, u, p, dt)."""
     call_f_rows(context.f, x.ctypes.data, 0, 1, u.ctypes.data, context.p, dt, out.ctypes.data, 0)
@@ -150,7 +150,7 @@ def transition_points(context, X, u, dt, out):
     call_f_rows(context.f, X.ctypes.data, stride, rows, u.ctypes.data, context.p, dt, out.ctypes.data, out.shape[1])
 
 
-@jit
+@part
 def expect(context, sensor, x, u, out):
     """out = h(x, u, p) of one sensor."""
     h = ints(context.h, context.n_sensors)[sensor]
@@ -179,7 +179,7 @@ def add_process_noise(context, x, u, dt, P, scratch):
         add_given_noise(context, x, u, dt, P, scratch)
 
 
-@jit
+@part
 def add_given_noise(context, x, u, dt, P, scratch):
     """Add the model's own Q(x, u, p, q, dt) to P."""
     n = context.nx
@@ -192,7 +192,7 @@ def add_given_noise(context, x, u, dt, P, scratch):
             P[i, j] += scratch[i, j]
 
 
-@jit
+@part
 def prior(context):
     """Mean (nx,) and covariance of the prior, (nx, nx), or (1, nx) where it is diagonal."""
     n = context.nx
@@ -218,7 +218,7 @@ def jump_chances(context, x, u, dt, out):
     call_jump(context.jump, x, u, parameters(context), dt, out)
 
 
-@jit
+@part
 def shown_states(context):
     """The index of the state in each of the track's columns."""
     return ints(context.shown, context.n_shown)

@@ -15,7 +15,7 @@ from typing import Any
 from numba import types
 from numba.core.serialize import dumps
 
-from ..numerics.jit import caller, f64, floats, i64, jit
+from ..numerics.jit import by_address, caller, f64, floats, i64
 
 f_rows_signature = types.void(i64, i64, i64, i64, i64, f64, i64, i64)
 h_rows_signature = types.void(i64, i64, i64, i64, i64, i64, i64)
@@ -75,4 +75,4 @@ def _looped(template: Callable, dispatcher: Any, sizes: dict[str, int]) -> Any:
     loop = FunctionType(code, {"function": dispatcher, "floats": floats, **sizes}, name)
     loop.__qualname__ = f"{model.__qualname__}_rows_{digest}"
     loop.__module__ = model.__module__
-    return jit(loop)
+    return by_address(loop)

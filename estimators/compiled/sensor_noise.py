@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..numerics.jit import floats, ints, jit
+from ..numerics.jit import floats, ints, jit, part
 from ..numerics.linalg import unit_factor
 from .context import sensor_rows, sensor_variances
 
@@ -22,7 +22,7 @@ def has_correlated_rows(context, sensor):
     return ints(context.correlation, context.n_sensors)[sensor] != 0
 
 
-@jit
+@part
 def sensor_correlation(context, sensor):
     """c (ny * ny,), by rows, of a sensor with correlated rows: R_ij = c_ij √(r_i r_j)."""
     _, ny = sensor_rows(context, sensor)

@@ -20,6 +20,9 @@ from .field_pictures import Picture
 from .normal_nis import PROBABILITY, nis_bounds, normal_nis
 from .refusals import log_density
 
+FARTHEST = 6.0
+"""σ from which on a row counts no more for what is normal (commission.py)."""
+
 
 class Fit(NamedTuple):
     """How well something was predicted: RMSE and mean error in its unit, share of errors inside their 95 % band.
@@ -41,7 +44,8 @@ class Score(NamedTuple):
 
     `states` are fits against the truth, by state; `held_out` fits of the readings of sensors held out, by sensor row.
     `field` is that of all cells of a large field, over the times at which they were told; None without such.
-    `commissioned` is whether the bounds are of what was normal when the tuning was accepted.
+    `commissioned` is whether the bounds are of what was normal when the tuning was accepted, `nis_judged` what is then
+    compared with them (consistency.py).
     """
 
     nis: float
@@ -58,11 +62,12 @@ class Score(NamedTuple):
     held_out: dict[str, Fit]
     field: Fit | None = None
     commissioned: bool = False
+    nis_judged: float = np.nan
 
     @property
     def nis_verdict(self) -> NisVerdict:
         """Whether the mean NIS is what it should be."""
-        return NisVerdict(self.nis, self.nis_low, self.nis_high, self.commissioned)
+        return NisVerdict(self.nis, self.nis_low, self.nis_high, self.commissioned, self.nis_judged)
 
 
 def score(
@@ -86,7 +91,7 @@ def score(
         baseline: That of the tuning: what was normal when it was accepted, by which the NIS is judged.
     """
     used = track.verdict == USED
-    nis, low, high, commissioned = nis_verdict(track, events, model, baseline)
+    nis, low, high, commissioned, judged = nis_verdict(track, events, model, baseline)
     count, verdicts = int(used.sum()), np.bincount(track.verdict, minlength=len(VERDICT_NAMES))
     gated = int(verdicts[GATED])
     likelihood = float(track.log_likelihood[used].sum())
@@ -105,17 +110,26 @@ def score(
         held_out=_held_out(track, events, model),
         field=_over_field(pictures),
         commissioned=commissioned,
+        nis_judged=judged,
     )
 
 
 def nis_verdict(track: Track, events: Events, model: StateSpaceModel, baseline: np.ndarray | None = None) -> NisVerdict:
     """The mean NIS of the used readings of a track, judged; args as of `score`."""
     used = track.verdict == USED
-    count = int(used.sum())
-    dof = np.bincount(events.channel[used], track.dof[used], len(model.sensors))
+    rows = used if baseline is None else used | (track.verdict == GATED)
+    count = int(rows.sum())
+    dof = np.bincount(events.channel[rows], track.dof[rows], len(model.sensors))
     normal = None if baseline is None else normal_nis(model, baseline)
-    nis = float(track.nis[used].mean()) if count else np.nan
-    return NisVerdict(nis, *nis_bounds(dof, count, normal), baseline is not None)
+    nis = float(track.nis[used].mean()) if used.any() else np.nan
+    low, high = nis_bounds(dof, count, normal)
+    if baseline is None or not count:
+        return NisVerdict(nis, low, high, baseline is not None)
+    with np.errstate(all="ignore"):
+        e = track.innovation[rows] / track.innovation_std[rows]
+    e = np.where(np.isfinite(track.whitened[rows]), track.whitened[rows], e)
+    judged = float(np.nansum(np.clip(e, -FARTHEST, FARTHEST) ** 2)) / count
+    return NisVerdict(nis, low, high, True, judged)
 
 
 def _over_field(pictures: Sequence[Picture]) -> Fit | None:

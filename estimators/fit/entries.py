@@ -23,10 +23,24 @@ from ..tuning import Tuning
 GROUPS = ("Q", "R", "p", "options", "prior")
 """What can be named as a whole."""
 
+SCALE = "scale"
+"""Q and R together by one factor. It moves no estimate of a linear filter that has settled, only its bands; where it is
+the most likely, the mean NIS is what it should be."""
+
 DECADE = float(np.log(10.0))
 
-SPREAD = {"Q": 2.0 * DECADE, "R": 2.0 * DECADE, "p": 0.5 * DECADE, "options": DECADE, "prior": DECADE}
+SPREAD = {
+    SCALE: 2.0 * DECADE,
+    "Q": 2.0 * DECADE,
+    "R": 2.0 * DECADE,
+    "p": 0.5 * DECADE,
+    "options": DECADE,
+    "prior": DECADE,
+}
 """Deviation of the weak belief in what the twin says, in logarithms: two decades of a variance is one of a std."""
+
+DIGITS = 4
+"""Of a value that is proposed: finer than any interval."""
 
 FURTHEST = 1e4
 """Factor by which a value may leave that of the twin where nothing else bounds it."""
@@ -54,6 +68,10 @@ class Entry:
     def outward(self, x: float) -> float:
         """The value that a point of the scale stands for, never out of its range by rounding."""
         return float(np.clip(np.exp(x) if self.log else x, self.low, self.high))
+
+    def written(self, x: float) -> float:
+        """The value at a point, with as many digits as a file should have."""
+        return float(np.clip(float(f"{self.outward(x):.{DIGITS}g}"), self.low, self.high))
 
     @property
     def group(self) -> str:
@@ -88,7 +106,8 @@ def entries_of(
         estimator: Whose options `options` means.
         tuning: Where they start.
         logs: What they are fitted to: a sensor that never speaks has no R to fit.
-        wanted: Keys as `Tuning.set` has them, `options.NAME`, `prior.STATE.mean`, `prior.STATE.std`, and `GROUPS`.
+        wanted: Keys as `Tuning.set` has them, `options.NAME`, `prior.STATE.mean`, `prior.STATE.std`, `SCALE`, and
+            `GROUPS`.
         bounds: Least and greatest value by key, in the entry's unit: a data sheet's.
 
     Raises:
@@ -120,12 +139,18 @@ def entries_of(
 
 def setting(tuning: Tuning, entries: Sequence[Entry], x: np.ndarray) -> Setting:
     """The tuning, and the prior where that is fitted, at a point (k,) of the fit's scales."""
+    return with_values(tuning, entries, [item.outward(float(value)) for item, value in zip(entries, x, strict=True)])
+
+
+def with_values(tuning: Tuning, entries: Sequence[Entry], values: Sequence[float]) -> Setting:
+    """The same with values of the entries, in their units."""
     mean: np.ndarray | None = None
-    options = dict(tuning.options)
-    for item, value in zip(entries, x, strict=True):
-        number = item.outward(float(value))
+    options, factor = dict(tuning.options), 1.0
+    for item, number in zip(entries, values, strict=True):
         if item.group == "options":
             options[item.key.partition(".")[2]] = number
+        elif item.key == SCALE:
+            factor = number
         elif item.group == "prior":
             if mean is None:
                 mean, std = tuning.model.prior_mean.copy(), tuning.model.prior_std.copy()
@@ -135,6 +160,8 @@ def setting(tuning: Tuning, entries: Sequence[Entry], x: np.ndarray) -> Setting:
             tuning = _scaled(tuning, item, number)
         else:
             tuning = tuning.set(item.key, number)
+    if factor != 1.0:
+        tuning = replace(tuning, q=factor * tuning.q, r=factor * tuning.r)
     if options != dict(tuning.options):
         tuning = tuning.with_options(options)
     return Setting(tuning, None if mean is None else (mean, np.diag(std**2)))
@@ -158,6 +185,7 @@ def _all(entry: Estimator, tuning: Tuning) -> dict[str, Entry]:
             if deviation > 0.0:
                 found.append(Entry(f"prior.{state.name}.mean", state.unit, value, -np.inf, np.inf, False, deviation))
                 found.append(_entry(f"prior.{state.name}.std", state.unit, deviation, 0.0, np.inf, SPREAD["prior"]))
+    found.append(_entry(SCALE, "", 1.0, 0.0, np.inf, SPREAD[SCALE]))
     return {item.key: item for item in found}
 
 

@@ -18,11 +18,12 @@ from ..log import READING, Log
 from ..registry import find_estimator
 from ..snapshots import Base
 from ..tuning import Tuning
+from .aims import LIKELIHOOD, Recording, aim_of
 from .blocks import BLOCKS, held_out_rows
-from .entries import Entry, Setting, Skipped, entries_of, setting
+from .entries import Entry, Setting, Skipped, entries_of, with_values
 from .judge import Worth, worths
 from .laplace import Curvature, curvature
-from .objective import ALONE, Cancelled, Go, Objective, Recording, only_told
+from .objective import ALONE, Cancelled, Go, Objective, only_told
 from .optimise import maximise, search
 from .profile import intervals
 from .verdict import Verdict, verdict
@@ -101,6 +102,8 @@ def fit(
     wanted: Sequence[str] = ("Q", "R"),
     bounds: Mapping[str, tuple[float, float]] | None = None,
     blocks: int = BLOCKS,
+    aim: str = LIKELIHOOD,
+    predict: Sequence[str] = (),
     go: Go = lambda folds: True,
 ) -> Fitted:
     """Fit entries of a tuning to recordings.
@@ -113,12 +116,14 @@ def fit(
         bounds: Least and greatest value by key.
         blocks: Blocks of time into which each recording is cut; every third is held out. 0 holds none out: then nothing
             is judged, and nothing proposed.
+        aim: What is maximised, see aims.py.
+        predict: Of an aim that holds sensors out, which; each in turn without.
         go: Called from any thread with the number of folds that were done more; says whether to go on.
 
     Raises:
         Cancelled: If `go` says so.
         ConfigError: If nothing that was asked for can be fitted.
-        EstimatorError: As `Fold`; if there is nothing to fit to.
+        EstimatorError: As `Fold`; if there is nothing to fit to, or no such aim.
     """
     done = [0]
 
@@ -132,7 +137,8 @@ def fit(
     entries, skipped = entries_of(estimator, tuning, [given.log for given in recordings], wanted, bounds)
     whole = [Recording(g.log, g.weight, held_out_rows(g.log, blocks), g.base) for g in recordings]
     lean = [Recording(log, g.weight, held_out_rows(log, blocks), g.base) for g, log in _lean(recordings)]
-    objective = Objective(estimator, tuning, tuple(entries), tuple(lean), go=count)
+    aimed = aim_of(aim, estimator, Setting(tuning, None), lean, tuple(predict))
+    objective = Objective(estimator, tuning, tuple(entries), tuple(lean), aim=aimed, go=count)
     draws = find_estimator(estimator, tuning.model).family in ALONE
     best = search if draws else maximise
     x, value = best(objective, objective.start)
@@ -155,7 +161,8 @@ def fit(
         shape = curvature(kept, x)
         told = _told(kept, shape)
     lines, correlation = _lines(objective, kept, x, value, shape, told, alone)
-    after = setting(tuning, kept.entries, x)
+    values = [item.written(value) for item, value in zip(kept.entries, x.tolist(), strict=True)]
+    after = with_values(tuning, kept.entries, values)
     one, other = worths(estimator, [Setting(tuning, None), after], whole, count)
     return Fitted(
         estimator=estimator,
@@ -165,7 +172,7 @@ def fit(
         correlation=correlation,
         before=one,
         after=other,
-        verdict=verdict(one, other, changed=x.size > 0),
+        verdict=verdict(one, other, aimed, changed=x.size > 0),
         folds=done[0],
     )
 
@@ -219,7 +226,7 @@ def _lines(
         )
         if i is not None:
             line = line._replace(
-                after=item.outward(float(x[i])),
+                after=item.written(float(x[i])),
                 low=item.outward(float(ends[i, 0])),
                 high=item.outward(float(ends[i, 1])),
                 deviation=float(shape.deviation[i]),

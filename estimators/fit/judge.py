@@ -3,11 +3,7 @@
 Four judges, none of which the fit has seen: the density of the readings of blocks held out, the readings of each sensor
 in turn predicted by the others, the coverage of the predictions, and, where a recording knows it, the true state. A
 prediction that is held out is judged by the continuous ranked probability score, which is proper, in its unit, and not
-carried away by a single reading:
-
-    CRPS(N(m, s²), y) = s (z (2 Φ(z) - 1) + 2 φ(z) - 1/√π),    z = (y - m) / s
-
-Source: Gneiting & Raftery (2007), doi:10.1198/016214506000001437, (21).
+carried away by a single reading.
 """
 
 from __future__ import annotations
@@ -16,17 +12,16 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
 
 from ..diagnostics.innovation_size import mean_nis
 from ..diagnostics.sensitivity.responses import each
-from ..fold import Fold
 from ..log import READING, truth_of
 from ..model.state_space import StateSpaceModel
 from ..registry import find_estimator
-from ..track import HELD_OUT, USED, Track
+from ..track import USED, Track
+from .aims import Recording, crps, densities, held_out_errors, sensors_in_turn, track_of
 from .entries import Setting
-from .objective import ALONE, Cancelled, Go, Recording, densities
+from .objective import ALONE, Cancelled, Go
 
 Z = 1.959963984540054
 
@@ -73,14 +68,6 @@ class Worth(NamedTuple):
     held_out: Part
 
 
-def crps(error: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """Continuous ranked probability score of a Gaussian, (n,), of its error and standard deviation."""
-    z = error / std
-    density = np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
-    found: np.ndarray = std * (z * (2.0 * ndtr(z) - 1.0) + 2.0 * density - 1.0 / np.sqrt(np.pi))
-    return found
-
-
 def worths(estimator: str, settings: Sequence[Setting], recordings: Sequence[Recording], go: Go) -> list[Worth]:
     """What each setting is worth.
 
@@ -94,18 +81,15 @@ def worths(estimator: str, settings: Sequence[Setting], recordings: Sequence[Rec
         Cancelled: If `go` says so.
     """
     model = settings[0].tuning.model
-    sensors = _in_turn(settings[0], recordings)
+    sensors = sensors_in_turn(settings[0], list(recordings))
     jobs = [(setting, record, s) for setting in settings for record in recordings for s in (None, *sensors)]
 
     def run(job: tuple[Setting, Recording, int | None]) -> Track:
-        (tuning, prior), record, s = job
-        if s is not None:
-            tuning = tuning.set(f"use.{model.sensor_names[s]}", False)
-        fold = Fold(estimator, model, tuning, record.log, base=record.base, prior=prior)
-        fold.advance()
+        given, record, s = job
+        track = track_of(estimator, given, record, without=s)
         if not go(1):
             raise Cancelled
-        return fold.track
+        return track
 
     alone = find_estimator(estimator, model).family in ALONE
     tracks = iter(each(run, jobs, None if alone else "threads"))
@@ -127,16 +111,6 @@ def gain(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
     return float(difference.mean()), float(means.std(ddof=1) / np.sqrt(BATCHES))
 
 
-def _in_turn(setting: Setting, recordings: Sequence[Recording]) -> list[int]:
-    """Sensors that are used and speak; none if there is only one, without which nothing is told."""
-    speak: set[int] = set()
-    for record in recordings:
-        log = record.log
-        speak |= set(np.unique(log.channel[: log.n][log.kind[: log.n] == READING]).tolist())
-    sensors = sorted(int(s) for s in speak if setting.tuning.used[s])
-    return sensors if len(sensors) > 1 else []
-
-
 def _part(
     model: StateSpaceModel, setting: Setting, sensors: list[int], taken: list[tuple[Recording, list[Track]]],
     held_out: bool,
@@ -154,10 +128,9 @@ def _part(
         normal.append((track.innovation[used] / track.innovation_std[used]).ravel())
         nis.append(track.select(wanted))
         for s, other in zip(sensors, others, strict=True):
-            own = reading & (log.channel[: log.n] == s) & (other.verdict == HELD_OUT)
-            for k in range(len(model.sensors[s].rows)):
-                name = model.row_names[model.row_start[s] + k]
-                _collect(errors, name, other.innovation[own, k], other.innovation_std[own, k])
+            for k, (rows, error, std) in enumerate(held_out_errors(model, log, other, s)):
+                kept = wanted[rows]
+                _collect(errors, model.row_names[model.row_start[s] + k], error[kept], std[kept])
         for column, (j, state) in enumerate(zip(model.shown, model.shown_states, strict=True)):
             rows, true = truth_of(log.events, int(j))
             kept = wanted[rows]

@@ -1,4 +1,6 @@
-"""What a fit maximises: the log of the density that the filter gave to each reading before it saw it.
+"""What a fit maximises: what it aims at (aims.py), and a weak belief in what the twin says.
+
+Usually that is
 
     log p(y_1..n) = Σ log p(y_t | y_1..t-1),    - ½ Σ ((θ - θ_0) / d)²
 
@@ -15,23 +17,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
-from ..diagnostics.refusals import log_density
 from ..diagnostics.sensitivity.responses import each
 from ..errors import NisusError
-from ..fold import Fold
 from ..log import INPUT, MAINTENANCE, READING, RESET, Log
 from ..registry import find_estimator
-from ..snapshots import Base
-from ..track import FAILED, GATED, USED, Track
 from ..tuning import Tuning
+from .aims import Aim, Recording
 from .entries import Entry, Setting, setting
-
-PRICE = 1e3
-"""Nats that a reading costs which failed."""
 
 HOPELESS = -1e12
 """Nats of a point at which nothing can be folded."""
@@ -51,15 +46,6 @@ class Cancelled(Exception):
     """Whoever asked for a fit wants it no more."""
 
 
-class Recording(NamedTuple):
-    """A log, how much its readings weigh, the events (n,) that take no part in the fit, and where it starts."""
-
-    log: Log
-    weight: float
-    held_out: np.ndarray
-    base: Base | None = None
-
-
 @dataclass(frozen=True)
 class Objective:
     """What is maximised over the entries, from the tuning on, over the recordings; `fixed` are held at their `at`."""
@@ -70,6 +56,7 @@ class Objective:
     recordings: tuple[Recording, ...]
     fixed: tuple[Entry, ...] = ()
     at: tuple[float, ...] = ()
+    aim: Aim = Aim()
     go: Go = lambda folds: True
     executor: Executor | str | None = "threads"
 
@@ -111,24 +98,17 @@ class Objective:
         """What a fold is given at a point."""
         return setting(self.tuning, (*self.entries, *self.fixed), np.concatenate([x, self.at]))
 
-    def fold(self, x: np.ndarray, recording: Recording) -> Fold:
-        """A recording, folded at a point."""
-        tuning, prior = self.setting(x)
-        fold = Fold(self.estimator, tuning.model, tuning, recording.log, base=recording.base, prior=prior)
-        fold.advance()
-        return fold
-
     def terms(self, x: np.ndarray) -> np.ndarray:
         """What each event of the fit adds, weighted, all recordings in one row."""
+        given = self.setting(x)
         found = []
         for recording in self.recordings:
             try:
-                track = self.fold(x, recording).track
-                values = recording.weight * densities(track, self.tuning.gate)
+                values = recording.weight * self.aim.terms(self.estimator, given, recording)
             except NisusError:
                 values = np.full(recording.log.n, HOPELESS / recording.log.n)
             found.append(np.where(recording.held_out, 0.0, values))
-        if not self.go(len(found)):
+        if not self.go(self.aim.folds * len(found)):
             raise Cancelled
         return np.concatenate(found)
 
@@ -155,17 +135,6 @@ class Objective:
         """What is maximised, and its gradient (k,)."""
         here, slopes = self.slopes(x)
         return float(here.sum()) - self.penalty(x), slopes.sum(axis=1) - self.precision * (x - self.start)
-
-
-def densities(track: Track, gate: float | None) -> np.ndarray:
-    """Log of the density of each reading, (n,): of those used and refused; of one that failed, its price; else 0."""
-    values = np.where(track.verdict == USED, track.log_likelihood, 0.0)
-    refused = np.flatnonzero(track.verdict == GATED)
-    if refused.size:
-        values[refused] = log_density(track.select(refused), gate)
-    values = np.where(np.isfinite(values), values, -PRICE)
-    values[track.verdict == FAILED] = -PRICE
-    return values
 
 
 def only_told(log: Log) -> Log:

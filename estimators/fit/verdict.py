@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .judge import Prediction, Worth, gain
+from .aims import LIKELIHOOD, Aim
+from .judge import Part, Prediction, Worth, gain
 
 SURE = 2.0
 """Standard errors that a gain must exceed, and a loss before it counts."""
@@ -33,17 +34,18 @@ class Verdict(NamedTuple):
     reasons: tuple[str, ...]
 
 
-def verdict(before: Worth, after: Worth, *, changed: bool = True) -> Verdict:
-    """Judge by the part that was held out."""
+def verdict(before: Worth, after: Worth, aim: Aim, *, changed: bool = True) -> Verdict:
+    """Judge by the part that was held out: what the fit aimed at must be better there, and nothing else worse."""
     one, other = before.held_out, after.held_out
     if not changed:
         return Verdict(False, 0.0, 0.0, ("the data tell none of the entries",))
     if not one.n:
         return Verdict(False, np.nan, np.nan, ("nothing was held out, so nothing judges it",))
-    mean, error = gain(one.terms, other.terms)
+    mean, error = _gain(one, other, aim)
     reasons = []
     if not mean > SURE * error:
-        reasons.append(f"it does not predict the blocks held out better: {mean:+.3g} ± {error:.2g} nats a reading")
+        unit = "nats a reading" if aim.kind == LIKELIHOOD else "of the score"
+        reasons.append(f"it does not predict the blocks held out better: {mean:+.3g} ± {error:.2g} {unit}")
     for kind, olds, news in (
         ("sensor", one.sensors, other.sensors), ("true state", one.states, other.states)
     ):  # fmt: skip
@@ -51,6 +53,18 @@ def verdict(before: Worth, after: Worth, *, changed: bool = True) -> Verdict:
             if name in news:
                 reasons += _against(f"{kind} {name}, held out,", old, news[name])
     return Verdict(not reasons, mean, error, tuple(reasons))
+
+
+def _gain(one: Part, other: Part, aim: Aim) -> tuple[float, float]:
+    """Of what was aimed at, and its standard error."""
+    if aim.kind == LIKELIHOOD:
+        return gain(one.terms, other.terms)
+    pairs = [(old.scores / old.crps, other.sensors[name].scores / old.crps) for name, old in one.sensors.items()]
+    found = [gain(-old, -new) for old, new in pairs if old.size == new.size]
+    if not found:
+        return 0.0, 0.0
+    means, errors = np.array(found).T
+    return float(means.mean()), float(np.sqrt(np.sum(errors**2)) / len(found))
 
 
 def _against(what: str, old: Prediction, new: Prediction) -> list[str]:

@@ -27,13 +27,14 @@ LONGEST_WAIT = 3600.0
 class Decision(NamedTuple):
     """What was decided of a sensor that stayed refused.
 
-    `row`: absolute index of the reading at which; `time` and `since` (of the first refused) in seconds of the log.
-    `outcome`: a word of stories.py. `refused`: readings in a row; `evidence`: log-likelihood of the story that the twin
-    is wrong over that of the sensor, NaN where none was weighed; `witnesses`: readings of other sensors in it. `text`:
-    one sentence.
+    `row`: absolute index of the reading at which, `first` of the first refused with which the stories begin; `time` and
+    `since` (of the first refused) in seconds of the log. `outcome`: a word of stories.py. `refused`: readings in a row;
+    `evidence`: log-likelihood of the story that the twin is wrong over that of the sensor, NaN where none was weighed;
+    `witnesses`: readings of other sensors in it. `text`: one sentence.
     """
 
     row: int
+    first: int
     time: float
     sensor: str
     outcome: str
@@ -82,7 +83,7 @@ def decide(fold: Told, row: int, doubt: np.ndarray, reopen: float) -> tuple[Deci
     if own[RUN] == 0.0:
         own[ASKED], own[WAIT], own[DUE] = 0.0, 0.0, -np.inf
         text = told(model, name, AGREES, 0, "", nothing, 0.0, reopen, False, np.zeros(0))
-        return Decision(index, time, name, AGREES, 0, time, np.nan, 0, text), False
+        return Decision(index, index, time, name, AGREES, 0, time, np.nan, 0, text), False
     run, begun = int(own[RUN]), own[FROM]
     start = _first_refused(fold, row, sensor, int(own[SINCE]) - log.first)
     story = fold.second_story(start, row + 1, sensor)
@@ -105,7 +106,9 @@ def decide(fold: Told, row: int, doubt: np.ndarray, reopen: float) -> tuple[Deci
         if asked:
             return None, False
     text = told(model, name, outcome, run, since(begun * 1e-9), evidence, own[WAIT], reopen, never, story.widened)
-    return Decision(index, time, name, outcome, run, begun * 1e-9, evidence.total, evidence.witnesses, text), changed
+    return Decision(
+        index, log.first + start, time, name, outcome, run, begun * 1e-9, evidence.total, evidence.witnesses, text
+    ), changed
 
 
 def _first_refused(fold: Told, row: int, sensor: int, since: int) -> int:

@@ -18,7 +18,7 @@ from ..compiled.context import sensor_rows
 from ..compiled.sensor_noise import independent_rows
 from ..compiled.verdict import limit_of
 from ..estimator import call_update
-from ..numerics.jit import floats, jit
+from ..numerics.jit import floats, jit, part
 from ..numerics.linalg import solve_unit
 from ..track import GATED, LOG_LIKELIHOOD, USED
 
@@ -55,7 +55,7 @@ def inflation(context, sensor, y, innovation, nis, m):
     return 1.0 + (1.0 / limit - 1.0 / nis) * square
 
 
-@jit
+@part
 def soften(code, context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """Update on a reading beyond the gate with its noise inflated: the verdict.
 

@@ -11,7 +11,7 @@ import numpy as np
 from ..compiled.context import add_process_noise, options, sensor_rows, sensor_variances
 from ..estimator import Option, Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import floats, inlined, jit
+from ..numerics.jit import floats, inlined, part
 from ..numerics.linalg import cholesky, solve_transposed, solve_upper
 
 JOSEPH, INFLATION, ROBUST, ROBUST_AT, ADAPT, ADAPT_RATE, ADAPT_BOUND, OWN = range(8)
@@ -81,7 +81,7 @@ def adapted_variances(context, state):
     return state[state.size - 2 * rows : state.size - rows], state[state.size - rows :]
 
 
-@jit
+@part
 def forget(context, state):
     """Set what an adaptation remembers to the tuned values."""
     kind = options(context)[ADAPT]
@@ -95,7 +95,7 @@ def forget(context, state):
         state[state.size - 1] = 1.0
 
 
-@jit
+@part
 def growth(context, dt):
     """The factor by which P grows in dt seconds beside Q.
 
@@ -106,7 +106,7 @@ def growth(context, dt):
     return np.exp(rate * dt) if rate != 0.0 else 1.0
 
 
-@jit
+@part
 def noise_scale(context, state):
     """The adapted factor of Q, or 1."""
     return state[state.size - 1] if options(context)[ADAPT] == ADAPT_Q else 1.0
@@ -124,7 +124,7 @@ def add_noise(context, x, u, dt, state, P, scratch):
         add_process_noise(context, x, u, dt, P, scratch)
 
 
-@jit
+@part
 def multiply(a, P):
     """P ← a P."""
     for i in range(P.shape[0]):
@@ -146,7 +146,7 @@ def reading_variances(context, sensor, state, r):
             r[i] = tuned[first + i]
 
 
-@jit
+@part
 def weight(kind, at, m, nu, r, S, V, z):
     """The weight w by which a reading counts: as if its noise were N(0, R / w). NaN if S + R (1/w - 1) has no factor.
 
@@ -156,7 +156,7 @@ def weight(kind, at, m, nu, r, S, V, z):
     return huber(at, m, nu, r, S, V, z) if kind == HUBER else student_t(at, m, nu, r, S, V, z)
 
 
-@jit
+@part
 def huber(k, m, nu, r, S, V, z):
     """Huber's weight w = min(1, k / d), where d is the distance |R^-½ (y - h(x⁺))| that the weighted update leaves.
 
@@ -184,7 +184,7 @@ def huber(k, m, nu, r, S, V, z):
     return 1.0 / s
 
 
-@jit
+@part
 def student_t(dof, m, nu, r, S, V, z):
     """The mean precision, as a share of R⁻¹, of noise that follows a multivariate t with scale matrix R.
 
@@ -214,7 +214,7 @@ def student_t(dof, m, nu, r, S, V, z):
     return w
 
 
-@jit
+@part
 def precision_times(s, m, nu, r, S, V, z):
     """Fill z with T⁻¹ ν and V with the factor of T = S + (s - 1) R; False if T has none."""
     for i in range(m):
@@ -229,7 +229,7 @@ def precision_times(s, m, nu, r, S, V, z):
     return True
 
 
-@jit
+@part
 def reweigh(context, m, nu, raw, d, S, U, V, z):
     """Weight the noise of a reading: d is divided by w; S, its factor U and the whitened nu then belong to that noise.
 
@@ -258,7 +258,7 @@ def reweigh(context, m, nu, raw, d, S, U, V, z):
     return w
 
 
-@jit
+@part
 def adapt(context, sensor, y, state, innovation, innovation_std, score):
     """Let R or Q follow the innovations of a reading that was used, over a fading memory of N readings.
 

@@ -16,7 +16,7 @@ from ..compiled.context import circular_rows, circular_states, shown_states
 from ..compiled.sensor_noise import has_correlated_rows, independent_rows
 from ..compiled.verdict import verdict_of
 from ..estimator import Options
-from ..numerics.jit import inlined, ints, jit
+from ..numerics.jit import inlined, ints, jit, part
 from ..numerics.linalg import EPSILON, cholesky, mirror, solve_transposed, solve_unit, solve_upper, wrap
 from ..numerics.padded_rows import subtract_squares
 from ..numerics.simd_ir import padded
@@ -202,7 +202,7 @@ def gather(context, sensor, y, reading, H, P, innovation, innovation_std):
     return m
 
 
-@jit
+@part
 def make_independent(m, L, nu, S, C, H):
     """ν ← L⁻¹ ν, S ← L⁻¹ S L⁻ᵀ, C ← C L⁻ᵀ, H ← L⁻¹ H, in their leading m rows of a reading: see sensor_noise.py."""
     solve_unit(L, m, nu)
@@ -293,7 +293,7 @@ def move_mean(m, C, U, nu, x):
             x[i] += C[i, j] * nu[j]
 
 
-@jit
+@part
 def joseph(m, d, C, H, K, P, N):
     """P ← (I - K H) P (I - K H)ᵀ + K R Kᵀ, in O(n² m); C = P Hᵀ, R = diag(d), N (nx, nx) is scratch.
 
@@ -330,7 +330,7 @@ def joseph(m, d, C, H, K, P, N):
     mirror(P)
 
 
-@jit
+@part
 def downdate(m, C, U, P, W):
     """P ← P - K S Kᵀ, as P - Wᵀ W with W = U⁻ᵀ Cᵀ, in scratch of (m or more, nx in whole vectors)."""
     n = P.shape[0]

@@ -31,6 +31,7 @@ from ..fold import fold as fold_track
 from ..log import Events, Log
 from ..model.state_space import StateSpaceModel
 from ..registry import checked, find_estimator
+from ..smoothing.smooth import check_smooth, smooth
 from ..track import Track
 from ..tuning import Tuning
 from .estimates import Estimates
@@ -54,6 +55,7 @@ def fold(
     seed: int = 0,
     prior: Prior | None = None,
     covariance: bool = False,
+    smoothed: bool = False,
     policy: HealthPolicy | None = None,
     tuning: Tuning | None = None,
     **options: float | str,
@@ -74,6 +76,8 @@ def fold(
         prior: Mean (nx,) and covariance (nx, nx), positive semidefinite, in place of the model's; a row of zeros is a
             state that is known exactly.
         covariance: Keep the whole covariance at every event, for `Estimates.cov` and `Estimates.nees`.
+        smoothed: Give mean, deviations and covariances of the states given all readings, those that came later too;
+            innovations, verdicts and health stay the filter's.
         policy: When the estimate may be trusted.
         tuning: What the names above change; None for what the model declares.
         **options: The estimator's own, by name; one of several words as the word: `resampling="stratified"`.
@@ -82,7 +86,8 @@ def fold(
         The estimates, one row an event.
 
     Raises:
-        EstimatorError: If the estimator does not exist or does not apply, an option or the prior breaks a rule.
+        EstimatorError: If the estimator does not exist, does not apply or cannot be smoothed, an option or the prior
+            breaks a rule.
         ConfigError: If a name is unknown or a value breaks its rule.
         EventError: If the log is of another model.
         ModelError: If the model's functions disagree with its declaration, or those of a black box fail.
@@ -90,7 +95,13 @@ def fold(
     tuned = tuned_by_name(estimator, model, tuning, R, Q, p, held_out, gate, seed, options)
     _check_named(log, model)
     pairs = all_pairs(model) if covariance else None
-    track = fold_track(estimator, model, tuned, log, pairs=pairs, policy=policy, prior=prior)
+    if smoothed:
+        check_smooth(find_estimator(estimator, model), model, tuned.options)
+        folded = Fold(estimator, model, tuned, log, pairs=pairs, policy=policy, prior=prior)
+        folded.advance()
+        track = smooth(folded).instead_of(folded.track)
+    else:
+        track = fold_track(estimator, model, tuned, log, pairs=pairs, policy=policy, prior=prior)
     return _estimates(estimator, model, tuned, _copied(log), track, covariance)
 
 

@@ -13,6 +13,7 @@ from ..diagnostics.evidence import CAUSES, IMPOVERISHED, OUTSIDE, SENSORS, TRUTH
 from ..events.batch import KIND_NAMES, READING, Events, truth_of
 from ..events.maintenance import model_versions
 from ..model.state_space import StateSpaceModel
+from ..smoothing.smoothed import Smoothed
 from ..track import HEALTH_NAMES, REASONS, VERDICT_NAMES, Track
 
 
@@ -22,6 +23,7 @@ def table_of(
     track: Track,
     episodes: Sequence[Episode] = (),
     *,
+    smoothed: Smoothed | None = None,
     tuning_version: int = 1,
     tuning: str = "",
     model_version: int = 1,
@@ -30,12 +32,12 @@ def table_of(
 
     Columns: `t_ns` and `arrival_ns`; `seconds`; `event`, `channel`, and `sensor` (null unless it is a reading);
     `value_k` and, where a reading brought its own, `variance_k`; for each state `NAME_true` (NaN where it is not
-    known), `NAME` and `NAME_std`; `innovation_k` and `innovation_std_k`; NIS with its windowed mean and bounds, log-
-    likelihood; verdict and health in words; `screened`: why the edge refused rows of the reading, null if it did not;
-    `model_version`, which counts up with each maintenance from that at the first event, and `tuning_version`, of the
-    tuning that the track was folded with, which `tuning` names (null if nobody did); `alarms`, the causes that are in
-    alarm after a reading or a truth, and `flags`, what else is wrong, both joined by commas, null where there is none.
-    The schema's metadata have `episodes`, as JSON.
+    known), `NAME` and `NAME_std`, and where the fold was smoothed `NAME_smooth` and `NAME_smooth_std`; `innovation_k`
+    and `innovation_std_k`; NIS with its windowed mean and bounds, log-likelihood; verdict and health in words;
+    `screened`: why the edge refused rows of the reading, null if it did not; `model_version`, which counts up with each
+    maintenance from that at the first event, and `tuning_version`, of the tuning that the track was folded with, which
+    `tuning` names (null if nobody did); `alarms`, the causes that are in alarm after a reading or a truth, and `flags`,
+    what else is wrong, both joined by commas, null where there is none. The schema's metadata have `episodes`, as JSON.
     """
     import pyarrow as pa
 
@@ -59,6 +61,9 @@ def table_of(
         columns[f"{name}_true"] = true
     columns |= {name: track.mean[:, k] for k, name in enumerate(shown)}
     columns |= {f"{name}_std": track.std[:, k] for k, name in enumerate(shown)}
+    if smoothed is not None:
+        columns |= {f"{name}_smooth": smoothed.mean[:, k] for k, name in enumerate(shown)}
+        columns |= {f"{name}_smooth_std": smoothed.std[:, k] for k, name in enumerate(shown)}
     columns |= {f"innovation_{k}": track.innovation[:, k] for k in range(model.ny)}
     columns |= {f"innovation_std_{k}": track.innovation_std[:, k] for k in range(model.ny)}
     for name in ("nis", "nis_mean", "nis_low", "nis_high", "log_likelihood"):

@@ -23,17 +23,10 @@ Source: Labbe, Kalman and Bayesian Filters in Python; FilterPy (MIT licence), ht
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import FunctionType, MethodType
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from filterpy.kalman import (
-    EnsembleKalmanFilter,
-    ExtendedKalmanFilter,
-    KalmanFilter,
-    MerweScaledSigmaPoints,
-    UnscentedKalmanFilter,
-)
 
 from ..ensemble import shared as ensemble
 from ..estimator import Estimator, Option, Options
@@ -45,6 +38,14 @@ from .view import View, wrapped
 
 PROCESS, START, PERTURB = range(3)
 """Streams of randomness."""
+
+
+@lru_cache(maxsize=1)
+def objects() -> Any:
+    """FilterPy's classes, imported when one is needed: with what they import of SciPy that takes as long as Numba."""
+    from . import filterpy_objects
+
+    return filterpy_objects
 
 
 def in_turn(block: np.ndarray) -> Callable[..., np.ndarray]:
@@ -82,7 +83,7 @@ def predict_kf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndarr
     """x ← F x + c, P ← F P Fᵀ + Q, with c what f adds to F x: inputs, offsets."""
     x, P = moments_of(view, state)
     F = view.F(view.prior()[0], u, dt)
-    filter_ = KalmanFilter(dim_x=view.nx, dim_z=1, dim_u=1)
+    filter_ = objects().KalmanFilter(dim_x=view.nx, dim_z=1, dim_u=1)
     filter_.x, filter_.P = x.copy(), P.copy()
     offset = view.f(x[None], u, dt)[0] - F @ x
     filter_.predict(u=np.ones(1), B=offset[:, None], F=F, Q=view.Q(x, u, dt))
@@ -93,7 +94,7 @@ def update_kf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any)
     """Condition on a reading z = y - h(x) + H x, which takes inputs and offsets out of it, and turns of angles."""
 
     def step(x: np.ndarray, P: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
-        filter_ = KalmanFilter(dim_x=view.nx, dim_z=rows.size)
+        filter_ = objects().KalmanFilter(dim_x=view.nx, dim_z=rows.size)
         filter_.x, filter_.P = x, P
         H = view.H(sensor, x, u)[rows]
         nu = wrapped(y[rows] - view.h(sensor, x[None], u)[0, rows], view.circular_rows(sensor)[rows])
@@ -103,19 +104,10 @@ def update_kf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any)
     return _update(view, sensor, y, step, *rest)
 
 
-class _Extended(ExtendedKalmanFilter):
-    """FilterPy's EKF whose mean goes through f itself."""
-
-    forward: np.ndarray
-
-    def predict_x(self, u: object = 0) -> None:
-        self.x = self.forward
-
-
 def predict_ekf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndarray, work: np.ndarray) -> None:
     """x ← f(x, u), P ← F P Fᵀ + Q."""
     x, P = moments_of(view, state)
-    filter_ = _Extended(dim_x=view.nx, dim_z=1)
+    filter_ = objects().Extended(dim_x=view.nx, dim_z=1)
     filter_.x, filter_.P = x.copy(), P.copy()
     filter_.F, filter_.Q = view.F(x, u, dt), view.Q(x, u, dt)
     filter_.forward = view.f(x[None], u, dt)[0]
@@ -127,7 +119,7 @@ def update_ekf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any
     """Condition on a reading, linearised at the prediction."""
 
     def step(x: np.ndarray, P: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
-        filter_ = _Extended(dim_x=view.nx, dim_z=rows.size)
+        filter_ = objects().Extended(dim_x=view.nx, dim_z=rows.size)
         filter_.x, filter_.P = x, P
         angles = view.circular_rows(sensor)[rows]
         filter_.update(
@@ -155,8 +147,8 @@ def _residual_of(angles: np.ndarray) -> Callable[..., np.ndarray] | None:
 
 def _unscented(view: View, angles: np.ndarray) -> Any:
     values = view.options
-    points = MerweScaledSigmaPoints(view.nx, values["alpha"], values["beta"], values["kappa"])
-    return UnscentedKalmanFilter(
+    points = objects().MerweScaledSigmaPoints(view.nx, values["alpha"], values["beta"], values["kappa"])
+    return objects().UnscentedKalmanFilter(
         view.nx,
         max(1, angles.size),
         0.0,
@@ -232,30 +224,9 @@ def _update(
     return verdict
 
 
-class _Ensemble(EnsembleKalmanFilter):
-    """FilterPy's EnKF with draws of its own generator."""
-
-    def __init__(self, nx: int, members: int) -> None:
-        self.rng = np.random.default_rng(0)
-
-        def draw(mean: np.ndarray, cov: np.ndarray, size: int) -> np.ndarray:
-            return self.rng.multivariate_normal(mean, cov, size, check_valid="ignore")
-
-        for name in ("initialize", "predict", "update"):
-            method = getattr(EnsembleKalmanFilter, name)
-            own = {**method.__globals__, "multivariate_normal": draw}
-            function = FunctionType(method.__code__, own, name, method.__defaults__, method.__closure__)
-            setattr(self, name, MethodType(function, self))
-        super().__init__(x=np.zeros(nx), P=np.zeros((nx, nx)), dim_z=1, dt=0.0, N=members, hx=None, fx=None)
-
-    def seed(self, *place: int) -> None:
-        """Draw from here on what (seed, draw, stream) determine."""
-        self.rng = np.random.default_rng([number % 2**64 for number in place])
-
-
 def _enkf(view: View) -> Any:
     if "enkf" not in view.kept:
-        view.kept["enkf"] = _Ensemble(view.nx, ensemble.members(view.options))
+        view.kept["enkf"] = objects().Ensemble(view.nx, ensemble.members(view.options))
     return view.kept["enkf"]
 
 

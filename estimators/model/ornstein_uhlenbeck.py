@@ -5,7 +5,6 @@ The equations are those of coloured.py.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -59,13 +58,6 @@ def _integrated(a: float) -> float:
     return 1.0 - gone * (1.0 + 0.5 * gone) / a
 
 
-def _named(function: Callable, inner: Any, layout: Layout, more: object = None) -> Callable:
-    """The wrapper under a name of its own, by which the cache of compiled code tells it from that of another model."""
-    told = repr((str(inner._uuid) if inner is not None else "", layout, more)).encode()
-    function.__qualname__ = f"{function.__qualname__}_{hashlib.sha256(told).hexdigest()[:12]}"
-    return function
-
-
 @lru_cache(maxsize=64)
 def _step(function: Callable, layout: Layout) -> Callable:
     inner = as_inner(function)
@@ -82,7 +74,7 @@ def _step(function: Callable, layout: Layout) -> Callable:
                     out[j] += along[j, i] * moved
             out[n + i] = np.exp(-a) * x[n + i]
 
-    return _named(f, inner, layout)
+    return f
 
 
 @lru_cache(maxsize=64)
@@ -101,7 +93,7 @@ def _slope(function: Callable, layout: Layout) -> Callable:
                     out[j, n + i] = -np.expm1(-a) * p[time[i]] * along[j, i]
             out[n + i, n + i] = np.exp(-a)
 
-    return _named(F, inner, layout)
+    return F
 
 
 @lru_cache(maxsize=64)
@@ -133,7 +125,7 @@ def _noise(function: Callable | None, acts_on: tuple[int, ...], layout: Layout) 
                     out[n + i, j] = both
             out[n + i, n + i] = -variance * np.expm1(-2.0 * a)
 
-    return _named(Q, inner, layout, acts_on)
+    return Q
 
 
 def _nothing(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
@@ -161,7 +153,7 @@ def _sensor(function: Callable, first: int | None, layout: Layout) -> Callable:
             for i in range(out.size):
                 out[i] += x[e + i]
 
-    return _named(h, inner, layout, first)
+    return h
 
 
 @lru_cache(maxsize=256)
@@ -176,7 +168,7 @@ def _sensor_slope(function: Callable, first: int | None, layout: Layout) -> Call
             for i in range(out.shape[0]):
                 out[i, e + i] = 1.0
 
-    return _named(H, inner, layout, first)
+    return H
 
 
 @lru_cache(maxsize=256)
@@ -191,7 +183,7 @@ def _likelihood(function: Callable, first: int | None, layout: Layout) -> Callab
                 told[i] -= x[e + i]
         return inner(told, x[:n], u, p[:k], r)
 
-    return _named(log_likelihood, inner, layout, first)
+    return log_likelihood
 
 
 @lru_cache(maxsize=64)
@@ -202,4 +194,4 @@ def _inside(function: Callable, layout: Layout) -> Callable:
     def chances(x, u, p, dt, out):  # noqa: ANN001, ANN202
         inner(x[:n], u, p[:k], dt, out)
 
-    return _named(chances, inner, layout)
+    return chances

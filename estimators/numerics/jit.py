@@ -6,19 +6,18 @@ are plain integers in a tuple: a call from Python with them costs 3 µs, against
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numba
 from numba import carray, njit, types
 from numba.core import cgutils
 from numba.experimental.function_type import _get_jit_address
-from numba.extending import intrinsic
+from numba.extending import intrinsic, register_jitable
 
+from .cache import cache_folder
 from .threads import threaded
 
 F1 = types.float64[::1]
@@ -30,28 +29,6 @@ B1 = types.int8[::1]
 
 f64 = types.float64
 i64 = types.int64
-
-
-CONSTANTS = ("errors.py", "batch.py", "state_space.py", "alarms.py", "hypotheses.py")
-"""Files from which compiled code takes constants, and nothing else."""
-
-
-def cache_folder() -> Path:
-    """Where machine code is kept: per user, and apart for each version of the sources.
-
-    Numba looks only at the file of the function it compiles, not at those that the function calls, or takes a constant
-    from; so the sources of the package that have to do with compiling are part of the path, and an edit to any of them
-    compiles all anew. The models that ship are left out: each is compiled by itself.
-    """
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    digest = hashlib.sha256(numba.__version__.encode())
-    package = Path(__file__).parent.parent
-    for path in sorted(package.rglob("*.py")):
-        source = path.read_bytes()
-        compiling = b"jit" in source or b"intrinsic" in source or path.name in CONSTANTS
-        if compiling and package / "models" not in path.parents:
-            digest.update(source)
-    return base / "nisus" / "numba" / digest.hexdigest()[:16]
 
 
 if "NUMBA_CACHE_DIR" not in os.environ:
@@ -66,12 +43,22 @@ numba.config.LOOP_VECTORIZE = 0
 # library reads this when it is loaded, which `threaded` does.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-jit = partial(njit, cache=True, nogil=True, error_model="numpy")
-"""Numba's njit as used here: cached, without the GIL, and with IEEE division (zero divisors give inf, no error)."""
+jit = partial(njit, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+"""Numba's njit as used here: cached, without the GIL, and with IEEE division (zero divisors give inf, no error).
 
-jit_brief = partial(njit, cache=True, error_model="numpy")
+Numba would compile two wrappers around each function: that for C, which nobody here calls, is left out.
+"""
+
+jit_brief = partial(njit, cache=True, error_model="numpy", no_cfunc_wrapper=True)
 """The same with the GIL, for calls of microseconds that run none of a model's functions: giving the GIL up would mean
 to wait for it again, after other threads."""
+
+by_address = partial(jit, no_cpython_wrapper=True)
+"""The same for what is called through its address alone: to call it from Python would end the program."""
+
+part: Callable[[Callable[..., Any]], Any] = register_jitable(cache=True, nogil=True, error_model="numpy")
+"""The same for what only compiled functions call. A wrapper for Python would take a third of the time of compiling;
+from Python it is the function as it is written, in Python."""
 
 inlined = partial(jit, inline="always")
 """`jit` for helpers that stand inside a filter's step: a call that hands over context and arrays costs 50 to 100 ns."""
@@ -133,61 +120,61 @@ _to_mask = _pointer_to(types.int32)
 _to_complex = _pointer_to(types.complex128)
 
 
-@jit
+@part
 def floats(target, n):
     """The n float64s at an address, as an array that is not reference-counted (counting costs more than the filter)."""
     return carray(_to_float(target), (n,))
 
 
-@jit
+@part
 def ints(target, n):
     """The n int64s at an address."""
     return carray(_to_int(target), (n,))
 
 
-@jit
+@part
 def flags(target, n):
     """The n int8s at an address."""
     return carray(_to_byte(target), (n,))
 
 
-@jit
+@part
 def flag_rows(target, rows, columns):
     """The (rows, columns) int8s at an address."""
     return carray(_to_byte(target), (rows, columns))
 
 
-@jit
+@part
 def counts(target, n):
     """The n int32s at an address."""
     return carray(_to_mask(target), (n,))
 
 
-@jit
+@part
 def masks(target, rows, columns):
     """The (rows, columns) int32s at an address."""
     return carray(_to_mask(target), (rows, columns))
 
 
-@jit
+@part
 def matrix(vector, start, rows, columns):
     """A matrix that lives in `vector` from `start` on (NumPy's reshape costs 50 ns here, this nothing)."""
     return carray(_to_float(vector.ctypes.data + 8 * start), (rows, columns))
 
 
-@jit
+@part
 def complexes(scratch, start, n):
     """n complex numbers that live in the float64s of `scratch` from `start` on."""
     return carray(_to_complex(scratch.ctypes.data + 8 * start), (n,))
 
 
-@jit
+@part
 def borrowed(vector):
     """The same float64s, not reference-counted."""
     return floats(vector.ctypes.data, vector.size)
 
 
-@jit
+@part
 def borrowed_rows(matrix):
     """The same matrix of float64s, not reference-counted."""
     return carray(_to_float(matrix.ctypes.data), matrix.shape)

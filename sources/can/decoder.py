@@ -89,7 +89,6 @@ class Decoder:
         )
         self._silent = {(channel.kind, channel.index) for *_, own in self._plans for channel in own}
         """Channels that no value has come for."""
-        self.decode(self.gather([], []))  # Compiles now, not when the first frame waits.
 
     def _check_unique(self) -> None:
         for k, key in enumerate(self._keys):

@@ -8,8 +8,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import types
 
-from estimators.numerics.jit import jit
+from estimators.numerics.jit import B1, F1, F2, I1, jit
 
 from ..mapping import ABSENT, PRESENT, SHORT
 
@@ -37,6 +38,13 @@ class Signals(NamedTuple):
     ids_first: np.ndarray
     known: np.ndarray
     known_first: np.ndarray
+
+
+_columns = {"big": types.bool_[::1], "scale": F1, "offset": F1}
+signals_type = types.NamedTuple([_columns.get(name, I1) for name in Signals._fields], Signals)
+extract_signature = types.void(
+    signals_type, I1, I1, types.Array(types.uint8, 2, "C"), F2, types.Array(types.int8, 2, "C"), B1
+)
 
 
 @jit

@@ -34,6 +34,7 @@ def twin(history=200_000, horizon=2.0, tick=1000.0, model=MODEL, estimator="kf")
         title="scripted",
         text="model: motor_winding\n",
         overrides={},
+        version=None,
         path="scripted.yaml",
         model=model,
         tuning=Tuning.of(model),

@@ -13,7 +13,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 
 def main() -> None:
-    from . import defences, ensembles, false_alarms, filters, history, page_, particles_, sources
+    from . import defences, ensembles, false_alarms, filters, history, page_, particles_, smoothing, sources, tuning
 
     begun = perf_counter()
     load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
@@ -34,6 +34,8 @@ def main() -> None:
         ensembles.large_states,
         history.growing_history,
         history.refold,
+        smoothing.smoothing,
+        tuning.tuning,
         defences.defences,
         sources.blf,
         false_alarms.false_alarms,

@@ -79,12 +79,15 @@ CASES = (
         "ekf",
         {"Q.x": 0.4, "Q.y": 0.9, "Q.z": 0.5, "R.position": 1.0, "p.sigma": 9.6, "p.rho": 28.4, "p.beta": 2.72},
         60.0,
-        {"source.sensors": "{position: {every: 1}}", "noise": "{x: {variance: 0.2}, y: {variance: 0.2}, z: {variance: 0.2}}"},
+        {"source.sensors": "{position: {every: 1}}", "noise": json.dumps({name: {"variance": 0.2} for name in "xyz"})},
     ),
     Case(
         "battery_pack",
         "ekf",
-        {"Q.v1": 4e-6, "Q.temperature": 4e-4, "R.voltage": 2e-5, "R.temperature": 0.04, "p.r0_5": 0.046, "p.r0_1": 0.033},
+        {
+            "Q.v1": 4e-6, "Q.temperature": 4e-4, "R.voltage": 2e-5, "R.temperature": 0.04,
+            "p.r0_5": 0.046, "p.r0_1": 0.033,
+        },
         600.0,
         {"noise.soc": "{variance: 1e-9}"},
     ),

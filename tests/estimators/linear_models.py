@@ -235,6 +235,13 @@ class JointGaussian:
         here = slice(self.n * k, self.n * (k + 1))
         return mean[here], cov[here, here]
 
+    def smoothed(self, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (K, n) and covariance (K, n, n) of every x_k given all readings of the sensors in use."""
+        mean, cov = self._given(used[self.channel])
+        n = self.n
+        blocks = np.array([cov[i : i + n, i : i + n] for i in range(0, mean.size, n)])
+        return mean.reshape(-1, n), blocks
+
     def predictive(self, k: int, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Innovation of event k and its covariance, given the readings before it of the sensors in use."""
         mean, cov = self._given((self.owner < k) & used[self.channel])

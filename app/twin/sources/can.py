@@ -15,7 +15,7 @@ from ..channels import channels
 from ..faults import read_faults
 from ..files import failure, find_databases
 from .asset import check_asset, make_asset
-from .can_log import make_decoder, open_can_log
+from .can_log import CAN_LOG, make_decoder, open_can_log
 from .kind import Kind, Opening
 
 if TYPE_CHECKING:
@@ -43,6 +43,11 @@ def _open(opening: Opening) -> Source:
     except NisusError:
         bus.close()
         raise
+
+
+def _files(opening: Opening) -> object:
+    """The recording that stands in for the bus, or the databases: nobody may be on the bus twice."""
+    return CAN_LOG.files(opening) if opening.log_files is not None else make_decoder(opening)
 
 
 def _check(loaded: Loaded, model: StateSpaceModel, section: CanSection, key: Key) -> None:
@@ -136,4 +141,4 @@ class PlayedBus:
         self._bus.close()
 
 
-CAN = Kind(_open, check=_check)
+CAN = Kind(_open, check=_check, kernels=CAN_LOG.kernels, files=_files)

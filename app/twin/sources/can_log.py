@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 from config.source_schema import CanSection
 from estimators.errors import SourceError
+from sources.pieces import FRAMES, VALUES
 
 from ..files import find_databases, find_recording
-from .kind import Kind, Opening, about, blamed
+from .kind import Kind, Opening, about, blamed, closed
 
 if TYPE_CHECKING:
     from sources.can.decoder import Decoder
@@ -43,4 +44,4 @@ def open_can_log(opening: Opening) -> Source:
         raise about(opening.loaded, (*opening.key, where), str(error)) from None
 
 
-CAN_LOG = Kind(open_can_log)
+CAN_LOG = Kind(open_can_log, kernels=(FRAMES, VALUES), files=closed(open_can_log))

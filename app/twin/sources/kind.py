@@ -11,6 +11,7 @@ from config.loader import Loaded
 from config.yaml_lines import Key, dotted
 from estimators.errors import SourceError
 from estimators.model.state_space import StateSpaceModel
+from sources.pieces import VALUES
 
 from ..channels import channels
 from ..files import find_recording
@@ -46,12 +47,16 @@ class Kind:
         check: Checks its section against the model beyond its channels, before any file is touched.
         sections: The sections whose channels feed the model, each with its key: itself, unless it has parts or none.
         takes_log: Whether `--log` can replace what it reads.
+        kernels: What it compiles; see `sources/pieces.py`.
+        files: Opens its files alone, as `open` does: what is wrong with them is told before anything is compiled.
     """
 
     open: Callable[[Opening], Source]
     check: Callable[[Loaded, StateSpaceModel, Any, Key], None] = lambda *_: None
     sections: Callable[[Any, Key], dict[Key, Any]] = lambda section, key: {key: section}
     takes_log: bool = True
+    kernels: tuple[str, ...] = ()
+    files: Callable[[Opening], object] = lambda _: None
 
 
 def blamed(opening: Opening, build: Callable[[list[Channel]], T]) -> T:
@@ -89,7 +94,12 @@ def recording(make: Callable[[Opening, list[Path], list[Channel]], Source]) -> K
         files = find_recording(opening.loaded, opening.section, opening.key, opening.log_files)
         return blamed(opening, lambda channels: make(opening, files, channels))
 
-    return Kind(open_recording)
+    return Kind(open_recording, kernels=(VALUES,), files=closed(open_recording))
+
+
+def closed(open_: Callable[[Opening], Source]) -> Callable[[Opening], None]:
+    """Opens a recording, and closes it again."""
+    return lambda opening: open_(opening).close()
 
 
 def about(loaded: Loaded, key: Key, text: str) -> SourceError:

@@ -12,7 +12,7 @@ from config.yaml_lines import Key
 from estimators.errors import SourceError
 
 from .can_log import CAN_LOG
-from .kind import Kind, Opening
+from .kind import Kind, Opening, closed
 from .table import TABLE
 
 if TYPE_CHECKING:
@@ -68,4 +68,4 @@ def _sections(section: MergedSection, key: Key) -> dict[Key, Any]:
     return {(*key, "parts", k): part for k, part in enumerate(section.parts)}
 
 
-MERGED = Kind(_open, sections=_sections)
+MERGED = Kind(_open, sections=_sections, kernels=CAN_LOG.kernels, files=closed(_open))

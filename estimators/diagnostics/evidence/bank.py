@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...model.state_space import StateSpaceModel
-from ...numerics.jit import floats, inlined, jit
+from ...numerics.jit import floats, inlined, part
 from ..normal_nis import normal_nis
 from .hypotheses import GAINS, JOINT, REFUSED_SHARE, TESTS
 
@@ -144,7 +144,7 @@ def row_part(state, sensors, row):
     return floats(state.ctypes.data + 8 * (TWIN + sensors * SENSOR + row * ROW), ROW)
 
 
-@jit
+@part
 def forget(state, sensors, rows, states):
     """A reset: what the readings said of the estimate before, they do not say of the new one."""
     for s in range(sensors):

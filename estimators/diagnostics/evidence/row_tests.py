@@ -23,7 +23,7 @@ import math
 
 import numpy as np
 
-from ...numerics.jit import inlined, jit
+from ...numerics.jit import inlined, jit, part
 from .alarms import AGREEING, ALTERNATING, DISAGREEING, SPIKY, STUCK
 from .bank import CALM_FOR, COUNTED, EQUAL, EXPECTED, QUANTUM, RAW, ROW, RUN, VALUE, WHITE
 from .hypotheses import (
@@ -90,7 +90,7 @@ def _spike_ratio(share, square):
     return low + (at - k) * (high - low)
 
 
-@jit
+@part
 def weigh(own, e, h, base, before):
     """Put one standardised innovation to the tests of its row; the causes that are in alarm."""
     raw = min(max((e - base[0]) / base[1], -FURTHEST), FURTHEST)
@@ -140,7 +140,7 @@ def weigh(own, e, h, base, before):
     return mask
 
 
-@jit
+@part
 def repeat(own, y, r, h, base, before):
     """Put a value to the test of repetition.
 
@@ -190,7 +190,7 @@ def highest(e, refused, y, r, h, base, chances):
     return found
 
 
-@jit
+@part
 def weigh_together(own, nis, dof, h, before):
     """Put the NIS of a sensor with several rows to the tests of their common scale: χ² with dof under the model.
 

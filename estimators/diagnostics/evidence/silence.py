@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 
-from ...numerics.jit import jit
+from ...numerics.jit import part
 from .bank import COUNT, DUE, FIRST, LAST, LONGEST, NEXT_DUE, SILENT, SILENT_SENSORS, THRESHOLD, sensor_part
 
 LEARNT = 16.0
 """Readings of a sensor from which on its period is known; before, it is silent the later the fewer there are."""
 
 
-@jit
+@part
 def note_time(own, now, every, tests, policy):
     """Note that a sensor has spoken: its period, its threshold, and when it will be silent."""
     count = own[COUNT]
@@ -35,7 +35,7 @@ def note_time(own, now, every, tests, policy):
     own[SILENT] = 0.0
 
 
-@jit
+@part
 def listen(state, sensors, now):
     """Which sensors are silent; from when on the next will be."""
     due = np.inf

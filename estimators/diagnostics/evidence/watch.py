@@ -6,7 +6,7 @@ import numpy as np
 
 from ...compiled.context import circular_states, sensor_rows, sensor_variances
 from ...log import INPUT, READING, RESET, TRUTH
-from ...numerics.jit import borrowed, borrowed_rows, floats, inlined, ints, jit
+from ...numerics.jit import borrowed, borrowed_rows, floats, inlined, ints, part
 from ...numerics.linalg import wrap
 from ...track import (
     DEGRADED,
@@ -63,7 +63,7 @@ PATIENCE = 60
 as lie between two counts of ancestors: of a sound cloud a count may be 1 by chance, hardly three in a row."""
 
 
-@jit
+@part
 def _miss(own, z, before):
     """Whether the truth of a state is missed, after another error of z standard deviations."""
     own[1] = min(own[1] + 1.0, TOLD)
@@ -82,7 +82,7 @@ def _is_copy(i, track):
     return False
 
 
-@jit
+@part
 def _hear(i, now, y, s, context, policy, state, track):
     """Put a reading y of sensor s, and the variances that it may have brought, to all tests."""
     width = track.alarms.shape[1]
@@ -134,7 +134,7 @@ def _hear(i, now, y, s, context, policy, state, track):
         state[LOST_ROWS] += (mask & LOST != 0) - (before & LOST != 0)
 
 
-@jit
+@part
 def _count_particles(effective, ancestors, state):
     """Whether a cloud is impoverished, after another reading that it used."""
     if effective < FEW_PARTICLES or ancestors < 2.0:
@@ -147,7 +147,7 @@ def _count_particles(effective, ancestors, state):
         state[POOR_CLOUD] = 0.0
 
 
-@jit
+@part
 def _tell(i, first, truth, context, state, track):
     """Compare the estimate with the truth of some states, from `first` on."""
     begin = TWIN + context.n_sensors * SENSOR + context.n_rows * ROW
@@ -169,7 +169,7 @@ def _tell(i, first, truth, context, state, track):
         state[MISSED_STATES] += (missed != 0) - before
 
 
-@jit
+@part
 def _range(i, u, context, track):
     """Whether a state, or an input that holds, is outside the range in which the model was fitted."""
     states = track.mean.shape[1]
@@ -181,7 +181,7 @@ def _range(i, u, context, track):
     return False
 
 
-@jit
+@part
 def _health(i, now, silent, flags, state, policy, track):
     """The state of the twin after an event."""
     finite = True
@@ -202,7 +202,7 @@ def _health(i, now, silent, flags, state, policy, track):
     return TRACKING
 
 
-@jit
+@part
 def watch_rows(first, last, t, kind, channel, value, context, policy, state, track):
     """Fill alarms, flags and health of rows `first` to `last` of a track, whose other columns are there.
 

@@ -15,6 +15,7 @@ from app.cli.fold import fold_twin, read_log
 from app.cli.fold_episodes import Told, dropped, episode_lines
 from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import Episode
+from estimators.errors import EstimatorError
 from estimators.fold import Fold as FoldOf
 from estimators.log import Log
 from estimators.models import MODELS
@@ -253,3 +254,22 @@ def test_what_was_dropped_is_said_if_it_was_much() -> None:
     (episode,) = dropped({"stale": 80, "wrong time": 10}, folded)
     assert (episode.cause, episode.subject, episode.size, episode.end) == ("dropped", "twin", 0.9, None)
     assert episode.text.startswith("90 % of the readings were dropped, 90 of 100:")
+
+
+def test_what_is_smoothed_stands_beside_the_filter(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    (tmp_path / "drive.csv").write_text(ROWS)
+    (tmp_path / "drive.yaml").write_text(DRIVE)
+    out = tmp_path / "track.csv"
+    assert fold_twin(Fold(str(tmp_path / "drive.yaml"), out=out, smooth=True, json=True)) == 0
+    said = json.loads(capsys.readouterr().out)
+    table = np.genfromtxt(out, delimiter=",", names=True, dtype=None, encoding=None)
+    true = np.isfinite(table["temperature_true"])
+    rmse = np.sqrt(np.mean((table["temperature_smooth"] - table["temperature_true"])[true] ** 2))
+    assert said["smoothed"]["rmse"]["temperature"] == pytest.approx(rmse, rel=1e-12)
+    assert np.all(table["temperature_smooth_std"] <= table["temperature_std"] * (1 + 1e-12))
+    # What comes last is filtered with all that there is.
+    assert table["rate_smooth"][-1] == table["rate"][-1] and table["rate_smooth"][0] != table["rate"][0]
+    assert fold_twin(Fold(str(tmp_path / "drive.yaml"), smooth=True)) == 0
+    assert f"RMSE temperature, smoothed  {rmse:.5g} °C" in capsys.readouterr().out
+    with pytest.raises(EstimatorError, match="filterpy-kf cannot be smoothed; use kf"):
+        fold_twin(Fold(str(tmp_path / "drive.yaml"), estimator="filterpy-kf", smooth=True))

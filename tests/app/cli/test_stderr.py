@@ -4,7 +4,10 @@ from pathlib import Path
 
 import pytest
 
+import app.cli.opener
+import app.cli.prepare
 from app.cli.main import main
+from app.engine.workshop import Workshop
 from app.stderr import printable
 from tests.app.cli.test_fold import DRIVE, ROWS
 
@@ -72,3 +75,32 @@ def test_times_that_run_backwards_are_said_once(
     (line,) = said(capsys, arguments[0], str(drive / "drive.yaml"), *arguments[1:])
     assert "drive.csv:3: t is 1 s before that of the row above, and so it goes on; " in line
     assert line.endswith("sort the rows by t")
+
+
+@pytest.mark.parametrize(
+    ("words", "rule"),
+    [
+        (["--port", "abc"], "--port 'abc': must be a whole number"),
+        (["--port=9e3"], "--port '9e3': must be a whole number"),
+        (["--duration", "5s"], "--duration '5s': must be a number"),
+    ],
+)
+def test_what_is_no_number_is_told_in_a_line(words: list[str], rule: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert said(capsys, "run", "motor_can", *words) == [f"nisus: {rule}"]
+
+
+@pytest.mark.parametrize("options", [[], ["--headless"]])
+def test_files_of_a_source_are_looked_at_before_anything_is_compiled(
+    drive: Path, options: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def too_late(*_: object) -> None:
+        raise AssertionError("it went on")
+
+    monkeypatch.setattr(app.cli.opener, "begin_to_compile", lambda *_: Workshop())
+    monkeypatch.setattr(app.cli.opener, "prepare_model", too_late)
+    monkeypatch.setattr(app.cli.prepare, "attend", too_late)
+    (drive / "drive.csv").write_text("t,y\n0,1\n")
+    (line,) = said(capsys, "run", str(drive / "drive.yaml"), "--no-browser", "--port", "0", *options)
+    assert "drive.yaml:" in line and "drive.csv" in line
+    (line,) = said(capsys, "run", "motor_can", "--log", str(drive / "drive.yaml"), "--port", "0", *options)
+    assert "is not a CAN log format" in line

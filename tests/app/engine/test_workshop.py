@@ -7,6 +7,7 @@ a fold of the same log that knows nothing of all this.
 import os
 import subprocess
 import sys
+import threading
 import time
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 from app.engine.commands import Record, SetEstimator, SetTuning
+from app.engine.compilers import MOST, Worker, first_workers
 from app.engine.engine import Engine
 from app.engine.workshop import Workshop
 from app.recording.format import tuning_from_json
@@ -22,10 +24,12 @@ from app.recording.reader import read_recording
 from app.recording.writer import Recorder
 from estimators.fold import Fold, fold
 from estimators.log import Log
+from estimators.numerics.cache import cache_folder
 from estimators.numerics.threads import threaded
 from estimators.pieces import LOOP, Piece, is_made, pieces_of
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
+from sources.pieces import FRAMES
 from tests.app.scripted import MODEL, Scripted, fresh_status, pull_all, readings, row_count, twin, wait_for
 from tests.support import assert_same
 
@@ -226,6 +230,103 @@ def test_what_fails_in_the_workshop_is_left_to_who_uses_it(shop, tmp_path):
     os.kill(begun(tmp_path, Piece("ckf", 0))[0], 9)
     (tmp_path / "go").touch()
     wait_for(lambda: told == ["ukf", "ckf"])
+
+
+def killed(tmp_path, piece, *others):
+    """The process that has begun a piece is ended from outside; it is none of the `others`."""
+    wait_for(lambda: begun(tmp_path, piece) and begun(tmp_path, piece)[0] not in others)
+    process = begun(tmp_path, piece)[0]
+    os.kill(process, 9)
+    return process
+
+
+def test_what_was_ended_from_outside_is_begun_once_more_and_said(shop, tmp_path):
+    workshop, told, said = shop(enkf=3), [], []
+    workshop.report = said.append
+    first, last = Piece("enkf", 0), Piece("enkf", 2)
+    for place in (1, 2):
+        paper(tmp_path, "go", Piece("enkf", place)).touch()
+    workshop.start()
+    workshop.ask("enkf", told.append)
+    process = killed(tmp_path, first)
+    wait_for(lambda: len(said) == 1)
+    assert "enkf was ended" in said[0] and said[0].endswith("another one begins anew")
+    wait_for(lambda: begun(tmp_path, first)[0] != process and paper(tmp_path, "done", last).exists())
+    assert not told and not workshop.ready("enkf")
+    # Twice is no accident: who uses it compiles it.
+    killed(tmp_path, first, process)
+    wait_for(lambda: told == ["enkf"])
+    assert len(said) == 2 and "compiled where it is used" in said[1] and not paper(tmp_path, "done", first).exists()
+
+
+def test_a_killed_compiler_does_not_take_what_comes_after_for_done(shop, tmp_path):
+    workshop, told = shop(enkf=4), []
+    workshop.start()
+    workshop.ask("enkf", told.append)
+    killed(tmp_path, Piece("enkf", 0))
+    (tmp_path / "go").touch()
+    wait_for(lambda: told == ["enkf"])
+    assert all(paper(tmp_path, "done", Piece("enkf", place)).exists() for place in range(4))
+
+
+def test_the_engine_says_that_a_compiler_was_ended_and_folds_with_the_filter_all_the_same(started, tmp_path):
+    engine, source = started(ukf=1)
+    times, values = series(50)
+    source.put(readings(times, values))
+    wait_for(lambda: row_count(engine) == 50)
+    engine.submit(SetEstimator("ukf"))
+    killed(tmp_path, Piece("ukf", 0))
+    wait_for(lambda: any("compiled ukf was ended" in line.text for line in engine.notices.since(0)))
+    assert engine.folded_with()[1] == "kf" and fresh_status(engine).awaited == "ukf"
+    (tmp_path / "go").touch()
+    wait_for(lambda: fresh_status(engine).revision == 1)
+    assert_same(pull_all(engine).track, cold(times, values, "ukf"))
+
+
+def test_what_a_source_needs_comes_first_and_is_waited_for_alone(shop, tmp_path):
+    workshop = shop(**{LOOP: 1, "ukf": 4, FRAMES: 1})
+    waiting = threading.Thread(target=workshop.wait, args=(FRAMES,), daemon=True)
+    for name in ("ukf", FRAMES):
+        workshop.ask(name)
+    waiting.start()
+    workshop.start()
+    wait_for(lambda: begun(tmp_path, Piece(FRAMES, 0)))
+    assert list(workshop.states()) == ["ukf"]
+    paper(tmp_path, "go", Piece(FRAMES, 0)).touch()
+    wait_for(lambda: not waiting.is_alive())
+    assert workshop.ready(FRAMES) and not workshop.ready("ukf")
+    # Who waits when the workshop is closed is let go.
+    waiting = threading.Thread(target=workshop.wait, args=("ukf",), daemon=True)
+    waiting.start()
+    workshop.stop()
+    waiting.join(10.0)
+    assert not waiting.is_alive()
+
+
+def test_workers_that_began_before_the_workshop_compile_in_it(tmp_path):
+    worker, other = (Worker(partial(slow_work, tmp_path), 0) for _ in range(2))
+    piece = Piece("ukf", 0)
+    pieces = {"ukf": [piece]}
+    busy = Workshop(["ukf"], pieces=lambda name: pieces.get(name, []), is_done=lambda _: False, workers=[worker])
+    busy.ask("ukf")
+    busy.start()
+    wait_for(lambda: begun(tmp_path, piece))
+    assert begun(tmp_path, piece)[0] == worker._process.pid
+    busy.stop()
+    idle = Workshop(["ukf"], pieces=lambda _: [], workers=[other])
+    idle.start()
+    assert worker._process.exitcode is not None and other._process.exitcode is not None
+
+
+def test_workers_begin_before_all_else_only_where_nothing_was_compiled(tmp_path, monkeypatch):
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    begun_first = first_workers()
+    assert len(begun_first) == MOST
+    for worker in begun_first:
+        worker.stop()
+    cache_folder().mkdir(parents=True)
+    assert first_workers() == []
 
 
 def test_nothing_is_left_running(shop, tmp_path):

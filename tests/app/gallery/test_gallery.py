@@ -9,7 +9,10 @@ import weakref
 import pytest
 from websockets.sync.client import connect
 
+import app.gallery.api
+from app.cli.opener import FileOpener
 from config.loader import shipped
+from estimators.errors import ConfigError
 from tests.app.gallery.opened import PATIENCE, opened
 from tests.app.scripted import wait_for
 
@@ -90,6 +93,27 @@ def test_the_page_is_the_gallery_until_a_twin_runs(empty):
     status, answer = empty.post("/api/command", {"command": "Reset"})
     assert status == 409 and "choose one" in answer["error"]
     assert told(empty) == {"boot": empty.state()["boot"]}
+
+
+def test_a_twin_that_is_started_says_that_its_model_is_compiled(tmp_path, monkeypatch):
+    begun, go = threading.Event(), threading.Event()
+
+    def made_ready(self, opening):
+        begun.set()
+        go.wait(PATIENCE)
+        raise ConfigError("enough")
+
+    monkeypatch.setattr(FileOpener, "made_ready", made_ready)
+    with opened(tmp_path) as session:
+        monkeypatch.setattr(app.gallery.api, "PATIENCE", 0.0)
+        assert session.post("/api/gallery/start", {"twin": "motor_winding"})[0] == 202
+        begun.wait(PATIENCE)
+        starting = session.state()["starting"]
+        assert starting["name"] == "motor_winding" and starting["doing"] == "compiling"
+        monkeypatch.setattr(app.gallery.api, "PATIENCE", PATIENCE)  # what takes no longer is loaded from the cache
+        assert session.state()["starting"]["doing"] == ""
+        go.set()
+        assert session.settled()["failed"] == {"title": "motor_winding", "text": "enough"}
 
 
 def test_one_twin_after_another_behind_one_port(tmp_path):

@@ -29,7 +29,7 @@ SEEN = {
 XYZ = np.array(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
 )
-LINES = ("estimate", "truth", "previous", "pin-0", "pin-1", "pin-2", "pin-3")
+LINES = ("estimate", "truth", "previous", "smoothed", "pin-0", "pin-1", "pin-2", "pin-3")
 DOTS = ("reading", "refused")
 HEALTH = ("tracking", "suspect", "degraded", "diverged", "waiting")
 

@@ -39,7 +39,7 @@ def said(name):
 
 
 def test_on_a_recording_whose_error_lasts_it_would_spoil_the_twin_and_is_doubted(data):
-    """In its 95 % band 98 % of the time before and 87 % after, and further off; so neither R of this twin is offered."""
+    """In its 95 % band 98 % of the time before, 87 % after, and further off: neither R of this twin is offered."""
     data("battery_panasonic_18650pf", "25degC_US06.mat")
     noise, before, after = said("battery_panasonic")
     assert before["soc"].coverage > 0.93 and after["soc"].coverage < 0.9

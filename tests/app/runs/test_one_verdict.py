@@ -54,6 +54,7 @@ def test_one_verdict_in_one_wording(engine):
     # The strip's quantiles are between those of whole degrees of freedom, which curve little.
     assert (status["nis"], status["nis_low"], status["nis_high"]) == pytest.approx((nis, low, high), rel=2e-3)
     assert (run["nis"], run["nis_low"], run["nis_high"]) == pytest.approx((nis, low, high), rel=1e-6)
+    assert status["nis_judged"] == pytest.approx(run["nis_judged"], rel=1e-9) == pytest.approx(nis, rel=1e-9)
     place = "below" if nis < low else "above" if nis > high else "inside"
     commissioned = engine.twin.tuning.baseline is not None
     expected = f"mean NIS {nis:.3g}, {place} its 95 % bounds {low:.3g} to {high:.3g}"

@@ -1,4 +1,5 @@
 # ruff: noqa: E501  (a table of whole messages reads better unbroken)
+import os
 from pathlib import Path
 
 import numpy as np
@@ -194,6 +195,9 @@ def test_log_files_that_fit_nothing_are_one_line() -> None:
     assert message(LOG, SourceError, log_files=["."]) == "--log .: it is a folder; name the files in it"
     assert (
         message(LOG, SourceError, log_files=["absent.blf"]) == "--log absent.blf: there is no such file; check the path"
+    )
+    assert message(LOG, SourceError, log_files=[os.devnull]) == (
+        f"--log {os.devnull}: it is a device or a pipe; name a file, which can be read again"
     )
     simulator = "model: motor_winding\nsource: {type: simulator}\n"
     assert message(simulator, SourceError, log_files=["a.blf"]).startswith(

@@ -6,7 +6,10 @@ from scipy.stats import chi2
 
 from estimators.diagnostics.consistency import NisVerdict
 from estimators.diagnostics.normal_nis import LEAST, MEAN, VARIANCE, nis_bounds, normal_nis
+from estimators.diagnostics.score import nis_verdict
+from estimators.log import READING, Events
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.track import GATED, USED, Track
 
 
 def still(x, u, p, dt, out):
@@ -96,3 +99,27 @@ def test_no_readings_have_no_bounds():
 )
 def test_it_says_where_a_mean_lies_and_by_what(nis, commissioned, words):
     assert NisVerdict(nis, 0.9, 1.1, commissioned).words == words
+
+
+def test_of_a_commissioned_twin_the_same_readings_are_compared_as_were_taken_for_normal():
+    """On the data of the commission a NIS is inside, though outliers are in its mean and refused ones are not."""
+    rng = np.random.default_rng(4)
+    n = 2000
+    e = np.concatenate((rng.normal(0, 0.5, n), [30.0] * 5, [8.0] * 40))
+    verdict = np.repeat([USED, USED, GATED], [n, 5, 40])
+    track, t = Track.allocate(e.size, 1, 0, 2), np.arange(e.size, dtype=np.int64)
+    track.verdict[:], track.dof[:], track.nis[:] = verdict, 1, e**2
+    track.innovation[:, 0], track.innovation_std[:, 0] = e, 1.0
+    track.innovation[:, 1] = track.whitened[:] = np.nan
+    events = Events(t, t, np.full(e.size, READING, np.int8), np.zeros(e.size, np.int32), np.zeros((e.size, 2)))
+    clipped = np.clip(e, -6, 6)
+    baseline = np.array([[clipped.mean(), clipped.std(), 0.0], [0, 1, 0], [0, 1, 0]])
+    found = nis_verdict(track, events, MODEL, baseline)
+    assert found.nis == pytest.approx((e[: n + 5] ** 2).mean(), rel=1e-12) and found.nis > found.high
+    assert found.judged == pytest.approx((clipped**2).mean(), rel=1e-12) and found.place == "inside"
+    assert found.words == (
+        f"mean NIS {found.nis:.3g}, {found.judged:.3g} with those refused and none beyond 6 σ, inside its 95 % bounds "
+        f"{found.low:.3g} to {found.high:.3g}, as commissioned"
+    )
+    white = nis_verdict(track, events, MODEL)
+    assert white.place == "above" and np.isnan(white.judged)

@@ -9,10 +9,11 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import brentq, minimize
 
 from estimators.errors import ConfigError
+from estimators.fit.aims import Recording
 from estimators.fit.blocks import held_out_rows
 from estimators.fit.entries import entries_of
 from estimators.fit.fit import Cancelled, Given, fit
-from estimators.fit.objective import Objective, Recording, only_told
+from estimators.fit.objective import Objective, only_told
 from estimators.log import READING, Log
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning

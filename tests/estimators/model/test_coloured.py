@@ -300,6 +300,10 @@ def test_a_noise_on_several_states_lasts_in_each_channel():
     three(None, None, None, np.array([0.2 * (dt - 1.5 * TAU), 0.05 * (dt - 4.5)]), 1.0, white)
     np.testing.assert_allclose(noise[:3, :3], white, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(F[:3, 3:6], [[TAU, 3.0, 0.0], [-TAU, 0.0, 0.0], [0.0, 0.0, 3.0]], rtol=1e-12)
+    # Where q counts four times, the disturbance does too; and a step is as two halves of it.
+    np.testing.assert_allclose(np.diag(noise)[3:6], [0.1 / TAU, 0.1 / 3.0, 0.1 / 3.0], rtol=1e-12)
+    (F, noise), (G, half) = discrete(mine, 4.0), discrete(mine, 2.0)
+    np.testing.assert_allclose(G @ half @ G.T + half, noise, rtol=1e-12, atol=1e-15)
 
 
 def two_rows(x, u, p, out):
@@ -333,7 +337,7 @@ def test_a_correlation_time_can_be_estimated_with_the_state():
 
 
 def test_two_wrapped_models_are_told_apart_when_both_are_wrapped_again():
-    """Wrappers of one layout differ by the model inside alone; machine code is kept by name."""
+    """Wrappers of one layout differ by the model inside alone; machine code is kept by the names of functions."""
     log = log_of(np.arange(20.0), np.sin(np.arange(20.0)))
     base = replace(WALK, parameters=(Parameter("leak", "1/s", 0.1, 0.0, 1.0),), linear=False)
     ends = []

@@ -1,0 +1,140 @@
+"""What drives a signal: a first-order lag behind others, fitted to the first half and judged by the second."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.signal import lfilter
+
+from sources.survey import Series
+
+from .grid import common
+from .signals import Signal
+
+TIMES = 24
+"""Time constants that are tried, from one interval to the length of the log, evenly by their logarithm."""
+
+MOST = 4
+"""Drivers of a signal."""
+
+WINS = 0.8
+"""Factor by which more drivers must lower the error on the second half to be worth it."""
+
+EXPLAINED = 0.5
+"""Share of the variance of the second half that drivers must explain to be taken."""
+
+LEAST = 60
+"""Common times that it takes."""
+
+
+class Driven(NamedTuple):
+    """A first-order lag, tau · y' = offset + Σ gain · u - y, of a signal y behind others.
+
+    `explained` is the share of the variance of the second half that is simulated, without any reading, with what was
+    fitted to the first. `start` is how far above the lag the signal began; that decays with tau.
+    """
+
+    signal: int
+    drivers: tuple[int, ...]
+    gains: tuple[float, ...]
+    offset: float
+    tau: float
+    explained: float
+    start: float = 0.0
+
+
+def driven(found: Sequence[Signal], target: int, candidates: Sequence[int]) -> Driven | None:
+    """The drivers of a signal among some others, the one that helps most first; None where none explains it.
+
+    For each time constant the driven lag is linear in offset, gains and start, so least squares finds these at once.
+    """
+    if not candidates:
+        return None
+    t, values = common([found[target].series, *(found[k].series for k in candidates)])
+    there = np.isfinite(values).all(axis=1)
+    if there.sum() < LEAST:
+        return None
+    # A hole is bridged by what was last there, and not scored.
+    y, u = values[:, 0], _held(values[:, 1:])
+    half = t.size // 2
+    if not (np.nanvar(y[half:]) > 0.0 and np.nanvar(y[:half]) > 0.0):
+        return None
+    taken: list[int] = []
+    sets: list[tuple[float, Driven]] = []
+    while len(taken) < min(MOST, len(candidates)):
+        tried = [(_fitted(t, y, u[:, [*taken, k]], half), k) for k in range(len(candidates)) if k not in taken]
+        (error, tau, weights), k = min(tried, key=lambda entry: entry[0][0])
+        taken.append(k)
+        explained = 1.0 - error / float(np.nanvar(y[half:]))
+        names, gains = tuple(candidates[k] for k in taken), tuple(float(w) for w in weights[2:])
+        sets.append((error, Driven(target, names, gains, float(weights[0]), tau, explained)))
+    least = min(error for error, _ in sets)
+    best = next(one for error, one in sets if WINS * error <= least)
+    if best.explained < EXPLAINED:
+        return None
+    own = u[:, [list(candidates).index(k) for k in best.drivers]]
+    fine = minimize_scalar(
+        lambda log_tau: _lag(t, y, own, half, float(np.exp(log_tau)))[0],
+        bounds=np.log([best.tau / 3.0, best.tau * 3.0]),
+        method="bounded",
+    )
+    tau = float(np.exp(fine.x))
+    _, error, weights = _lag(t, y, own, half, tau)
+    gains = tuple(float(w) for w in weights[2:])
+    explained = 1.0 - error / float(np.nanvar(y[half:]))
+    return best._replace(tau=tau, gains=gains, offset=float(weights[0]), explained=explained, start=float(weights[1]))
+
+
+def simulated(found: Sequence[Signal], lag: Driven) -> Series:
+    """What the drivers leave of a signal: its values less the driven lag, which is simulated without any reading."""
+    t, values = common([found[lag.signal].series, *(found[k].series for k in lag.drivers)])
+    weights = np.array([lag.offset, lag.start, *lag.gains])
+    course = _columns(t, _held(values[:, 1:]), lag.tau) @ weights
+    own = found[lag.signal].series
+    begin = max(int(found[k].series.t[0]) for k in (lag.signal, *lag.drivers))
+    at = np.interp((own.t - begin) * 1e-9, t, course)
+    return replace(own, values=own.values - at)
+
+
+def _held(values: np.ndarray) -> np.ndarray:
+    """The last value that was there, in place of NaN; at first the first."""
+    out = values.copy()
+    for column in out.T:
+        known = np.flatnonzero(np.isfinite(column))
+        if known.size:
+            column[:] = column[
+                known[np.clip(np.searchsorted(known, np.arange(column.size), side="right") - 1, 0, None)]
+            ]
+    return out
+
+
+def _fitted(t: np.ndarray, y: np.ndarray, u: np.ndarray, half: int) -> tuple[float, float, np.ndarray]:
+    """Mean square error on the second half, time constant, and weights: offset, start, gains."""
+    step = float(t[1] - t[0])
+    times = np.geomspace(step, max(2.0 * step, t[-1] - t[0]), TIMES).tolist()
+    tried = [(*_lag(t, y, u, half, tau), tau) for tau in times]
+    # The first half alone chooses the time constant.
+    _, error, weights, tau = min(tried, key=lambda entry: entry[0])
+    return error, tau, weights
+
+
+def _lag(t: np.ndarray, y: np.ndarray, u: np.ndarray, half: int, tau: float) -> tuple[float, float, np.ndarray]:
+    """Mean square errors of one time constant on the first and the second half, and weights, fitted to the first."""
+    columns = _columns(t, u, tau)
+    early = np.isfinite(y) & (np.arange(t.size) < half)
+    late = np.isfinite(y) & (np.arange(t.size) >= half)
+    scale = np.maximum(np.abs(columns[early]).max(axis=0), 1e-300)
+    weights = np.linalg.lstsq(columns[early] / scale, y[early], rcond=1e-8)[0] / scale
+    error = (y - columns @ weights) ** 2
+    return float(np.mean(error[early])), float(np.mean(error[late])), weights
+
+
+def _columns(t: np.ndarray, u: np.ndarray, tau: float) -> np.ndarray:
+    """What a lag is made of: offset, start, and each input lagged, which holds from its time to the next."""
+    a = np.exp(-float(t[1] - t[0]) / tau)
+    lagged = lfilter([0.0, 1.0 - a], [1.0, -a], u, axis=0, zi=u[:1])[0]
+    return np.column_stack([np.ones(t.size), np.exp(-t / tau), lagged])

@@ -1,0 +1,107 @@
+"""`nisus guard`: archived recordings folded with their accepted tunings, and compared with their recorded scores."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from typing import TYPE_CHECKING
+
+import numba
+
+from config.files import shown_path
+from estimators.compiled.orphan import leave_with_parent
+from estimators.errors import ConfigError, printable
+
+from ..export.parts import Part
+from ..guard.junit import Guarded, junit
+from .arguments import settings
+from .check_text import as_text
+from .guard_archive import Archived, chosen
+from .guard_fold import Wanted, guarded
+from .progress import progress
+
+if TYPE_CHECKING:
+    from .arguments import Guard as Arguments
+
+
+def guard(arguments: Arguments) -> int:
+    """Carry the command out: 0 if nothing is worse than recorded, 1 if something is, 2 if something failed."""
+    if arguments.accept and not arguments.note.strip():
+        raise ConfigError("--accept: say why with --note TEXT; it is kept with the scores")
+    archive = chosen(arguments.twins, arguments.archive)
+    note = printable(arguments.note).strip() if arguments.accept else None
+    found = _all(archive, Wanted(note, settings(arguments.set)), arguments.jobs)
+    must = os.environ.get("CI", "").lower() in ("true", "1")
+    if arguments.junit is not None:
+        try:
+            arguments.junit.write_bytes(junit(found, absent_fails=must))
+        except OSError as error:
+            raise ConfigError(
+                f"--junit {shown_path(arguments.junit)}: {error.strerror}; choose another place"
+            ) from None
+    print("\n".join(as_text(_parts(found, must))))
+    if any(each.failure or (each.absent and must) for each in found):
+        return 2
+    return 0 if arguments.accept else int(any(judged.worse for each in found for judged in each.judged))
+
+
+def _all(archive: Sequence[Archived], wanted: Wanted, jobs: int | None) -> list[Guarded]:
+    jobs = min(len(archive), jobs or os.cpu_count() or 1)
+    with progress("guard", len(archive), "recordings") as advance:
+        if jobs == 1:
+            found = []
+            for archived in archive:
+                found.append(guarded(archived, wanted))
+                advance()
+            return found
+        # As for `nisus compare`: threads that spin beside a small matrix, and libraries that do not survive a fork.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin) as pool:
+            futures = [pool.submit(guarded, archived, wanted) for archived in archive]
+            for future in futures:
+                future.add_done_callback(lambda _: advance())
+            return [future.result() for future in futures]
+
+
+def _begin() -> None:
+    leave_with_parent()
+    numba.set_num_threads(1)
+
+
+def _parts(found: Sequence[Guarded], must: bool) -> list[Part]:
+    """What got worse, what could not be folded, what is absent, and the sum."""
+    worse = [(each, judged) for each in found for judged in each.judged if judged.worse]
+    better = [(each, judged) for each in found for judged in each.judged if judged.better]
+    folded = [each for each in found if not each.failure and not each.absent]
+    failures = [f"{each.name}: {each.failure}" for each in found if each.failure]
+    absent = [f"{each.name}: {each.absent}" for each in found if each.absent]
+    figures = sum(len(each.judged) for each in found)
+    said = [f"{len(folded)} recordings, {figures} figures: {len(worse)} worse, {len(better)} better"]
+    if better and not worse:
+        said.append("What got better is guarded once it is recorded: --accept --note ...")
+    parts = [Part("Guard", tuple(said))]
+    for title, some in (("Worse than recorded", worse), ("Better than recorded", better)):
+        if some:
+            head = ("recording", "tuning", "figure", "was", "is", "change", "allowed")
+            rows = tuple(
+                (
+                    each.name,
+                    each.version,
+                    judged.figure if not judged.log else f"{judged.figure} (log {judged.log})",
+                    f"{judged.before:.6g}",
+                    f"{judged.now:.6g}",
+                    f"{judged.change:+.3g}",
+                    f"{judged.allowed:.2g}",
+                )
+                for each, judged in some
+            )
+            parts.append(Part(title, (), head, rows))
+    if failures:
+        parts.append(Part("Could not be folded", tuple(failures)))
+    if absent:
+        title = "Absent, which CI=true makes an error" if must else "Absent, and left out"
+        parts.append(Part(title, tuple(absent)))
+    return parts

@@ -1,0 +1,104 @@
+"""Tuning versions over HTTP: listed, a run kept as one, and one loaded."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+
+from config.tunings import NAME
+from estimators.errors import ConfigError, printable
+from estimators.fold import Fold
+from estimators.log import Log
+
+from ..engine.interface import Running
+from ..engine.reload import obstacle
+from ..engine.revisions import LONGEST_NOTE
+from ..runs.scores import RunScores
+from ..tunings.figures import figures
+from ..tunings.keep import Settings, keep, version_text
+from ..tunings.listing import listing
+from ..twin.twin import with_version
+from .answer import answered
+from .api import Json
+
+
+class TuningsApi:
+    """The routes."""
+
+    def __init__(self, engine: Running, scores: RunScores) -> None:
+        self._engine, self._scores = engine, scores
+
+    def routes(self) -> list[Route]:
+        """What is served."""
+        return [
+            Route("/api/tunings", self._list),
+            Route("/api/tunings", self._keep, methods=["POST"]),
+            Route("/api/tunings/load", self._load, methods=["POST"]),
+        ]
+
+    async def _list(self, request: Request) -> Response:
+        versions = await asyncio.to_thread(listing, self._engine.twin)
+        return Json({"running": self._engine.status().tuning.name, "versions": versions})
+
+    async def _keep(self, request: Request) -> Response:
+        """Keep a run as a version, with what it was worth."""
+
+        async def work(body: Any) -> Response:
+            return Json({"name": await asyncio.to_thread(self._kept, *_fields(body, run=int, name=str, note=str))})
+
+        return await answered(request, work)
+
+    def _kept(self, number: int, name: str, note: str) -> str:
+        if len(note) > LONGEST_NOTE:
+            raise ConfigError(f"note: it has {len(note)} characters; it may have {LONGEST_NOTE}")
+        run = self._engine.revisions.find(number)
+        known = next((known for other, known in self._scores.all() if other.number == number), None)
+        given = Settings(
+            run.estimator,
+            run.tuning,
+            note=printable(note),
+            scores={} if known is None else figures(known.score),
+            model_version=self._engine.status().model_version,
+        )
+        twin = self._engine.twin
+        keep(twin, name, version_text(twin, given))
+        return name
+
+    async def _load(self, request: Request) -> Response:
+        """Go on with a version; the history is folded again with it."""
+
+        async def work(body: Any) -> Response:
+            return Json({"name": await asyncio.to_thread(self._loaded, *_fields(body, name=str))})
+
+        return await answered(request, work)
+
+    def _loaded(self, name: str) -> str:
+        if not NAME.fullmatch(name) or name.endswith((".yaml", ".yml")):
+            # A path: a page chooses among what is beside the twin.
+            raise ConfigError(f"{name}: no version is read from there; name one that /api/tunings lists")
+        twin = with_version(self._engine.twin, name)
+        reason = obstacle(self._engine.twin, twin)
+        if reason is not None:
+            raise ConfigError(f"{name}: {reason}; start the twin with --tuning {name}")
+        # Compiled before the engine's thread asks for it.
+        Fold(twin.estimator, twin.model, twin.tuning, Log.of(twin.model), pairs=twin.pairs, idle=True)
+        self._engine.reload(twin, f"version {name}", exact=True)
+        return name
+
+
+def _fields(body: Any, **kinds: type) -> list[Any]:
+    """The fields of a request, in their order.
+
+    Raises:
+        ConfigError: If one is missing, of another kind, or unknown.
+    """
+    if not isinstance(body, dict) or set(body) != set(kinds):
+        raise ConfigError(f"the body must be an object of {', '.join(kinds)}")
+    for name, kind in kinds.items():
+        if type(body[name]) is not kind:
+            raise ConfigError(f"{name}: it must be {'a text' if kind is str else 'a whole number'}")
+    return [body[name] for name in kinds]

@@ -1,0 +1,70 @@
+"""Smoothing: what the readings of a whole log say of each moment of it, those that came later too.
+
+It works on what a fold did, reading by reading: refused, weighted, adapted, let in again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ..errors import EstimatorError
+from ..estimator import Estimator
+from ..fold import Fold
+from ..model.state_space import StateSpaceModel
+from .cross_covariance import CONSTANT, POINTS, TANGENT
+from .moments_back import MomentsBack
+from .recorder import COVARIANCE, FACTOR, MEMBERS, Kind
+from .smoothed import Smoothed
+from .trajectories_back import TrajectoriesBack
+from .walk import Notes, Walk
+
+KINDS = {
+    "kf": Kind(CONSTANT, COVARIANCE),
+    "kf-steady": Kind(CONSTANT, COVARIANCE),
+    "ekf": Kind(TANGENT, COVARIANCE),
+    "iekf": Kind(TANGENT, COVARIANCE),
+    "ukf": Kind(POINTS, COVARIANCE),
+    "ckf": Kind(POINTS, COVARIANCE),
+    "sr-kf": Kind(CONSTANT, FACTOR),
+    "sr-ekf": Kind(TANGENT, FACTOR),
+    "sr-ukf": Kind(POINTS, FACTOR),
+    **dict.fromkeys(("enkf", "etkf", "ensrf", "letkf"), Kind(TANGENT, MEMBERS)),
+}
+"""Filters that are smoothed by means and covariances."""
+
+PARTICLES = ("pf", "pf-reg")
+"""Filters that are smoothed by trajectories."""
+
+
+def check_smooth(estimator: Estimator, model: StateSpaceModel, options: Mapping[str, float | str]) -> None:
+    """Refuse a filter whose estimates of a model cannot be smoothed.
+
+    Raises:
+        EstimatorError: With the reason.
+    """
+    if estimator.name not in (*KINDS, *PARTICLES):
+        raise EstimatorError(f"{estimator.name} cannot be smoothed; use {', '.join((*KINDS, *PARTICLES))}")
+    if model.black_box:
+        raise EstimatorError(f"{estimator.name} cannot be smoothed: {model.name} is a black box, which is not compiled")
+    if estimator.name in KINDS and KINDS[estimator.name].holds == MEMBERS:
+        members = int(estimator.complete(options)["members"])
+        if members < model.nx + 2:
+            raise EstimatorError(
+                f"{estimator.name} cannot be smoothed: the covariance of {members} members of {model.name} with its "
+                f"{model.nx:,} states has no inverse; give at least {model.nx + 2:,} members, better several times that"
+            )
+
+
+def smooth(fold: Fold) -> Smoothed:
+    """Smooth what a fold has folded; the fold itself stays as it is.
+
+    Raises:
+        EstimatorError: If there is no smoother for its filter and model.
+    """
+    check_smooth(fold.estimator, fold.model, fold.options)
+    out = Smoothed.room_for(fold)
+    if fold.n:
+        kind = KINDS.get(fold.estimator.name)
+        notes: Notes = TrajectoriesBack(fold, out) if kind is None else MomentsBack(fold, kind, out)
+        Walk(fold, notes).back()
+    return out

@@ -1,0 +1,24 @@
+"""Smoothed, on the page: drawn in its colour on the charts of states while it is on, and gone when it is off."""
+
+import pytest
+
+from tests.app.page import test_runs_browser as runs
+from tests.app.page.test_runs_browser import PATIENCE, page, session  # noqa: F401  fixtures
+from tests.app.scripted import wait_for
+
+pytestmark = pytest.mark.browser
+
+SMOOTHED = (38, 76, 70)
+"""app/page/style.css, --smoothed, in the light theme."""
+
+
+def test_it_is_drawn_while_it_is_on(page, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(runs, "PINNED", SMOOTHED)
+    chart = "#charts .chart canvas"
+    before = runs.coloured(page, chart)
+    button = page.locator("#smoothed")
+    button.click()
+    assert button.get_attribute("aria-pressed") == "true"
+    wait_for(lambda: runs.coloured(page, chart) > before + 100, PATIENCE)
+    button.click()
+    wait_for(lambda: runs.coloured(page, chart) <= before + 20, PATIENCE)

@@ -1,0 +1,117 @@
+"""`python -m tests.benchmarks.recordings`: real recordings, fitted on the first half, scored on the second.
+
+Each is scored as shipped, as fitted (whether or not the fit was proposed), and by FilterPy with its own defaults, Q and
+R the identity. The fit sees the first half alone, and its own judge of it blocks and sensors held out of that half. The
+truth of the second half is known to nobody until it is scored.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from app.cli.fold import read_log
+from app.twin.bounds import bounds_of
+from app.twin.twin import Twin, load_twin
+from estimators.errors import NisusError
+from estimators.fit.aims import AIMS, Recording
+from estimators.fit.entries import Setting
+from estimators.fit.fit import Given, fit
+from estimators.fit.judge import Part, worths
+from estimators.log import Log
+from estimators.registry import find_entry, unfit
+
+
+class Case(NamedTuple):
+    """A twin, and how many seconds of its recording are taken; None for all."""
+
+    twin: str
+    seconds: float | None = None
+
+
+CASES = (
+    Case("uwb_rover_labyrinth"),
+    Case("uwb_rover_plaza"),
+    Case("battery_dmegc"),
+    Case("motor_bench"),
+    Case("motor_bench_joint"),
+    Case("road_car_rav4"),
+    Case("road_car", 300.0),
+    Case("battery_panasonic", 2400.0),
+)
+
+
+def halves(log: Log) -> tuple[Log, np.ndarray]:
+    """The first half in time, and a mask (n,) of the second."""
+    middle = log.t[0] + (log.t[log.n - 1] - log.t[0]) // 2
+    first = log.copy()
+    first.n = int(np.searchsorted(log.t[: log.n], middle))
+    return first, log.t[: log.n] >= middle
+
+
+def scored(twin: Twin, estimator: str, setting: Setting, log: Log, second: np.ndarray) -> Part:
+    """What it is worth on the second half."""
+    (worth,) = worths(estimator, [setting], [Recording(log, 1.0, second)], lambda folds: True)
+    return worth.held_out
+
+
+def line(name: str, part: Part) -> str:
+    """As a row of the table."""
+
+    def predictions(group: str) -> str:
+        items = getattr(part, group).items()
+        return ", ".join(f"{key} {item.rms:.3g} {item.unit} {100 * item.coverage:.0f} %" for key, item in items) or "-"
+
+    return (
+        f"  {name:12} NIS/dof {part.nis:8.3g}  in band {100 * part.coverage:5.1f} %  "
+        f"log density {part.log_density:8.3g}\n      sensors held out: {predictions('sensors')}\n"
+        f"      truth: {predictions('states')}"
+    )
+
+
+def show(case: Case, wanted: Sequence[str], aim: str) -> None:
+    """Fit and print one recording."""
+    twin = load_twin(case.twin)
+    log, _ = read_log(twin, case.seconds)
+    first, second = halves(log)
+    own = Setting(twin.tuning, None)
+    print(f"{case.twin}, {twin.estimator}: {first.n:,} events fitted, {int(second.sum()):,} scored", flush=True)
+    print(line("as shipped", scored(twin, twin.estimator, own, log, second)), flush=True)
+    bounds = bounds_of(twin.config, twin.model)
+    found = fit(twin.estimator, twin.tuning, [Given(first)], wanted=wanted, bounds=bounds, aim=aim)
+    for item in found.lines:
+        what = (
+            "left alone" if item.alone else f"{item.before:.3g} -> {item.after:.3g} ({item.low:.2g} to {item.high:.2g})"
+        )
+        print(f"      {item.key} {what}")
+    print("      " + ("proposed" if found.proposed else "not proposed: " + "; ".join(found.verdict.reasons)))
+    print(line("fitted", scored(twin, twin.estimator, found.setting, log, second)), flush=True)
+    theirs = "filterpy-ekf"
+    if unfit(find_entry(theirs), twin.model) is None:
+        unit = replace(
+            twin.tuning.with_options({}), q=np.ones_like(twin.tuning.q), r=np.ones_like(twin.tuning.r), gate=None
+        )
+        try:
+            print(line("FilterPy", scored(twin, theirs, Setting(unit, None), log, second)), flush=True)
+        except NisusError as error:
+            print(f"  FilterPy: {error}")
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("twins", nargs="*", help="only these")
+    parser.add_argument("--fit", default="Q,R")
+    parser.add_argument("--aim", default=AIMS[0], choices=AIMS)
+    arguments = parser.parse_args()
+    for case in CASES:
+        if not arguments.twins or case.twin in arguments.twins:
+            show(case, arguments.fit.split(","), arguments.aim)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,311 @@
+"""On linear models every smoothed Gaussian filter equals a dense joint Gaussian over all states, in one solve.
+
+Tolerance 1e-9, relative to the size of the quantity, as for the filters (gaussian/test_joint_gaussian.py).
+"""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+
+from estimators.errors import EstimatorError
+from estimators.events.maintenance import maintained
+from estimators.fold import Fold
+from estimators.log import READING, RESET, TICK, Events, Log
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.registry import ESTIMATORS
+from estimators.smoothing import moments_back, walk
+from estimators.smoothing.smooth import KINDS, smooth
+from estimators.track import GATED
+from estimators.tuning import Tuning
+from tests.estimators.linear_models import JointGaussian, random_linear, random_log
+from tests.support import SECOND
+
+GAUSSIAN = [name for name in KINDS if ESTIMATORS[name].family == "Gaussian" and name != "kf-steady"]
+CASES = [(nx, nu, seed) for nx, nu in ((1, 0), (3, 2), (5, 1)) for seed in range(3)]
+CORRELATED = 2
+"""The seed of a case whose sensors' rows are correlated."""
+
+
+def close(actual, expected, what):
+    scale = max(1e-3, float(np.max(np.abs(expected))))
+    error = float(np.max(np.abs(np.asarray(actual) - expected))) / scale
+    assert error < 1e-9, f"{what}: off by {error:.1e} of {scale:.3g}"
+
+
+def pairs_of(nx):
+    return np.stack(np.triu_indices(nx, 1), axis=1)
+
+
+def moments(smoothed, nx):
+    """Means (N, nx) and covariances (N, nx, nx) of what was smoothed with all pairs."""
+    cov = np.empty((len(smoothed.mean), nx, nx))
+    cov[:, range(nx), range(nx)] = smoothed.std**2
+    i, j = np.triu_indices(nx, 1)
+    cov[:, i, j] = cov[:, j, i] = smoothed.cross
+    return smoothed.mean, cov
+
+
+def smoothed_by(estimator, model, tuning, log):
+    fold = Fold(estimator, model, tuning, log, pairs=pairs_of(model.nx))
+    fold.advance()
+    return moments(smooth(fold), model.nx)
+
+
+@cache
+def case(nx, nu, seed):
+    rng = np.random.default_rng([nx, nu, seed])
+    matrices = random_linear(rng, nx, nu, correlated=seed == CORRELATED)
+    log = random_log(rng, matrices, events=40)
+    return matrices, log, JointGaussian(matrices, log)
+
+
+@pytest.mark.parametrize("estimator", GAUSSIAN)
+@pytest.mark.parametrize(("nx", "nu", "seed"), CASES)
+def test_smoothed_moments(estimator, nx, nu, seed):
+    matrices, log, joint = case(nx, nu, seed)
+    mean, cov = smoothed_by(estimator, matrices.model, Tuning.of(matrices.model), log)
+    expected_mean, expected_cov = joint.smoothed(np.ones(3, bool))
+    close(mean, expected_mean, "mean")
+    close(cov, expected_cov, "covariance")
+
+
+@pytest.mark.parametrize("estimator", GAUSSIAN)
+def test_a_sensor_held_out_says_nothing(estimator):
+    matrices, log, joint = case(3, 2, 0)
+    mean, cov = smoothed_by(estimator, matrices.model, Tuning.of(matrices.model).set("use.second", False), log)
+    expected_mean, expected_cov = joint.smoothed(np.array([True, False, True]))
+    close(mean, expected_mean, "mean")
+    close(cov, expected_cov, "covariance")
+
+
+@pytest.mark.parametrize("estimator", [name for name in GAUSSIAN if ESTIMATORS[name].singular])
+def test_states_that_are_certain_at_first(estimator):
+    rng = np.random.default_rng(7)
+    matrices = random_linear(rng, 3, 1, certain=True)
+    log = random_log(rng, matrices, events=40)
+    mean, cov = smoothed_by(estimator, matrices.model, Tuning.of(matrices.model), log)
+    expected_mean, expected_cov = JointGaussian(matrices, log).smoothed(np.ones(3, bool))
+    close(mean, expected_mean, "mean")
+    close(cov, expected_cov, "covariance")
+
+
+# A body that moves at a speed which wanders: F and Q of two steps are those of one, so that queries between two
+# readings, steps no longer than the model allows, and the dense solution speak of the same process.
+
+
+def f(x, u, p, dt, out):
+    out[0] = x[0] + dt * x[1]
+    out[1] = x[1]
+
+
+def Q(x, u, p, q, dt, out):
+    out[0, 0] = q[0] * dt**3 / 3.0
+    out[0, 1] = out[1, 0] = q[0] * dt**2 / 2.0
+    out[1, 1] = q[0] * dt
+
+
+def h(x, u, p, out):
+    out[0] = x[0]
+
+
+VARIANCE, START = 0.25, (np.array([1.0, -0.5]), np.diag([4.0, 1.0]))
+BODY = StateSpaceModel(
+    name="body",
+    title="a body whose speed wanders",
+    states=(State("place", "m", mean=1.0, std=2.0), State("speed", "m/s", mean=-0.5, std=1.0)),
+    noises=(Noise("push", "m²/s³", variance=0.3),),
+    sensors=(Sensor("place", (Row("place", "m", variance=VARIANCE),), h=h),),
+    f=f,
+    Q=Q,
+    linear=True,
+    max_step=0.4,
+)
+
+
+def moved(dt):
+    return np.array([[1.0, dt], [0.0, 1.0]]), 0.3 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+
+
+class Chain:
+    """States at times, one Gaussian: what joins them, and readings of the place. Solved at once."""
+
+    def __init__(self, mean, cov):
+        self._F, self._c, self._Q, self._read = [np.zeros((2, 2))], [mean], [cov], []
+
+    def go_on(self, F, Q, c=(0.0, 0.0)):
+        self._F.append(F)
+        self._Q.append(Q)
+        self._c.append(np.array(c))
+
+    def read(self, y):
+        self._read.append((len(self._F) - 1, y))
+
+    def solved(self):
+        K = len(self._F)
+        M = np.eye(2 * K)
+        for k in range(1, K):
+            M[2 * k : 2 * k + 2, 2 * k - 2 : 2 * k] = -self._F[k]
+        inverse = np.linalg.inv(M)
+        mean, cov = inverse @ np.concatenate(self._c), inverse @ block_diag(*self._Q) @ inverse.T
+        H = np.zeros((len(self._read), 2 * K))
+        for i, (k, _) in enumerate(self._read):
+            H[i, 2 * k] = 1.0
+        S = H @ cov @ H.T + VARIANCE * np.eye(len(H))
+        gain = np.linalg.solve(S, H @ cov).T
+        mean = mean + gain @ (np.array([y for _, y in self._read]) - H @ mean)
+        cov = cov - gain @ H @ cov
+        return mean.reshape(-1, 2), np.array([cov[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(K)])
+
+
+def body_log(events):
+    log = Log.of(BODY)
+    log.extend(Events.concat(events, 1))
+    return log
+
+
+def reading(t, y):
+    return Events.one(round(t * SECOND), 0, READING, 0, [y], 1)
+
+
+def query(t):
+    return Events.one(round(t * SECOND), 0, TICK, 0, [], 1)
+
+
+TIMES = (0.0, 0.5, 0.5, 1.75, 3.0, 3.25)
+PLACES = (0.7, 0.1, 0.4, -1.2, 0.3, 1.1)
+
+
+@pytest.mark.parametrize("estimator", GAUSSIAN)
+def test_queries_between_readings_and_steps_within(estimator):
+    asked = (0.5, 0.6, 1.0, 1.0, 1.75, 2.9, 3.25, 4.0)
+    events = [reading(t, y) for t, y in zip(TIMES, PLACES, strict=True)] + [query(t) for t in asked]
+    log = body_log(events)
+    chain, clock = Chain(*START), 0.0
+    for t, kind, value in zip(log.t[: log.n] / SECOND, log.kind[: log.n], log.value[: log.n, 0], strict=True):
+        chain.go_on(*moved(t - clock))
+        clock = t
+        if kind == READING:
+            chain.read(value)
+    mean, cov = smoothed_by(estimator, BODY, Tuning.of(BODY), log)
+    expected_mean, expected_cov = chain.solved()
+    close(mean, expected_mean[1:], "mean")
+    close(cov, expected_cov[1:], "covariance")
+
+
+@pytest.mark.parametrize("estimator", GAUSSIAN)
+def test_a_reset_and_a_maintenance(estimator):
+    """What comes after a reset says nothing of before; a part that was changed, nothing of the part before it."""
+    changed, reset = 1.0, 2.0
+    events = [reading(t, y) for t, y in zip(TIMES, PLACES, strict=True)]
+    events += [maintained(round(changed * SECOND), 0, (1,), 1), query(0.8), query(1.0), query(1.2), query(1.9)]
+    events += [Events.one(round(reset * SECOND), 0, RESET, 0, [], 1), query(2.5)]
+    log = body_log(events)
+    fold = Fold(estimator, BODY, Tuning.of(BODY), log)
+    fold.advance()
+    chains, clock = [Chain(*START)], 0.0
+    for i in range(log.n):
+        t = log.t[i] / SECOND
+        if log.kind[i] == RESET:
+            chains.append(Chain(*START))
+        else:
+            chains[-1].go_on(*moved(t - clock))
+        if log.kind[i] == READING:
+            chains[-1].read(log.value[i, 0])
+        clock = t
+        if t == changed and log.t[i + 1] > log.t[i]:
+            # The filter keeps the mean of what it no longer knows.
+            chains[-1].go_on(np.diag([1.0, 0.0]), np.diag([0.0, START[1][1, 1]]), (0.0, fold.track.mean[i, 1]))
+    (first, first_cov), (second, second_cov) = (chain.solved() for chain in chains)
+    # Of the two states at the maintenance the row shows the later; the first is the prior.
+    at = int(np.flatnonzero(log.t[: log.n] == changed * SECOND)[-1]) + 1
+    mean, cov = moments(smooth_with_pairs(estimator, log), 2)
+    close(mean, np.vstack((np.delete(first, at, 0)[1:], second)), "mean")
+    close(cov, np.concatenate((np.delete(first_cov, at, 0)[1:], second_cov)), "covariance")
+
+
+def smooth_with_pairs(estimator, log, tuning=None):
+    fold = Fold(estimator, BODY, tuning or Tuning.of(BODY), log, pairs=pairs_of(2))
+    fold.advance()
+    return smooth(fold)
+
+
+def long_log(n=3000, seed=3, jump=0.0):
+    rng = np.random.default_rng(seed)
+    t = np.cumsum(rng.integers(1, 40, n)) * (SECOND // 100)
+    y = np.cumsum(rng.normal(0, 0.3, n)) + np.where(np.arange(n) < n // 2, 0.0, jump)
+    log = Log.of(BODY)
+    readings = Events(t, t, np.full(n, READING, np.int8), np.zeros(n, np.int32), y.reshape(n, 1))
+    asked = readings.select(np.arange(0, n, 3))
+    between = asked._replace(t=asked.t + SECOND // 300, kind=np.full(asked.t.size, TICK, np.int8))
+    at = asked._replace(kind=np.full(asked.t.size, TICK, np.int8))
+    log.extend(Events.concat([readings, between, at], 1))
+    return log
+
+
+@pytest.mark.parametrize("notes", [10_000, 1])
+@pytest.mark.parametrize("estimator", ["kf", "sr-ukf"])
+def test_the_memory_is_bounded_and_the_bits_are_the_same(estimator, notes, monkeypatch):
+    log = long_log()
+    whole = smooth_with_pairs(estimator, log)
+    rooms = []
+    made = moments_back.Recorder
+
+    def noting(*given):
+        rooms.append(given[-1])
+        return made(*given)
+
+    monkeypatch.setattr(moments_back, "Recorder", noting)
+    monkeypatch.setattr(walk, "ROOM", notes)
+    for one, other in zip(whole, smooth_with_pairs(estimator, log), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert rooms[0] < 100
+
+
+def test_the_fold_stays_as_it_is():
+    log = long_log(500)
+    fold = Fold("ukf", BODY, Tuning.of(BODY), log)
+    fold.advance(300)
+    before, state = fold.track.copy(), fold.moments()
+    smooth(fold)
+    for one, other in zip(before, fold.track, strict=True):
+        np.testing.assert_array_equal(one, other)
+    for one, other in zip(state, fold.moments(), strict=True):
+        np.testing.assert_array_equal(one, other)
+    fold.advance()
+    whole = Fold("ukf", BODY, Tuning.of(BODY), log)
+    whole.advance()
+    np.testing.assert_array_equal(whole.track.mean, fold.track.mean)
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "sr-kf"])
+def test_a_twin_that_was_found_wrong(estimator):
+    """The readings that were refused at first speak, and the widening before them lets the place jump."""
+    log = long_log(400, jump=60.0)
+    tuning = Tuning.of(BODY).set("gate", 0.999).set("gate.reopen", 3.0)
+    fold = Fold(estimator, BODY, tuning, log, pairs=pairs_of(2))
+    fold.advance()
+    (decision,) = [d for d in fold.decisions if d.outcome in ("reopened", "believed")]
+    refused = np.flatnonzero(fold.track.verdict == GATED)
+    assert decision.first == refused[0] and decision.row > refused[0] + 1
+    story = fold.second_story(decision.first, decision.row + 1, 0)
+    chain, clock = Chain(*START), log.t[0] / SECOND
+    for i in range(log.n):
+        t = log.t[i] / SECOND
+        F, noise = moved(t - clock)
+        if i == decision.first:
+            noise = noise + F @ np.diag(story.widened**2) @ F.T
+        chain.go_on(F, noise)
+        if log.kind[i] == READING and (i not in refused or decision.first <= i <= decision.row):
+            chain.read(log.value[i, 0])
+        clock = t
+    expected_mean, expected_cov = chain.solved()
+    mean, cov = moments(smooth(fold), 2)
+    close(mean, expected_mean[1:], "mean")
+    close(cov, expected_cov[1:], "covariance")
+
+
+def test_a_filter_without_a_smoother_is_refused():
+    with pytest.raises(EstimatorError, match="filterpy-kf cannot be smoothed"):
+        smooth(Fold("filterpy-kf", BODY, Tuning.of(BODY), long_log(10)))

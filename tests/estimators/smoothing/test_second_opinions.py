@@ -1,0 +1,139 @@
+"""Other people's smoothers on the same data: statsmodels' and FilterPy's, of linear models and by sigma points."""
+
+import numpy as np
+import pytest
+from filterpy.kalman import JulierSigmaPoints, KalmanFilter, UnscentedKalmanFilter
+from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
+
+from estimators import ESTIMATORS, Log, fold
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.smoothing.smooth import KINDS
+from tests.estimators.smoothing.test_dense import BODY, START, VARIANCE, moved
+
+DT, N = 0.3, 300
+
+
+def drive(seed=0):
+    rng = np.random.default_rng(seed)
+    F, Q = moved(DT)
+    x, ys = rng.multivariate_normal(*START), []
+    for _ in range(N):
+        ys.append(x[0] + rng.normal(0, np.sqrt(VARIANCE)))
+        x = F @ x + rng.multivariate_normal(np.zeros(2), Q)
+    return np.array(ys)
+
+
+def smoothed(estimator, model, ys, **settings):
+    log = Log.of(model)
+    log.add(model.sensor_names[0], DT * np.arange(ys.size), ys)
+    return fold(estimator, model, log, covariance=True, smoothed=True, **settings)
+
+
+@pytest.mark.parametrize(
+    "estimator", [name for name in KINDS if name.endswith("kf") and ESTIMATORS[name].family == "Gaussian"]
+)
+def test_statsmodels_on_a_linear_model(estimator):
+    ys = drive()
+    ys[40:60] = np.nan
+    F, Q = moved(DT)
+    # Tolerance 0: it would take a covariance that hardly changes for the steady one.
+    its = KalmanSmoother(1, 2, design=[[1.0, 0.0]], transition=F, selection=np.eye(2), tolerance=0.0)
+    its["state_cov"], its["obs_cov"] = Q, [[VARIANCE]]
+    its.bind(ys[:, None])
+    its.initialize_known(*START)
+    expected = its.smooth()
+    ours = smoothed(estimator, BODY, ys)
+    # 300 steps, rounded at each, of numbers of order 10.
+    np.testing.assert_allclose(ours.mean, expected.smoothed_state.T, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(ours.cov, expected.smoothed_state_cov.transpose(2, 0, 1), rtol=0, atol=1e-9)
+
+
+def test_filterpy_on_a_linear_model():
+    ys = drive(1)
+    F, Q = moved(DT)
+    its = KalmanFilter(2, 1)
+    its.x, its.P, its.F, its.Q = START[0][:, None].copy(), START[1].copy(), F, Q
+    its.H, its.R = np.array([[1.0, 0.0]]), np.array([[VARIANCE]])
+    means, covs = [], []
+    for k, y in enumerate(ys):
+        if k:
+            its.predict()
+        its.update(y)
+        means.append(its.x.copy())
+        covs.append(its.P.copy())
+    expected, cov, _, _ = its.rts_smoother(np.array(means), np.array(covs))
+    ours = smoothed("kf", BODY, ys)
+    np.testing.assert_allclose(ours.mean, expected[:, :, 0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(ours.cov, cov, rtol=0, atol=1e-9)
+
+
+def swing(x, u, p, dt, out):
+    out[0] = x[0] + dt * x[1]
+    out[1] = x[1] - dt * 9.8 * np.sin(x[0])
+
+
+def height(x, u, p, out):
+    out[0] = np.sin(x[0])
+
+
+def swing_noise(x, u, p, q, dt, out):
+    out[0, 0] = q[0] * dt**3 / 3.0
+    out[0, 1] = out[1, 0] = q[0] * dt**2 / 2.0
+    out[1, 1] = q[0] * dt
+
+
+PENDULUM = StateSpaceModel(
+    name="swing",
+    title="a pendulum whose height is read, as Särkkä has it",
+    states=(State("angle", "rad", mean=1.5, std=np.sqrt(0.1)), State("rate", "rad/s", std=np.sqrt(0.1))),
+    noises=(Noise("push", "rad²/s³", variance=0.01),),
+    sensors=(Sensor("height", (Row("height", "m", variance=0.1),), h=height),),
+    f=swing,
+    Q=swing_noise,
+)
+
+
+def test_filterpy_by_sigma_points():
+    """Their cross-covariance is the sum over the points too; on a curved model the tangent's is another."""
+    dt, n = 0.05, 120
+    rng = np.random.default_rng(2)
+    x, ys = np.array([1.5, 0.0]), []
+    for _ in range(n):
+        out = np.empty(2)
+        swing(x, None, None, dt, out)
+        x = out + rng.normal(0, [1e-3, 0.02])
+        ys.append(np.sin(x[0]) + rng.normal(0, np.sqrt(0.1)))
+
+    def fx(state, step):
+        out = np.empty(2)
+        swing(state, None, None, step, out)
+        return out
+
+    its = UnscentedKalmanFilter(2, 1, dt, lambda s: np.sin(s[:1]), fx, JulierSigmaPoints(2, kappa=1.0))
+    its.x, its.P, its.R = np.array([1.5, 0.0]), 0.1 * np.eye(2), np.array([[0.1]])
+    its.Q = 0.01 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+    means, covs = [], []
+    for k, y in enumerate(ys):
+        if k:
+            its.predict()
+        # FilterPy would reuse the points of the prediction, without the noise that came since.
+        its.sigmas_f = its.points_fn.sigma_points(its.x, its.P)
+        its.update(np.array([y]))
+        means.append(its.x.copy())
+        covs.append(its.P.copy())
+    expected, cov, _ = its.rts_smoother(np.array(means), np.array(covs))
+    log = Log.of(PENDULUM)
+    log.add("height", dt * np.arange(n), np.array(ys))
+    for estimator in ("ukf", "sr-ukf"):
+        ours = fold(estimator, PENDULUM, log, covariance=True, smoothed=True, alpha=1.0, beta=0.0, kappa=1.0)
+        np.testing.assert_allclose(ours.mean, expected, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(ours.cov, cov, rtol=0, atol=1e-9)
+
+
+def test_the_steady_filter_is_smoothed_as_the_kalman_filter_once_it_has_settled():
+    ys = drive(3)
+    steady = smoothed("kf-steady", BODY, ys, period=DT)
+    exact = smoothed("kf", BODY, ys)
+    # Its gain is that of the covariance from some dozen readings on; at first it is another, and the smoother's too.
+    np.testing.assert_allclose(steady.mean[60:], exact.mean[60:], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(steady.std[60:], exact.std[60:], rtol=0, atol=1e-6)
