@@ -125,7 +125,20 @@ export class Fit {
     if (!Object.keys(told.values).length) return [];
     const late = told.current ? null : `It was fitted from run ${told.revision}; another runs now`;
     const use = element("button", { type: "button", id: "fit-use", class: proposed ? "go first" : "go quiet", disabled: Boolean(late), title: late ?? "One edit, which U takes back", onclick: () => this.use(told) }, proposed ? "Use it" : "use it all the same: it did not win");
-    return [use, late ? element("span", { class: "faint" }, late) : null].filter(Boolean);
+    return [use, ...(proposed ? this.keeping(told) : []), late ? element("span", { class: "faint" }, late) : null].filter(Boolean);
+  }
+
+  // Under a name, whether it is put in or not.
+  keeping(told) {
+    const name = element("input", { type: "text", id: "fit-name", "aria-label": "Name of the version", placeholder: "name", maxlength: 60, value: `fit-${told.number}` });
+    const keep = async () => {
+      const note = `fitted: ${told.wanted.join(", ")}`;
+      const answer = await fetch("/api/fit/keep", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ name: name.value.trim(), note }) }).catch(() => null);
+      this.say(answer?.ok ? "" : ((await answer?.json().catch(() => null))?.error ?? "the twin does not answer"));
+      setText(kept, answer?.ok ? `kept as ${name.value.trim()}, see Runs` : "");
+    };
+    const kept = element("span", { class: "faint", role: "status" });
+    return [element("span", { class: "space" }), name, element("button", { type: "button", id: "fit-keep", class: "go", title: "Beside the twin, with what it was worth on the blocks held out", onclick: keep }, "Keep as a version"), kept];
   }
 
   async use(told) {
