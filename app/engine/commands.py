@@ -31,7 +31,10 @@ class SetTuning:
 
 @dataclass(frozen=True)
 class SetTunings:
-    """Turn several entries of the tuning at once, by key: Q, R and parameters. One refold, one revision."""
+    """Turn several entries of the tuning at once, by key: Q, R, parameters, and `options.<name>` of the estimator.
+
+    One refold, one revision.
+    """
 
     values: Mapping[str, float]
 

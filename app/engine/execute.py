@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from estimators.errors import ConfigError, nearest, quoted
 from estimators.estimator import Estimator
@@ -33,6 +33,10 @@ Refolding = (
 """Commands that fold the history again."""
 
 
+OPTION = "options."
+"""Before an option's name among the keys of `SetTunings`."""
+
+
 def retuned(command: Refolding, engine: Running) -> tuple[str, Tuning]:
     """The estimator and the tuning that a command asks for.
 
@@ -51,11 +55,7 @@ def retuned(command: Refolding, engine: Running) -> tuple[str, Tuning]:
         _check(entry, engine, options)
         return entry.name, tuning.with_options(options)
     if isinstance(command, commands.SetOption):
-        entry = find_estimator(estimator, engine.model)
-        number = entry.complete({command.name: command.value})[command.name]
-        options = {**tuning.options, command.name: number}
-        _check(entry, engine, options)
-        return estimator, tuning.with_options(options)
+        return estimator, _with_options(estimator, tuning, {command.name: command.value}, engine)
     if isinstance(command, commands.UseSensor):
         names = engine.model.sensor_names
         if command.name not in names:
@@ -65,9 +65,21 @@ def retuned(command: Refolding, engine: Running) -> tuple[str, Tuning]:
     values = command.values if isinstance(command, commands.SetTunings) else {command.key: command.value}
     if not values:
         raise ConfigError("SetTunings: values is empty; it takes the value of each key")
+    given: dict[str, Any] = {key.removeprefix(OPTION): value for key, value in values.items() if key.startswith(OPTION)}
+    if given and isinstance(command, commands.SetTuning):
+        raise ConfigError(f"{command.key} is an option of the estimator; turn it with SetOption")
     for key, value in values.items():
-        tuning = tuning.set(key, value)
-    return estimator, tuning
+        if not key.startswith(OPTION):
+            tuning = tuning.set(key, value)
+    return estimator, _with_options(estimator, tuning, given, engine) if given else tuning
+
+
+def _with_options(estimator: str, tuning: Tuning, given: Mapping[str, Any], engine: Running) -> Tuning:
+    entry = find_estimator(estimator, engine.model)
+    known = entry.complete(given)
+    options = {**tuning.options, **{name: known[name] for name in given}}
+    _check(entry, engine, options)
+    return tuning.with_options(options)
 
 
 def _check(entry: Estimator, engine: Running, options: Mapping[str, float]) -> None:

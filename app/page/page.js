@@ -67,7 +67,7 @@ window.nisus.view = view;
 
 const side = new Tabs($("side-tabs"), "nisus.side");
 new Trust(model, link, (tab) => side.show(tab));
-const tune = new Tune(model, link);
+const tune = (window.nisus.tune = new Tune(model, link));
 new Faults($("faults"), model, link);
 new Episodes($("episodes"), link, view, charts);
 const runs = new Runs($("runs"), link);

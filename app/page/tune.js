@@ -2,6 +2,7 @@
 
 import { Around } from "./around.js";
 import { $, element, setAttribute, setText } from "./dom.js";
+import { Fit } from "./fit.js";
 import { Knob } from "./knob.js";
 import { words } from "./format.js";
 
@@ -30,6 +31,7 @@ export class Tune {
     }
     this.sections.append(this.gateSection(), this.sensorSection());
     this.around = new Around(model, link, this);
+    this.fit = new Fit(model, link, this);
     link.addEventListener("status", (event) => this.sync(event.detail));
   }
 

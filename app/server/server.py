@@ -38,6 +38,7 @@ from .api import Json, command_from_json, episodes_json, faults_json, one_line, 
 from .bounds import BODY
 from .door import Door
 from .export_api import ExportApi
+from .fit_api import FitApi
 from .model_json import model_json
 from .one_at_a_time import OneAtATime
 from .page_file import PAGE, page_file
@@ -88,6 +89,7 @@ class PageServer:
         self._choices = choices
         self._series = Series(engine)
         self._runs = RunsApi(engine)
+        self._fit = FitApi(engine)
         self._exports = ExportApi(engine, self._series, self._runs.scores)
         self._forecasts, self._diagnosis = Forecasts(engine), Diagnosis(engine)
         self._forecasting, self._diagnosing = OneAtATime("forecast"), OneAtATime("diagnosis")
@@ -121,6 +123,7 @@ class PageServer:
         """Compute nothing any more; close all connections and the port, if it is this twin's own."""
         self._stopping.set()
         self._runs.stop()
+        self._fit.stop()
         if self._own_door:
             self.door.stop()
 
@@ -143,6 +146,7 @@ class PageServer:
             Route("/api/model", self._model),
             Route("/api/episodes", self._episodes),
             *self._runs.routes(),
+            *self._fit.routes(),
             *TuningsApi(self._engine, self._runs.scores).routes(),
             *self._exports.routes(),
             Route("/api/recordings", self._list_recordings),

@@ -14,6 +14,7 @@ from estimators.errors import ConfigError, printable
 from estimators.fold import Fold
 from estimators.log import Log
 
+from ..engine.changes import difference
 from ..engine.interface import Running
 from ..engine.reload import obstacle
 from ..engine.revisions import LONGEST_NOTE
@@ -23,7 +24,7 @@ from ..tunings.keep import Settings, keep, version_text
 from ..tunings.listing import listing
 from ..twin.twin import with_version
 from .answer import answered
-from .api import Json
+from .api import Json, one_line
 
 
 class TuningsApi:
@@ -38,6 +39,7 @@ class TuningsApi:
             Route("/api/tunings", self._list),
             Route("/api/tunings", self._keep, methods=["POST"]),
             Route("/api/tunings/load", self._load, methods=["POST"]),
+            Route("/api/tunings/{name}/against", self._against),
         ]
 
     async def _list(self, request: Request) -> Response:
@@ -48,7 +50,7 @@ class TuningsApi:
         """Keep a run as a version, with what it was worth."""
 
         async def work(body: Any) -> Response:
-            return Json({"name": await asyncio.to_thread(self._kept, *_fields(body, run=int, name=str, note=str))})
+            return Json({"name": await asyncio.to_thread(self._kept, *fields_of(body, run=int, name=str, note=str))})
 
         return await answered(request, work)
 
@@ -68,19 +70,29 @@ class TuningsApi:
         keep(twin, name, version_text(twin, given))
         return name
 
+    async def _against(self, request: Request) -> Response:
+        """In which entries a version differs from what runs."""
+        try:
+            return Json(await asyncio.to_thread(self._differing, request.path_params["name"]))
+        except ConfigError as error:
+            return Json({"error": one_line(str(error))}, 404)
+
+    def _differing(self, name: str) -> list[dict[str, Any]]:
+        tuning, estimator = self._engine.folded_with()
+        twin = with_version(self._engine.twin, _listed(name))
+        differ = difference(twin.estimator, twin.tuning, estimator, tuning)
+        return [{"key": change.key, "values": [change.before, change.after]} for change in differ]
+
     async def _load(self, request: Request) -> Response:
         """Go on with a version; the history is folded again with it."""
 
         async def work(body: Any) -> Response:
-            return Json({"name": await asyncio.to_thread(self._loaded, *_fields(body, name=str))})
+            return Json({"name": await asyncio.to_thread(self._loaded, *fields_of(body, name=str))})
 
         return await answered(request, work)
 
     def _loaded(self, name: str) -> str:
-        if not NAME.fullmatch(name) or name.endswith((".yaml", ".yml")):
-            # A path: a page chooses among what is beside the twin.
-            raise ConfigError(f"{name}: no version is read from there; name one that /api/tunings lists")
-        twin = with_version(self._engine.twin, name)
+        twin = with_version(self._engine.twin, _listed(name))
         reason = obstacle(self._engine.twin, twin)
         if reason is not None:
             raise ConfigError(f"{name}: {reason}; start the twin with --tuning {name}")
@@ -90,7 +102,14 @@ class TuningsApi:
         return name
 
 
-def _fields(body: Any, **kinds: type) -> list[Any]:
+def _listed(name: str) -> str:
+    """A name, no path: a page chooses among what is beside the twin."""
+    if not NAME.fullmatch(name) or name.endswith((".yaml", ".yml")):
+        raise ConfigError(f"{name}: no version is read from there; name one that /api/tunings lists")
+    return name
+
+
+def fields_of(body: Any, **kinds: type) -> list[Any]:
     """The fields of a request, in their order.
 
     Raises:

@@ -1,0 +1,127 @@
+"""A fit over HTTP: begun, looked at, given up, and kept as a version."""
+
+from __future__ import annotations
+
+import asyncio
+from math import isfinite
+from typing import TYPE_CHECKING, Any
+
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+
+from estimators.errors import ConfigError, printable
+
+from ..engine.interface import Running
+from ..engine.revisions import LONGEST_NOTE
+from ..runs.fitting import Attempt, Fitting
+from ..runs.window import ALL
+from ..tunings.figures import COVERAGE, LIKELIHOOD, RMSE
+from ..tunings.keep import Settings, keep, version_text
+from .answer import answered
+from .api import Json, one_line
+from .tunings_api import fields_of
+
+if TYPE_CHECKING:
+    from estimators.fit.judge import Part
+
+
+class FitApi:
+    """The route, and the thread behind it."""
+
+    def __init__(self, engine: Running) -> None:
+        self._engine = engine
+        self.fitting = Fitting(engine)
+
+    def stop(self) -> None:
+        """End what is under way."""
+        self.fitting.stop()
+
+    def routes(self) -> list[Route]:
+        """What is served."""
+        return [
+            Route("/api/fit", self._fit, methods=["GET", "POST", "DELETE"]),
+            Route("/api/fit/keep", self._keep, methods=["POST"]),
+        ]
+
+    async def _fit(self, request: Request) -> Response:
+        if request.method == "POST":
+            return await answered(request, self._begin)
+        if request.method == "DELETE":
+            self.fitting.cancel()
+        return Json(self._state())
+
+    async def _begin(self, body: Any) -> Response:
+        """`{"wanted": ["Q", "R.winding"], "events": 20000}`; without `events` over all that is there."""
+        if not isinstance(body, dict) or not body.keys() <= {"wanted", "events"}:
+            raise ConfigError('fit: the body must be like {"wanted": ["Q", "R"], "events": 20000}')
+        wanted, events = body.get("wanted"), body.get("events")
+        if not isinstance(wanted, list) or not all(isinstance(key, str) for key in wanted):
+            raise ConfigError('fit: wanted must be a list of keys, like ["Q", "R.winding"]')
+        if events is not None and (not isinstance(events, int) or isinstance(events, bool) or events < 1):
+            raise ConfigError("fit: events must be a positive whole number, or be left out for all")
+        self.fitting.begin(list(dict.fromkeys(wanted)), events)
+        return Json(self._state(), 202)
+
+    async def _keep(self, request: Request) -> Response:
+        """Keep what the last fit found as a tuning version, with what it was worth on the blocks held out."""
+
+        async def work(body: Any) -> Response:
+            return Json({"name": await asyncio.to_thread(self._kept, *fields_of(body, name=str, note=str))})
+
+        return await answered(request, work)
+
+    def _kept(self, name: str, note: str) -> str:
+        twin, attempt = self._engine.twin, self.fitting.latest
+        if attempt is None or attempt.fitted is None:
+            raise ConfigError("fit: there is no result to keep; fit first")
+        if len(note) > LONGEST_NOTE:
+            raise ConfigError(f"note: it has {len(note)} characters; it may have {LONGEST_NOTE}")
+        given = Settings(
+            attempt.estimator,
+            attempt.fitted.setting.tuning,
+            note=printable(note),
+            fitted_on=[f"{attempt.events} events over {attempt.seconds:.4g} s, from run {attempt.revision}"],
+            scores=_scores(attempt.fitted.after.held_out),
+            model_version=self._engine.status().model_version,
+        )
+        keep(twin, name, version_text(twin, given))
+        return name
+
+    def _state(self) -> dict[str, Any]:
+        """`available` events there are to fit to; `current` is whether what runs is what it was fitted from."""
+        engine, attempt = self._engine, self.fitting.latest
+        there = {"available": engine.index_at(ALL) - engine.rows(0, 0).first}
+        if attempt is None:
+            return {"state": "none"} | there
+        return attempt_json(attempt) | there | {"current": engine.folded_with()[0] is attempt.tuning}
+
+
+def _scores(part: Part) -> dict[str, float]:
+    """Of the blocks held out, by the names that versions have."""
+    known = {LIKELIHOOD: part.log_density}
+    for name, item in (*part.sensors.items(), *part.states.items()):
+        known |= {f"{RMSE}.{name}": item.rms, f"{COVERAGE}.{name}": item.coverage}
+    return {name: float(value) for name, value in known.items() if isfinite(value)}
+
+
+def attempt_json(attempt: Attempt) -> dict[str, Any]:
+    """A fit as JSON; `values` are those by which the tuning would be turned, by key."""
+    told: dict[str, Any] = {
+        "number": attempt.number,
+        "state": attempt.state,
+        "wanted": list(attempt.wanted),
+        "estimator": attempt.estimator,
+        "revision": attempt.revision,
+        "events": attempt.events,
+        "seconds": attempt.seconds,
+        "folds": attempt.folds,
+        "elapsed": attempt.elapsed,
+        "reason": one_line(attempt.reason),
+    }
+    if attempt.fitted is None:
+        return told
+    from ..runs.fit_json import fit_json
+
+    values = {line.key: line.after for line in attempt.fitted.lines if not line.alone}
+    return told | {"result": fit_json(attempt.fitted), "values": values}
