@@ -467,7 +467,7 @@ def check_numbers(command: type, words: Sequence[str]) -> None:
         ConfigError: With the option and the value.
     """
     hints = get_type_hints(command)
-    for word, after in zip(words, [*words[1:], ""], strict=True):
+    for word, after in zip(words, [*words[1:], ""], strict=False):
         option, equals, given = word.partition("=")
         value = given if equals else after
         hint = hints.get(option.removeprefix("--").replace("-", "_")) if option.startswith("--") else None

@@ -1,4 +1,7 @@
-"""Fit and versions on the page: a noise that is wrong is found, put in as one edit and taken back; what does not win is not offered."""
+"""Fit and versions on the page: a noise that is wrong is found, put in as one edit and taken back.
+
+What does not win on the blocks held out is not offered.
+"""
 
 import json
 
