@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimators.errors import EstimatorError
+from estimators.errors import EstimatorError, NisusError
+from estimators.fold import Fold
 from estimators.registry import checked, find_entry
 
 from .claim import UNTOLD, YES, Claim
-from .measured import Measured
+from .measured import Measured, likelihood_of
 from .words import bytes_text, digits
 
 PREFERRED = ("ensrf", "letkf", "etkf", "enkf")
@@ -23,7 +24,7 @@ INFLATION = (1.0, 1.02, 1.05, 1.1)
 MARGIN = 0.01
 """Nats a value; what is less likely by no more than this is as good, and the cheaper one is taken."""
 
-BUDGET = 4.0
+BUDGET = 2.0
 """Seconds of one processor for each fold of the sweep."""
 
 
@@ -45,7 +46,7 @@ def _best(
     measured: Measured, estimator: str, options: dict[str, float], name: str, values: list[float], question: str
 ) -> Claim:
     """Try the values of one option, the others as they are; the first within the margin of the best is taken."""
-    found = [_likelihood(measured, estimator, {**options, name: value}) for value in values]
+    found = _likelihoods(measured, estimator, [{**options, name: value} for value in values])
     of = f"{name} of {estimator}, the likeliest within {MARGIN:g} nats a value"
     if not np.any(np.isfinite(found)):
         return Claim(name, question, UNTOLD, None, None, of, f"{estimator} fails with every {name}")
@@ -63,10 +64,17 @@ def _best(
     return Claim(name, question, YES, chosen, best, of, reason)
 
 
-def _likelihood(measured: Measured, estimator: str, options: dict[str, float]) -> float:
-    """Mean log-likelihood of a value."""
+def _likelihoods(measured: Measured, estimator: str, tried: list[dict[str, float]]) -> list[float]:
+    """Mean log-likelihood of a value, over the events that all of them folded within the budget."""
+    folds: list[Fold | None] = []
+    for options in tried:
+        try:
+            folds.append(measured.folded(estimator, options, BUDGET).fold)
+        except NisusError:
+            folds.append(None)
+    n = min((fold.n for fold in folds if fold is not None), default=0)
     rows = max(len(sensor.rows) for sensor in measured.twin.model.sensors)
-    return measured.likelihood(estimator, options, BUDGET) / rows
+    return [-np.inf if fold is None else likelihood_of(fold, n) / rows for fold in folds]
 
 
 def _radii(measured: Measured, estimator: str) -> list[float]:

@@ -84,14 +84,13 @@ class Measured:
             self._folds[key] = self._fold(estimator, given, budget)
         return self._folds[key]
 
-    def likelihood(self, estimator: str, options: Mapping[str, float] | None = None, budget: float = BUDGET) -> float:
-        """Log-likelihood of a reading, the mean over those used and refused, nats; minus infinity where it fails."""
+    def likelihood(self, estimator: str) -> float:
+        """As `likelihood_of` a fold of the log; minus infinity where it fails."""
         try:
-            fold = self.folded(estimator, options, budget).fold
+            fold = self.folded(estimator).fold
         except NisusError:
             return -np.inf
-        found = score(fold.track, fold.log.events, fold.model, (), gate=fold.tuning.gate)
-        return found.log_likelihood / max(1, found.readings + found.gated)
+        return likelihood_of(fold, fold.n)
 
     def _fold(self, estimator: str, options: Mapping[str, float], budget: float) -> Folded:
         twin, log = self.twin, self.log
@@ -109,3 +108,10 @@ class Measured:
         fold.log.n = fold.n
         readings = int(np.sum(log.kind[: fold.n] == READING))
         return Folded(fold, (time.process_time() - begun) / max(1, readings))
+
+
+def likelihood_of(fold: Fold, n: int) -> float:
+    """Log-likelihood of a reading, the mean over those used and refused among the first n events, nats."""
+    part = slice(0, n)
+    found = score(fold.track.select(part), fold.log.events.select(part), fold.model, (), gate=fold.tuning.gate)
+    return found.log_likelihood / max(1, found.readings + found.gated)

@@ -40,7 +40,7 @@ def as_text(twin: Twin, log: Log, told: Advice) -> list[str]:
 
 def _lower(title: str) -> str:
     """A title within a sentence."""
-    return title[0].lower() + title[1:] if title[1:2].islower() and not title.startswith("Kalman") else title
+    return title if title.startswith(("Kalman", "Rao")) else title[0].lower() + title[1:]
 
 
 def _wrapped(text: str, indent: int) -> list[str]:
