@@ -1,7 +1,4 @@
-"""Fit and versions on the page: a noise that is wrong is found, put in as one edit and taken back.
-
-What does not win on the blocks held out is not offered.
-"""
+"""Fit and versions on the page: what is wrong is found, put in as one edit and taken back; what loses is not offered."""
 
 import json
 
