@@ -1,4 +1,4 @@
-"""A fit over HTTP: begun, looked at, given up, and kept as a version."""
+"""A fit over HTTP: begun, looked at, given up, and kept as a version; and advice on the estimator."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from estimators.errors import ConfigError, printable
 
 from ..engine.interface import Running
 from ..engine.revisions import LONGEST_NOTE
+from ..runs.advising import DONE, Advising
 from ..runs.fitting import Attempt, Fitting
 from ..runs.window import ALL
 from ..tunings.figures import COVERAGE, LIKELIHOOD, RMSE
@@ -32,6 +33,7 @@ class FitApi:
     def __init__(self, engine: Running) -> None:
         self._engine = engine
         self.fitting = Fitting(engine)
+        self._advising = Advising(engine)
 
     def stop(self) -> None:
         """End what is under way."""
@@ -42,6 +44,7 @@ class FitApi:
         return [
             Route("/api/fit", self._fit, methods=["GET", "POST", "DELETE"]),
             Route("/api/fit/keep", self._keep, methods=["POST"]),
+            Route("/api/advice", self._advice, methods=["GET", "POST"]),
         ]
 
     async def _fit(self, request: Request) -> Response:
@@ -70,6 +73,22 @@ class FitApi:
             return Json({"name": await asyncio.to_thread(self._kept, *fields_of(body, name=str, note=str))})
 
         return await answered(request, work)
+
+    async def _advice(self, request: Request) -> Response:
+        """Which estimator the log speaks for; begun by a post."""
+
+        async def begin(body: Any) -> Response:
+            fields_of(body)
+            self._advising.begin()
+            return Json(self._advised(), 202)
+
+        return await answered(request, begin) if request.method == "POST" else Json(self._advised())
+
+    def _advised(self) -> dict[str, Any]:
+        found = self._advising
+        current = found.revision == self._engine.revisions.runs[-1].number
+        told = {"state": found.state, "revision": found.revision, "current": current, "reason": one_line(found.reason)}
+        return told | ({"advice": found.told} if found.state == DONE else {})
 
     def _kept(self, name: str, note: str) -> str:
         twin, attempt = self._engine.twin, self.fitting.latest

@@ -1,4 +1,4 @@
-"""Fit and versions on the page: what is wrong is found, put in as one edit and taken back; what loses is not offered."""
+"""Fit and versions on the page: what is wrong is found, put in as one edit and undone; what loses is not offered."""
 
 import json
 

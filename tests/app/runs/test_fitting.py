@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from app.engine.engine import Engine
-from app.runs import fitting as module
 from app.runs.fitting import CANCELLED, DONE, FAILED, Fitting
+from app.runs.history import PIECE
 from estimators.errors import ConfigError
 from estimators.fit.fit import Given, fit
 from estimators.log import Log
@@ -56,7 +56,7 @@ def alone(n):
 
 def test_what_is_fitted_beside_the_twin_is_the_fit_of_its_log(started):
     # More than one piece is copied.
-    n = module.PIECE + 900
+    n = PIECE + 900
     engine = started(n)
     fitting = Fitting(engine)
     fitting.begin(WANTED)
