@@ -19,6 +19,7 @@ from estimators.tuning import Tuning
 
 from ..engine.integrity import LOWEST
 from ..engine.interface import Running
+from ..twin.bounds import bounds_of
 from .history import history
 
 if TYPE_CHECKING:
@@ -128,6 +129,7 @@ class Fitting:
                 attempt.tuning,
                 [Given(log, base=base)],
                 wanted=attempt.wanted,
+                bounds=bounds_of(self._engine.twin.config, self._engine.model),
                 go=lambda folds: self._count(attempt, folds),
             )
         except Cancelled:
