@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 from config.loader import shipped
 from estimators.errors import ConfigError
 
+from ..advice.advice_json import advice_json
 from ..advice.lines import apply, lines
 from ..advice.measured import Measured
 from ..advice.verdict import Advice
 from ..advice.verdict import advise as verdict
 from ..twin.twin import load_twin
-from .advise_text import as_dict, as_text
+from .advise_text import as_text
 from .arguments import settings
 from .fold import read_log
 from .prepare import attend, prepare
@@ -49,7 +50,7 @@ def _of_twin(arguments: Arguments, name: str) -> int:
     log, _ = read_log(twin, arguments.duration)
     told: Advice = attend(twin.model, lambda: verdict(Measured(twin, log)), "measuring")
     if arguments.json:
-        print(json.dumps(as_dict(twin, log, told), allow_nan=False))
+        print(json.dumps(advice_json(twin, log, told), allow_nan=False))
     else:
         print("\n".join(as_text(twin, log, told)))
     if arguments.apply or arguments.out is not None:

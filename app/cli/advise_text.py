@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import textwrap
-from typing import Any
 
 from estimators.log import READING, Log
 
@@ -11,7 +10,6 @@ from ..advice.lines import lines
 from ..advice.verdict import Advice
 from ..twin.twin import Twin
 from .check_text import WIDTH
-from .fold_report import number
 
 
 def as_text(twin: Twin, log: Log, told: Advice) -> list[str]:
@@ -45,31 +43,3 @@ def _lower(title: str) -> str:
 
 def _wrapped(text: str, indent: int) -> list[str]:
     return textwrap.wrap(text, WIDTH, initial_indent=" " * indent, subsequent_indent=" " * (indent + 2))
-
-
-def as_dict(twin: Twin, log: Log, told: Advice) -> dict[str, Any]:
-    """For scripts: `estimator`, `options`, `because`, `claims` with figure and threshold, `lines`, `remedies`."""
-    return {
-        "twin": twin.name,
-        "has": twin.estimator,
-        "seconds": float(log.t[log.n - 1] - log.t[0]) * 1e-9,
-        "estimator": told.estimator,
-        "options": told.options,
-        "because": list(told.because),
-        "reasons": told.reasons,
-        "claims": [
-            {
-                "key": claim.key,
-                "question": claim.question,
-                "answer": claim.answer,
-                "figure": None if claim.figure is None else number(claim.figure),
-                "threshold": None if claim.threshold is None else number(claim.threshold),
-                "of": claim.of,
-                "reason": claim.reason,
-                "remedy": claim.remedy,
-            }
-            for claim in told.claims
-        ],
-        "lines": lines(told),
-        "remedies": told.remedies,
-    }

@@ -13,9 +13,13 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class SetEstimator:
-    """Fold the history with another estimator of the catalogue, and go on with it."""
+    """Fold the history with another estimator of the catalogue, and go on with it.
+
+    With the options with which it was left, and these.
+    """
 
     name: str
+    options: Mapping[str, float] | None = None
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ def retuned(command: Refolding, engine: Running) -> tuple[str, Tuning]:
     estimator, tuning = engine.estimator, engine.tuning
     if isinstance(command, commands.SetEstimator):
         entry = find_estimator(command.name, engine.model)
-        options = engine.options_of(entry.name)
+        options = {**engine.options_of(entry.name), **(command.options or {})}
         _check(entry, engine, options)
         return entry.name, tuning.with_options(options)
     if isinstance(command, commands.SetOption):

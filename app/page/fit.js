@@ -1,9 +1,10 @@
 // Fit: a small panel beside the Tune column. What is fitted and over what, how far it is, and what came of it, which is
 // offered only if it won on what it had not seen.
 
-import { $, element, setText } from "./dom.js";
+import { element, setText } from "./dom.js";
 import { fitted } from "./fitted.js";
 import { span, words } from "./format.js";
+import { Panel } from "./panel.js";
 
 const LOOK = 300; // ms between two looks at how far it is
 const GROUPS = { Q: "Q", R: "R", p: "parameters", options: "options" };
@@ -15,39 +16,25 @@ export class Fit {
   // tune: whose head has the button, and which puts in what was found
   constructor(model, link, tune) {
     Object.assign(this, { model, link, tune });
-    this.button = element("button", { type: "button", id: "fit", title: "Fit noises and parameters to what was read", "aria-haspopup": "dialog", "aria-expanded": "false", onclick: () => this.toggle() }, "Fit…");
+    this.button = element("button", { type: "button", id: "fit", title: "Fit noises and parameters to what was read" }, "Fit…");
     tune.restoreButton.before(this.button);
     this.form = element("div", { class: "form" });
     this.progress = element("div", { class: "progress", role: "status", hidden: true });
     this.error = element("p", { class: "error", role: "alert", hidden: true });
     this.result = element("div", { class: "result" });
-    this.panel = element("section", { id: "fit-panel", popover: "manual", role: "dialog", "aria-label": "Fit", tabindex: "-1" },
-      element("header", {}, element("h2", {}, "Fit to what was read"), element("span", { class: "space" }), element("button", { type: "button", title: "Close (Esc)", "aria-label": "Close", onclick: () => this.toggle(false) }, "×")),
-      this.form, this.progress, this.error, this.result);
-    this.panel.addEventListener("keydown", (event) => event.key === "Escape" && (event.stopPropagation(), this.toggle(false)));
-    document.body.append(this.panel);
+    const opened = () => {
+      if (this.estimator !== link.status.estimator) this.offer();
+      return this.ask("GET");
+    };
+    this.box = new Panel(this.button, "fit-panel", "Fit to what was read", opened, this.form, this.progress, this.error, this.result);
+    this.panel = this.box.node;
     this.count = element("output", {});
     this.progress.append(element("progress", { "aria-label": "Folding" }), this.count, this.cancelButton = element("button", { type: "button", id: "fit-cancel", class: "go", onclick: () => this.ask("DELETE") }, "Cancel"));
     link.addEventListener("status", ({ detail }) => {
-      if (this.estimator !== detail.estimator && this.panel.matches(":popover-open")) this.offer();
+      if (this.estimator !== detail.estimator && this.box.open) this.offer();
       if (this.told?.result && this.revision !== detail.revision) this.ask("GET");
       this.revision = detail.revision;
     });
-  }
-
-  toggle(open = !this.panel.matches(":popover-open")) {
-    this.button.setAttribute("aria-expanded", String(open));
-    if (!open) {
-      this.panel.hidePopover();
-      this.button.focus();
-      return;
-    }
-    this.panel.showPopover();
-    const [column, bar] = [$("tune").getBoundingClientRect(), this.button.getBoundingClientRect()];
-    this.panel.style.left = `${Math.max(4, Math.min(column.right + 6, innerWidth - this.panel.offsetWidth - 4))}px`;
-    this.panel.style.top = `${bar.bottom + 4}px`;
-    if (this.estimator !== this.link.status.estimator) this.offer();
-    this.ask("GET").then(() => (this.form.querySelector("input") ?? this.panel).focus());
   }
 
   // What may be fitted: a box a group, and under it one an entry.

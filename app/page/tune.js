@@ -1,5 +1,6 @@
 // The Tune panel: filter and options, noises, parameters, gate, sensors. Undo and redo.
 
+import { Advice } from "./advice.js";
 import { Around } from "./around.js";
 import { $, element, setAttribute, setText } from "./dom.js";
 import { Fit } from "./fit.js";
@@ -32,6 +33,7 @@ export class Tune {
     this.sections.append(this.gateSection(), this.sensorSection());
     this.around = new Around(model, link, this);
     this.fit = new Fit(model, link, this);
+    this.advice = new Advice(model, link, this);
     link.addEventListener("status", (event) => this.sync(event.detail));
   }
 

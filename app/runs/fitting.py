@@ -15,19 +15,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from estimators.errors import ConfigError, NisusError
-from estimators.log import READING, Events, Log
-from estimators.snapshots import Base
 from estimators.tuning import Tuning
 
 from ..engine.integrity import LOWEST
 from ..engine.interface import Running
-from .window import ALL
+from ..twin.bounds import bounds_of
+from .history import history
 
 if TYPE_CHECKING:
     from estimators.fit.fit import Fitted
-
-PIECE = 4096
-"""Events that are copied at once, so that the engine never waits for long."""
 
 RUNNING, CANCELLING, CANCELLED, FAILED, DONE = "running", "cancelling", "cancelled", "failed", "done"
 
@@ -125,12 +121,15 @@ class Fitting:
 
         state, reason, fitted = DONE, "", None
         try:
-            log, base = self._copy(attempt, most)
+            log, base = history(self._engine, attempt.tuning, most, lambda: self._count(attempt, 0))
+            attempt.events = log.n
+            attempt.seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9
             fitted = fit(
                 attempt.estimator,
                 attempt.tuning,
                 [Given(log, base=base)],
                 wanted=attempt.wanted,
+                bounds=bounds_of(self._engine.twin.config, self._engine.model),
                 go=lambda folds: self._count(attempt, folds),
             )
         except Cancelled:
@@ -147,31 +146,3 @@ class Fitting:
         with self._lock:
             attempt.folds += folds
             return attempt.state == RUNNING
-
-    def _copy(self, attempt: Attempt, most: int | None) -> tuple[Log, Base | None]:
-        """The last events as a log of their own, and where its fold starts; None for the prior.
-
-        Raises:
-            ConfigError: If another tuning took over meanwhile, or there is nothing to fit to.
-        """
-        engine = self._engine
-        end = engine.index_at(ALL)
-        at, base = engine.origin(0 if most is None else max(0, end - most))
-        pieces = []
-        for start in range(at, end, PIECE):
-            pull = engine.rows(start, min(start + PIECE, end))
-            if engine.folded_with()[0] is not attempt.tuning or pull.first != start:
-                raise ConfigError("fit: the history became another while it was copied; ask again")
-            pieces.append(pull.events)
-            if not self._count(attempt, 0):
-                break
-        events = Events.concat(pieces, engine.model.width)
-        log = Log.of(engine.model, capacity=max(1, len(events)))
-        if base is not None:
-            log.first, log.floor, log.version = base.first, base.clock, base.version
-        log.extend(events)
-        if not (log.kind[: log.n] == READING).any():
-            raise ConfigError("fit: no reading has come yet; there is nothing to fit to")
-        attempt.events = log.n
-        attempt.seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9
-        return log, base

@@ -1,10 +1,10 @@
-"""A fit over HTTP: begun, looked at, given up, and kept as a version."""
+"""A fit over HTTP: begun, looked at, given up, and kept as a version; and advice on the estimator."""
 
 from __future__ import annotations
 
 import asyncio
-from math import isfinite
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import Any
 
 from starlette.requests import Request
 from starlette.responses import Response
@@ -14,16 +14,14 @@ from estimators.errors import ConfigError, printable
 
 from ..engine.interface import Running
 from ..engine.revisions import LONGEST_NOTE
+from ..runs.advising import DONE, Advising
 from ..runs.fitting import Attempt, Fitting
 from ..runs.window import ALL
-from ..tunings.figures import COVERAGE, LIKELIHOOD, RMSE
-from ..tunings.keep import Settings, keep, version_text
+from ..tunings.fitted import settings_of
+from ..tunings.keep import keep, version_text
 from .answer import answered
 from .api import Json, one_line
 from .tunings_api import fields_of
-
-if TYPE_CHECKING:
-    from estimators.fit.judge import Part
 
 
 class FitApi:
@@ -32,6 +30,7 @@ class FitApi:
     def __init__(self, engine: Running) -> None:
         self._engine = engine
         self.fitting = Fitting(engine)
+        self._advising = Advising(engine)
 
     def stop(self) -> None:
         """End what is under way."""
@@ -42,6 +41,7 @@ class FitApi:
         return [
             Route("/api/fit", self._fit, methods=["GET", "POST", "DELETE"]),
             Route("/api/fit/keep", self._keep, methods=["POST"]),
+            Route("/api/advice", self._advice, methods=["GET", "POST"]),
         ]
 
     async def _fit(self, request: Request) -> Response:
@@ -71,20 +71,31 @@ class FitApi:
 
         return await answered(request, work)
 
+    async def _advice(self, request: Request) -> Response:
+        """Which estimator the log speaks for; begun by a post."""
+
+        async def begin(body: Any) -> Response:
+            fields_of(body)
+            self._advising.begin()
+            return Json(self._advised(), 202)
+
+        return await answered(request, begin) if request.method == "POST" else Json(self._advised())
+
+    def _advised(self) -> dict[str, Any]:
+        found = self._advising
+        current = found.revision == self._engine.revisions.runs[-1].number
+        told = {"state": found.state, "revision": found.revision, "current": current, "reason": one_line(found.reason)}
+        return told | ({"advice": found.told} if found.state == DONE else {})
+
     def _kept(self, name: str, note: str) -> str:
         twin, attempt = self._engine.twin, self.fitting.latest
         if attempt is None or attempt.fitted is None:
             raise ConfigError("fit: there is no result to keep; fit first")
         if len(note) > LONGEST_NOTE:
             raise ConfigError(f"note: it has {len(note)} characters; it may have {LONGEST_NOTE}")
-        given = Settings(
-            attempt.estimator,
-            attempt.fitted.setting.tuning,
-            note=printable(note),
-            fitted_on=[f"{attempt.events} events over {attempt.seconds:.4g} s, from run {attempt.revision}"],
-            scores=_scores(attempt.fitted.after.held_out),
-            model_version=self._engine.status().model_version,
-        )
+        fitted_on = [f"{attempt.events} events over {attempt.seconds:.4g} s, from run {attempt.revision}"]
+        given = settings_of(attempt.fitted, fitted_on, printable(note))
+        given = replace(given, model_version=self._engine.status().model_version)
         keep(twin, name, version_text(twin, given))
         return name
 
@@ -95,14 +106,6 @@ class FitApi:
         if attempt is None:
             return {"state": "none"} | there
         return attempt_json(attempt) | there | {"current": engine.folded_with()[0] is attempt.tuning}
-
-
-def _scores(part: Part) -> dict[str, float]:
-    """Of the blocks held out, by the names that versions have."""
-    known = {LIKELIHOOD: part.log_density}
-    for name, item in (*part.sensors.items(), *part.states.items()):
-        known |= {f"{RMSE}.{name}": item.rms, f"{COVERAGE}.{name}": item.coverage}
-    return {name: float(value) for name, value in known.items() if isfinite(value)}
 
 
 def attempt_json(attempt: Attempt) -> dict[str, Any]:

@@ -1,13 +1,14 @@
 """A fit beside a running twin: the same as the fit of its log alone, told, cancelled, refused."""
 
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from app.engine.engine import Engine
-from app.runs import fitting as module
 from app.runs.fitting import CANCELLED, DONE, FAILED, Fitting
+from app.runs.history import PIECE
 from estimators.errors import ConfigError
 from estimators.fit.fit import Given, fit
 from estimators.log import Log
@@ -56,7 +57,7 @@ def alone(n):
 
 def test_what_is_fitted_beside_the_twin_is_the_fit_of_its_log(started):
     # More than one piece is copied.
-    n = module.PIECE + 900
+    n = PIECE + 900
     engine = started(n)
     fitting = Fitting(engine)
     fitting.begin(WANTED)
@@ -77,6 +78,19 @@ def test_the_last_events_are_folded_from_a_snapshot_on(started):
     assert told.state == DONE and told.fitted.before.fitted.n + told.fitted.before.held_out.n == told.events
     # From the last snapshot at or before the event that was asked for.
     assert 3000 <= told.events < 6000
+
+
+def test_a_data_sheet_bounds_it(started):
+    engine = started(1500)
+    free = alone(1500).lines[1].after
+    # R was found below where the data sheet ends.
+    bounds = (1.2 * free, FIRST.get("R.winding"))
+    sheet = SimpleNamespace(bounds=bounds)
+    engine.twin.config.sensors = {"winding": sheet}
+    fitting = Fitting(engine)
+    fitting.begin(WANTED)
+    line = ended(fitting).fitted.lines[1]
+    assert free < bounds[0] <= line.after <= bounds[1]
 
 
 def held_up(monkeypatch):
