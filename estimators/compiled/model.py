@@ -20,7 +20,7 @@ from ..model.check import probe, probe_angles, probe_likelihoods, uncompilable
 from ..model.claims import check_parts
 from ..model.state_space import LARGE, Field, StateSpaceModel
 from ..numerics.helpers import with_helpers
-from ..numerics.jit import address, by_address, jit, plain
+from ..numerics.jit import address, jit, plain
 from .black_box import ANSWER, BlackBox, answered_f, answered_h
 from .context import (
     F_signature,
@@ -106,7 +106,7 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                dispatcher = by_address(with_helpers(plain(function)))
+                dispatcher = jit(with_helpers(plain(function)))
                 kept.append(dispatcher)
                 return address(dispatcher, signature)
         except Exception as error:  # noqa: BLE001  Numba raises many kinds; each means the same here

@@ -54,7 +54,10 @@ jit_brief = partial(njit, cache=True, error_model="numpy", no_cfunc_wrapper=True
 to wait for it again, after other threads."""
 
 by_address = partial(jit, no_cpython_wrapper=True)
-"""The same for what is called through its address alone: to call it from Python would end the program."""
+"""The same for what is called through its address alone: to call it from Python would end the program.
+
+Not for a function that is also compiled by `jit`: the cache does not tell the two apart.
+"""
 
 part: Callable[[Callable[..., Any]], Any] = register_jitable(cache=True, nogil=True, error_model="numpy")
 """The same for what only compiled functions call. A wrapper for Python would take a third of the time of compiling;
