@@ -109,7 +109,7 @@ export class Layout {
       return element("li", {}, element("label", {}, box, chart.what.title, element("span", { class: "faint" }, chart.what.note ?? "")), button("↑", "up", -1), button("↓", "down", 1));
     };
     const again = element("button", { type: "button", class: "go", onclick: () => ((this.kept = {}), this.changed()) }, "As at first");
-    this.menu.replaceChildren(element("summary", { title: "Which charts, in which order" }, "Charts shown"), element("div", { class: "menu" }, element("ol", {}, ...this.order.map(row)), again));
+    this.menu.replaceChildren(element("summary", { title: "Which charts, in which order" }, "Shown"), element("div", { class: "menu" }, element("ol", {}, ...this.order.map(row)), again));
   }
 
   changed() {

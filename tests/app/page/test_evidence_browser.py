@@ -104,7 +104,7 @@ def test_many_states_of_a_kind_are_one_chart_in_which_the_odd_one_stands_out(sho
     strong = page.evaluate("window.nisus.charts.charts[0].data.at(-1).at(-1)")
     assert strong == pytest.approx(soc[lowest], rel=1e-6)
     # Each of them can be had.
-    page.get_by_text("Charts shown").click()
+    page.get_by_text("Shown", exact=True).click()
     page.locator("#layout li").filter(has_text="soc 5").first.get_by_role("checkbox").check()
     wait_for(lambda: "upper:soc_5" in lanes(session)["charts"], PATIENCE)
 

@@ -56,7 +56,7 @@ def test_hidden_charts_ask_for_nothing(page, session):
 
 def test_a_chart_that_is_not_chosen_is_not_sent(page, session):
     wait_for(lambda: "innovation:yoke" in lanes(session).get("charts", ()), PATIENCE)
-    page.get_by_text("Charts shown").click()
+    page.get_by_text("Shown", exact=True).click()
     for name in ("yoke", "magnet"):
         page.locator("#layout li", has_text=name).last.get_by_role("checkbox").uncheck()
     wait_for(lambda: "innovation:yoke" not in lanes(session)["charts"], PATIENCE)

@@ -177,7 +177,7 @@ def test_the_track_that_is_shown(page, session, tmp_path):
 
 def test_a_link_goes_to_the_moment_and_holds_it(browser, page, session):
     hidden = page.evaluate("window.nisus.charts.charts.at(-1).what.key")
-    page.get_by_text("Charts shown").click()
+    page.get_by_text("Shown", exact=True).click()
     page.locator("#layout li").last.get_by_role("checkbox").uncheck()
     page.keyboard.press("Escape")
     page.evaluate("window.nisus.view.show(12.3456789, 22.5)")
