@@ -54,6 +54,11 @@ def ships(twin: Path) -> bool:
     return twin.resolve().parent == (_CONFIG / "twins").resolve()
 
 
+def named(twin: Path) -> str:
+    """A twin's YAML as the command line takes it."""
+    return twin.stem if ships(twin) else shown_path(twin)
+
+
 def folders(twin: Path) -> tuple[Path, ...]:
     """Where the versions of a twin's YAML are kept; the first is where new ones go.
 
@@ -86,10 +91,9 @@ def find_version(twin: Path, reference: str) -> Version | None:
         return load_version(Path(reference).expanduser())
     files = version_files(twin)
     if reference not in files:
-        shown_twin = twin.stem if ships(twin) else shown_path(twin)
         near = nearest(reference, [OWN, *files]).rstrip("?")
         raise ConfigError(
-            f"--tuning {reference}: {twin.stem} has no such version; {near}; see `nisus tunings {shown_twin}`"
+            f"--tuning {reference}: {twin.stem} has no such version; {near}; see `nisus tunings {named(twin)}`"
         )
     return load_version(files[reference])
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from estimators.errors import SourceError
+from estimators.errors import SourceError, shown_name
 from estimators.log import READING
 
 from .can.databases import load_database, same_bus
@@ -108,6 +108,8 @@ def survey(
         SourceError: If a file cannot be read, or the kinds are mixed.
     """
     for path in files:
+        if path.is_dir():
+            raise SourceError(f"{path}: it is a folder; name the recordings in it")
         if not path.is_file():
             raise SourceError(f"{path}: there is no such file; check the path")
         if not path.stat().st_size:
@@ -224,6 +226,13 @@ def _tables(files: list[Path], time: str | None, unit: str) -> Survey:
             f"{files[0]}: which column holds the time is not known; name it with --time, one of {', '.join(names[:12])}"
         )
     columns = [name for name in dict.fromkeys(names) if name != chosen]
+    for path in files[1:]:
+        missing = [name for name in (chosen, *columns) if name not in names_of(path)]
+        if missing:
+            raise SourceError(
+                f"{path}: it has no column {shown_name(missing[0])}, which {files[0]} has; "
+                "give tables with the same columns"
+            )
     faults: list[str] = []
     times, values = [], []
     for path in files:
@@ -231,7 +240,7 @@ def _tables(files: list[Path], time: str | None, unit: str) -> Survey:
             times.append(rows.t[rows.known])
             values.append(rows.values[rows.known])
     if not times:
-        raise SourceError("; ".join(faults) or f"{files[0]}: no row has a time")
+        raise SourceError("; ".join(faults) or f"{files[0]}: no row has a time in column {chosen}; give one that has")
     t, v = np.concatenate(times), np.concatenate(values)
     order = np.argsort(t, kind="stable")
     t, v = t[order], v[order]

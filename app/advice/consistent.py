@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from config.tunings import named
 from estimators.diagnostics.calibration import LIMITS, calibrations
 from estimators.diagnostics.innovation_size import mean_nis
 
@@ -25,7 +26,9 @@ def consistent(measured: Measured, estimator: str, options: dict[str, float] | N
     found = calibrations(
         twin.model, fold.log.events, fold.track, gate=fold.tuning.gate, marginal=fold.marginal, limits=LIMITS
     )
-    rows = [entry for entry in found if entry.role == "used"]
+    rows = [entry for entry in found if entry.role == "used" and np.isfinite(entry.scale.high)]
+    if not rows:
+        return Claim("consistent", QUESTION, UNTOLD, nis, 1.0, OF, "no row has enough readings for an interval")
     wide = 1.0 + LIMITS.width
     size = [entry for entry in rows if entry.scale.beyond(1.0 / wide, wide)]
     related = [entry for entry in rows if entry.correlation.beyond(-LIMITS.correlation, LIMITS.correlation)]
@@ -40,7 +43,7 @@ def consistent(measured: Measured, estimator: str, options: dict[str, float] | N
     if size:
         one = max(size, key=lambda entry: abs(np.log(entry.scale.value)))
         reason += f"; bands of {one.subject} would have to be {digits(one.scale.value)} times as wide"
-        remedies.append(f"noises are off: nisus tune {twin.path.stem} fits Q and R to the log")
+        remedies.append(f"noises are off: nisus tune {named(twin.path)} fits Q and R to the log")
     if related:
         one = max(related, key=lambda entry: abs(entry.correlation.value))
         reason += f"; innovations of {one.subject} follow one another with {one.correlation.value:+.2f}"

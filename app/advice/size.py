@@ -26,9 +26,9 @@ def small(measured: Measured) -> Claim:
     share = rate * flops / SPEED
     fits = n <= LARGE and share <= SHARE
     reason = (
-        f"{n:,} states: a covariance takes {bytes_text(8.0 * n**2)} and 4 n³ + 6 m n² = {digits(flops)} operations a "
-        f"reading of m = {m} rows; at {digits(rate)} readings a second that is {digits(100 * share)} % of a processor "
-        f"of {digits(SPEED)} operations a second"
+        f"{_counted(n, 'state')}: a covariance takes {bytes_text(8.0 * n**2)} and 4 n³ + 6 m n² = {digits(flops)} "
+        f"operations a reading of m = {_counted(m, 'row')}; at {digits(rate)} readings a second that is "
+        f"{digits(100 * share)} % of a processor of {digits(SPEED)} operations a second"
     )
     if fits:
         figure, threshold, of = float(n), float(LARGE), "states"
@@ -39,3 +39,7 @@ def small(measured: Measured) -> Claim:
         figure, threshold, of = share, SHARE, "of a processor for a covariance"
     question = "Is the state small enough for a covariance at this rate?"
     return Claim("size", question, YES if fits else NO, figure, threshold, of, reason)
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number:,} {what}{'s' if number > 1 else ''}"

@@ -55,7 +55,8 @@ def heavy(measured: Measured, estimator: str, options: dict[str, float] | None =
             "; they are correlated too, so these are errors of the model, and weights would keep good readings out"
         )
         return Claim("tails", QUESTION, NO, worst.kurtosis, HEAVY, OF, reason), np.inf
-    dof = max(LEAST_DOF, 4.0 + 6.0 / worst.kurtosis)
+    # A kurtosis tells no more figures; more would differ each time that the lines are put in and asked for again.
+    dof = float(f"{max(LEAST_DOF, 4.0 + 6.0 / worst.kurtosis):.2g}")
     reason += f"; Student's t with 4 + 6 / κ = {digits(dof)} degrees of freedom has as heavy ones"
     weighing, weighted = with_weights(estimator, dof)
     if not weighted:

@@ -30,6 +30,9 @@ def advise(arguments: Arguments) -> int:
     Raises:
         ConfigError: If twins and recordings are mixed, or an option is for the other.
     """
+    for what in arguments.what:
+        if what not in shipped() and Path(what).is_dir():
+            raise ConfigError(f"{what}: it is a folder; name a twin's YAML or recordings in it")
     twins = [what for what in arguments.what if what in shipped() or Path(what).suffix in (".yaml", ".yml")]
     if not twins and all(Path(what).suffix for what in arguments.what):
         from .advise_log import advise_log

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +13,6 @@ import numpy as np
 
 from config.loader import shipped
 from config.source_schema import SimulatorSection
-from estimators.compiled.orphan import leave_with_parent
 from estimators.errors import ConfigError, SourceError
 from estimators.log import MARK, Events
 from estimators.registry import ESTIMATORS, find_estimator, unfit
@@ -23,6 +20,7 @@ from estimators.registry import ESTIMATORS, find_estimator, unfit
 from ..stderr import complain
 from ..twin.twin import Twin, load_twin
 from .arguments import settings
+from .beside import beside, jobs_of
 from .compare_fold import BUDGET, Row, fold_row
 from .compare_table import cells, printed
 from .fold import read_log
@@ -151,7 +149,7 @@ def compare(
         jobs: Processes; None for one a processor.
         budget: Seconds for a filter; see `fold_row`.
     """
-    jobs = min(len(names), jobs or os.cpu_count() or 1)
+    jobs = jobs_of(jobs, len(names))
     if jobs == 1:
         ready = load_twin(twin, overrides=overrides)
         threads = numba.get_num_threads()
@@ -161,20 +159,14 @@ def compare(
         finally:
             numba.set_num_threads(threads)
         return
-    # Read when a process loads NumPy: threads that spin beside a small matrix would count as the filter's cost.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Spawned: the libraries that the filters' threads come from do not survive a fork.
-    context = multiprocessing.get_context("spawn")
     given = (twin, dict(overrides), [tuple(log) for log in logs])
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_share, initargs=given) as pool:
-        # The last filters of the catalogue are the slow ones.
-        futures = [pool.submit(_fold, name, budget) for name in reversed(names)]
+    # The last filters of the catalogue are the slow ones.
+    with beside(_fold, [(name, budget) for name in reversed(names)], jobs, _share, given) as futures:
         for future in as_completed(futures):
             yield future.result()
 
 
 def _share(name: str, overrides: dict[str, str], logs: list[tuple[np.ndarray, ...]]) -> None:
-    leave_with_parent()
     _shared["twin"] = load_twin(name, overrides=overrides)
     _shared["logs"] = [Events(*columns) for columns in logs]
     numba.set_num_threads(1)  # the processors have a filter each, and a step costs what it costs one

@@ -48,8 +48,11 @@ def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
     """Everything that the twin's source says, in the order of time, and what was counted on the way.
 
     Raises:
+        ConfigError: If `duration` is not positive.
         SourceError: If the source cannot be opened, has no end, or says nothing.
     """
+    if duration is not None and not duration > 0.0:
+        raise ConfigError(f"--duration {duration:g}: must be positive")
     counts: Counter[str] = Counter()
 
     def count(key: str, text: str) -> None:

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from typing import TYPE_CHECKING
 
 import numba
 
 from config.files import shown_path
-from estimators.compiled.orphan import leave_with_parent
 from estimators.errors import ConfigError, printable
 
 from ..export.parts import Part
 from ..guard.junit import Guarded, junit
 from .arguments import settings
+from .beside import beside, jobs_of
 from .check_text import as_text
 from .guard_archive import Archived, chosen
 from .guard_fold import Wanted, guarded
+from .places import check_place
 from .progress import progress
 
 if TYPE_CHECKING:
@@ -30,6 +29,8 @@ def guard(arguments: Arguments) -> int:
     """Carry the command out: 0 if nothing is worse than recorded, 1 if something is, 2 if something failed."""
     if arguments.accept and not arguments.note.strip():
         raise ConfigError("--accept: say why with --note TEXT; it is kept with the scores")
+    if arguments.junit is not None:
+        check_place("--junit", arguments.junit)
     archive = chosen(arguments.twins, arguments.archive)
     note = printable(arguments.note).strip() if arguments.accept else None
     found = _all(archive, Wanted(note, settings(arguments.set)), arguments.jobs)
@@ -48,7 +49,7 @@ def guard(arguments: Arguments) -> int:
 
 
 def _all(archive: Sequence[Archived], wanted: Wanted, jobs: int | None) -> list[Guarded]:
-    jobs = min(len(archive), jobs or os.cpu_count() or 1)
+    jobs = jobs_of(jobs, len(archive))
     with progress("guard", len(archive), "recordings") as advance:
         if jobs == 1:
             found = []
@@ -56,19 +57,11 @@ def _all(archive: Sequence[Archived], wanted: Wanted, jobs: int | None) -> list[
                 found.append(guarded(archived, wanted))
                 advance()
             return found
-        # As for `nisus compare`: threads that spin beside a small matrix, and libraries that do not survive a fork.
-        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin) as pool:
-            futures = [pool.submit(guarded, archived, wanted) for archived in archive]
+        calls = [(archived, wanted) for archived in archive]
+        with beside(guarded, calls, jobs, numba.set_num_threads, (1,)) as futures:
             for future in futures:
                 future.add_done_callback(lambda _: advance())
             return [future.result() for future in futures]
-
-
-def _begin() -> None:
-    leave_with_parent()
-    numba.set_num_threads(1)
 
 
 def _parts(found: Sequence[Guarded], must: bool) -> list[Part]:

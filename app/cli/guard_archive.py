@@ -11,7 +11,7 @@ import numpy as np
 from config.loader import find, shipped
 from config.source_schema import SimulatorSection
 from config.tunings import OWN, Version, accepted_version, folders, ships
-from estimators.errors import ConfigError
+from estimators.errors import ConfigError, SourceError
 from estimators.log import Log
 from estimators.registry import find_entry
 from estimators.snapshots import Base
@@ -35,7 +35,8 @@ GUARD = ".guard.yaml"
 class Archived:
     """One recording that is guarded: a twin with the log of its own source, or of a recording.
 
-    `reference` is the file of its recorded scores, `writes` where they are written, which may hide it.
+    `reference` is the file of its recorded scores, `writes` where they are written, which may hide it; `failure` says
+    why a recording cannot be read, which is no reason to leave out the others of its folder.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Archived:
     recording: Path | None
     reference: Path
     writes: Path
+    failure: str = ""
 
     @property
     def version(self) -> Version | None:
@@ -74,7 +76,6 @@ def of_folder(folder: Path) -> list[Archived]:
 
     Raises:
         ConfigError: If there are none.
-        SourceError: If a recording cannot be read.
     """
     twins = [of_twin(str(path)) for path in sorted(folder.glob("*.yaml")) if not path.name.endswith(GUARD)]
     found = [_of_recording(path) for path in sorted(folder.glob("*.rrd"))]
@@ -85,7 +86,11 @@ def of_folder(folder: Path) -> list[Archived]:
 
 def _of_recording(path: Path) -> Archived:
     beside = path.with_name(f"{path.stem}{GUARD}")
-    return Archived(path.stem, read_recording(path).twin_path, path, beside, beside)
+    try:
+        twin = read_recording(path).twin_path
+    except SourceError as error:
+        return Archived(path.stem, path, path, beside, beside, str(error))
+    return Archived(path.stem, twin, path, beside, beside)
 
 
 def chosen(names: Sequence[str], folder: Path | None) -> list[Archived]:

@@ -6,8 +6,10 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from config.files import shown_path
 from config.guard_schema import FigureSection, ReferenceSection
 from config.tuning_schema import AcceptedSection
+from config.tunings import named
 from estimators.errors import NisusError, SourceError
 from estimators.fold import Fold
 from estimators.log import Log
@@ -44,11 +46,13 @@ def guarded(archived: Archived, wanted: Wanted) -> Guarded:
     begun = time.monotonic()
     found = Guarded(archived.name)
     try:
+        if archived.failure:
+            raise SourceError(archived.failure)
         twin = twin_of(archived, dict(wanted.overrides or {}))
         found = replace(found, version=twin.tuning.name)
         known = read_reference(archived.reference)
         if known is None and wanted.note is None:
-            text = f"no scores are recorded; `nisus guard {archived.name} --accept --note ...` records them"
+            text = f"no scores are recorded; `nisus guard {_called(archived)} --accept --note ...` records them"
             return replace(found, absent=text)
         span = known.span if known is not None else _span(archived, twin)
         measures = measure(archived, twin, span, wanted.note)
@@ -165,3 +169,8 @@ def _span(archived: Archived, twin: Twin) -> float | None:
         if seconds < 0.5 * part:
             return None
         part *= 4.0
+
+
+def _called(archived: Archived) -> str:
+    """What is guarded, as the command line takes it."""
+    return named(archived.twin) if archived.recording is None else f"--archive {shown_path(archived.recording.parent)}"

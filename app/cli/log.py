@@ -64,7 +64,7 @@ def look(files: tuple[Path, ...], dbc: tuple[str, ...], time: str | None, unit: 
         SourceError: If a file cannot be read.
     """
     if not files:
-        raise ConfigError("log: no file is named; give at least one recording")
+        raise ConfigError("no recording is named; give at least one")
     if unit not in UNITS:
         raise ConfigError(f"--time-unit {unit}: is no unit of time; choose from {', '.join(UNITS)}")
     return survey([file.expanduser() for file in files], [database_of(text) for text in dbc], time, unit)

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from config.files import shown_path
+from config.loader import find
 from config.source_schema import SimulatorSection
-from config.tunings import check_name
 from estimators.errors import ConfigError, printable
+from estimators.fit.aims import LIKELIHOOD
 from estimators.fit.fit import Fitted, Given, fit
 from estimators.log import Log
 
@@ -17,12 +18,13 @@ from ..runs.fit_json import fit_json
 from ..runs.tuning_yaml import tuning_yaml
 from ..stderr import complain
 from ..tunings.fitted import settings_of
-from ..tunings.keep import keep, version_text
+from ..tunings.keep import check_free, keep, version_text
 from ..twin.bounds import bounds_of
 from ..twin.twin import Twin, load_twin
 from .arguments import settings
 from .check_text import as_text
 from .fold import read_log
+from .places import check_place
 from .prepare import attend, prepare
 from .tune_text import heading, sections
 
@@ -40,8 +42,14 @@ def tune_twin(arguments: Arguments) -> int:
         raise ConfigError("--fit names nothing; write for example --fit Q,R")
     if arguments.blocks < FEWEST:
         raise ConfigError(f"--blocks {arguments.blocks}: must be {FEWEST} or more, or nothing is held out")
+    if arguments.predict and arguments.aim == LIKELIHOOD:
+        raise ConfigError("--predict: is for --aim crps and --aim error; the likelihood is that of every sensor")
+    if arguments.save is not None:
+        if arguments.save.suffix not in (".yaml", ".yml"):
+            raise ConfigError(f"--save {arguments.save}: must end in .yaml")
+        check_place("--save", arguments.save)
     if arguments.keep is not None:
-        check_name(arguments.keep)
+        check_free(find(arguments.twin), arguments.keep)
     twin, recordings = _recordings(arguments)
 
     def work() -> Fitted:

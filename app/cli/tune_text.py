@@ -18,7 +18,8 @@ BOUND = "only a bound: the data cannot tell it from none"
 
 def sections(twin: Twin, fitted: Fitted) -> list[Section]:
     """From top to bottom."""
-    return [_entries(twin, fitted), _scores(fitted), _held_out(fitted), _verdict(fitted)]
+    held_out = _held_out(fitted)
+    return [_entries(twin, fitted), _scores(fitted), *([held_out] if held_out.rows else []), _verdict(fitted)]
 
 
 def heading(twin: Twin, fitted: Fitted) -> str:
@@ -29,6 +30,12 @@ def heading(twin: Twin, fitted: Fitted) -> str:
 
 def _number(value: float) -> str:
     return digits(value) if np.isfinite(value) else "-"
+
+
+def _pair(before: float, after: float, form: str, unit: str = "") -> str:
+    """A figure before and after; a dash where nothing told it."""
+    old, new = (f"{value:{form}}" if np.isfinite(value) else "-" for value in (before, after))
+    return f"{old} -> {new}{unit if np.isfinite(after) else ''}"
 
 
 def _entries(twin: Twin, fitted: Fitted) -> Section:
@@ -63,9 +70,9 @@ def _scores(fitted: Fitted) -> Section:
         return (
             what,
             f"{before.n:,}",
-            f"{before.log_density:.4f} -> {after.log_density:.4f}",
-            f"{before.nis:.3f} -> {after.nis:.3f}",
-            f"{100 * before.coverage:.1f} -> {100 * after.coverage:.1f} %",
+            _pair(before.log_density, after.log_density, ".4f"),
+            _pair(before.nis, after.nis, ".3f"),
+            _pair(100 * before.coverage, 100 * after.coverage, ".1f", " %"),
         )
 
     rows = [row("fitted", fitted.before.fitted, fitted.after.fitted)]
@@ -88,7 +95,7 @@ def _rows(kind: str, group: str, before: Worth, after: Worth) -> list[tuple[str,
         old, new = (getattr(part, group).get(name) for part in worths)
         if not isinstance(old, Prediction) or not isinstance(new, Prediction):
             return "", ""
-        return f"{_number(old.rms)} -> {_number(new.rms)}", f"{100 * old.coverage:.0f} -> {100 * new.coverage:.0f} %"
+        return f"{_number(old.rms)} -> {_number(new.rms)}", _pair(100 * old.coverage, 100 * new.coverage, ".0f", " %")
 
     parts = (before.fitted, after.fitted), (before.held_out, after.held_out)
     names = dict.fromkeys(name for part in parts for name in getattr(part[0], group))

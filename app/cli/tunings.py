@@ -79,6 +79,7 @@ def _list(arguments: Arguments) -> None:
     if arguments.json:
         print(json.dumps(listed))
         return
+    broken = tuple(item["error"] for item in listed if "error" in item)
     rows = tuple(
         (
             item["name"] + (" *" if item.get("holds") else ""),
@@ -89,10 +90,14 @@ def _list(arguments: Arguments) -> None:
             _noted(item),
         )
         for item in listed
+        if "error" not in item
     )
     head = ("version", "saved", "filter", "NIS", "log L", "in 95 %", "fitted on", "note")
     said = ("*: holds; `nisus guard` folds with it.",)
-    print("\n".join(as_text([Part(f"Tuning versions of {twin.name}", said, head, rows)])))
+    parts = [Part(f"Tuning versions of {twin.name}", said, head, rows)]
+    if broken:
+        parts.append(Part("Cannot be read", broken))
+    print("\n".join(as_text(parts)))
 
 
 def _scored(scores: dict[str, float]) -> tuple[str, str, str]:
@@ -105,8 +110,6 @@ def _scored(scores: dict[str, float]) -> tuple[str, str, str]:
 def _noted(item: dict[str, Any]) -> str:
     if item["name"] == OWN:
         return "what the twin's file says"
-    if "error" in item:
-        return str(item["error"])
     accepted = item["accepted"]
     said = [item["note"], f"accepted: {accepted['note']}" if accepted and accepted["note"] else ""]
     return "; ".join(filter(None, said))

@@ -45,8 +45,9 @@ def _figures(entry: Calibration) -> str:
     bands = ", ".join(f"{100 * band:.0f}" for band in BANDS)
     said = [f"{shares} % in the {bands} % bands"]
     if np.isfinite(entry.scale.value):
-        low, high = f"{entry.scale.low:.2f}", f"{entry.scale.high:.2f}"
-        said = [f"scale {entry.scale.value:.2f} ({low} to {high})", f"bias {entry.bias.value:+.2f} σ", *said]
+        low, high = entry.scale.low, entry.scale.high
+        interval = f" ({low:.2f} to {high:.2f})" if np.isfinite([low, high]).all() else ""
+        said = [f"scale {entry.scale.value:.2f}{interval}", f"bias {entry.bias.value:+.2f} σ", *said]
     if np.isfinite(entry.correlation.value):
         said.insert(2, f"correlation {entry.correlation.value:+.2f}")
     return ", ".join(said)

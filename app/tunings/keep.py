@@ -60,6 +60,22 @@ def version_text(twin: Twin, given: Settings) -> str:
     return heading + _header(head) + values + "".join(f"{line}\n" for line in more)
 
 
+def check_free(twin: Path, name: str) -> Path:
+    """The file that a version of this name would have, of a twin's YAML.
+
+    Raises:
+        ConfigError: If the name is none or taken.
+    """
+    path = folders(twin)[0] / f"{check_name(name)}.yaml"
+    if path.exists():
+        raise _taken(path)
+    return path
+
+
+def _taken(path: Path) -> ConfigError:
+    return ConfigError(f"{shown_path(path)}: there is a version of that name; choose another name")
+
+
 def keep(twin: Twin, name: str, text: str) -> Path:
     """Write a version beside its twin.
 
@@ -69,15 +85,14 @@ def keep(twin: Twin, name: str, text: str) -> Path:
     Raises:
         ConfigError: If the name is none or taken, the text is wrong, or the file cannot be written.
     """
-    folder = folders(twin.path)[0]
-    path = folder / f"{check_name(name)}.yaml"
+    path = check_free(twin.path, name)
     version_of(name, text, path)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        raise ConfigError(f"{shown_path(path)}: there is a version of that name; choose another name") from None
+        raise _taken(path) from None
     except OSError as error:
         raise ConfigError(f"{shown_path(path)}: {error.strerror}; the version cannot be written there") from None
     return path

@@ -74,7 +74,8 @@ def _against(what: str, old: Prediction, new: Prediction) -> list[str]:
     mean, error = gain(old.scores, new.scores)
     found = []
     if mean > WORSE * old.crps and mean > SURE * error:
-        found.append(f"{what} is predicted worse: RMS {new.rms:.3g} {new.unit} after {old.rms:.3g}".replace(" .", "."))
+        unit = f" {new.unit}" if new.unit else ""
+        found.append(f"{what} is predicted worse: CRPS {new.crps:.3g}{unit} after {old.crps:.3g}")
     if new.coverage < COVERED and new.coverage < old.coverage - NARROWER:
         found.append(f"{what} leaves its band: {100 * new.coverage:.0f} % inside after {100 * old.coverage:.0f} %")
     return found

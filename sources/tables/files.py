@@ -98,8 +98,8 @@ def _header(path: Path) -> tuple[list[str], str]:
         head = binary.read(CHUNK)
     if any(byte < 9 or 13 < byte < 32 for byte in head):
         raise SourceError(
-            f"{path}:1: it begins with {head[:20]!r} and is not text; give a CSV in UTF-8, or name the file by what it "
-            "is (.parquet, .mat, .npz)"
+            f"{path}:1: it begins with the bytes {head[:8].hex(' ')} and is not text; give a CSV in UTF-8, "
+            "or name the file by what it is (.parquet, .mat, .npz)"
         )
     with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
         first = file.readline(LONGEST)

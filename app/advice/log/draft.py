@@ -107,7 +107,8 @@ def step(x, u, p, dt, out):
 
 
 def _title(plan: Plan) -> str:
-    return f"{len(plan.signals)} signals of a recording"
+    number = len(plan.signals)
+    return f"{number} signal{'s' if number > 1 else ''} of a recording"
 
 
 def _start(item: Moves) -> float:

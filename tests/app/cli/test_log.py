@@ -153,3 +153,21 @@ def test_the_noise_of_a_signal_is_found_in_its_differences():
         out[k] = x[0]
     smooth, q, r = noise_of(series(out + rng.normal(0, 0.01, n)))
     assert smooth and q == pytest.approx(9.0, rel=0.15) and r == pytest.approx(1e-4, rel=0.3)
+
+
+@pytest.mark.parametrize("command", ["log", "advise"])
+def test_tables_of_other_columns_are_one_line(tmp_path, capsys, command):
+    (tmp_path / "one.csv").write_text("time,a\n0,1\n1,2\n")
+    (tmp_path / "two.csv").write_text("seconds,a\n2,1\n3,2\n")
+    assert main([command, str(tmp_path / "one.csv"), str(tmp_path / "two.csv")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "two.csv: it has no column time, which " in said
+
+
+@pytest.mark.parametrize("command", ["log", "advise"])
+@pytest.mark.parametrize("name", ["folder", "folder.csv"])
+def test_a_folder_is_called_one(tmp_path, capsys, command, name):
+    (tmp_path / name).mkdir()
+    assert main([command, str(tmp_path / name)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and f"{name}: it is a folder; name " in said

@@ -66,6 +66,10 @@ def test_a_fit_stays_within_the_data_sheet(capsys):
         (["--fit", "R.wnding"], "R.wnding is no entry that can be fitted; did you mean R.winding"),
         (["--fit", ","], "--fit names nothing; write for example --fit Q,R"),
         (["--blocks", "2"], "--blocks 2: must be 3 or more"),
+        (["--predict", "winding"], "--predict: is for --aim crps and --aim error"),
+        (["--duration", "-1"], "--duration -1: must be positive"),
+        (["--save", "found.txt"], "--save found.txt: must end in .yaml"),
+        (["--save", "nowhere/found.yaml"], "--save nowhere/found.yaml: there is no folder nowhere; make it first"),
         (["--logs", "0"], "--logs 0: must be 1 or more"),
         (["--aim", "crps"], "the aim is crps; it needs a sensor to hold out, and another one that is used"),
         (
@@ -98,3 +102,20 @@ def test_what_is_proposed_is_kept_as_a_version(capsys, tmp_path):
 def test_a_name_that_is_none_is_told_before_the_fit(capsys):
     assert main(["tune", "motor_winding", "--keep", "../x"]) == 2
     assert "the version's name is" in capsys.readouterr().err
+
+
+def test_a_name_that_is_taken_is_told_before_the_fit(capsys, tmp_path, monkeypatch):
+    file = tmp_path / "winding.yaml"
+    shutil.copy(TWINS / "motor_winding.yaml", file)
+    assert main(["tunings", str(file), "--save", "taken"]) == 0
+    monkeypatch.setattr("app.cli.tune.fit", lambda *_, **__: pytest.fail("it was fitted"))
+    assert main(["tune", str(file), "--keep", "taken"]) == 2
+    assert "taken.yaml: there is a version of that name; choose another name" in capsys.readouterr().err
+
+
+def test_what_nothing_tells_is_a_dash(capsys):
+    """Of no reading there is no NIS and no share in a band, and of a lone sensor nothing is held out."""
+    beyond = ["--set", "sensors.winding.range=[1000, 2000]"]
+    status, out = printed(capsys, "--set", "source.duration=100", *beyond)
+    assert status == 1 and "- -> -" in out and "nan" not in out
+    assert ("Sensors held out in turn" in out) == ("truth  temperature" in out)

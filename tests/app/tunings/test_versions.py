@@ -233,3 +233,13 @@ def test_a_name_that_is_none(own, name):
     twin = load_twin(own)
     with pytest.raises(ConfigError, match="the version's name is"):
         keep(twin, name, version_text(twin, Settings("kf", twin.tuning)))
+
+
+def test_one_that_cannot_be_read_is_listed_beneath_the_others(own, capsys):
+    assert main(["tunings", str(own), "--save", "good"]) == 0
+    (folders(own)[0] / "bad.yaml").write_text("- 1\n")
+    capsys.readouterr()
+    tunings_of(Tunings(str(own)))
+    table, beneath = capsys.readouterr().out.split("Cannot be read")
+    assert [line.split()[0] for line in table.splitlines()[-3:-1]] == ["own", "good"]
+    assert "bad.yaml:1: the file is [1]; a tuning version is a mapping" in " ".join(beneath.split())
