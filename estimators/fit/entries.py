@@ -235,6 +235,8 @@ def _against(item: Entry, tuning: Tuning, logs: Sequence[Log]) -> str:
         return "is of a sensor that is held out"
     if not any(np.any((log.kind[: log.n] == READING) & (log.channel[: log.n] == s)) for log in logs):
         return "is of a sensor that says nothing here"
+    if all(_constant(log, s) for log in logs):
+        return "is of a sensor that says the same all the time here: one that is stuck tells no noise"
     return ""
 
 
@@ -244,3 +246,9 @@ def _scaled(tuning: Tuning, item: Entry, number: float) -> Tuning:
     r = tuning.r.copy()
     r[model.row_start[s] : model.row_start[s] + len(model.sensors[s].rows)] *= number / item.start
     return replace(tuning, r=r)
+
+
+def _constant(log: Log, sensor: int) -> bool:
+    """Whether no row of a sensor ever changes."""
+    said = log.value[: log.n][(log.kind[: log.n] == READING) & (log.channel[: log.n] == sensor)]
+    return bool(np.all((said == said[:1]) | np.isnan(said)))

@@ -157,6 +157,14 @@ def test_a_tuning_that_is_right_stays():
     assert sum(proposed) <= 1
 
 
+def test_a_sensor_that_is_stuck_tells_no_noise(ys):
+    """It predicts itself so well that its R would run to nothing, and win on what was held out."""
+    stuck, moves = log_of(np.full(300, 1.3)), log_of(ys)
+    with pytest.raises(ConfigError, match="R.float is of a sensor that says the same all the time here"):
+        entries_of("kf", Tuning.of(MODEL), [stuck], ["R"])
+    assert [item.key for item in entries_of("kf", Tuning.of(MODEL), [stuck, moves], ["R"])[0]] == ["R.float"]
+
+
 def test_several_logs_weigh_as_they_should(ys):
     one = fit("kf", Tuning.of(MODEL), [Given(log_of(ys), 2.0)], blocks=0)
     two = fit("kf", Tuning.of(MODEL), [Given(log_of(ys)), Given(log_of(ys))], blocks=0)
