@@ -187,6 +187,10 @@ class Curve {
     // The likelihood, too, is that of white innovations.
     const doubted = Boolean(this.around.said.R[this.key]?.doubt);
     const offers = [best && best.factor !== 1 && !doubted ? [best.value, "likeliest of those that were folded"] : null, said?.value ? [said.value, said.text] : null].filter(Boolean);
+    // A button that is replaced under the pointer cannot be pressed.
+    const shape = JSON.stringify([offers, said?.text]);
+    if (shape === this.offered) return;
+    this.offered = shape;
     this.takes.replaceChildren(
       ...offers.map(([value, title], k) => element("button", { type: "button", class: "go", title: `Take it: ${title}`, onclick: () => this.knob.set(value) }, `${k || !best || best.factor === 1 ? "data say" : "take"} ${compact(value, 3)}`)),
       said && !said.value ? element("span", { class: "faint" }, said.text) : "",

@@ -313,7 +313,8 @@ def test_recorded_scores_that_are_wrong_are_said_with_their_line(tmp_path, capsy
     assert re.search(problem, said(capsys))
 
 
-def test_bad_requests(tmp_path, capsys):
+def test_bad_requests(tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("CI", raising=False)
     path = twin_file(tmp_path, "w", 1)
     with pytest.raises(ConfigError, match="--accept: say why with --note TEXT"):
         guarded(None, path, accept=True)
@@ -322,6 +323,8 @@ def test_bad_requests(tmp_path, capsys):
         guarded(tmp_path / "empty")
     assert guarded(None, path) == 0
     assert "w: no scores are recorded; `nisus guard" in said(capsys)
+    monkeypatch.setenv("CI", "true")
+    assert guarded(None, path) == 2
     assert main(["guard", "nobody"]) == 2
 
 

@@ -31,7 +31,8 @@ def visit(browser):
     def visit(session):
         page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
         page.set_default_timeout(PATIENCE * 1000)
-        own = (f"http://127.0.0.1:{session.session.door.port}/", "blob:", "data:")
+        names = [f"http://{name}:{session.session.door.port}/" for name in ("127.0.0.1", "localhost")]
+        own = (*names, "blob:", "data:")
         page.on("request", lambda request: None if request.url.startswith(own) else wrong.append(request.url))
         page.on("pageerror", lambda error: wrong.append(f"{error} {error.stack}"))
         page.goto(session.session.url)

@@ -170,8 +170,8 @@ def test_a_session_on_the_page(browser, served, tmp_path, monkeypatch):
     page.get_by_role("link", name=path.name).wait_for()
 
     # Nothing was asked of anybody else, and nothing failed.
-    own = f"http://127.0.0.1:{session.server.port}/"
-    strangers = [url for url in asked if not url.startswith((own, "blob:", "data:", "https://tel.rerun.io/"))]
+    own = tuple(f"http://{name}:{session.server.port}/" for name in ("127.0.0.1", "localhost"))
+    strangers = [url for url in asked if not url.startswith((*own, "blob:", "data:", "https://tel.rerun.io/"))]
     assert strangers == []
     page.context.close()
 

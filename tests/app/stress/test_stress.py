@@ -248,9 +248,9 @@ def test_what_was_said_without_the_mistake_is_not_counted_for_it():
 
 
 def test_a_wrong_belief_over_a_recording_is_foretold_by_what_follows(data):
-    """Begun anew every 300 s of it: a hundred times R is found each time, a tenth of Q hardly ever."""
+    """Begun anew every 300 s of it: a hundred times R is found each time, a tenth of Q now and then."""
     data("battery_panasonic_18650pf", "25degC_US06.mat")
     twin = load_twin("battery_panasonic")
     bench, oracle = Bench(twin, 0, 300.0), Oracle(twin, 300.0)
     told = {name: oracle.foretell(bench, chosen(bench, name), "ekf").verdict for name in ("R x100", "Q /10")}
-    assert told == {"R x100": VISIBLE, "Q /10": INVISIBLE}
+    assert told == {"R x100": VISIBLE, "Q /10": CHANCE}

@@ -393,7 +393,7 @@ def test_vehicle_scene_stands_at_the_heaviest_peak_among_its_walls():
         scene.draw(rows, belief)
         assert tuple(scene._vehicle.position[:2]) == (4.0, 0.5)
         assert scene._cloud.visible and scene._cloud.points.shape == (2, 3)
-        assert [label.text for _, label in scene._peaks if label.visible] == ["70 %", "30 %"]
+        assert [label.text for _, label in scene._peaks if label.visible] == ["70 % drawn", "30 %"]
         scene.draw(rows, SimpleNamespace(**{**vars(belief), "peaks": peaks[:1]}))
         assert tuple(scene._vehicle.position[:2]) == (2.5, 0.0)
         assert not any(label.visible for _, label in scene._peaks)

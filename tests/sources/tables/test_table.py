@@ -130,7 +130,8 @@ def test_a_file_that_is_no_text_is_told_in_letters_and_briefly(tmp_path, content
     with pytest.raises(SourceError) as caught:
         table(path)
     text = str(caught.value)
-    assert text.startswith(f"{path}:1: it begins with {content[:20]!r} and is not text; give a CSV in UTF-8")
+    begins = " ".join(f"{byte:02x}" for byte in content[:8])
+    assert text.startswith(f"{path}:1: it begins with the bytes {begins} and is not text; give a CSV in UTF-8")
     assert text.isprintable() and len(text) < len(str(path)) + 250
 
 
