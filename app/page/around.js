@@ -117,7 +117,10 @@ class Curve {
     Object.assign(this, { around, key, knob });
     this.drawing = element("svg:svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, class: "curve", role: "img", onpointermove: (event) => this.point(event), onpointerleave: () => this.write() });
     this.line = element("output", {});
-    this.takes = element("span", { class: "takes" });
+    // They stay: a button that is replaced under the pointer cannot be pressed.
+    this.buttons = [0, 1].map((k) => element("button", { type: "button", class: "go", hidden: "", onclick: () => this.knob.set(this.offers[k][0]) }));
+    this.why = element("span", { class: "faint" });
+    this.takes = element("span", { class: "takes" }, ...this.buttons, this.why);
     const close = element("button", { type: "button", title: "Close", "aria-label": `Close the curve of ${knob.what.label}`, onclick: () => around.close(key) }, "×");
     this.node = element("div", { class: "around" }, this.drawing, element("div", { class: "said" }, this.line, close), this.takes);
     knob.below.replaceChildren(this.node);
@@ -187,13 +190,14 @@ class Curve {
     // The likelihood, too, is that of white innovations.
     const doubted = Boolean(this.around.said.R[this.key]?.doubt);
     const offers = [best && best.factor !== 1 && !doubted ? [best.value, "likeliest of those that were folded"] : null, said?.value ? [said.value, said.text] : null].filter(Boolean);
-    // A button that is replaced under the pointer cannot be pressed.
-    const shape = JSON.stringify([offers, said?.text]);
-    if (shape === this.offered) return;
-    this.offered = shape;
-    this.takes.replaceChildren(
-      ...offers.map(([value, title], k) => element("button", { type: "button", class: "go", title: `Take it: ${title}`, onclick: () => this.knob.set(value) }, `${k || !best || best.factor === 1 ? "data say" : "take"} ${compact(value, 3)}`)),
-      said && !said.value ? element("span", { class: "faint" }, said.text) : "",
-    );
+    this.offers = offers;
+    for (const [k, button] of this.buttons.entries()) {
+      button.hidden = !offers[k];
+      if (!offers[k]) continue;
+      const [value, title] = offers[k];
+      setText(button, `${k || !best || best.factor === 1 ? "data say" : "take"} ${compact(value, 3)}`);
+      setAttribute(button, "title", `Take it: ${title}`);
+    }
+    setText(this.why, said && !said.value ? said.text : "");
   }
 }
