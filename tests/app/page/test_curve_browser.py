@@ -61,6 +61,12 @@ def settled(engine, revision):
     wait_for(lambda: engine.revisions.runs[-1].number >= revision and not engine.status().refolding, PATIENCE)
 
 
+def likelihood(track):
+    used = track.verdict == USED
+    assert not np.any(track.verdict == GATED)
+    return track.log_likelihood[used].sum()
+
+
 def test_the_curve_around_a_knob_shows_the_likeliest_value(page, session):
     engine = session.engine
     key = next(item.key for item in engine.tuning.items() if item.key.startswith("R."))

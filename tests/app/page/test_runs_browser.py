@@ -8,7 +8,6 @@ import pytest
 from app.cli.run import live_source
 from app.session import Page, Session
 from app.twin.twin import load_twin
-from estimators.track import GATED, USED
 from tests.app.scripted import pull_all, wait_for
 
 pytestmark = pytest.mark.browser
@@ -105,9 +104,3 @@ def test_pin_overlay_and_unpin(page, session):
     wait_for(lambda: page.locator(".chart.difference").is_hidden(), PATIENCE)
     wait_for(lambda: coloured(page, "#charts") == 0, PATIENCE)
     assert page.evaluate("Object.keys(window.nisus.link.lanes).filter(name => /^(run|less) /.test(name))") == []
-
-
-def likelihood(track):
-    used = track.verdict == USED
-    assert not np.any(track.verdict == GATED)
-    return track.log_likelihood[used].sum()
