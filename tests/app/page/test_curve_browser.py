@@ -10,6 +10,7 @@ from app.session import Page, Session
 from app.twin.twin import load_twin
 from estimators.fold import fold
 from estimators.log import Log
+from estimators.track import GATED, USED
 from tests.app.scripted import pull_all, wait_for
 
 pytestmark = pytest.mark.browser
