@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from app.cli.run import live_source
+from app.engine.commands import SetTuning
 from app.session import Page, Session
 from app.twin.twin import load_twin
+from estimators.fold import fold
+from estimators.log import Log
+from estimators.track import GATED, USED
 from tests.app.scripted import pull_all, wait_for
 
 pytestmark = pytest.mark.browser
@@ -104,3 +108,39 @@ def test_pin_overlay_and_unpin(page, session):
     wait_for(lambda: page.locator(".chart.difference").is_hidden(), PATIENCE)
     wait_for(lambda: coloured(page, "#charts") == 0, PATIENCE)
     assert page.evaluate("Object.keys(window.nisus.link.lanes).filter(name => /^(run|less) /.test(name))") == []
+
+
+def likelihood(track):
+    used = track.verdict == USED
+    assert not np.any(track.verdict == GATED)
+    return track.log_likelihood[used].sum()
+
+
+def test_the_curve_around_a_knob_shows_the_likeliest_value(page, session):
+    engine = session.engine
+    # The test before left a Q that is wrong, under which no R is to be taken.
+    configured = engine.twin.tuning.q[0]
+    noise = next(item.key for item in engine.tuning.items() if item.key.startswith("Q."))
+    engine.submit(SetTuning(noise, configured))
+    wait_for(lambda: engine.status().tuning.q[0] == configured and not engine.status().refolding, PATIENCE)
+    key = next(item.key for item in engine.tuning.items() if item.key.startswith("R."))
+    label = page.locator(f'[data-key="{key}"] label')
+    label.focus()
+    label.press("Enter")
+    curve = page.locator(f'[data-key="{key}"] .around')
+    wait_for(lambda: curve.get_attribute("data-done") == "true", PATIENCE)
+    assert curve.locator("circle").count() == 7
+
+    status, model, log = engine.status(), engine.model, Log.of(engine.model)
+    log.extend(pull_all(engine).events)
+    value = status.tuning.get(key)
+    values = [value * factor for factor in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)]
+    ungated = [status.tuning.set(key, item).set("gate", None) for item in values]
+    best = values[int(np.argmax([likelihood(fold(status.estimator, model, tuning, log)) for tuning in ungated]))]
+    said = curve.locator("output").inner_text()
+    assert float(said.split("likeliest at ")[1].split(",")[0]) == pytest.approx(best, rel=0.01)
+
+    take = curve.locator(".takes button:not([hidden])").last
+    wanted = float(take.inner_text().split()[-1])
+    take.click()
+    wait_for(lambda: engine.status().tuning.get(key) == pytest.approx(wanted, rel=0.01), PATIENCE)
