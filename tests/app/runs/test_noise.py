@@ -16,9 +16,17 @@ SLOW = SensorNoise(0.001, 0.0001, 2000, 0.6, 0.0)
 ALTERNATING = SensorNoise(0.5, 0.01, 2000, -0.3, 0.0)
 
 
-def said(name):
+WHITE_NOISE = {
+    "sensors.voltage": "{std: 0.06}",
+    "sensors.temperature": "{std: 0.06}",
+    "noise.temperature": "{variance: 1e-4}",
+}
+"""The battery without errors that last, as whoever has not found them would set it."""
+
+
+def said(name, **overrides):
     """What the innovations of a twin say of each R once it is taken, and its fits before and after."""
-    twin = load_twin(name)
+    twin = load_twin(name, **overrides)
     prepare(twin)
     log, _ = read_log(twin, None)
 
@@ -39,10 +47,10 @@ def said(name):
 
 
 def test_on_a_recording_whose_error_lasts_it_would_spoil_the_twin_and_is_doubted(data):
-    """In its 95 % band 98 % of the time before, 87 % after, and further off: neither R of this twin is offered."""
+    """A coverage of 95 % before and far less after; so neither R of this twin is offered."""
     data("battery_panasonic_18650pf", "25degC_US06.mat")
-    noise, before, after = said("battery_panasonic")
-    assert before["soc"].coverage > 0.93 and after["soc"].coverage < 0.9
+    noise, before, after = said("battery_panasonic", overrides=WHITE_NOISE)
+    assert before["soc"].coverage > 0.93 and after["soc"].coverage < 0.8
     assert after["soc"].rmse > 1.3 * before["soc"].rmse
     found = doubts(noise, 0.4)
     assert set(found) == {"R.voltage", "R.temperature", "Q"}

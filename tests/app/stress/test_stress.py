@@ -248,9 +248,20 @@ def test_what_was_said_without_the_mistake_is_not_counted_for_it():
 
 
 def test_a_wrong_belief_over_a_recording_is_foretold_by_what_follows(data):
-    """Begun anew every 300 s of it: a hundred times R is found each time, a tenth of Q now and then."""
+    """Begun anew every 300 s of it: a hundred times R is found each time, a tenth of Q hardly ever."""
     data("battery_panasonic_18650pf", "25degC_US06.mat")
-    twin = load_twin("battery_panasonic")
+    # Without the errors that last, and with what was normal then.
+    overrides = {
+        "sensors.voltage": "{std: 0.06}",
+        "sensors.temperature": "{std: 0.06}",
+        "noise.temperature": "{variance: 1e-4}",
+        "commissioned": """{voltage: {bias: 0.002, scale: 0.372, correlation: 0.609,
+          reached: {narrow: 295.4, wide: 3524.3, shifted up: 211.4, shifted down: 229.5, correlated: 997.6,
+          alternating: 522.3, spiky: 2106.5, stuck: 237.6}}, temperature: {bias: 0.008, scale: 1.004, correlation: 0.683,
+          reached: {narrow: 292.2, wide: 1029.4, shifted up: 24.7, shifted down: 16.6, correlated: 326.2,
+          alternating: 161.9, spiky: 2302.4, stuck: 15.1}}}""",
+    }
+    twin = load_twin("battery_panasonic", overrides=overrides)
     bench, oracle = Bench(twin, 0, 300.0), Oracle(twin, 300.0)
     told = {name: oracle.foretell(bench, chosen(bench, name), "ekf").verdict for name in ("R x100", "Q /10")}
-    assert told == {"R x100": VISIBLE, "Q /10": CHANCE}
+    assert told == {"R x100": VISIBLE, "Q /10": INVISIBLE}
