@@ -257,7 +257,8 @@ def test_a_wrong_belief_over_a_recording_is_foretold_by_what_follows(data):
         "noise.temperature": "{variance: 1e-4}",
         "commissioned": """{voltage: {bias: 0.002, scale: 0.372, correlation: 0.609,
           reached: {narrow: 295.4, wide: 3524.3, shifted up: 211.4, shifted down: 229.5, correlated: 997.6,
-          alternating: 522.3, spiky: 2106.5, stuck: 237.6}}, temperature: {bias: 0.008, scale: 1.004, correlation: 0.683,
+          alternating: 522.3, spiky: 2106.5, stuck: 237.6}},
+          temperature: {bias: 0.008, scale: 1.004, correlation: 0.683,
           reached: {narrow: 292.2, wide: 1029.4, shifted up: 24.7, shifted down: 16.6, correlated: 326.2,
           alternating: 161.9, spiky: 2302.4, stuck: 15.1}}}""",
     }
