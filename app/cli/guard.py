@@ -13,6 +13,7 @@ from estimators.errors import ConfigError, printable
 
 from ..export.parts import Part
 from ..guard.junit import Guarded, junit
+from ..guard.last import keep_last
 from .arguments import settings
 from .beside import beside, jobs_of
 from .check_text import as_text
@@ -35,6 +36,9 @@ def guard(arguments: Arguments) -> int:
     note = printable(arguments.note).strip() if arguments.accept else None
     found = _all(archive, Wanted(note, settings(arguments.set)), arguments.jobs)
     must = os.environ.get("CI", "").lower() in ("true", "1")
+    if not arguments.set:
+        for twin in dict.fromkeys(each.twin for each in archive):
+            keep_last(twin, [one for each, one in zip(archive, found, strict=True) if each.twin == twin])
     if arguments.junit is not None:
         try:
             arguments.junit.write_bytes(junit(found, absent_fails=must))

@@ -14,14 +14,17 @@ export class Versions {
     this.note = element("input", { type: "text", "aria-label": "Note on the version", placeholder: "note", maxlength: 2000 });
     const keep = element("button", { type: "submit", class: "go", title: "Keep what runs as a version, beside the twin" }, "keep");
     this.form = element("form", { onsubmit: (event) => (event.preventDefault(), this.keepRunning()) }, this.name, this.note, keep);
-    this.node = element("details", { class: "versions", open: true }, element("summary", { title: "Filter and tuning under a name, in files beside the twin" }, "Tuning versions"), this.table, this.form, this.error);
+    this.guard = element("p", { class: "guard faint", hidden: true });
+    this.node = element("details", { class: "versions", open: true }, element("summary", { title: "Filter and tuning under a name, in files beside the twin" }, "Tuning versions"), this.table, this.guard, this.form, this.error);
   }
 
   // Asked for while somebody looks; what has the focus keeps it.
   async list() {
     const answer = await fetch("/api/tunings").catch(() => null);
     if (!answer?.ok) return;
-    const { running, versions } = await answer.json();
+    const { running, versions, guard } = await answer.json();
+    this.guard.hidden = !guard.length;
+    this.guard.replaceChildren(...guard.map((each) => guarded(each, versions)));
     const differ = this.compared && (await this.difference(this.compared));
     const focused = this.table.contains(document.activeElement) ? document.activeElement.dataset.focus : null;
     const head = element("tr", {}, element("th", { scope: "col" }, "version"), element("th", { scope: "col", title: "Mean NIS where it was scored" }, "NIS"), element("th", { scope: "col", title: "Log-likelihood of a reading where it was scored" }, "log L"), element("th", {}));
@@ -73,6 +76,16 @@ export class Versions {
     const kept = await this.ask("/api/tunings", { run: this.link.status.revision, name: this.name.value.trim().replaceAll(" ", "_"), note: this.note.value });
     if (kept) this.name.value = this.note.value = "";
   }
+}
+
+// What `nisus guard` said last of one recording: what got worse is shown, the rest is told.
+function guarded(each, versions) {
+  const { recording, at, version, figures, worse, better, failure } = each;
+  const verdict = failure || (worse.length ? `${worse.length} of ${figures} figures worse: ${worse[0]}` : `none of ${figures} figures worse${better.length ? `, ${better.length} better` : ""}`);
+  const holds = versions.find((item) => item.holds)?.name;
+  const since = holds && version && holds !== version ? `; since then ${holds} was accepted` : "";
+  const title = [...worse, ...better.map((text) => `better: ${text}`)].join("\n") || "What nisus guard compared with the recorded scores";
+  return element("span", { class: failure || worse.length ? "error" : "", title, dataset: { guarded: recording } }, `${failure || worse.length ? "✗" : "✓"} guard, ${at.slice(0, 16).replace("T", " ")} UTC, ${recording} with ${version || "?"}: ${verdict}${since}`);
 }
 
 function differences(name, differ) {

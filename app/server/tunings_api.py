@@ -18,6 +18,7 @@ from ..engine.changes import difference
 from ..engine.interface import Running
 from ..engine.reload import obstacle
 from ..engine.revisions import LONGEST_NOTE
+from ..guard.last import last
 from ..runs.scores import RunScores
 from ..tunings.figures import figures
 from ..tunings.keep import Settings, keep, version_text
@@ -43,8 +44,10 @@ class TuningsApi:
         ]
 
     async def _list(self, request: Request) -> Response:
-        versions = await asyncio.to_thread(listing, self._engine.twin)
-        return Json({"running": self._engine.status().tuning.name, "versions": versions})
+        twin = self._engine.twin
+        versions = await asyncio.to_thread(listing, twin)
+        guarded = await asyncio.to_thread(last, twin.path)
+        return Json({"running": self._engine.status().tuning.name, "versions": versions, "guard": guarded})
 
     async def _keep(self, request: Request) -> Response:
         """Keep a run as a version, with what it was worth."""

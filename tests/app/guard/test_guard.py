@@ -18,6 +18,7 @@ from app.cli.guard import guard
 from app.cli.guard_archive import of_twin
 from app.cli.main import main
 from app.guard.figures import MOST, SHARE, allowances, measured
+from app.guard.last import last
 from app.guard.reference import read_reference
 from app.guard.verdict import judge
 from app.tunings.keep import Settings, accept, keep, version_text
@@ -113,6 +114,23 @@ def test_five_percent_in_one_of_ten_recordings_are_caught(archive, capsys):
         failed = {case.get("name") for case in suite if case.find("failure") is not None}
         assert int(suite.get("failures")) == len(failed) and int(suite.get("tests")) == len(suite)
         assert ("rmse.temperature" in failed) == (name == f"w{PLANTED}") and (name == f"w{PLANTED}" or not failed)
+
+
+def test_what_was_said_last_is_kept_beside_the_versions(archive, capsys):
+    path = archive / f"w{PLANTED}.yaml"
+    before = last(path)
+    assert [each["recording"] for each in before] == [path.stem] and last(archive / "none.yaml") == []
+    # A trial with other settings says nothing of what was accepted.
+    assert guarded(None, path, set=("sensors.winding={std: 5.0}",)) == 1 and last(path) == before
+    kept(path, worse_by(path, 0.05))
+    assert guarded(archive) == 1
+    (worse,), (fine,) = last(path), last(archive / "w0.yaml")
+    assert worse["version"] == "planted" and any(line.startswith("rmse.temperature was ") for line in worse["worse"])
+    assert fine["version"] == "own" and fine["figures"] > 5 and not fine["worse"] and not fine["failure"]
+    # Of one twin alone: what was said of the others stays; a file that was damaged is no obstacle.
+    (archive / "w1.tunings" / "guard.json").write_text("{")
+    assert last(archive / "w1.yaml") == [] and guarded(None, archive / "w1.yaml") == 0
+    assert last(archive / "w1.yaml")[0]["recording"] == "w1" and last(path) == [worse]
 
 
 def test_ten_reruns_are_silent(archive, capsys):

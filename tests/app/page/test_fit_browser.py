@@ -5,6 +5,9 @@ import json
 import pytest
 
 from app.cli.run import live_source
+from app.guard.junit import Guarded
+from app.guard.last import keep_last
+from app.guard.verdict import Judged
 from app.session import Page, Session
 from app.tunings.listing import listing
 from app.twin.twin import load_twin, with_version
@@ -127,7 +130,10 @@ def test_single_entries_are_fitted_alone(page, session):
 
 def test_what_runs_is_kept_compared_and_loaded_again(page, session):
     engine = session.engine
+    keep_last(engine.twin.path, [Guarded("winding", "own", [Judged("rmse.temperature", 0.5, 0.6, 0.1, 0.01)])])
     page.get_by_role("tab", name="Runs").click()
+    guarded = page.locator('.versions [data-guarded="winding"]')
+    wait_for(lambda: "1 of 1 figures worse: rmse.temperature was 0.5 and is 0.6" in guarded.inner_text(), PATIENCE)
     page.get_by_role("textbox", name="Name of the version").fill("as it was")
     page.get_by_role("textbox", name="Note on the version").fill("too much noise")
     page.locator(".versions form button").click()

@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 from app.engine.commands import SetTuning
+from app.guard.junit import Guarded
+from app.guard.last import keep_last
+from app.guard.verdict import Judged
 from app.twin.twin import load_twin
 from config.loader import TWINS
 from estimators.fold import Fold
@@ -37,6 +40,15 @@ def post(page, path, **fields):
 
 def tunings(page):
     return json.loads(page.client.get("/api/tunings").text)
+
+
+def test_what_guard_said_last_is_listed_beside_the_versions(page):
+    assert tunings(page)["guard"] == []
+    worse = Judged("rmse.temperature", 0.5, 0.6, 0.1, 0.01)
+    keep_last(page.engine.twin.path, [Guarded("winding", "own", [worse])])
+    (said,) = tunings(page)["guard"]
+    assert said["recording"] == "winding" and said["figures"] == 1
+    assert said["worse"] == ["rmse.temperature was 0.5 and is 0.6: worse by 0.1, allowed 0.01"]
 
 
 def turn(page, key, value):
