@@ -8,7 +8,7 @@ from typing import Any
 from estimators.log import Log
 
 from ..twin.twin import Twin
-from .lines import lines
+from .lines import lasting_lines, lines
 from .verdict import Advice
 
 
@@ -35,7 +35,7 @@ def advice_json(twin: Twin, log: Log, told: Advice) -> dict[str, Any]:
             }
             for claim in told.claims
         ],
-        "lines": lines(told),
+        "lines": lines(told) + lasting_lines(told),
         "remedies": told.remedies,
     }
 

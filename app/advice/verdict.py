@@ -12,9 +12,11 @@ enough, at the end.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from estimators.errors import NisusError
+from estimators.fit.objective import ALONE
 from estimators.registry import find_entry, unfit
 
 from .claim import NO, UNTOLD, YES, Claim
@@ -22,6 +24,7 @@ from .consistent import consistent
 from .cost import affordable
 from .curvature import curvature
 from .ensemble import PREFERRED, sweep
+from .lasting import lasting
 from .linear import STEADY, linear, steady
 from .measured import Measured
 from .observed import observed
@@ -55,13 +58,14 @@ class Advice:
     """A recommendation: filter and options, the claims in the order in which they were asked, and which decided.
 
     `because` are the keys of the claims that led to this filter and not to the one before it in the tree. `remedies`
-    are what to do beside choosing it.
+    are what to do beside choosing it; `sections` entries of the YAML, by key, that say which errors last.
     """
 
     estimator: str = ""
     options: dict[str, float] = field(default_factory=dict)
     claims: list[Claim] = field(default_factory=list)
     because: tuple[str, ...] = ()
+    sections: Mapping[str, dict[str, object]] = field(default_factory=dict)
 
     def claim(self, key: str) -> Claim | None:
         """The claim of that key, if it was asked."""
@@ -101,9 +105,22 @@ def advise(measured: Measured) -> Advice:
         _of_ensemble(told, measured)
     else:
         _of_small(told, measured)
-    _ask(told, consistent(measured, told.estimator, told.options))
+    _consistency(told, measured, ensemble=size.answer == NO)
     _ask(told, affordable(measured, told.estimator, told.options))
     return told
+
+
+def _consistency(told: Advice, measured: Measured, *, ensemble: bool) -> None:
+    """Whether the result bears out; where its innovations follow one another, whether noise that lasts explains it."""
+    claim = consistent(measured, told.estimator, told.options)
+    _ask(told, claim)
+    # A filter that draws is too slow to be fitted here, and has no likelihood that is smooth.
+    if claim.answer != NO or ensemble or find_entry(told.estimator).family in ALONE:
+        return
+    found = lasting(measured, told.estimator, told.options)
+    if found is not None:
+        told.sections = found[1].sections
+        _ask(told, found[0])
 
 
 def _ask(told: Advice, claim: Claim) -> Claim:

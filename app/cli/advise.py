@@ -57,7 +57,7 @@ def _of_twin(arguments: Arguments, name: str) -> int:
     else:
         print("\n".join(as_text(twin, log, told)))
     if arguments.apply or arguments.out is not None:
-        kept = apply(twin.path, lines(told), arguments.out)
+        kept = apply(twin.path, lines(told), arguments.out, told.sections)
         if not arguments.json:
             was = f"; as it was: {kept}" if kept else ""
             print(f"\n{arguments.out or twin.path}: its estimator is {told.estimator}{was}")

@@ -6,7 +6,7 @@ import textwrap
 
 from estimators.log import READING, Log
 
-from ..advice.lines import lines
+from ..advice.lines import lasting_lines, lines
 from ..advice.verdict import Advice
 from ..twin.twin import Twin
 from .check_text import WIDTH
@@ -30,7 +30,11 @@ def as_text(twin: Twin, log: Log, told: Advice) -> list[str]:
         mark = " *" if claim.key in told.because else ""
         page.append(f"  {claim.question} {claim.answer}{mark}")
         page += _wrapped(claim.reason, 6)
-    page += ["", f"Lines for {twin.path.name}", *(f"  {line}" for line in lines(told).splitlines())]
+    page += [
+        "",
+        f"Lines for {twin.path.name}",
+        *(f"  {line}" for line in (lines(told) + lasting_lines(told)).splitlines()),
+    ]
     if told.remedies:
         page += ["", "What else to do", *(line for text in told.remedies for line in _wrapped(f"- {text}", 2))]
     return page

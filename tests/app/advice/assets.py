@@ -72,6 +72,17 @@ def staying(x, u, p, dt, out):
     out[0] = x[0]
 
 
+STILL = StateSpaceModel(
+    name="still",
+    title="A level that hardly changes",
+    states=(State("level", "m", std=3.0),),
+    noises=(Noise("level", "m²/s", 1e-6),),
+    sensors=(Sensor("float", (Row("float", "m", 1.0),), h=first),),
+    f=staying,
+    linear=True,
+)
+
+
 def squared(x, u, p, out):
     """A sensor that knows no sign."""
     out[0] = x[0] * x[0]

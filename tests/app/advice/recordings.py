@@ -57,6 +57,19 @@ def strong(rng):
     return {"glow": np.exp(xs) + rng.normal(0, 0.5, N)}, {}
 
 
+ERROR, LASTS, WHITE = 0.8, 15.0, 0.3
+"""Of the float: deviation of the error that lasts, m, how long it lasts, s, and deviation of its white noise, m."""
+
+
+def erring(rng):
+    """A level that hardly changes, read with an error that is e⁻¹ of itself after `LASTS` seconds."""
+    error, errors, a = 0.0, [], np.exp(-1.0 / LASTS)
+    for _ in range(4 * N):
+        error = a * error + rng.normal(0, ERROR * np.sqrt(1.0 - a * a))
+        errors.append(error)
+    return {"float": 2.0 + np.array(errors) + rng.normal(0, WHITE, 4 * N)}, {}
+
+
 def peaks(rng):
     x = 5.0 + np.cumsum(rng.normal(0, 0.1, N))
     x = np.sign(x) * np.maximum(np.abs(x), 2.0)

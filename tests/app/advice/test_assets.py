@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from app.advice.claim import UNTOLD
+from app.advice.lines import apply, lines
 from app.advice.measured import Measured
 from app.advice.verdict import Advice, advise
 from app.cli.fold import read_log
@@ -92,6 +93,26 @@ def test_time_varying_takes_a_gain_that_follows(told):
     found = told("varying", "VARYING", recordings.varying, "probe")
     assert (found.estimator, found.because) == ("kf", ("linear", "steady"))
     assert "varies with its inputs" in found.claim("steady").reason
+
+
+def test_an_error_that_lasts_is_found_with_its_size_and_time(told, tmp_path):
+    found = told("erring", "STILL", recordings.erring, "float")
+    before, after = found.claim("consistent"), found.claim("lasting")
+    assert before.answer == "no" and "follow one another" in before.reason
+    assert after.answer == "yes" and after.figure < after.threshold
+    assert list(found.sections) == ["sensors.float"]
+    entry = found.sections["sensors.float"]
+    # 160 times as long as it lasts: logarithms of its time and variance are off by √(2 / 160) = 0.11 at best.
+    assert float(entry["error"]["over"].removesuffix(" s")) == pytest.approx(recordings.LASTS, rel=0.5)
+    assert entry["error"]["variance"] == pytest.approx(recordings.ERROR**2, rel=0.5)
+    assert entry["variance"] == pytest.approx(recordings.WHITE**2, rel=0.3)
+    # The lines as they are put in make a twin that is consistent.
+    path = write(tmp_path, "erring", "STILL", "kf", recordings.erring, "float")
+    assert apply(path, lines(found), None, found.sections) is not None
+    twin = load_twin(path)
+    assert "float_error" in twin.model.state_names
+    again = advise(Measured(twin, read_log(twin, None)[0]))
+    assert again.claim("consistent").answer == "yes" and again.claim("lasting") is None
 
 
 @pytest.mark.parametrize("number", [1, 2])

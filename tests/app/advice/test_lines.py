@@ -4,10 +4,11 @@ import json
 
 import pytest
 
-from app.advice.lines import apply, changed, lines
+from app.advice.lines import apply, changed, lines, with_entry
 from app.advice.verdict import Advice
 from app.cli.main import main
 from config.yaml_lines import parse
+from estimators.errors import ConfigError
 
 BEFORE = """\
 # A twin.
@@ -30,6 +31,29 @@ def test_the_section_gives_way_and_nothing_else(end):
     assert data["estimator"] == {"name": "kf", "options": {"robust": "student-t", "dof": 7}}
     assert data["model"] == "motor_winding" and data["gate"] is None
     assert "# A twin." in text and "# about the gate" in text and "alpha" not in text
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("noise:   # Q\n  a: {std: 2}  # by hand\n  b: {variance: 3}\ngate: null\n", {"b": {"variance": 3}}),
+        ("noise:\n    # of old\n    a:\n      std: 2\n    b: {variance: 3}\ngate: null\n", {"b": {"variance": 3}}),
+        ("noise:\n  b: {variance: 3}\ngate: null\n", {"b": {"variance": 3}}),
+        ("gate: null\n", {}),
+    ],
+)
+def test_an_entry_takes_the_place_of_what_it_says_too(before, after):
+    text = with_entry(before, "noise.a", {"variance": 4.0, "over": "3 s"})
+    data, _ = parse(text, "x")
+    assert data == {"noise": {"a": {"variance": 4, "over": "3 s"}, **after}, "gate": None}
+
+
+def test_what_else_an_entry_says_stays():
+    text = with_entry("sensors:\n  a: {std: 2, from: 1}\n", "sensors.a", {"variance": 1.0, "error": {"over": "2 s"}})
+    data, _ = parse(text, "x")
+    assert data["sensors"]["a"] == {"from": 1, "variance": 1, "error": {"over": "2 s"}}
+    with pytest.raises(ConfigError, match="sensors: is written in one line; put a: {variance: 1} in by hand"):
+        with_entry("sensors: {a: {std: 2}}\n", "sensors.a", {"variance": 1.0})
 
 
 def test_a_file_without_the_section_gets_it():

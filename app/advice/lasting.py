@@ -1,0 +1,269 @@
+"""Would noise that lasts explain innovations that follow one another? Tried, and fitted, before it is recommended.
+
+White noise makes white innovations. Where they follow one another, something that lasts is missing: a disturbance of
+the process, or an error of the sensor (estimators/model/coloured.py). Each that has to do with the row is appended in
+turn, its size and its time are fitted by likelihood, and the one that explains most stays, until no row is left.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from estimators.diagnostics.calibration import LIMITS, Calibration, calibrations
+from estimators.errors import ModelError, NisusError
+from estimators.fit.aims import Recording
+from estimators.fit.entries import entries_of
+from estimators.fit.objective import Cancelled, Objective, only_told
+from estimators.fit.optimise import maximise
+from estimators.fold import Fold
+from estimators.log import READING, Log
+from estimators.model.coloured import Lasting, coloured, disturbance_time, error_time, errors_of
+from estimators.model.state_space import StateSpaceModel
+from estimators.tuning import Tuning
+
+from .claim import NO, UNTOLD, YES, Claim
+from .measured import Measured
+from .words import digits
+
+QUESTION = "Would noise that lasts explain innovations that follow one another?"
+OF = "correlation of one innovation with the next"
+
+MOST = 3
+"""Errors that are appended; beyond that the model itself is to be mended."""
+
+WORTH = 10.0
+"""Nats that one must gain, at least: it brings two numbers, and the best of several is taken."""
+
+BUDGET = 30.0
+"""Seconds of one processor for all that is tried; what was found by then is said."""
+
+REACHES = 0.05
+"""Change of a row's innovations, in parts of their size, by four times the Q of a noise that has to do with it."""
+
+LONGER = 30.0
+"""How many times as long as that of the innovations themselves the time of an error is tried at most."""
+
+
+class Appended(NamedTuple):
+    """A noise or the error of a sensor, and where its fit begins: correlation time, s, and variance of a sensor."""
+
+    noise: str | None
+    sensor: str | None
+    over: float
+    variance: float = 0.0
+
+
+@dataclass(frozen=True)
+class Explained:
+    """What is appended, by key of the YAML, the likelihood that it gains, nats, and the rows that are related still."""
+
+    sections: Mapping[str, dict[str, object]] = field(default_factory=dict)
+    gain: float = 0.0
+    related: tuple[Calibration, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """The model with some errors appended, its tuning as fitted, the fold with it, and its log-likelihood."""
+
+    appended: tuple[Appended, ...]
+    tuning: Tuning
+    fold: Fold
+    likelihood: float
+
+
+def lasting(measured: Measured, estimator: str, options: Mapping[str, float] | None) -> tuple[Claim, Explained] | None:
+    """Ask it of the filter that is chosen; None where no row of its innovations follows itself."""
+    before = _begun(measured, estimator, options)
+    related = _related(before)
+    if not related:
+        return None
+    worst = related[0].correlation.value
+    try:
+        after = _explained(measured.twin.model, estimator, before)
+    except NisusError as error:
+        return Claim("lasting", QUESTION, UNTOLD, worst, LIMITS.correlation, OF, str(error)), Explained()
+    if after is before:
+        reason = f"{related[0].subject} follows itself with {worst:+.2f}, and no noise that lasts makes that likelier"
+        text = "a state is missing, or the asset is at times another one: look at Innovations over time"
+        return Claim("lasting", QUESTION, NO, worst, LIMITS.correlation, OF, reason, text), Explained()
+    left = _related(after)
+    found = Explained(_sections(after), after.likelihood - before.likelihood, tuple(left))
+    figure = max((entry.correlation.value for entry in _rows(after)), default=0.0)
+    times = ", ".join(
+        f"{each.noise or each.sensor} for {digits(_time(after.tuning, each))} s" for each in after.appended
+    )
+    reason = (
+        f"with what lasts of {times} the log is {digits(found.gain)} nats likelier; of {len(related)} "
+        f"row{'s' if len(related) > 1 else ''} that followed themselves by up to {worst:+.2f}, "
+        + (f"{len(left)} still do{'es' * (len(left) == 1)}, {left[0].subject} most" if left else "none does any more")
+    )
+    remedy = "put the lines with `over` into the YAML, then nisus tune fits their size and time"
+    return Claim("lasting", QUESTION, NO if left else YES, figure, LIMITS.correlation, OF, reason, remedy), found
+
+
+def _begun(measured: Measured, estimator: str, options: Mapping[str, float] | None) -> _Trial:
+    fold = measured.folded(estimator, options).fold
+    return _Trial((), fold.tuning, fold, _likelihood(fold))
+
+
+def _likelihood(fold: Fold) -> float:
+    return float(np.nansum(fold.track.log_likelihood[: fold.n]))
+
+
+def _rows(trial: _Trial) -> list[Calibration]:
+    fold = trial.fold
+    found = calibrations(
+        fold.model, fold.log.events, fold.track, gate=fold.tuning.gate, marginal=fold.marginal, limits=LIMITS
+    )
+    return [entry for entry in found if entry.role == "used" and np.isfinite(entry.scale.high)]
+
+
+def _related(trial: _Trial) -> list[Calibration]:
+    """The rows that follow themselves, those first that do so most."""
+    rows = [entry for entry in _rows(trial) if entry.correlation.beyond(-LIMITS.correlation, LIMITS.correlation)]
+    return sorted((entry for entry in rows if entry.correlation.value > 0.0), key=lambda each: -each.correlation.value)
+
+
+def _explained(model: StateSpaceModel, estimator: str, begun: _Trial) -> _Trial:
+    """Append what explains the row that follows itself most, and again, until the budget is spent."""
+    log, best, given_up = only_told(begun.fold.log), begun, set[str]()
+    end = time.thread_time() + BUDGET
+    while len(best.appended) < MOST and time.thread_time() < end:
+        rows = [entry for entry in _related(best) if entry.subject not in given_up]
+        if not rows:
+            break
+        candidates = list(_candidates(model, estimator, best, rows[0]))
+        tried = [_tried(model, estimator, begun, best, one, log, end) for one in candidates]
+        better = max((one for one in tried if one is not None), key=lambda one: one.likelihood, default=None)
+        if better is None or better.likelihood < best.likelihood + WORTH:
+            given_up.add(rows[0].subject)
+        else:
+            best = better
+    return best
+
+
+def _candidates(model: StateSpaceModel, estimator: str, trial: _Trial, row: Calibration) -> Iterator[Appended]:
+    """The noises that change the innovations of a row, and the error of its sensor, where they do not last yet."""
+    fold = trial.fold
+    index = fold.model.row_names.index(row.subject)
+    k = int(np.searchsorted(fold.model.row_start, index, side="right")) - 1
+    said = np.flatnonzero((fold.log.kind[: fold.n] == READING) & (fold.log.channel[: fold.n] == k))
+    column = index - int(fold.model.row_start[k])
+    innovation = fold.track.innovation[said, column]
+    period = float(np.median(np.diff(fold.log.t[said]))) * 1e-9
+    # Of a lag of first order the correlation over a period is exp(-period / time).
+    over = float(np.clip(-period / np.log(np.clip(row.correlation.value, 0.05, 0.95)), period, LONGER * period))
+    done = {each.noise or each.sensor for each in trial.appended}
+    for noise in model.noises:
+        if noise.name in done or not _can(model, Appended(noise.name, None, over)):
+            continue
+        key = f"Q.{noise.name}"
+        other = _folded(estimator, fold, trial.tuning.set(key, 4.0 * float(trial.tuning.get(key) or 0.0)))
+        if np.nanstd(other.track.innovation[said, column] - innovation) > REACHES * np.nanstd(innovation):
+            yield Appended(noise.name, None, over)
+    sensor = model.sensors[k]
+    one = Appended(None, sensor.name, over, float(trial.tuning.r[index]))
+    if sensor.name not in done and len(sensor.rows) == 1 and _can(model, one):
+        yield one
+
+
+def _can(model: StateSpaceModel, one: Appended) -> bool:
+    try:
+        _model(model, (one,))
+    except ModelError:
+        return False
+    return True
+
+
+def _model(model: StateSpaceModel, appended: tuple[Appended, ...]) -> StateSpaceModel:
+    noises = {each.noise: each.over for each in appended if each.noise is not None}
+    errors = {each.sensor: Lasting((each.variance,), each.over) for each in appended if each.sensor is not None}
+    return coloured(model, noises, errors)
+
+
+def _tried(
+    model: StateSpaceModel, estimator: str, begun: _Trial, best: _Trial, one: Appended, log: Log, end: float
+) -> _Trial | None:
+    """One more error, its size and time fitted; None if it cannot be folded, or there is no time left for it."""
+    appended = (*best.appended, one)
+    larger = _model(model, appended)
+    tuning = _onto(larger, begun.tuning)
+    if one.noise is not None:
+        # What lasts explains what white noise of that strength did not.
+        key = f"Q.{one.noise}"
+        tuning = tuning.set(key, 2.0 * float(tuning.get(key) or 0.0))
+    for key in _keys(larger, best.appended):
+        if key in best.tuning.keys():  # noqa: SIM118  a method of a tuning
+            tuning = tuning.set(key, best.tuning.get(key))
+    whole = Log.of(larger, capacity=max(1, log.n))
+    whole.extend(log.events)
+    try:
+        entries, _ = entries_of(estimator, tuning, [whole], _keys(larger, (one,)))
+        recording = Recording(whole, 1.0, np.zeros(whole.n, bool))
+        objective = Objective(
+            estimator, tuning, tuple(entries), (recording,), go=lambda _: time.thread_time() < end, executor=None
+        )
+        x, _ = maximise(objective, objective.start, rounds=1)
+        tuning = objective.setting(x).tuning
+        fold = Fold(estimator, larger, tuning, whole)
+        fold.advance()
+    except (NisusError, Cancelled):
+        return None
+    return None if fold.failure is not None else _Trial(appended, tuning, fold, _likelihood(fold))
+
+
+def _onto(model: StateSpaceModel, tuning: Tuning) -> Tuning:
+    """A tuning of the model that something was appended to: what is new stands behind what was there."""
+    new = Tuning.of(model)
+    new.q[: tuning.q.size], new.p[: tuning.p.size] = tuning.q, tuning.p
+    return replace(tuning, model=model, q=new.q, p=new.p, baseline=None)
+
+
+def _keys(model: StateSpaceModel, appended: tuple[Appended, ...]) -> list[str]:
+    """What is fitted: how strong each is, and how long it lasts; of a sensor also what is white of its noise."""
+    keys = []
+    for each in appended:
+        if each.noise is not None:
+            keys += [f"Q.{each.noise}", f"p.{disturbance_time(each.noise)}"]
+        elif each.sensor is not None:
+            sensor = model.sensors[model.sensor_names.index(each.sensor)]
+            keys += [f"R.{sensor.rows[0].name}", f"Q.{errors_of(sensor)[0]}", f"p.{error_time(each.sensor)}"]
+    return keys
+
+
+def _time(tuning: Tuning, one: Appended) -> float:
+    name = disturbance_time(one.noise) if one.noise is not None else error_time(str(one.sensor))
+    return float(tuning.get(f"p.{name}") or 0.0)
+
+
+def _sections(trial: _Trial) -> dict[str, dict[str, object]]:
+    """The entries of the YAML that say so, by `noise.NAME` or `sensors.NAME`; what else they say stays."""
+    found: dict[str, dict[str, object]] = {}
+    for each in trial.appended:
+        over = f"{_time(trial.tuning, each):.3g} s"
+        if each.noise is not None:
+            found[f"noise.{each.noise}"] = {"variance": _figure(trial.tuning.get(f"Q.{each.noise}")), "over": over}
+        elif each.sensor is not None:
+            sensor = trial.fold.model.sensors[trial.fold.model.sensor_names.index(each.sensor)]
+            white, error = f"R.{sensor.rows[0].name}", f"Q.{errors_of(sensor)[0]}"
+            found[f"sensors.{each.sensor}"] = {
+                "variance": _figure(trial.tuning.get(white)),
+                "error": {"variance": _figure(trial.tuning.get(error)), "over": over},
+            }
+    return found
+
+
+def _figure(value: object) -> float:
+    return float(f"{float(value):.3g}")  # type: ignore[arg-type]
+
+
+def _folded(estimator: str, fold: Fold, tuning: Tuning) -> Fold:
+    other = Fold(estimator, fold.model, tuning, fold.log)
+    other.advance()
+    return other
