@@ -14,6 +14,7 @@ from .engine.engine import Engine
 from .recording.split import NEVER, Split
 from .recording.writer import FINE, Recorder
 from .rerun.rows import RerunRows
+from .runs.refits import Refits
 
 if TYPE_CHECKING:
     from estimators.snapshots import Base
@@ -96,6 +97,7 @@ class RunningTwin:
             self.engine, lambda stream: RerunRows(stream, self.engine, series=FINE), split, recordings or Path()
         )
         self.engine.recorder = self.recorder
+        self.refits = Refits(self.engine)
         self.view: Any = None
         self.server: Any = None
         self.gone: threading.Event | None = None
@@ -114,6 +116,7 @@ class RunningTwin:
                     secret=secret,
                     review=opening.review,
                     choices=self.view.stage.choices,
+                    refits=self.refits,
                 )
             except BaseException:
                 self.discard()
@@ -132,9 +135,13 @@ class RunningTwin:
             self.view.start()
             self.gone = self.server.start()
         self.engine.start()
+        if self.opening.review is None:
+            # A recording is over; what it had adopted is in it.
+            self.refits.start()
 
     def stop(self) -> None:
         """Stop everything; a recording is finished."""
+        self.refits.stop()
         self.engine.stop()
         self.recorder.stop()
         if self.server is not None:

@@ -14,6 +14,7 @@ from .fault_schema import FaultSection
 from .fields import (
     LONGEST,
     Count,
+    Duration,
     ErrorSection,
     Flag,
     NoiseSection,
@@ -27,6 +28,7 @@ from .fields import (
     SomeSeconds,
     SpreadSection,
     Text,
+    Texts,
     Time,
 )
 from .limits_schema import DuplicatesSection, Ranges, StuckSection, Validity
@@ -52,6 +54,24 @@ class UnknownSection(Section):
     """Standard deviation of what is believed of it at the start, about its value, in its unit."""
     drift: NotNegative = 0.0
     """What one second adds to it: standard deviation of a random walk. Default: 0, an unknown constant."""
+
+
+class RefitSection(Section):
+    """Dual estimation: beside the filter of the state, a slow fit of parameters on windows of what was read.
+
+    In joint estimation (`estimate`) one filter moves both.
+    """
+
+    entries: Texts
+    """What is fitted: parameters (p.r0), noises (Q.winding, R.voltage), options of the estimator (options.alpha), or
+    groups of them (p, Q, R, options)."""
+    every: Duration
+    """Time between two fits, of the asset's clock: 600, or 10 min."""
+    window: Duration
+    """Over how long the last readings are fitted: 1800, or 30 min. The first fit waits until so much was read."""
+    adopt: Literal["by hand", "if better"] = "by hand"
+    """What becomes of a result that predicts better what it was not fitted to. by hand: it is proposed, and waits. if
+    better: it is adopted, and said. Either way it becomes a tuning version with its evidence. Default: by hand."""
 
 
 class SensorSection(SpreadSection):
@@ -261,6 +281,9 @@ class TwinSection(Section):
     estimate: dict[str, UnknownSection] = {}
     """Parameters that are moved into the state and estimated with it, by name: {std, drift}. They become the last
     states, which may be named wherever a state may. Default: none."""
+    refit: RefitSection | None = None
+    """Parameters that are fitted again now and then, beside the running twin, on its last readings: {entries, every,
+    window, adopt}. Default: never."""
     prior: dict[str, PriorSection] = {}
     """The belief before the first reading, by state, or of a whole field under its name. Default: the model's."""
     noise: dict[str, NoiseSection] = {}

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from pydantic import BeforeValidator, Field
 
-from .fields import ErrorSection, NoiseSection, Number, Option, Section, SpreadSection, Text, as_list
+from .fields import ErrorSection, NoiseSection, NotNegative, Number, Option, Section, SpreadSection, Text, as_list
 from .schema import EstimatorSection, GateProbability, GateSection, NormalSection, PriorSection, as_estimator, as_gate
 
 
@@ -31,6 +31,34 @@ class AcceptedSection(Section):
     """Why."""
 
 
+class MovedSection(Section):
+    """What a fit found of one entry, in the entry's unit."""
+
+    before: Number
+    """Its value before."""
+    after: Number
+    """Its value in this version."""
+    low: Number | None = None
+    """Where the 95 % interval begins. Default: without bound."""
+    high: Number | None = None
+    """Where it ends. Default: without bound."""
+    sigma: Number = 0.0
+    """By how many standard deviations of its estimate it moved, on the logarithm of what is positive."""
+
+
+class EvidenceSection(Section):
+    """Why a fit proposed this version: what it predicts better of the blocks of time that were held out."""
+
+    gain: Number
+    """Log-likelihood of a reading there, more than before, nats; of another aim, its score."""
+    error: NotNegative
+    """Standard error of that."""
+    before: dict[str, Number] = {}
+    """What the settings before were worth there; `scores` are those after."""
+    entries: dict[str, MovedSection] = {}
+    """What moved, by key."""
+
+
 class VersionSection(Section):
     """What a tuning version is of, and what it was worth."""
 
@@ -48,6 +76,8 @@ class VersionSection(Section):
     """The recordings that it was fitted on, or where else it is from."""
     scores: dict[str, Number] = {}
     """What it was worth there: nis, log_likelihood (of a reading), rmse.NAME, coverage.NAME, ..."""
+    evidence: EvidenceSection | None = None
+    """Why it was proposed. Default: nothing proposed it."""
     accepted: AcceptedSection | None = None
     """Default: not accepted. Of several that are, the last counts."""
 

@@ -224,6 +224,12 @@ class Tune:
     """Take only this many seconds of each."""
     blocks: int = 9
     """Blocks of time, of as many readings each; every third is held out."""
+    windows: str | None = None
+    """Dual estimation: go through each log window after window of this length (600, 10min, 1h) as a running twin with
+    `refit` does that adopts what is better, and print every parameter against time. A log that is shorter is one
+    window."""
+    every: str | None = None
+    """Time between the ends of two windows. Default: the windows' length."""
     save: Path | None = None
     """Write what is proposed to this .yaml, as sections that stand in place of the twin's own; else nothing."""
     keep: str | None = None

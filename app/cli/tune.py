@@ -27,6 +27,7 @@ from .fold import read_log
 from .places import check_place
 from .prepare import attend, prepare
 from .tune_text import heading, sections
+from .tune_windows import tune_windows
 
 if TYPE_CHECKING:
     from .arguments import Tune as Arguments
@@ -50,6 +51,10 @@ def tune_twin(arguments: Arguments) -> int:
         check_place("--save", arguments.save)
     if arguments.keep is not None:
         check_free(find(arguments.twin), arguments.keep)
+    if arguments.windows is not None:
+        return tune_windows(arguments, wanted, _recordings)
+    if arguments.every is not None:
+        raise ConfigError("--every: is the time between the ends of two --windows; give both")
     twin, recordings = _recordings(arguments)
 
     def work() -> Fitted:

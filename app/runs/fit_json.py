@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from estimators.fit.dual import shift
 from estimators.fit.fit import Fitted, Line
 from estimators.fit.judge import Part, Prediction
 
@@ -16,7 +17,8 @@ TOGETHER = 0.9
 def fit_json(fitted: Fitted) -> dict[str, Any]:
     """All there is to know of a fit; null stands for what is not a number.
 
-    `entries` have before and after, the 95 % interval, whether the data tell them, and whether they were left alone;
+    `entries` have before and after, the 95 % interval, by how many deviations of the estimate they moved (`sigma`),
+    whether the data tell them, and whether they were left alone;
     `correlated` names pairs of entries that the data hardly tell apart. `before` and `after` have scores of the part
     that was fitted and of that which was held out: log density of a reading, mean NIS a degree of freedom, coverage of
     the 95 % bands; `sensors` held out in turn, and true `states`. `verdict` says whether the fit is proposed, by which
@@ -51,7 +53,8 @@ def correlated(fitted: Fitted) -> list[dict[str, Any]]:
 
 
 def _line(line: Line) -> dict[str, Any]:
-    return {name: _number(value) if isinstance(value, float) else value for name, value in line._asdict().items()}
+    fields = {**line._asdict(), "sigma": shift(line)}
+    return {name: _number(value) if isinstance(value, float) else value for name, value in fields.items()}
 
 
 def _part(part: Part) -> dict[str, Any]:

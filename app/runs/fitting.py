@@ -14,13 +14,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from estimators.errors import ConfigError, NisusError
+from estimators.fold import Fold
+from estimators.log import Log
+from estimators.snapshots import Base
 from estimators.tuning import Tuning
 
 from ..engine.integrity import LOWEST
 from ..engine.interface import Running
 from ..twin.bounds import bounds_of
 from .history import history
+from .window import ALL
 
 if TYPE_CHECKING:
     from estimators.fit.fit import Fitted
@@ -66,12 +72,13 @@ class Fitting:
         self.latest: Attempt | None = None
         """The last that was begun."""
 
-    def begin(self, wanted: Sequence[str], most: int | None = None) -> Attempt:
+    def begin(self, wanted: Sequence[str], most: int | None = None, *, since: int | None = None) -> Attempt:
         """Fit entries of the tuning that runs.
 
         Args:
             wanted: Keys and groups, as `estimators.fit` takes them.
             most: Events, the last of the log; None for all that the engine holds.
+            since: In place of that, the time (ns) from which on they are fitted, to the event.
 
         Raises:
             ConfigError: If another fit is under way, nothing is asked for, or it would be too slow.
@@ -96,7 +103,7 @@ class Fitting:
                 begun=time.monotonic(),
             )
             self.latest = attempt
-            self._thread = threading.Thread(target=self._run, args=(attempt, most), name="fit", daemon=True)
+            self._thread = threading.Thread(target=self._run, args=(attempt, most, since), name="fit", daemon=True)
             self._thread.start()
         return attempt
 
@@ -112,7 +119,7 @@ class Fitting:
         if self._thread is not None:
             self._thread.join(timeout=1.0)
 
-    def _run(self, attempt: Attempt, most: int | None) -> None:
+    def _run(self, attempt: Attempt, most: int | None, since: int | None) -> None:
         if sys.platform == "linux":
             # What this thread starts to fold side by side takes after it.
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOWEST)
@@ -121,7 +128,7 @@ class Fitting:
 
         state, reason, fitted = DONE, "", None
         try:
-            log, base = history(self._engine, attempt.tuning, most, lambda: self._count(attempt, 0))
+            log, base = self._log(attempt, most, since)
             attempt.events = log.n
             attempt.seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9
             fitted = fit(
@@ -141,6 +148,21 @@ class Fitting:
         with self._lock:
             attempt.fitted, attempt.reason, attempt.ended = fitted, reason, time.monotonic()
             attempt.state = state
+
+    def _log(self, attempt: Attempt, most: int | None, since: int | None) -> tuple[Log, Base | None]:
+        """What is fitted to, and where a fold of it starts."""
+        from estimators.fit.dual import tail
+
+        engine = self._engine
+        if since is not None:
+            most = engine.index_at(ALL) - engine.index_at(since)
+        log, base = history(engine, attempt.tuning, most, lambda: self._count(attempt, 0))
+        if since is None:
+            return log, base
+        # A copy starts at a snapshot, which may be long before.
+        fold = Fold(attempt.estimator, attempt.tuning.model, attempt.tuning, log, base=base)
+        fold.advance()
+        return tail(fold, int(np.searchsorted(log.t[: log.n], since)), base)
 
     def _count(self, attempt: Attempt, folds: int) -> bool:
         with self._lock:

@@ -32,6 +32,7 @@ from ..engine.interface import Running
 from ..export import markdown
 from ..export.alarms import alarms_text
 from ..rerun.feed import RerunFeed
+from ..runs.refits import Refits
 from ..series.series import Series
 from .answer import answered
 from .api import Json, command_from_json, episodes_json, faults_json, one_line, status_json
@@ -43,6 +44,7 @@ from .model_json import model_json
 from .one_at_a_time import OneAtATime
 from .page_file import PAGE, page_file
 from .page_stream import PageStream
+from .refit_api import RefitApi
 from .runs_api import RunsApi
 from .tunings_api import TuningsApi
 from .viewer_assets import FILES, viewer_assets, viewer_version
@@ -70,6 +72,7 @@ class PageServer:
         secret: str,
         review: Path | None = None,
         choices: Choices | None = None,
+        refits: Refits | None = None,
     ) -> None:
         """Take the port, if it is not open yet.
 
@@ -80,6 +83,7 @@ class PageServer:
             secret: What Viser asks for.
             review: The recording that is reviewed, offered beside those that this process writes.
             choices: What may be chosen about Viser's scene; None if there is none.
+            refits: What is fitted beside it now and then; None for nothing, ever.
 
         Raises:
             ConfigError: If the port cannot be had.
@@ -89,7 +93,7 @@ class PageServer:
         self._choices = choices
         self._series = Series(engine)
         self._runs = RunsApi(engine)
-        self._fit = FitApi(engine)
+        self._fit, self._refit = FitApi(engine), RefitApi(refits or Refits(engine))
         self._exports = ExportApi(engine, self._series, self._runs.scores)
         self._forecasts, self._diagnosis = Forecasts(engine), Diagnosis(engine)
         self._forecasting, self._diagnosing = OneAtATime("forecast"), OneAtATime("diagnosis")
@@ -147,6 +151,7 @@ class PageServer:
             Route("/api/episodes", self._episodes),
             *self._runs.routes(),
             *self._fit.routes(),
+            *self._refit.routes(),
             *TuningsApi(self._engine, self._runs.scores).routes(),
             *self._exports.routes(),
             Route("/api/recordings", self._list_recordings),
@@ -189,7 +194,8 @@ class PageServer:
     def _state(self) -> dict[str, Any]:
         scene = [] if self._choices is None else self._choices.json()
         status = {**status_json(self._engine), "recordings": sorted(self._recordings()), "scene": scene}
-        return {**status, "unread": self.unread, "reloads": getattr(self._engine, "reloads", 0)}
+        reloads = getattr(self._engine, "reloads", 0)
+        return {**status, "unread": self.unread, "reloads": reloads, "refit": self._refit.brief()}
 
     async def _model(self, request: Request) -> Response:
         return Json(await asyncio.to_thread(model_json, self._engine))

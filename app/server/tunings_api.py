@@ -11,18 +11,16 @@ from starlette.routing import Route
 
 from config.tunings import NAME
 from estimators.errors import ConfigError, printable
-from estimators.fold import Fold
-from estimators.log import Log
 
 from ..engine.changes import difference
 from ..engine.interface import Running
-from ..engine.reload import obstacle
 from ..engine.revisions import LONGEST_NOTE
 from ..guard.last import last
 from ..runs.scores import RunScores
 from ..tunings.figures import figures
 from ..tunings.keep import Settings, keep, version_text
 from ..tunings.listing import listing
+from ..tunings.load import load_into
 from ..twin.twin import with_version
 from .answer import answered
 from .api import Json, one_line
@@ -95,13 +93,7 @@ class TuningsApi:
         return await answered(request, work)
 
     def _loaded(self, name: str) -> str:
-        twin = with_version(self._engine.twin, _listed(name))
-        reason = obstacle(self._engine.twin, twin)
-        if reason is not None:
-            raise ConfigError(f"{name}: {reason}; start the twin with --tuning {name}")
-        # Compiled before the engine's thread asks for it.
-        Fold(twin.estimator, twin.model, twin.tuning, Log.of(twin.model), pairs=twin.pairs, idle=True)
-        self._engine.reload(twin, f"version {name}", exact=True)
+        load_into(self._engine, _listed(name))
         return name
 
 

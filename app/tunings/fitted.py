@@ -6,10 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from estimators.fit.fit import Fitted
+from config.tuning_schema import EvidenceSection, MovedSection
+from estimators.errors import LARGEST
+from estimators.fit.dual import shift
+from estimators.fit.fit import Fitted, Line
+from estimators.fit.judge import Part
 
 from .figures import COVERAGE, LIKELIHOOD, NIS, RMSE
-from .keep import Settings
+from .keep import DIGITS, Settings
 
 
 def settings_of(found: Fitted, fitted_on: Sequence[str], note: str = "") -> Settings:
@@ -21,14 +25,6 @@ def settings_of(found: Fitted, fitted_on: Sequence[str], note: str = "") -> Sett
         note: What was tried.
     """
     tuning, prior = found.setting
-    part = found.after.held_out
-    predicted = {**part.sensors, **part.states}
-    scores = {
-        NIS: part.nis,
-        LIKELIHOOD: part.log_density,
-        **{f"{RMSE}.{name}": item.rms for name, item in predicted.items()},
-        **{f"{COVERAGE}.{name}": item.coverage for name, item in predicted.items()},
-    }
     beliefs = {}
     if prior is not None:
         stds = np.sqrt(np.diag(prior[1]))
@@ -36,5 +32,47 @@ def settings_of(found: Fitted, fitted_on: Sequence[str], note: str = "") -> Sett
             name: {"mean": float(mean), "std": float(std)}
             for name, mean, std in zip(tuning.model.state_names, prior[0], stds, strict=True)
         }
-    known = {name: float(value) for name, value in scores.items() if np.isfinite(value)}
-    return Settings(found.estimator, tuning, note, tuple(fitted_on), known, beliefs)
+    return Settings(
+        found.estimator,
+        tuning,
+        note,
+        tuple(fitted_on),
+        _scores(found.after.held_out),
+        beliefs,
+        evidence=_evidence(found) if found.proposed else None,
+    )
+
+
+def _scores(part: Part) -> dict[str, float]:
+    predicted = {**part.sensors, **part.states}
+    scores = {
+        NIS: part.nis,
+        LIKELIHOOD: part.log_density,
+        **{f"{RMSE}.{name}": item.rms for name, item in predicted.items()},
+        **{f"{COVERAGE}.{name}": item.coverage for name, item in predicted.items()},
+    }
+    return {name: float(value) for name, value in scores.items() if np.isfinite(value)}
+
+
+def _evidence(found: Fitted) -> EvidenceSection:
+    return EvidenceSection(
+        gain=_rounded(found.verdict.gain) or 0.0,
+        error=_rounded(found.verdict.error) or 0.0,
+        before={name: float(f"{value:.{DIGITS}g}") for name, value in _scores(found.before.held_out).items()},
+        entries={line.key: _moved(line) for line in found.lines if not line.alone},
+    )
+
+
+def _moved(line: Line) -> MovedSection:
+    return MovedSection(
+        before=line.before,
+        after=line.after,
+        low=_rounded(line.low),
+        high=_rounded(line.high),
+        sigma=_rounded(shift(line)) or 0.0,
+    )
+
+
+def _rounded(value: float) -> float | None:
+    """With as many digits as a file should have; None for what is no number."""
+    return float(f"{value:.4g}") if np.isfinite(value) and abs(value) <= LARGEST else None

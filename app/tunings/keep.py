@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from config.files import shown_path
-from config.tuning_schema import AcceptedSection, VersionSection
+from config.tuning_schema import AcceptedSection, EvidenceSection, VersionSection
 from config.tunings import Version, check_name, folders, load_version, version_of
 from estimators.errors import ConfigError
 from estimators.tuning import Tuning
@@ -25,7 +25,8 @@ DIGITS = 8
 class Settings:
     """What a version is made of: the filter, the tuning, and what is known of them.
 
-    `prior` has mean and std by state where that was fitted; `scores` are those of `figures`.
+    `prior` has mean and std by state where that was fitted; `scores` are those of `figures`; `evidence` is why a fit
+    proposed it.
     """
 
     estimator: str
@@ -35,6 +36,7 @@ class Settings:
     scores: Mapping[str, float] = field(default_factory=dict)
     prior: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     model_version: int = 1
+    evidence: EvidenceSection | None = None
 
 
 def version_text(twin: Twin, given: Settings) -> str:
@@ -47,6 +49,7 @@ def version_text(twin: Twin, given: Settings) -> str:
         note=given.note,
         fitted_on=tuple(given.fitted_on),
         scores={name: float(f"{value:.{DIGITS}g}") for name, value in given.scores.items()},
+        evidence=given.evidence,
     )
     heading = f"# A tuning version of {twin.name}; `nisus tunings` lists, compares and accepts them.\n"
     normal = {}

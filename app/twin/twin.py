@@ -32,6 +32,7 @@ from .dropout import DegradedAfter, degraded_after
 from .late import Late, late_policy
 from .model import configure, find_model
 from .names import check_named
+from .refit import check_refit
 from .scene_names import check_scene
 from .source import Plan, plan_source
 
@@ -274,6 +275,7 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
     name = OWN if loaded.version is None else loaded.version.name
     changed = bool(turned) or any(key.split(".")[0] in TuningSection.model_fields for key in overrides)
     tuning = replace(tuning, name=name + (TURNED if changed else ""))
+    check_refit(loaded, first.name, tuning)
     for k, item in enumerate(config.maintenance):
         check_named(loaded, ("maintenance", k, "states"), item.states, model)
         if len(set(item.states)) != len(item.states):

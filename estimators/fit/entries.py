@@ -137,6 +137,17 @@ def entries_of(
     return list(found.values()), list(skipped.values())
 
 
+def check_key(estimator: str, tuning: Tuning, key: str) -> None:
+    """Refuse what no fit could turn, before there is anything to fit to.
+
+    Raises:
+        ConfigError: If it is no group, and there is no such entry.
+    """
+    known = _all(find_estimator(estimator, tuning.model), tuning)
+    if key not in GROUPS and key not in known and _sensor_of(key, tuning) is None:
+        raise ConfigError(f"{shown_name(key)} is no entry that can be fitted; {nearest(key, [*known, *GROUPS])}")
+
+
 def setting(tuning: Tuning, entries: Sequence[Entry], x: np.ndarray) -> Setting:
     """The tuning, and the prior where that is fitted, at a point (k,) of the fit's scales."""
     return with_values(tuning, entries, [item.outward(float(value)) for item, value in zip(entries, x, strict=True)])
