@@ -11,7 +11,6 @@ from pydantic_core import PydanticCustomError
 
 from config.fields import as_seconds
 from config.files import shown_path
-from estimators.diagnostics.sensitivity.words import digits
 from estimators.errors import ConfigError, printable
 from estimators.fit.aims import LIKELIHOOD
 from estimators.fit.dual import Refit, shift, walk
@@ -75,7 +74,7 @@ def tune_windows(arguments: Arguments, wanted: Sequence[str], recordings: Record
         told = [window_json(k, refit, origins[k]) for k, refit in found]
         print(json.dumps({"twin": twin.name, "window": window, "every": every, "windows": told}, allow_nan=False))
     else:
-        print("\n".join(as_text([*_sections(twin, found, origins), _verdict(twin, found)])))
+        print("\n".join(as_text([*_sections(found, origins), _verdict(twin, found, origins)])))
     adopted = [refit.fitted for _, refit in found if refit.fitted is not None and refit.proposed]
     if not adopted:
         return 1
@@ -118,12 +117,11 @@ def window_json(recording: int, refit: Refit, origin: int) -> dict[str, Any]:
     return told | ({} if refit.fitted is None else {"result": fit_json(refit.fitted)})
 
 
-def _sections(twin: Twin, found: Sequence[tuple[int, Refit]], origins: Sequence[int]) -> list[Section]:
+def _sections(found: Sequence[tuple[int, Refit]], origins: Sequence[int]) -> list[Section]:
     """For every entry a table: its value and interval of each window, and what the twin went on with."""
     keys = dict.fromkeys(line.key for _, refit in found if refit.fitted is not None for line in refit.fitted.lines)
     head = (
-        *(("recording",) if len(origins) > 1 else ()),
-        "from s", "to s", "fitted", "95 % interval", "σ moved", "gain, nats a reading", "went on with",
+        *_place(None, None, origins), "fitted", "95 % interval", "σ moved", "gain, nats a reading", "went on with",
     )  # fmt: skip
     sections = []
     for key in keys:
@@ -132,11 +130,18 @@ def _sections(twin: Twin, found: Sequence[tuple[int, Refit]], origins: Sequence[
         for k, refit in found:
             line = _line_of(refit, key)
             unit = unit or ("" if line is None else line.unit)
-            at = [digits((t - origins[k]) * 1e-9) for t in (refit.start, refit.end)]
-            rows.append((*((str(k + 1),) if len(origins) > 1 else ()), *at, *_row(refit, line)))
+            rows.append((*_place(k, refit, origins), *_row(refit, line)))
         title = f"{key}{f', {unit}' if unit else ''}"
         sections.append(Section(title, (), head, tuple(rows)))
     return sections
+
+
+def _place(k: int | None, refit: Refit | None, origins: Sequence[int]) -> tuple[str, ...]:
+    """Recording, where there are several, start and end of a window, s; the head of these columns for None."""
+    if k is None or refit is None:
+        return (*(("recording",) if len(origins) > 1 else ()), "from s", "to s")
+    at = (f"{(t - origins[k]) * 1e-9:,.0f}" for t in (refit.start, refit.end))
+    return (*((str(k + 1),) if len(origins) > 1 else ()), *at)
 
 
 def _line_of(refit: Refit, key: str) -> Line | None:
@@ -146,7 +151,7 @@ def _line_of(refit: Refit, key: str) -> Line | None:
 
 def _row(refit: Refit, line: Line | None) -> tuple[str, ...]:
     if refit.fitted is None or line is None:
-        return ("-", "", "", "", refit.reason or "not fitted")
+        return ("-", "", "", "", "-")
     verdict = refit.fitted.verdict
     gain = f"{verdict.gain:+.3g} ± {verdict.error:.2g}" if np.isfinite(verdict.gain) else "-"
     kept = f"{line.after if refit.proposed else line.before:.4g}"
@@ -157,10 +162,15 @@ def _row(refit: Refit, line: Line | None) -> tuple[str, ...]:
     return (f"{line.after:.4g}", f"{line.low:.4g} to {line.high:.4g}{bound}", f"{shift(line):+.1f}", gain, kept)
 
 
-def _verdict(twin: Twin, found: Sequence[tuple[int, Refit]]) -> Section:
+def _verdict(twin: Twin, found: Sequence[tuple[int, Refit]], origins: Sequence[int]) -> Section:
+    """How many were adopted, and of each other one why not."""
     adopted = sum(refit.proposed for _, refit in found)
     folds = sum(refit.fitted.folds for _, refit in found if refit.fitted is not None)
     said = [f"{adopted} of {len(found)} windows were adopted ({twin.estimator}, {folds} folds)."]
-    failed = [refit.reason for _, refit in found if refit.reason]
-    said += [f"{len(failed)} could not be fitted, first because: {failed[0]}"] if failed else []
+    for k, refit in found:
+        if not refit.proposed:
+            reasons = (refit.reason,) if refit.fitted is None else refit.fitted.verdict.reasons
+            *recording, begin, end = _place(k, refit, origins)
+            which = f"recording {recording[0]}, " if recording else ""
+            said.append(f"{which}{begin} to {end} s: {'; '.join(reasons)}.")
     return Section("Verdict", tuple(said))

@@ -5,6 +5,7 @@ import { Around } from "./around.js";
 import { $, element, setAttribute, setText } from "./dom.js";
 import { Fit } from "./fit.js";
 import { Knob } from "./knob.js";
+import { Refit } from "./refit.js";
 import { words } from "./format.js";
 
 const GROUPS = { Q: "Process noise Q", R: "Sensor noise R", p: "Parameters" };
@@ -34,6 +35,7 @@ export class Tune {
     this.around = new Around(model, link, this);
     this.fit = new Fit(model, link, this);
     this.advice = new Advice(model, link, this);
+    this.refit = new Refit(model, link, this);
     link.addEventListener("status", (event) => this.sync(event.detail));
   }
 
