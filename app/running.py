@@ -14,7 +14,7 @@ from .engine.engine import Engine
 from .recording.split import NEVER, Split
 from .recording.writer import FINE, Recorder
 from .rerun.rows import RerunRows
-from .runs.refits import Refits
+from .dual.refits import Refits
 
 if TYPE_CHECKING:
     from estimators.snapshots import Base

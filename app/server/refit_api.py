@@ -9,7 +9,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from ..runs.refits import FITTING, Refit, Refits
+from ..dual.refits import FITTING, Refit, Refits
 from .answer import answered
 from .api import Json, one_line
 from .tunings_api import fields_of

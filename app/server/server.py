@@ -32,7 +32,7 @@ from ..engine.interface import Running
 from ..export import markdown
 from ..export.alarms import alarms_text
 from ..rerun.feed import RerunFeed
-from ..runs.refits import Refits
+from ..dual.refits import Refits
 from ..series.series import Series
 from .answer import answered
 from .api import Json, command_from_json, episodes_json, faults_json, one_line, status_json

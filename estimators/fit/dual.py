@@ -25,6 +25,7 @@ from ..snapshots import Base
 from ..track import Track
 from ..tuning import Tuning
 from .blocks import BLOCKS
+from .entries import check_key
 from .fit import Fitted, Given, Line, fit
 from .objective import Go
 
@@ -87,11 +88,14 @@ def walk(
 
     Raises:
         Cancelled: If `go` says so.
+        ConfigError: If there is no such entry.
         EstimatorError: As `Fold`; if a window or the time between two is not positive.
     """
     step = window if every is None else every
     if not (window > 0.0 and step > 0.0):
         raise EstimatorError(f"windows of {window:g} s every {step:g} s: both must be positive")
+    for key in wanted:
+        check_key(estimator, tuning, key)
     span, stride = round(window * 1e9), round(step * 1e9)
     t = log.t[: log.n]
     fold, done = Fold(estimator, tuning.model, tuning, log), 0

@@ -20,7 +20,7 @@ from estimators.errors import ConfigError, NisusError
 from ..engine.interface import Running
 from ..tunings.keep import keep, version_text
 from ..tunings.load import load_into
-from .fitting import DONE, FAILED, Attempt, Fitting
+from ..runs.fitting import DONE, FAILED, Attempt, Fitting
 
 if TYPE_CHECKING:
     from estimators.fit.fit import Fitted

@@ -1,0 +1,1 @@
+"""Dual estimation: parameters fitted again while the twin runs, and what becomes of what is found."""
