@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .dual.refits import Refits
 from .engine.engine import Engine
 from .recording.split import NEVER, Split
 from .recording.writer import FINE, Recorder
 from .rerun.rows import RerunRows
-from .dual.refits import Refits
 
 if TYPE_CHECKING:
     from estimators.snapshots import Base

@@ -18,9 +18,9 @@ from config.tunings import version_files
 from estimators.errors import ConfigError, NisusError
 
 from ..engine.interface import Running
+from ..runs.fitting import DONE, FAILED, Attempt, Fitting
 from ..tunings.keep import keep, version_text
 from ..tunings.load import load_into
-from ..runs.fitting import DONE, FAILED, Attempt, Fitting
 
 if TYPE_CHECKING:
     from estimators.fit.fit import Fitted

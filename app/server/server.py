@@ -28,11 +28,11 @@ from ..analysis.diagnosis import Diagnosis
 from ..analysis.forecast import Forecasts, question_from_json
 from ..drawing.choices import Choices
 from ..drawing.palette import EITHER, THEMES
+from ..dual.refits import Refits
 from ..engine.interface import Running
 from ..export import markdown
 from ..export.alarms import alarms_text
 from ..rerun.feed import RerunFeed
-from ..dual.refits import Refits
 from ..series.series import Series
 from .answer import answered
 from .api import Json, command_from_json, episodes_json, faults_json, one_line, status_json

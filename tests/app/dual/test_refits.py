@@ -6,11 +6,11 @@ import threading
 import numpy as np
 import pytest
 
+from app.dual.refits import ADOPTED, BROKEN, DISMISSED, FITTING, NOTHING, OFFERED, OUTDATED, Refits
 from app.engine.commands import SetTuning
 from app.engine.engine import Engine
 from app.engine.feeder import Restarted
 from app.runs.fitting import Fitting
-from app.dual.refits import ADOPTED, BROKEN, DISMISSED, FITTING, NOTHING, OFFERED, OUTDATED, Refits
 from app.twin.twin import load_twin
 from config.loader import TWINS
 from config.tunings import load_version, version_files
