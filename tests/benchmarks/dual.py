@@ -3,7 +3,8 @@
 Each recording is folded with a parameter held where the twin starts it, moved into the state (`estimate`, joint), and
 fitted window after window by what a running twin with `refit` does (dual; a window's result counts from its end on).
 All are scored on the same rows, those after the first window: the state that was withheld, root mean square and share
-in the 95 % band; the parameter at the end with its 95 % interval; and seconds of the processor.
+in the 95 % band; the log density of a reading before it was seen; the parameter at the end with its 95 % interval; and
+seconds of the processor.
 
 The last two tables are of wear over cycles: fifty discharges of one cell, each from what the one before left of the
 parameters, as recorded (by its counter it did not fade), and with voltages of a cell that is simulated under the same
@@ -27,7 +28,7 @@ from estimators.fit.dual import Refit, walk
 from estimators.fit.fit import Fitted, Line
 from estimators.fold import Fold
 from estimators.log import INPUT, READING, Events, Log, truth_of
-from estimators.track import Track
+from estimators.track import USED, Track
 from estimators.tuning import Tuning
 
 Z = 1.959963984540054
@@ -77,6 +78,16 @@ CASES = (
         300.0,
         {},
         "fitted with the magnet measured: 0.032 K/W",
+    ),
+    Case(
+        "motor_bench, resistance between tooth and magnet, which no sensor touches, started 50 % off",
+        "motor_bench",
+        "magnet",
+        ("tooth_magnet",),
+        600.0,
+        300.0,
+        {"parameters.tooth_magnet": "1.65", "estimate": "{tooth_magnet: {std: 0.5, drift: 1e-4}}", "view": "{}"},
+        "fitted with the magnet measured: 1.1 K/W",
     ),
     Case(
         "battery_panasonic, US06, series resistance as the cell was fitted",
@@ -187,19 +198,26 @@ def errors(
     return true[kept] - track.mean[rows[kept], k], track.std[rows[kept], k]
 
 
-def row(name: str, error: np.ndarray, std: np.ndarray, came: Came) -> str:
+def density(track: Track, start: int) -> float:
+    """Mean log density of a reading from row `start` on, nats."""
+    used = track.verdict[start:] == USED
+    return float(np.mean(track.log_likelihood[start:][used]))
+
+
+def row(name: str, error: np.ndarray, std: np.ndarray, came: Came, start: int) -> str:
     """Of the table."""
     values = ", ".join(f"{key} {value}" for key, value in came.values.items())
     inside = 100 * np.mean(np.abs(error) <= Z * std)
     cost = f"{came.seconds:.2f} s, {came.folds} fold{'s' if came.folds > 1 else ''}"
-    return f"  {name:6}{np.sqrt(np.mean(error**2)):10.4g}{inside:10.0f} %   {cost:22}{values}"
+    told = f"{np.sqrt(np.mean(error**2)):10.4g}{inside:10.0f} %{density(came.track, start):14.4f}"
+    return f"  {name:6}{told}   {cost:22}{values}"
 
 
 def show(case: Case) -> None:
     """Fold and print one recording."""
     together, single = load_twin(case.twin, overrides=case.more), apart(case)
     print(f"{case.title}: windows of {case.window:g} s every {case.every:g} s; {case.note}", flush=True)
-    print(f"  {'way':6}{case.truth + ' RMSE':>10}{'in band':>12}   {'cost':22}parameter at the end")
+    print(f"  {'way':6}{case.truth + ' RMSE':>10}{'in band':>12}{'log density':>14}   {'cost':22}parameter at the end")
     ways: dict[str, Callable[[], tuple[Twin, Log, Came]]] = {
         HELD: lambda: _with(single, lambda twin, log: held(twin, log, case.parameters)),
         JOINT: lambda: _with(together, lambda twin, log: joint(twin, log, case.parameters)),
@@ -209,7 +227,7 @@ def show(case: Case) -> None:
         way() if name != DUAL else None  # compiled, before it is timed
         twin, log, came = way()
         start = int(np.searchsorted(log.t[: log.n], log.t[0] + round(case.window * 1e9)))
-        print(row(name, *errors(twin.model.state_names, log, came.track, case.truth, start), came), flush=True)
+        print(row(name, *errors(twin.model.state_names, log, came.track, case.truth, start), came, start), flush=True)
 
 
 def _with(twin: Twin, work: Callable[[Twin, Log], Came]) -> tuple[Twin, Log, Came]:
