@@ -27,7 +27,7 @@ from app.twin.twin import Twin, load_twin
 from estimators.fit.dual import Refit, walk
 from estimators.fit.fit import Fitted, Line
 from estimators.fold import Fold
-from estimators.log import INPUT, READING, Events, Log, truth_of
+from estimators.log import INPUT, READING, TICK, TRUTH, Events, Log, truth_of
 from estimators.track import USED, Track
 from estimators.tuning import Tuning
 
@@ -47,12 +47,13 @@ class Value(NamedTuple):
 
 
 class Came(NamedTuple):
-    """What came of one way: its rows, the parameters at the end by name, seconds of the processor, and folds."""
+    """What came of one way: its rows, the parameters at the end by name, seconds of the processor, folds, and more."""
 
     track: Track
     values: dict[str, Value]
     seconds: float
     folds: int
+    said: str = ""
 
 
 class Case(NamedTuple):
@@ -151,7 +152,7 @@ def at_end(fold: Fold, parameters: Sequence[str]) -> dict[str, Value]:
 
 def dual(twin: Twin, log: Log, parameters: Sequence[str], window: float, every: float) -> tuple[Came, list[Refit]]:
     """By windows; the rows are those that the filter had at the time."""
-    begun = process_time()
+    log, begun = untold(log), process_time()
     found = list(walked(twin, twin.tuning, log, parameters, window, every))
     last = found[-1]
     tuning = last.fitted.setting.tuning if last.fitted is not None and last.proposed else last.tuning
@@ -161,7 +162,8 @@ def dual(twin: Twin, log: Log, parameters: Sequence[str], window: float, every: 
     tracks = [refit.lived for refit in found] + [rest.track.select(slice(rows, None))]
     track = Track(*(np.concatenate(columns) for columns in zip(*tracks, strict=True)))
     folds = sum(refit.fitted.folds for refit in found if refit.fitted is not None)
-    return Came(track, told(found, tuning, parameters), process_time() - begun, folds), found
+    said = f"; adopted {sum(refit.proposed for refit in found)} of {len(found)} windows"
+    return Came(track, told(found, tuning, parameters), process_time() - begun, folds, said), found
 
 
 def walked(
@@ -171,6 +173,18 @@ def walked(
     wanted = [f"p.{name}" for name in parameters]
     bounds = bounds_of(twin.config, twin.model)
     return walk(twin.estimator, tuning, log, wanted=wanted, window=window, every=every, bounds=bounds)
+
+
+def untold(log: Log) -> Log:
+    """The same events, with a query in place of each truth: a fit's judge would see it, too."""
+    kind = log.kind[: log.n].copy()
+    truth = kind == TRUTH
+    kind[truth] = TICK
+    again = Log.of(log.model, capacity=log.n) if log.model is not None else Log(log.width, log.n)
+    value = np.where(truth[:, None], np.nan, log.value[: log.n])
+    events = log.events
+    again.extend(Events(events.t, events.arrival, kind, np.where(truth, 0, events.channel).astype(np.int32), value))
+    return again
 
 
 def told(found: Sequence[Refit], tuning: Tuning, parameters: Sequence[str]) -> dict[str, Value]:
@@ -210,7 +224,7 @@ def row(name: str, error: np.ndarray, std: np.ndarray, came: Came, start: int) -
     inside = 100 * np.mean(np.abs(error) <= Z * std)
     cost = f"{came.seconds:.2f} s, {came.folds} fold{'s' if came.folds > 1 else ''}"
     told = f"{np.sqrt(np.mean(error**2)):10.4g}{inside:10.0f} %{density(came.track, start):14.4f}"
-    return f"  {name:6}{told}   {cost:22}{values}"
+    return f"  {name:6}{told}   {cost:22}{values}{came.said}"
 
 
 def show(case: Case) -> None:
@@ -335,7 +349,7 @@ def cycles(simulated: bool) -> None:
 
         begun = process_time()
         tuning = replace(tunings[DUAL], model=single.model) if tunings else single.tuning
-        (refit,) = walked(single, tuning, log, PARAMETERS, 1e6, 1e6)
+        (refit,) = walked(single, tuning, untold(log), PARAMETERS, 1e6, 1e6)
         tunings[DUAL] = refit.fitted.setting.tuning if refit.fitted is not None and refit.proposed else tuning
         seconds[DUAL] += process_time() - begun
         found[DUAL].append(errors(single.model.state_names, log, refit.lived, "soc", 0))
