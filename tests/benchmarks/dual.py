@@ -253,16 +253,17 @@ def _with(twin: Twin, work: Callable[[Twin, Log], Came]) -> tuple[Twin, Log, Cam
 
 CYCLES = 50
 PARAMETERS = ("r0", "capacity")
-SPREAD = {"r0": (0.005, 3e-5), "capacity": (0.15, 1e-4)}
-"""What joint estimation believes of each: deviation at the start, and drift in √s, in the parameter's unit."""
+SPREAD = {"r0": (0.005, 3e-5), "capacity": (0.15, 2e-4)}
+"""What joint estimation believes of each: deviation at the start, and drift in √s, which is what a cycle wears of the
+capacity, or more."""
 
 WORN = {"r0": 1.5, "capacity": 0.8}
 """What is left of each after the last cycle, as a share of what it was."""
 
 
 def cycle(number: int, parameters: Sequence[str]) -> tuple[Twin, Log]:
-    """One discharge of the cell; `parameters` are moved into the state."""
-    column = f"rw_data({number})"
+    """One discharge of the cell, the first is 0; `parameters` are moved into the state."""
+    column = f"rw_data({number + 1})"
     flow = ", ".join(f"{name}: {{std: {SPREAD[name][0]}, drift: {SPREAD[name][1]}}}" for name in parameters)
     twin = load_twin(
         "battery_dmegc",
