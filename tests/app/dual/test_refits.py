@@ -6,11 +6,15 @@ import threading
 import numpy as np
 import pytest
 
+from app.cli.opener import recorded_twin
+from app.cli.run import live_source
 from app.dual.refits import ADOPTED, BROKEN, DISMISSED, FITTING, NOTHING, OFFERED, OUTDATED, Refits
-from app.engine.commands import SetTuning
+from app.engine.commands import Record, SetTuning
 from app.engine.engine import Engine
 from app.engine.feeder import Restarted
+from app.recording.reader import read_recording
 from app.runs.fitting import Fitting
+from app.session import Session
 from app.twin.twin import load_twin
 from config.loader import TWINS
 from config.tunings import load_version, version_files
@@ -288,3 +292,24 @@ def test_at_once_if_asked_and_not_without_a_section(begin):
     assert twin.refits.section is None
     with pytest.raises(ConfigError, match="no `refit` section"):
         twin.refits.now()
+
+
+def test_without_a_page_it_is_in_the_recording(tmp_path):
+    """By rule, headless: what was adopted, and why, is what a review begins with."""
+    path, recording = tmp_path / "winding.yaml", tmp_path / "run.rrd"
+    shutil.copy(TWINS / "motor_winding.yaml", path)
+    section = "{entries: [R.winding], every: 10 min, window: 10 min, adopt: if better}"
+    twin = load_twin(path, overrides={"refit": section, "R.winding": "100", "source.duration": "900"})
+    session = Session(twin, live_source(twin, np.inf), page=None)
+    session.start()
+    try:
+        session.engine.submit(Record(recording))
+        wait_for(lambda: session.engine.folded_with()[0].name == "refit-1")
+        wait_for(lambda: session.engine.status().recording is not None)
+    finally:
+        session.stop()
+    recorded = read_recording(recording)
+    assert any(text.startswith("refit 1: adopted by rule as tuning version refit-1") for _, _, text in recorded.notices)
+    again = recorded_twin(recorded)
+    assert again.tuning.name == "refit-1" and again.version.head.evidence.gain > 0.0
+    assert again.tuning.get("R.winding") == session.engine.tuning.get("R.winding") < 10.0
