@@ -13,7 +13,7 @@ from config.fields import as_seconds
 from config.files import shown_path
 from estimators.errors import ConfigError, printable
 from estimators.fit.aims import LIKELIHOOD
-from estimators.fit.dual import Refit, shift, walk
+from estimators.fit.dual import Refit, against, shift, walk
 from estimators.fit.fit import Given, Line
 
 from ..export.parts import Part as Section
@@ -169,7 +169,7 @@ def _verdict(twin: Twin, found: Sequence[tuple[int, Refit]], origins: Sequence[i
     said = [f"{adopted} of {len(found)} windows were adopted ({twin.estimator}, {folds} folds)."]
     for k, refit in found:
         if not refit.proposed:
-            reasons = (refit.reason,) if refit.fitted is None else refit.fitted.verdict.reasons
+            reasons = (refit.reason,) if refit.fitted is None else against(refit.fitted)
             *recording, begin, end = _place(k, refit, origins)
             which = f"recording {recording[0]}, " if recording else ""
             said.append(f"{which}{begin} to {end} s: {'; '.join(reasons)}.")

@@ -207,8 +207,8 @@ class Refits:
         if attempt.state != DONE or fitted is None:
             reason = attempt.reason or "it was given up"
             self._tell(number, BROKEN, reason, "warn" if attempt.state == FAILED else "info")
-        elif not fitted.proposed:
-            self._tell(number, NOTHING, "; ".join(fitted.verdict.reasons))
+        elif reasons := _against(fitted):
+            self._tell(number, NOTHING, "; ".join(reasons))
         elif not self._current(attempt):
             self._tell(number, OUTDATED, f"{_moves(fitted)}; but another tuning runs by now")
         elif self._dismissed is not None and _same(fitted, self._dismissed):
@@ -252,6 +252,12 @@ class Refits:
         self.known = tuple(
             replace(item, state=state, text=text, name=name) if item.number == number else item for item in self.known
         )
+
+
+def _against(fitted: Fitted) -> tuple[str, ...]:
+    from estimators.fit.dual import against
+
+    return against(fitted)
 
 
 def _same(fitted: Fitted, other: Fitted) -> bool:

@@ -2,10 +2,10 @@
 
 The filter goes on with parameters that are held. Now and then the last window of its log is fitted in one batch
 (fit.py): from the state that the filter had where the window begins, about the values of the day, which are weakly
-believed. If that wins on the window's blocks that were held out, it is proposed; what is adopted takes the place of
-the values before, the log is folded again with it, and the filter goes on. In joint estimation the parameters are
-states instead, and one filter moves both (`model/joint.py`): that costs no fit, but it asks for a belief in how fast
-each parameter drifts, and nothing judges what it concludes.
+believed. If that wins on the window's blocks that were held out, and moved beyond chance, it is proposed; what is
+adopted takes the place of the values before, the log is folded again with it, and the filter goes on. In joint
+estimation the parameters are states instead, and one filter moves both (`model/joint.py`): that costs no fit, but it
+asks for a belief in how fast each parameter drifts, and nothing judges what it concludes.
 
 Sources: Nelson & Stear (1976), doi:10.1109/TAC.1976.1101148, for two estimators, each of which takes the other's
 estimate for true; Plett (2006), doi:10.1016/j.jpowsour.2006.06.004, for both ways on a battery.
@@ -51,8 +51,8 @@ class Refit(NamedTuple):
 
     @property
     def proposed(self) -> bool:
-        """Whether it won on the blocks held out."""
-        return self.fitted is not None and self.fitted.proposed
+        """Whether nothing speaks against it."""
+        return self.fitted is not None and not against(self.fitted)
 
 
 def walk(
@@ -149,6 +149,19 @@ def tail(fold: Fold, start: int, base: Base | None = None) -> tuple[Log, Base | 
         part.first, part.floor, part.start, part.version = log.first, log.floor, log.start, log.version
     part.extend(log.events.select(slice(start, stop)))
     return part, base
+
+
+def against(fitted: Fitted) -> tuple[str, ...]:
+    """Why a window's fit is not proposed; nothing where it is.
+
+    Beside what blocks and sensors held out say: a value of the day that lies in every interval has nothing against it,
+    and to follow each window's chance would be a new version an hour, and none of them news.
+    """
+    if not fitted.proposed:
+        return fitted.verdict.reasons
+    if all(line.alone or line.low <= line.before <= line.high for line in fitted.lines):
+        return ("every value of the day lies in its 95 % interval",)
+    return ()
 
 
 def shift(line: Line) -> float:

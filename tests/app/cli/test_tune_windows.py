@@ -59,6 +59,24 @@ def test_recordings_follow_each_other_and_the_last_is_kept_with_its_evidence(cap
     assert load_twin(file, overrides={"tuning": "worn"}).tuning.get("R.winding") == kept
 
 
+def test_wear_of_a_simulated_asset_is_followed(capsys):
+    """The water jacket of a motor silts up halfway: its true resistance grows by 40 %, and nobody tells the twin."""
+    asset = {
+        "estimate": "{}", "source.initial": "{}", "source.truth": "{}", "view": "{}",
+        "source.faults": "[{kind: model, parameter: yoke_coolant, size: 1.4, start: 600}]",
+    }  # fmt: skip
+    given = [word for key, value in asset.items() for word in ("--set", f"{key}={value}")]
+    status = main(["tune", "motor_joint", *given, "--fit", "p.yoke_coolant", "--windows", "5min", "--json"])
+    windows = json.loads(capsys.readouterr().out)["windows"]
+    assert status == 0 and len(windows) == 4
+    for item, true in zip(windows, [0.03, 0.03, 0.042, 0.042], strict=True):
+        (entry,) = item["result"]["entries"]
+        assert entry["low"] < true < entry["high"]
+    assert [item["adopted"] for item in windows[:2]] == [False, False]
+    adopted = [item["result"]["entries"][0] for item in windows if item["adopted"]]
+    assert adopted and adopted[-1]["sigma"] > 10.0
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

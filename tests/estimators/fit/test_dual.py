@@ -1,10 +1,12 @@
 """Dual estimation over a log: windows follow a parameter that changes, and nothing is proposed that does not win."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from estimators.errors import EstimatorError
-from estimators.fit.dual import agrees, shift, tail, walk
+from estimators.fit.dual import against, agrees, shift, tail, walk
 from estimators.fit.fit import Cancelled, Given, fit
 from estimators.fold import Fold
 from estimators.tuning import Tuning
@@ -141,3 +143,14 @@ def test_two_fits_agree_while_the_data_say_the_same():
     # Other entries are another statement.
     both = fit("kf", believed(), [Given(log_of(readings))], wanted=["p.rate", "R.float"])
     assert not agrees(both, one)
+
+
+def test_a_value_that_lies_in_its_interval_has_nothing_against_it():
+    won = fit("kf", believed(), [Given(wearing(9, [0.6]))], wanted=["p.rate", "R.float"])
+    assert won.proposed and against(won) == ()
+    inside = tuple(line if line.alone else line._replace(before=line.after) for line in won.lines)
+    assert against(replace(won, lines=inside)) == ("every value of the day lies in its 95 % interval",)
+    # One that has left it is enough.
+    assert against(replace(won, lines=(won.lines[0], inside[1]))) == ()
+    lost = fit("kf", believed(), [Given(wearing(10, [0.2]))], wanted=["p.rate"])
+    assert not lost.proposed and against(lost) == lost.verdict.reasons
