@@ -82,6 +82,16 @@ CASES = (
         {"parameters": "{r0: 0.0492}", "estimate.r0": "{std: 0.02, drift: 3e-5}"},
         "fitted with the charge known: 0.0328 Ω",
     ),
+    Case(
+        "battery_panasonic, US06, capacity started 20 % off, series resistance in the state both ways",
+        "battery_panasonic",
+        "soc",
+        ("capacity",),
+        1800.0,
+        900.0,
+        {"parameters": "{capacity: 2.32}", "estimate.capacity": "{std: 0.6, drift: 1e-4}"},
+        "by the tester's counter: 2.9 A h",
+    ),
 )
 
 
