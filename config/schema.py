@@ -70,8 +70,9 @@ class RefitSection(Section):
     window: Duration
     """Over how long the last readings are fitted: 1800, or 30 min. The first fit waits until so much was read."""
     adopt: Literal["by hand", "if better"] = "by hand"
-    """What becomes of a result that predicts better what it was not fitted to. by hand: it is proposed, and waits. if
-    better: it is adopted, and said. Either way it becomes a tuning version with its evidence. Default: by hand."""
+    """What becomes of a result that predicts better what it was not fitted to, and has moved beyond its interval. by
+    hand: it is proposed on the page, and waits. if better: it is adopted, and said. What is adopted is a tuning version
+    with its evidence. Default: by hand."""
 
 
 class SensorSection(SpreadSection):
