@@ -22,7 +22,7 @@ def settings_of(found: Fitted, fitted_on: Sequence[str], note: str = "") -> Sett
     """
     tuning, prior = found.setting
     part = found.after.held_out
-    predicted = {**part.sensors, **part.states}
+    predicted = {**part.sensors, **part.withheld, **part.states}
     scores = {
         NIS: part.nis,
         LIKELIHOOD: part.log_density,

@@ -16,11 +16,15 @@ import numpy as np
 from ..errors import ConfigError, nearest, shown_name
 from ..estimator import Estimator
 from ..log import READING, Log
+from ..model.coloured import disturbance_time, error_time
 from ..model.state_space import LARGE, Field
 from ..registry import find_estimator
 from ..tuning import Tuning
 
-GROUPS = ("Q", "R", "p", "options", "prior")
+OVER = "over"
+"""How long the errors last that are given a time: the parameters that `coloured` appends."""
+
+GROUPS = ("Q", "R", "p", "options", "prior", OVER)
 """What can be named as a whole."""
 
 SCALE = "scale"
@@ -118,7 +122,7 @@ def entries_of(
     found: dict[str, Entry] = {}
     skipped: dict[str, Skipped] = {}
     for name in wanted:
-        keys = [key for key in known if key.partition(".")[0] == name] if name in GROUPS else [name]
+        keys = _group(name, known, tuning) if name in GROUPS else [name]
         for key in keys:
             item = known.get(key) or _sensor_of(key, tuning)
             if item is None:
@@ -135,6 +139,14 @@ def entries_of(
         reasons = "; ".join(f"{item.key} {item.reason}" for item in skipped.values())
         raise ConfigError(f"nothing of {', '.join(wanted)} can be fitted: {reasons or 'there is no such entry'}")
     return list(found.values()), list(skipped.values())
+
+
+def _group(name: str, known: Mapping[str, Entry], tuning: Tuning) -> list[str]:
+    if name != OVER:
+        return [key for key in known if key.partition(".")[0] == name]
+    model = tuning.model
+    times = {disturbance_time(noise.name) for noise in model.noises} | {error_time(name) for name in model.sensor_names}
+    return [key for key in known if key.partition(".")[2] in times and key.startswith("p.")]
 
 
 def setting(tuning: Tuning, entries: Sequence[Entry], x: np.ndarray) -> Setting:

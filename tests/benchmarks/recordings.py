@@ -18,7 +18,7 @@ from app.cli.fold import read_log
 from app.twin.bounds import bounds_of
 from app.twin.twin import Twin, load_twin
 from estimators.errors import NisusError
-from estimators.fit.aims import AIMS, Recording
+from estimators.fit.aims import AIMS, WITNESSES, Recording
 from estimators.fit.entries import Setting
 from estimators.fit.fit import Given, fit
 from estimators.fit.judge import Part, worths
@@ -69,7 +69,8 @@ def line(name: str, part: Part) -> str:
     return (
         f"  {name:12} NIS/dof {part.nis:8.3g}  in band {100 * part.coverage:5.1f} %  "
         f"log density {part.log_density:8.3g}\n"
-        f"      sensors held out: {predictions('sensors')}\n      truth: {predictions('states')}"
+        f"      sensors held out in turn: {predictions('sensors')}\n"
+        f"      sensors never used: {predictions('withheld')}\n      truth: {predictions('states')}"
     )
 
 
@@ -88,6 +89,8 @@ def show(case: Case, wanted: Sequence[str], aim: str) -> None:
             "left alone" if item.alone else f"{item.before:.3g} -> {item.after:.3g} ({item.low:.2g} to {item.high:.2g})"
         )
         print(f"      {item.key} {what}")
+    gained = f"{found.verdict.gain:+.3g} ± {found.verdict.error:.2g}"
+    print(f"      power {found.power:.3g}, {found.folds} folds, gain on the blocks held out {gained}")
     print("      " + ("proposed" if found.proposed else "not proposed: " + "; ".join(found.verdict.reasons)))
     print(line("fitted", scored(twin, twin.estimator, found.setting, log, second)), flush=True)
     theirs = "filterpy-ekf"
@@ -106,7 +109,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("twins", nargs="*", help="only these")
     parser.add_argument("--fit", default="Q,R")
-    parser.add_argument("--aim", default=AIMS[0], choices=AIMS)
+    parser.add_argument("--aim", default=WITNESSES, choices=AIMS)
     arguments = parser.parse_args()
     for case in CASES:
         if not arguments.twins or case.twin in arguments.twins:
