@@ -2,8 +2,9 @@
 
 - `likelihood`: the log density that the filter gave to the reading before it saw it.
 - `witnesses`: the same, and the log density that it gave to what the recording knows and the filter is never told
-  (witnesses.py). Either is weighted by how many of its errors are independent: a model that errs slowly, as that of
-  every asset does, must not pass for one that was confirmed at every reading.
+  (witnesses.py). These are weighted by how many of their errors are independent: a model that errs slowly, as that of
+  every asset does, must not pass for one that was confirmed at every step. All readings together weigh as much as all
+  witnesses, and no more than they have independent ones: what lasts of a sensor's error the next reading confirms too.
 - `crps`: how well sensors are predicted that the filter does not use, each held out in turn: the continuous ranked
   probability score, which judges error and band together. What no sensor sees is more like these than like the next
   reading of a sensor that is used.
@@ -39,7 +40,10 @@ PRICE = 1e3
 LIKELIHOOD, WITNESSES, CRPS, ERROR = AIMS = ("likelihood", "witnesses", "crps", "error")
 
 FARTHEST = 5.0
-"""Standard deviations beyond which an error counts as this for how long errors last: one peak must not hide that."""
+"""Root mean squares beyond which an error counts as this for how long errors last: one peak must not hide that."""
+
+
+SHARE = 1.0
 
 
 class Recording(NamedTuple):
@@ -138,7 +142,7 @@ def aim_of(kind: str, estimator: str, given: Setting, recordings: list[Recording
 
 
 def _weighed(estimator: str, given: Setting, recordings: list[Recording]) -> Aim:
-    """Readings and witnesses, each by the share of its errors that are independent at the start."""
+    """Witnesses by the share of their errors that are independent at the start, and readings to match."""
     lasting: dict[str, list[tuple[float, int]]] = {}
     for record in recordings:
         track = track_of(estimator, given, record)
@@ -148,11 +152,13 @@ def _weighed(estimator: str, given: Setting, recordings: list[Recording]) -> Aim
         for item in witnesses(given.tuning.model, record.log, track):
             squares[item.name] = ((item.error / item.std) ** 2)[~record.held_out[item.rows]]
         for name, values in squares.items():
-            values = np.minimum(values[np.isfinite(values)], FARTHEST**2)
+            values = values[np.isfinite(values)]
+            values = np.minimum(values, FARTHEST**2 * values.mean()) if values.size else values
             lasting.setdefault(name, []).append((correlation_time(values), values.size))
-    known = {name: [item for item in items if item[1]] for name, items in lasting.items()}
-    weights = {name: sum(n for _, n in items) / sum(t * n for t, n in items) for name, items in known.items() if items}
-    own = weights.pop("", 1.0)
+    independent = {name: sum(n / tau for tau, n in items) for name, items in lasting.items()}
+    counts = {name: sum(n for _, n in items) for name, items in lasting.items()}
+    weights = {name: independent[name] / count for name, count in counts.items() if name and count}
+    own = min(independent[""], SHARE * sum(independent[name] for name in weights)) / max(1, counts[""])
     # Without a witness it is the likelihood as it is.
     return Aim(WITNESSES, weights=weights, own=own) if weights else Aim()
 

@@ -3,7 +3,8 @@
 Two readings of standard deviation σ, rounded to a quantum q, are equal with a probability of erf(q / 2σ) at most,
 whatever was measured, and an asset at rest repeats itself more often: the share of its repetitions in all other runs
 counts if it is larger. A run of repetitions that would come by chance in one of a thousand such logs is too long. It
-is the test of the running twin (diagnostics/evidence/row_tests.py), over the whole log at once.
+is the test of the running twin (diagnostics/evidence/row_tests.py), over the whole log at once. Runs that are a small
+share of the readings stay: an asset at rest has many, and they hardly change what is fitted.
 """
 
 from __future__ import annotations
@@ -17,6 +18,9 @@ from ..tuning import Tuning
 
 RARE = 1e-3
 """Logs in which chance brings such a run."""
+
+SHARE = 0.05
+"""Of the readings of a sensor that a run has, at least: with fewer its R is off by less than its interval is wide."""
 
 LEAST = 0.01
 """Probability of a repetition that is granted at least."""
@@ -65,7 +69,7 @@ def repeated(values: np.ndarray, std: float) -> np.ndarray:
     others = (lengths.sum() - lengths) / np.maximum(1, values.size - 1 - lengths)
     chance = np.minimum(np.maximum(others, max(by_noise, LEAST)), 1.0)
     with np.errstate(divide="ignore"):
-        longest = math.log(values.size / RARE) / -np.log(chance)
+        longest = np.maximum(SHARE * values.size, math.log(values.size / RARE) / -np.log(chance))
     found = np.zeros(values.size, bool)
     for begin, length in zip(begins[lengths >= longest], lengths[lengths >= longest], strict=True):
         found[begin : begin + length] = True
