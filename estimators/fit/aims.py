@@ -43,9 +43,6 @@ FARTHEST = 5.0
 """Root mean squares beyond which an error counts as this for how long errors last: one peak must not hide that."""
 
 
-SHARE = 1.0
-
-
 class Recording(NamedTuple):
     """A log, how much its readings weigh, the events (n,) that take no part in the fit, and where it starts."""
 
@@ -158,7 +155,7 @@ def _weighed(estimator: str, given: Setting, recordings: list[Recording]) -> Aim
     independent = {name: sum(n / tau for tau, n in items) for name, items in lasting.items()}
     counts = {name: sum(n for _, n in items) for name, items in lasting.items()}
     weights = {name: independent[name] / count for name, count in counts.items() if name and count}
-    own = min(independent[""], SHARE * sum(independent[name] for name in weights)) / max(1, counts[""])
+    own = min(independent[""], sum(independent[name] for name in weights)) / max(1, counts[""])
     # Without a witness it is the likelihood as it is.
     return Aim(WITNESSES, weights=weights, own=own) if weights else Aim()
 

@@ -103,6 +103,8 @@ def entries_of(
     logs: Sequence[Log],
     wanted: Sequence[str] = ("Q", "R"),
     bounds: Mapping[str, tuple[float, float]] | None = None,
+    *,
+    witnesses: bool = False,
 ) -> tuple[list[Entry], list[Skipped]]:
     """The entries that some keys and groups mean.
 
@@ -113,6 +115,7 @@ def entries_of(
         wanted: Keys as `Tuning.set` has them, `options.NAME`, `prior.STATE.mean`, `prior.STATE.std`, `SCALE`, and
             `GROUPS`.
         bounds: Least and greatest value by key, in the entry's unit: a data sheet's.
+        witnesses: Whether the fit aims at sensors held out too, so that it tells of their R.
 
     Raises:
         ConfigError: If there is no such entry, or it is no number.
@@ -130,7 +133,7 @@ def entries_of(
                     f"{shown_name(key)} is no entry that can be fitted; {nearest(key, [*known, *GROUPS])}"
                 )
             item = _bounded(item, (bounds or {}).get(key))
-            reason = _against(item, tuning, logs)
+            reason = _against(item, tuning, logs, witnesses)
             if reason:
                 skipped[key] = Skipped(key, reason)
             else:
@@ -230,7 +233,7 @@ def _bounded(item: Entry, bounds: tuple[float, float] | None) -> Entry:
     return replace(item, low=low, high=high)
 
 
-def _against(item: Entry, tuning: Tuning, logs: Sequence[Log]) -> str:
+def _against(item: Entry, tuning: Tuning, logs: Sequence[Log], witnesses: bool) -> str:
     """Why an entry cannot be fitted; nothing if it can."""
     if item.low >= item.high:
         return "has no room in its range"
@@ -243,7 +246,7 @@ def _against(item: Entry, tuning: Tuning, logs: Sequence[Log]) -> str:
         s = model.sensor_names.index(name)
     else:
         s = int(np.searchsorted(model.row_start, list(model.row_names).index(name), side="right")) - 1
-    if not tuning.used[s]:
+    if not tuning.used[s] and not witnesses:
         return "is of a sensor that is held out"
     if not any(np.any((log.kind[: log.n] == READING) & (log.channel[: log.n] == s)) for log in logs):
         return "is of a sensor that says nothing here"

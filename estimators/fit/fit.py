@@ -141,7 +141,8 @@ def fit(
     for given in recordings:
         if not np.any(given.log.kind[: given.log.n] == READING):
             raise EstimatorError("a recording has no reading; there is nothing to fit to")
-    entries, skipped = entries_of(estimator, tuning, [given.log for given in recordings], wanted, bounds)
+    logs = [given.log for given in recordings]
+    entries, skipped = entries_of(estimator, tuning, logs, wanted, bounds, witnesses=aim == WITNESSES)
     recordings, left_out = _unstuck(tuning, recordings)
     whole = [Recording(g.log, g.weight, held_out_rows(g.log, blocks), g.base) for g in recordings]
     lean = [

@@ -5,9 +5,10 @@
 If the model is right, η = 1. The model of an asset errs slowly, so that a thousand readings say as much as ten would,
 and the likelihood is sure of what it cannot know: it explains the one stretch that it was fitted to, with noises under
 which what is not measured leaves its band. A smaller power counts readings for fewer, and entries go back to where they
-were, those first of which the data tell least. The power is that with which the blocks held out are predicted best, or
-rather the smallest that is no worse than that by more than chance (two standard errors of the difference), and with
-which nothing else is predicted worse; where there is one, of those with which all witnesses stay in their bands.
+were, those first of which the data tell least. The power is that with which the blocks held out are predicted best, of
+those with which nothing else is predicted worse. Where witnesses tell, of which few errors are independent, it is the
+smallest that is no worse than that by more than chance (two standard errors of the difference), if there is one with
+which all of them stay in their bands.
 
 The maximum at a power is taken from the parabola at the maximum x̂ of power 1, with H minus its second derivatives, D
 those of the belief in x_0: x(η) = x_0 + (η (H - D) + D)⁻¹ η H (x̂ - x_0). What each is worth is known by folding.
@@ -69,7 +70,7 @@ def tempered(
     found = [at_power(objective, x, shape, power) for power in powers]
     own, *others = judged([setting(objective.start), *(setting(point) for point, _ in found)])
     verdicts = [verdict(own, other, aim, changed=x.size > 0) for other in others]
-    k = _chosen(own, others, verdicts)
+    k = _chosen(own, others, verdicts, aim)
     return Tempered(powers[k], *found[k], own, others[k], verdicts[k])
 
 
@@ -84,13 +85,15 @@ def at_power(objective: Objective, x: np.ndarray, shape: Curvature, power: float
     return np.clip(start + cov @ (power * H @ (x - start)), low, high), cov
 
 
-def _chosen(own: Worth, others: Sequence[Worth], verdicts: Sequence[Verdict]) -> int:
+def _chosen(own: Worth, others: Sequence[Worth], verdicts: Sequence[Verdict], aim: Aim) -> int:
     """Which power: of those with which the fit is proposed; else that of 1, whose reasons are told."""
     proposed = [k for k, item in enumerate(verdicts) if item.proposed]
     if not proposed:
         return 0
     proposed = [k for k in proposed if _in_band(own, others[k])] or proposed
     best = max(proposed, key=lambda k: verdicts[k].gain)
+    if not aim.weights:
+        return best
     for k in reversed(proposed):
         less, error = gain(others[k].held_out.aimed, others[best].held_out.aimed)
         if less <= SURE * error:

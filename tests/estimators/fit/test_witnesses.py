@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from estimators.errors import ConfigError
 from estimators.fit.aims import LIKELIHOOD, WITNESSES, Recording, aim_of
 from estimators.fit.entries import Setting
 from estimators.fit.fit import Given, fit
@@ -95,3 +96,19 @@ def test_without_a_witness_it_is_the_likelihood():
     ys = simulated(3, 200)
     one, other = (fit("kf", Tuning.of(MODEL), [Given(log_of(ys))], aim=aim) for aim in (LIKELIHOOD, WITNESSES))
     assert [line.after for line in one.lines] == [line.after for line in other.lines]
+
+
+def test_the_noise_of_a_sensor_that_is_held_out_is_told_by_its_own_prediction():
+    rng = np.random.default_rng(3)
+    xs, ys = lasting_errors(2)
+    log = log_of(ys)
+    log.add("silent", np.arange(xs.size, dtype=float), xs + rng.normal(0.0, 2.0, xs.size))
+    tuning = Tuning.of(MODEL).set("use.silent", False)
+    with pytest.raises(ConfigError, match="R.silent is of a sensor that is held out"):
+        fit("kf", tuning, [Given(log)], wanted=("R.silent",))
+    found = fit("kf", tuning, [Given(log)], wanted=("Q", "R"), aim=WITNESSES)
+    # It reads with a variance of 4, beside what the estimate is off by, about 1.
+    (line,) = [line for line in found.lines if line.key == "R.silent"]
+    assert found.proposed and abs(np.log(line.after / 4.0)) < np.log(1.5)
+    after, before = (worth.held_out.withheld["silent"].coverage for worth in (found.after, found.before))
+    assert before < 0.8 and 0.9 < after < 0.98
