@@ -56,7 +56,8 @@ class Recording(NamedTuple):
 class Aim:
     """What is aimed at; `sensors` are held out in turn, and their rows' scores are in units of `scale` (rows,).
 
-    `weights` are those of the witnesses, by name, and `own` is that of the readings.
+    `weights` are those of the witnesses, by name, and `own` is that of the readings; the witnesses have `independent`
+    errors in all.
     """
 
     kind: str = LIKELIHOOD
@@ -64,6 +65,7 @@ class Aim:
     scale: np.ndarray | None = None
     weights: Mapping[str, float] = field(default_factory=dict)
     own: float = 1.0
+    independent: float = np.inf
 
     @property
     def folds(self) -> int:
@@ -155,9 +157,10 @@ def _weighed(estimator: str, given: Setting, recordings: list[Recording]) -> Aim
     independent = {name: sum(n / tau for tau, n in items) for name, items in lasting.items()}
     counts = {name: sum(n for _, n in items) for name, items in lasting.items()}
     weights = {name: independent[name] / count for name, count in counts.items() if name and count}
-    own = min(independent[""], sum(independent[name] for name in weights)) / max(1, counts[""])
+    told = sum(independent[name] for name in weights)
+    own = min(independent[""], told) / max(1, counts[""])
     # Without a witness it is the likelihood as it is.
-    return Aim(WITNESSES, weights=weights, own=own) if weights else Aim()
+    return Aim(WITNESSES, weights=weights, own=own, independent=told) if weights else Aim()
 
 
 def track_of(estimator: str, given: Setting, recording: Recording, without: int | None = None) -> Track:

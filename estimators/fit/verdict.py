@@ -44,7 +44,8 @@ def verdict(before: Worth, after: Worth, aim: Aim, *, changed: bool = True) -> V
     """Judge by the part that was held out: what the fit aimed at must be better there, and nothing else worse."""
     one, other = before.held_out, after.held_out
     if not changed:
-        return Verdict(False, 0.0, 0.0, ("the data tell none of the entries",))
+        few = f": what the recording knows has {aim.independent:.0f} independent errors" if aim.weights else ""
+        return Verdict(False, 0.0, 0.0, (f"the data tell none of the entries{few}",))
     if not one.n:
         return Verdict(False, np.nan, np.nan, ("nothing was held out, so nothing judges it",))
     mean, error = _gain(one, other, aim)

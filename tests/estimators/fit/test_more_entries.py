@@ -93,11 +93,12 @@ def test_a_search_without_slopes_ends_where_one_with_them_does():
     assert np.all(np.abs(y - x) < 0.1 / np.sqrt(curvature) + 0.02)
 
 
-def test_a_filter_that_draws_is_fitted_without_slopes():
+def test_a_filter_that_draws_is_fitted_without_slopes(monkeypatch):
     """Its members stand for the Kalman filter's moments: 400 of them to 1 / √200 of a variance."""
     ys = simulated(1, 150)
     tuning = Tuning.of(MODEL)
     exact = fit("kf", tuning, [Given(log_of(ys))], wanted=("Q", "R.float"), blocks=0)
+    monkeypatch.setattr("estimators.fit.fit.maximise", lambda *_: pytest.fail("by slopes"))
     drawn = fit("enkf", tuning.with_options({"members": 400.0}), [Given(log_of(ys))], wanted=("Q", "R.float"), blocks=0)
     for line, other in zip(exact.lines, drawn.lines, strict=True):
         # Chance of the members moves the maximum by much less than the data leave open.

@@ -36,6 +36,14 @@ def test_what_repeats_itself_by_its_quantum_is_not_stuck():
     assert not repeated(ys, np.sqrt(0.5)).any()
 
 
+def test_an_asset_at_rest_is_not_stuck():
+    """A car that stands and then drives, its speed in steps that are wide beside the noise: 0 is what it should say."""
+    speeds = np.concatenate([np.zeros(150), np.abs(np.cumsum(np.resize([1.0, 1.0, -1.0, 1.0], 250)))])
+    assert not repeated(speeds, 0.1).any()
+    # Noise of ten steps would have moved it.
+    assert repeated(speeds, 10.0).sum() == 149
+
+
 def test_a_short_run_stays():
     log = log_of(stuck_for(0.03))
     same, found = unstuck(RIGHT, log)
