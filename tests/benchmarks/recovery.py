@@ -105,7 +105,7 @@ CASES = (
         "lorenz96",
         "ekf",
         {"Q.x": 0.02, "R.stations": 0.5, "p.forcing": 8.2},
-        10.0,
+        6.0,
         {"noise.x": "{variance: 0.01}"},
     ),
 )  # fmt: skip
