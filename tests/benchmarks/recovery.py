@@ -27,7 +27,8 @@ import numpy as np
 from app.cli.fold import read_log
 from app.twin.twin import Twin, load_twin
 from estimators.diagnostics.score import score
-from estimators.fit.fit import Fitted, Given, Line, fit
+from estimators.fit.entries import Entry, entries_of, with_values
+from estimators.fit.fit import Fitted, Given, fit
 from estimators.fold import Fold
 from estimators.log import Log
 from estimators.track import USED
@@ -184,25 +185,23 @@ def recover(case: Case, count: int) -> Recovered:
 def of_the_fit(twin: Twin, fitted: Fitted, log: Log) -> float:
     """Standard deviation of the mean NIS of a log that is due to how sure the fit is: √(gᵀ C g)."""
     told = [i for i, line in enumerate(fitted.lines) if not line.alone]
+    if not told:
+        return 0.0
     tuning = fitted.setting.tuning
+    entries, _ = entries_of(twin.estimator, tuning, [log], [fitted.lines[i].key for i in told])
 
-    def nis(line: Line, steps: float) -> float:
-        by = steps * line.deviation
-        value = line.after * np.exp(by) if line.log else line.after + by
-        fold = Fold(twin.estimator, twin.model, tuning.set(line.key, float(np.clip(value, *ends(twin, line)))), log)
+    def nis(item: Entry, by: float) -> float:
+        given = with_values(tuning, [item], [item.outward(item.inward(item.start) + by)])
+        fold = Fold(twin.estimator, twin.model, given.tuning, log, prior=given.prior)
         fold.advance()
         return float(fold.track.nis[fold.track.verdict == USED].mean())
 
     # A difference over half a deviation: of the slope as wide as the estimate is uncertain.
-    slopes = np.array([nis(fitted.lines[i], 0.25) - nis(fitted.lines[i], -0.25) for i in told]) / 0.5
+    steps = [0.25 * fitted.lines[i].deviation for i in told]
+    slopes = [nis(item, step) - nis(item, -step) for item, step in zip(entries, steps, strict=True)]
+    g = np.array(slopes) / 0.5
     correlation = fitted.correlation[np.ix_(told, told)]
-    return float(np.sqrt(max(0.0, slopes @ correlation @ slopes)))
-
-
-def ends(twin: Twin, line: Line) -> tuple[float, float]:
-    """The range of an entry."""
-    item = next(item for item in twin.tuning.items() if item.key == line.key)
-    return item.low, item.high
+    return float(np.sqrt(max(0.0, g @ correlation @ g)))
 
 
 def lines(case: Case, found: Recovered) -> list[str]:
