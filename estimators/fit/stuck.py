@@ -55,22 +55,30 @@ def unstuck(tuning: Tuning, log: Log) -> tuple[Log, dict[str, int]]:
 
 
 def repeated(values: np.ndarray, std: float) -> np.ndarray:
-    """Which of the values (n,) of a row repeat the one before in a run that is too long for chance, (n,)."""
-    again = np.zeros(values.size, bool)
-    again[1:] = values[1:] == values[:-1]
-    steps = np.abs(np.diff(values[np.isfinite(values)]))
-    if not again.any() or not np.any(steps > 0.0):
-        return np.zeros(values.size, bool)
+    """Which of the values (n,) of a row repeat the one before in a run that is too long for chance, (n,).
+
+    What is missing neither repeats nor interrupts.
+    """
+    there = np.isfinite(values)
+    found = np.zeros(values.size, bool)
+    found[there] = _repeated(values[there], std)
+    return found
+
+
+def _repeated(values: np.ndarray, std: float) -> np.ndarray:
+    found = np.zeros(values.size, bool)
+    steps = np.abs(np.diff(values))
+    if not np.any(steps == 0.0) or not np.any(steps > 0.0):
+        return found
     quantum = float(steps[steps > 0.0].min())
     by_noise = math.erf(0.5 * quantum / std) if std > 0.0 else 1.0
     # Where a run of repetitions begins, and how many it has.
-    edges = np.flatnonzero(np.diff(again.astype(np.int8), prepend=0, append=0))
+    edges = np.flatnonzero(np.diff((steps == 0.0).astype(np.int8), prepend=0, append=0)) + 1
     begins, lengths = edges[::2], edges[1::2] - edges[::2]
-    others = (lengths.sum() - lengths) / np.maximum(1, values.size - 1 - lengths)
+    others = (lengths.sum() - lengths) / np.maximum(1, steps.size - lengths)
     chance = np.minimum(np.maximum(others, max(by_noise, LEAST)), 1.0)
     with np.errstate(divide="ignore"):
         longest = np.maximum(SHARE * values.size, math.log(values.size / RARE) / -np.log(chance))
-    found = np.zeros(values.size, bool)
     for begin, length in zip(begins[lengths >= longest], lengths[lengths >= longest], strict=True):
         found[begin : begin + length] = True
     return found

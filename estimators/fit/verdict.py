@@ -12,6 +12,9 @@ from .judge import Part, Prediction, Worth, gain
 SURE = 2.0
 """Standard errors that a gain must exceed, and a loss before it counts."""
 
+LEAST = 1.0
+"""Nats that a fit must bring on all that was held out: with less it is the same tuning in other digits."""
+
 WORSE = 0.05
 """Share by which the score of a held-out prediction may grow before it counts."""
 
@@ -54,6 +57,8 @@ def verdict(before: Worth, after: Worth, aim: Aim, *, changed: bool = True) -> V
     if not mean > SURE * error:
         unit = "of the score" if aim.kind in (CRPS, ERROR) else f"nats {each}"
         reasons.append(f"it does not predict the blocks held out better: {mean:+.3g} ± {error:.2g} {unit}")
+    elif aim.kind in EACH and mean * other.aimed.size < LEAST:
+        reasons.append(f"what it gains is next to nothing: {mean * other.aimed.size:.2g} nats in all")
     for kind, olds, news in _judges(one, other):
         for name, old in olds.items():
             if name in news:

@@ -44,6 +44,12 @@ def test_an_asset_at_rest_is_not_stuck():
     assert repeated(speeds, 10.0).sum() == 149
 
 
+def test_what_is_missing_does_not_interrupt():
+    ys = stuck_for(0.2)
+    ys[110:180:5] = np.nan
+    assert repeated(ys, 0.7).sum() == 79 - 14 and not repeated(ys, 0.7)[110:180:5].any()
+
+
 def test_a_short_run_stays():
     log = log_of(stuck_for(0.03))
     same, found = unstuck(RIGHT, log)

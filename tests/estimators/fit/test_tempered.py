@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from estimators.fit.aims import Recording
+from estimators.fit.aims import Aim, Recording
 from estimators.fit.entries import entries_of
 from estimators.fit.fit import Given, fit
+from estimators.fit.judge import Part, Worth
 from estimators.fit.laplace import curvature
 from estimators.fit.objective import Objective
 from estimators.fit.optimise import maximise
 from estimators.fit.tempered import POWERS, at_power
+from estimators.fit.verdict import verdict
 from estimators.tuning import Tuning
 from tests.estimators.fit.test_fit import DECADES, MODEL, dense, log_of, simulated
 
@@ -56,3 +58,16 @@ def test_what_is_not_proposed_is_told_of_the_whole_likelihood():
     right = Tuning.of(MODEL).set("Q.level", 0.2).set("R.float", 0.5)
     found = fit("kf", right, [Given(log_of(simulated(0, 300)))])
     assert not found.proposed and found.power == 1.0 and found.verdict.reasons
+
+
+@pytest.mark.parametrize("gained, said", [(1e-4, "what it gains is next to nothing: 0.02 nats in all"), (0.1, None)])
+def test_a_little_of_a_gain_is_none(gained, said):
+    """A small enough step towards what is better is surely better, and worth nothing: it is not proposed."""
+
+    def worth(each):
+        terms = np.full(200, each)
+        part = Part(200, each, 1.0, 0.95, terms, terms, {}, {}, {})
+        return Worth(part, part)
+
+    found = verdict(worth(0.0), worth(gained), Aim())
+    assert (found.proposed, found.reasons) == (said is None, () if said is None else (said,))
