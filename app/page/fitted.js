@@ -60,4 +60,4 @@ function scores({ before, after }) {
 }
 
 const about = ({ result, revision, events, elapsed }) =>
-  element("p", { class: "about" }, `From run ${revision}, ${result.estimator}: ${result.folds} folds of ${events.toLocaleString("en")} events in ${compact(elapsed, 2)} s.${result.power < 1 ? ` Of what the fitted blocks say ${compact(result.power, 2)} is believed: with more of it the others are predicted no better.` : ""}`);
+  element("p", { class: "about" }, `From run ${revision}, ${result.estimator}: ${result.folds} folds of ${events.toLocaleString("en")} events in ${compact(elapsed, 2)} s.${result.power < 1 ? ` Of what the fitted blocks say ${compact(result.power, 2)} is believed, in the intervals too: with more of it the others are predicted no better.` : ""}`);

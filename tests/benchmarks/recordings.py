@@ -78,7 +78,7 @@ def outside(twin: Twin, setting: Setting, log: Log, second: np.ndarray) -> list[
         if not GOOD[0] <= now <= GOOD[1]:
             independent = late.sum() / correlation_time(np.minimum(squares[late], 25.0 * squares[late].mean()))
             chance = np.sqrt(0.95 * 0.05 / independent)
-            said = f"{100 * now:.0f} % of {late.sum():,}, about {independent:.0f} independent errors"
+            said = f"{100 * now:.1f} % of {late.sum():,}, about {independent:.0f} independent errors"
             said += f", by chance 95 ± {100 * chance:.0f} %; {100 * then:.0f} % on the first half"
             found.append(f"{item.name} {said}")
     return found
