@@ -204,11 +204,14 @@ class Tune:
     twin: Twin
     """Name of a twin that ships, or path of a YAML file."""
     fit: str = "Q,R"
-    """What to fit: groups (Q, R, p, options, prior) and single entries, as Q.winding, R.yoke, p.NAME, options.alpha,
-    prior.STATE.std, with commas. scale: one factor for all of Q and R."""
-    aim: Literal["likelihood", "crps", "error"] = "likelihood"
-    """What is maximised: the likelihood of every reading before it was seen; or how well sensors held out are
-    predicted, by continuous ranked probability score or by squared error."""
+    """What to fit: groups (Q, R, p, options, prior; over: how long the errors last that have a time) and single
+    entries, as Q.winding, R.yoke, p.NAME, options.alpha, prior.STATE.std, with commas. scale: one factor for all of Q
+    and R."""
+    aim: Literal["witnesses", "likelihood", "crps", "error"] | None = None
+    """What is maximised. likelihood: that of every reading before it was seen. witnesses: and of what a recording knows
+    and the filter is never told, true states and sensors that the twin holds out. crps, error: how well sensors held
+    out in turn are predicted, by continuous ranked probability score or squared error. Default: witnesses of a
+    recording, likelihood of a simulation."""
     predict: tuple[str, ...] = ()
     """The sensors that those hold out. Default: each in turn."""
     estimator: str | None = None

@@ -10,7 +10,7 @@ from config.files import shown_path
 from config.loader import find
 from config.source_schema import SimulatorSection
 from estimators.errors import ConfigError, printable
-from estimators.fit.aims import LIKELIHOOD
+from estimators.fit.aims import CRPS, ERROR
 from estimators.fit.fit import Fitted, Given, fit
 from estimators.log import Log
 
@@ -19,7 +19,7 @@ from ..runs.tuning_yaml import tuning_yaml
 from ..stderr import complain
 from ..tunings.fitted import settings_of
 from ..tunings.keep import check_free, keep, version_text
-from ..twin.bounds import bounds_of
+from ..twin.bounds import bounds_of, natural_aim
 from ..twin.twin import Twin, load_twin
 from .arguments import settings
 from .check_text import as_text
@@ -43,7 +43,7 @@ def tune_twin(arguments: Arguments) -> int:
         raise ConfigError("--fit names nothing; write for example --fit Q,R")
     if arguments.blocks < FEWEST:
         raise ConfigError(f"--blocks {arguments.blocks}: must be {FEWEST} or more, or nothing is held out")
-    if arguments.predict and arguments.aim == LIKELIHOOD:
+    if arguments.predict and arguments.aim not in (CRPS, ERROR):
         raise ConfigError("--predict: is for --aim crps and --aim error; the likelihood is that of every sensor")
     if arguments.save is not None:
         if arguments.save.suffix not in (".yaml", ".yml"):
@@ -56,6 +56,7 @@ def tune_twin(arguments: Arguments) -> int:
     if arguments.every is not None:
         raise ConfigError("--every: is the time between the ends of two --windows; give both")
     twin, recordings = _recordings(arguments)
+    aim = arguments.aim or natural_aim(twin.config)
 
     def work() -> Fitted:
         return fit(
@@ -65,7 +66,7 @@ def tune_twin(arguments: Arguments) -> int:
             wanted=wanted,
             bounds=bounds_of(twin.config, twin.model),
             blocks=arguments.blocks,
-            aim=arguments.aim,
+            aim=aim,
             predict=arguments.predict,
         )
 

@@ -14,6 +14,9 @@ from ..twin.twin import Twin
 
 ALONE = "left alone: the data cannot tell"
 BOUND = "only a bound: the data cannot tell it from none"
+TEMPERED = (
+    "Of what the fitted blocks say {:.2g} is believed: with more of it the blocks held out are predicted no better."
+)
 
 
 def sections(twin: Twin, fitted: Fitted) -> list[Section]:
@@ -24,7 +27,7 @@ def sections(twin: Twin, fitted: Fitted) -> list[Section]:
 
 def heading(twin: Twin, fitted: Fitted) -> str:
     """Comment above the lines of a tuning that is proposed: what it is, and why it is proposed."""
-    gained = f"{fitted.verdict.gain:+.3g} ± {fitted.verdict.error:.2g} nats a reading on blocks held out"
+    gained = f"{_gained(fitted)} on blocks held out"
     return f"# Fitted by `nisus tune {twin.name}`: {gained}.\n# These sections stand in place of the twin's own.\n"
 
 
@@ -54,9 +57,10 @@ def _entries(twin: Twin, fitted: Fitted) -> Section:
     pairs = [
         f"{pair['entries'][0]} with {pair['entries'][1]} ({pair['correlation']:+.2f})" for pair in correlated(fitted)
     ]
-    said = (f"Hardly told apart: {', '.join(pairs)}.",) if pairs else ()
+    said = [f"Hardly told apart: {', '.join(pairs)}."] if pairs else []
+    said += [f"{name} was stuck: {n:,} of its readings were left out." for name, n in fitted.left_out.items()]
     head = ("entry", "before", "after", "95 % interval", "unit", "")
-    return Section(f"{twin.name}: {fitted.estimator}, {fitted.folds} folds", said, head, tuple(rows))
+    return Section(f"{twin.name}: {fitted.estimator}, {fitted.folds} folds", tuple(said), head, tuple(rows))
 
 
 def _remark(line: Line) -> str:
@@ -84,7 +88,7 @@ def _scores(fitted: Fitted) -> Section:
 
 def _held_out(fitted: Fitted) -> Section:
     rows: list[tuple[str, ...]] = []
-    for kind, group in (("sensor", "sensors"), ("truth", "states")):
+    for kind, group in (("sensor", "sensors"), ("never used", "withheld"), ("truth", "states")):
         rows += _rows(kind, group, fitted.before, fitted.after)
     head = ("", "", "unit", "RMS", "in the 95 % band", "RMS, blocks held out", "in the 95 % band")
     return Section("Sensors held out in turn, and what is known to be true, before and after", (), head, tuple(rows))
@@ -103,9 +107,13 @@ def _rows(kind: str, group: str, before: Worth, after: Worth) -> list[tuple[str,
     return [(kind, name, units[name], *pair(name, parts[0]), *pair(name, parts[1])) for name in names]
 
 
+def _gained(fitted: Fitted) -> str:
+    return f"{fitted.verdict.gain:+.3g} ± {fitted.verdict.error:.2g} nats {fitted.verdict.each}"
+
+
 def _verdict(fitted: Fitted) -> Section:
     verdict = fitted.verdict
     if verdict.proposed:
-        said = f"Proposed: {verdict.gain:+.3g} ± {verdict.error:.2g} nats a reading on the blocks held out."
-        return Section("Verdict", (said,))
+        said = f"Proposed: {_gained(fitted)} on the blocks held out."
+        return Section("Verdict", (said, *([] if fitted.power == 1.0 else [TEMPERED.format(fitted.power)])))
     return Section("Verdict", ("Not proposed:", *verdict.reasons))

@@ -44,7 +44,7 @@ function scores({ before, after }) {
     row("NIS / dof", "1 where the filter is consistent", (part) => compact(part.nis, 3)),
     row("in 95 %", "Share of innovations inside their 95 % band", (part) => share(part.coverage)),
   ];
-  for (const [group, title] of [["sensors", "Sensors, each predicted by the others: RMS error, in 95 %"], ["states", "States, against the truth: RMS error, in 95 %"]]) {
+  for (const [group, title] of [["sensors", "Sensors, each predicted by the others: RMS error, in 95 %"], ["withheld", "Sensors that are never used: RMS error, in 95 %"], ["states", "States, against the truth: RMS error, in 95 %"]]) {
     const names = new Set(parts.flatMap((part) => Object.keys(part[group])));
     if (names.size) rows.push(element("tr", {}, element("th", { scope: "rowgroup", colspan: 5, class: "faint" }, title)));
     for (const name of names) {
@@ -60,4 +60,4 @@ function scores({ before, after }) {
 }
 
 const about = ({ result, revision, events, elapsed }) =>
-  element("p", { class: "about" }, `From run ${revision}, ${result.estimator}: ${result.folds} folds of ${events.toLocaleString("en")} events in ${compact(elapsed, 2)} s.`);
+  element("p", { class: "about" }, `From run ${revision}, ${result.estimator}: ${result.folds} folds of ${events.toLocaleString("en")} events in ${compact(elapsed, 2)} s.${result.power < 1 ? ` Of what the fitted blocks say ${compact(result.power, 2)} is believed, in the intervals too: with more of it the others are predicted no better.` : ""}`);

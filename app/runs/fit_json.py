@@ -18,11 +18,12 @@ def fit_json(fitted: Fitted) -> dict[str, Any]:
     """All there is to know of a fit; null stands for what is not a number.
 
     `entries` have before and after, the 95 % interval, by how many deviations of the estimate they moved (`sigma`),
-    whether the data tell them, and whether they were left alone;
-    `correlated` names pairs of entries that the data hardly tell apart. `before` and `after` have scores of the part
-    that was fitted and of that which was held out: log density of a reading, mean NIS a degree of freedom, coverage of
-    the 95 % bands; `sensors` held out in turn, and true `states`. `verdict` says whether the fit is proposed, by which
-    gain in nats a reading on the blocks held out, and what speaks against it.
+    whether the data tell them, and whether they were left alone; `correlated` names pairs of entries that the data
+    hardly tell apart. `power` is that of the likelihood that was believed, `left_out` the readings of sensors that
+    were stuck. `before` and `after` have scores of the part that was fitted and of that which was held out: log
+    density of a reading, mean NIS a degree of freedom, coverage of the 95 % bands; `sensors` held out in turn, those
+    `withheld`, which the twin never uses, and true `states`. `verdict` says whether the fit is proposed, by which
+    gain in nats on the blocks held out, and what speaks against it.
     """
     return {
         "estimator": fitted.estimator,
@@ -33,7 +34,9 @@ def fit_json(fitted: Fitted) -> dict[str, Any]:
             "reasons": list(fitted.verdict.reasons),
         },
         "entries": [_line(line) for line in fitted.lines],
+        "power": fitted.power,
         "skipped": [item._asdict() for item in fitted.skipped],
+        "left_out": dict(fitted.left_out),
         "correlated": correlated(fitted),
         "before": {"fitted": _part(fitted.before.fitted), "held_out": _part(fitted.before.held_out)},
         "after": {"fitted": _part(fitted.after.fitted), "held_out": _part(fitted.after.held_out)},
@@ -64,6 +67,7 @@ def _part(part: Part) -> dict[str, Any]:
         "nis": _number(part.nis),
         "coverage": _number(part.coverage),
         "sensors": {name: _prediction(item) for name, item in part.sensors.items()},
+        "withheld": {name: _prediction(item) for name, item in part.withheld.items()},
         "states": {name: _prediction(item) for name, item in part.states.items()},
     }
 

@@ -24,7 +24,7 @@ from estimators.tuning import Tuning
 
 from ..engine.integrity import LOWEST
 from ..engine.interface import Running
-from ..twin.bounds import bounds_of
+from ..twin.bounds import bounds_of, natural_aim
 from .history import history
 from .window import ALL
 
@@ -137,6 +137,7 @@ class Fitting:
                 [Given(log, base=base)],
                 wanted=attempt.wanted,
                 bounds=bounds_of(self._engine.twin.config, self._engine.model),
+                aim=natural_aim(self._engine.twin.config),
                 go=lambda folds: self._count(attempt, folds),
             )
         except Cancelled:

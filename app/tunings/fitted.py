@@ -44,7 +44,7 @@ def settings_of(found: Fitted, fitted_on: Sequence[str], note: str = "") -> Sett
 
 
 def _scores(part: Part) -> dict[str, float]:
-    predicted = {**part.sensors, **part.states}
+    predicted = {**part.sensors, **part.withheld, **part.states}
     scores = {
         NIS: part.nis,
         LIKELIHOOD: part.log_density,

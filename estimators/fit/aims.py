@@ -1,17 +1,24 @@
 """What a fit aims at: what each event adds to what is maximised.
 
 - `likelihood`: the log density that the filter gave to the reading before it saw it.
+- `witnesses`: the same, and the log density that it gave to what the recording knows and the filter is never told
+  (witnesses.py). These are weighted by how many of their errors are independent: a model that errs slowly, as that of
+  every asset does, must not pass for one that was confirmed at every step. All readings together weigh as much as all
+  witnesses, and no more than they have independent ones: what lasts of a sensor's error the next reading confirms too.
 - `crps`: how well sensors are predicted that the filter does not use, each held out in turn: the continuous ranked
   probability score, which judges error and band together. What no sensor sees is more like these than like the next
   reading of a sensor that is used.
 - `error`: the same without the band, half the square of the error.
 
 The last two are in units of what they are at the start, so that a reading weighs about as much as in the first.
+
+Source: Varin, Reid & Firth, Statistica Sinica 21, 5 (2011), for a likelihood that is composed of several, with weights.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -23,13 +30,17 @@ from ..fold import Fold
 from ..log import READING, Log
 from ..model.state_space import StateSpaceModel
 from ..snapshots import Base
-from ..track import FAILED, GATED, HELD_OUT, USED, Track
+from ..track import FAILED, GATED, USED, Track
 from .entries import Setting
+from .witnesses import correlation_time, of_sensor, witnesses
 
 PRICE = 1e3
 """Nats that a reading costs which failed."""
 
-LIKELIHOOD, CRPS, ERROR = AIMS = ("likelihood", "crps", "error")
+LIKELIHOOD, WITNESSES, CRPS, ERROR = AIMS = ("likelihood", "witnesses", "crps", "error")
+
+FARTHEST = 5.0
+"""Root mean squares beyond which an error counts as this for how long errors last: one peak must not hide that."""
 
 
 class Recording(NamedTuple):
@@ -43,11 +54,18 @@ class Recording(NamedTuple):
 
 @dataclass(frozen=True)
 class Aim:
-    """What is aimed at; `sensors` are held out in turn, and their rows' scores are in units of `scale` (rows,)."""
+    """What is aimed at; `sensors` are held out in turn, and their rows' scores are in units of `scale` (rows,).
+
+    `weights` are those of the witnesses, by name, and `own` is that of the readings; the witnesses have `independent`
+    errors in all.
+    """
 
     kind: str = LIKELIHOOD
     sensors: tuple[int, ...] = ()
     scale: np.ndarray | None = None
+    weights: Mapping[str, float] = field(default_factory=dict)
+    own: float = 1.0
+    independent: float = np.inf
 
     @property
     def folds(self) -> int:
@@ -56,17 +74,27 @@ class Aim:
 
     def terms(self, estimator: str, given: Setting, recording: Recording) -> np.ndarray:
         """What each event adds, (n,); zero where it adds nothing."""
-        if self.kind == LIKELIHOOD:
-            return densities(track_of(estimator, given, recording), given.tuning.gate)
         model = given.tuning.model
+        if self.kind in (LIKELIHOOD, WITNESSES):
+            track = track_of(estimator, given, recording)
+            return self.told(model, recording.log, track, given.tuning.gate)
         found = np.zeros(recording.log.n)
         for s in self.sensors:
             track = track_of(estimator, given, recording, without=s)
             first = model.row_start[s]
-            for k, (rows, error, std) in enumerate(held_out_errors(model, recording.log, track, s)):
+            for k, item in enumerate(of_sensor(model, recording.log, track, s)):
                 scale = 1.0 if self.scale is None else self.scale[first + k]
-                lost = crps(error, std) / scale if self.kind == CRPS else 0.5 * (error / scale) ** 2
-                found[rows] -= np.where(np.isfinite(lost), lost, PRICE)
+                lost = crps(item.error, item.std) / scale if self.kind == CRPS else 0.5 * (item.error / scale) ** 2
+                found[item.rows] -= np.where(np.isfinite(lost), lost, PRICE)
+        return found
+
+    def told(self, model: StateSpaceModel, log: Log, track: Track, gate: float | None) -> np.ndarray:
+        """What a fold says of each event, (n,), of an aim that holds no sensor out."""
+        found = self.own * densities(track, gate)
+        if self.weights:
+            for item in witnesses(model, log, track):
+                # What was never told when the fit began has no weight.
+                found[item.rows] += self.weights.get(item.name, 0.0) * np.maximum(item.log_density, -PRICE)
         return found
 
 
@@ -87,6 +115,8 @@ def aim_of(kind: str, estimator: str, given: Setting, recordings: list[Recording
         raise EstimatorError(f"the aim is {quoted(kind)}; it must be one of {', '.join(AIMS)}")
     if kind == LIKELIHOOD:
         return Aim()
+    if kind == WITNESSES:
+        return _weighed(estimator, given, recordings)
     model = given.tuning.model
     for name in wanted:
         if name not in model.sensor_names:
@@ -100,14 +130,37 @@ def aim_of(kind: str, estimator: str, given: Setting, recordings: list[Recording
     for record in recordings:
         for s in sensors:
             track = track_of(estimator, given, record, without=s)
-            for k, (rows, error, std) in enumerate(held_out_errors(model, record.log, track, s)):
-                lost = crps(error, std) if kind == CRPS else error**2
-                sums.setdefault(model.row_start[s] + k, []).append(lost[~record.held_out[rows]])
+            for k, item in enumerate(of_sensor(model, record.log, track, s)):
+                lost = crps(item.error, item.std) if kind == CRPS else item.error**2
+                sums.setdefault(model.row_start[s] + k, []).append(lost[~record.held_out[item.rows]])
     for row, parts in sums.items():
         mean = float(np.mean(np.concatenate(parts)))
         if np.isfinite(mean) and mean > 0.0:
             scale[row] = mean if kind == CRPS else np.sqrt(mean)
     return Aim(kind, sensors, scale)
+
+
+def _weighed(estimator: str, given: Setting, recordings: list[Recording]) -> Aim:
+    """Witnesses by the share of their errors that are independent at the start, and readings to match."""
+    lasting: dict[str, list[tuple[float, int]]] = {}
+    for record in recordings:
+        track = track_of(estimator, given, record)
+        # Of several rows, those that are there.
+        used = (track.verdict == USED) & ~record.held_out
+        squares = {"": track.nis[used] / np.maximum(track.dof[used], 1)}
+        for item in witnesses(given.tuning.model, record.log, track):
+            squares[item.name] = ((item.error / item.std) ** 2)[~record.held_out[item.rows]]
+        for name, values in squares.items():
+            values = values[np.isfinite(values)]
+            values = np.minimum(values, FARTHEST**2 * values.mean()) if values.size else values
+            lasting.setdefault(name, []).append((correlation_time(values), values.size))
+    independent = {name: sum(n / tau for tau, n in items) for name, items in lasting.items()}
+    counts = {name: sum(n for _, n in items) for name, items in lasting.items()}
+    weights = {name: independent[name] / count for name, count in counts.items() if name and count}
+    told = sum(independent[name] for name in weights)
+    own = min(independent[""], told) / max(1, counts[""])
+    # Without a witness it is the likelihood as it is.
+    return Aim(WITNESSES, weights=weights, own=own, independent=told) if weights else Aim()
 
 
 def track_of(estimator: str, given: Setting, recording: Recording, without: int | None = None) -> Track:
@@ -128,18 +181,6 @@ def sensors_in_turn(given: Setting, recordings: list[Recording]) -> list[int]:
         speak |= set(np.unique(log.channel[: log.n][log.kind[: log.n] == READING]).tolist())
     sensors = sorted(int(s) for s in speak if given.tuning.used[s])
     return sensors if len(sensors) > 1 else []
-
-
-def held_out_errors(
-    model: StateSpaceModel, log: Log, track: Track, s: int
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Of each row of a sensor that a fold held out: the events, error and standard deviation of its predictions."""
-    own = (log.kind[: log.n] == READING) & (log.channel[: log.n] == s) & (track.verdict == HELD_OUT)
-    found = []
-    for k in range(len(model.sensors[s].rows)):
-        rows = np.flatnonzero(own & np.isfinite(track.innovation[:, k]) & (track.innovation_std[:, k] > 0.0))
-        found.append((rows, track.innovation[rows, k], track.innovation_std[rows, k]))
-    return found
 
 
 def densities(track: Track, gate: float | None) -> np.ndarray:

@@ -16,11 +16,15 @@ import numpy as np
 from ..errors import ConfigError, nearest, shown_name
 from ..estimator import Estimator
 from ..log import READING, Log
+from ..model.coloured import disturbance_time, error_time
 from ..model.state_space import LARGE, Field
 from ..registry import find_estimator
 from ..tuning import Tuning
 
-GROUPS = ("Q", "R", "p", "options", "prior")
+OVER = "over"
+"""How long the errors last that are given a time: the parameters that `coloured` appends."""
+
+GROUPS = ("Q", "R", "p", "options", "prior", OVER)
 """What can be named as a whole."""
 
 SCALE = "scale"
@@ -99,6 +103,8 @@ def entries_of(
     logs: Sequence[Log],
     wanted: Sequence[str] = ("Q", "R"),
     bounds: Mapping[str, tuple[float, float]] | None = None,
+    *,
+    witnesses: bool = False,
 ) -> tuple[list[Entry], list[Skipped]]:
     """The entries that some keys and groups mean.
 
@@ -109,6 +115,7 @@ def entries_of(
         wanted: Keys as `Tuning.set` has them, `options.NAME`, `prior.STATE.mean`, `prior.STATE.std`, `SCALE`, and
             `GROUPS`.
         bounds: Least and greatest value by key, in the entry's unit: a data sheet's.
+        witnesses: Whether the fit aims at sensors held out too, so that it tells of their R.
 
     Raises:
         ConfigError: If there is no such entry, or it is no number.
@@ -118,7 +125,7 @@ def entries_of(
     found: dict[str, Entry] = {}
     skipped: dict[str, Skipped] = {}
     for name in wanted:
-        keys = [key for key in known if key.partition(".")[0] == name] if name in GROUPS else [name]
+        keys = _group(name, known, tuning) if name in GROUPS else [name]
         for key in keys:
             item = known.get(key) or _sensor_of(key, tuning)
             if item is None:
@@ -126,7 +133,7 @@ def entries_of(
                     f"{shown_name(key)} is no entry that can be fitted; {nearest(key, [*known, *GROUPS])}"
                 )
             item = _bounded(item, (bounds or {}).get(key))
-            reason = _against(item, tuning, logs)
+            reason = _against(item, tuning, logs, witnesses)
             if reason:
                 skipped[key] = Skipped(key, reason)
             else:
@@ -146,6 +153,14 @@ def check_key(estimator: str, tuning: Tuning, key: str) -> None:
     known = _all(find_estimator(estimator, tuning.model), tuning)
     if key not in GROUPS and key not in known and _sensor_of(key, tuning) is None:
         raise ConfigError(f"{shown_name(key)} is no entry that can be fitted; {nearest(key, [*known, *GROUPS])}")
+
+
+def _group(name: str, known: Mapping[str, Entry], tuning: Tuning) -> list[str]:
+    if name != OVER:
+        return [key for key in known if key.partition(".")[0] == name]
+    model = tuning.model
+    times = {disturbance_time(noise.name) for noise in model.noises} | {error_time(name) for name in model.sensor_names}
+    return [key for key in known if key.partition(".")[2] in times and key.startswith("p.")]
 
 
 def setting(tuning: Tuning, entries: Sequence[Entry], x: np.ndarray) -> Setting:
@@ -229,7 +244,7 @@ def _bounded(item: Entry, bounds: tuple[float, float] | None) -> Entry:
     return replace(item, low=low, high=high)
 
 
-def _against(item: Entry, tuning: Tuning, logs: Sequence[Log]) -> str:
+def _against(item: Entry, tuning: Tuning, logs: Sequence[Log], witnesses: bool) -> str:
     """Why an entry cannot be fitted; nothing if it can."""
     if item.low >= item.high:
         return "has no room in its range"
@@ -242,7 +257,7 @@ def _against(item: Entry, tuning: Tuning, logs: Sequence[Log]) -> str:
         s = model.sensor_names.index(name)
     else:
         s = int(np.searchsorted(model.row_start, list(model.row_names).index(name), side="right")) - 1
-    if not tuning.used[s]:
+    if not tuning.used[s] and not witnesses:
         return "is of a sensor that is held out"
     if not any(np.any((log.kind[: log.n] == READING) & (log.channel[: log.n] == s)) for log in logs):
         return "is of a sensor that says nothing here"

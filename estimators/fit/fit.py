@@ -2,11 +2,13 @@
 
 The maximum is sought on blocks of time; entries that the data cannot tell go back to what the twin says, and the others
 are fitted again without them; intervals follow from the curvature there. Then blocks and sensors that were held out
-decide whether the result is better than what was: if not, that is what is said, and nothing is proposed.
+decide how much of it is believed (tempered.py), and whether the result is better than what was: if not, that is what is
+said, and nothing is proposed.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -18,15 +20,17 @@ from ..log import READING, Log
 from ..registry import find_estimator
 from ..snapshots import Base
 from ..tuning import Tuning
-from .aims import LIKELIHOOD, Recording, aim_of
+from .aims import LIKELIHOOD, WITNESSES, Recording, aim_of
 from .blocks import BLOCKS, held_out_rows
 from .entries import Entry, Setting, Skipped, entries_of, with_values
 from .judge import Worth, worths
 from .laplace import Curvature, curvature
 from .objective import ALONE, Cancelled, Go, Objective, only_told
 from .optimise import maximise, search
-from .profile import intervals
-from .verdict import Verdict, verdict
+from .profile import Z, intervals
+from .stuck import unstuck
+from .tempered import POWERS, Tempered, tempered
+from .verdict import Verdict
 
 TOLD = 0.25
 """Share of the weak belief's deviation, up to which an entry counts as told by the data: of a variance a factor of 3 in
@@ -75,17 +79,20 @@ class Fitted:
     """What came of a fit.
 
     `setting` is the tuning that was found (and the prior, where that was fitted); whether it is proposed says
-    `verdict`. correlation (k, k) is that of the estimates of `lines`, NaN for those left alone.
+    `verdict`. `power` is that of the likelihood at which it was found. correlation (k, k) is that of the estimates of
+    `lines`, NaN for those left alone. `left_out` are readings of sensors that were stuck, by sensor (stuck.py).
     """
 
     estimator: str
     setting: Setting
     lines: tuple[Line, ...]
     skipped: tuple[Skipped, ...]
+    left_out: Mapping[str, int]
     correlation: np.ndarray
     before: Worth
     after: Worth
     verdict: Verdict
+    power: float
     folds: int
 
     @property
@@ -134,9 +141,14 @@ def fit(
     for given in recordings:
         if not np.any(given.log.kind[: given.log.n] == READING):
             raise EstimatorError("a recording has no reading; there is nothing to fit to")
-    entries, skipped = entries_of(estimator, tuning, [given.log for given in recordings], wanted, bounds)
+    logs = [given.log for given in recordings]
+    entries, skipped = entries_of(estimator, tuning, logs, wanted, bounds, witnesses=aim == WITNESSES)
+    recordings, left_out = _unstuck(tuning, recordings)
     whole = [Recording(g.log, g.weight, held_out_rows(g.log, blocks), g.base) for g in recordings]
-    lean = [Recording(log, g.weight, held_out_rows(log, blocks), g.base) for g, log in _lean(recordings)]
+    lean = [
+        Recording(log, g.weight, held_out_rows(log, blocks), g.base)
+        for g, log in _lean(recordings, truth=aim == WITNESSES)
+    ]
     aimed = aim_of(aim, estimator, Setting(tuning, None), lean, tuple(predict))
     objective = Objective(estimator, tuning, tuple(entries), tuple(lean), aim=aimed, go=count)
     draws = find_estimator(estimator, tuning.model).family in ALONE
@@ -160,25 +172,42 @@ def fit(
         x, value = best(kept, np.delete(start, leave))
         shape = curvature(kept, x)
         told = _told(kept, shape)
-    lines, correlation = _lines(objective, kept, x, value, shape, told, alone)
-    values = [item.written(value) for item, value in zip(kept.entries, x.tolist(), strict=True)]
-    after = with_values(tuning, kept.entries, values)
-    one, other = worths(estimator, [Setting(tuning, None), after], whole, count)
+
+    def setting_at(point: np.ndarray) -> Setting:
+        values = [item.written(value) for item, value in zip(kept.entries, point.tolist(), strict=True)]
+        return with_values(tuning, kept.entries, values)
+
+    believed = tempered(
+        kept, x, shape, setting_at, lambda settings: worths(estimator, settings, whole, count, aimed), aim=aimed,
+        powers=POWERS if blocks and x.size else (1.0,),
+    )  # fmt: skip
+    lines, correlation = _lines(objective, kept, x, value, shape, believed, told, alone)
     return Fitted(
         estimator=estimator,
-        setting=after,
+        setting=setting_at(believed.x),
         lines=lines,
         skipped=tuple(skipped),
+        left_out=left_out,
         correlation=correlation,
-        before=one,
-        after=other,
-        verdict=verdict(one, other, aimed, changed=x.size > 0),
+        before=believed.before,
+        after=believed.after,
+        verdict=believed.verdict,
+        power=believed.power,
         folds=done[0],
     )
 
 
-def _lean(recordings: Sequence[Given]) -> list[tuple[Given, Log]]:
-    return [(given, only_told(given.log)) for given in recordings]
+def _unstuck(tuning: Tuning, recordings: Sequence[Given]) -> tuple[list[Given], dict[str, int]]:
+    found, left_out = [], Counter[str]()
+    for given in recordings:
+        log, repetitions = unstuck(tuning, given.log)
+        found.append(given._replace(log=log))
+        left_out.update(repetitions)
+    return found, dict(left_out)
+
+
+def _lean(recordings: Sequence[Given], *, truth: bool) -> list[tuple[Given, Log]]:
+    return [(given, only_told(given.log, truth=truth)) for given in recordings]
 
 
 def _told(objective: Objective, shape: Curvature) -> np.ndarray:
@@ -202,11 +231,22 @@ def _leave(objective: Objective, x: np.ndarray, value: float, shape: Curvature, 
 
 
 def _lines(
-    whole: Objective, kept: Objective, x: np.ndarray, value: float, shape: Curvature, told: np.ndarray,
-    alone: Sequence[Entry],
+    whole: Objective, kept: Objective, x: np.ndarray, value: float, shape: Curvature, believed: Tempered,
+    told: np.ndarray, alone: Sequence[Entry],
 ) -> tuple[tuple[Line, ...], np.ndarray]:  # fmt: skip
     """Of every entry that was asked for, those left alone too, in the order in which they were; and correlations."""
-    ends, profiled = intervals(kept, x, value, shape) if x.size else (np.zeros((0, 2)), np.zeros(0, bool))
+    deviation = shape.deviation
+    ends, profiled = np.zeros((0, 2)), np.zeros(0, bool)
+    if believed.power < 1.0:
+        # Of what is believed, in which correlated errors count for what they are.
+        deviation = np.sqrt(np.diag(believed.cov))
+        low, high = np.array(kept.limits).T
+        ends = np.clip(
+            np.stack([believed.x - Z * deviation, believed.x + Z * deviation], axis=1), low[:, None], high[:, None]
+        )
+        profiled = np.zeros(x.size, bool)
+    elif x.size:
+        ends, profiled = intervals(kept, x, value, shape)
     place = {item.key: i for i, item in enumerate(kept.entries)} if x.size else {}
     lines = []
     for item in whole.entries:
@@ -226,10 +266,10 @@ def _lines(
         )
         if i is not None:
             line = line._replace(
-                after=item.written(float(x[i])),
+                after=item.written(float(believed.x[i])),
                 low=item.outward(float(ends[i, 0])),
                 high=item.outward(float(ends[i, 1])),
-                deviation=float(shape.deviation[i]),
+                deviation=float(deviation[i]),
                 told=bool(told[i]),
                 alone=False,
                 profile=bool(profiled[i]),

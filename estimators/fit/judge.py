@@ -15,15 +15,19 @@ import numpy as np
 
 from ..diagnostics.innovation_size import mean_nis
 from ..diagnostics.sensitivity.responses import each
-from ..log import READING, truth_of
+from ..log import READING, TRUTH
 from ..model.state_space import StateSpaceModel
 from ..registry import find_estimator
 from ..track import USED, Track
-from .aims import Recording, crps, densities, held_out_errors, sensors_in_turn, track_of
+from .aims import Aim, Recording, crps, densities, sensors_in_turn, track_of
 from .entries import Setting
 from .objective import ALONE, Cancelled, Go
+from .witnesses import Witness, of_sensor, witnesses
 
 Z = 1.959963984540054
+
+_Found = dict[str, tuple[str, list[tuple[np.ndarray, np.ndarray]]]]
+"""Unit, errors and standard deviations, by name."""
 
 BATCHES = 20
 """Batches of time over which a difference is averaged, to know how much of it is chance."""
@@ -48,8 +52,9 @@ class Part(NamedTuple):
     """What the readings of one part of the recordings say.
 
     How many they are, mean log density of one, mean NIS a degree of freedom, share of innovations inside their 95 %
-    band. `terms` (n,) are the single log densities. `sensors` are those held out in turn, `states` those whose truth is
-    known, by name.
+    band. `terms` (n,) are the single log densities, `aimed` what readings and truths add to the aim of the fit, if that
+    holds no sensor out. `sensors` are those held out in turn, `withheld` the rows of those
+    that the twin itself never uses, `states` those whose truth is known, by name.
     """
 
     n: int
@@ -57,7 +62,9 @@ class Part(NamedTuple):
     nis: float
     coverage: float
     terms: np.ndarray
+    aimed: np.ndarray
     sensors: dict[str, Prediction]
+    withheld: dict[str, Prediction]
     states: dict[str, Prediction]
 
 
@@ -68,7 +75,9 @@ class Worth(NamedTuple):
     held_out: Part
 
 
-def worths(estimator: str, settings: Sequence[Setting], recordings: Sequence[Recording], go: Go) -> list[Worth]:
+def worths(
+    estimator: str, settings: Sequence[Setting], recordings: Sequence[Recording], go: Go, aim: Aim | None = None
+) -> list[Worth]:
     """What each setting is worth.
 
     Args:
@@ -76,6 +85,7 @@ def worths(estimator: str, settings: Sequence[Setting], recordings: Sequence[Rec
         settings: Tunings and priors.
         recordings: With the truth, where it is known.
         go: Told of each fold.
+        aim: Of the fit; None for the likelihood.
 
     Raises:
         Cancelled: If `go` says so.
@@ -96,7 +106,7 @@ def worths(estimator: str, settings: Sequence[Setting], recordings: Sequence[Rec
     found = []
     for setting in settings:
         taken = [(record, [next(tracks) for _ in (None, *sensors)]) for record in recordings]
-        fitted, held = (_part(model, setting, sensors, taken, wanted) for wanted in (False, True))
+        fitted, held = (_part(model, setting, sensors, taken, aim or Aim(), wanted) for wanted in (False, True))
         found.append(Worth(fitted, held))
     return found
 
@@ -113,45 +123,39 @@ def gain(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
 
 def _part(
     model: StateSpaceModel, setting: Setting, sensors: list[int], taken: list[tuple[Recording, list[Track]]],
-    held_out: bool,
+    aim: Aim, held_out: bool,
 ) -> Part:  # fmt: skip
-    terms, normal, nis = [], [], []
-    errors: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
-    truths: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+    terms, aimed, normal, nis = [], [], [], []
+    errors, withheld, truths = ({} for _ in range(3))  # type: tuple[_Found, _Found, _Found]
     for record, (track, *others) in taken:
         log = record.log
         wanted = record.held_out == held_out
-        reading = wanted & (log.kind[: log.n] == READING)
+        kind = log.kind[: log.n]
+        reading, told = wanted & (kind == READING), wanted & ((kind == READING) | (kind == TRUTH))
         values = densities(track, setting.tuning.gate)
         terms.append(values[reading])
+        aimed.append(aim.told(model, log, track, setting.tuning.gate)[told])
         used = wanted & (track.verdict == USED)
         normal.append((track.innovation[used] / track.innovation_std[used]).ravel())
         nis.append(track.select(wanted))
         for s, other in zip(sensors, others, strict=True):
-            for k, (rows, error, std) in enumerate(held_out_errors(model, log, other, s)):
-                kept = wanted[rows]
-                _collect(errors, model.row_names[model.row_start[s] + k], error[kept], std[kept])
-        for column, (j, state) in enumerate(zip(model.shown, model.shown_states, strict=True)):
-            rows, true = truth_of(log.events, int(j))
-            kept = wanted[rows]
-            if kept.any():
-                error = true[kept] - track.mean[rows[kept], column]
-                if state.circular:
-                    error = (error + np.pi) % (2.0 * np.pi) - np.pi
-                _collect(truths, state.name, error, track.std[rows[kept], column])
+            for item in of_sensor(model, log, other, s):
+                _collect(errors, item, wanted)
+        for item in witnesses(model, log, track):
+            _collect(truths if item.truth else withheld, item, wanted)
     every, inside = np.concatenate(terms), np.concatenate(normal)
     inside = inside[np.isfinite(inside)]
     weights = [len(track) for track in nis]
-    units = dict(zip(model.row_names, (row.unit for sensor in model.sensors for row in sensor.rows), strict=True))
-    units_of = {state.name: state.unit for state in model.shown_states}
     return Part(
         n=every.size,
         log_density=float(every.mean()) if every.size else np.nan,
         nis=_mean_nis(nis, weights, setting.tuning.gate),
         coverage=float(np.mean(np.abs(inside) <= Z)) if inside.size else np.nan,
         terms=every,
-        sensors={name: _prediction(units[name], pairs) for name, pairs in errors.items()},
-        states={name: _prediction(units_of[name], pairs) for name, pairs in truths.items()},
+        aimed=np.concatenate(aimed),
+        sensors=_predictions(errors),
+        withheld=_predictions(withheld),
+        states=_predictions(truths),
     )
 
 
@@ -161,12 +165,14 @@ def _mean_nis(tracks: list[Track], weights: list[int], gate: float | None) -> fl
     return float(np.average(values[kept], weights=np.array(weights)[kept])) if kept.any() else np.nan
 
 
-def _collect(
-    into: dict[str, list[tuple[np.ndarray, np.ndarray]]], name: str, error: np.ndarray, std: np.ndarray
-) -> None:
-    finite = np.isfinite(error) & (std > 0.0)
-    if finite.any():
-        into.setdefault(name, []).append((error[finite], std[finite]))
+def _collect(into: _Found, item: Witness, wanted: np.ndarray) -> None:
+    kept = wanted[item.rows]
+    if kept.any():
+        into.setdefault(item.name, (item.unit, []))[1].append((item.error[kept], item.std[kept]))
+
+
+def _predictions(found: _Found) -> dict[str, Prediction]:
+    return {name: _prediction(unit, pairs) for name, (unit, pairs) in found.items()}
 
 
 def _prediction(unit: str, pairs: list[tuple[np.ndarray, np.ndarray]]) -> Prediction:

@@ -22,7 +22,7 @@ import numpy as np
 
 from ..diagnostics.sensitivity.responses import each
 from ..errors import NisusError
-from ..log import INPUT, MAINTENANCE, READING, RESET, Log
+from ..log import INPUT, MAINTENANCE, READING, RESET, TRUTH, Log
 from ..registry import find_estimator
 from ..tuning import Tuning
 from .aims import Aim, Recording
@@ -137,13 +137,13 @@ class Objective:
         return float(here.sum()) - self.penalty(x), slopes.sum(axis=1) - self.precision * (x - self.start)
 
 
-def only_told(log: Log) -> Log:
-    """The same log without queries, which never change the estimate.
+def only_told(log: Log, *, truth: bool = False) -> Log:
+    """The same log without queries, which never change the estimate; true states stay if `truth`.
 
     The first event stays in any case: it is where the prior holds.
     """
     kind = log.kind[: log.n]
-    says = np.isin(kind, (READING, INPUT, RESET, MAINTENANCE))
+    says = np.isin(kind, (READING, INPUT, RESET, MAINTENANCE, *((TRUTH,) if truth else ())))
     if not says.any():
         return log
     says[0] = True

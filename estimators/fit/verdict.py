@@ -6,11 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .aims import LIKELIHOOD, Aim
+from .aims import CRPS, ERROR, LIKELIHOOD, WITNESSES, Aim
 from .judge import Part, Prediction, Worth, gain
 
 SURE = 2.0
 """Standard errors that a gain must exceed, and a loss before it counts."""
+
+LEAST = 1.0
+"""Nats that a fit must bring on all that was held out: with less it is the same tuning in other digits."""
 
 WORSE = 0.05
 """Share by which the score of a held-out prediction may grow before it counts."""
@@ -22,43 +25,58 @@ NARROWER = 0.05
 """Coverage that may be lost before it counts, where it is below `COVERED`."""
 
 
+EACH = {LIKELIHOOD: "a reading", WITNESSES: "a reading or witness"}
+"""What a gain in nats is a mean of, by aim."""
+
+
 class Verdict(NamedTuple):
     """Whether the fit is proposed.
 
-    With the gain in nats a reading on the blocks held out, its standard error, and the reasons against it.
+    With the mean gain on the blocks held out, `each` of what that is in nats, its standard error, and the reasons
+    against it.
     """
 
     proposed: bool
     gain: float
     error: float
     reasons: tuple[str, ...]
+    each: str = "a reading"
 
 
 def verdict(before: Worth, after: Worth, aim: Aim, *, changed: bool = True) -> Verdict:
     """Judge by the part that was held out: what the fit aimed at must be better there, and nothing else worse."""
     one, other = before.held_out, after.held_out
     if not changed:
-        return Verdict(False, 0.0, 0.0, ("the data tell none of the entries",))
+        few = f": what the recording knows has {aim.independent:.0f} independent errors" if aim.weights else ""
+        return Verdict(False, 0.0, 0.0, (f"the data tell none of the entries{few}",))
     if not one.n:
         return Verdict(False, np.nan, np.nan, ("nothing was held out, so nothing judges it",))
     mean, error = _gain(one, other, aim)
+    each = EACH.get(aim.kind, "a reading")
     reasons = []
     if not mean > SURE * error:
-        unit = "nats a reading" if aim.kind == LIKELIHOOD else "of the score"
+        unit = "of the score" if aim.kind in (CRPS, ERROR) else f"nats {each}"
         reasons.append(f"it does not predict the blocks held out better: {mean:+.3g} ± {error:.2g} {unit}")
-    for kind, olds, news in (
-        ("sensor", one.sensors, other.sensors), ("true state", one.states, other.states)
-    ):  # fmt: skip
+    elif aim.kind in EACH and mean * other.aimed.size < LEAST:
+        reasons.append(f"what it gains is next to nothing: {mean * other.aimed.size:.2g} nats in all")
+    for kind, olds, news in _judges(one, other):
         for name, old in olds.items():
             if name in news:
                 reasons += _against(f"{kind} {name}, held out,", old, news[name])
-    return Verdict(not reasons, mean, error, tuple(reasons))
+    return Verdict(not reasons, mean, error, tuple(reasons), each)
+
+
+def _judges(one: Part, other: Part) -> list[tuple[str, dict[str, Prediction], dict[str, Prediction]]]:
+    """What must not be predicted worse: the witnesses; where there are none, each sensor in turn stands in for them."""
+    if one.withheld or one.states:
+        return [("sensor", one.withheld, other.withheld), ("true state", one.states, other.states)]
+    return [("sensor", one.sensors, other.sensors)]
 
 
 def _gain(one: Part, other: Part, aim: Aim) -> tuple[float, float]:
     """Of what was aimed at, and its standard error."""
-    if aim.kind == LIKELIHOOD:
-        return gain(one.terms, other.terms)
+    if aim.kind not in (CRPS, ERROR):
+        return gain(one.aimed, other.aimed)
     pairs = [(old.scores / old.crps, other.sensors[name].scores / old.crps) for name, old in one.sensors.items()]
     found = [gain(-old, -new) for old, new in pairs if old.size == new.size]
     if not found:

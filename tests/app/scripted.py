@@ -27,7 +27,7 @@ def readings(times_s, values):
 
 def twin(history=200_000, horizon=2.0, tick=1000.0, model=MODEL, estimator="kf"):
     time = SimpleNamespace(horizon=horizon, degraded_after=5.0, stale_after=30.0, tick=tick)
-    config = SimpleNamespace(time=time, history=history, noise={}, sensors={}, refit=None)
+    config = SimpleNamespace(time=time, history=history, noise={}, sensors={}, source=None, refit=None)
     return SimpleNamespace(
         options_of=lambda estimator: {},
         name="scripted",

@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from app.cli.main import main
+from app.twin.bounds import natural_aim
 from app.twin.twin import load_twin
 from config.loader import TWINS
 from tests.app.runs.test_tuning_yaml import pasted
@@ -119,3 +120,18 @@ def test_what_nothing_tells_is_a_dash(capsys):
     status, out = printed(capsys, "--set", "source.duration=100", *beyond)
     assert status == 1 and "- -> -" in out and "nan" not in out
     assert ("Sensors held out in turn" in out) == ("truth  temperature" in out)
+
+
+def test_a_sensor_that_was_stuck_is_said(capsys):
+    """A fifth of the log repeats one reading: of what is left R is that of the rest."""
+    stuck = ["--set", "source.faults=[{sensor: winding, kind: stuck, start: 100, end: 160}]"]
+    _, out = printed(capsys, "--set", "source.duration=300", *stuck, "--fit", "R")
+    assert "winding was stuck: " in out and "of its readings were left out" in out
+    _, out = printed(capsys, "--set", "source.duration=300", *stuck, "--fit", "R", "--json")
+    found = json.loads(out)
+    assert found["left_out"]["winding"] >= 50 and found["power"] == 1.0
+
+
+def test_what_a_recording_knows_is_aimed_at_and_a_simulated_truth_is_not():
+    assert natural_aim(load_twin("motor_winding").config) == "likelihood"
+    assert natural_aim(load_twin("battery_dmegc").config) == "witnesses"

@@ -1,0 +1,73 @@
+"""How much of a likelihood is believed: the maximum at a power, and which power is chosen."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from estimators.fit.aims import Aim, Recording
+from estimators.fit.entries import entries_of
+from estimators.fit.fit import Given, fit
+from estimators.fit.judge import Part, Worth
+from estimators.fit.laplace import curvature
+from estimators.fit.objective import Objective
+from estimators.fit.optimise import maximise
+from estimators.fit.tempered import POWERS, at_power
+from estimators.fit.verdict import verdict
+from estimators.tuning import Tuning
+from tests.estimators.fit.test_fit import DECADES, MODEL, dense, log_of, simulated
+
+
+@pytest.fixture(scope="module")
+def climbed():
+    ys = simulated(1, 200)
+    tuning, log = Tuning.of(MODEL).set("Q.level", 0.15).set("R.float", 0.6), log_of(ys)
+    entries, _ = entries_of("kf", tuning, [log], ("Q", "R.float"))
+    objective = Objective("kf", tuning, tuple(entries), (Recording(log, 1.0, np.zeros(log.n, bool)),))
+    x, _ = maximise(objective, objective.start)
+    return ys, objective, x, curvature(objective, x)
+
+
+@pytest.mark.parametrize("power", [1.0, 0.25, 1e-2, 1e-4])
+def test_the_maximum_at_a_power_is_that_of_the_dense_density_to_the_power(climbed, power):
+    ys, objective, x, shape = climbed
+    start = np.log([0.15, 0.6])
+
+    def loss(theta):
+        return -power * dense(ys, *np.exp(theta)) + 0.5 * float(np.sum(((theta - start) / DECADES) ** 2))
+
+    best = minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-8}).x
+    found, _ = at_power(objective, x, shape, power)
+    # A parabola in place of the hill: what it misses is of second order in how far the maximum is from the start.
+    assert np.all(np.abs(found - best) < 0.02 + 0.25 * np.max(np.abs(x - start)) ** 2)
+
+
+def test_the_powers_lead_back_to_the_start(climbed):
+    _, objective, x, shape = climbed
+    far = [np.max(np.abs(at_power(objective, x, shape, power)[0] - objective.start)) for power in (*POWERS, 1e-9)]
+    assert far[-1] < 1e-4 and far[0] == np.max(np.abs(x - objective.start))
+
+
+def test_a_model_that_is_right_is_believed():
+    """Its readings are independent news, and the blocks held out say so."""
+    wrong = Tuning.of(MODEL).set("Q.level", 0.005).set("R.float", 8.0)
+    found = fit("kf", wrong, [Given(log_of(simulated(2, 600)))], wanted=("Q", "R"))
+    assert found.proposed and found.power >= POWERS[3]
+
+
+def test_what_is_not_proposed_is_told_of_the_whole_likelihood():
+    right = Tuning.of(MODEL).set("Q.level", 0.2).set("R.float", 0.5)
+    found = fit("kf", right, [Given(log_of(simulated(0, 300)))])
+    assert not found.proposed and found.power == 1.0 and found.verdict.reasons
+
+
+@pytest.mark.parametrize("gained, said", [(1e-4, "what it gains is next to nothing: 0.02 nats in all"), (0.1, None)])
+def test_a_little_of_a_gain_is_none(gained, said):
+    """A small enough step towards what is better is surely better, and worth nothing: it is not proposed."""
+
+    def worth(each):
+        terms = np.full(200, each)
+        part = Part(200, each, 1.0, 0.95, terms, terms, {}, {}, {})
+        return Worth(part, part)
+
+    found = verdict(worth(0.0), worth(gained), Aim())
+    assert (found.proposed, found.reasons) == (said is None, () if said is None else (said,))
