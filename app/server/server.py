@@ -184,7 +184,7 @@ class PageServer:
         return Response((PAGE / "alarms.html").read_text().replace("{{text}}", text), media_type="text/html")
 
     async def _status(self, request: Request) -> Response:
-        return Json(self._state())
+        return Json(await asyncio.to_thread(self._state))
 
     def _state(self) -> dict[str, Any]:
         scene = [] if self._choices is None else self._choices.json()
@@ -314,7 +314,7 @@ class PageServer:
             begun = time.monotonic()
             if begun - told >= STATUS_PERIOD:
                 told = begun
-                status = {"status": status_json(self._engine), "boot": self._boot}
+                status = {"status": await asyncio.to_thread(status_json, self._engine), "boot": self._boot}
                 await browser.send_text(json.dumps({**status, "recordings": sorted(self._recordings())}))
             if drawn.is_set():
                 async for message in _given(feed):
