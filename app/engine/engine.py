@@ -22,6 +22,7 @@ from estimators.snapshots import SPARSE_EVERY, Base
 
 from ..intake import Intake
 from ..stderr import complain
+from ..together import together
 from . import commands
 from .counts import RowCounts
 from .execute import Remembered, execute
@@ -129,14 +130,14 @@ class Engine(RunningFold):
     def stop(self) -> None:
         """Stop reading and folding."""
         self._stopping.set()
-        self._watchers.rest()
-        self._feeder.stop()
-        self._workshop.stop()
-        self._refolder.stop()
-        if self._thread.is_alive():
-            self._thread.join(timeout=5.0 if self._stall.text is None else 0.1)
+        together(self._fold_last, self._feeder.stop, self._workshop.stop, self._refolder.stop, *self._watchers.resting)
         self._watchers.stop()
         self._stall.stop()
+
+    def _fold_last(self) -> None:
+        """Wait for the piece that is being folded."""
+        if self._thread.is_alive():
+            self._thread.join(timeout=5.0 if self._stall.text is None else 0.1)
 
     def submit(self, command: commands.Command) -> None:
         """Queue a command."""
