@@ -62,7 +62,7 @@ export function shownExtent({ lines = [], bands = [], dots = [] }, from, to) {
   let [low, high] = extent(lines, settled, to);
   const take = ([under, over]) => ([low, high] = [Math.min(low, under), Math.max(high, over)]);
   for (const [lower, upper] of bands) take(bandExtent(lower, upper, from, to));
-  for (const values of dots) take(middle(values, from, to));
+  take(middle(dots, from, to));
   const reach = FAR * (high - low);
   const near = reach > 0 ? [low - reach, high + reach] : [-Infinity, Infinity];
   for (const values of [...lines, ...dots])
@@ -73,10 +73,10 @@ export function shownExtent({ lines = [], bands = [], dots = [] }, from, to) {
   return [low, high];
 }
 
-// From the value below which few are to that above which few are; of a handful of them all.
-function middle(values, from, to) {
+// Of all these together: from the value below which few are to that above which few are; of a handful of them all.
+function middle(columns, from, to) {
   const known = [];
-  for (let k = from; k <= to; k++) if (typeof values[k] === "number") known.push(values[k]);
+  for (const values of columns) for (let k = from; k <= to; k++) if (typeof values[k] === "number") known.push(values[k]);
   if (!known.length) return [Infinity, -Infinity];
   known.sort((a, b) => a - b);
   const last = known.length - 1;
