@@ -48,6 +48,7 @@ export class Chart {
     this.data = [[], ...what.series.map(() => [])];
     this.actions = { select, home, wheel };
     this.visible = true;
+    this.empty = true;
   }
 
   // Once it is in the page, and has a size.

@@ -259,13 +259,15 @@ function nisChart(charts) {
   };
 }
 
-// Decades about the bounds, and more where the mean itself leaves them, once it has settled.
+// Decades about the bounds, and more where the mean itself leaves them, once it has settled, or more than a few readings.
 function nisRange({ live, range }) {
   const middle = Math.log10(Math.sqrt(live.last("nis_low") * live.last("nis_high"))) || 0;
-  const means = live.column("nis_mean").map((value) => (typeof value === "number" && value > 0 ? Math.log10(value) : null));
-  const [low, high] = shownExtent({ lines: [means] }, ...within(live.x, range));
-  const known = Number.isFinite(low);
-  return [known ? Math.min(middle - 1, low - 0.15) : middle - 1, known ? Math.max(middle + 1, high + 0.15) : middle + 1];
+  const decades = (name) => live.column(name).map((value) => (typeof value === "number" && value > 0 ? Math.log10(value) : null));
+  const place = within(live.x, range);
+  const [low, high] = shownExtent({ lines: [decades("nis_mean")] }, ...place);
+  if (!Number.isFinite(low)) return [middle - 1, middle + 1];
+  const [, most] = shownExtent({ dots: [decades("nis")] }, ...place);
+  return [Math.min(middle - 1, low - 0.15), Math.max(middle + 1, high + 0.15, Math.min(most + 0.1, high + 1.5))];
 }
 
 function innovationChart(charts, row, further) {

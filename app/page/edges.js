@@ -51,10 +51,16 @@ export function drawOutsiders(plot, series, says, colour) {
     ctx.fill();
     if (!furthest) continue;
     const late = at > bbox.left + 0.8 * bbox.width;
+    const text = says(value);
+    const { width } = ctx.measureText(text);
+    const left = at + (late ? -1.6 * size - width : 1.6 * size);
+    // On a plate, as there may be much beneath it.
+    ctx.fillStyle = colour("panel");
+    ctx.fillRect(left - 2 * scale, above ? tip : tip - 12 * scale, width + 4 * scale, 12 * scale);
     ctx.fillStyle = colour("faint");
-    ctx.textAlign = late ? "right" : "left";
+    ctx.textAlign = "left";
     ctx.textBaseline = above ? "top" : "bottom";
-    ctx.fillText(says(value), at + (late ? -1 : 1) * 1.6 * size, tip);
+    ctx.fillText(text, left, tip);
   }
   ctx.restore();
   return marks;
