@@ -314,8 +314,9 @@ class PageServer:
             begun = time.monotonic()
             if begun - told >= STATUS_PERIOD:
                 told = begun
-                status = {"status": await asyncio.to_thread(status_json, self._engine), "boot": self._boot}
-                await browser.send_text(json.dumps({**status, "recordings": sorted(self._recordings())}))
+                status, origin = await asyncio.to_thread(lambda: (status_json(self._engine), self._series.origin()))
+                news = {"status": status, "boot": self._boot, "origin": None if origin is None else str(origin)}
+                await browser.send_text(json.dumps({**news, "recordings": sorted(self._recordings())}))
             if drawn.is_set():
                 async for message in _given(feed):
                     if isinstance(message, str):
