@@ -28,11 +28,13 @@ WIDER = """() => {
       // Nothing is to be scrolled sideways to be seen.
       if (/auto|scroll/.test(style.overflowX) && node.scrollWidth > node.clientWidth + 1) found.push(`${name(node)} scrolls: ${node.scrollWidth} > ${node.clientWidth}`);
       const place = node.getBoundingClientRect();
+      const cell = node.parentElement.closest("td, th");
+      if (cell && place.width && place.right > cell.getBoundingClientRect().right + 1) found.push(`${name(node)} leaves its cell`);
       if (!place.width || !place.height || (place.right <= right + 1 && place.left >= left - 1)) continue;
       // What is cut off on purpose, as with an ellipsis, is within its own frame.
       let cut = node.parentElement;
       while (cut !== column && getComputedStyle(cut).overflowX === "visible") cut = cut.parentElement;
-      if (cut === column && getComputedStyle(column).overflowX === "visible") found.push(`${name(node)} ${Math.round(place.left)}–${Math.round(place.right)} in ${name(column)} ${Math.round(left)}–${Math.round(right)}`);
+      if (cut === column) found.push(`${name(node)} ${Math.round(place.left)}–${Math.round(place.right)} in ${name(column)} ${Math.round(left)}–${Math.round(right)}`);
     }
   }
   const { scrollWidth, clientWidth } = document.documentElement;
