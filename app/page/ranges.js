@@ -5,7 +5,7 @@ const ROOMY = 0.5;
 const WIDE = 8; // times the usual width of a band, beyond which it does not rule the axis: a prior of ± 2000 m
 const SETTLING = 0.1; // share of the rows, the first ones, in which a line may settle
 const FEW = 0.05; // share of the dots, at either end, that may be wild
-const FAR = 2; // times the span of all others, beyond which a value does not rule the axis
+const FAR = 1; // times the span of all others, beyond which a value does not rule the axis
 const USUAL = 0.2; // share of the rows whose band is narrower than the usual one
 
 export class Range {
