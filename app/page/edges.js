@@ -40,7 +40,7 @@ export function drawOutsiders(plot, series, says, colour) {
   const size = 4.5 * scale;
   ctx.save();
   ctx.font = `${11 * scale}px system-ui, sans-serif`;
-  for (const { x, value, tone, above, furthest } of marks) {
+  for (const { x, tone, above } of marks) {
     const at = plot.valToPos(x, "x", true);
     const [tip, base] = above ? [bbox.top + scale, bbox.top + 2 * size] : [bbox.top + bbox.height - scale, bbox.top + bbox.height - 2 * size];
     ctx.fillStyle = colour(tone);
@@ -49,7 +49,10 @@ export function drawOutsiders(plot, series, says, colour) {
     ctx.lineTo(at - size, base);
     ctx.lineTo(at + size, base);
     ctx.fill();
-    if (!furthest) continue;
+  }
+  for (const { x, value, above } of marks.filter((mark) => mark.furthest)) {
+    const at = plot.valToPos(x, "x", true);
+    const tip = above ? bbox.top + scale : bbox.top + bbox.height - scale;
     const late = at > bbox.left + 0.8 * bbox.width;
     const text = says(value);
     const { width } = ctx.measureText(text);
