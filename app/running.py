@@ -15,6 +15,7 @@ from .engine.engine import Engine
 from .recording.split import NEVER, Split
 from .recording.writer import FINE, Recorder
 from .rerun.rows import RerunRows
+from .together import together
 
 if TYPE_CHECKING:
     from estimators.snapshots import Base
@@ -140,10 +141,11 @@ class RunningTwin:
             self.refits.start()
 
     def stop(self) -> None:
-        """Stop everything; a recording is finished."""
+        """Stop everything; a recording is finished, with the last row that there will be."""
         self.refits.stop()
+        shown = () if self.server is None else (self.server.stop, self.view.stop)
+        together(self._close_log, *shown)
+
+    def _close_log(self) -> None:
         self.engine.stop()
         self.recorder.stop()
-        if self.server is not None:
-            self.server.stop()
-            self.view.stop()

@@ -23,6 +23,7 @@ from .server.door import Door
 from .server.open_browser import Opening as BrowserOpening
 from .signals import restore, when_asked_to_end
 from .stderr import complain
+from .together import together
 
 if TYPE_CHECKING:
     from sources.source import Source
@@ -217,10 +218,8 @@ class Session:
         for item in self.beside:
             item.stop()
         with self._changing:
-            if self.running is not None:
-                self.running.stop()
-        if self.door is not None:
-            self.door.stop()
+            ends = [item.stop for item in (self.running, self.door) if item is not None]
+            together(*ends)
 
     def _open(self, url: str) -> BrowserOpening | None:
         """Open the page in a browser; where that cannot be, the printed address is there."""

@@ -4,28 +4,21 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from estimators.errors import LARGEST, ConfigError
 from estimators.forecast import Crossing, Forecast, first_time, forecast
-from estimators.log import INPUT, Events
 from estimators.model.state_space import StateSpaceModel
 
 from ..engine.interface import Running
 from ..engine.outputs import Here
+from .inputs import MOST_STEPS, REPEAT, TIMES, Changes, input_events, recorded, told_changes
 from .numbers import listed, number
-
-MOST_STEPS = 20_000
-"""Steps of a forecast; each is as long as readings are apart."""
 
 MOST_CHANGES = 200
 """Changes of one input."""
-
-TIMES = 160
-"""Times that are told of."""
 
 PATIENCE = 8.0
 """Seconds that one may take to compute."""
@@ -38,15 +31,19 @@ SHARES = (0.1, 0.5, 0.9)
 
 
 class Question(NamedTuple):
-    """What is asked: `horizon` in seconds; by input, (seconds from now, value) pairs; by state, a limit in its unit."""
+    """What is asked: `horizon` in seconds; by input its changes; by state, a limit in its unit.
+
+    The inputs in `repeated` do again what they did in the last seconds, as long as the horizon.
+    """
 
     horizon: float
-    inputs: dict[str, list[tuple[float, float]]]
+    inputs: dict[str, Changes]
     limits: dict[str, float]
+    repeated: tuple[str, ...] = ()
 
 
 def question_from_json(body: Any, model: StateSpaceModel) -> Question:
-    """The question `{"horizon": s, "inputs": {name: value | [[t, value], ...]}, "limits": {state: value}}`.
+    """The question `{"horizon": s, "inputs": {name: value | [[t, value], ...] | "repeat"}, "limits": {state: value}}`.
 
     Raises:
         ConfigError: If it is not that.
@@ -56,13 +53,14 @@ def question_from_json(body: Any, model: StateSpaceModel) -> Question:
     horizon = _number("horizon", body.get("horizon"))
     if not horizon > 0.0:
         raise ConfigError(f"forecast: horizon is {horizon:g} s; it must be positive")
-    inputs = {
-        name: _changes(f"inputs.{name}", given, horizon)
-        for name, given in _named("inputs", body.get("inputs", {}), model.input_names).items()
-    }
+    given = _named("inputs", body.get("inputs", {}), model.input_names)
+    repeated = tuple(name for name, value in given.items() if value == REPEAT)
+    inputs = {name: _changes(f"inputs.{name}", value, horizon) for name, value in given.items() if name not in repeated}
     shown = [state.name for state in model.shown_states]
     limits = _named("limits", body.get("limits", {}), shown)
-    return Question(horizon, inputs, {name: _number(f"limits.{name}", value) for name, value in limits.items()})
+    return Question(
+        horizon, inputs, {name: _number(f"limits.{name}", value) for name, value in limits.items()}, repeated
+    )
 
 
 class Forecasts:
@@ -95,6 +93,7 @@ class Forecasts:
         begun = time.monotonic()
         here = self._here()
         step = _step(here, question.horizon, self._engine.model.max_step)
+        inputs = question.inputs | recorded(self._engine, question.repeated, here.t, question.horizon)
 
         def between() -> None:
             if time.monotonic() - begun > PATIENCE:
@@ -111,12 +110,14 @@ class Forecasts:
             here.t,
             question.horizon,
             step,
-            inputs=_events(question.inputs, here.t, self._engine.model),
+            inputs=input_events(inputs, here.t, self._engine.model),
             limits=question.limits,
             most=TIMES,
             between=between,
         )
-        return {**forecast_json(self._engine.model, here, found), "step": step, "took": time.monotonic() - begun}
+        told = forecast_json(self._engine.model, here, found)
+        chosen = {name: told_changes(changes) for name, changes in inputs.items()}
+        return {**told, "chosen": chosen, "step": step, "took": time.monotonic() - begun}
 
 
 def forecast_json(model: StateSpaceModel, here: Here, found: Forecast) -> dict[str, Any]:
@@ -179,18 +180,6 @@ def _step(here: Here, horizon: float, longest: float) -> float:
             f"{MOST_STEPS * step:.4g} s at most"
         )
     return step
-
-
-def _events(inputs: Mapping[str, list[tuple[float, float]]], now: int, model: StateSpaceModel) -> Events | None:
-    """The changes of the inputs as events."""
-    batch = []
-    for name, changes in inputs.items():
-        for seconds, value in changes:
-            row = np.full(model.nu, np.nan)
-            row[model.input_names.index(name)] = value
-            t = now + round(seconds * 1e9)
-            batch.append(Events.one(t, t, INPUT, 0, row, model.width))
-    return Events.concat(batch, model.width) if batch else None
 
 
 def _named(where: str, given: Any, names: Any) -> dict[str, Any]:

@@ -139,7 +139,7 @@ def fold_twin(arguments: Arguments) -> int:
     if arguments.html is not None:
         run = Reported(
             twin, twin.estimator, twin.tuning, log.events, fold.track, pictures, [item.episode for item in told],
-            fold.marginal,
+            fold.marginal, smoothed=smoothed,
         )  # fmt: skip
         arguments.html.write_text(as_html(f"{twin.name}, {twin.estimator}", report(run)), encoding="utf-8")
     if arguments.json:
@@ -161,7 +161,7 @@ def _write(
     if path.suffix == ".rrd":
         from ..recording.writer import write_recording
 
-        write_recording(path, twin, log, track, pictures, found)
+        write_recording(path, twin, log, track, pictures, found, smoothed)
         return
     table = table_of(
         twin.model, log.events, track, found, smoothed=smoothed,

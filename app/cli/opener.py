@@ -21,7 +21,6 @@ from ..recording.reader import read_recording
 from ..recording.split import NEVER, Split
 from ..running import Opening, stamp_of
 from ..session import Page, Session
-from ..twin.model import model_file
 from ..twin.twin import Twin, load_twin, restore_twin
 from .prepare import begin_to_compile, compile_for, prepare_model
 from .remarks import remarking
@@ -56,9 +55,7 @@ def opened_twin(
         return load_twin(name, log_files=logs or None, overrides=overrides)
 
     twin = read()
-    version = () if twin.version is None else (twin.version.path,)
-    files = (twin.path, *version, *model_file(twin.loaded))
-    return Opening(twin, live_source(twin, speed), files=files, stamp=stamp_of(files), again=read)
+    return Opening(twin, live_source(twin, speed), files=twin.files, stamp=stamp_of(twin.files), again=read)
 
 
 def recorded_twin(recorded: Recorded) -> Twin:

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from estimators.model.state_space import Sensor, StateSpaceModel
 
+from ..stderr import complain
+
 NEAR, AWAY = 0.05, 0.2
 """How far a row may be from its state, as a share: where the prior has its mean (a wheel's scale), and elsewhere, where
 a small error that the model estimates too comes on top (a GNSS receiver's)."""
+
+ARITHMETIC = (ArithmeticError, ValueError)
+"""What Python raises where machine code gives a value that is none."""
 
 STEP = 1e-3
 """Of a state's standard deviation, for slopes."""
@@ -77,11 +83,22 @@ def expected(model: StateSpaceModel, sensor: Sensor, x: np.ndarray, p: np.ndarra
 def _expect(
     model: StateSpaceModel, sensor: Sensor, x: np.ndarray, u: np.ndarray, p: np.ndarray, out: np.ndarray
 ) -> None:
-    """Fill `out` with h(x, u, p); NaN, which is near nothing, where Python raises and machine code would not."""
+    """Fill `out` with h(x, u, p); NaN, which is near nothing, where it fails.
+
+    Of a domain or a division Python says so where machine code gives NaN and the twin runs; all else is told.
+    """
     try:
         if model.black_box:
             out[:] = sensor.h(x[np.newaxis], u, p)[0]
         else:
             sensor.h(x, u, p, out)
-    except Exception:
+    except Exception as error:  # noqa: BLE001  a user's model may raise anything; the views go on without its dots
         out[:] = np.nan
+        if model.black_box or not isinstance(error, ARITHMETIC):
+            _tell(f"model {model.name}: h of {sensor.name} fails near the prior: {type(error).__name__}: {error}")
+
+
+@cache
+def _tell(text: str) -> None:
+    """Say it once: every view asks."""
+    complain(f"{text}; what it reads is drawn over no state")

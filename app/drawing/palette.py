@@ -38,13 +38,14 @@ class Palette:
     refused: RGB
     previous: RGB
     bound: RGB
+    smoothed: RGB
     health: dict[str, RGB] = field(hash=False)
 
 
 LIGHT = Palette(
     ground=rgb("#f3f5f8"), panel=rgb("#ffffff"), ink=rgb("#14202f"), faint=rgb("#5b6a7d"), rule=rgb("#d9dfe8"),
     grid=rgb("#edf0f4"), estimate=rgb("#0b62c4"), truth=rgb("#111827"), reading=rgb("#c47b00"), refused=rgb("#c72a08"),
-    previous=rgb("#808b98"), bound=rgb("#8390a1"),
+    previous=rgb("#808b98"), bound=rgb("#8390a1"), smoothed=rgb("#264c46"),
     health={
         "waiting": rgb("#7b8798"), "tracking": rgb("#007d57"), "suspect": rgb("#c08200"), "degraded": rgb("#ab3f00"),
         "diverged": rgb("#7d1224"), "stale": rgb("#7b8798"),
@@ -54,7 +55,7 @@ LIGHT = Palette(
 DARK = Palette(
     ground=rgb("#0c1118"), panel=rgb("#131a23"), ink=rgb("#e4eaf2"), faint=rgb("#94a3b5"), rule=rgb("#273242"),
     grid=rgb("#1c2531"), estimate=rgb("#69b1ff"), truth=rgb("#f3f4f6"), reading=rgb("#f2b134"), refused=rgb("#f0592c"),
-    previous=rgb("#6c7788"), bound=rgb("#7d8b9e"),
+    previous=rgb("#6c7788"), bound=rgb("#7d8b9e"), smoothed=rgb("#a8d293"),
     health={
         "waiting": rgb("#8a97a8"), "tracking": rgb("#2ecd9b"), "suspect": rgb("#ffe066"), "degraded": rgb("#d98a2d"),
         "diverged": rgb("#e85a6e"), "stale": rgb("#8a97a8"),

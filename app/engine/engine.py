@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from estimators.errors import EstimatorError, NisusError
+from estimators.errors import NisusError
 from estimators.late import inflated
 from estimators.log import TICK, Events
 from estimators.snapshots import SPARSE_EVERY, Base
 
 from ..intake import Intake
 from ..stderr import complain
+from ..together import together
 from . import commands
 from .counts import RowCounts
 from .execute import Remembered, execute
@@ -33,7 +34,7 @@ from .refolder import Refolded, Refolder
 from .reload import Reloaded, merged
 from .running_fold import RunningFold
 from .stall import Stall
-from .status import status_of
+from .status import Asked, kept_status, status_of
 from .watchers import Watchers
 from .workshop import Workshop
 
@@ -46,6 +47,10 @@ if TYPE_CHECKING:
     from ..twin.twin import Twin
 
 STATUS_AGE = 0.1
+"""Seconds for which a status is kept."""
+
+STATUS_PATIENCE = 0.03
+"""Seconds for which a status waits for the fold, longer than a piece of it usually takes."""
 
 
 class Ready:
@@ -101,8 +106,8 @@ class Engine(RunningFold):
         self._idle_ticks = IdleTicks(section.tick)
         self._watchers = Watchers(self)
         self.revisions.said = self._watchers.episodes_of
-        self._status: tuple[float, Status] | None = None
         self.recorder: Records | None = None
+        self._status: tuple[float, Status] | None = (-np.inf, self._status_now())
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
 
     def _begin_intake(self) -> None:
@@ -125,14 +130,14 @@ class Engine(RunningFold):
     def stop(self) -> None:
         """Stop reading and folding."""
         self._stopping.set()
-        self._watchers.rest()
-        self._feeder.stop()
-        self._workshop.stop()
-        self._refolder.stop()
-        if self._thread.is_alive():
-            self._thread.join(timeout=5.0 if self._stall.text is None else 0.1)
+        together(self._fold_last, self._feeder.stop, self._workshop.stop, self._refolder.stop, *self._watchers.resting)
         self._watchers.stop()
         self._stall.stop()
+
+    def _fold_last(self) -> None:
+        """Wait for the piece that is being folded."""
+        if self._thread.is_alive():
+            self._thread.join(timeout=5.0 if self._stall.text is None else 0.1)
 
     def submit(self, command: commands.Command) -> None:
         """Queue a command."""
@@ -156,30 +161,44 @@ class Engine(RunningFold):
         return self._watchers.episodes()
 
     def status(self) -> Status:
-        """What a panel shows; computed at most ten times a second."""
+        """What a panel shows; computed at most ten times a second. Of a fold that is at work it is the last one."""
         kept = self._status
         if kept is not None and time.monotonic() - kept[0] < STATUS_AGE:
             return kept[1]
-        with self._reading():
-            status = status_of(
-                self._fold,
-                self._row_counts,
-                self._watchers,
-                self.source,
-                estimator=self.estimator,
-                tuning=self.tuning,
-                revision=self._revision,
-                refolding=self._requests.waiting,
-                finished=self._finished,
-                recording=self.recorder.path if self.recorder is not None else None,
-                inflated=self._late,
-                held=self._intake.held,
-                awaited=self._awaited,
-                compiling=self._workshop.states(),
-                notices=self.notices.counts(),
-            )
+        with self._reading(np.inf if kept is None else STATUS_PATIENCE) as still:
+            status = self._status_now() if still or kept is None else self._status_kept(kept[1])
         self._status = (time.monotonic(), status)
         return status
+
+    def _status_now(self) -> Status:
+        """That of a fold that stands still."""
+        return status_of(
+            self._fold,
+            self._row_counts,
+            self._watchers,
+            self.source,
+            self._asked(self._requests.waiting),
+            revision=self._revision,
+            inflated=self._late,
+            held=self._intake.held,
+            notices=self.notices.counts(),
+        )
+
+    def _status_kept(self, kept: Status) -> Status:
+        """That of a fold that is at work; a refold is waited for until the revision that came of it is shown."""
+        asked = self._asked(self._requests.waiting or kept.revision != self._revision)
+        return kept_status(kept, asked, self.model, self.source, self._stall.busy)
+
+    def _asked(self, refolding: bool) -> Asked:
+        return Asked(
+            self.estimator,
+            self.tuning,
+            refolding,
+            self._finished,
+            self.recorder.path if self.recorder is not None else None,
+            self._awaited,
+            self._workshop.states(),
+        )
 
     # The engine's own thread
 
@@ -225,7 +244,7 @@ class Engine(RunningFold):
             self._watchers.arrived(batch, passed.events)
 
     def _put(self, passed: Passed) -> None:
-        with self._lock, self._stall.watched(self._fold):
+        with self._moving():
             events = passed.events
             if self._horizon is not None and self.twin.late.inflate:
                 events, late = inflated(events, self._fold, self._log.newest, self._horizon)
@@ -234,16 +253,26 @@ class Engine(RunningFold):
             self._idle_ticks.broken(self._log.newest)
             if self._log.n:
                 self._watchers.silence.broken()
+        self._fold_on()
+        with self._moving():
             self._forget()
         if stale:
             text = f"{stale} reading(s) later than the horizon, or older than the history, dropped"
             self.notices.report("stale", text, times=stale)
 
     def _take(self, batch: Events, horizon: int | None = None, settled: np.ndarray | None = None) -> int:
-        """Put events where they belong, and fold from there on; how many were stale."""
+        """Put events where they belong, and begin to fold them; how many were stale."""
         before, stale = self._extend(batch, horizon, settled)
         self._watchers.alerts.look(self._fold, before)
         return stale
+
+    def _fold_on(self) -> None:
+        """Fold what is left in pieces, between which others may read; none once the twin is asked to stop."""
+        while self._behind and not self._stopping.is_set():
+            with self._moving():
+                before = self._fold.n
+                self._pieces.advance(self._fold)
+                self._watchers.alerts.look(self._fold, before)
 
     def _when_silent(self) -> None:
         if self._finished:
@@ -272,7 +301,7 @@ class Engine(RunningFold):
             self._reload(item)
         elif isinstance(item, Finished):
             self._put(self._intake.finish())
-            with self._lock, self._stall.watched(self._fold):
+            with self._moving():
                 self._fold.finish()
             self._finished = True
             self.notices.say("the source has ended; the estimate stays")
@@ -282,7 +311,7 @@ class Engine(RunningFold):
     def _restart(self) -> None:
         """The source began again: so does the log. The fold is a new revision of it; a refold is asked for again."""
         wanted = (self.estimator, self.tuning) if self._requests.waiting else None
-        with self._lock, self._stall.watched(self._fold):
+        with self._moving():
             self._begin_again(self._first_base)
             self._begin_intake()
             self._finished = False
@@ -306,8 +335,9 @@ class Engine(RunningFold):
 
     def insert(self, event: Events) -> None:
         """Put in an event of our own."""
-        with self._lock, self._stall.watched(self._fold):
+        with self._moving():
             self._take(event)
+        self._fold_on()
 
     def retune(self, estimator: str, tuning: Tuning) -> None:
         """Fold the history again, beside the running fold, over a copy of the log; when the filter is compiled."""
@@ -319,7 +349,8 @@ class Engine(RunningFold):
         ticket = self._requests.ask()
         self.estimator, self.tuning = estimator, tuning
         self._awaited = None if self._workshop.ready(estimator) else estimator
-        self._status = None
+        if (kept := self._status) is not None:
+            self._status = (-np.inf, kept[1])
         if self._awaited is not None:
             self._workshop.ask(estimator, lambda name: self._inbox.put(Ready(name)))
             return
@@ -328,40 +359,30 @@ class Engine(RunningFold):
 
     def _adopt(self, done: Refolded) -> None:
         """Swap a finished refold in, after it has caught up with what came meanwhile."""
-        # Answered under the lock, so that nobody sees the old fold, and that none is waited for.
-        with self._lock:
-            wanted, changed_from = self._requests.answer(done.ticket)
-            if wanted and not self._swap(done, changed_from):
-                # The log was cut meanwhile: ask again.
-                self.retune(self.estimator, self.tuning)
-
-    def _swap(self, done: Refolded, changed_from: int | None) -> bool:
-        """Go on with a refold, or say why not; False if it no longer fits the log."""
-        if done.fold is None:
-            self._refuse(done.ticket, done.error)
-            return True
-        fold = done.fold
-        with self._stall.watched(fold):
-            log = self._log
-            # What the new revision says of the readings counts, also of those that it loses here; not what others said.
-            lost = max(0, log.first - fold.log.first)
-            row_counts = RowCounts(self.model)
-            row_counts.forget(fold.track.select(slice(0, lost)), fold.log.channel[:lost])
+        wanted, changed_from = self._requests.look(done.ticket)
+        fold, again = done.fold, False
+        row_counts: RowCounts | None = None
+        if wanted and fold is not None:
             try:
-                fold.follow(log, changed_from)
-            except EstimatorError:
-                return False
-            try:
-                fold.advance()
+                # Nobody but this thread moves the log, and nobody sees this fold yet.
+                row_counts = self._caught_up(fold, changed_from, self._stopping)
+                again = row_counts is None
             except NisusError as error:
-                self._refuse(done.ticket, str(error))
-                return True
-            self._become(fold, row_counts)
-            if self._finished:
-                fold.finish()
-            self._watchers.alerts.again()
-            self._watchers.alerts.look(fold, fold.n)
-        return True
+                done = replace(done, fold=None, error=str(error))
+        # Answered under the lock, and last, so that nobody sees the old fold, and that none is waited for.
+        with self._moving():
+            if row_counts is not None and fold is not None:
+                self._become(fold, row_counts)
+                if self._finished:
+                    fold.finish()
+                self._watchers.alerts.again()
+                self._watchers.alerts.look(fold, fold.n)
+            elif wanted and not again:
+                self._refuse(done.ticket, done.error)
+            self._requests.answer(done.ticket)
+        if again and not self._stopping.is_set():
+            # The log was cut meanwhile: ask again.
+            self.retune(self.estimator, self.tuning)
 
     def _refuse(self, ticket: int, reason: str) -> None:
         """A refold failed: what runs goes on, and is what the panel shows."""

@@ -11,10 +11,8 @@ from typing import Any
 from estimators.errors import NisusError
 from estimators.fold import Fold
 
+from .pieces import Pieces
 from .stall import Stall
-
-CHUNK = 16384
-"""Events between two looks at whether the twin is stopping."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +48,14 @@ class Requests:
         for ticket, known in self._open.items():
             self._open[ticket] = index if known is None else min(known, index)
 
-    def answer(self, ticket: int) -> tuple[bool, int | None]:
+    def look(self, ticket: int) -> tuple[bool, int | None]:
         """A refold is done: whether its log is still the present one, and from where on that has changed."""
-        wanted, changed = ticket in self._open, self._open.get(ticket)
+        return ticket in self._open, self._open.get(ticket)
+
+    def answer(self, ticket: int) -> None:
+        """Of this request, and of those before it, nothing more comes."""
         self._answered = max(self._answered, ticket)
         self._open = {number: index for number, index in self._open.items() if number > ticket}
-        return wanted, changed
 
     def forget(self) -> None:
         """The log has started again, so no answer fits it."""
@@ -135,9 +135,9 @@ class Refolder:
 
     def _fold(self, ticket: int, make: Callable[[], Any]) -> Refolded:
         try:
-            fold = make()
+            fold, pieces = make(), Pieces()
             with self._stall.watched(fold):
-                while fold.advance(CHUNK) and not self._stopping:
+                while pieces.advance(fold) and not self._stopping:
                     pass
         except NisusError as error:
             return Refolded(ticket, None, str(error))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimators.diagnostics.health import HealthPolicy
+from estimators.errors import EstimatorError
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
 from estimators.numerics.peaks import peaks_of
@@ -20,9 +22,11 @@ from .counts import RowCounts
 from .integrity import MOST, Window, window
 from .notices import Notices
 from .outputs import Belief, Cursor, Here, Pull
+from .pieces import Pieces
 from .refolder import Requests
 from .revisions import Revisions
 from .stall import Stall
+from .turns import Turns
 
 if TYPE_CHECKING:
     from estimators.diagnostics.field_pictures import Picture
@@ -37,7 +41,8 @@ LATELY = 1024
 class RunningFold:
     """The log, the fold that follows it, and the revisions before.
 
-    Whoever moves it (the methods at the end) holds the lock; whoever reads holds it for no longer than copying takes.
+    Whoever moves it (the methods at the end) holds the lock, for a piece of the fold at most; whoever reads holds it
+    for no longer than copying takes. In between the log may have events that are not folded yet: nobody is shown them.
     """
 
     def __init__(self, twin: Twin, stall: Stall, base: Base | None, ready: Callable[[str], bool]) -> None:
@@ -55,9 +60,11 @@ class RunningFold:
         self._policy = twin.policy
         self._history = max(2 * SPARSE_EVERY, twin.config.history)
         self.estimator, self.tuning = twin.estimator, twin.tuning
-        self._lock = threading.Lock()
+        self._lock = Turns()
         self._stall, self._ready = stall, ready
-        self._cursors: list[Cursor] = []
+        self._pieces = Pieces()
+        self._cursors: tuple[Cursor, ...] = ()
+        self._changing_cursors = threading.Lock()
         self._requests = Requests()
         self.revisions = Revisions(self.estimator, self.tuning)
         self._revision = 0
@@ -66,12 +73,17 @@ class RunningFold:
         self.notices = Notices(lambda: self._log.newest if self._log.n else 0)
 
     @contextmanager
-    def _reading(self) -> Iterator[None]:
-        """Nothing changes meanwhile; also not beneath a fold that never returns, which keeps the lock for ever."""
-        while not (held := self._lock.acquire(timeout=0.05)) and self._stall.text is None:
-            pass
+    def _reading(self, patience: float = np.inf) -> Iterator[bool]:
+        """Nothing changes meanwhile; also not beneath a fold that never returns, which keeps the lock for ever.
+
+        It says whether that is so: not if the fold was at work for `patience` seconds.
+        """
+        end = time.monotonic() + patience
+        while not (held := self._lock.acquire(timeout=min(0.05, patience))):
+            if self._stall.text is not None or time.monotonic() >= end:
+                break
         try:
-            yield
+            yield held or self._stall.text is not None
         finally:
             if held:
                 self._lock.release()
@@ -86,14 +98,14 @@ class RunningFold:
     def cursor(self, *, follows_log: bool = False, span: int | None = None) -> Cursor:
         """A cursor for one consumer, for `pull`; give it back with `release`. See `Cursor` for the rest."""
         cursor = Cursor(follows_log=follows_log, span=span)
-        with self._reading():
-            self._cursors.append(cursor)
+        with self._changing_cursors:
+            self._cursors = (*self._cursors, cursor)
         return cursor
 
     def release(self, cursor: Cursor) -> None:
         """Forget a cursor."""
-        with self._reading():
-            self._cursors = [item for item in self._cursors if item is not cursor]
+        with self._changing_cursors:
+            self._cursors = tuple(item for item in self._cursors if item is not cursor)
 
     def pull(self, cursor: Cursor, limit: int | None = None, *, align: int = 1) -> Pull:
         """Copies of the rows since the cursor, from a multiple of `align` on, at most `limit`; the notices since."""
@@ -152,9 +164,8 @@ class RunningFold:
             return self._log.first + int(np.searchsorted(self._log.t[: self._fold.n], t))
 
     def span(self) -> tuple[int, int]:
-        """Times of the first and the last event, ns; zeros while there is none."""
-        with self._reading():
-            return (int(self._log.t[0]), int(self._log.t[self._log.n - 1])) if self._log.n else (0, 0)
+        """Times of the first and the last event, ns; zeros while there is none. Waits for nobody."""
+        return self._span
 
     def base(self) -> Base | None:
         """Where a fold of the present log starts, if its oldest events were dropped; else None, for the prior."""
@@ -213,6 +224,16 @@ class RunningFold:
 
     # For the thread that moves it
 
+    @contextmanager
+    def _moving(self) -> Iterator[None]:
+        """Nobody reads meanwhile; a fold that does not return is noticed."""
+        with self._lock, self._stall.watched(self._fold):
+            try:
+                yield
+            finally:
+                log = self._log
+                self._span = (int(log.t[0]), int(log.t[log.n - 1])) if log.n else (0, 0)
+
     def _clear(self, base: Base | None) -> None:
         """An empty log and the fold that follows it."""
         self._log = Log.of(self.model, capacity=self._history + 4 * SPARSE_EVERY)
@@ -223,6 +244,8 @@ class RunningFold:
         idle = not self._ready(self.estimator)
         self._fold = self._make_fold(self.estimator, self.tuning, self._log, base, idle=idle)
         self._row_counts = RowCounts(self.model)
+        self._span = (0, 0)
+        self._pieces.begin()
 
     def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None, *, idle: bool = False) -> Fold:
         period = self.twin.picture if self.model.grid is not None else None
@@ -240,13 +263,24 @@ class RunningFold:
         )
 
     def _extend(self, batch: Events, horizon: int | None, settled: np.ndarray | None) -> tuple[int, int]:
-        """Put events where they belong, and fold from there on; the first row that is new, and how many were stale."""
+        """Put events where they belong, and fold the first of them; the first row that is new, and how many were stale.
+
+        What was shown already is folded again at once, so that nobody sees the twin go back in time.
+        """
+        shown = self._fold.n
+        newest = int(self._log.t[shown - 1]) if shown else 0
         first, stale = self._log.extend(batch, horizon, settled)
-        before = min(first, self._fold.n)
-        if first < self._fold.n:
+        if first < shown:
             self._go_back(first)
-        self._fold.advance()
-        return before, stale
+            again = int(np.searchsorted(self._log.t[: self._log.n], newest, side="right"))
+            self._fold.advance(again - self._fold.n)
+        self._pieces.advance(self._fold)
+        return min(first, shown), stale
+
+    @property
+    def _behind(self) -> bool:
+        """Whether there are events that are to be folded."""
+        return not self._fold.idle and self._fold.n < self._log.n
 
     def _go_back(self, index: int) -> None:
         """Events at and after `index` changed: fold them again, and let every cursor fetch them again."""
@@ -279,6 +313,7 @@ class RunningFold:
     def _become(self, fold: Fold, row_counts: RowCounts) -> None:
         """Go on with another fold of the same log, which has caught up with it: a new revision."""
         old, log = self._fold, self._log
+        self._pieces.begin()
         if old.idle:  # the first
             self._fold, self._row_counts = fold, row_counts
             self.revisions.began_with(fold.estimator.name, fold.tuning)
@@ -298,6 +333,29 @@ class RunningFold:
         self.revisions.left(left, fold.estimator.name, fold.tuning)
         self._fold, self._row_counts = fold, row_counts
         self._count_up()
+
+    def _caught_up(self, fold: Fold, changed_from: int | None, stopping: threading.Event) -> RowCounts | None:
+        """Let a refold follow the log, and fold what came meanwhile; None if it no longer fits the log.
+
+        What the new revision says of the readings counts, also of those that it loses here; not what others said.
+
+        Raises:
+            NisusError: If an event does not fit the model.
+        """
+        log = self._log
+        lost = max(0, log.first - fold.log.first)
+        row_counts = RowCounts(self.model)
+        row_counts.forget(fold.track.select(slice(0, lost)), fold.log.channel[:lost])
+        try:
+            fold.follow(log, changed_from)
+        except EstimatorError:
+            return None
+        pieces = Pieces()
+        with self._stall.watched(fold):
+            while pieces.advance(fold):
+                if stopping.is_set():
+                    return None
+        return row_counts
 
     def _count_up(self) -> None:
         self._revision += 1

@@ -71,6 +71,12 @@ class Stall:
         """Watch no longer."""
         self._stop.set()
 
+    @property
+    def busy(self) -> float:
+        """For how many seconds the present work has been going on; 0 while there is none."""
+        work = self._work
+        return 0.0 if work is None else self._clock() - work[0]
+
     @contextmanager
     def watched(self, fold: Fold) -> Iterator[None]:
         """Around work that folds."""

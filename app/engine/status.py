@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from estimators.diagnostics.score import nis_verdict
 from estimators.diagnostics.sensor_states import sensor_states
 from estimators.fold import Fold
 from estimators.log import RESET
+from estimators.model.state_space import StateSpaceModel
 from estimators.registry import find_estimator
 from estimators.track import FAILED, GATED, USED
 from estimators.versions import model_version_at
@@ -27,24 +29,51 @@ from .watchers import Watchers
 if TYPE_CHECKING:
     from estimators.tuning import Tuning
 
+FOLDED = "the readings that came so far are being folded"
+"""Why there is no row yet."""
+
+
+class Asked(NamedTuple):
+    """What of a status needs no look at the fold.
+
+    `estimator` and `tuning` are those that are asked for, others than the fold's while a refold is waited for
+    (`refolding`); `finished` says whether the source has ended, `recording` is the file that is being written,
+    `awaited` the filter for whose compiling a refold waits, `compiling` see `Status`.
+    """
+
+    estimator: str
+    tuning: Tuning
+    refolding: bool
+    finished: bool
+    recording: Path | None
+    awaited: str | None
+    compiling: Mapping[str, float | None]
+
+    def fields(self, model: StateSpaceModel, source: Source) -> dict[str, Any]:
+        """These and what follows from them and from the source, as fields of a status."""
+        options = find_estimator(self.estimator, model).complete(dict(self.tuning.options))
+        return {**self._asdict(), "options": options, **playback_status(source)}
+
+
+def kept_status(kept: Status, asked: Asked, model: StateSpaceModel, source: Source, busy: float) -> Status:
+    """The last status of a fold that has been at work for `busy` seconds, with what is known without it."""
+    fields = asked.fields(model, source)
+    if kept.t is None and busy >= 1.0 and asked.awaited is None:
+        fields["cause"] = f"{FOLDED} ({busy:.0f} s so far)"
+    return replace(kept, **fields)
+
 
 def status_of(
     fold: Fold,
     rows: RowCounts,
     watchers: Watchers,
     source: Source,
+    asked: Asked,
     *,
-    estimator: str,
-    tuning: Tuning,
     revision: int,
-    refolding: bool,
-    finished: bool,
-    recording: Path | None,
     inflated: int,
     held: int,
     notices: Mapping[str, int],
-    awaited: str | None,
-    compiling: Mapping[str, float | None],
 ) -> Status:
     """The status of a fold that stands still meanwhile.
 
@@ -53,17 +82,11 @@ def status_of(
         rows: Counts of its rows.
         watchers: What they found.
         source: Of its readings.
-        estimator: That is asked for; another than the fold's while a refold is waited for.
-        tuning: The same of the tuning.
+        asked: What is known without it.
         revision: Its number.
-        refolding: Whether a refold is waited for.
-        finished: Whether the source has ended.
-        recording: The file that is being written.
         inflated: Late readings whose noise was inflated.
         held: Events that wait for the next to tell whether their time is true.
         notices: Counts of what was said.
-        awaited: The filter for whose compiling a refold waits.
-        compiling: See `Status`.
     """
     model, log, track = fold.model, fold.log, fold.track
     last = fold.n - 1
@@ -75,15 +98,12 @@ def status_of(
     layer = source.faults if isinstance(source, Faulty) else None
     silenced, recovered = layer.lost if layer is not None else 0, fold.recoveries()
     return Status(
-        estimator=estimator,
-        tuning=tuning,
-        options=find_estimator(estimator, model).complete(dict(tuning.options)),
+        **asked.fields(model, source),
         revision=revision,
-        refolding=refolding,
         t=int(log.t[last]) if last >= 0 else None,
         health=health,
         since=int(log.t[last_run(track.health)]) if last >= 0 else None,
-        cause=watchers.cause(leading, health) if last >= 0 else _before(fold, watchers, awaited, compiling),
+        cause=watchers.cause(leading, health) if last >= 0 else _before(fold, watchers, asked),
         sensors=account.of_sensors(model.sensor_names, states),
         episodes_open=len(account.lasting),
         lost=watchers.alerts.lost,
@@ -102,15 +122,10 @@ def status_of(
         nis_low=float(track.nis_low[last]) if last >= 0 else np.nan,
         nis_high=float(track.nis_high[last]) if last >= 0 else np.nan,
         nis_judged=_judged(fold),
-        **playback_status(source),
-        finished=finished,
-        recording=recording,
         latency_ms=watchers.latency.percentile(99.0),
         latency_p50_ms=watchers.latency.percentile(50.0),
         integrity=watchers.integrity.of(revision),
         faults=layer.status() if layer is not None else (),
-        awaited=awaited,
-        compiling=compiling,
     )
 
 
@@ -127,12 +142,12 @@ def _judged(fold: Fold) -> float:
     return nis_verdict(track, events, fold.model, baseline).judged
 
 
-def _before(fold: Fold, watchers: Watchers, awaited: str | None, compiling: Mapping[str, float | None]) -> str:
+def _before(fold: Fold, watchers: Watchers, asked: Asked) -> str:
     """Why there is no row."""
-    if fold.idle and awaited is not None:
-        begun = compiling.get(awaited)
+    if fold.idle and asked.awaited is not None:
+        begun = asked.compiling.get(asked.awaited)
         since = f" ({begun:.0f} s so far)" if begun else ""
-        return f"{awaited} is being compiled, which happens once{since}; readings are kept meanwhile"
+        return f"{asked.awaited} is being compiled, which happens once{since}; readings are kept meanwhile"
     if fold.idle:
-        return "the readings that came so far are being folded"
+        return FOLDED
     return watchers.silence.cause

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from estimators.log import Events
@@ -39,10 +40,10 @@ class Watchers:
         self.integrity.start()
         self.blame.start()
 
-    def rest(self) -> None:
-        """Begin no more folds."""
-        self.integrity.stop()
-        self.blame.stop()
+    @property
+    def resting(self) -> tuple[Callable[[], None], ...]:
+        """What ends those that fold."""
+        return self.integrity.stop, self.blame.stop
 
     def stop(self) -> None:
         """Look at the last rows, and end."""

@@ -17,6 +17,7 @@ from estimators.diagnostics.sensitivity import Bound
 from estimators.diagnostics.sensitivity.words import digits
 from estimators.log import READING, Events
 from estimators.registry import find_entry
+from estimators.smoothing.smoothed import Smoothed
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES, Track
 from estimators.tuning import GATE_KEYS, Tuning
 
@@ -40,7 +41,8 @@ class Reported(NamedTuple):
 
     `about` are more lines of its head, by name; `bounds` the integrity bounds of its states, where they are known;
     `others` the runs before and after it: number, what was changed, scores in words; `before` the episodes of each
-    earlier run that had any, by its number and what it was.
+    earlier run that had any, by its number and what it was; `smoothed` what all readings say of the states, if that was
+    asked for.
     """
 
     twin: Twin
@@ -55,14 +57,17 @@ class Reported(NamedTuple):
     bounds: Mapping[str, Bound] | None = None
     others: tuple[tuple[str, ...], ...] = ()
     before: tuple[tuple[str, Sequence[Episode]], ...] = ()
+    smoothed: Smoothed | None = None
 
 
 def report(run: Reported) -> list[Part]:
     """The report, from top to bottom."""
     model = run.twin.model
     found = score(run.track, run.events, model, run.pictures, gate=run.tuning.gate, baseline=run.tuning.baseline)
-    charts = run_charts(model, run.events, run.track, run.episodes)
-    said = ("Time counts from the first event. Red shades: episodes. Extremes are kept.",)
+    charts = run_charts(model, run.events, run.track, run.episodes, run.smoothed)
+    said: tuple[str, ...] = ("Time counts from the first event. Red shades: episodes. Extremes are kept.",)
+    if run.smoothed is not None:
+        said += ("Dark lines: the states given the readings after each moment too, with their ± 2σ.",)
     return [
         _head(run),
         _scores(run, found),

@@ -9,6 +9,7 @@ import numpy as np
 from estimators.diagnostics.episodes import Episode
 from estimators.log import Events
 from estimators.model.state_space import StateSpaceModel
+from estimators.smoothing.smoothed import Smoothed
 from estimators.track import Track
 
 from ..drawing.direct_readings import observed
@@ -30,6 +31,9 @@ TALL, LOW = 190, 120
 WIDE, USUAL = 8.0, 0.2
 """Times the usual width of a band beyond which it does not rule the axis, and the share of rows whose is narrower."""
 
+SMOOTHED = ("mean:", "upper:", "lower:")
+"""Columns of which there are smoothed ones."""
+
 DECADES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 
 
@@ -39,16 +43,30 @@ def _hex(color: RGB, alpha: str = "") -> str:
 
 ESTIMATE, BAND, TRUTH = _hex(LIGHT.estimate), _hex(LIGHT.estimate, "26"), _hex(LIGHT.truth)
 READING, REFUSED, BOUND = _hex(LIGHT.reading), _hex(LIGHT.refused), _hex(LIGHT.bound)
+LATER = _hex(LIGHT.smoothed)
 BOUNDS, QUIET = _hex(LIGHT.bound, "22"), _hex(LIGHT.previous)
 
 
-def run_charts(model: StateSpaceModel, events: Events, track: Track, episodes: Sequence[Episode]) -> list[str]:
+def run_charts(
+    model: StateSpaceModel,
+    events: Events,
+    track: Track,
+    episodes: Sequence[Episode],
+    smoothed: Smoothed | None = None,
+) -> list[str]:
     """The charts as SVG; times count from the first event."""
-    return _Charts(model, events, track, episodes).all() if len(events) else []
+    return _Charts(model, events, track, episodes, smoothed).all() if len(events) else []
 
 
 class _Charts:
-    def __init__(self, model: StateSpaceModel, events: Events, track: Track, episodes: Sequence[Episode]) -> None:
+    def __init__(
+        self,
+        model: StateSpaceModel,
+        events: Events,
+        track: Track,
+        episodes: Sequence[Episode],
+        smoothed: Smoothed | None,
+    ) -> None:
         self._model, self._made = model, 0
         size = -(-len(events) // POINTS)
         self._columns = {
@@ -62,6 +80,13 @@ class _Charts:
         times, points = drawn(groups, np.array([column.kind for column in self._columns.values()]))
         self._x = (times - self._origin) * 1e-9
         self._points = dict(zip(self._columns, points.T, strict=True))
+        self._smoothed: dict[str, np.ndarray] = {}
+        if smoothed is not None:
+            names = [name for name in self._columns if name.startswith(SMOOTHED)]
+            values = np.column_stack([self._columns[name].values(events, smoothed.instead_of(track)) for name in names])
+            kinds = np.array([self._columns[name].kind for name in names])
+            points = drawn(grouped(size, 0, events.t, values), kinds)[1]
+            self._smoothed = dict(zip(names, points.T, strict=True))
         end = float(self._x[-1])
         self._span = (0.0, max(end, 1e-9))
         start = self._origin * 1e-9
@@ -102,12 +127,25 @@ class _Charts:
         if known.any():
             layers.append(Layer("truth", TRUTH, self._x[known], truth[known], width=1.2, dash="5 3"))
         layers.append(Layer("estimate", ESTIMATE, self._x, mean, width=1.6))
+        layers += self._smoothed_layers(name, circular=getattr(state, "circular", False))
         extent = _extent(upper, lower, [layer.y for layer in layers if layer.low is None])
         if j == self._model.mode:
             extent = (-0.03, 1.03)
         note = "" if readers else "not measured"
         label = self._model.label(name).replace("_", " ")
         return self._drawn(label, unit, note, TALL, extent, layers)
+
+    def _smoothed_layers(self, name: str, *, circular: bool) -> list[Layer]:
+        """Its mean, and an edge of its band to either side."""
+        if not self._smoothed:
+            return []
+        mean = self._smoothed[f"mean:{name}"]
+        turned = mean - _turn(mean) if circular else np.zeros_like(mean)
+        layers = []
+        for kind, said, width in (("upper", "", 0.75), ("lower", "", 0.75), ("mean", "smoothed", 1.25)):
+            values = self._smoothed[f"{kind}:{name}"] - turned
+            layers.append(Layer(said, LATER, self._x, _unbroken(values) if circular else values, width=width))
+        return layers
 
     def _nis(self) -> str:
         nis, mean, low, high = (_log(self._points[name]) for name in ("nis", "nis_mean", "nis_low", "nis_high"))

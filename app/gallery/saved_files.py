@@ -31,6 +31,7 @@ class SavedFiles:
         self._gallery, self._every = gallery, every
         # Not to be kept alive by being looked at.
         self._of: weakref.ref[RunningTwin] | None = None
+        self._files: tuple[Path, ...] = ()
         self._known: Stamp = ()
         self._seen: Stamp = ()
         self._stopping = threading.Event()
@@ -52,21 +53,27 @@ class SavedFiles:
         if running is None or running.opening.again is None:
             self._of = None
             return
-        stamp = stamp_of(running.opening.files)
         if self._of is None or running is not self._of():
-            self._of, self._known, self._seen = weakref.ref(running), running.opening.stamp, stamp
+            self._of, self._files = weakref.ref(running), running.opening.files
+            self._known = self._seen = running.opening.stamp
+        stamp = stamp_of(self._files)
         settled, self._seen = stamp == self._seen, stamp
         if settled and stamp != self._known and self._gallery.starting is None:
-            changed = [
-                file for file, was, now in zip(running.opening.files, self._known, stamp, strict=True) if was != now
-            ]
+            changed = [file for file, was, now in zip(self._files, self._known, stamp, strict=True) if was != now]
             self._known = stamp
             self._read(running, ", ".join(shown_path(file) for file in changed), running.opening.again)
+
+    def _watch(self, files: tuple[Path, ...]) -> None:
+        """The twin was read from these, some of which it may not have imported before."""
+        known = dict(zip(self._files, self._known, strict=True))
+        self._files = files
+        self._known = self._seen = tuple(known.get(file, *stamp_of((file,))) for file in files)
 
     def _read(self, running: RunningTwin, what: str, again: Callable[[], Twin]) -> None:
         engine = running.engine
         try:
             twin = again()
+            self._watch(twin.files)
             chosen = engine.twin.overrides.get(VERSION, OWN)
             if chosen != twin.overrides.get(VERSION, OWN):
                 # Loaded on the page.

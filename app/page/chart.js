@@ -1,6 +1,7 @@
 // One chart: a canvas of uPlot's with a line above it that says what it is and what it reads at the cursor.
 
 import { element, setText } from "./dom.js";
+import { drawOutsiders } from "./edges.js";
 import { compact } from "./format.js";
 import { within } from "./ranges.js";
 
@@ -9,6 +10,9 @@ export const CURSOR = "time";
 
 const styles = getComputedStyle(document.documentElement);
 export const colour = (name) => styles.getPropertyValue(`--${name}`).trim();
+
+// A value of the value axis in words.
+export const amount = (what, value) => what.amount?.(value) ?? `${compact(value, 3)} ${what.unit.replace(/^\[|\]$/g, "")}`.trim();
 
 // What uPlot draws, and for a file: the name of its colour, and which mark it is.
 export const line = (name, options = {}) => ({
@@ -27,7 +31,8 @@ export const dots = (name, size = 4, ring = false) => ({
 
 export class Chart {
   // what: {title, unit, note, weight, series, bands, range(self, low, high), scale, draw: [hook], values: [label of a tick],
-  // sync: charts of one name share their cursor, names: what a file calls its colours, extras: more lines of a file}
+  // sync: charts of one name share their cursor, names: what a file calls its colours, extras: more lines of a file,
+  // amount(value): a value in words, where the axis is no plain one}
   constructor(what, { select, home, wheel, save }) {
     this.what = what;
     this.reading = element("output", { class: "reading" });
@@ -43,6 +48,7 @@ export class Chart {
     this.data = [[], ...what.series.map(() => [])];
     this.actions = { select, home, wheel };
     this.visible = true;
+    this.empty = true;
   }
 
   // Once it is in the page, and has a size.
@@ -75,7 +81,7 @@ export class Chart {
           setSelect: [(self) => this.selected(self)],
           drawAxes: what.under ? [(self) => what.under(self, this)] : [],
           drawSeries: what.between ? [(self, series) => what.between(self, series)] : [],
-          draw: what.over ? [(self) => what.over(self, this)] : [],
+          draw: [(self) => what.over?.(self, this), (self) => this.outside(self)],
           setCursor: [(self) => this.pointed(self)],
         },
       },
@@ -129,6 +135,11 @@ export class Chart {
     const here = this.moment === null || this.moment === undefined ? x.length - 1 : within(x, [-Infinity, this.moment])[1];
     const at = left >= 0 && idx !== null && idx !== undefined ? idx : here;
     setText(this.reading, at < 0 ? "" : this.what.says((series) => this.at(series, at)));
+  }
+
+  // What does not fit the axis is marked at its edge.
+  outside(self) {
+    this.outsiders = drawOutsiders(self, this.what.series, (value) => amount(this.what, value), colour);
   }
 
   // The value of a series there, or the last one before it.

@@ -3,14 +3,15 @@
 import { Chart, apart, band, colour, dots, edge, line } from "./chart.js";
 import { $ } from "./dom.js";
 import { bracketed, clock, compact, decimals, fixed, spaced, withDeviation, words } from "./format.js";
-import { groupChart, groupsOf } from "./groups.js";
+import { groupCharts, groupsOf } from "./groups.js";
 import { Lane } from "./lane.js";
 import { Layout } from "./layout.js";
 import { marks } from "./marks.js";
 import { Pins } from "./pins.js";
 import { Smoothed } from "./smoothed.js";
+import { Strong } from "./strong.js";
 import { TimeAxis } from "./time_axis.js";
-import { Range, bandExtent, extent, within } from "./ranges.js";
+import { Range, extent, shownExtent, within } from "./ranges.js";
 
 const MOST = 24; // charts of states or rows
 const FEW = 6; // states of which those that nobody measures have more room; rows that are charted at first
@@ -40,9 +41,10 @@ export class Charts {
       wheel: (event, plot) => this.wheel(event, plot),
       save: (chart, button) => this.saving.chart(chart, button),
     };
+    this.strong = new Strong(this, link);
     const groups = groupsOf(model.states);
     const grouped = new Set(groups.flatMap(({ members }) => members.map((state) => state.name)));
-    this.groups = groups.map((group) => groupChart(this, group));
+    this.groups = groups.flatMap((group) => groupCharts(this, group));
     this.parts = [
       ...this.groups,
       ...order.map((state) => ({ ...stateChart(this, state), further: grouped.has(state.name) })),
@@ -106,6 +108,7 @@ export class Charts {
     this.link.look("previous", { ...place, run: "previous", columns: before }, (...frame) => this.previous.take(...frame));
     this.pins.ask(place);
     this.smoothed.ask(place);
+    this.strong.ask(place);
     if (!this.view.following) this.draw(); // what is there already, until the points for it come
   }
 
@@ -116,6 +119,7 @@ export class Charts {
       this.link.look("previous", null);
       this.pins.ask(null);
       this.smoothed.ask(null);
+      this.strong.ask(null);
     }
     this.draw();
   }
@@ -207,11 +211,9 @@ function stateChart(charts, state) {
     },
     range: (chart) => {
       if (state.probability) return [-0.03, 1.03];
-      const [x, upper, lower, ...lines] = chart.data;
-      const [from, to] = within(x, charts.range);
-      const [lowest, highest] = extent(lines.slice(1), from, to); // what was before does not rule the axis
-      const [under, over] = bandExtent(lower, upper, from, to);
-      return range.fit(...charts.pins.widened(Math.min(lowest, under), Math.max(highest, over), state.name));
+      const [x, upper, lower, , ...others] = chart.data; // what was before does not rule the axis
+      const drawn = { lines: others.slice(rows.length), bands: [[lower, upper]], dots: others.slice(0, rows.length) };
+      return range.fit(...charts.pins.widened(...shownExtent(drawn, ...within(x, charts.range)), state.name));
     },
     says: (value) => {
       const [upper, truth, mean] = [value(1), value(4 + rows.length), value(5 + rows.length)];
@@ -246,22 +248,26 @@ function nisChart(charts) {
     },
     under: (plot) => marks(plot, charts.episodes, charts.view.at),
     data: () => {
-      const [low, high] = nisRange(live);
-      // Readings that fit are of no interest; one that does not fit at all stands at the top.
-      const clamped = (value) => (typeof value !== "number" || log(value) < low ? null : Math.min(high - 0.03, log(value)));
-      return [live.x, ...names.map((name) => live.column(name).map(name === "nis" ? clamped : log))];
+      const [low] = nisRange(charts);
+      // Readings that fit are of no interest.
+      const large = (value) => (typeof value !== "number" || log(value) < low ? null : log(value));
+      return [live.x, ...names.map((name) => live.column(name).map(name === "nis" ? large : log))];
     },
-    range: () => nisRange(live),
+    range: () => nisRange(charts),
+    amount: (value) => compact(10 ** value, 2),
     says: (value) => `${compact(10 ** value(4), 3)}  bounds ${compact(10 ** value(2), 3)} – ${compact(10 ** value(1), 3)}`,
   };
 }
 
-// Decades about the bounds, and more where the mean itself leaves them.
-function nisRange(live) {
+// Decades about the bounds, and more where the mean itself leaves them, once it has settled, or more than a few readings.
+function nisRange({ live, range }) {
   const middle = Math.log10(Math.sqrt(live.last("nis_low") * live.last("nis_high"))) || 0;
-  const [low, high] = extent([live.column("nis_mean")], 0, live.x.length - 1);
-  const known = Number.isFinite(low) && low > 0;
-  return [known ? Math.min(middle - 1, Math.log10(low) - 0.15) : middle - 1, known ? Math.max(middle + 1, Math.log10(high) + 0.15) : middle + 1];
+  const decades = (name) => live.column(name).map((value) => (typeof value === "number" && value > 0 ? Math.log10(value) : null));
+  const place = within(live.x, range);
+  const [low, high] = shownExtent({ lines: [decades("nis_mean")] }, ...place);
+  if (!Number.isFinite(low)) return [middle - 1, middle + 1];
+  const [, most] = shownExtent({ dots: [decades("nis")] }, ...place);
+  return [Math.min(middle - 1, low - 0.15), Math.max(middle + 1, high + 0.15, Math.min(most + 0.1, high + 1.5))];
 }
 
 function innovationChart(charts, row, further) {
@@ -282,10 +288,7 @@ function innovationChart(charts, row, further) {
     data: () => [live.x, ...names.map((name) => live.column(name))],
     range: (chart) => {
       const [x, upper, lower, values] = chart.data;
-      const [from, to] = within(x, charts.range);
-      const [, over] = bandExtent(lower, upper, from, to);
-      const [low, high] = extent([values], from, to);
-      const most = Math.max(Math.abs(low), Math.abs(high), over);
+      const most = Math.max(...shownExtent({ bands: [[lower, upper]], dots: [values] }, ...within(x, charts.range)).map(Math.abs));
       return range.fit(-most, most);
     },
     says: (value) => (Number.isFinite(value(3)) ? `${compact(value(3), 3)}${spaced(row.unit)}  ± ${compact(value(1), 3)} expected` : "no reading"),

@@ -9,8 +9,8 @@ import { Viewer } from "./rerun_viewer.js";
 const LATE = 1; // s by which Rerun may be behind without a word
 
 export class Explore {
-  // page: {link, view, charts}, whose time it shares; null in a window of its own
-  constructor(base, theme, page = null) {
+  // page: {link, view, charts}, whose time it shares; heard(status): in a window of its own, which has no link
+  constructor(base, theme, page) {
     Object.assign(this, { base, theme, page });
     this.revisions = { newest: null, drawn: null };
   }
@@ -26,8 +26,8 @@ export class Explore {
       this.viewer = await Viewer.open($("rerun"), $("before"), this.base, this.theme);
       this.stream = new ExploreStream({ viewer: this.viewer, changed: () => {}, told: (message) => this.told(message) });
       window.nisus.viewer = this.viewer;
-      this.time = this.page && new ExploreTime(this.viewer, this.page);
-      this.time?.wake();
+      this.time = window.nisus.exploreTime = new ExploreTime(this.viewer, this.page);
+      this.time.wake();
     } catch (error) {
       this.note(`Rerun could not be loaded: ${error.message}`);
       this.starting = false;
@@ -41,7 +41,10 @@ export class Explore {
 
   told(message) {
     if (message.recording) this.revisions.announced = message.revision;
-    if (message.status) this.revisions.newest = message.status.revision;
+    if (message.status) {
+      this.revisions.newest = message.status.revision;
+      this.page.heard?.({ ...message.status, origin: message.origin });
+    }
     if (message.drawn) {
       // Unless it lost patience with the viewer, that shows the recording announced last.
       if (!this.viewer.announced) this.revisions.drawn = this.revisions.announced;

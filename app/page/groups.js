@@ -1,13 +1,14 @@
-// Many states of one kind in one chart: a line each, the one that is furthest from the others drawn strong; of a dozen
-// and more a picture, time to the right, one row a state.
+// Many states of one kind in one chart: a line each, the one that is furthest from the others drawn strong, with its band;
+// of a dozen and more a picture, time to the right, one row a state, and beneath it how far they are apart and how sure.
 
-import { edge, line } from "./chart.js";
+import { band, edge, line } from "./chart.js";
 import { bracketed, compact, spaced, words } from "./format.js";
 import { marks } from "./marks.js";
-import { Range, extent, within } from "./ranges.js";
+import { Range, extent, shownExtent, within } from "./ranges.js";
 
 const FEWEST = 4; // of one kind that are a group
 const PICTURED = 12; // from which on lines would hide each other
+const MOST_SURE = 120; // states of whose bands the page is told
 const NUMBERED = /^(.*?)(?:_(\d+)|\[(\d+)\])$/;
 const WARM = ["#0b1354", "#3b2e8c", "#7b2f8d", "#b73779", "#e8604c", "#f9a03f", "#fcf3a6"]; // as of pictures of fields
 
@@ -26,7 +27,7 @@ export function groupsOf(states) {
   return groups;
 }
 
-export const groupChart = (charts, group) => (group.members.length < PICTURED ? lines(charts, group) : picture(charts, group));
+export const groupCharts = (charts, group) => (group.members.length < PICTURED ? [lines(charts, group)] : [picture(charts, group), spread(charts, group)]);
 
 function common(charts, { name, unit, members }) {
   return {
@@ -44,18 +45,30 @@ function lines(charts, group) {
   const names = members.map((state) => words(state.label));
   const own = common(charts, group);
   let furthest = -1;
+  const strong = () => members[furthest]?.name;
   return {
     ...own,
-    note: `${members[0].number} to ${members.at(-1).number}; drawn strong: the one furthest from the others`,
+    note: `${members[0].number} to ${members.at(-1).number}; drawn strong, ± 2σ: the one furthest from the others`,
     names: { quiet: "each", estimate: "furthest from the others" },
     weight: 1.6,
     series: [...members.map(() => line("quiet", { width: 1 })), line("estimate", { width: 2 })],
+    under: (plot) => {
+      own.under(plot);
+      charts.strong.draw(plot, strong());
+    },
+    extras: () => charts.strong.curves(strong()),
     data: () => {
       const values = own.columns.map((name) => charts.live.column(name));
       furthest = outlier(values.map((column) => column.findLast((value) => typeof value === "number") ?? NaN));
+      charts.strong.choose(own.key, strong());
       return [charts.live.x, ...values, furthest < 0 ? [] : values[furthest]];
     },
-    range: (chart) => range.fit(...extent(chart.data.slice(1), ...within(chart.data[0], charts.range))),
+    range: (chart) => {
+      const [x, ...values] = chart.data;
+      const [low, high] = shownExtent({ lines: values }, ...within(x, charts.range));
+      const [under, over] = charts.strong.extent(strong(), charts.range);
+      return range.fit(Math.min(low, under), Math.max(high, over));
+    },
     says: (value) => {
       const known = names.map((name, k) => [value(k + 1), name]).filter(([number]) => Number.isFinite(number)).sort(([a], [b]) => a - b);
       if (!known.length) return "";
@@ -135,6 +148,51 @@ function picture(charts, group) {
       return known.length ? `${compact(Math.min(...known), 3)} to ${compact(Math.max(...known), 3)}${spaced(unit)}; dark ${compact(low, 2)}, light ${compact(high, 2)}` : "";
     },
   };
+}
+
+// How far they are apart, and how sure the estimate is of one of them.
+function spread(charts, group) {
+  const { name, members, unit } = group;
+  const range = new Range();
+  const own = common(charts, group);
+  const uppers = members.length <= MOST_SURE ? members.map((state) => `upper:${state.name}`) : [];
+  return {
+    ...own,
+    key: `spread:${name}`,
+    title: `${words(name)}, all`,
+    columns: [...own.columns, ...uppers],
+    note: `mean of ${members.length}; grey: lowest to highest${uppers.length ? "; blue: ± 2σ of one" : ""}`,
+    names: { estimate: "mean of all", bounds: "lowest to highest", band: "± 2σ of one" },
+    weight: 1,
+    series: [edge(), edge(), edge(), edge(), line("estimate", { width: 1.75 })],
+    bands: [band("bounds", [1, 2]), band("band", [3, 4])],
+    data: () => [charts.live.x, ...overall(own.columns.map((name) => charts.live.column(name)), uppers.map((name) => charts.live.column(name)))],
+    range: (chart) => {
+      const [x, highest, lowest, upper, lower, mean] = chart.data;
+      return range.fit(...shownExtent({ lines: [mean], bands: [[lowest, highest], [lower, upper]] }, ...within(x, charts.range)));
+    },
+    says: (value) => (Number.isFinite(value(5)) ? `mean ${compact(value(5), 4)}${spaced(unit)} · ${compact(value(2), 4)} to ${compact(value(1), 4)}${uppers.length ? ` · ± ${compact((value(3) - value(5)) / 2, 2)} of one` : ""}` : ""),
+  };
+}
+
+// Row by row of all means: highest, lowest; their mean and twice the root mean square of σ to either side of it; the mean.
+export function overall(means, uppers) {
+  const none = () => new Array(means[0].length).fill(null);
+  const [highest, lowest, upper, lower, middle] = [none(), none(), none(), none(), none()];
+  for (let row = 0; row < means[0].length; row++) {
+    let [count, sum, low, high, squares, sure] = [0, 0, Infinity, -Infinity, 0, 0];
+    means.forEach((values, k) => {
+      const value = values[row];
+      if (typeof value !== "number") return;
+      [count, sum, low, high] = [count + 1, sum + value, Math.min(low, value), Math.max(high, value)];
+      const over = uppers[k]?.[row];
+      if (typeof over === "number") [squares, sure] = [squares + (over - value) ** 2, sure + 1];
+    });
+    if (!count) continue;
+    [highest[row], lowest[row], middle[row]] = [high, low, sum / count];
+    if (sure) [upper[row], lower[row]] = [1, -1].map((side) => middle[row] + side * Math.sqrt(squares / sure));
+  }
+  return [highest, lowest, upper, lower, middle];
 }
 
 // A colour of the scale, from 0 to 1.

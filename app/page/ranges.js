@@ -3,6 +3,9 @@
 const MARGIN = 0.08;
 const ROOMY = 0.5;
 const WIDE = 8; // times the usual width of a band, beyond which it does not rule the axis: a prior of ± 2000 m
+const SETTLING = 0.1; // share of the rows, the first ones, in which a line may settle
+const FEW = 0.05; // share of the dots, at either end, that may be wild
+const FAR = 1; // times the span of all others, beyond which a value does not rule the axis
 const USUAL = 0.2; // share of the rows whose band is narrower than the usual one
 
 export class Range {
@@ -50,6 +53,34 @@ export function bandExtent(lower, upper, from, to) {
     if (upper[k] > high) high = upper[k];
   }
   return [low, high];
+}
+
+// What an axis spans: lines once they have settled, bands, and nearly all of the dots; of the rest what is not far from
+// these. What is left lies outside, where edges.js marks it: one wild value does not flatten all others.
+export function shownExtent({ lines = [], bands = [], dots = [] }, from, to) {
+  const settled = from + Math.ceil(SETTLING * (to - from));
+  let [low, high] = extent(lines, settled, to);
+  const take = ([under, over]) => ([low, high] = [Math.min(low, under), Math.max(high, over)]);
+  for (const [lower, upper] of bands) take(bandExtent(lower, upper, from, to));
+  take(middle(dots, from, to));
+  const reach = FAR * (high - low);
+  const near = reach > 0 ? [low - reach, high + reach] : [-Infinity, Infinity];
+  for (const values of [...lines, ...dots])
+    for (let k = from; k <= to; k++) {
+      const value = values[k];
+      if (typeof value === "number" && near[0] <= value && value <= near[1]) take([value, value]);
+    }
+  return [low, high];
+}
+
+// Of all these together: from the value below which few are to that above which few are; of a handful of them all.
+function middle(columns, from, to) {
+  const known = [];
+  for (const values of columns) for (let k = from; k <= to; k++) if (typeof values[k] === "number") known.push(values[k]);
+  if (!known.length) return [Infinity, -Infinity];
+  known.sort((a, b) => a - b);
+  const last = known.length - 1;
+  return [known[Math.floor(FEW * last)], known[Math.ceil((1 - FEW) * last)]];
 }
 
 // First and last index of ascending times within a span.

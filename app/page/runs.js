@@ -95,7 +95,7 @@ export class Runs {
           cell("step", compact(score.step_us, 3)))
       : element("tr", { class: "scores" }, element("td", { colspan: 5 }, run.unscored));
     return element("tbody", { dataset: { number, running: run.running } },
-      element("tr", { class: "title" }, element("th", { scope: "rowgroup", colspan: 5 }, element("div", {}, this.pin(run), ...this.names(run), element("span", { class: "space" }), ...this.buttons(run)))),
+      element("tr", { class: "title" }, element("th", { scope: "rowgroup", colspan: 5 }, element("div", {}, this.pin(run), ...this.names(run), element("span", { class: "does" }, ...this.buttons(run))))),
       element("tr", { class: "what" }, element("td", { colspan: 5, title: `${run.title}; since ${new Date(1000 * run.began).toLocaleTimeString()}` }, run.what, score ? element("span", { class: "over" }, `over ${span(score.seconds)}`) : null)),
       this.noted === number || run.note ? this.note(run) : null,
       scores);

@@ -1,5 +1,7 @@
 // A chart as an SVG file of its own, from the points that it shows: title, axes, units, legend, in the light theme.
 
+import { amount } from "./chart.js";
+import { outsiders } from "./edges.js";
 import { bracketed, clock, compact } from "./format.js";
 
 const [W, H] = [960, 330]; // px
@@ -75,6 +77,12 @@ export function chartSvg(chart, [title, about], episodes, tone = lightColours())
   });
   const image = what.image?.(chart);
   if (image) marks.push(`<image x="${round(x(image.from))}" y="${TOP}" width="${round(x(image.to) - x(image.from))}" height="${H - TOP - BOTTOM}" preserveAspectRatio="none" style="image-rendering:pixelated" href="${image.url}"/>`);
+  for (const { x: time, value, tone: name, above, furthest } of outsiders(data, what.series, span, [low, high], x)) {
+    const [at, tip, base] = [round(x(time)), above ? TOP + 1 : H - BOTTOM - 1, above ? TOP + 9 : H - BOTTOM - 9];
+    marks.push(`<path d="M${at} ${tip}L${at - 4.5} ${base}h9Z" fill="${tone(name)}"/>`);
+    const late = at > LEFT + 0.8 * (W - LEFT - RIGHT);
+    if (furthest) marks.push(`<text x="${at + (late ? -8 : 8)}" y="${above ? TOP + 10 : H - BOTTOM - 2}" text-anchor="${late ? "end" : "start"}">${escaped(amount(what, value))}</text>`);
+  }
   for (const extra of what.extras?.(chart) ?? []) add(extra.name ?? extra.tone, ...curve(extra.x, extra.values, extra));
   return [
     `<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 ${W} ${H}" width="${W}" height="${H}" font-size="12" fill="${tone("faint")}" ${FONT}>`,

@@ -1,13 +1,15 @@
 // What if: the twin goes on from now without readings, with inputs that are chosen here. A fan for each state, and when
 // it reaches a limit. Nothing is asked while this is hidden.
 
-import { Chart, band, colour, dots, edge, line } from "./chart.js";
+import { Chart, band, dots, edge, line } from "./chart.js";
 import { unbroken } from "./charts.js";
 import { element, setText } from "./dom.js";
+import { lines, probability } from "./fan_marks.js";
 import { bracketed, compact, spaced, span, words } from "./format.js";
 import { Lane } from "./lane.js";
-import { Range, extent, within } from "./ranges.js";
+import { Range, shownExtent, within } from "./ranges.js";
 import { TimeAxis } from "./time_axis.js";
+import { inputChart, inputRow, profile } from "./whatif_inputs.js";
 
 const AGAIN = 2000; // ms between two forecasts, while the twin goes on
 const REST = 2; // times as long as a forecast took, at least
@@ -26,7 +28,7 @@ export class WhatIf {
     this.horizon = kept.horizon ?? null;
     const names = model.states.map((state) => state.name);
     this.limits = Object.fromEntries(Object.entries(kept.limits ?? {}).filter(([name]) => names.includes(name)));
-    this.inputs = {}; // those that were chosen, by name
+    this.inputs = {}; // what was chosen: {kind, value, after}, by name
     this.lane = new Lane();
     this.states = [...model.states].sort((a, b) => (a.rows.length > 0) - (b.rows.length > 0)).slice(0, MOST);
     this.shown = false;
@@ -63,7 +65,7 @@ export class WhatIf {
     const axis = element("div", { class: "axis", "aria-hidden": "true" });
     this.node.replaceChildren(asked, this.problem, this.charts, axis, element("p", { class: "faint foot" }, "From now on without readings, by the filter that runs. Bands ± 1σ, ± 2σ. ", this.method, this.state));
     const { states } = this;
-    const actions = { select: () => {}, home: () => {}, wheel: () => {}, save: (chart, button) => this.saving.chart(chart, button) };
+    const actions = (this.actions = { select: () => {}, home: () => {}, wheel: () => {}, save: (chart, button) => this.saving.chart(chart, button) });
     this.parts = states.map((state) => new Chart(fan(this, state), actions));
     this.charts.append(...this.parts.map((chart) => chart.node));
     this.parts.forEach((chart, k) => {
@@ -84,6 +86,22 @@ export class WhatIf {
     // More than is shown: what is forecast may be seconds old.
     const past = 1.5 * PAST * (this.horizon ?? this.model.window) + LONGEST_REST / 1000;
     this.link.look("whatif", { span: past, points: 400, columns }, (...frame) => this.lane.take(...frame));
+  }
+
+  // Charts of the inputs that were chosen stand beneath the fans.
+  showInputs() {
+    for (const [name, row] of this.rows) {
+      const wanted = Boolean(this.found.chosen[name]);
+      if (wanted && !row.chart) {
+        row.chart = new Chart(inputChart(this, row.input), this.actions);
+        this.charts.append(row.chart.node);
+        row.chart.span = [0, 1];
+        row.chart.begin();
+      } else if (!wanted && row.chart) {
+        row.chart.end();
+        row.chart = null;
+      }
+    }
   }
 
   turn() {
@@ -112,7 +130,8 @@ export class WhatIf {
   }
 
   get question() {
-    return JSON.stringify({ horizon: this.horizon, inputs: this.inputs, limits: this.limits });
+    const inputs = Object.fromEntries(Object.entries(this.inputs).map(([name, chosen]) => [name, profile(chosen, this.rows.get(name).now, this.horizon)]));
+    return JSON.stringify({ horizon: this.horizon, inputs, limits: this.limits });
   }
 
   async ask() {
@@ -159,6 +178,7 @@ export class WhatIf {
     this.times = found.t.map((t) => found.now - this.origin + t);
     setText(this.method, `Limits: ${found.method}.`);
     for (const [name, row] of this.rows) row.show(found.inputs[name], this.lane.columns[`input:${name}`] ?? []);
+    this.showInputs();
     for (const [name, output] of Object.entries(this.said ?? {})) setText(output, sentence(this, name, found.limits[name]));
     this.draw();
     window.nisus.forecasts = (window.nisus.forecasts ?? 0) + 1;
@@ -170,7 +190,8 @@ export class WhatIf {
     const horizon = this.found.t.at(-1);
     const first = Math.max(now - PAST * horizon, Math.min(now, this.lane.x[0] ?? now));
     const range = [first - MARGIN * horizon, this.times.at(-1)];
-    for (const chart of this.parts) chart.show(chart.what.data(), range);
+    const inputs = [...this.rows.values()].flatMap((row) => row.chart ?? []);
+    for (const chart of [...this.parts, ...inputs]) chart.show(chart.what.data(), range);
     this.axis.show(range);
   }
 }
@@ -179,43 +200,6 @@ async function told(answer) {
   const text = await answer.text();
   if (answer.ok) return JSON.parse(text);
   throw new Error(answer.headers.get("content-type")?.includes("json") ? JSON.parse(text).error : text.trim());
-}
-
-// One input: its value now, a slider over what it has been and as much again to either side, and a field.
-function inputRow(whatif, input) {
-  const name = words(input.name);
-  const label = `${name}${input.unit ? ` [${input.unit}]` : ""}`;
-  const slider = element("input", { type: "range", step: "any", "aria-label": `${label} from now on`, oninput: () => choose(Number(slider.value)) });
-  const field = element("input", { type: "text", inputmode: "decimal", "aria-label": `${label} from now on, as a number`, onchange: () => choose(Number(field.value.replace(",", "."))) });
-  const back = element("button", { type: "button", class: "back", title: "As it is now", "aria-label": `${name} as it is now`, onclick: () => choose(null) }, "↺");
-  const node = element("div", { class: "choice" }, element("span", { title: label }, name), slider, field, element("span", { class: "unit" }, input.unit), back);
-  let now = NaN;
-  function choose(value) {
-    if (value === null || !Number.isFinite(value)) delete whatif.inputs[input.name];
-    else whatif.inputs[input.name] = Number(value.toPrecision(4));
-    place();
-    whatif.changed();
-  }
-  function place() {
-    const value = whatif.inputs[input.name] ?? now;
-    node.toggleAttribute("data-turned", input.name in whatif.inputs);
-    if (document.activeElement !== field) field.value = compact(value, 4);
-    if (document.activeElement !== slider) slider.value = value;
-  }
-  return {
-    node,
-    show(value, history) {
-      now = value;
-      const [low, high] = extent([[...history, value, whatif.inputs[input.name] ?? value]], 0, history.length + 1);
-      const width = high - low || Math.abs(high) || 1;
-      if (!(Number(slider.min) <= low && high <= Number(slider.max) && slider.dataset.placed)) {
-        slider.min = low - width;
-        slider.max = high + width;
-        slider.dataset.placed = "";
-      }
-      place();
-    },
-  };
 }
 
 function limitField(whatif, state) {
@@ -275,7 +259,10 @@ function fan(whatif, state) {
       band("band", [first, first + 1]),
       band("band", [first + 2, first + 3]),
     ],
-    over: (plot) => lines(plot, whatif.times?.[0], whatif.limits[state.name]),
+    over: (plot) => {
+      probability(plot, whatif.times, whatif.found?.limits[state.name]);
+      lines(plot, whatif.times?.[0], whatif.limits[state.name]);
+    },
     data: () => {
       const { found, times } = whatif;
       const count = within(lane.x, [-Infinity, times[0]])[1] + 1;
@@ -292,7 +279,9 @@ function fan(whatif, state) {
       if (state.probability) return [-0.03, 1.03];
       const [x, ...columns] = chart.data;
       const limit = whatif.limits[state.name];
-      const [low, high] = extent(columns, 0, x.length - 1);
+      // The fan is in view as far as it opens; of what was, only what is not wild.
+      const drawn = { bands: [columns.slice(0, 2)], dots: columns.slice(2, first - 3), lines: columns.slice(first - 3) };
+      const [low, high] = shownExtent(drawn, 0, x.length - 1);
       return range.fit(Math.min(low, limit ?? low), Math.max(high, limit ?? high));
     },
     says: (value) => {
@@ -313,28 +302,4 @@ function around(columns, place, edges) {
     const side = (value, i) => (value === null || broken[i] === null ? null : broken[i] + value - mean[i]);
     columns[k] = edges.includes(k) ? values.map(side) : unbroken(values);
   });
-}
-
-// Now, upright; the limit, level.
-function lines(plot, now, limit) {
-  const { ctx, bbox } = plot;
-  ctx.save();
-  ctx.lineWidth = devicePixelRatio;
-  const draw = (name, dash, ...points) => {
-    ctx.strokeStyle = colour(name);
-    ctx.setLineDash(dash.map((length) => length * devicePixelRatio));
-    ctx.beginPath();
-    ctx.moveTo(...points[0]);
-    ctx.lineTo(...points[1]);
-    ctx.stroke();
-  };
-  if (now !== undefined) {
-    const x = plot.valToPos(now, "x", true);
-    draw("faint", [], [x, bbox.top], [x, bbox.top + bbox.height]);
-  }
-  if (limit !== undefined) {
-    const y = plot.valToPos(limit, "y", true);
-    draw("ink", [8, 4], [bbox.left, y], [bbox.left + bbox.width, y]);
-  }
-  ctx.restore();
 }

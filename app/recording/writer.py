@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from estimators.diagnostics.episodes import Episode
     from estimators.diagnostics.field_pictures import Picture
     from estimators.log import Log
+    from estimators.smoothing.smoothed import Smoothed
     from estimators.track import Track
 
     from ..engine.interface import Running
@@ -305,6 +306,7 @@ def write_recording(
     track: Track,
     pictures: Sequence[Picture] = (),
     episodes: Sequence[Episode] = (),
+    smoothed: Smoothed | None = None,
 ) -> None:
     """Write a finished fold as a recording, in the same form as a running twin's, with the pictures of a large field.
 
@@ -315,6 +317,7 @@ def write_recording(
         track: Their rows.
         pictures: Of a large field.
         episodes: What was wrong; a line each among the recording's events.
+        smoothed: What all readings say of the states, drawn beside the filter's; a review has the filter's alone.
 
     Raises:
         SourceError: If the file cannot be written.
@@ -338,6 +341,8 @@ def write_recording(
             pull = Pull(0, start == 0, start, log.events.select(rows), track.select(rows), said, here)
             file.write(pull)
             drawing(pull)
+            if smoothed is not None:
+                drawing.smoothed(log.events.t[rows], smoothed.instead_of(track).select(rows))
             file.flush()
         file.summary(summary(twin.estimator, twin.tuning, log.events, track, pictures))
         file.close()

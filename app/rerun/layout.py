@@ -57,7 +57,8 @@ def blueprint(
     for j, state in zip(model.shown.tolist(), model.shown_states, strict=True):
         rows = [model.row_names[model.row_start[d.sensor] + d.row] for d in dots if d.state == j]
         over = [f"/{kind}/{row}" for row in rows for kind in ("reading", "refused", "screened")]
-        contents = [*over, f"/previous/state/{state.name}", f"/state/{state.name}", f"/truth/{state.name}"]
+        lines = [f"{above}/state/{state.name}" for above in ("/previous", "/smoothed", "")]
+        contents = [*over, *lines, f"/truth/{state.name}"]
         states.append(chart(with_unit(model.label(state.name), state.unit), contents))
     if model.grid is not None:
         innovations = layout_field.sums(model, chart, truth=truth)
@@ -145,6 +146,8 @@ def styles(
 
     for state in model.shown_states:
         style(f"/state/{state.name}", band("estimate", palette.estimate))
+        dark = rr.SeriesLines(colors=[palette.smoothed] * 3, names=["smoothed", "+2σ", "−2σ"], widths=[1.5, 0.75, 0.75])
+        style(f"/smoothed/state/{state.name}", dark)
         style(f"/truth/{state.name}", rr.SeriesLines(colors=[palette.truth], names=["truth"], widths=[1.0]))
         style(f"/previous/state/{state.name}", rr.SeriesLines(colors=[grey], names=["previous"], widths=[1.0]))
     dots = {model.row_names[model.row_start[item.sensor] + item.row] for item in observed(model)}

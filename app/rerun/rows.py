@@ -208,14 +208,18 @@ class RerunRows:
             columns=rr.TextLog.columns(text=[line.text for line in due], level=[line.level.upper() for line in due]),
         )
 
-    def _states(self, t: np.ndarray, track: Track, width: int) -> None:
+    def smoothed(self, t: np.ndarray, track: Track) -> None:
+        """Log a smoothed track's states, a line and a band of their own beside the filter's."""
+        self._states(t, track, self.width(t), "/smoothed")
+
+    def _states(self, t: np.ndarray, track: Track, width: int, above: str = "") -> None:
         rows = last_of_each_time(t)
         known = estimated_rows(track)[rows]
         for j, name in enumerate(state.name for state in self.model.shown_states):
             # A probability has no band.
             mean, twice = track.mean[rows, j], 2.0 * track.std[rows, j] * (j != self.model.mode)
             band = np.where(known[:, None], np.stack((mean, mean + twice, mean - twice), axis=1), np.nan)
-            self.sink.line(f"/state/{name}", t[rows], band, width, gaps=True)
+            self.sink.line(f"{above}/state/{name}", t[rows], band, width, gaps=True)
 
     def _window_nis(self, t: np.ndarray, track: Track, width: int) -> None:
         rows = last_of_each_time(t)

@@ -49,7 +49,7 @@ class FitApi:
             return await answered(request, self._begin)
         if request.method == "DELETE":
             self.fitting.cancel()
-        return Json(self._state())
+        return Json(await asyncio.to_thread(self._state))
 
     async def _begin(self, body: Any) -> Response:
         """`{"wanted": ["Q", "R.winding"], "events": 20000}`; without `events` over all that is there."""
@@ -60,8 +60,8 @@ class FitApi:
             raise ConfigError('fit: wanted must be a list of keys, like ["Q", "R.winding"]')
         if events is not None and (not isinstance(events, int) or isinstance(events, bool) or events < 1):
             raise ConfigError("fit: events must be a positive whole number, or be left out for all")
-        self.fitting.begin(list(dict.fromkeys(wanted)), events)
-        return Json(self._state(), 202)
+        await asyncio.to_thread(self.fitting.begin, list(dict.fromkeys(wanted)), events)
+        return Json(await asyncio.to_thread(self._state), 202)
 
     async def _keep(self, request: Request) -> Response:
         """Keep what the last fit found as a tuning version, with what it was worth on the blocks held out."""

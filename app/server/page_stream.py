@@ -64,7 +64,8 @@ class PageStream:
         """Serve until either side ends it."""
         await self._browser.accept()
         await self._browser.send_text(json.dumps({"boot": self._boot}))
-        tasks = [asyncio.create_task(self._listen()), asyncio.create_task(self._tell())]
+        # What the twin says of itself does not wait for its rows, nor these for the fold.
+        tasks = [asyncio.create_task(work) for work in (self._listen(), self._tell(), self._draw())]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
@@ -75,8 +76,7 @@ class PageStream:
                     self._engine.notices.report(
                         "page error", f"page error: {type(outcome).__name__}: {outcome}", "error"
                     )
-            for lane in self._lanes.values():
-                self._series.close(lane)
+            await asyncio.to_thread(self._exchange, list(self._lanes.values()), [])
             with contextlib.suppress(RuntimeError):
                 await self._browser.close()
 
@@ -89,11 +89,11 @@ class PageStream:
             if len(text) > LONGEST:
                 return
             try:
-                self._take(json.loads(text))
+                await self._take(json.loads(text))
             except (ConfigError, ValueError, RecursionError) as error:
                 await self._browser.send_text(json.dumps({"error": one_line(str(error))}))
 
-    def _take(self, message: Any) -> None:
+    async def _take(self, message: Any) -> None:
         if not isinstance(message, dict):
             raise ConfigError(f"page: {message!r} is no object")
         if message.get("drawn"):
@@ -109,22 +109,34 @@ class PageStream:
         }
         if len({*self._lanes, *wanted}) > MOST_LANES:
             raise ConfigError(f"page: there are more than {MOST_LANES} lanes; close some")
-        for name, want in wanted.items():
-            if name in self._lanes:
-                self._series.close(self._lanes.pop(name))
-            if want is not None:
-                self._lanes[name] = Lane(name, want, self._series.columns)
-                self._series.open(self._lanes[name])
-        if wanted:
-            self._asked.set()
+        if not wanted:
+            return
+        closed = [self._lanes[name] for name in wanted if name in self._lanes]
+        opened = {name: Lane(name, want, self._series.columns) for name, want in wanted.items() if want is not None}
+        kept = {name: lane for name, lane in self._lanes.items() if name not in wanted}
+        self._lanes = {**kept, **opened}
+        # In a thread, as the levels of a long history may just be made.
+        await _finished(asyncio.to_thread(self._exchange, closed, list(opened.values())))
+        self._asked.set()
+
+    def _exchange(self, closed: list[Lane], opened: list[Lane]) -> None:
+        """Look at other lanes; the new ones first, so that what both show is kept."""
+        for lane in opened:
+            self._series.open(lane)
+        for lane in closed:
+            self._series.close(lane)
 
     async def _tell(self) -> None:
-        told = -STATUS
+        """Say what is new of the twin, again and again."""
         while True:
             begun = time.monotonic()
-            if begun - told >= STATUS:
-                told = begun
-                await self._say()
+            await self._say()
+            await asyncio.sleep(max(0.001, STATUS - (time.monotonic() - begun)))
+
+    async def _draw(self) -> None:
+        """Send what the page draws, when that has drawn what came before."""
+        while True:
+            begun = time.monotonic()
             if self._drawn.is_set():
                 self._asked.clear()
                 lanes = list(self._lanes.values())
@@ -135,15 +147,25 @@ class PageStream:
                         await self._browser.send_bytes(frame)
                     # The page says `drawn` once it has drawn all of them.
                     await self._browser.send_text('{"frames":true}')
-            awaited = time.monotonic() - self._hurried < HURRY or self._engine.status().refolding
+            await self._believe()
+            awaited = time.monotonic() - self._hurried < HURRY or self._told.get("refolding")
             rest = (WAITING if awaited else PERIOD) - (time.monotonic() - begun)
             with contextlib.suppress(TimeoutError):
                 # What a page asks for newly, it shall see at once.
                 await asyncio.wait_for(self._asked.wait(), max(0.001, rest))
 
+    async def _believe(self) -> None:
+        """Send what is believed of the two states that the page shows, if that is news."""
+        if self._pair is None or self._told.get("t") is None:
+            return
+        now = (self._told["revision"], self._told["t"])
+        if now != self._believed:
+            self._believed = now
+            belief = await _finished(asyncio.to_thread(belief_json, self._engine, *self._pair))
+            await self._send({"belief": belief})
+
     async def _say(self) -> None:
-        status, episodes = await _finished(asyncio.to_thread(lambda: (self._status(), episodes_json(self._engine))))
-        origin = self._series.origin()
+        status, episodes, origin = await _finished(asyncio.to_thread(self._look))
         status["origin"] = None if origin is None else str(origin)
         news = {key: value for key, value in status.items() if key not in self._told or self._told[key] != value}
         self._told = status
@@ -156,13 +178,14 @@ class PageStream:
             message["notices"] = [
                 {"number": item.number, "t": item.t, "level": item.level, "text": item.text} for item in notices
             ]
-        if self._pair is not None and status["t"] is not None:
-            now = (status["revision"], status["t"])
-            if now != self._believed:
-                self._believed = now
-                message["belief"] = await _finished(asyncio.to_thread(belief_json, self._engine, *self._pair))
         if message:
-            await self._browser.send_text(json.dumps(message, allow_nan=False, separators=(",", ":")))
+            await self._send(message)
+
+    def _look(self) -> tuple[dict[str, Any], list[dict[str, Any]], int | None]:
+        return self._status(), episodes_json(self._engine), self._series.origin()
+
+    async def _send(self, message: dict[str, Any]) -> None:
+        await self._browser.send_text(json.dumps(message, allow_nan=False, separators=(",", ":")))
 
 
 async def _finished(work: Any) -> Any:

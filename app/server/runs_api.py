@@ -69,7 +69,8 @@ class RunsApi:
 
     async def _around(self, request: Request) -> Response:
         try:
-            return Json(swept_json(self._sweeps.around(request.query_params.get("key", ""))))
+            swept = await asyncio.to_thread(self._sweeps.around, request.query_params.get("key", ""))
+            return Json(swept_json(swept))
         except ConfigError as error:
             return _refused(error, 400)
 

@@ -189,7 +189,7 @@ class PageServer:
         return Response((PAGE / "alarms.html").read_text().replace("{{text}}", text), media_type="text/html")
 
     async def _status(self, request: Request) -> Response:
-        return Json(self._state())
+        return Json(await asyncio.to_thread(self._state))
 
     def _state(self) -> dict[str, Any]:
         scene = [] if self._choices is None else self._choices.json()
@@ -320,8 +320,9 @@ class PageServer:
             begun = time.monotonic()
             if begun - told >= STATUS_PERIOD:
                 told = begun
-                status = {"status": status_json(self._engine), "boot": self._boot}
-                await browser.send_text(json.dumps({**status, "recordings": sorted(self._recordings())}))
+                status, origin = await asyncio.to_thread(lambda: (status_json(self._engine), self._series.origin()))
+                news = {"status": status, "boot": self._boot, "origin": None if origin is None else str(origin)}
+                await browser.send_text(json.dumps({**news, "recordings": sorted(self._recordings())}))
             if drawn.is_set():
                 async for message in _given(feed):
                     if isinstance(message, str):

@@ -19,7 +19,7 @@ from estimators.errors import ModelError, NisusError, nearest
 from estimators.model.correlation import Correlation, flaw
 from estimators.model.joint import Unknown, joint
 from estimators.model.state_space import Field, State, StateSpaceModel
-from estimators.model.user_file import run_file
+from estimators.model.user_file import imported_beside, run_file
 from estimators.models import MODELS
 
 from .lasting import with_lasting_errors
@@ -52,10 +52,13 @@ def find_model(loaded: Loaded, key: Key, reference: str) -> StateSpaceModel:
     return _as_model(getattr(module, name), name, path, loaded, key)
 
 
-def model_file(loaded: Loaded) -> list[Path]:
-    """The user's file that holds the model; none of a model of the catalogue."""
+def model_files(loaded: Loaded) -> tuple[Path, ...]:
+    """The user's file that holds the model, and those beside it that it imports; none of a model of the catalogue."""
     file = loaded.config.model.rpartition(":")[0]
-    return [_beside(loaded, file)] if file else []
+    if not file:
+        return ()
+    path = _beside(loaded, file)
+    return (path, *imported_beside(path))
 
 
 def _beside(loaded: Loaded, file: str) -> Path:

@@ -30,7 +30,7 @@ from ..intake import Planned
 from .commissioned import commissioned
 from .dropout import DegradedAfter, degraded_after
 from .late import Late, late_policy
-from .model import configure, find_model
+from .model import configure, find_model, model_files
 from .names import check_named
 from .refit import check_refit
 from .scene_names import check_scene
@@ -81,6 +81,12 @@ class Twin:
     def version(self) -> Version | None:
         """The tuning version whose values stand in place of the YAML's; None for none."""
         return self.loaded.version
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """What it was read from: its YAML, its tuning version, the user's files that hold its model."""
+        version = () if self.version is None else (self.version.path,)
+        return (self.path, *version, *model_files(self.loaded))
 
     @property
     def name(self) -> str:

@@ -6,19 +6,77 @@ YAML has no such name; so its functions go with the path of their file, which is
 
 from __future__ import annotations
 
+import ast
+import hashlib
+import importlib
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import lru_cache, partial, reduce
 from importlib.machinery import PathFinder
 from pathlib import Path
 from pickle import PicklingError
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Any
+
+MARK = "~"
+"""In the name of a function, before what tells the versions of the files that its own file imports."""
+
+
+def imported_beside(path: Path) -> tuple[Path, ...]:
+    """The files in a Python file's folder, and below it, that it imports, and those that they import, by name."""
+    path, found = path.resolve(), set[Path]()
+    waiting = [path]
+    while waiting:
+        file = waiting.pop()
+        try:
+            tree = ast.parse(file.read_bytes())
+        except (OSError, ValueError, SyntaxError):
+            continue
+        for base, name in _imports(tree, file, path.parent):
+            place = base.joinpath(*name.split("."))
+            packages = [base.joinpath(*name.split(".")[:k], "__init__.py") for k in range(1, name.count(".") + 2)]
+            for item in (place.with_suffix(".py"), *packages):
+                if item.is_file() and item != path and item not in found:
+                    found.add(item)
+                    waiting.append(item)
+    return tuple(sorted(found))
+
+
+def _imports(tree: ast.Module, file: Path, top: Path) -> Iterator[tuple[Path, str]]:
+    """What a file imports: the folder where it is sought, and its dotted name."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((top, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = file.parents[node.level - 1] if node.level else top
+            names = [node.module] if node.module else []
+            yield from (
+                (base, ".".join([*names, part])) for part in ("", *(alias.name for alias in node.names)) if part
+            )
+            yield from ((base, name) for name in names)
+
+
+def _forget(files: tuple[Path, ...]) -> None:
+    """Let these be imported anew, as they may have been edited."""
+    importlib.invalidate_caches()
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if file is not None and Path(file).resolve() in files:
+            del sys.modules[name]
+
+
+def _marked(code: CodeType, mark: str) -> CodeType:
+    """The code, with functions of other names in it, so that no machine code of before is taken for theirs."""
+    inner = tuple(_marked(item, mark) if isinstance(item, CodeType) else item for item in code.co_consts)
+    return code.replace(co_consts=inner, co_qualname=code.co_qualname + mark)
 
 
 def run_file(name: str, path: Path) -> ModuleType:
-    """Run a Python file as the module `name`, with its folder importable meanwhile.
+    """Run a Python file as the module `name`, with its folder importable meanwhile, and what it imports there anew.
+
+    Numba keeps machine code under a function's own file and name. What that took from another file, a constant say, is
+    part of neither; so the bytes of the files that this one imports become part of its functions' names.
 
     Raises:
         ImportError: If its name does not end in .py.
@@ -29,12 +87,18 @@ def run_file(name: str, path: Path) -> ModuleType:
         raise ImportError(f"{path}: it is not a Python file; its name must end in .py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # Before it runs: dataclasses and Numba look their module up by name.
+    beside = imported_beside(path)
+    _forget(beside)
     sys.path.insert(0, str(path.parent))
     # Nothing is left beside the user's files, by those that this one imports either.
     before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
     try:
         # Not through the loader, which would trust a stale __pycache__.
-        exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)
+        code = compile(path.read_bytes(), str(path), "exec")
+        if beside:
+            digest = hashlib.sha256(b"".join(file.read_bytes() for file in beside)).hexdigest()[:8]
+            code = _marked(code, MARK + digest)
+        exec(code, module.__dict__)
     except BaseException:
         sys.modules.pop(name, None)
         raise
@@ -55,7 +119,7 @@ def portable(function: Callable) -> Callable:
     found = PathFinder.find_spec(name)
     if found is not None and found.origin is not None and Path(found.origin) == Path(file):
         return function
-    return _FromFile(name, function.__qualname__, file, Path(file).stat().st_mtime_ns, function)
+    return _FromFile(name, function.__qualname__.partition(MARK)[0], file, Path(file).stat().st_mtime_ns, function)
 
 
 class _FromFile:

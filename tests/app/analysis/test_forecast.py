@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from app.analysis.forecast import Forecasts, forecast_json, question_from_json
+from app.analysis.inputs import recorded
 from app.engine.engine import Engine
 from app.server.one_at_a_time import OneAtATime
 from app.server.server import PageServer
 from estimators.errors import ConfigError
 from estimators.forecast import Forecast
-from estimators.log import READING, Events
+from estimators.log import INPUT, READING, Events
 from estimators.models import MODELS
 from tests.app.scripted import MODEL, Scripted, pull_all, readings
 from tests.app.served import SECRET, Client, shown_twin
@@ -83,6 +84,39 @@ def test_inputs_hold_from_the_time_that_is_asked_for():
     np.testing.assert_array_equal(winding[1][before], winding[0][before])
     assert np.all(winding[1][~before] > winding[0][~before]) and np.all(winding[2][1:] > winding[0][1:])
     assert as_now["inputs"]["i_q"] == 0.0
+
+
+def driven(*, changes):
+    """A drive that was read every second for 40 s, and whose current changed meanwhile, by (seconds, A)."""
+    model = MODELS["motor_drive"]
+    engine = Engine(shown_twin(model=model, estimator="ekf"), lambda report: Scripted())
+    read = np.arange(1, 41) * SECOND
+    turned = np.array([round(seconds * SECOND) for seconds, _ in changes], np.int64)
+    t = np.concatenate((read, turned))
+    kind = np.repeat(np.array([READING, INPUT], np.int8), (read.size, turned.size))
+    value = np.full((t.size, model.width), np.nan)
+    value[: read.size, 0] = 45.0
+    value[read.size :, model.input_names.index("i_q")] = [current for _, current in changes]
+    order = np.argsort(t)
+    engine._accept([Events(t[order], t[order], kind[order], np.zeros(t.size, np.int32), value[order])])
+    return engine
+
+
+def test_what_was_recorded_of_an_input_is_repeated():
+    engine = driven(changes=[(5.0, 100.0), (15.0, 300.0), (38.5, 50.0)])
+    # The last 30 s, 10 to 40: 100 A held at first.
+    again = ask(engine, horizon=30.0, inputs={"i_q": "repeat"})
+    expected = [[0.0, 100.0], [5.0, 300.0], [28.5, 50.0]]
+    assert again["chosen"] == {"i_q": {"t": [t for t, _ in expected], "value": [value for _, value in expected]}}
+    told = ask(engine, horizon=30.0, inputs={"i_q": expected})
+    assert again["states"] == told["states"] and again["states"] != ask(engine, horizon=30.0)["states"]
+    # The log is 39 s long: what is beyond comes once more, and 50 A hold until the first change of it.
+    longer = ask(engine, horizon=60.0, inputs={"i_q": "repeat"})["chosen"]["i_q"]
+    assert longer == {"t": [4.0, 14.0, 37.5, 43.0, 53.0], "value": [100.0, 300.0, 50.0, 100.0, 300.0]}
+    # Of an input that never changed there is nothing to repeat.
+    assert ask(engine, horizon=30.0, inputs={"i_d": "repeat"})["chosen"] == {}
+    with pytest.raises(ConfigError, match="i_q changed 3 times in 39 s, too often to be repeated for 1e"):
+        recorded(engine, ["i_q"], 40 * SECOND, 1e6)
 
 
 def test_nothing_of_the_running_twin_changes():

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from rerun.chunk import RrdReader
 
 from app.cli.arguments import Fold
 from app.cli.compare_fold import fold_row
@@ -273,3 +274,35 @@ def test_what_is_smoothed_stands_beside_the_filter(tmp_path: Path, capsys: pytes
     assert f"RMSE temperature, smoothed  {rmse:.5g} °C" in capsys.readouterr().out
     with pytest.raises(EstimatorError, match="filterpy-kf cannot be smoothed; use kf"):
         fold_twin(Fold(str(tmp_path / "drive.yaml"), estimator="filterpy-kf", smooth=True))
+
+
+def smoothed_lines(path: Path) -> np.ndarray:
+    """Of a recording, (n, 3): the smoothed temperature, and the edges of its band, in the order of time."""
+    rows = []
+    for chunk in RrdReader(str(path)).stream():
+        if chunk.entity_path == "/smoothed/state/temperature" and not chunk.is_static:
+            batch = chunk.to_record_batch()
+            values = batch["Scalars:scalars"].flatten().to_numpy().reshape(-1, 3)
+            rows += list(zip(batch["time"].cast("int64").to_pylist(), values, strict=True))
+    return np.array([values for _, values in sorted(rows, key=lambda row: row[0])])
+
+
+def test_what_is_smoothed_is_drawn_in_recording_and_report(tmp_path: Path) -> None:
+    (tmp_path / "drive.csv").write_text(ROWS)
+    (tmp_path / "drive.yaml").write_text(DRIVE)
+    name = str(tmp_path / "drive.yaml")
+    table_file, out, html = (tmp_path / f"run.{end}" for end in ("csv", "rrd", "html"))
+    assert fold_twin(Fold(name, out=table_file, smooth=True)) == 0
+    assert fold_twin(Fold(name, out=out, html=html, smooth=True)) == 0
+    table = np.genfromtxt(table_file, delimiter=",", names=True, dtype=None, encoding=None)
+    mean, std = table["temperature_smooth"], table["temperature_smooth_std"]
+    # Rows of one time are drawn once, as the last of them.
+    last = np.flatnonzero(np.diff(table["t_ns"].astype(float), append=np.inf))
+    np.testing.assert_allclose(
+        smoothed_lines(out), np.stack((mean, mean + 2 * std, mean - 2 * std), axis=1)[last], rtol=1e-12
+    )
+    # A chart in the report has three curves in its colour, and a word on it; without --smooth there is none.
+    text = html.read_text()
+    assert text.count('stroke="#264c46"') >= 3 * 2 and "the readings after each moment too" in text
+    assert fold_twin(Fold(name, html=html)) == 0
+    assert "#264c46" not in html.read_text()

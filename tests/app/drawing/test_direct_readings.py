@@ -85,10 +85,26 @@ def test_a_black_box_is_asked_for_blocks():
     assert [(item.sensor, item.row, item.state) for item in observed(model)] == [(0, 0, 0)]
 
 
-def test_a_sensor_that_raises_near_the_prior_has_no_dots():
+def test_a_sensor_that_raises_near_the_prior_has_no_dots(capsys):
     """Machine code gives NaN there, and the twin runs."""
     model = StateSpaceModel(
         name="m", title="m", states=(State("a", "m"),), noises=(Noise("a", "m²/s", 1.0),), f=f,
         sensors=(Sensor("s", (Row("a", "m", 1.0), Row("b", "m", 1.0)), raises_beyond_the_mean),),
     )  # fmt: skip
     assert observed(model) == []
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("black_box", [False, True])
+def test_a_sensor_that_fails_otherwise_is_named_once(black_box, capsys):
+    def h(x, u, p, out=None):
+        raise LookupError(f"no table of {black_box}")
+
+    model = StateSpaceModel(
+        name="m", title="m", states=(State("a", "m"),), noises=(Noise("a", "m²/s", 1.0),),
+        f=identity_of_a_block if black_box else f, sensors=(Sensor("gauge", (Row("a", "m", 1.0),), h),),
+        black_box=black_box,
+    )  # fmt: skip
+    assert observed(model) == observed(model) == []
+    said = f"nisus: model m: h of gauge fails near the prior: LookupError: no table of {black_box}; "
+    assert capsys.readouterr().err == said + "what it reads is drawn over no state\n"

@@ -13,6 +13,7 @@ from app.running import stamp_of
 from app.twin.twin import load_twin
 from estimators.fold import Fold
 from estimators.log import Log
+from estimators.model.user_file import imported_beside
 from tests.app.gallery.opened import PATIENCE, opened
 from tests.app.scripted import pull_all, wait_for
 
@@ -145,6 +146,65 @@ def test_a_saved_model_is_folded_and_its_mistake_has_a_line(pump):
         engine.submit(SetEstimator("ekf"))
         wait_for(lambda: engine.status().revision == 2, PATIENCE)
         assert engine.folded_with()[0].model is engine.model
+
+
+IMPORTING = MODEL.replace("FACTOR = 1.0", "from lib.numbers import FACTOR")
+
+
+def test_a_saved_helper_of_the_model_is_folded_too_and_its_mistake_has_a_line(pump):
+    """`f` takes its factor from a file of its own: in machine code, which is kept, it is a constant."""
+    helper = pump.parent / "lib" / "numbers.py"
+    helper.parent.mkdir()
+    save(helper, "FACTOR = 1.0\nDAMPING = 1.0\n")
+    damped = """
+from lib.numbers import DAMPING
+def f(x, u, p, dt, out):
+    out[0] = x[0] + DAMPING * dt * x[1]
+    out[1] = x[1]
+Pump = replace(Pump, f=f, F=None, linear=False)
+"""
+    save(pump.with_name("pump.py"), IMPORTING + damped)
+    save(pump, YAML.replace("motor_winding", "./pump.py:Pump").replace("kf", "ekf"))
+    with opened(pump.parent / "r", pump, speed=1e6) as session:
+        engine = session.engine
+        wait_for(lambda: engine.status().finished, PATIENCE)
+        began = pull_all(engine)
+        save(helper, "FACTOR = 1.0\nDAMPING = 1.0 +\n")
+        wait_for(lambda: told(session)["unread"] is not None, PATIENCE)
+        assert told(session)["unread"].startswith("lib/numbers.py:2: ")
+        save(helper, "FACTOR = 1.0\nDAMPING = 0.0\n")
+        wait_for(lambda: engine.status().revision == 1, PATIENCE)
+        folded(session)
+        after = pull_all(engine)
+        assert told(session)["unread"] is None
+        assert "numbers.py saved" in [run["what"] for run in session.get("/api/runs")][-1]
+        # What was said of the rate no longer moves the temperature: of the rate nothing is learnt.
+        np.testing.assert_array_equal(after.events.value, began.events.value)
+        assert np.abs(after.track.mean[-1] - began.track.mean[-1]).max() > 1e-3
+        spread = engine.model.states[1].std ** 2 + 0.001 * (after.events.t[-1] - after.events.t[0]) * 1e-9
+        assert began.track.std[-1, 1] ** 2 < 0.5 * spread
+        np.testing.assert_array_equal(after.track.mean, mean(pump, after.events))
+        assert after.track.mean[-1, 1] == pytest.approx(engine.model.states[1].mean)
+
+
+def test_what_a_file_imports_beside_it_is_found_however_it_is_written(tmp_path):
+    for name, text in {
+        "pump.py": "import math, a\nfrom b import x\nfrom pack.c import y\nfrom pack import d\nimport numpy\n",
+        "a.py": "import e\n",
+        "e.py": "import a\nimport pump\n",
+        "b.py": "x = 1\ndef late():\n    import f\n",
+        "f.py": "",
+        "other.py": "",
+        "pack/__init__.py": "",
+        "pack/c.py": "from . import g\nfrom .h import z\n",
+        "pack/d.py": "from ..b import x\n",
+        "pack/g.py": "not Python",
+        "pack/h.py": "z = 1\n",
+    }.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    found = [str(path.relative_to(tmp_path.resolve())) for path in imported_beside(tmp_path / "pump.py")]
+    assert found == ["a.py", "b.py", "e.py", "f.py", *(f"pack/{name}.py" for name in ("__init__", "c", "d", "g", "h"))]
 
 
 def test_a_recording_has_the_twin_as_it_was_saved_last(pump):

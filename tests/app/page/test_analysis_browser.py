@@ -1,11 +1,13 @@
 """What if and Diagnose in headless Chromium: they draw, follow what is asked, and rest while hidden."""
 
+import numpy as np
 import pytest
 
 from app.cli.run import live_source
 from app.session import Page, Session
 from app.twin.twin import load_twin
-from tests.app.scripted import row_count, wait_for
+from estimators.log import INPUT
+from tests.app.scripted import pull_all, row_count, wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -80,6 +82,80 @@ def test_what_if_draws_a_fan_and_says_when_a_limit_is_reached(page, session):
     page.get_by_label("i q as it is now").click()
     until(page, f"window.nisus.panes.whatif.found.states.winding.mean.at(-1) < {hot} - 50")
     assert session.engine.status().health != 4
+
+
+def chosen(page):
+    """Of i q, what the forecast was told, and what is drawn of it."""
+    return page.evaluate("window.nisus.panes.whatif.found.chosen.i_q ?? null")
+
+
+def test_an_input_steps_ramps_or_repeats_what_was_recorded(page, session):
+    page.get_by_role("tab", name="What if").click()
+    kind, field = page.get_by_label("How i q goes on"), page.get_by_label("i q [A] from now on, as a number")
+    charts = page.locator("#whatif .chart")
+    assert charts.count() == 4 and page.get_by_label("Seconds until i q is there").is_hidden()
+
+    field.fill("600")
+    field.press("Enter")
+    until(page, 'JSON.stringify(window.nisus.panes.whatif.found.chosen.i_q) === \'{"t":[0],"value":[600]}\'')
+    kind.select_option("step")
+    after = page.get_by_label("Seconds until i q is there")
+    after.fill("60")
+    after.press("Enter")
+    until(page, "window.nisus.panes.whatif.found.chosen.i_q?.t[0] === 60")
+    # Before the step nothing differs, after it the winding is hotter by far.
+    winding = page.evaluate("window.nisus.panes.whatif.found.states.winding.mean")
+    t = page.evaluate("window.nisus.panes.whatif.found.t")
+    assert winding[-1] > winding[max(k for k, time in enumerate(t) if time <= 60.0)] + 50.0
+    drawn = page.evaluate("window.nisus.panes.whatif.rows.get('i_q').chart.data[2].filter((value) => value !== null)")
+    assert drawn[-1] == drawn[-2] == 600.0 and drawn[0] == drawn[1] != 600.0
+    assert page.get_by_label("Chart of i q", exact=True).is_visible() and charts.count() == 5
+
+    kind.select_option("ramp")
+    until(page, "window.nisus.panes.whatif.found.chosen.i_q?.t.length === 100")
+    ramp = chosen(page)
+    assert ramp["t"][-1] == 60.0 and ramp["value"][-1] == 600.0
+    assert all(abs(b - a - 0.6) < 1e-3 for a, b in zip(ramp["t"], ramp["t"][1:], strict=False))
+
+    kind.select_option("repeat")
+    until(page, "window.nisus.panes.whatif.found.chosen.i_q?.t.length !== 100")
+    assert field.is_disabled()
+    recorded = pull_all(session.engine).events
+    k = session.engine.model.input_names.index("i_q")
+    known = recorded.value[(recorded.kind == INPUT), k]
+    told = chosen(page)["value"]
+    assert told and all(np.nanmin(np.abs(known - value)) < 1e-4 * abs(value) for value in told)
+
+    page.get_by_label("i q as it is now").click()
+    until(page, "!window.nisus.panes.whatif.found.chosen.i_q")
+    wait_for(lambda: charts.count() == 4, PATIENCE)
+
+
+def test_how_likely_a_limit_is_passed_stands_at_the_foot_of_its_chart(page):
+    page.get_by_role("tab", name="What if").click()
+    page.get_by_label("Limit of winding °C", exact=True).fill("90")
+    page.get_by_label("Limit of winding °C", exact=True).press("Enter")
+    until(page, "window.nisus.panes.whatif.found?.limits.winding?.limit === 90")
+    # The height of its curve at the right edge, in shares of a quarter of the chart.
+    page.get_by_label("i q [A] from now on, as a number").fill("600")
+    page.get_by_label("i q [A] from now on, as a number").press("Enter")
+    until(page, "window.nisus.panes.whatif.found.limits.winding.probability.at(-1) > 0.99")
+    height = """() => {
+        const chart = window.nisus.panes.whatif.parts.find((part) => part.what.key === "whatif:winding");
+        const { ctx, bbox } = chart.plot;
+        const x = Math.round(chart.plot.valToPos(window.nisus.panes.whatif.times.at(-1), "x", true)) - 3;
+        const ink = getComputedStyle(document.documentElement).getPropertyValue("--ink");
+        const rgb = ink.match(/[0-9a-f]{2}/g).map((part) => parseInt(part, 16));
+        const { data } = ctx.getImageData(x, bbox.top, 1, bbox.height);
+        for (let k = Math.ceil(0.6 * bbox.height); k < bbox.height; k++) {
+            const off = rgb.map((part, i) => Math.abs(data[4 * k + i] - part));
+            if (Math.max(...off) < 40) return (bbox.height - k) / bbox.height;
+        }
+        return 0;
+    }"""
+    wait_for(lambda: abs(page.evaluate(height) - 0.25) < 0.03, PATIENCE)
+    page.get_by_label("i q as it is now").click()
+    until(page, "!window.nisus.panes.whatif.found.chosen.i_q")
 
 
 def test_diagnose_draws_what_the_rows_say(page):

@@ -103,6 +103,29 @@ def test_many_states_of_a_kind_are_one_chart_in_which_the_odd_one_stands_out(sho
     )
     strong = page.evaluate("window.nisus.charts.charts[0].data.at(-1).at(-1)")
     assert strong == pytest.approx(soc[lowest], rel=1e-6)
+    # The band is that of the strong one alone, and no other is asked for.
+    until(page, "window.nisus.charts.strong.edges('soc_5')[0].length > 0")
+    assert {column for column in lanes(session)["strong"] if "soc" in column} == {"upper:soc_5", "lower:soc_5"}
+    upper, lower = page.evaluate("window.nisus.charts.strong.edges('soc_5').map((values) => values.at(-1))")
+    half = 2 * pull_all(session.engine).track.std[-1, states.index("soc_5")]
+    assert (upper, lower) == pytest.approx((soc[lowest] + half, soc[lowest] - half), rel=1e-5)
+    blue = page.evaluate(
+        """() => {
+            const { plot, what } = window.nisus.charts.charts[0];
+            const { ctx, bbox } = plot;
+            const [x] = plot.data;
+            const middle = x[Math.floor(0.7 * x.length)];
+            const { x: times } = window.nisus.charts.strong.lane;
+            const at = times.findLastIndex((time) => time <= middle);
+            const lower = window.nisus.charts.strong.edges("soc_5")[1][at]; // beneath it there is no other line
+            const strong = what.data().at(-1)[Math.floor(0.7 * x.length)];
+            const left = plot.valToPos(middle, "x", true);
+            const place = (value) => ctx.getImageData(left, plot.valToPos(value, "y", true), 1, 1).data;
+            const [inside, outside] = [(lower + strong) / 2, lower - (strong - lower) / 2].map(place);
+            return [inside[2] - inside[0], outside[2] - outside[0]];
+        }"""
+    )
+    assert blue[0] > blue[1] + 15
     # Each of them can be had.
     page.get_by_text("Shown", exact=True).click()
     page.locator("#layout li").filter(has_text="soc 5").first.get_by_role("checkbox").check()
@@ -134,3 +157,11 @@ def test_a_dozen_states_and_more_are_a_picture_of_space_and_time(shown):
     light = np.array(data).reshape(-1, 4)[::-1, :3].sum(axis=1)  # the first state below
     # The scale goes from dark to light: lightness has the order of the values.
     assert np.all(np.diff(light[np.argsort(values)]) >= 0)
+    # Beneath it how far they are apart, and how sure the estimate is of one.
+    assert page.evaluate("window.nisus.charts.layout.shown()[1][0]") == "spread:x"
+    until(page, "window.nisus.charts.charts[1].data[3].at(-1) !== null")
+    rows = page.evaluate("window.nisus.charts.charts[1].data.slice(1).map((values) => values.at(-1))")
+    track = pull_all(session.engine).track
+    mean, half = track.mean[-1].mean(), 2 * np.sqrt(np.mean(track.std[-1] ** 2))
+    expected = (track.mean[-1].max(), track.mean[-1].min(), mean + half, mean - half, mean)
+    np.testing.assert_allclose(rows, expected, rtol=1e-4, atol=1e-4)

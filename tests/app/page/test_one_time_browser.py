@@ -77,3 +77,35 @@ def test_page_and_rerun_show_one_time(browser):  # noqa: F811
     finally:
         page.context.close()
         session.stop()
+
+
+def test_rerun_in_a_window_of_its_own_shares_the_time_of_the_page(browser):  # noqa: F811
+    twin = load_twin("motor_winding")
+    session = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
+    session.start()
+    context = browser.new_context(viewport={"width": 1000, "height": 700})
+    page, alone = context.new_page(), context.new_page()
+    try:
+        wait_for(lambda: session.engine.status().finished, PATIENCE)
+        page.goto(session.url, timeout=PATIENCE * 1000)
+        until(page, "window.nisus?.drawn > 0")
+        page.evaluate("window.nisus.view.show(20, 50)")
+        alone.goto(session.url.partition("?")[0] + "explore", timeout=PATIENCE * 1000)
+        until(alone, "window.nisus?.explored > 0")
+        assert alone.locator("#shared").inner_text() == "one time with the page"
+        cursor_is(alone, 50.0, PAUSED)
+        # What is gone to on the page moves it, and what is scrubbed in it moves the page.
+        page.evaluate("window.nisus.view.goTo(33, window.nisus.charts.range)")
+        cursor_is(alone, 33.0, PAUSED)
+        alone.evaluate(SCRUB, [30.5, PAUSED])
+        until(page, "Math.abs(window.nisus.view.at - 30.5) < 1e-6 && !window.nisus.view.following")
+        alone.evaluate(SCRUB, [0, FOLLOWING])
+        until(page, "window.nisus.view.following")
+        # Without the page it says that it is alone, and is its own master.
+        page.goto("about:blank")
+        until(alone, "document.getElementById('shared').textContent.startsWith('a time of its own')")
+        alone.evaluate(SCRUB, [12.0, PAUSED])
+        until(alone, "Math.abs(window.nisus.view.at - 12) < 1e-6")
+    finally:
+        context.close()
+        session.stop()

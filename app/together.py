@@ -1,0 +1,32 @@
+"""Several things side by side: an end that waits for many threads takes as long as the slowest, not as their sum."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+
+def together(*works: Callable[[], Any]) -> None:
+    """Do all of these, each in a thread of its own but the first, and wait for them.
+
+    Raises:
+        BaseException: What the first of them that failed raised, once all are done.
+    """
+    failures: list[BaseException] = []
+
+    def carry_out(work: Callable[[], Any]) -> None:
+        try:
+            work()
+        except BaseException as error:  # noqa: BLE001  raised again below, in the caller's thread
+            failures.append(error)
+
+    threads = [threading.Thread(target=carry_out, args=(work,), daemon=True) for work in works[1:]]
+    for thread in threads:
+        thread.start()
+    for work in works[:1]:
+        carry_out(work)
+    for thread in threads:
+        thread.join()
+    if failures:
+        raise failures[0]

@@ -1,0 +1,90 @@
+"""A twin that is stopped: nothing waits for what does not concern it, and its recording has every row that there is."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from app.cli.run import live_source
+from app.recording.reader import finished, read_recording
+from app.recording.writer import _Part
+from app.running import Opening, RunningTwin
+from app.together import together
+from app.twin.twin import load_twin
+from tests.app.scripted import row_count, wait_for
+from tests.conftest import ROOT
+
+PATIENCE = 120.0
+
+
+def test_works_are_done_side_by_side_and_all_before_it_returns():
+    meeting, done = threading.Barrier(3), []
+
+    def work():
+        meeting.wait(PATIENCE)
+        done.append(threading.current_thread())
+
+    together(work, work, work)
+    assert len(set(done)) == 3 and threading.current_thread() in done
+    together()
+
+
+def test_what_fails_is_raised_once_all_are_done():
+    failing, done = threading.Event(), []
+
+    def fail():
+        failing.set()
+        raise OSError("it cannot be closed")
+
+    def work():
+        failing.wait(PATIENCE)
+        done.append(True)
+
+    with pytest.raises(OSError, match="it cannot be closed"):
+        together(work, fail, work)
+    assert done == [True, True]
+
+
+def test_the_recording_is_closed_after_the_last_row_and_has_it(tmp_path, monkeypatch):
+    twin, path = load_twin("motor_winding"), tmp_path / "run.rrd"
+    running = RunningTwin(Opening(twin, live_source(twin, 100.0)), door=None, recordings=tmp_path)
+    order = []
+
+    def end(part, *, short=False):
+        # Who moves the rows has ended; what looks at the last of them too.
+        assert not running.engine._thread.is_alive() and not running.engine._watchers.chronicle._thread.is_alive()
+        order.append(row_count(running.engine))
+        ended(part, short=short)
+        assert finished(path)
+        order.append("closed")
+
+    ended = _Part.end
+    monkeypatch.setattr(_Part, "end", end)
+    running.start()
+    running.recorder.record(path)
+    wait_for(lambda: path.exists() and row_count(running.engine) > 100, PATIENCE)
+    running.stop()
+    assert order == [row_count(running.engine), "closed"]
+    assert read_recording(path).rows == order[0] and not running.recorder._thread.is_alive()
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGTERM") or os.name == "nt", reason="no such signal")
+def test_a_page_that_is_asked_to_end_ends_well_and_its_recording_is_whole(tmp_path):
+    path = tmp_path / "run.rrd"
+    words = ["run", "motor_winding", "--port", "0", "--no-browser", "--speed", "50", "--record", str(path)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "app.cli.main", *words], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout is not None
+        assert any("http://" in line for line in process.stdout)
+        wait_for(lambda: path.exists() and path.stat().st_size > 20_000, PATIENCE)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(PATIENCE) == 0
+    finally:
+        process.kill()
+    recorded = read_recording(path)
+    assert finished(path) and recorded.closed and recorded.rows > 0
