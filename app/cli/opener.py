@@ -21,6 +21,7 @@ from ..recording.reader import read_recording
 from ..recording.split import NEVER, Split
 from ..running import Opening, stamp_of
 from ..session import Page, Session
+from ..twin.learned import correction_files
 from ..twin.model import model_file
 from ..twin.twin import Twin, load_twin, restore_twin
 from .prepare import begin_to_compile, compile_for, prepare_model
@@ -57,7 +58,7 @@ def opened_twin(
 
     twin = read()
     version = () if twin.version is None else (twin.version.path,)
-    files = (twin.path, *version, *model_file(twin.loaded))
+    files = (twin.path, *version, *model_file(twin.loaded), *correction_files(twin.loaded))
     return Opening(twin, live_source(twin, speed), files=files, stamp=stamp_of(files), again=read)
 
 
