@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 FEWEST = 3
 """Blocks, with which one is held out."""
 
-FINER = 3
-"""Blocks by which candidates are chosen, in each of those by which the result is judged."""
+STRETCHES = 9
+"""Of each recording, by which candidates are chosen: long, as it is what adds up over them that counts."""
 
 
 def learn_correction(arguments: Arguments) -> int:
@@ -77,7 +77,7 @@ def learn_correction(arguments: Arguments) -> int:
                     corrects=corrects,
                     features=features,
                     seconds=arguments.window,
-                    blocks=FINER * arguments.blocks,
+                    stretches=STRETCHES,
                 )  # fmt: skip
             )
         return Windows.joined(parts)

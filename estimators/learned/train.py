@@ -84,7 +84,7 @@ def train(
     _check(kind, given, names)
     scale = np.sqrt(np.mean(given.rates**2, axis=0))
     best: tuple[float, Candidate, np.ndarray] | None = None
-    for candidate in _candidates(kind, degree, net):
+    for candidate in _candidates(kind, given, degree, net):
         rest = left(candidate, given)
         lost = float(np.sum(drift(given, rest / scale)))
         if best is None or lost < best[0]:
@@ -129,10 +129,11 @@ def _check(kind: str, given: Windows, names: Sequence[str]) -> None:
             raise EstimatorError(f"{name} is {values[0]:g} in every window, and tells nothing apart; leave it out")
 
 
-def _candidates(kind: str, degree: int, net: Callable | None) -> Iterator[Candidate]:
+def _candidates(kind: str, given: Windows, degree: int, net: Callable | None) -> Iterator[Candidate]:
     if kind == NET:
         assert net is not None
-        yield Candidate("trained elsewhere", lambda given: Net(given.features, net))
+        found = Net(given.features, net)
+        yield Candidate("trained elsewhere", lambda part: found)
     elif kind == RIDGE:
         for penalty in PENALTIES:
             yield Candidate(f"degree {degree}, penalty {penalty:g}", partial(_ridge, penalty, degree))

@@ -76,7 +76,7 @@ def known_states(fold: Fold, physics: StateSpaceModel) -> np.ndarray:
 
 def windows(
     physics: StateSpaceModel, log: Log, known: np.ndarray, held_out: np.ndarray, *, corrects: Sequence[str],
-    features: Sequence[str], seconds: float, blocks: int,
+    features: Sequence[str], seconds: float, stretches: int,
 ) -> Windows:  # fmt: skip
     """Cut a log into windows.
 
@@ -88,7 +88,7 @@ def windows(
         corrects: States to correct.
         features: States and inputs by which.
         seconds: Length of a window.
-        blocks: Stretches of time by which windows are told apart.
+        stretches: Of time, by which windows are told apart (`Windows.block`).
     """
     t = log.t[: log.n]
     u = _inputs(physics, log)
@@ -111,7 +111,7 @@ def windows(
         rate = _residual(compiled.f, p, physics, t, known, u, edges[k], edges[k + 1], target)
         weight = np.diff(t[edges[k] : edges[k + 1] + 1]) * 1e-9
         mean = weight @ values[rows] / lasted
-        found.append((mean, rate, t[edges[k]] * 1e-9, t[edges[k + 1]] * 1e-9, k * blocks // count, judging[0]))
+        found.append((mean, rate, t[edges[k]] * 1e-9, t[edges[k + 1]] * 1e-9, k * stretches // count, judging[0]))
     return Windows(
         np.array([item[0] for item in found], float).reshape(-1, len(features)),
         np.array([item[1] for item in found], float).reshape(-1, len(corrects)),

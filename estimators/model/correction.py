@@ -38,8 +38,8 @@ from .correction_loops import (
     ridge_slope,
 )
 
-SMALL = 1e-6
-"""What is added to the diagonal of a correlation of features: two may say the same."""
+APART = 0.01
+"""Added to the diagonal of a correlation of features: two that say the same may differ by a tenth of a deviation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +177,7 @@ def support(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     centre, scale = points.mean(axis=0), points.std(axis=0)
     z = (points - centre) / scale
     d = points.shape[1]
-    precision = np.linalg.inv(z.T @ z / len(z) + SMALL * np.eye(d))
+    precision = np.linalg.inv(z.T @ z / len(z) + APART * np.eye(d))
     reach = np.sqrt(np.max(np.einsum("ni,ij,nj->n", z, precision, z)))
     return centre, scale, precision, np.array([reach])
 
