@@ -47,7 +47,7 @@ def against(physics: Sequence[Part], corrected: Part, states: Sequence[str]) -> 
     """What speaks against a correction, on blocks that were held out; nothing if it is better.
 
     Args:
-        physics: The physics alone, under each tuning that it might have: the correction must be better than all.
+        physics: The physics alone, first as the twin has it: the correction must be better under any of the tunings.
         corrected: With the correction.
         states: Those that are corrected: judged by their truth where it is known, else by the next reading.
     """
@@ -62,7 +62,8 @@ def against(physics: Sequence[Part], corrected: Part, states: Sequence[str]) -> 
                     f"the true {name}, held out, is not estimated better: CRPS {new.crps:.3g} {new.unit} after "
                     f"{old.crps:.3g}, by {mean:+.2g} ± {error:.2g}"
                 )
-            reasons += _narrower(f"the true {name}", old, new)
+            if one is physics[0]:
+                reasons += _narrower(f"the true {name}", old, new)
         if not judged:
             mean, error = gain(one.terms, corrected.terms)
             if not mean > SURE * error:

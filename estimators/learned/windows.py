@@ -1,10 +1,10 @@
 """What there is to learn from a recording: windows of time, and the rates by which the physics was wrong in them.
 
-    rₖ = (x(t + T) - x̂(t + T | x(t))) / T
+    r: x(t + T) = x̂(t + T | x(t), r),   dx̂ = (f + r) dt
 
 x is what is known of the states: the truth where the recording has it, else the smoothed estimate. x̂ begins there and
-goes through the window as f says, with the inputs that were; states that are not corrected follow what is known of
-them, as sensors would keep them there. The features of a window are their means over its time.
+goes through the window as f says, with the inputs that were, and a rate r beside it; states that are not corrected
+follow what is known of them, as sensors would keep them there. The features of a window are their means over its time.
 """
 
 from __future__ import annotations
@@ -24,6 +24,9 @@ from ..smoothing.smooth import smooth
 
 SHORTEST = 0.5
 """Share of a window's length that there must be of it, and the longest that it may last in such units the other way."""
+
+LITTLE = 1e-3
+"""Prior standard deviations by which a state is moved to see what a rate does."""
 
 
 class Windows(NamedTuple):
@@ -108,7 +111,10 @@ def windows(
             continue
         if not np.any(kinds == READING) or np.any(kinds == RESET):
             continue
-        rate = _residual(compiled.f, p, physics, t, known, u, edges[k], edges[k + 1], target)
+        whole = slice(edges[k], edges[k + 1] + 1)
+        rate = _rates(compiled.f, p, physics, t[whole], known[whole], u[whole], target)
+        if not np.all(np.isfinite(rate)):
+            continue
         weight = np.diff(t[edges[k] : edges[k + 1] + 1]) * 1e-9
         mean = weight @ values[rows] / lasted
         found.append((mean, rate, t[edges[k]] * 1e-9, t[edges[k + 1]] * 1e-9, k * stretches // count, judging[0]))
@@ -135,25 +141,38 @@ def _inputs(model: StateSpaceModel, log: Log) -> np.ndarray:
     return u
 
 
-def _residual(
-    f: Callable, p: np.ndarray, model: StateSpaceModel, t: np.ndarray, known: np.ndarray, u: np.ndarray, first: int,
-    last: int, target: np.ndarray,
+def _rates(
+    f: Callable, p: np.ndarray, model: StateSpaceModel, t: np.ndarray, known: np.ndarray, u: np.ndarray,
+    target: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Rates (k,) by which the physics misses what is known at row `last`, from row `first` on."""
-    x, out = known[first].copy(), np.empty(model.nx)
-    for i in range(first, last):
-        own = x[target]
-        x[:] = known[i]
-        x[target] = own
-        dt = (t[i + 1] - t[i]) * 1e-9
-        if not dt > 0.0:
-            continue
-        steps = steps_of(dt, model.max_step)
-        for _ in range(steps):
-            f(x, u[i], p, dt / steps, out)
-            x[:] = out
-    off = known[last][target] - x[target]
+    """Constant rates (k,) beside the physics with which it leads from the first row to the last.
+
+    One step of Newton's method; NaN where it leads nowhere.
+    """
+    seconds = (t[-1] - t[0]) * 1e-9
+    little = LITTLE * model.prior_std[target] / seconds
     turned = np.array([bool(model.circular[j]) for j in target])
-    off = np.where(turned, (off + np.pi) % (2.0 * np.pi) - np.pi, off)
-    rates: np.ndarray = off / ((t[last] - t[first]) * 1e-9)
-    return rates
+
+    def missed(rates: np.ndarray) -> np.ndarray:
+        x, out = known[0].copy(), np.empty(model.nx)
+        for i in range(len(t) - 1):
+            own = x[target]
+            x[:] = known[i]
+            x[target] = own
+            dt = (t[i + 1] - t[i]) * 1e-9
+            if dt > 0.0:
+                steps = steps_of(dt, model.max_step)
+                for _ in range(steps):
+                    f(x, u[i], p, dt / steps, out)
+                    x[:] = out
+                    x[target] += rates * dt / steps
+        off = known[-1][target] - x[target]
+        return np.where(turned, (off + np.pi) % (2.0 * np.pi) - np.pi, off)
+
+    off = missed(np.zeros(target.size))
+    slopes = np.array([(off - missed(rates)) / rates[c] for c, rates in enumerate(np.diag(little))]).T
+    with np.errstate(all="ignore"):
+        try:
+            return np.asarray(np.linalg.solve(slopes, off))
+        except np.linalg.LinAlgError:
+            return np.full(target.size, np.nan)

@@ -96,10 +96,10 @@ def test_what_the_model_leaves_out_is_learned_kept_and_folded(heated, kind, caps
     noise = {"learned": keep.name, "noise.body.variance": "0.003"}
     twin = load_twin(heated, overrides=noise)
     assert [item.name for item in twin.model.noises] == ["body", "shell", "body_learned"]
-    correction = twin.model.f.__closure__ and load_correction(keep)
+    correction = load_correction(keep)
     z = np.linspace(0.1, 1.9, 19)[:, None]
-    # Windows of 10 s see the heating through a loss of 5 % a second: some 80 % of it.
-    np.testing.assert_allclose(correction.mean(z)[:, 0], 0.8 * heating(z[:, 0]), rtol=0.0, atol=0.1)
+    # Noise of 0.05 °C a step is a rate of 0.016 °C/s of a window; most windows see two loads.
+    np.testing.assert_allclose(correction.mean(z)[:, 0], heating(z[:, 0]), rtol=0.0, atol=0.1)
     errors = {}
     for name, each in (("physics", alone), ("hybrid", twin)):
         log, _ = read_log(each, None)
@@ -168,10 +168,10 @@ def test_a_net_says_the_same_alone_and_among_others(tmp_path, kind):
 
 
 def test_a_net_is_judged_kept_and_folded(heated, capsys):
-    # A line in the load for what is a parabola: 0.8 · 0.4 load², about 0.45 load.
-    net = net_file(heated.with_name("net.onnx"), [[0.45]], kind="FLOAT")
+    # A line in the load for what is a parabola: 0.4 load² of loads up to 2.
+    net = net_file(heated.with_name("net.onnx"), [[0.6]], kind="FLOAT")
     keep = heated.with_name("net.yaml")
-    more = "--net", str(net), "--keep", str(keep), "--set", "Q.body=0.01", "--estimator", "ekf"
+    more = "--net", str(net), "--keep", str(keep), "--estimator", "enkf"
     status, said = learned(heated, "net", capsys, *more)
     assert "Blocks held out, folded" in said.out
     assert status == 0, said.out
