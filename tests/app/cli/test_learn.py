@@ -120,7 +120,7 @@ def load_correction(path):
 
 
 def test_where_the_model_has_all_of_it_nothing_is_kept(tmp_path, capsys):
-    # A gain must exceed two standard errors: of 17 such logs, seeds 7 and 100 to 107 with either kind, one did by chance.
+    # A gain must exceed two standard errors. Of 17 such logs (seed 7, and 100 to 107 by both kinds) one did by chance.
     path = vessel(tmp_path, 0.0, seed=101)
     keep = tmp_path / "none.yaml"
     status, said = learned(path, "ridge", capsys, "--keep", str(keep))
