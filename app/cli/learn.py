@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ from estimators.learned.judge import against, known, on_held_out, on_windows
 from estimators.learned.train import NET, Trained, train
 from estimators.learned.windows import Windows, known_states, windows
 from estimators.model.hybrid import check_places
+from estimators.model.state_space import StateSpaceModel
 from estimators.registry import find_estimator
 from estimators.smoothing.smooth import check_smooth
 from estimators.tuning import Tuning
@@ -26,7 +28,7 @@ from estimators.tuning import Tuning
 from ..stderr import complain
 from ..twin.learned import run_net
 from ..twin.model import physics_of
-from ..twin.twin import load_twin
+from ..twin.twin import Twin, load_twin
 from .arguments import settings
 from .check_text import as_text
 from .fold import read_log
@@ -56,7 +58,7 @@ def learn_correction(arguments: Arguments) -> int:
         for files in ([Path(part) for part in text.split(",") if part] for text in arguments.log or ("",))
     ]
     twin = twins[0]
-    physics = physics_of(twin.loaded)
+    physics = _tuned_physics(twin)
     check_places(physics, corrects, features)
     check_smooth(find_estimator(twin.estimator, twin.model), twin.model, twin.tuning.options)
     prepare(twin)
@@ -78,7 +80,7 @@ def learn_correction(arguments: Arguments) -> int:
                     features=features,
                     seconds=arguments.window,
                     stretches=STRETCHES,
-                )  # fmt: skip
+                )
             )
         return Windows.joined(parts)
 
@@ -139,6 +141,14 @@ def _check(arguments: Arguments) -> None:
         if arguments.keep.suffix not in (".yaml", ".yml"):
             raise ConfigError(f"--keep {arguments.keep}: must end in .yaml")
         check_place("--keep", arguments.keep)
+
+
+def _tuned_physics(twin: Twin) -> StateSpaceModel:
+    """The twin's model before anything is appended to it, with the parameters as they are tuned."""
+    physics = physics_of(twin.loaded)
+    values = dict(zip((item.name for item in twin.model.parameters), twin.tuning.p.tolist(), strict=True))
+    parameters = tuple(replace(item, value=values.get(item.name, item.value)) for item in physics.parameters)
+    return replace(physics, parameters=parameters)
 
 
 def _names(option: str, text: str) -> tuple[str, ...]:
