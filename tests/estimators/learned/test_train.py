@@ -38,7 +38,7 @@ LEFT_OUT = 0.03, -0.2
 """m/s: what the asset does beside the physics."""
 
 
-def recorded(seconds=100.0, step=0.25):
+def recorded(seconds=100.0, step=0.25, uneven=0.0):
     """A log of an asset that does more than its physics, with the truth of both states."""
     log = Log.of(PHYSICS)
     t = np.arange(0.0, seconds, step)
@@ -46,7 +46,7 @@ def recorded(seconds=100.0, step=0.25):
     x = np.zeros((t.size, 2))
     for i in range(1, t.size):
         f(x[i - 1], drive[i - 1 : i], (0.1,), step, x[i])
-        x[i] += step * np.array(LEFT_OUT)
+        x[i] += step * np.array(LEFT_OUT) * (1.0 + uneven * (-1.0) ** i)
     log.add_inputs(t, drive=drive)
     log.add("gauge", t, x[:, 0])
     log.add_truth(t, lag=x[:, 0], level=x[:, 1])
@@ -71,6 +71,12 @@ def test_the_rate_of_a_window_is_what_the_physics_leaves_out():
     assert len(given.rates) == 18  # 19 windows of 5 s, of which one lies in both parts
     # Over a window a lag of 10 s forgets a fifth of what a rate adds: that is not taken for a smaller rate.
     np.testing.assert_allclose(given.rates, np.tile(LEFT_OUT[::-1], (18, 1)), rtol=0.0, atol=1e-9)
+
+
+def test_a_rate_that_changes_within_a_window_counts_with_its_mean():
+    log, t, x, drive = recorded(uneven=1.0)
+    given = cut(log, known_states(folded(log), PHYSICS))
+    np.testing.assert_allclose(given.rates[:, 0], LEFT_OUT[1], rtol=0.0, atol=1e-9)
 
 
 def test_features_are_means_over_the_window():
