@@ -279,6 +279,9 @@ class TwinSection(Section):
     of a function that returns one, in it (./pump.py:Pump)."""
     parameters: dict[str, Number] = {}
     """The model's parameters by name, in their units. Default: the model's values."""
+    learned: Text | None = None
+    """A file beside this one that corrects what the model says, as `nisus learn` writes it: what was learned from
+    recordings, with a noise NAME_learned for each state that it corrects. Default: none, the model alone."""
     estimate: dict[str, UnknownSection] = {}
     """Parameters that are moved into the state and estimated with it, by name: {std, drift}. They become the last
     states, which may be named wherever a state may. Default: none."""

@@ -244,6 +244,45 @@ class Tune:
 
 
 @dataclass(frozen=True)
+class Learn:
+    """Learn from recordings what a twin's model leaves out, as a correction with an uncertainty of its own.
+
+    Each recording is cut into blocks of time: every third is held out, and there the twin is folded with the correction
+    and without. Exit status: 0 if it is better there, 1 if not; then nothing is written.
+    """
+
+    twin: Twin
+    """Name of a twin that ships, or path of a YAML file."""
+    corrects: str
+    """States whose rates are corrected, with commas: magnet."""
+    features: str
+    """States and inputs by which, with commas: speed,i_d,i_q."""
+    kind: Literal["gp", "ridge", "net"] = "gp"
+    """gp: a Gaussian process, which takes scikit-learn. ridge: ridge regression. net: a network of --net, judged only,
+    which takes onnxruntime."""
+    net: Path | None = None
+    """ONNX file of --kind net: it takes features (N, d) and gives rates (N, k), units of the states a second."""
+    degree: Literal[1, 2] = 1
+    """Of ridge: 2 has squares and products of the features too."""
+    window: float = 30.0
+    """Seconds over which the physics is compared with what is known: the truth of the recording, else smoothed."""
+    estimator: str | None = None
+    """Estimator to use instead of the twin's own; `nisus filters` lists all of them."""
+    set: Settings = ()
+    """KEY=VALUE, repeatable, as for `run`."""
+    log: Files = ()
+    """Recording to learn from instead of the twin's own, repeatable; FILE,FILE are parts of one."""
+    duration: float | None = None
+    """Take only this many seconds of each."""
+    blocks: int = 9
+    """Blocks of time, of as many readings each; every third is held out: of 3 the last."""
+    keep: Path | None = None
+    """Write the correction to this .yaml, which a twin's YAML then names: `learned: FILE`."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print one JSON object."""
+
+
+@dataclass(frozen=True)
 class Guard:
     """Fold archived recordings with the accepted tunings of their twins, and say what got worse than recorded.
 
@@ -434,6 +473,7 @@ Command = (
     | Advise
     | Compare
     | Tune
+    | Learn
     | Guard
     | Stress
     | Commission

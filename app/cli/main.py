@@ -25,6 +25,7 @@ from .arguments import (
     Filters,
     Fold,
     Guard,
+    Learn,
     Log,
     Review,
     Run,
@@ -74,6 +75,10 @@ def carry_out(command: Command) -> int:
         from .tune import tune_twin
 
         return tune_twin(command)
+    if isinstance(command, Learn):
+        from .learn import learn_correction
+
+        return learn_correction(command)
     if isinstance(command, Stress):
         from .stress import stress_twin
 

@@ -38,8 +38,8 @@ def fit_json(fitted: Fitted) -> dict[str, Any]:
         "skipped": [item._asdict() for item in fitted.skipped],
         "left_out": dict(fitted.left_out),
         "correlated": correlated(fitted),
-        "before": {"fitted": _part(fitted.before.fitted), "held_out": _part(fitted.before.held_out)},
-        "after": {"fitted": _part(fitted.after.fitted), "held_out": _part(fitted.after.held_out)},
+        "before": {"fitted": part_json(fitted.before.fitted), "held_out": part_json(fitted.before.held_out)},
+        "after": {"fitted": part_json(fitted.after.fitted), "held_out": part_json(fitted.after.held_out)},
         "folds": fitted.folds,
     }
 
@@ -60,7 +60,8 @@ def _line(line: Line) -> dict[str, Any]:
     return {name: _number(value) if isinstance(value, float) else value for name, value in fields.items()}
 
 
-def _part(part: Part) -> dict[str, Any]:
+def part_json(part: Part) -> dict[str, Any]:
+    """What the readings of one part of the recordings say."""
     return {
         "readings": part.n,
         "log_density": _number(part.log_density),

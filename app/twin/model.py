@@ -23,6 +23,7 @@ from estimators.model.user_file import imported_beside, run_file
 from estimators.models import MODELS
 
 from .lasting import with_lasting_errors
+from .learned import with_correction
 from .limits import limits_of
 from .names import check_named, check_names, one_each
 
@@ -111,17 +112,7 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
         ConfigError: With file and line, if the YAML names what the model lacks or a value breaks its rule.
     """
     config = loaded.config
-    names = [item.name for item in model.parameters]
-    check_names(loaded, ("parameters",), config.parameters, names, "parameter", model)
-    for item in model.parameters:
-        value = config.parameters.get(item.name, item.value)
-        if not item.low <= value <= item.high:
-            raise loaded.error(
-                ("parameters", item.name),
-                f"is {value:g} {item.unit}; it must lie between {item.low:g} and {item.high:g}",
-            )
-    parameters = tuple(replace(p, value=config.parameters.get(p.name, p.value)) for p in model.parameters)
-    model = with_lasting_errors(replace(model, parameters=parameters), loaded)
+    model = with_lasting_errors(with_correction(with_parameters(model, loaded), loaded), loaded)
     names = [item.name for item in model.parameters]
     check_names(loaded, ("estimate",), config.estimate, names, "parameter", model)
     unknowns = {name: Unknown(section.std, section.drift) for name, section in config.estimate.items()}
@@ -143,6 +134,27 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
         ),
         sensors=tuple(_sensor(sensor, loaded) for sensor in model.sensors),
     )
+
+
+def physics_of(loaded: Loaded) -> StateSpaceModel:
+    """The model as the YAML has it, before anything is learned, estimated or appended; raises as both of these."""
+    return with_parameters(find_model(loaded, ("model",), loaded.config.model), loaded)
+
+
+def with_parameters(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
+    """The model with the YAML's parameters in place of its own; raises as `configure`."""
+    config = loaded.config
+    names = [item.name for item in model.parameters]
+    check_names(loaded, ("parameters",), config.parameters, names, "parameter", model)
+    for item in model.parameters:
+        value = config.parameters.get(item.name, item.value)
+        if not item.low <= value <= item.high:
+            raise loaded.error(
+                ("parameters", item.name),
+                f"is {value:g} {item.unit}; it must lie between {item.low:g} and {item.high:g}",
+            )
+    parameters = tuple(replace(p, value=config.parameters.get(p.name, p.value)) for p in model.parameters)
+    return replace(model, parameters=parameters)
 
 
 def _states(model: StateSpaceModel, loaded: Loaded) -> Sequence[State]:

@@ -30,6 +30,7 @@ from ..intake import Planned
 from .commissioned import commissioned
 from .dropout import DegradedAfter, degraded_after
 from .late import Late, late_policy
+from .learned import correction_files
 from .model import configure, find_model, model_files
 from .names import check_named
 from .refit import check_refit
@@ -84,9 +85,9 @@ class Twin:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """What it was read from: its YAML, its tuning version, the user's files that hold its model."""
+        """What it was read from: its YAML, its tuning version, the user's files of its model and correction."""
         version = () if self.version is None else (self.version.path,)
-        return (self.path, *version, *model_files(self.loaded))
+        return (self.path, *version, *model_files(self.loaded), *correction_files(self.loaded))
 
     @property
     def name(self) -> str:

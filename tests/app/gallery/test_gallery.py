@@ -17,8 +17,8 @@ from tests.app.gallery.opened import PATIENCE, opened
 from tests.app.scripted import wait_for
 
 RECORDED = {
-    "battery_dmegc", "battery_panasonic", "field_era5", "motor_bench", "motor_bench_joint", "road_car", "road_car_rav4",
-    "uwb_rover_labyrinth", "uwb_rover_plaza",
+    "battery_dmegc", "battery_panasonic", "field_era5", "motor_bench", "motor_bench_hybrid", "motor_bench_joint",
+    "road_car", "road_car_rav4", "uwb_rover_labyrinth", "uwb_rover_plaza",
 }  # fmt: skip
 """The twins whose recordings do not ship."""
 

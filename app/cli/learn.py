@@ -1,0 +1,176 @@
+"""`nisus learn`: what a twin's model leaves out, learned from recordings, and whether the twin is better with it."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from config.files import shown_path
+from estimators.errors import ConfigError
+from estimators.fit.aims import Recording
+from estimators.fit.blocks import held_out_rows
+from estimators.fit.entries import Setting
+from estimators.fit.judge import Part, worths
+from estimators.fold import Fold
+from estimators.learned.judge import against, known, on_held_out, on_windows
+from estimators.learned.train import NET, Trained, train
+from estimators.learned.windows import Windows, known_states, windows
+from estimators.model.hybrid import check_places
+from estimators.model.state_space import StateSpaceModel
+from estimators.registry import find_estimator
+from estimators.smoothing.smooth import check_smooth
+from estimators.tuning import Tuning
+
+from ..stderr import complain
+from ..twin.learned import run_net
+from ..twin.model import physics_of
+from ..twin.twin import Twin, load_twin
+from .arguments import settings
+from .check_text import as_text
+from .fold import read_log
+from .learn_file import correction_text, noises_of
+from .learn_text import Lesson, as_dict, scores_of, sections
+from .places import check_place
+from .prepare import attend, prepare
+
+if TYPE_CHECKING:
+    from .arguments import Learn as Arguments
+
+FEWEST = 3
+"""Blocks, with which one is held out."""
+
+STRETCHES = 9
+"""Of each recording, by which candidates are chosen: long, as it is what adds up over them that counts."""
+
+
+def learn_correction(arguments: Arguments) -> int:
+    """Carry the command out."""
+    corrects, features = _names("--corrects", arguments.corrects), _names("--features", arguments.features)
+    _check(arguments)
+    net = None if arguments.net is None else run_net(arguments.net, len(features), len(corrects))
+    overrides = {**settings(arguments.set, arguments.estimator), "learned": "null"}
+    twins = [
+        load_twin(arguments.twin, log_files=files or None, overrides=overrides)
+        for files in ([Path(part) for part in text.split(",") if part] for text in arguments.log or ("",))
+    ]
+    twin = twins[0]
+    physics = _tuned_physics(twin)
+    check_places(physics, corrects, features)
+    check_smooth(find_estimator(twin.estimator, twin.model), twin.model, twin.tuning.options)
+    prepare(twin)
+    logs = [read_log(each, arguments.duration)[0] for each in twins]
+
+    def cut() -> Windows:
+        parts = []
+        for log in logs:
+            fold = Fold(twin.estimator, twin.model, twin.tuning, log)
+            fold.advance()
+            held_out = held_out_rows(log, arguments.blocks)
+            parts.append(
+                windows(
+                    physics,
+                    log,
+                    known_states(fold, physics),
+                    held_out,
+                    corrects=corrects,
+                    features=features,
+                    seconds=arguments.window,
+                    stretches=STRETCHES,
+                )
+            )
+        return Windows.joined(parts)
+
+    given: Windows = attend(twin.model, cut, "comparing the physics with what is known")
+    own, apart = given.of(~given.held_out), given.of(given.held_out)
+
+    def learn() -> Trained:
+        return train(arguments.kind, own, names=features, degree=arguments.degree, net=net)
+
+    trained: Trained = attend(twin.model, learn, "learning")
+    own_noise, _ = noises_of(physics, trained, corrects)
+
+    def text(net: Path | None, scores: Mapping[str, float] | None = None) -> str:
+        on = arguments.log or (f"{twin.name}, its own log",)
+        return correction_text(twin, physics, trained, corrects, features, learned_on=on, net=net, scores=scores)
+
+    with tempfile.TemporaryDirectory(prefix="nisus-") as folder:
+        file = Path(folder) / "correction.yaml"
+        file.write_text(text(arguments.net and arguments.net.absolute()), encoding="utf-8")
+        corrected = load_twin(arguments.twin, overrides={**overrides, "learned": str(file)})
+    wider = {name: float(trained.before[k]) for k, name in enumerate(corrects) if name in own_noise}
+    tunings = twin.tuning, _tuned(twin.tuning, wider), _tuned(corrected.tuning, own_noise)
+    recordings = [Recording(log, 1.0, held_out_rows(log, arguments.blocks)) for log in logs]
+
+    def judge() -> list[Part]:
+        return [worths(twin.estimator, [Setting(each, None)], recordings, _go)[0].held_out for each in tunings]
+
+    parts: list[Part] = attend(twin.model, judge, "judging")
+    lesson = Lesson(
+        corrects=corrects,
+        units=tuple(physics.states[physics.state_names.index(name)].unit for name in corrects),
+        words=trained.words,
+        learned_from=on_windows(own, trained.rest, known(trained, own)),
+        held_out=on_held_out(trained, apart) if len(apart.start) else None,
+        parts=tuple(parts),
+        noise=own_noise,
+        reasons=against(parts[:2], parts[2], corrects),
+    )
+    if arguments.json:
+        print(json.dumps({"twin": twin.name, **as_dict(lesson)}, allow_nan=False))
+    else:
+        print("\n".join(as_text(sections(twin.name, arguments.window, lesson, arguments.keep))))
+    if lesson.better and arguments.keep is not None:
+        arguments.keep.write_text(text(_beside(arguments.net, arguments.keep), scores_of(lesson)), encoding="utf-8")
+        complain(f"{shown_path(arguments.keep)}: kept")
+    return 0 if lesson.better else 1
+
+
+def _check(arguments: Arguments) -> None:
+    """Refuse numbers and files that cannot be, before the work."""
+    if arguments.blocks < FEWEST:
+        raise ConfigError(f"--blocks {arguments.blocks}: must be {FEWEST} or more, or nothing is held out")
+    if not arguments.window > 0.0:
+        raise ConfigError(f"--window {arguments.window:g}: must be positive")
+    if (arguments.kind == NET) != (arguments.net is not None):
+        raise ConfigError("--net FILE.onnx: is for --kind net, which needs it")
+    if arguments.keep is not None:
+        if arguments.keep.suffix not in (".yaml", ".yml"):
+            raise ConfigError(f"--keep {arguments.keep}: must end in .yaml")
+        check_place("--keep", arguments.keep)
+
+
+def _tuned_physics(twin: Twin) -> StateSpaceModel:
+    """The twin's model before anything is appended to it, with the parameters as they are tuned."""
+    physics = physics_of(twin.loaded)
+    values = dict(zip((item.name for item in twin.model.parameters), twin.tuning.p.tolist(), strict=True))
+    parameters = tuple(replace(item, value=values.get(item.name, item.value)) for item in physics.parameters)
+    return replace(physics, parameters=parameters)
+
+
+def _names(option: str, text: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    if not names:
+        raise ConfigError(f"{option} names nothing; write names with commas")
+    return names
+
+
+def _tuned(tuning: Tuning, noise: Mapping[str, float]) -> Tuning:
+    for name, variance in noise.items():
+        tuning = tuning.set(f"Q.{name}", variance)
+    return tuning
+
+
+def _go(folds: int) -> bool:
+    return True
+
+
+def _beside(net: Path | None, keep: Path) -> Path | None:
+    """The net's path as the correction's file names it: relative where it lies in the same folder."""
+    if net is None:
+        return None
+    near, folder = net.absolute(), keep.absolute().parent
+    return near.relative_to(folder) if near.is_relative_to(folder) else near

@@ -1,0 +1,127 @@
+"""A twin's learned correction: read from its file, and put beside the model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from config.files import shown_path
+from config.learned_schema import CorrectionSection, load_correction
+from config.loader import Loaded
+from estimators.errors import ConfigError, ModelError
+from estimators.model.correction import Correction, GaussianProcess, Net, Ridge
+from estimators.model.hybrid import Learned, hybrid
+from estimators.model.state_space import StateSpaceModel
+
+INSTALL = "pip install 'nisus[learned]'"
+
+
+def with_correction(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
+    """The model with the correction that the YAML names, if it names one.
+
+    Raises:
+        ConfigError: If its file is not there, is wrong, or is of another model.
+    """
+    files = correction_files(loaded)
+    if not files:
+        return model
+    path = files[0]
+    if not path.is_file():
+        raise loaded.error(("learned",), f"is {loaded.config.learned!r}; there is no file {shown_path(path)}; "
+                           "`nisus learn` writes one")  # fmt: skip
+    section, places = load_correction(path)
+    if section.learned.model != model.name:
+        raise ConfigError(
+            f"{places.at(('learned', 'model'))}: learned.model is {section.learned.model!r}; that of "
+            f"{loaded.path.stem} is {model.name!r}, whose states and inputs are others; learn it anew"
+        )
+    try:
+        return hybrid(model, learned_of(section, path))
+    except ModelError as error:
+        raise ConfigError(f"{places.at(())}: {error}") from None
+
+
+def correction_files(loaded: Loaded) -> list[Path]:
+    """The file of the correction that the YAML names; none of a twin without."""
+    if loaded.config.learned is None:
+        return []
+    return [loaded.path.absolute().parent / Path(loaded.config.learned).expanduser()]
+
+
+def learned_of(section: CorrectionSection, path: Path) -> Learned:
+    """What a correction's file at `path` says; of the same content the same object, so that it is compiled once.
+
+    Raises:
+        ConfigError: If its net cannot be read.
+    """
+    net = None if section.net is None else path.parent / section.net
+    stamp = net.stat().st_mtime_ns if net is not None and net.is_file() else 0
+    return _learned_of(section.model_dump_json(), net, stamp)
+
+
+@lru_cache(maxsize=16)
+def _learned_of(text: str, net: Path | None, stamp: int) -> Learned:
+    section = CorrectionSection.model_validate_json(text)
+    points = np.array(section.points, float)
+    rates = np.array(section.rates or (), float)
+    correction: Correction
+    if section.kind == "gp":
+        correction = GaussianProcess(points, rates, np.array(section.lengths, float), float(section.ratio or 0.0))
+    elif section.kind == "ridge":
+        correction = Ridge(points, rates, float(section.penalty or 0.0), section.degree)
+    else:
+        assert net is not None
+        correction = Net(points, run_net(net, len(section.features), len(section.corrects)))
+    noise = tuple(section.noise[name] for name in section.corrects)
+    return Learned(section.corrects, section.features, noise, correction)
+
+
+def run_net(path: Path, features: int, corrects: int) -> Callable[[np.ndarray], np.ndarray]:
+    """An ONNX network as a function of features (N, d) that gives rates (N, k), run state by state.
+
+    State by state, since of a block of another size it would round otherwise.
+
+    Raises:
+        ConfigError: If onnxruntime is not installed, or the file holds no network of these sizes.
+    """
+    try:
+        import onnxruntime
+    except ImportError:
+        raise ConfigError(f"{shown_path(path)}: a net needs onnxruntime, which is not installed: {INSTALL}") from None
+    if not path.is_file():
+        raise ConfigError(f"{shown_path(path)}: there is no such file; name an ONNX file beside the correction's")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    try:
+        session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # noqa: BLE001  its errors have no common base but this
+        gist = str(error).strip().splitlines()[0]
+        raise ConfigError(f"{shown_path(path)}: it cannot be read as an ONNX network: {gist}") from None
+    given, told = session.get_inputs(), session.get_outputs()
+    kinds = {"tensor(float)": np.float32, "tensor(double)": np.float64}
+    if len(given) != 1 or given[0].type not in kinds:
+        raise ConfigError(
+            f"{shown_path(path)}: it takes {', '.join(f'{item.name} {item.type}' for item in given)}; a net takes one "
+            "tensor of float or double, (N, features)"
+        )
+    name, kind = given[0].name, kinds[given[0].type]
+
+    def run(z: np.ndarray) -> np.ndarray:
+        rows = [session.run([told[0].name], {name: row[None].astype(kind)})[0] for row in np.asarray(z)]
+        return np.array(rows, float).reshape(len(rows), -1)
+
+    try:
+        found = run(np.zeros((1, features)))
+    except Exception as error:  # noqa: BLE001  as above
+        gist = str(error).strip().splitlines()[0]
+        raise ConfigError(f"{shown_path(path)}: it does not take {features} features: {gist}") from None
+    if found.shape != (1, corrects):
+        raise ConfigError(
+            f"{shown_path(path)}: it gives {found.shape[1]} numbers; it must give one for each of {corrects} corrected "
+            "states"
+        )
+    return run

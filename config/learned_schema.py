@@ -1,0 +1,120 @@
+"""The schema of a learned correction: a YAML of its own, which a twin's YAML names under `learned`.
+
+It holds what was learned from, so that what it says elsewhere can be computed again. The docstring under each field is
+its documentation.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
+
+from estimators.errors import ConfigError
+
+from .fields import NotNegative, Number, Positive, Positives, Section, Text, Texts, as_list
+from .files import read_text, shown_path
+from .problems import report, shown
+from .yaml_lines import Places, parse
+
+Table = Annotated[tuple[Annotated[tuple[Number, ...], Field(min_length=1)], ...], Field(min_length=2)]
+
+
+class LearnedHeadSection(Section):
+    """What a correction is of, and what it was worth."""
+
+    twin: Text
+    """Name of the twin whose physics it corrects."""
+    model: Text
+    """Name of its model: states and inputs of another mean something else."""
+    saved: Text
+    """When, as 2026-11-22T10:30:00Z."""
+    learned_on: Annotated[tuple[Text, ...], BeforeValidator(as_list, json_schema_input_type=str | list[str])] = ()
+    """The recordings from which it was learned."""
+    how: str = ""
+    """How it was chosen."""
+    scores: dict[str, Number] = {}
+    """What it was worth on the blocks that were held out: rmse.NAME, coverage.NAME, crps.NAME, nis, log_density, and
+    the same of the physics alone under physics.*."""
+
+
+class CorrectionSection(Section):
+    """A correction of the rates of some states by features, learned from windows of recordings (nisus learn)."""
+
+    learned: LearnedHeadSection
+    """What it is of."""
+    kind: Literal["gp", "ridge", "net"]
+    """gp: a Gaussian process. ridge: ridge regression. net: a network of an ONNX file, which makes the model a black
+    box."""
+    corrects: Texts
+    """The states whose rates are corrected."""
+    features: Texts
+    """States and inputs by which."""
+    noise: dict[str, NotNegative]
+    """Of each corrected state the variance that a second adds where the correction knows nothing, in the state's unit
+    squared: the noise NAME_learned, which may be tuned like any other."""
+    points: Table
+    """The features of each window, in their units, in the order of `features`."""
+    rates: Table | None = None
+    """By how much the physics was wrong there, in units of the corrected states a second. Not of a net."""
+    lengths: Positives | None = None
+    """gp: the length scale of each feature, in its unit."""
+    ratio: Positive | None = None
+    """gp: the variance that a window has beside the correction, over that of the correction."""
+    penalty: Positive | None = None
+    """ridge: what is added to the diagonal of its normal equations, of standardised features."""
+    degree: Literal[1, 2] = 1
+    """ridge: 2 has products and squares of the features too. Default: 1."""
+    net: Text | None = None
+    """net: the ONNX file, beside this one. It takes features (N, d) and gives rates (N, k)."""
+
+    @model_validator(mode="after")
+    def _fits(self) -> CorrectionSection:
+        needs = {"gp": ("rates", "lengths", "ratio"), "ridge": ("rates", "penalty"), "net": ("net",)}[self.kind]
+        for key in needs:
+            if getattr(self, key) is None:
+                raise PydanticCustomError(
+                    "neither", "is of kind {kind} and has no {key}", {"kind": self.kind, "key": key}
+                )
+        sizes = {"points": len(self.features), "rates": len(self.corrects)}
+        for key, size in sizes.items():
+            wrong = next((row for row in getattr(self, key) or () if len(row) != size), None)
+            if wrong is not None:
+                raise PydanticCustomError(
+                    "length", "has a row of {n} numbers; each needs {size}", {"n": len(wrong), "size": size, "key": key}
+                )
+        if self.rates is not None and len(self.rates) != len(self.points):
+            raise PydanticCustomError(
+                "length", "has {n} rows; points has {size}",
+                {"n": len(self.rates), "size": len(self.points), "key": "rates"},
+            )  # fmt: skip
+        if self.lengths is not None and len(self.lengths) != len(self.features):
+            raise PydanticCustomError(
+                "length", "has {n} numbers; it needs one for each of {size} features",
+                {"n": len(self.lengths), "size": len(self.features), "key": "lengths"},
+            )  # fmt: skip
+        if set(self.noise) != set(self.corrects):
+            raise PydanticCustomError(
+                "length", "names {names}; it must name each corrected state, and no other",
+                {"names": ", ".join(self.noise) or "nothing", "key": "noise"},
+            )  # fmt: skip
+        return self
+
+
+def load_correction(path: Path) -> tuple[CorrectionSection, Places]:
+    """Read and check a correction's file.
+
+    Raises:
+        ConfigError: With a line for each of the first problems.
+    """
+    file = shown_path(path)
+    data, places = parse(read_text(path, "nisus learn --help"), file)
+    if not isinstance(data, dict):
+        what = "empty" if data is None else shown(data)
+        raise ConfigError(f"{file}:1: the file is {what}; a correction is a mapping, written by `nisus learn`")
+    try:
+        return CorrectionSection.model_validate(data), places
+    except ValidationError as error:
+        raise report(error, data, places) from None

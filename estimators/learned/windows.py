@@ -1,0 +1,178 @@
+"""What there is to learn from a recording: windows of time, and the rates by which the physics was wrong in them.
+
+    r: x(t + T) = x̂(t + T | x(t), r),   dx̂ = (f + r) dt
+
+x is what is known of the states: the truth where the recording has it, else the smoothed estimate. x̂ begins there and
+goes through the window as f says, with the inputs that were, and a rate r beside it; states that are not corrected
+follow what is known of them, as sensors would keep them there. The features of a window are their means over its time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..compiled.model import compile_model
+from ..fold import Fold
+from ..log import INPUT, READING, RESET, Log, truth_of
+from ..model.hybrid import gathered, places
+from ..model.state_space import StateSpaceModel
+from ..numerics.steps import steps_of
+from ..smoothing.smooth import smooth
+
+SHORTEST = 0.5
+"""Share of a window's length that there must be of it, and the longest that it may last in such units the other way."""
+
+LITTLE = 1e-3
+"""Prior standard deviations by which a state is moved to see what a rate does."""
+
+
+class Windows(NamedTuple):
+    """M windows: features (M, d), rates (M, k) in units of the states a second, start and end (M,) in s, block (M,).
+
+    `block` is the recording's number of the stretch of time that each lies in, in order; `held_out` (M,) says whether
+    it is one to judge by.
+    """
+
+    features: np.ndarray
+    rates: np.ndarray
+    start: np.ndarray
+    end: np.ndarray
+    block: np.ndarray
+    held_out: np.ndarray
+
+    def of(self, rows: np.ndarray) -> Windows:
+        """Some of them."""
+        return Windows(*(column[rows] for column in self))
+
+    @staticmethod
+    def joined(parts: Sequence[Windows]) -> Windows:
+        """Those of several recordings, whose blocks stay apart."""
+        shifted, first = [], 0
+        for part in parts:
+            shifted.append(part._replace(block=part.block + first))
+            first += int(part.block.max(initial=-1)) + 1
+        return Windows(*(np.concatenate(columns) for columns in zip(*shifted, strict=True)))
+
+
+def known_states(fold: Fold, physics: StateSpaceModel) -> np.ndarray:
+    """What is known of the states of the physics (events, nx): the truth, between its events too; else smoothed.
+
+    Args:
+        fold: Over the whole log, of a model whose first states are those of the physics.
+        physics: The model that is to be corrected.
+
+    Raises:
+        EstimatorError: If the fold's filter cannot be smoothed.
+    """
+    log = fold.log
+    known = np.array(smooth(fold).mean[:, : physics.nx])
+    t = log.t[: log.n].astype(float)
+    for j in range(physics.nx):
+        rows, values = truth_of(log.events, j)
+        if rows.size and not physics.circular[j]:
+            known[:, j] = np.interp(t, t[rows], values)
+    return known
+
+
+def windows(
+    physics: StateSpaceModel, log: Log, known: np.ndarray, held_out: np.ndarray, *, corrects: Sequence[str],
+    features: Sequence[str], seconds: float, stretches: int,
+) -> Windows:  # fmt: skip
+    """Cut a log into windows.
+
+    Args:
+        physics: The model that is to be corrected.
+        log: What the asset said.
+        known: Its states at each event, see `known_states`.
+        held_out: Mask (events,) of the blocks that judge. A window that lies in both parts is left out.
+        corrects: States to correct.
+        features: States and inputs by which.
+        seconds: Length of a window.
+        stretches: Of time, by which windows are told apart (`Windows.block`).
+    """
+    t = log.t[: log.n]
+    u = _inputs(physics, log)
+    target, place = places(physics, corrects), places(physics, features)
+    values = gathered(known, u, place)
+    compiled = compile_model(physics)
+    p = np.array([item.value for item in physics.parameters], float)
+    count = int((t[-1] - t[0]) * 1e-9 / seconds)
+    edges = np.searchsorted(t, t[0] + np.round(np.arange(count + 1) * seconds * 1e9).astype(np.int64))
+    found = []
+    for k in range(count):
+        rows = slice(edges[k], edges[k + 1])
+        lasted = (t[min(edges[k + 1], log.n - 1)] - t[edges[k]]) * 1e-9
+        kinds = log.kind[rows]
+        judging = held_out[rows]
+        if not SHORTEST * seconds < lasted < seconds / SHORTEST or judging.any() != judging.all():
+            continue
+        if not np.any(kinds == READING) or np.any(kinds == RESET):
+            continue
+        whole = slice(edges[k], edges[k + 1] + 1)
+        rate = _rates(compiled.f, p, physics, t[whole], known[whole], u[whole], target)
+        if not np.all(np.isfinite(rate)):
+            continue
+        weight = np.diff(t[edges[k] : edges[k + 1] + 1]) * 1e-9
+        mean = weight @ values[rows] / lasted
+        found.append((mean, rate, t[edges[k]] * 1e-9, t[edges[k + 1]] * 1e-9, k * stretches // count, judging[0]))
+    return Windows(
+        np.array([item[0] for item in found], float).reshape(-1, len(features)),
+        np.array([item[1] for item in found], float).reshape(-1, len(corrects)),
+        np.array([item[2] for item in found], float),
+        np.array([item[3] for item in found], float),
+        np.array([item[4] for item in found], int),
+        np.array([item[5] for item in found], bool),
+    )
+
+
+def _inputs(model: StateSpaceModel, log: Log) -> np.ndarray:
+    """The inputs that hold from each event on (events, nu)."""
+    u = np.full((log.n, model.nu), np.nan)
+    told = log.kind[: log.n] == INPUT
+    u[told] = log.value[: log.n, : model.nu][told]
+    row = np.arange(log.n)
+    for j, item in enumerate(model.inputs):
+        given = np.isfinite(u[:, j])
+        last = np.maximum.accumulate(np.where(given, row, -1))
+        u[:, j] = np.where(last >= 0, u[np.maximum(last, 0), j], item.default)
+    return u
+
+
+def _rates(
+    f: Callable, p: np.ndarray, model: StateSpaceModel, t: np.ndarray, known: np.ndarray, u: np.ndarray,
+    target: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Constant rates (k,) beside the physics with which it leads from the first row to the last.
+
+    One step of Newton's method; NaN where it leads nowhere.
+    """
+    seconds = (t[-1] - t[0]) * 1e-9
+    little = LITTLE * model.prior_std[target] / seconds
+    turned = np.array([bool(model.circular[j]) for j in target])
+
+    def missed(rates: np.ndarray) -> np.ndarray:
+        x, out = known[0].copy(), np.empty(model.nx)
+        for i in range(len(t) - 1):
+            own = x[target]
+            x[:] = known[i]
+            x[target] = own
+            dt = (t[i + 1] - t[i]) * 1e-9
+            if dt > 0.0:
+                steps = steps_of(dt, model.max_step)
+                for _ in range(steps):
+                    f(x, u[i], p, dt / steps, out)
+                    x[:] = out
+                    x[target] += rates * dt / steps
+        off = known[-1][target] - x[target]
+        return np.where(turned, (off + np.pi) % (2.0 * np.pi) - np.pi, off)
+
+    off = missed(np.zeros(target.size))
+    slopes = np.array([(off - missed(rates)) / rates[c] for c, rates in enumerate(np.diag(little))]).T
+    with np.errstate(all="ignore"):
+        try:
+            return np.asarray(np.linalg.solve(slopes, off))
+        except np.linalg.LinAlgError:
+            return np.full(target.size, np.nan)

@@ -1,0 +1,191 @@
+"""Learned corrections: what one adds to the rates of some states, and what share of its ignorance is left there.
+
+A correction has learned from windows of recordings: their features z (d of the model's states and inputs), and the
+rates r, units of the state a second, by which the physics was wrong in them. It gives m(z), and s(z) from 0 to 1: the
+variance that is left beside that of knowing nothing. Far from its windows m → 0 and s → 1, which leaves the physics.
+
+Gaussian process, the prior variance being 1 for all corrected states:
+
+    κᵢ = exp(-½ Σⱼ ((zⱼ - Zᵢⱼ) / ℓⱼ)²),   m = κᵀ (K + ρ I)⁻¹ r,   s = 1 - κᵀ (K + ρ I)⁻¹ κ
+
+Ridge, over φ = (1, z, and for degree 2 all zᵢ zⱼ) of standardised features, where D is the Mahalanobis distance from
+the windows and g = exp(-½ max(0, D - reach)²) how far it is believed:
+
+    m = g φᵀ A⁻¹ Φᵀ r,   A = ΦᵀΦ + λ I,   s = 1 - g (1 - min(1, λ φᵀ A⁻¹ φ / mean |Φ|²))
+
+A net that somebody else has trained says m itself, and is believed as far as ridge is: m = g·net(z), s = 1 - g.
+
+Sources: Rasmussen & Williams (2006), Gaussian Processes for Machine Learning, (2.25), (2.26), and 2.1.1 for ridge as
+what is believed of weights; Ko & Fox (2009), GP-BayesFilters, doi:10.1007/s10514-009-9119-x, for Q of x from s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import cho_solve, solve_triangular
+
+from .correction_loops import (
+    net_share,
+    process_add,
+    process_share,
+    process_slope,
+    ridge_add,
+    ridge_share,
+    ridge_slope,
+)
+
+APART = 0.01
+"""Added to the diagonal of a correlation of features: two that say the same may differ by a tenth of a deviation."""
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianProcess:
+    """A Gaussian process over points (M, d) at which the rates (M, k) were, with length scales (d,), and ρ, `ratio`.
+
+    ρ is the variance that a window has beside the correction, over that of the correction.
+    """
+
+    points: np.ndarray
+    rates: np.ndarray
+    lengths: np.ndarray
+    ratio: float
+
+    @cached_property
+    def data(self) -> tuple[np.ndarray, ...]:
+        """What the compiled functions take: Z / ℓ, 1 / ℓ, weights (M, k), and L⁻¹ (M, M) with L Lᵀ = K + ρ I."""
+        scaled = np.ascontiguousarray(self.points / self.lengths)
+        K = self._near(self.points) + self.ratio * np.eye(len(scaled))
+        L = np.linalg.cholesky(K)
+        weights = cho_solve((L, True), self.rates)
+        root = solve_triangular(L, np.eye(len(K)), lower=True)
+        return scaled, 1.0 / self.lengths, np.ascontiguousarray(weights), np.ascontiguousarray(root)
+
+    def _near(self, z: np.ndarray) -> np.ndarray:
+        """κ (N, M) of features z (N, d)."""
+        off = z[:, None, :] / self.lengths - self.points / self.lengths
+        near: np.ndarray = np.exp(-0.5 * np.sum(off**2, axis=-1))
+        return near
+
+    def mean(self, z: np.ndarray) -> np.ndarray:
+        """m (N, k) at features z (N, d)."""
+        found: np.ndarray = self._near(z) @ self.data[2]
+        return found
+
+    def share(self, z: np.ndarray) -> np.ndarray:
+        """s (N,) at features z (N, d)."""
+        explained = np.sum((self._near(z) @ self.data[3].T) ** 2, axis=1)
+        return np.clip(1.0 - explained, 0.0, 1.0)
+
+    @property
+    def functions(self) -> tuple[Callable, Callable, Callable]:
+        """Plain functions that are compiled: they add m, its slope, and say s."""
+        return process_add, process_slope, process_share
+
+
+@dataclass(frozen=True, eq=False)
+class Ridge:
+    """Ridge regression on points (M, d) at which the rates (M, k) were, with the penalty λ, of degree 1 or 2."""
+
+    points: np.ndarray
+    rates: np.ndarray
+    penalty: float
+    degree: int = 1
+
+    @cached_property
+    def terms(self) -> np.ndarray:
+        """Of each entry of φ the features that it is the product of, (n, 2); -1 for none."""
+        d = self.points.shape[1]
+        pairs = [(-1, -1), *((i, -1) for i in range(d))]
+        if self.degree > 1:
+            pairs += [(i, j) for i in range(d) for j in range(i, d)]
+        return np.array(pairs, np.int64)
+
+    @cached_property
+    def data(self) -> tuple[np.ndarray, ...]:
+        """What the compiled functions take: `support`, terms, weights (n, k), and C (n, n): s = 1 - g (1 - φᵀCφ)."""
+        centre, scale, precision, reach = support(self.points)
+        phi = self._phi((self.points - centre) / scale)
+        A = phi.T @ phi + self.penalty * np.eye(phi.shape[1])
+        L = np.linalg.cholesky(A)
+        inverse = cho_solve((L, True), np.eye(len(A)))
+        C = self.penalty * inverse / np.mean(np.sum(phi**2, axis=1))
+        return centre, scale, precision, reach, self.terms, cho_solve((L, True), phi.T @ self.rates), C
+
+    def _phi(self, z: np.ndarray) -> np.ndarray:
+        whole = np.concatenate((z, np.ones((len(z), 1))), axis=1)  # the last column, at -1, is 1
+        phi: np.ndarray = whole[:, self.terms[:, 0]] * whole[:, self.terms[:, 1]]
+        return phi
+
+    def mean(self, z: np.ndarray) -> np.ndarray:
+        """m (N, k) at features z (N, d)."""
+        centre, scale, _, _, _, weights, _ = self.data
+        found: np.ndarray = believed(z, self.data)[:, None] * (self._phi((z - centre) / scale) @ weights)
+        return found
+
+    def share(self, z: np.ndarray) -> np.ndarray:
+        """s (N,) at features z (N, d)."""
+        centre, scale, *_, C = self.data
+        phi = self._phi((z - centre) / scale)
+        left = np.minimum(1.0, np.einsum("ni,ij,nj->n", phi, C, phi))
+        return 1.0 - believed(z, self.data) * (1.0 - left)
+
+    @property
+    def functions(self) -> tuple[Callable, Callable, Callable]:
+        """Plain functions that are compiled: they add m, its slope, and say s."""
+        return ridge_add, ridge_slope, ridge_share
+
+
+@dataclass(frozen=True, eq=False)
+class Net:
+    """A function of features (N, d) that gives rates (N, k), believed as far as the points (M, d) reach.
+
+    It is not compiled, so the model that it corrects becomes a black box.
+    """
+
+    points: np.ndarray
+    run: Callable[[np.ndarray], np.ndarray]
+
+    @cached_property
+    def data(self) -> tuple[np.ndarray, ...]:
+        """What the compiled function takes: see `support`."""
+        return support(self.points)
+
+    def mean(self, z: np.ndarray) -> np.ndarray:
+        """m (N, k) at features z (N, d)."""
+        found: np.ndarray = believed(z, self.data)[:, None] * self.run(z)
+        return found
+
+    def share(self, z: np.ndarray) -> np.ndarray:
+        """s (N,) at features z (N, d)."""
+        return 1.0 - believed(z, self.data)
+
+    @property
+    def functions(self) -> tuple[None, None, Callable]:
+        """Only s is compiled."""
+        return None, None, net_share
+
+
+Correction = GaussianProcess | Ridge | Net
+
+
+def support(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Where points (M, d) lie: centre and scale (d,), inverse correlation (d, d), and their greatest distance (1,)."""
+    centre, scale = points.mean(axis=0), points.std(axis=0)
+    z = (points - centre) / scale
+    d = points.shape[1]
+    precision = np.linalg.inv(z.T @ z / len(z) + APART * np.eye(d))
+    reach = np.sqrt(np.max(np.einsum("ni,ij,nj->n", z, precision, z)))
+    return centre, scale, precision, np.array([reach])
+
+
+def believed(z: np.ndarray, data: tuple[np.ndarray, ...]) -> np.ndarray:
+    """g (N,) at features z (N, d), of a support."""
+    centre, scale, precision, reach = data[:4]
+    off = (z - centre) / scale
+    beyond = np.maximum(0.0, np.sqrt(np.einsum("ni,ij,nj->n", off, precision, off)) - reach[0])
+    g: np.ndarray = np.exp(-0.5 * beyond**2)
+    return g

@@ -1,0 +1,90 @@
+"""A correction's file beside a twin: what is wrong with it is one line with its place."""
+
+import pytest
+
+from app.cli.opener import opened_twin
+from app.twin.twin import load_twin
+from estimators.errors import ConfigError
+from estimators.models import MODELS
+
+RIGHT = """\
+learned: {twin: motor_winding, model: motor_winding, saved: 2026-11-22T10:30:00Z}
+kind: gp
+corrects: [temperature]
+features: [temperature]
+noise: {temperature: 0.25}
+lengths: [10]
+ratio: 1
+points: [[20], [30], [40]]
+rates: [[0.1], [0.2], [0.1]]
+"""
+TWIN = """\
+model: motor_winding
+learned: correction.yaml
+source: {type: simulator, seed: 1, step: 1.0, duration: 60}
+"""
+
+
+def twin_with(folder, text):
+    (folder / "correction.yaml").write_text(text)
+    (folder / "motor.yaml").write_text(TWIN)
+    return load_twin(folder / "motor.yaml")
+
+
+def test_what_it_says_is_in_the_model(tmp_path):
+    model = twin_with(tmp_path, RIGHT).model
+    assert [(item.name, item.unit, item.variance) for item in model.noises][-1] == (
+        "temperature_learned",
+        "°C²/s",
+        0.25,
+    )
+    # The same content is the same object, and what was compiled of it.
+    assert twin_with(tmp_path, RIGHT).model.f is model.f
+    assert twin_with(tmp_path, RIGHT.replace("0.2", "0.3")).model.f is not model.f
+
+
+def test_its_noise_is_tuned_like_any_other(tmp_path):
+    twin = twin_with(tmp_path, RIGHT)
+    assert "Q.temperature_learned" in twin.tuning.keys()
+    changed = load_twin(tmp_path / "motor.yaml", overrides={"Q.temperature_learned": "0.5"})
+    assert changed.tuning.q[-1] == 0.5
+
+
+def test_a_twin_without_is_what_it_was(tmp_path):
+    twin_with(tmp_path, RIGHT)
+    bare = load_twin(tmp_path / "motor.yaml", overrides={"learned": "null"})
+    alone = load_twin("motor_winding").model
+    assert bare.model.f is alone.f and bare.model.Q is alone.Q and bare.model.noises == MODELS["motor_winding"].noises
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ("kind: gp", "kind: gpp", "correction.yaml:2: kind is 'gpp'; it must be 'gp', 'ridge' or 'net'"),
+        ("ratio: 1\n", "", "correction.yaml:1: the file is of kind gp and has no ratio; add it"),
+        ("lengths: [10]", "lengths: [10, 2]", "lengths has 2 numbers; it needs one for each of 1 features"),
+        ("[[20], [30], [40]]", "[[20], [30, 1], [40]]", "points has a row of 2 numbers; each needs 1"),
+        ("[[0.1], [0.2], [0.1]]", "[[0.1], [0.2]]", "rates has 2 rows; points has 3"),
+        ("noise: {temperature: 0.25}", "noise: {rate: 0.25}", "noise names rate; it must name each corrected state"),
+        ("model: motor_winding", "model: motor_drive", "learned.model is 'motor_drive'; that of motor is"),
+        ("features: [temperature]", "features: [temprature]", "has no state or input 'temprature'"),
+        ("lengths: [10]", "lengths: [0]", "correction.yaml:6: lengths[0] is 0; it must be positive"),
+        ("ratio: 1", "ratio: 1\nmore: 2", "more is not known"),
+    ],
+)
+def test_what_is_wrong_has_its_line(tmp_path, before, after, said):
+    assert before in RIGHT
+    with pytest.raises(ConfigError) as caught:
+        twin_with(tmp_path, RIGHT.replace(before, after))
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    (tmp_path / "motor.yaml").write_text(TWIN)
+    with pytest.raises(ConfigError, match="motor.yaml:2: learned is 'correction.yaml'; there is no file"):
+        load_twin(tmp_path / "motor.yaml")
+
+
+def test_a_page_looks_at_it_too(tmp_path):
+    twin_with(tmp_path, RIGHT)
+    assert tmp_path / "correction.yaml" in opened_twin(str(tmp_path / "motor.yaml")).files
