@@ -10,10 +10,10 @@ from typing import Any
 
 from config.tunings import SPREADS
 from config.yaml_lines import parse
+from config.yaml_text import as_flow
 from estimators.errors import ConfigError
 from estimators.registry import find_entry
 
-from ..runs.tuning_yaml import as_flow
 from .verdict import Advice
 
 ESTIMATOR = re.compile(r"^estimator[ \t]*:[^\n]*\n(?:(?:[ \t]*\n)*[ \t]+\S[^\n]*\n)*", re.MULTILINE)

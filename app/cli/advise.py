@@ -16,8 +16,8 @@ from ..advice.verdict import Advice
 from ..advice.verdict import advise as verdict
 from ..twin.twin import load_twin
 from .advise_text import as_text
-from .arguments import settings
 from .fold import read_log
+from .given import settings
 from .prepare import attend, prepare
 
 if TYPE_CHECKING:

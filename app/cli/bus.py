@@ -13,7 +13,7 @@ from estimators.errors import ConfigError
 from ..signals import restore, when_asked_to_end
 from ..stderr import complain
 from ..twin.twin import Twin, load_twin
-from .arguments import settings
+from .given import settings
 
 if TYPE_CHECKING:
     from .arguments import Bus

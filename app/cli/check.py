@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 from ..export.html import as_html
 from ..twin.twin import load_twin
-from .arguments import settings
 from .check_figures import figures
 from .check_tables import sections
 from .check_text import as_text
 from .checked import Checked, check
 from .fold import read_log
+from .given import settings
 from .prepare import attend, prepare
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ from estimators.track import DIVERGED, FAILED, GATED, SCREENED, STALE
 from ..engine.stall import interruptible
 from ..tunings.section_text import write_section
 from ..twin.twin import load_twin
-from .arguments import settings
 from .fold import read_log
+from .given import settings
 from .prepare import prepare
 
 if TYPE_CHECKING:

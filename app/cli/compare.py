@@ -19,11 +19,11 @@ from estimators.registry import ESTIMATORS, find_estimator, unfit
 
 from ..stderr import complain
 from ..twin.twin import Twin, load_twin
-from .arguments import settings
 from .beside import beside, jobs_of
 from .compare_fold import BUDGET, Row, fold_row
 from .compare_table import cells, printed
 from .fold import read_log
+from .given import settings
 from .prepare import prepare
 from .progress import progress
 from .scores import write_scores

@@ -31,10 +31,10 @@ from ..export.report import Reported, report
 from ..export.track_file import encoded
 from ..intake import Intake
 from ..twin.twin import Twin, load_twin
-from .arguments import settings
 from .fold_episodes import blamed, dropped, episode_lines
 from .fold_report import as_dict, as_text, calibration_of
 from .fold_smoothed import Better
+from .given import settings
 from .prepare import attend, prepare
 from .remarks import remarking
 

@@ -14,9 +14,9 @@ from estimators.errors import ConfigError, printable
 from ..export.parts import Part
 from ..guard.junit import Guarded, junit
 from ..guard.last import keep_last
-from .arguments import settings
 from .beside import beside, jobs_of
 from .check_text import as_text
+from .given import settings
 from .guard_archive import Archived, chosen
 from .guard_fold import Wanted, guarded
 from .places import check_place

@@ -29,9 +29,9 @@ from ..stderr import complain
 from ..twin.learned import run_net
 from ..twin.model import physics_of
 from ..twin.twin import Twin, load_twin
-from .arguments import settings
 from .check_text import as_text
 from .fold import read_log
+from .given import settings
 from .learn_file import correction_text, noises_of
 from .learn_text import Lesson, as_dict, scores_of, sections
 from .places import check_place

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from config.learned_schema import LearnedHeadSection
+from config.yaml_text import as_flow, as_section
 from estimators.learned.train import Trained
 from estimators.model.correction import Correction, GaussianProcess, Net, Ridge
 from estimators.model.state_space import StateSpaceModel
 
-from ..runs.tuning_yaml import as_flow, as_section
 from ..tunings.keep import now
 from ..twin.twin import Twin
 

@@ -34,8 +34,8 @@ from .arguments import (
     Tune,
     Tunings,
     Twins,
-    check_numbers,
 )
+from .given import check_numbers
 
 
 def carry_out(command: Command) -> int:

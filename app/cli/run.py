@@ -16,7 +16,7 @@ from ..recording.split import NEVER, parse_split
 from ..server.port import check_port
 from ..session import Page
 from ..stderr import complain
-from .arguments import settings
+from .given import settings
 from .opener import FileOpener, live_source, open_session, opened_twin
 from .prepare import prepare
 

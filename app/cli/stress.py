@@ -22,7 +22,7 @@ from ..stress.matrix import matrix
 from ..stress.mistake import Mistake
 from ..stress.trial import FALSE, MISNAMED, MISSED, NAMED, UNSEEN, Trial, make
 from ..twin.twin import load_twin
-from .arguments import settings
+from .given import settings
 from .prepare import prepare
 from .progress import progress
 

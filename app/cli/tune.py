@@ -21,9 +21,9 @@ from ..tunings.fitted import settings_of
 from ..tunings.keep import check_free, keep, version_text
 from ..twin.bounds import bounds_of, natural_aim
 from ..twin.twin import Twin, load_twin
-from .arguments import settings
 from .check_text import as_text
 from .fold import read_log
+from .given import settings
 from .places import check_place
 from .prepare import attend, prepare
 from .tune_text import heading, sections

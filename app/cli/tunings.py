@@ -18,9 +18,9 @@ from ..tunings.figures import COVERAGE, figures
 from ..tunings.keep import Settings, accept, keep, version_text
 from ..tunings.listing import listing
 from ..twin.twin import load_twin
-from .arguments import settings
 from .check_text import as_text
 from .fold import read_log
+from .given import settings
 from .prepare import prepare
 
 if TYPE_CHECKING:

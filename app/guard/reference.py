@@ -12,10 +12,9 @@ from config.files import read_text, shown_path
 from config.guard_schema import ReferenceSection
 from config.problems import report, shown
 from config.yaml_lines import parse
+from config.yaml_text import as_flow
 from estimators.errors import ConfigError
 from estimators.log import Log
-
-from ..runs.tuning_yaml import as_flow
 
 DIGITS = 10
 """Significant digits of a figure: a thousandth of what it may change by at least."""

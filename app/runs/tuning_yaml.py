@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from config.schema import TwinSection
+from config.yaml_text import as_flow, as_section
 from estimators.errors import LARGEST
 from estimators.estimator import Estimator
 from estimators.model.coloured import disturbance_time, error_time, errors_of
@@ -17,9 +16,6 @@ from estimators.registry import find_entry
 from estimators.tuning import REOPEN, Tuning
 
 from ..twin.bounds import bounds_of
-
-PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
-RESERVED = {"null", "true", "false"}
 
 
 def tuning_yaml(
@@ -132,25 +128,3 @@ def _option(entry: Estimator, name: str, value: float) -> float | str:
     """An option's value, a choice by its word."""
     choices = next((option.choices for option in entry.options if option.name == name), ())
     return choices[round(value)] if choices else float(value)
-
-
-def as_section(name: str, items: Mapping[str, Any]) -> list[str]:
-    """A section as lines, an entry each; none if it is empty."""
-    return [f"{name}:", *(f"  {_key(key)}: {as_flow(value)}" for key, value in items.items())] if items else []
-
-
-def _key(name: str) -> str:
-    return name if PLAIN.fullmatch(name) and name.lower() not in RESERVED else json.dumps(name, ensure_ascii=False)
-
-
-def as_flow(value: Any) -> str:
-    """A value in one line of YAML."""
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_key(key)}: {as_flow(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(map(as_flow, value)) + "]"
-    if isinstance(value, str):
-        return _key(value)
-    if isinstance(value, float) and value == round(value) and abs(value) < 1e15:
-        return str(int(value))
-    return json.dumps(value)

@@ -10,10 +10,11 @@ from pathlib import Path
 from config.files import shown_path
 from config.tuning_schema import AcceptedSection, EvidenceSection, VersionSection
 from config.tunings import Version, check_name, folders, load_version, version_of
+from config.yaml_text import as_section
 from estimators.errors import ConfigError
 from estimators.tuning import Tuning
 
-from ..runs.tuning_yaml import as_section, tuning_yaml
+from ..runs.tuning_yaml import tuning_yaml
 from ..twin.twin import Twin
 from .section_text import write_section
 
