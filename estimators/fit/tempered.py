@@ -5,10 +5,13 @@
 If the model is right, η = 1. The model of an asset errs slowly, so that a thousand readings say as much as ten would,
 and the likelihood is sure of what it cannot know: it explains the one stretch that it was fitted to, with noises under
 which what is not measured leaves its band. A smaller power counts readings for fewer, and entries go back to where they
-were, those first of which the data tell least. The power is that with which the blocks held out are predicted best, of
-those with which nothing else is predicted worse. Where witnesses tell, of which few errors are independent, it is the
-smallest that is no worse than that by more than chance (two standard errors of the difference), if there is one with
-which all of them stay in their bands.
+were, those first of which the data tell least.
+
+Where nothing but readings tells, the likelihood is believed unless there is evidence against it: of the powers that
+predict nothing that was held out worse, the largest is taken with which the blocks held out are predicted no worse than
+with the best by more than chance (two standard errors of the difference). Where witnesses tell, of which few errors are
+independent, it is the smallest of those with which the fit is proposed, if there is one with which all witnesses stay
+in their bands.
 
 The maximum at a power is taken from the parabola at the maximum x̂ of power 1, with H minus its second derivatives, D
 those of the belief in x_0: x(η) = x_0 + (η (H - D) + D)⁻¹ η H (x̂ - x_0). What each is worth is known by folding.
@@ -24,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .aims import Aim
+from .aims import LIKELIHOOD, Aim
 from .entries import Setting
 from .judge import Worth, gain
 from .laplace import Curvature
@@ -86,7 +89,14 @@ def at_power(objective: Objective, x: np.ndarray, shape: Curvature, power: float
 
 
 def _chosen(own: Worth, others: Sequence[Worth], verdicts: Sequence[Verdict], aim: Aim) -> int:
-    """Which power: of those with which the fit is proposed; else that of 1, whose reasons are told."""
+    """Which power: of those with which the fit is proposed; else that of 1, whose reasons are told.
+
+    Where nothing but readings tells, of those that do no harm, as each that is tried may win by chance.
+    """
+    if aim.kind == LIKELIHOOD:
+        harmless = [k for k, item in enumerate(verdicts) if item.harmless]
+        best = max(harmless, key=lambda k: verdicts[k].gain, default=0)
+        return next((k for k in harmless if _as_good(others[k], others[best])), 0)
     proposed = [k for k, item in enumerate(verdicts) if item.proposed]
     if not proposed:
         return 0
@@ -94,11 +104,13 @@ def _chosen(own: Worth, others: Sequence[Worth], verdicts: Sequence[Verdict], ai
     best = max(proposed, key=lambda k: verdicts[k].gain)
     if not aim.weights:
         return best
-    for k in reversed(proposed):
-        less, error = gain(others[k].held_out.aimed, others[best].held_out.aimed)
-        if less <= SURE * error:
-            return k
-    return best
+    return next(k for k in reversed(proposed) if _as_good(others[k], others[best]))
+
+
+def _as_good(one: Worth, best: Worth) -> bool:
+    """Whether what one of them predicts of the blocks held out is no worse than the best by more than chance."""
+    less, error = gain(one.held_out.aimed, best.held_out.aimed)
+    return less <= SURE * error
 
 
 def _in_band(own: Worth, other: Worth) -> bool:

@@ -33,7 +33,7 @@ class Verdict(NamedTuple):
     """Whether the fit is proposed.
 
     With the mean gain on the blocks held out, `each` of what that is in nats, its standard error, and the reasons
-    against it.
+    against it. `harmless` is whether nothing that was held out is predicted worse, though it may not gain either.
     """
 
     proposed: bool
@@ -41,6 +41,7 @@ class Verdict(NamedTuple):
     error: float
     reasons: tuple[str, ...]
     each: str = "a reading"
+    harmless: bool = False
 
 
 def verdict(before: Worth, after: Worth, aim: Aim, *, changed: bool = True) -> Verdict:
@@ -59,11 +60,15 @@ def verdict(before: Worth, after: Worth, aim: Aim, *, changed: bool = True) -> V
         reasons.append(f"it does not predict the blocks held out better: {mean:+.3g} ± {error:.2g} {unit}")
     elif aim.kind in EACH and mean * other.aimed.size < LEAST:
         reasons.append(f"what it gains is next to nothing: {mean * other.aimed.size:.2g} nats in all")
-    for kind, olds, news in _judges(one, other):
-        for name, old in olds.items():
-            if name in news:
-                reasons += _against(f"{kind} {name}, held out,", old, news[name])
-    return Verdict(not reasons, mean, error, tuple(reasons), each)
+    against = [
+        reason
+        for kind, olds, news in _judges(one, other)
+        for name, old in olds.items()
+        if name in news
+        for reason in _against(f"{kind} {name}, held out,", old, news[name])
+    ]
+    reasons += against
+    return Verdict(not reasons, mean, error, tuple(reasons), each, not against)
 
 
 def _judges(one: Part, other: Part) -> list[tuple[str, dict[str, Prediction], dict[str, Prediction]]]:
