@@ -43,7 +43,7 @@ def tune_windows(arguments: Arguments, wanted: Sequence[str], recordings: Record
     assert arguments.windows is not None
     window = _seconds("--windows", arguments.windows)
     every = window if arguments.every is None else _seconds("--every", arguments.every)
-    if arguments.aim != LIKELIHOOD:
+    if arguments.aim not in (None, LIKELIHOOD):
         raise ConfigError(f"--aim {arguments.aim}: windows are fitted by their likelihood; leave it out")
     twin, given = recordings(arguments)
     if any(item.weight != 1.0 for item in given):
