@@ -147,10 +147,11 @@ class Recorder:
 
     def _finish(self, part: _Part, *, short: bool = False, goes_on: bool = False) -> None:
         part.end(short=short)
+        # In this order, so that whoever lists the files meanwhile never misses it.
+        self.finished.append(part.file.path)
         self._open = None
         if not goes_on:
             part.release()
-        self.finished.append(part.file.path)
         self._engine.notices.say(f"recorded {part.file.rows} rows into {part.file.path}")
 
     def _reason(self, error: Exception) -> str:

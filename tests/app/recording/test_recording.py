@@ -14,6 +14,7 @@ from app.cli.main import main
 from app.engine import commands
 from app.engine.engine import Engine
 from app.engine.outputs import Pull
+from app.recording import writer
 from app.recording.format import RecordingFile, tuning_from_json
 from app.recording.reader import finished, read_recording
 from app.recording.writer import Recorder
@@ -111,6 +112,25 @@ def test_several_recordings_one_after_the_other(running, tmp_path):
         wait_for(lambda name=name: tmp_path / name in recorder.finished)
     assert read_recording(tmp_path / "a.rrd").rows == 2
     assert read_recording(tmp_path / "b.rrd").rows == 2
+
+
+def test_a_recording_that_is_being_finished_is_among_the_files(running, tmp_path, monkeypatch):
+    source, engine, recorder = running
+    path = tmp_path / "run.rrd"
+    source.put(readings([1.0, 2.0], [40, 41]))
+    seen, release = [], writer._Part.release
+
+    def releasing(part):
+        seen.append(list(recorder.written))
+        release(part)
+
+    monkeypatch.setattr(writer._Part, "release", releasing)
+    engine.submit(commands.Record(path))
+    wait_for(path.is_file)
+    engine.submit(commands.Record(None))
+    wait_for(lambda: recorder.finished == [path])
+    wait_for(lambda: seen)
+    assert seen == [[path]] and recorder.written == [path]
 
 
 def test_place_that_cannot_be_written_is_one_line_and_the_twin_goes_on(running, tmp_path):
