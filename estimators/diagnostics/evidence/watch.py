@@ -83,6 +83,15 @@ def _is_copy(i, track):
 
 
 @part
+def _says(y, count):
+    """Whether a reading has a value in any of its rows."""
+    for k in range(count):
+        if np.isfinite(y[k]):
+            return True
+    return False
+
+
+@part
 def _hear(i, now, y, s, context, policy, state, track):
     """Put a reading y of sensor s, and the variances that it may have brought, to all tests."""
     width = track.alarms.shape[1]
@@ -227,11 +236,13 @@ def watch_rows(first, last, t, kind, channel, value, context, policy, state, tra
         for k in range(width):
             track.alarms[i, k] = 0
         if kind[i] == READING:
-            if track.verdict[i] != SCREENED:
-                state[HEARD] = 1.0
-            if not _is_copy(i, track):
-                y = floats(value[i:].ctypes.data, value.shape[1])
-                _hear(i, now, y, channel[i], context, policy, state, track)
+            y = floats(value[i:].ctypes.data, value.shape[1])
+            # A sensor that says no value is as silent as one that does not speak.
+            if _says(y, sensor_rows(context, channel[i])[1]):
+                if track.verdict[i] != SCREENED:
+                    state[HEARD] = 1.0
+                if not _is_copy(i, track):
+                    _hear(i, now, y, channel[i], context, policy, state, track)
             if np.isfinite(track.effective[i]):
                 _count_particles(track.effective[i], track.ancestors[i], state)
         elif kind[i] == TRUTH:

@@ -250,8 +250,10 @@ def by_definition(events, track, gate, baseline, expected):
         alarms = np.zeros(track.alarms.shape[1], int)
         if kind == READING:
             verdict = track.verdict[i]
-            heard |= verdict != SCREENED
-            if not np.any(track.screened[i] & DUPLICATE):
+            # Without a value in any row it says no more than silence does.
+            says = bool(np.isfinite(events.value[i, : len(ROWS[s])]).any())
+            heard |= says and verdict != SCREENED
+            if says and not np.any(track.screened[i] & DUPLICATE):
                 sensor = sensors[s]
                 sensor.speaks(now)
                 judged = verdict in (USED, GATED)
