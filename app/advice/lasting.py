@@ -103,7 +103,7 @@ def lasting(measured: Measured, estimator: str, options: Mapping[str, float] | N
         f"row{'s' if len(related) > 1 else ''} that followed themselves by up to {worst:+.2f}, "
         + (f"{len(left)} still do{'es' * (len(left) == 1)}, {left[0].subject} most" if left else "none does any more")
     )
-    remedy = "put the lines with `over` into the YAML, then nisus tune fits their size and time"
+    remedy = "with the lines with `over` in the YAML, nisus tune fits their size and time"
     return Claim("lasting", QUESTION, NO if left else YES, figure, LIMITS.correlation, OF, reason, remedy), found
 
 

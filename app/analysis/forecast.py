@@ -115,6 +115,12 @@ class Forecasts:
             most=TIMES,
             between=between,
         )
+        lost = (~(np.abs(found.mean) <= LARGEST) & np.isfinite(found.mean[0])).any(axis=1)
+        if lost.any():
+            raise ConfigError(
+                f"forecast: {float(found.t[np.argmax(lost)]):.4g} s from now a state is beyond {LARGEST:g}, or no "
+                "number; are the inputs possible? or ask for a shorter horizon"
+            )
         told = forecast_json(self._engine.model, here, found)
         chosen = {name: told_changes(changes) for name, changes in inputs.items()}
         return {**told, "chosen": chosen, "step": step, "took": time.monotonic() - begun}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -30,6 +31,7 @@ from ..export.html import as_html
 from ..export.report import Reported, report
 from ..export.track_file import encoded
 from ..intake import Intake
+from ..recording.format import TAKEN
 from ..twin.twin import Twin, load_twin
 from .fold_episodes import blamed, dropped, episode_lines
 from .fold_report import as_dict, as_text, calibration_of
@@ -105,6 +107,8 @@ def fold_twin(arguments: Arguments) -> int:
     )
     if arguments.out is not None and arguments.out.suffix not in (".csv", ".parquet", ".rrd"):
         raise ConfigError(f"--out {arguments.out}: must end in .csv, .parquet or .rrd")
+    if arguments.out is not None and arguments.out.suffix == ".rrd" and os.path.lexists(arguments.out):
+        raise ConfigError(f"--out {arguments.out}: {TAKEN}")
     if arguments.smooth:
         check_smooth(find_estimator(twin.estimator, twin.model), twin.model, twin.tuning.options)
     prepare(twin)

@@ -76,5 +76,9 @@ def run_twin(arguments: Run, workers: Sequence[Worker] = ()) -> int:
         failures = dict.fromkeys([*failed, *(line.text for line in lines if line.level == "error")])
         for text in list(failures)[:SAID]:
             complain(text)
+        refits = [line.text for line in lines if line.text.startswith("refit ")]
+        for k, text in enumerate(refits):
+            if "adopted" in text or k >= len(refits) - SAID:
+                complain(text)
         return 2 if failed else 0
     return 0

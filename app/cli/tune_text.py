@@ -14,6 +14,7 @@ from ..twin.twin import Twin
 
 ALONE = "left alone: the data cannot tell"
 BOUND = "only a bound: the data cannot tell it from none"
+EDGE = "at the edge of its range: the best may lie beyond"
 TEMPERED = (
     "Of what the fitted blocks say {:.2g} is believed: with more of it the blocks held out are predicted no better."
 )
@@ -66,6 +67,8 @@ def _entries(twin: Twin, fitted: Fitted) -> Section:
 def _remark(line: Line) -> str:
     if line.alone:
         return ALONE
+    if line.edge and line.told:
+        return EDGE
     return BOUND if not line.told else ""
 
 

@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 
 Recordings = Callable[["Arguments"], tuple[Twin, list[Given]]]
 
+UNSEEN = 0.05
+"""Share of a window up to which nobody need be told that the end of a log is in none."""
+
 
 def tune_windows(arguments: Arguments, wanted: Sequence[str], recordings: Recordings) -> int:
     """Carry the command out; `recordings` reads what is named.
@@ -70,11 +73,12 @@ def tune_windows(arguments: Arguments, wanted: Sequence[str], recordings: Record
 
     found = attend(twin.model, work, "fitting window after window")
     origins = [int(item.log.t[0]) for item in given]
+    ends = [int(item.log.t[item.log.n - 1]) for item in given]
     if arguments.json:
         told = [window_json(k, refit, origins[k]) for k, refit in found]
         print(json.dumps({"twin": twin.name, "window": window, "every": every, "windows": told}, allow_nan=False))
     else:
-        print("\n".join(as_text([*_sections(found, origins), _verdict(twin, found, origins)])))
+        print("\n".join(as_text([*_sections(found, origins), _verdict(twin, found, origins, ends)])))
     adopted = [refit.fitted for _, refit in found if refit.fitted is not None and refit.proposed]
     if not adopted:
         return 1
@@ -162,8 +166,8 @@ def _row(refit: Refit, line: Line | None) -> tuple[str, ...]:
     return (f"{line.after:.4g}", f"{line.low:.4g} to {line.high:.4g}{bound}", f"{shift(line):+.1f}", gain, kept)
 
 
-def _verdict(twin: Twin, found: Sequence[tuple[int, Refit]], origins: Sequence[int]) -> Section:
-    """How many were adopted, and of each other one why not."""
+def _verdict(twin: Twin, found: Sequence[tuple[int, Refit]], origins: Sequence[int], ends: Sequence[int]) -> Section:
+    """How many were adopted, of each other one why not, and what no window looked at."""
     adopted = sum(refit.proposed for _, refit in found)
     folds = sum(refit.fitted.folds for _, refit in found if refit.fitted is not None)
     said = [f"{adopted} of {len(found)} windows were adopted ({twin.estimator}, {folds} folds)."]
@@ -173,4 +177,10 @@ def _verdict(twin: Twin, found: Sequence[tuple[int, Refit]], origins: Sequence[i
             *recording, begin, end = _place(k, refit, origins)
             which = f"recording {recording[0]}, " if recording else ""
             said.append(f"{which}{begin} to {end} s: {'; '.join(reasons)}.")
+    for k, last in enumerate(ends):
+        own = [refit for other, refit in found if other == k]
+        left = (last - max((refit.end for refit in own), default=origins[k])) * 1e-9
+        if left > UNSEEN * max((refit.end - refit.start for refit in own), default=0) * 1e-9:
+            which = f"Of recording {k + 1} the" if len(ends) > 1 else "The"
+            said.append(f"{which} last {left:,.0f} s are less than half a window, or half a step, and were not fitted.")
     return Section("Verdict", tuple(said))

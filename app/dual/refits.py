@@ -10,6 +10,7 @@ data say the same.
 from __future__ import annotations
 
 import threading
+import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,11 @@ if TYPE_CHECKING:
 
 LOOK = 0.5
 """Seconds between two looks at the log's clock."""
+
+EPOCH = 10**18
+"""Nanoseconds since 1970 from which on a time is one of this century, and has a date."""
+
+EDGE = ", at the edge of its range"
 
 KEPT = 50
 """Fits of which it is told what came of them."""
@@ -134,7 +140,7 @@ class Refits:
             taken = version_files(twin.path)
             name = next(name for k in range(1, len(taken) + 2) if (name := f"refit-{k}") not in taken)
             attempt = refit.attempt
-            fitted_on = [f"{attempt.events} events over {attempt.seconds:.4g} s, to {refit.end * 1e-9:.9g} s"]
+            fitted_on = [f"{attempt.events} events over {attempt.seconds:.4g} s, to {_utc(refit.end)}"]
             given = settings_of(refit.fitted, fitted_on, f"dual estimation, fit {number}, adopted {why}: {refit.text}")
             given = replace(given, model_version=engine.status().model_version)
             keep(twin, name, version_text(twin, given))
@@ -266,12 +272,20 @@ def _same(fitted: Fitted, other: Fitted) -> bool:
     return agrees(fitted, other)
 
 
+def _utc(t: int) -> str:
+    """A time of the log: a date, where its clock counts from 1970, or else its seconds."""
+    if t < EPOCH:
+        return f"{t * 1e-9:.9g} s"
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(t // 10**9))
+
+
 def _moves(fitted: Fitted) -> str:
     """What moved, and what that is worth, in a line."""
     from estimators.fit.dual import shift
 
     moved = [
-        f"{line.key} {line.before:.4g} → {line.after:.4g}{line.unit and ' ' + line.unit} ({shift(line):+.1f} σ)"
+        f"{line.key} {line.before:.4g} → {line.after:.4g}{line.unit and ' ' + line.unit} "
+        f"({shift(line):+.1f} σ{EDGE if line.edge else ''})"
         for line in fitted.lines
         if not line.alone
     ]

@@ -5,6 +5,7 @@ import { element } from "./dom.js";
 import { compact, spaced, words } from "./format.js";
 
 const ALONE = "left alone: the data cannot tell";
+const EDGE = "at the edge of its range: the best may lie beyond";
 const BOUND = "only a bound: the data cannot tell it from none";
 
 // told: the answer of /api/fit; offers: buttons
@@ -27,7 +28,7 @@ function entries(result) {
     if (line.alone) return element("tr", {}, name, element("td", {}, compact(line.before)), element("td", { class: "faint", colspan: 2 }, ALONE));
     const ends = `${compact(line.low, 3)} … ${compact(line.high, 3)}`;
     return element("tr", {}, name, element("td", {}, compact(line.before)), element("td", {}, element("b", {}, compact(line.after))),
-      element("td", { title: line.told ? (line.profile ? "By profile likelihood" : null) : BOUND }, line.told ? ends : `${ends} (bound)`));
+      element("td", { title: !line.told ? BOUND : line.edge ? EDGE : line.profile ? "By profile likelihood" : null }, !line.told ? `${ends} (bound)` : line.edge ? `${ends} (edge)` : ends));
   });
   const skipped = result.skipped.map((item) => element("tr", {}, element("th", { scope: "row" }, words(item.key)), element("td", { class: "faint", colspan: 3 }, `not fitted: ${item.reason}`)));
   const pairs = result.correlated.map((pair) => `${pair.entries.map(words).join(" with ")} (${pair.correlation.toFixed(2)})`);

@@ -58,7 +58,8 @@ class Line(NamedTuple):
 
     `told` is whether the data tell it; an entry that they do not tell is left alone where that costs nothing, and then
     `after` is `before`; else only a bound of it is known. `deviation` is that of the estimate, on the logarithm where
-    `log` is true. `profile` says that the interval is by profile likelihood.
+    `log` is true. `profile` says that the interval is by profile likelihood, `edge` that the value is at an end of the
+    range that was searched: the best may lie beyond.
     """
 
     key: str
@@ -72,6 +73,7 @@ class Line(NamedTuple):
     told: bool
     alone: bool
     profile: bool
+    edge: bool = False
 
 
 @dataclass(frozen=True)
@@ -230,6 +232,12 @@ def _leave(objective: Objective, x: np.ndarray, value: float, shape: Curvature, 
     return [int(i) for i, cost in zip(loose, costs, strict=True) if cost <= CHEAP * shape.widened[i] ** 2]
 
 
+def _at_edge(item: Entry, x: float) -> bool:
+    value = item.outward(x)
+    near = 1e-6 * (item.high - item.low) if np.isfinite(item.high - item.low) and not item.log else 1e-6 * abs(value)
+    return bool(value - item.low <= near or item.high - value <= near)
+
+
 def _lines(
     whole: Objective, kept: Objective, x: np.ndarray, value: float, shape: Curvature, believed: Tempered,
     told: np.ndarray, alone: Sequence[Entry],
@@ -273,6 +281,7 @@ def _lines(
                 told=bool(told[i]),
                 alone=False,
                 profile=bool(profiled[i]),
+                edge=_at_edge(item, float(believed.x[i])),
             )
         lines.append(line)
     correlation = np.full((len(lines), len(lines)), np.nan)

@@ -13,7 +13,7 @@ from app.engine.engine import Engine
 from app.server.one_at_a_time import OneAtATime
 from app.server.server import PageServer
 from estimators.errors import ConfigError
-from estimators.forecast import Forecast
+from estimators.forecast import Forecast, forecast
 from estimators.log import INPUT, READING, Events
 from estimators.models import MODELS
 from tests.app.scripted import MODEL, Scripted, pull_all, readings
@@ -150,6 +150,20 @@ def test_what_cannot_be_asked_is_refused_in_one_line():
         ask(engine, horizon=1e6)
     with pytest.raises(ConfigError, match="no reading has come yet"):
         ask(running(0), horizon=1.0)
+
+
+@pytest.mark.parametrize("lost", [1e60, np.nan])
+def test_a_future_without_numbers_is_said_and_has_no_probability(monkeypatch, lost):
+    engine = running()
+
+    def running_away(*arguments, **options):
+        found = forecast(*arguments, **options)
+        found.mean[4:, 0] = lost
+        return found
+
+    monkeypatch.setattr("app.analysis.forecast.forecast", running_away)
+    with pytest.raises(ConfigError, match=r"forecast: 2 s from now a state is beyond 1e\+50, or no number"):
+        ask(engine, horizon=10.0)
 
 
 def test_the_page_asks_by_post(tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ from app.cli.fold import fold_twin, read_log
 from app.cli.fold_episodes import Told, dropped, episode_lines
 from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import Episode
-from estimators.errors import EstimatorError
+from estimators.errors import ConfigError, EstimatorError
 from estimators.fold import Fold as FoldOf
 from estimators.log import Log
 from estimators.models import MODELS
@@ -301,6 +301,11 @@ def test_what_is_smoothed_is_drawn_in_recording_and_report(tmp_path: Path) -> No
     np.testing.assert_allclose(
         smoothed_lines(out), np.stack((mean, mean + 2 * std, mean - 2 * std), axis=1)[last], rtol=1e-12
     )
+    # A recording is never replaced.
+    before = out.read_bytes()
+    with pytest.raises(ConfigError, match=r"run\.rrd: is there already"):
+        fold_twin(Fold(name, out=out))
+    assert out.read_bytes() == before
     # A chart in the report has three curves in its colour, and a word on it; without --smooth there is none.
     text = html.read_text()
     assert text.count('stroke="#264c46"') >= 3 * 2 and "the readings after each moment too" in text

@@ -77,6 +77,15 @@ def test_wear_of_a_simulated_asset_is_followed(capsys):
     assert adopted and adopted[-1]["sigma"] > 10.0
 
 
+def test_what_no_window_looked_at_is_said(capsys):
+    main(["tune", "motor_winding", "--set", "source.duration=120", "--fit", "R", "--windows", "50"])
+    said = capsys.readouterr().out
+    # Of 121 readings, one a second, two windows hold 100.
+    assert "The last 21 s are less than half a window, or half a step, and were not fitted." in said
+    main(["tune", "motor_winding", "--set", "source.duration=120", "--fit", "R", "--windows", "60"])
+    assert "were not fitted" not in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

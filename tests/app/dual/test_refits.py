@@ -6,8 +6,10 @@ import threading
 import numpy as np
 import pytest
 
+from app.cli.main import main
 from app.cli.opener import recorded_twin
 from app.cli.run import live_source
+from app.dual import refits
 from app.dual.refits import ADOPTED, BROKEN, DISMISSED, FITTING, NOTHING, OFFERED, OUTDATED, Refits
 from app.engine.commands import Record, SetTuning
 from app.engine.engine import Engine
@@ -143,6 +145,13 @@ def test_adopted_by_hand_a_version_with_its_evidence_goes_on(begin):
     # The next one starts from there, and finds nothing to mend.
     twin.hears(EVERY, 5.0)
     assert twin.looks() == NOTHING and [item.state for item in twin.refits.known] == [ADOPTED, NOTHING]
+
+
+@pytest.mark.parametrize(
+    ("t", "said"), [(61 * 10**9, "61 s"), (1_795_358_420_700_000_000, "2026-11-22T14:40:20Z"), (10**18 - 1, "1e+09 s")]
+)
+def test_the_end_of_a_window_is_a_date_where_the_clock_has_one(t, said):
+    assert refits._utc(t) == said
 
 
 def test_dismissed_it_does_not_come_again_until_the_data_say_something_else(begin):
@@ -313,3 +322,14 @@ def test_without_a_page_it_is_in_the_recording(tmp_path):
     again = recorded_twin(recorded)
     assert again.tuning.name == "refit-1" and again.version.head.evidence.gain > 0.0
     assert again.tuning.get("R.winding") == session.engine.tuning.get("R.winding") < 10.0
+
+
+def test_without_a_page_it_is_said_on_the_terminal(tmp_path, capsys):
+    path = tmp_path / "winding.yaml"
+    shutil.copy(TWINS / "motor_winding.yaml", path)
+    section = "{entries: [R.winding], every: 10 s, window: 20 s, adopt: if better}"
+    given = {"refit": section, "R.winding": "100", "source.duration": "120"}
+    sets = [word for key, value in given.items() for word in ("--set", f"{key}={value}")]
+    assert main(["run", str(path), "--headless", "--speed", "10", *sets]) == 0
+    said = capsys.readouterr().err
+    assert "adopted by rule as tuning version refit-" in said and "nothing better" in said
