@@ -9,6 +9,9 @@ from ..export.parts import Part
 
 WIDTH = 118
 
+SHORT = 12
+"""Characters up to which a cell is a value."""
+
 
 def as_text(parts: Sequence[Part]) -> list[str]:
     """Lines of the page; a table whose rows do not fit is a paragraph for each row."""
@@ -36,6 +39,9 @@ def _paragraphs(part: Part) -> list[str]:
     for row in part.rows:
         first, second, *others = row
         lines.append(f"  {first} {second}".rstrip())
-        for other in filter(None, others):
+        # What is short means nothing without its head, and what is a sentence needs none.
+        cells = [*zip(part.head[2:], others, strict=True)]
+        short = [f"{head} {cell}".strip() for head, cell in cells if cell not in ("", "-") and len(cell) <= SHORT]
+        for other in [", ".join(short), *(cell for _, cell in cells if len(cell) > SHORT)]:
             lines += textwrap.wrap(other, WIDTH, initial_indent="      ", subsequent_indent="      ")
     return lines

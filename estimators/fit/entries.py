@@ -126,6 +126,8 @@ def entries_of(
     skipped: dict[str, Skipped] = {}
     for name in wanted:
         keys = _group(name, known, tuning) if name in GROUPS else [name]
+        if not keys:
+            skipped[name] = Skipped(name, "there is no such entry")
         for key in keys:
             item = known.get(key) or _sensor_of(key, tuning)
             if item is None:
@@ -139,7 +141,7 @@ def entries_of(
             else:
                 found[key] = item
     if not found:
-        reasons = "; ".join(f"{item.key} {item.reason}" for item in skipped.values())
+        reasons = "; ".join(f"{item.key} {item.reason}" for item in skipped.values() if item.key not in GROUPS)
         raise ConfigError(f"nothing of {', '.join(wanted)} can be fitted: {reasons or 'there is no such entry'}")
     return list(found.values()), list(skipped.values())
 
