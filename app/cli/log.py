@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +18,7 @@ from sources.can.unseen import shown_id
 from sources.survey import Message, Series, Survey, survey
 from sources.tables.time_column import UNITS
 
+from ..moment import LATER_THAN, moment
 from ..stderr import complain
 
 if TYPE_CHECKING:
@@ -94,9 +94,7 @@ def _head(found: Survey) -> list[str]:
     name = found.files[0].name + (f" and {len(found.files) - 1} more" if len(found.files) > 1 else "")
     what = "frames" if found.kind == "can_log" else "rows"
     span = (end - start) * 1e-9
-    when = ""
-    if start > 10**17:  # years after 1970: a clock, not the seconds of a run
-        when = f", from {datetime.fromtimestamp(start // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    when = f", from {moment(start)}" if start >= LATER_THAN else ""
     lines = [f"{name}: {found.t.size} {what} in {span:.1f} s{when}"]
     gaps = found.holes
     if gaps:

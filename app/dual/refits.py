@@ -10,7 +10,6 @@ data say the same.
 from __future__ import annotations
 
 import threading
-import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -19,6 +18,7 @@ from config.tunings import version_files
 from estimators.errors import ConfigError, NisusError
 
 from ..engine.interface import Running
+from ..moment import moment
 from ..runs.fitting import DONE, FAILED, Attempt, Fitting
 from ..tunings.keep import keep, version_text
 from ..tunings.load import load_into
@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
 LOOK = 0.5
 """Seconds between two looks at the log's clock."""
-
-EPOCH = 10**18
-"""Nanoseconds since 1970 from which on a time is one of this century, and has a date."""
 
 EDGE = ", at the edge of its range"
 
@@ -140,7 +137,7 @@ class Refits:
             taken = version_files(twin.path)
             name = next(name for k in range(1, len(taken) + 2) if (name := f"refit-{k}") not in taken)
             attempt = refit.attempt
-            fitted_on = [f"{attempt.events} events over {attempt.seconds:.4g} s, to {_utc(refit.end)}"]
+            fitted_on = [f"{attempt.events} events over {attempt.seconds:.4g} s, to {moment(refit.end)}"]
             given = settings_of(refit.fitted, fitted_on, f"dual estimation, fit {number}, adopted {why}: {refit.text}")
             given = replace(given, model_version=engine.status().model_version)
             keep(twin, name, version_text(twin, given))
@@ -270,13 +267,6 @@ def _same(fitted: Fitted, other: Fitted) -> bool:
     from estimators.fit.dual import agrees
 
     return agrees(fitted, other)
-
-
-def _utc(t: int) -> str:
-    """A time of the log: a date, where its clock counts from 1970, or else its seconds."""
-    if t < EPOCH:
-        return f"{t * 1e-9:.9g} s"
-    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(t // 10**9))
 
 
 def _moves(fitted: Fitted) -> str:

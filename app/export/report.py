@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -22,6 +21,7 @@ from estimators.track import HEALTH_NAMES, VERDICT_NAMES, Track
 from estimators.tuning import GATE_KEYS, Tuning
 
 from ..engine.changes import difference, in_words
+from ..moment import moment
 from ..twin.twin import Twin
 from .alarms import advice
 from .calibration_lines import calibration_lines
@@ -31,9 +31,6 @@ from .svg import clock
 
 MOST = 60
 """Rows of a table; of more the rest is counted."""
-
-LATER_THAN = 10**18
-"""Nanoseconds since 1970 from which on a time is one of this century, and has a date."""
 
 
 class Reported(NamedTuple):
@@ -93,13 +90,6 @@ def _head(run: Reported) -> Part:
     if given:
         rows.append(("on the command line", given))
     return Part(f"{twin.name}: {twin.title}", (), ("", ""), (*rows, *run.about))
-
-
-def moment(t: int) -> str:
-    """A time of the log (ns): with its date where it has one, else in seconds."""
-    if t < LATER_THAN:
-        return f"{t * 1e-9:.6g} s"
-    return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(t // 10**9))
 
 
 def _source(twin: Twin) -> str:

@@ -9,7 +9,6 @@ import pytest
 from app.cli.main import main
 from app.cli.opener import recorded_twin
 from app.cli.run import live_source
-from app.dual import refits
 from app.dual.refits import ADOPTED, BROKEN, DISMISSED, FITTING, NOTHING, OFFERED, OUTDATED, Refits
 from app.engine.commands import Record, SetTuning
 from app.engine.engine import Engine
@@ -145,13 +144,6 @@ def test_adopted_by_hand_a_version_with_its_evidence_goes_on(begin):
     # The next one starts from there, and finds nothing to mend.
     twin.hears(EVERY, 5.0)
     assert twin.looks() == NOTHING and [item.state for item in twin.refits.known] == [ADOPTED, NOTHING]
-
-
-@pytest.mark.parametrize(
-    ("t", "said"), [(61 * 10**9, "61 s"), (1_795_358_420_700_000_000, "2026-11-22T14:40:20Z"), (10**18 - 1, "1e+09 s")]
-)
-def test_the_end_of_a_window_is_a_date_where_the_clock_has_one(t, said):
-    assert refits._utc(t) == said
 
 
 def test_dismissed_it_does_not_come_again_until_the_data_say_something_else(begin):
