@@ -5,8 +5,9 @@ import pytest
 from app.cli.run import live_source
 from app.session import Page, Session
 from app.twin.twin import load_twin
+from tests.app.page.browsed import PATIENCE
 from tests.app.page.test_fit_browser import page  # noqa: F401  a fixture
-from tests.app.page.test_runs_browser import PATIENCE, settled
+from tests.app.page.test_runs_browser import settled
 from tests.app.scripted import wait_for
 
 pytestmark = pytest.mark.browser

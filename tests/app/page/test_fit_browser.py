@@ -11,7 +11,8 @@ from app.guard.verdict import Judged
 from app.session import Page, Session
 from app.tunings.listing import listing
 from app.twin.twin import load_twin, with_version
-from tests.app.page.test_runs_browser import FLAGS, PATIENCE, settled
+from tests.app.page.browsed import PATIENCE, browsed
+from tests.app.page.test_runs_browser import settled
 from tests.app.scripted import wait_for
 
 pytestmark = pytest.mark.browser
@@ -36,18 +37,8 @@ def session(tmp_path, monkeypatch):
 
 @pytest.fixture
 def page(chromium, session):
-    sync_api = pytest.importorskip("playwright.sync_api")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        page = browser.new_context(viewport={"width": 1440, "height": 900}, color_scheme="light").new_page()
-        page.set_default_timeout(PATIENCE * 1000)
-        errors: list[str] = []
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(session.url)
-        wait_for(lambda: page.evaluate("window.nisus?.drawn > 0"), PATIENCE)
+    with browsed(chromium, session) as page:
         yield page
-        assert errors == []
-        browser.close()
 
 
 def fitted(page):

@@ -5,7 +5,7 @@ import pytest
 from app.cli.run import live_source
 from app.session import Page, Session
 from app.twin.twin import load_twin
-from tests.app.page.test_runs_browser import FLAGS, PATIENCE
+from tests.app.page.browsed import FLAGS, PATIENCE
 from tests.app.scripted import wait_for
 
 pytestmark = pytest.mark.browser

@@ -12,13 +12,10 @@ from app.twin.twin import load_twin
 from estimators.fold import fold
 from estimators.log import Log
 from estimators.track import GATED, USED
+from tests.app.page.browsed import PATIENCE, browsed
 from tests.app.scripted import pull_all, wait_for
 
 pytestmark = pytest.mark.browser
-
-FLAGS = "--headless=new --no-sandbox --disable-gpu --enable-unsafe-swiftshader --no-first-run".split()
-PATIENCE = 120.0
-"""Seconds for a step on a busy machine; a test that works takes a fraction."""
 
 PINNED = (176, 51, 143)
 """The colour of the first place, in the light theme: app/page/style.css, --pin-0."""
@@ -36,18 +33,8 @@ def session():
 
 @pytest.fixture
 def page(chromium, session):
-    sync_api = pytest.importorskip("playwright.sync_api")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        page = browser.new_context(viewport={"width": 1440, "height": 900}, color_scheme="light").new_page()
-        page.set_default_timeout(PATIENCE * 1000)
-        errors: list[str] = []
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(session.url)
-        wait_for(lambda: page.evaluate("window.nisus?.drawn > 0"), PATIENCE)
+    with browsed(chromium, session) as page:
         yield page
-        assert errors == []
-        browser.close()
 
 
 def coloured(page, selector):

@@ -3,7 +3,8 @@
 import pytest
 
 from tests.app.page import test_runs_browser as runs
-from tests.app.page.test_runs_browser import PATIENCE, page, session  # noqa: F401  fixtures
+from tests.app.page.browsed import PATIENCE
+from tests.app.page.test_runs_browser import page, session  # noqa: F401  fixtures
 from tests.app.scripted import wait_for
 
 pytestmark = pytest.mark.browser

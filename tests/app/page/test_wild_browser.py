@@ -7,7 +7,8 @@ from app.cli.run import live_source
 from app.session import Page, Session
 from app.twin.twin import load_twin
 from estimators.log import READING
-from tests.app.page.test_runs_browser import PATIENCE, page  # noqa: F401  fixture
+from tests.app.page.browsed import PATIENCE
+from tests.app.page.test_runs_browser import page  # noqa: F401  fixture
 from tests.app.scripted import pull_all, wait_for
 
 pytestmark = pytest.mark.browser
