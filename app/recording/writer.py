@@ -66,6 +66,7 @@ class Recorder:
         self._wake = threading.Event()
         self._wanted: Path | None = None
         self._asked: deque[Path | None] = deque()
+        self._taken: Path | None = None
         self._stopping = False
         self._open: _Part | None = None
         self.finished: list[Path] = []
@@ -79,9 +80,11 @@ class Recorder:
 
     @property
     def writing(self) -> Path | None:
-        """The file that is being written: of a recording that is split, the part that began last."""
+        """The file that is being written, or will be next: of a recording that is split, the part that began last."""
         part = self._open
-        return self._wanted if part is None else part.file.path
+        if part is not None:
+            return part.file.path
+        return next((path for path in (self._taken, *tuple(self._asked)) if path is not None), None)
 
     @property
     def written(self) -> list[Path]:
@@ -107,10 +110,12 @@ class Recorder:
             self._thread.join(timeout=10.0)
 
     def _run(self) -> None:
-        wanted: Path | None = None
         while True:
-            # One after the other: a recording that is stopped at once is one too.
-            wanted = self._asked.popleft() if self._asked else wanted
+            # One after the other: a recording that is stopped at once is one too. In this order, as in `_finish`.
+            if self._asked:
+                self._taken = self._asked[0]
+                self._asked.popleft()
+            wanted = self._taken
             try:
                 if self._open is not None and wanted != self._open.asked:
                     self._finish(self._open)
@@ -120,10 +125,10 @@ class Recorder:
                 if self._open is not None:
                     self._go_on(self._open)
             except NisusError as error:
-                wanted = None
+                self._taken = None
                 self._fail(str(error))
             except Exception as error:  # noqa: BLE001  a full disk or a driver's fault must not stop the twin
-                wanted = None
+                self._taken = None
                 self._fail(self._reason(error))
             if self._asked:
                 continue

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +100,33 @@ def test_recording_holds_history_late_readings_and_retunes(running, tmp_path):
     tuning, estimator = tuning_from_json(recorded.tuning, MODEL)
     assert estimator == "ukf"
     assert tuning.get("Q.rate") == 0.02
+
+
+def test_a_recording_is_listed_from_when_it_is_asked_for_until_it_is_finished(tmp_path):
+    """It is ended while its file is only being begun, and the next is asked for already."""
+    going_on, source = threading.Event(), Scripted()
+    engine = Engine(twin(), lambda report: source)
+    recorder = engine.recorder = Recorder(engine, lambda stream: going_on.wait(10.0) and drawn(stream))
+    recorder.start()
+    engine.start()
+    first, second = tmp_path / "first.rrd", tmp_path / "second.rrd"
+    try:
+        recorder.record(first)
+        assert recorder.writing == first and recorder.written == [first]
+        wait_for(first.exists)
+        recorder.record(None)
+        assert recorder.path is None and recorder.writing == first and recorder.written == [first]
+        recorder.record(second)
+        recorder.record(None)
+        assert recorder.writing == first and recorder.written == [first]
+        going_on.set()
+        wait_for(lambda: recorder.finished == [first, second])
+        wait_for(lambda: recorder.writing is None)
+        assert recorder.written == [first, second]
+    finally:
+        going_on.set()
+        engine.stop()
+        recorder.stop()
 
 
 def test_several_recordings_one_after_the_other(running, tmp_path):
