@@ -160,9 +160,8 @@ class BesideRun:
     def __init__(self, beside: Beside, columns: dict[str, Column], than: Running | None = None) -> None:
         self.beside, self._levels, self._than = beside, Levels(columns), than
         self._mark = beside.mark()
-        self.revision, self.generation, self.end = beside.run.number, 0, 0
-        self.changed = 0
-        """First row that changed in the last `sync`; `end` if none did."""
+        self.revision = beside.run.number
+        self.generation = self.changed = self.end = 0
 
     def sync(self, columns: Iterable[str]) -> None:
         """See `Run`."""
@@ -184,7 +183,7 @@ class BesideRun:
 
     def span(self, since: int, until: int) -> tuple[int, int]:
         """See `Run`."""
-        return self.beside.index_at(since), min(self.end, self.beside.index_at(until))
+        return self.beside.index_at(since), self.beside.index_at(until)
 
     def groups(self, size: int, start: int, stop: int, columns: list[str]) -> Groups:
         """See `Run`."""

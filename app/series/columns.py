@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -16,16 +16,41 @@ from ..engine.counts import estimated_rows
 LINE, UPPER, LOWER, DOTS = "line", "upper", "lower", "dots"
 """How the rows of a bucket become its points: both extremes; the highest or the lowest alone; a few rows among many."""
 
-Values = Callable[[Events, Track], np.ndarray]
+
+class Rows:
+    """Events and what was concluded of them, with what several columns need of them."""
+
+    def __init__(self, events: Events, track: Track) -> None:
+        self.events, self.track = events, track
+        self._of_sensors: dict[int, np.ndarray] = {}
+
+    @cached_property
+    def estimated(self) -> np.ndarray:
+        """Which rows hold an estimate, (n,)."""
+        return estimated_rows(self.track)
+
+    def of_sensor(self, sensor: int) -> np.ndarray:
+        """Which are readings of a sensor, (n,)."""
+        if sensor not in self._of_sensors:
+            events = self.events
+            self._of_sensors[sensor] = (events.kind == READING) & (events.channel == sensor)
+        return self._of_sensors[sensor]
+
+
+Values = Callable[[Rows], np.ndarray]
 
 
 class Column:
     """A name, how its buckets are drawn, and how its values (n,) come from n rows."""
 
-    __slots__ = ("kind", "name", "values")
+    __slots__ = ("kind", "name", "of")
 
-    def __init__(self, name: str, kind: str, values: Values) -> None:
-        self.name, self.kind, self.values = name, kind, values
+    def __init__(self, name: str, kind: str, of: Values) -> None:
+        self.name, self.kind, self.of = name, kind, of
+
+    def values(self, events: Events, track: Track) -> np.ndarray:
+        """Of these rows alone."""
+        return self.of(Rows(events, track))
 
 
 def columns_of(model: StateSpaceModel) -> dict[str, Column]:
@@ -51,13 +76,13 @@ def columns_of(model: StateSpaceModel) -> dict[str, Column]:
         ]
     found += [Column(f"input:{item.name}", LINE, partial(_input, k)) for k, item in enumerate(model.inputs)]
     found += [
-        Column("nis", DOTS, lambda events, track: track.nis),
-        Column("nis_mean", LINE, lambda events, track: track.nis_mean),
-        Column("nis_low", LOWER, lambda events, track: track.nis_low),
-        Column("nis_high", UPPER, lambda events, track: track.nis_high),
-        Column("health", UPPER, lambda events, track: track.health.astype(float)),
-        Column("effective", LINE, lambda events, track: track.effective),
-        Column("ancestors", LINE, lambda events, track: track.ancestors),
+        Column("nis", DOTS, lambda rows: rows.track.nis),
+        Column("nis_mean", LINE, lambda rows: rows.track.nis_mean),
+        Column("nis_low", LOWER, lambda rows: rows.track.nis_low),
+        Column("nis_high", UPPER, lambda rows: rows.track.nis_high),
+        Column("health", UPPER, lambda rows: rows.track.health.astype(float)),
+        Column("effective", LINE, lambda rows: rows.track.effective),
+        Column("ancestors", LINE, lambda rows: rows.track.ancestors),
     ]
     return {column.name: column for column in found}
 
@@ -71,37 +96,37 @@ def rows_of(model: StateSpaceModel) -> list[tuple[str, int, int]]:
     ]
 
 
-def _mean(j: int, spread: float, events: Events, track: Track) -> np.ndarray:
-    return np.where(estimated_rows(track), track.mean[:, j] + spread * track.std[:, j], np.nan)
+def _mean(j: int, spread: float, rows: Rows) -> np.ndarray:
+    track = rows.track
+    value = track.mean[:, j] + spread * track.std[:, j] if spread else track.mean[:, j]
+    return np.where(rows.estimated, value, np.nan)
 
 
-def _truth(state: int, events: Events, track: Track) -> np.ndarray:
-    out = np.full(len(events), np.nan)
-    rows, values = truth_of(events, state)
-    out[rows] = values
+def _truth(state: int, rows: Rows) -> np.ndarray:
+    out = np.full(len(rows.events), np.nan)
+    told, values = truth_of(rows.events, state)
+    out[told] = values
     return out
 
 
-def _of_sensor(sensor: int, events: Events) -> np.ndarray:
-    return (events.kind == READING) & (events.channel == sensor)
+def _reading(sensor: int, row: int, verdicts: tuple[int, ...], rows: Rows) -> np.ndarray:
+    verdict = rows.track.verdict
+    judged = np.logical_or.reduce([verdict == one for one in verdicts])
+    mine = rows.of_sensor(sensor) & judged & (rows.track.screened[:, row] == 0)
+    return np.where(mine, rows.events.value[:, row], np.nan)
 
 
-def _reading(sensor: int, row: int, verdicts: tuple[int, ...], events: Events, track: Track) -> np.ndarray:
-    mine = _of_sensor(sensor, events) & np.isin(track.verdict, verdicts) & (track.screened[:, row] == 0)
-    return np.where(mine, events.value[:, row], np.nan)
+def _screened(sensor: int, row: int, rows: Rows) -> np.ndarray:
+    return np.where(rows.of_sensor(sensor) & (rows.track.screened[:, row] != 0), rows.events.value[:, row], np.nan)
 
 
-def _screened(sensor: int, row: int, events: Events, track: Track) -> np.ndarray:
-    return np.where(_of_sensor(sensor, events) & (track.screened[:, row] != 0), events.value[:, row], np.nan)
+def _innovation(sensor: int, row: int, rows: Rows) -> np.ndarray:
+    return np.where(rows.of_sensor(sensor), rows.track.innovation[:, row], np.nan)
 
 
-def _innovation(sensor: int, row: int, events: Events, track: Track) -> np.ndarray:
-    return np.where(_of_sensor(sensor, events), track.innovation[:, row], np.nan)
+def _bound(sensor: int, row: int, spread: float, rows: Rows) -> np.ndarray:
+    return np.where(rows.of_sensor(sensor), spread * rows.track.innovation_std[:, row], np.nan)
 
 
-def _bound(sensor: int, row: int, spread: float, events: Events, track: Track) -> np.ndarray:
-    return np.where(_of_sensor(sensor, events), spread * track.innovation_std[:, row], np.nan)
-
-
-def _input(k: int, events: Events, track: Track) -> np.ndarray:
-    return np.where(events.kind == INPUT, events.value[:, k], np.nan)
+def _input(k: int, rows: Rows) -> np.ndarray:
+    return np.where(rows.events.kind == INPUT, rows.events.value[:, k], np.nan)

@@ -21,7 +21,8 @@ class DifferenceRun:
     def __init__(self, pull: Pull, columns: dict[str, Column], engine: Running) -> None:
         self.of, self._columns, self._engine = pull, columns, engine
         self._kept = KeptRun(pull, columns)
-        self.revision, self.generation, self.end = -1, 0, self._kept.end
+        self.revision, self.generation = -1, 0
+        self.end = self.changed = self._kept.end
 
     def sync(self, columns: Iterable[str]) -> None:
         """See `Run`. Another revision runs: all rows are others."""

@@ -16,7 +16,7 @@ import numpy as np
 from estimators.errors import ConfigError
 
 from .columns import DOTS, LOWER, UPPER, Column
-from .pyramid import FACTOR, Groups
+from .pyramid import FACTOR, FIRST, Groups
 from .run import Run
 
 SLACK = 1.3
@@ -81,6 +81,8 @@ class Lane:
         self.name, self.wanted = name, wanted
         self._kinds = np.array([columns[column].kind for column in wanted.columns])
         self._size = 0
+        self._rows = (0, 0)
+        """The rows in sight: the first, and the one after the last."""
         self._sent = (0, 0)
         """Numbers of the groups that the browser has: from the first to before the second."""
         self._told: object = None
@@ -93,11 +95,11 @@ class Lane:
         """Rows from that one on are new or others."""
         self._dirty = min(self._dirty, row)
 
-    def frame(self, run: Run, origin: int, newest: int) -> bytes | None:
-        """What has changed since the last frame, or None.
+    def look(self, run: Run, origin: int, newest: int) -> None:
+        """Find the rows in sight, and how many of them a group has.
 
         Args:
-            run: Whose rows; its levels are up to date.
+            run: Whose rows; its levels need not be up to date.
             origin: Time of the first event, ns, from which seconds count.
             newest: Time of the last one.
         """
@@ -108,8 +110,17 @@ class Lane:
             since = max(since, until - round(wanted.span * 1e9))
         # One row more to either side, so that lines leave the chart at its edges.
         start, stop = run.span(since, until + 1)
-        start, stop = max(0, start - 1), stop + 1
-        size = self._sized(stop - start)
+        self._rows = max(0, start - 1), stop + 1
+        self._size = self._sized(self._rows[1] - self._rows[0])
+
+    @property
+    def levelled(self) -> tuple[str, ...]:
+        """The columns of which it needs levels: none while it is near enough to take the rows themselves."""
+        return self.wanted.columns if self._size >= FIRST else ()
+
+    def frame(self, run: Run, origin: int) -> bytes | None:
+        """What has changed in what it looks at since the last frame, or None; the levels of the run are up to date."""
+        (start, stop), size = self._rows, self._size
         told = (run, run.generation, size)
         first, last = start // size, -(-min(stop, run.end) // size)
         have_first, have_last = self._sent
@@ -118,7 +129,7 @@ class Lane:
         at = max(first, min(at, last))
         if not fresh and (at >= last or self._dirty >= run.end):
             return None
-        groups = run.groups(size, at, last, list(wanted.columns))
+        groups = run.groups(size, at, last, list(self.wanted.columns))
         self._told, self._dirty = told, FOREVER
         # The last group may grow.
         self._sent = (first, groups.start + groups.n)
@@ -133,7 +144,6 @@ class Lane:
         size = 1
         while rows > points * size:
             size *= FACTOR
-        self._size = size
         return size
 
     def _packed(self, groups: Groups, origin: int, fresh: bool, first: int, revision: int) -> bytes:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..engine.interface import Running
 from ..engine.outputs import Cursor, Pull
-from .columns import Column
+from .columns import Column, Rows
 from .pyramid import FIRST, Groups, Pyramid, grouped
 
 ROWS = 16_384
@@ -21,13 +21,16 @@ class Run(Protocol):
 
     revision: int
     generation: int
+    """Counts up when all rows are to be looked at again: of another revision or log, or for another column."""
     end: int
+    changed: int
+    """First row that changed in the last `sync`; `end` if none did."""
 
     def sync(self, columns: Iterable[str]) -> None:
-        """Bring the levels up to date, of these columns at least."""
+        """Take the rows that came, and bring the levels of these columns up to date."""
 
     def span(self, since: int, until: int) -> tuple[int, int]:
-        """Absolute indices of the rows between two times, ns: the first, and the one after the last."""
+        """Absolute indices of the rows between two times, ns: the first, and the one after the last, synced or not."""
 
     def groups(self, size: int, start: int, stop: int, columns: list[str]) -> Groups:
         """Groups of `size` rows with numbers from `start` to before `stop`."""
@@ -48,8 +51,10 @@ class Levels:
             self.asked = sorted({*self.asked, *new})
         return bool(new)
 
-    def clear(self) -> None:
-        """Forget the rows."""
+    def clear(self, names: Iterable[str] | None = None) -> None:
+        """Forget the rows, and all columns but these."""
+        if names is not None:
+            self.asked = sorted(name for name in names if name in self.known)
         self.pyramid = Pyramid(len(self.asked))
 
     def take(self, pull: Pull) -> None:
@@ -59,9 +64,9 @@ class Levels:
     def values(self, pull: Pull, names: list[str]) -> np.ndarray:
         """Columns of rows, (n, columns)."""
         # Each column in one piece: they are filled, and grouped, one after the other.
-        out = np.empty((len(pull.events), len(names)), order="F")
+        out, rows = np.empty((len(pull.events), len(names)), order="F"), Rows(pull.events, pull.track)
         for k, name in enumerate(names):
-            out[:, k] = self.known[name].values(pull.events, pull.track)
+            out[:, k] = self.known[name].of(rows)
         return out
 
     def part(self, size: int, start: int, stop: int, names: list[str]) -> Groups:
@@ -78,18 +83,15 @@ class LiveRun:
         self._engine, self._levels = engine, Levels(columns)
         self._cursor: Cursor = engine.cursor()
         self.revision = -1
-        self.generation = 0
-        """Counts up when all rows are to be looked at again: of another revision or log, or for another column."""
-        self.changed = 0
-        """First row that changed in the last `sync`; `end` if none did."""
-        self.end = 0
+        self.generation = self.changed = self.end = 0
 
     def close(self) -> None:
         """Give the cursor back."""
         self._engine.release(self._cursor)
 
     def sync(self, columns: Iterable[str]) -> None:
-        """See `Run`."""
+        """See `Run`. Columns whose levels are wanted no more cost nothing from the next revision on."""
+        columns = set(columns)
         if self._levels.ask(columns):
             self._engine.release(self._cursor)
             self._cursor = self._engine.cursor()
@@ -97,7 +99,7 @@ class LiveRun:
         while True:
             pull = self._engine.pull(self._cursor, ROWS, align=FIRST)
             if pull.fresh:
-                self._levels.clear()
+                self._levels.clear(columns)
                 self.generation += 1
                 self.revision, self.changed = pull.revision, 0
             if len(pull.events):
@@ -110,7 +112,7 @@ class LiveRun:
 
     def span(self, since: int, until: int) -> tuple[int, int]:
         """See `Run`."""
-        return self._engine.index_at(since), min(self.end, self._engine.index_at(until))
+        return self._engine.index_at(since), self._engine.index_at(until)
 
     def groups(self, size: int, start: int, stop: int, columns: list[str]) -> Groups:
         """See `Run`."""
@@ -126,7 +128,7 @@ class KeptRun:
     def __init__(self, pull: Pull, columns: dict[str, Column]) -> None:
         self.of, self._levels = pull, Levels(columns)
         self.revision, self.generation = pull.revision, 0
-        self.end = pull.first + len(pull.events)
+        self.end = self.changed = pull.first + len(pull.events)
 
     def sync(self, columns: Iterable[str]) -> None:
         """See `Run`."""

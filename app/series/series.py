@@ -14,7 +14,7 @@ from .lane import Lane
 from .run import KeptRun, LiveRun, Run
 from .smoothed import Smoothing
 
-PREVIOUS, SMOOTHED = "previous", "smoothed"
+LIVE, PREVIOUS, SMOOTHED = "live", "previous", "smoothed"
 
 ALL = 2**62
 """Later than every event."""
@@ -70,39 +70,29 @@ class Series:
             origin, newest = self.origin(), self._engine.span()[1]
             if origin is None or not newest:
                 return []
-            asked = [lane for lane in lanes if lane in self._lanes]
             looked_at = {lane.wanted.run for lane in self._lanes}
             self._kept = {name: run for name, run in self._kept.items() if name in looked_at}
             self._leave({name.removeprefix(LESS) for name in looked_at})
-            self._sync({column for lane in asked if lane.wanted.run == "live" for column in lane.wanted.columns})
-            frames = [frame for lane in asked if (frame := self._frame(lane, origin, newest)) is not None]
-            return frames
+            found = [(lane, self._find(lane.wanted.run)) for lane in lanes if lane in self._lanes]
+            asked = [(lane, run) for lane, run in found if run is not None]
+            for lane, run in asked:
+                lane.look(run, origin, newest)
+            for name, run in {lane.wanted.run: run for lane, run in asked}.items():
+                self._sync(run, [lane for lane in self._lanes if lane.wanted.run == name])
+            return [frame for lane, run in asked if (frame := lane.frame(run, origin)) is not None]
 
-    def _sync(self, columns: set[str]) -> None:
-        if self._live is None:
-            self._live = LiveRun(self._engine, self.columns)
-        self._live.sync(columns)
-        for lane in self._lanes:
-            if lane.wanted.run == "live":
-                lane.changed(self._live.changed)
-
-    def _frame(self, lane: Lane, origin: int, newest: int) -> bytes | None:
-        name = lane.wanted.run
-        if name == "live":
-            assert self._live is not None
-            return lane.frame(self._live, origin, newest)
-        run = self._find(name)
-        if run is None:
-            return None
-        run.sync(lane.wanted.columns)
-        if isinstance(run, BesideRun):
-            for other in self._lanes:
-                if other.wanted.run == name:
-                    other.changed(run.changed)
-        return lane.frame(run, origin, newest)
+    def _sync(self, run: Run, lanes: list[Lane]) -> None:
+        """Bring a run up to date for the lanes that show it."""
+        run.sync({column for lane in lanes for column in lane.levelled})
+        for lane in lanes:
+            lane.changed(run.changed)
 
     def _find(self, name: str) -> Run | None:
-        """The previous revision, what is smoothed, a pinned one, or one less what runs; None if there is none."""
+        """What runs, the previous revision, what is smoothed, a pinned one, or one less what runs; None if none is."""
+        if name == LIVE:
+            if self._live is None:
+                self._live = LiveRun(self._engine, self.columns)
+            return self._live
         pull = self._pulled(name.removeprefix(LESS))
         kept = self._kept.get(name)
         if pull is None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from app.engine.commands import SetTuning
 from app.engine.outputs import Pull
 from app.series.columns import columns_of
 from app.series.lane import Lane, Wanted, drawn, wanted_from_json
@@ -100,6 +101,32 @@ def test_small_frames_are_as_good_as_one(engine: FakeEngine, wanted: dict, point
     np.testing.assert_array_equal(browser.x[-len(again.x) :], again.x)
     for name in names:
         np.testing.assert_allclose(browser.values[name][-len(again.x) :], again.values[name], rtol=1e-6, atol=1e-5)
+
+
+def test_only_what_is_far_away_has_levels(engine: FakeEngine) -> None:
+    """And what is near, or was looked at from afar, holds what it would without."""
+    engine.put(readings(engine, 0, 20_000))
+    series = Series(engine)
+    names = tuple(series.columns)
+    near, close = look(series, columns=names, span=30.0)
+    far, _ = look(series, columns=("health",))
+    close.take(series.frames([near, far])[0])
+    assert series._live is not None and series._live._levels.asked == ["health"]
+    alone = whole(Series(engine), columns=names, span=30.0)
+    np.testing.assert_array_equal(close.x, alone.x)
+    for name in names:
+        np.testing.assert_array_equal(close.values[name], alone.values[name])
+    wide, from_afar = look(series, columns=("nis",))
+    for frame in series.frames([wide]):
+        from_afar.take(frame)
+    assert series._live._levels.asked == ["health", "nis"]
+    alone = whole(Series(engine), columns=("nis",))
+    np.testing.assert_array_equal(from_afar.values["nis"], alone.values["nis"])
+    # Nobody looks at it any more, and another revision begins.
+    series.close(wide)
+    engine.submit(SetTuning("Q.rate", 0.5))
+    assert series.frames([near, far])
+    assert series._live._levels.asked == ["health"]
 
 
 def test_points_are_no_more_than_asked_for(engine: FakeEngine) -> None:

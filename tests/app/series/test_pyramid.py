@@ -34,7 +34,7 @@ def rows(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return np.sort(rng.integers(0, 10**9, n)), values
 
 
-@pytest.mark.parametrize(("size", "first"), [(1, 0), (4, 0), (4, 3), (16, 15), (16, 16), (64, 1000)])
+@pytest.mark.parametrize(("size", "first"), [(1, 0), (4, 0), (4, 3), (5, 7), (12, 0), (16, 15), (16, 16), (64, 1000)])
 def test_groups_hold_the_extremes(size: int, first: int) -> None:
     t, values = rows(333)
     same(grouped(size, first, t, values), by_hand(size, first, t, values))
