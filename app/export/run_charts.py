@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from ..drawing.palette import LIGHT, RGB
 from ..series.columns import columns_of, rows_of
 from ..series.lane import drawn
 from ..series.pyramid import Groups, grouped
+from .extent import extent
 from .svg import Frame, Layer, chart
 
 MOST = 24
@@ -27,9 +28,6 @@ POINTS = 400
 
 TALL, LOW = 190, 120
 """Pixels."""
-
-WIDE, USUAL = 8.0, 0.2
-"""Times the usual width of a band beyond which it does not rule the axis, and the share of rows whose is narrower."""
 
 SMOOTHED = ("mean:", "upper:", "lower:")
 """Columns of which there are smoothed ones."""
@@ -128,12 +126,13 @@ class _Charts:
             layers.append(Layer("truth", TRUTH, self._x[known], truth[known], width=1.2, dash="5 3"))
         layers.append(Layer("estimate", ESTIMATE, self._x, mean, width=1.6))
         layers += self._smoothed_layers(name, circular=getattr(state, "circular", False))
-        extent = _extent(upper, lower, [layer.y for layer in layers if layer.low is None])
+        lines = [layer.y for layer in layers if layer.low is None and not layer.radius]
+        spanned = extent(lines, [(lower, upper)], [layer.y for layer in layers if layer.radius])
         if j == self._model.mode:
-            extent = (-0.03, 1.03)
+            spanned = (-0.03, 1.03)
         note = "" if readers else "not measured"
         label = self._model.label(name).replace("_", " ")
-        return self._drawn(label, unit, note, TALL, extent, layers)
+        return self._drawn(label, unit, note, TALL, spanned, layers)
 
     def _smoothed_layers(self, name: str, *, circular: bool) -> list[Layer]:
         """Its mean, and an edge of its band to either side."""
@@ -153,14 +152,14 @@ class _Charts:
         finite = mean[np.isfinite(mean)]
         bottom = min(middle - 1.0, float(finite.min()) - 0.15) if finite.size else middle - 1.0
         top = max(middle + 1.0, float(finite.max()) + 0.15) if finite.size else middle + 1.0
-        dots = np.where(nis < bottom, np.nan, np.minimum(nis, top - 0.03))
+        dots = np.where(nis < bottom, np.nan, nis)
         layers = [
             Layer("95 % bounds", BOUNDS, self._x, high, low),
             Layer("of a reading", QUIET, self._x, dots, radius=1.2),
             Layer("mean", ESTIMATE, self._x, mean, width=1.6),
         ]
         marks = tuple((float(np.log10(v)), f"{v:g}") for v in DECADES if bottom <= np.log10(v) <= top)
-        return self._drawn("NIS", "", "mean of the last readings", TALL, (bottom, top), layers, marks)
+        return self._drawn("NIS", "", "mean of the last readings", TALL, (bottom, top), layers, marks, _power)
 
     def _innovation(self, name: str, sensor: int, row: int) -> str:
         over, under, values = (
@@ -171,7 +170,7 @@ class _Charts:
             Layer("± 2σ expected", BOUNDS, self._x[known], over[known], under[known]),
             Layer("reading − prediction", READING, self._x, values, radius=1.3),
         ]
-        low, high = _extent(over, under, [values])
+        low, high = extent([], [(under, over)], [values])
         most = max(abs(low), abs(high))
         unit = self._model.sensors[sensor].rows[row].unit
         return self._drawn(f"{name.replace('_', ' ')}: innovation", unit, "", LOW, (-most, most), layers)
@@ -182,14 +181,14 @@ class _Charts:
         unit: str,
         note: str,
         height: int,
-        extent: tuple[float, float],
+        spanned: tuple[float, float],
         layers: list[Layer],
         marks: tuple[tuple[float, str], ...] | None = None,
+        says: Callable[[float], str] | None = None,
     ) -> str:
         self._made += 1
-        return chart(
-            Frame(f"chart{self._made}", title, unit, note, height, self._span, extent, marks), layers, self._shades
-        )
+        frame = Frame(f"chart{self._made}", title, unit, note, height, self._span, spanned, marks, says)
+        return chart(frame, layers, self._shades)
 
 
 def _turn(angles: np.ndarray) -> np.ndarray:
@@ -204,21 +203,10 @@ def _unbroken(angles: np.ndarray) -> np.ndarray:
     return out
 
 
+def _power(decades: float) -> str:
+    return f"{10.0**decades:.3g}"
+
+
 def _log(values: np.ndarray) -> np.ndarray:
     out: np.ndarray = np.log10(np.maximum(values, 1e-9))
     return out
-
-
-def _extent(upper: np.ndarray, lower: np.ndarray, others: Sequence[np.ndarray]) -> tuple[float, float]:
-    """What the value axis spans: all that is drawn, but for bands that are far wider than usual, as a prior's."""
-    widths = upper - lower
-    known = np.isfinite(widths)
-    if known.any():
-        known &= widths <= WIDE * np.quantile(widths[known], USUAL)
-    values = np.concatenate([upper[known], lower[known], *others])
-    values = values[np.isfinite(values)]
-    if not values.size:
-        return 0.0, 1.0
-    low, high = float(values.min()), float(values.max())
-    margin = 0.06 * (high - low) or max(1e-9, 1e-3 * abs(high))
-    return low - margin, high + margin

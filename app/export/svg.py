@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from html import escape
 from typing import NamedTuple
 
@@ -12,7 +12,13 @@ import numpy as np
 WIDTH, LEFT, RIGHT, TOP, BOTTOM = 820, 58, 18, 26, 22
 """Pixels: of the whole, and of the margins around the frame."""
 
-INK, FAINT, GRID = "#14202f", "#5b6a7d", "#e5e9ef"
+INK, FAINT, GRID, WRONG = "#14202f", "#5b6a7d", "#e5e9ef", "#c72a08"
+
+APART = 7
+"""Pixels from one mark at the edge to the next."""
+
+SHARE = 0.15
+"""Of a chart, beyond which the tint of what was wrong fades, as what covers all tells nothing; its strip stays."""
 
 SECONDS = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400)
 """Steps of a time axis."""
@@ -38,7 +44,7 @@ class Layer(NamedTuple):
 class Frame(NamedTuple):
     """A chart's name in its file, title, unit, note, height in pixels, and what its axes span.
 
-    `ticks` are values and labels of the value axis, in place of round numbers.
+    `ticks` are values and labels of the value axis, in place of round numbers; `says` puts a value in words.
     """
 
     key: str
@@ -49,6 +55,7 @@ class Frame(NamedTuple):
     span: tuple[float, float]
     extent: tuple[float, float]
     ticks: tuple[tuple[float, str], ...] | None = None
+    says: Callable[[float], str] | None = None
 
 
 def chart(frame: Frame, layers: Sequence[Layer], shades: Sequence[tuple[float, float]] = ()) -> str:
@@ -77,15 +84,56 @@ def chart(frame: Frame, layers: Sequence[Layer], shades: Sequence[tuple[float, f
         body.append(f'<path d="M{at:.1f} {TOP}v{inner[1]}" stroke="{GRID}"/>')
         body.append(f'<text x="{at:.1f}" y="{frame.height - 7}" text-anchor="middle">{clock(value)}</text>')
     body.append(f'<g clip-path="url(#{frame.key})">')
-    for start, end in shades:
-        a, b = float(x(max(left, start))), float(x(min(right, end)))
-        body.append(f'<rect x="{a:.1f}" y="{TOP}" width="{max(2.0, b - a):.1f}" height="{inner[1]}" fill="#cc3f0c14"/>')
+    stretches = _stretches(shades, left, right)
+    covered = sum(end - start for start, end in stretches)
+    strength = min(1.0, SHARE * (right - left) / (covered or 1e-9))
+    for start, end in stretches:
+        place = f'x="{float(x(start)):.1f}" y="{TOP}" width="{max(2.0, float(x(end) - x(start))):.1f}"'
+        body.append(f'<rect {place} height="{inner[1]}" fill="{WRONG}14" opacity="{strength:.3f}"/>')
+        body.append(f'<rect {place} height="3" fill="{WRONG}a0"/>')
     body += [_layer(layer, x(layer.x), y(layer.y), None if layer.low is None else y(layer.low)) for layer in layers]
+    body += _outsiders([layer for layer in layers if layer.low is None], frame, x)
     body.append("</g>")
     note = f'<tspan fill="{FAINT}" font-weight="400">  {escape(frame.note)}</tspan>' if frame.note else ""
     body.append(f'<text x="{LEFT}" y="16" fill="{INK}" font-size="12" font-weight="650">{escape(heading)}{note}</text>')
     body.append(_legend([layer for layer in layers if layer.name]))
     return "\n".join([*body, "</svg>"])
+
+
+def _stretches(shades: Sequence[tuple[float, float]], left: float, right: float) -> list[list[float]]:
+    """What of them is between two times, joined where they overlap."""
+    found: list[list[float]] = []
+    for start, end in sorted((max(left, start), min(right, end)) for start, end in shades):
+        if found and start <= found[-1][1]:
+            found[-1][1] = max(found[-1][1], end)
+        elif end >= start:
+            found.append([start, end])
+    return found
+
+
+def _outsiders(layers: Sequence[Layer], frame: Frame, x: Callable[[np.ndarray], np.ndarray]) -> list[str]:
+    """Marks at the edges of the frame where a value lies beyond it, and of the furthest which it is."""
+    body = []
+    low, high = frame.extent
+    for above, edge in ((True, TOP + 1), (False, frame.height - BOTTOM - 1)):
+        slots: dict[int, tuple[float, float, str]] = {}
+        for layer in layers:
+            beyond = np.flatnonzero(layer.y > high if above else layer.y < low)
+            for at, value in zip(x(layer.x[beyond]).tolist(), layer.y[beyond].tolist(), strict=True):
+                slot = round(at / APART)
+                if slot not in slots or (value > slots[slot][1]) is above:
+                    slots[slot] = at, value, layer.color
+        base = edge + (8 if above else -8)
+        body += [
+            f'<path d="M{at:.1f} {edge}L{at - 4:.1f} {base}h8Z" fill="{color}"/>' for at, _, color in slots.values()
+        ]
+        if slots:
+            at, value, _ = (max if above else min)(slots.values(), key=lambda mark: mark[1])
+            late = at > LEFT + 0.8 * (WIDTH - LEFT - RIGHT)
+            side = f'x="{at - 7:.1f}" text-anchor="end"' if late else f'x="{at + 7:.1f}"'
+            said = frame.says(value) if frame.says else f"{value:.4g} {frame.unit}".strip()
+            body.append(f'<text {side} y="{edge + 9 if above else edge - 1}">{escape(said)}</text>')
+    return body
 
 
 def _layer(layer: Layer, x: np.ndarray, y: np.ndarray, low: np.ndarray | None) -> str:

@@ -54,7 +54,7 @@ export class Around {
   }
 
   heard(status) {
-    if (status.refolding || this.asking || !$("tune").checkVisibility()) return;
+    if (status.refolding || !this.link.settled || this.asking || !$("tune").checkVisibility()) return;
     const now = performance.now();
     const wait = this.said.Q?.done ? AGAIN : SOON;
     const due = this.revision !== status.revision || now - this.when > wait;

@@ -1,7 +1,7 @@
 // The stack of charts: one time axis, one cursor. States that nobody measures first, then the others, NIS, innovations.
 
 import { Chart, apart, band, colour, dots, edge, line } from "./chart.js";
-import { $ } from "./dom.js";
+import { $, setText } from "./dom.js";
 import { bracketed, clock, compact, decimals, fixed, spaced, withDeviation, words } from "./format.js";
 import { groupCharts, groupsOf } from "./groups.js";
 import { Lane } from "./lane.js";
@@ -124,7 +124,9 @@ export class Charts {
     this.draw();
   }
 
+  // Of charts without a row it is said why there is none.
   told(status) {
+    setText($("no-rows"), status.t === null ? status.cause || "waiting for the first reading" : "");
     if (status.integrity) this.integrity = status.integrity;
   }
 

@@ -2,6 +2,7 @@
 
 const SLOWEST = 8000; // ms between two attempts to connect
 const QUIET = 1000; // ms without news after which the last status is told again
+const SETTLED = 700; // ms after the last edit or revision
 
 // Events: "status", "episodes", "notices", "frames", "connection"; each with `detail`.
 export class Link extends EventTarget {
@@ -13,6 +14,7 @@ export class Link extends EventTarget {
     this.lanes = {}; // what was asked for, to ask again after a break
     this.takers = {}; // by lane: take(header, seconds, columns)
     this.delay = 250;
+    this.turned = -Infinity; // when something was edited, or folded anew
     document.addEventListener("visibilitychange", () => (document.hidden ? this.close("hidden") : this.open()));
     // A twin whose source has ended has no news, but ages and answers that are waited for go on.
     setInterval(() => this.socket && this.told && performance.now() - this.told > QUIET && this.tell("status", this.status), QUIET);
@@ -55,6 +57,11 @@ export class Link extends EventTarget {
     this.tell("connection", why);
   }
 
+  // Whether a drag is over: what a run is worth, and what lies around a knob, is not worked out for each value on the way.
+  get settled() {
+    return performance.now() - this.turned > SETTLED;
+  }
+
   say(message) {
     if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
   }
@@ -91,6 +98,7 @@ export class Link extends EventTarget {
     const message = JSON.parse(data);
     if (message.boot && message.boot !== this.boot) location.reload(); // another server, perhaps another twin
     if (message.status) {
+      if ("revision" in message.status) this.turned = performance.now();
       Object.assign(this.status, message.status);
       this.tell("status", this.status);
     }
@@ -107,6 +115,7 @@ export class Link extends EventTarget {
 
   // Ask something of the twin. Resolves to null, or to the reason why not.
   async ask(command, fields = {}) {
+    this.turned = performance.now();
     try {
       const answer = await fetch("/api/command", {
         method: "POST",

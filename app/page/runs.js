@@ -31,7 +31,7 @@ export class Runs {
 
   // While somebody looks, and is not just writing.
   async heard(status) {
-    if (!this.node.checkVisibility() || this.asking) return;
+    if (!this.node.checkVisibility() || this.asking || (this.key && !this.link.settled)) return;
     const key = `${status.runs.version}/${status.revision}/${status.refolding}`;
     if (key === this.key && (status.finished || performance.now() - this.when < AGAIN)) return;
     if (this.node.contains(document.activeElement) && document.activeElement.matches("input, textarea")) return;

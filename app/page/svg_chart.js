@@ -3,6 +3,7 @@
 import { amount } from "./chart.js";
 import { outsiders } from "./edges.js";
 import { bracketed, clock, compact } from "./format.js";
+import { stretches } from "./marks.js";
 
 const [W, H] = [960, 330]; // px
 const [LEFT, RIGHT, TOP, BOTTOM] = [64, 16, 50, 30];
@@ -43,9 +44,11 @@ export function chartSvg(chart, [title, about], episodes, tone = lightColours())
     const name = what.names?.[key] ?? NAMES[key] ?? key;
     if (mark && name && !legend.has(name)) legend.set(name, sample);
   };
-  for (const episode of episodes) {
-    const [start, end] = [Math.max(span[0], episode.from ?? span[0]), Math.min(span[1], episode.to ?? span[1])];
-    if (end >= start) marks.push(`<rect x="${round(x(start))}" y="${TOP}" width="${Math.max(2, round(x(end) - x(start)))}" height="${H - TOP - BOTTOM}" fill="${tone("episode")}"/>`);
+  const { found, strength } = stretches(episodes, span);
+  for (const [from, to] of found) {
+    const place = `x="${round(x(from))}" y="${TOP}" width="${Math.max(2, round(x(to) - x(from)))}"`;
+    marks.push(`<rect ${place} height="${H - TOP - BOTTOM}" fill="${tone("episode")}" opacity="${strength.toFixed(3)}"/>`);
+    marks.push(`<rect ${place} height="3" fill="${tone("episode-strip")}"/>`);
   }
   const times = data[0];
   const finite = (value) => typeof value === "number";
