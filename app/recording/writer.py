@@ -198,6 +198,7 @@ class _Part:
             self._events.next = self._start
         self._drawn_from = self._charts.next
         self._revision = -1
+        self._before = before._revision if before else -1
         self._edited, self._undrawn = False, True
         self._turned: float | None = None
         try:
@@ -258,7 +259,8 @@ class _Part:
                     self._twin = self._engine.twin
                     self.file.twin(self._twin.text, self._twin.overrides, self._twin.version)
                 self.file.tuning(tuning, estimator, pull.first, pull.revision)
-                if begun and not pull.fresh:
+                # An edit while this part was begun, too: its base may be of the revision before.
+                if (begun or self._before not in (-1, pull.revision)) and not pull.fresh:
                     self._edited, self._turned = True, time.monotonic()
                 self._revision = pull.revision
             self.file.write(pull)

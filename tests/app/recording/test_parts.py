@@ -175,6 +175,29 @@ def test_parts_fold_by_themselves_to_the_same_bits(estimator, start, tmp_path):
     assert reached == COUNT and seen is last
 
 
+def test_an_edit_while_a_part_is_begun_reviews_to_the_same_bits(start, tmp_path):
+    """Where the part starts was copied from the revision before, which nobody sees any more when its rows are written."""
+    source, engine, drawn = start(split=Split(size=50_000))
+
+    def draw(stream):
+        if len(engine.recorder.finished) == 2:
+            edit(engine, "Q.rate", 0.013)
+        return drawn.append
+
+    engine.recorder._draw = draw
+    path = tmp_path / "run.rrd"
+    engine.submit(commands.Record(path))
+    wait_for(lambda: engine.recorder.path == path)
+    feed(source, engine, 0, COUNT)
+    last = pull_all(engine)
+    stop_recording(engine)
+    third = read_recording(engine.recorder.finished[2])
+    assert engine._revision == 1 and third.first > 0
+    end = third.first + third.rows
+    # What health and age at the start look back at is in the part before.
+    assert_same(refold(third).select(slice(1000, None)), last.track.select(slice(third.first + 1000, end)))
+
+
 @pytest.mark.parametrize("estimator", ["kf", "pf"])
 def test_a_session_that_forgot_its_oldest_events_reviews_to_the_same_bits(estimator, start, tmp_path):
     """The history is folded again from what the forgotten events left, and random numbers go by a row's own index."""
