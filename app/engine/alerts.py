@@ -10,8 +10,9 @@ from estimators.diagnostics.failure_cause import failures
 from estimators.fold import Fold
 from estimators.fold_failures import cause_of
 from estimators.gate.stories import AGREES
+from estimators.track import estimated_rows
 
-from .counts import UNSETTLED, complaints, estimated_rows
+from .counts import UNSETTLED, complaints
 from .notices import Notices
 from .refusals import refusals
 

@@ -20,9 +20,9 @@ from estimators.diagnostics.episodes import ANY, JOINED, LOSSES, Course, Episode
 from estimators.diagnostics.evidence import LOST
 from estimators.diagnostics.held_out import Offset, offsets
 from estimators.registry import find_estimator
-from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING, WAITING
+from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING, WAITING, estimated_rows
 
-from .counts import estimated_rows, last_run
+from .counts import last_run
 from .interface import Running
 from .tail import ROWS, Tail
 

@@ -81,12 +81,6 @@ def complaints(model: StateSpaceModel, channel: np.ndarray, track: Track, first:
             yield f"{VERDICT_NAMES[code]} {sensor}", f"{sensor}: reading {what}{nis}"
 
 
-def estimated_rows(track: Track) -> np.ndarray:
-    """Which rows hold an estimate: one state that is not a number leaves none, whatever the others say."""
-    # A sum is finite only where all of it is; and it takes a third of the time that `all` does along so few columns.
-    return np.asarray(np.isfinite(np.einsum("ij->i", track.mean) + np.einsum("ij->i", track.std)))
-
-
 def last_run(codes: np.ndarray) -> int:
     """The first of the equal codes at the end of an array that is not empty."""
     end = len(codes)

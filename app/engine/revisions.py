@@ -73,6 +73,8 @@ class Revisions:
         """Counts up with every change, so that a page knows when to ask again."""
         self.why = ""
         """Why the next revision is folded, if not for another setting."""
+        self.watchers: set[Callable[[], None]] = set()
+        """Called at every change, by the thread that makes it: they must neither wait nor fail."""
         self.said: Callable[[int], tuple[Episode, ...]] = lambda number: ()
         """Gives the episodes of the revision that runs."""
 
@@ -193,6 +195,8 @@ class Revisions:
         # At once, so that a reader in another thread never sees half of it.
         self.runs = tuple(runs)
         self.version += 1
+        for told in tuple(self.watchers):
+            told()
 
 
 def _of_one(running: Run, changes: tuple[Change, ...]) -> bool:

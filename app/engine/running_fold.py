@@ -260,6 +260,7 @@ class RunningFold:
             picture=period,
             expected=self.twin.expected,
             idle=idle,
+            room=self._log.capacity,
         )
 
     def _extend(self, batch: Events, horizon: int | None, settled: np.ndarray | None) -> tuple[int, int]:

@@ -8,11 +8,10 @@ import rerun as rr
 from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.sensor_states import STATES, states_along
 from estimators.log import READING, Events, truth_of
-from estimators.track import FAILED, GATED, HEALTH_NAMES, Track
+from estimators.track import FAILED, GATED, HEALTH_NAMES, Track, estimated_rows
 
 from ..drawing.direct_readings import observed
 from ..drawing.palette import EITHER, Palette
-from ..engine.counts import estimated_rows
 from ..engine.interface import Running
 from ..engine.notices import Notice
 from ..engine.outputs import Pull

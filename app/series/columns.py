@@ -9,9 +9,7 @@ import numpy as np
 
 from estimators.log import INPUT, READING, Events, truth_of
 from estimators.model.state_space import StateSpaceModel
-from estimators.track import FAILED, GATED, HELD_OUT, USED, Track
-
-from ..engine.counts import estimated_rows
+from estimators.track import FAILED, GATED, HELD_OUT, USED, Track, estimated_rows
 
 LINE, UPPER, LOWER, DOTS = "line", "upper", "lower", "dots"
 """How the rows of a bucket become its points: both extremes; the highest or the lowest alone; a few rows among many."""

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..engine.counts import estimated_rows
+from estimators.track import estimated_rows
+
 from ..engine.interface import Running
 from ..engine.outputs import Pull
 from .columns import Column

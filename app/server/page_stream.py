@@ -22,12 +22,6 @@ from .belief_json import belief_json, pair_from_json
 PERIOD = 0.1
 """Seconds between two frames, at least."""
 
-WAITING = 0.03
-"""The same while a refold is waited for: somebody has just turned something."""
-
-HURRY = 0.5
-"""Seconds for which it is so after a command, before which the engine has taken it."""
-
 STATUS = 0.25
 """Seconds between two words on the state of the twin."""
 
@@ -53,12 +47,6 @@ class PageStream:
         self._notice = 0
         self._pair: tuple[int, int] | None = None
         self._believed: tuple[int, int] | None = None
-        self._hurried = -HURRY
-
-    def hurry(self) -> None:
-        """A command has come: what follows from it shall not wait for the next frame."""
-        self._hurried = time.monotonic()
-        self._asked.set()
 
     async def run(self) -> None:
         """Serve until either side ends it."""
@@ -66,9 +54,17 @@ class PageStream:
         await self._browser.send_text(json.dumps({"boot": self._boot}))
         # What the twin says of itself does not wait for its rows, nor these for the fold.
         tasks = [asyncio.create_task(work) for work in (self._listen(), self._tell(), self._draw())]
+        loop, watchers = asyncio.get_running_loop(), self._engine.revisions.watchers
+
+        def folded_anew() -> None:
+            with contextlib.suppress(RuntimeError):  # the server has ended
+                loop.call_soon_threadsafe(self._asked.set)
+
+        watchers.add(folded_anew)
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
+            watchers.discard(folded_anew)
             for task in tasks:
                 task.cancel()
             for outcome in await asyncio.gather(*tasks, return_exceptions=True):
@@ -148,11 +144,11 @@ class PageStream:
                     # The page says `drawn` once it has drawn all of them.
                     await self._browser.send_text('{"frames":true}')
             await self._believe()
-            awaited = time.monotonic() - self._hurried < HURRY or self._told.get("refolding")
-            rest = (WAITING if awaited else PERIOD) - (time.monotonic() - begun)
             with contextlib.suppress(TimeoutError):
-                # What a page asks for newly, it shall see at once.
-                await asyncio.wait_for(self._asked.wait(), max(0.001, rest))
+                async with asyncio.timeout(max(0.001, PERIOD - (time.monotonic() - begun))):
+                    # What a page asks for newly, and another revision, it shall see at once, if it has drawn the last.
+                    await self._drawn.wait()
+                    await self._asked.wait()
 
     async def _believe(self) -> None:
         """Send what is believed of the two states that the page shows, if that is news."""

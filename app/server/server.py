@@ -98,7 +98,6 @@ class PageServer:
         self._forecasts, self._diagnosis = Forecasts(engine), Diagnosis(engine)
         self._forecasting, self._diagnosing = OneAtATime("forecast"), OneAtATime("diagnosis")
         self._boot = uuid.uuid4().hex
-        self._streams = set[PageStream]()
         self.unread: str | None = None
         """What is wrong with the twin's files as they were saved last, if they are not what runs."""
         self._own_door = not isinstance(port, Door)
@@ -201,12 +200,7 @@ class PageServer:
         return Json(await asyncio.to_thread(model_json, self._engine))
 
     async def _page_stream(self, browser: WebSocket) -> None:
-        stream = PageStream(browser, self._engine, self._series, self._state, self._boot)
-        self._streams.add(stream)
-        try:
-            await stream.run()
-        finally:
-            self._streams.discard(stream)
+        await PageStream(browser, self._engine, self._series, self._state, self._boot).run()
 
     async def _episodes(self, request: Request) -> Response:
         return Json(episodes_json(self._engine))
@@ -222,8 +216,6 @@ class PageServer:
         async def submit(body: Any) -> Response:
             command = command_from_json(body, self._engine)
             self._engine.submit(command)
-            for stream in self._streams:
-                stream.hurry()
             return Json({"submitted": type(command).__name__}, 202)
 
         return await answered(request, submit)

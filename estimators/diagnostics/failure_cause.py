@@ -18,7 +18,7 @@ from ..errors import ModelError
 from ..model.check import indefinite, numbers, place
 from ..model.state_space import SHOWN
 from ..numerics.steps import steps_of
-from ..track import FAILED, GATED, Track
+from ..track import FAILED, GATED, Track, estimated_rows
 
 AWAY = (1.0, -1.0, 3.0, -3.0)
 """Standard deviations from the estimate, a state at a time; the sigma points of nx states lie at about √nx."""
@@ -37,9 +37,8 @@ class Estimate(NamedTuple):
 def failures(track: Track, first: int = 0) -> np.ndarray:
     """Rows from `first` on whose reading failed (or was refused without a NIS), or whose estimate is not a number."""
     rows = track.select(slice(first, len(track)))
-    known = np.all(np.isfinite(rows.mean), axis=1) & np.all(np.isfinite(rows.std), axis=1)
     failed = (rows.verdict == FAILED) | (rows.verdict == GATED) & ~np.isfinite(rows.nis)
-    return first + np.flatnonzero(~known | failed)
+    return first + np.flatnonzero(~estimated_rows(rows) | failed)
 
 
 def cause(
