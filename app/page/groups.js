@@ -48,7 +48,7 @@ function lines(charts, group) {
   const strong = () => members[furthest]?.name;
   return {
     ...own,
-    note: `${members[0].number} to ${members.at(-1).number}; drawn strong, ± 2σ: the one furthest from the others`,
+    note: `${members[0].number} to ${members.at(-1).number}; strong: furthest from the others`,
     names: { quiet: "each", estimate: "furthest from the others" },
     weight: 1.6,
     series: [...members.map(() => line("quiet", { width: 1 })), line("estimate", { width: 2 })],

@@ -2,7 +2,7 @@
 
 import { colour } from "./chart.js";
 
-const STRIP = 3; // px
+const STRIP = 2; // px
 const SHARE = 0.15; // of a chart, beyond which its tint fades, as what covers all tells nothing
 
 // Episodes between two times as stretches that do not overlap, [[from, to]], and how strong their tint is, up to 1.

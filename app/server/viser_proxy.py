@@ -19,8 +19,8 @@ from .private_viser import HEADER
 PASSED_ON = ("content-type", "content-encoding", "etag", "last-modified", "cache-control")
 ASKED = ("accept", "accept-encoding", "if-none-match")
 HEAD = b"<head>"
-LABELS = PAGE / "viser_labels.js"
-AHEAD = "<script>{labels}</script>"
+SCRIPTS = PAGE / "viser_labels.js", PAGE / "viser_shown.js"
+AHEAD = "<script>{script}</script>"
 """What goes into Viser's page ahead of its own script; in the text, as a frame under another name may fetch no more."""
 
 SCENE_ALONE = """<style>
@@ -54,7 +54,8 @@ class ViserProxy:
         except (OSError, http.client.HTTPException) as error:
             return PlainTextResponse(f"Nisus: the Viser pane does not answer ({error}).\n", 502)
         if path == "/":
-            ahead = AHEAD.format(labels=LABELS.read_text()) + (SCENE_ALONE if "scene" in request.query_params else "")
+            ahead = "".join(AHEAD.format(script=script.read_text()) for script in SCRIPTS)
+            ahead += SCENE_ALONE if "scene" in request.query_params else ""
             body = body.replace(HEAD, HEAD + ahead.encode(), 1)
         answer = Response(body, status)
         for name, value in headers:

@@ -9,7 +9,7 @@ from estimators.log import Events
 from ..engine.outputs import Pull
 
 _EVENTS = ("t", "kind", "channel", "value")
-_COLUMNS = (*_EVENTS, "mean", "nis", "nis_mean", "nis_low", "nis_high", "verdict")
+_COLUMNS = (*_EVENTS, "mean", "std", "nis", "nis_mean", "nis_low", "nis_high", "verdict")
 
 
 class History:
@@ -24,7 +24,7 @@ class History:
         self.span: int | None = None
         self.base = 0
         self.n = 0
-        shapes = {"value": (width,), "mean": (nx,)}
+        shapes = {"value": (width,), "mean": (nx,), "std": (nx,)}
         kinds = {"t": np.int64, "kind": np.int8, "channel": np.int32, "verdict": np.int8}
         # Filled, not empty: the pages are paid for now, and memory stays flat.
         self._columns = {

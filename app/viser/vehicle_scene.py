@@ -27,6 +27,9 @@ from .camera import Outlook
 from .history import History
 from .peak_trail import PeakTrail
 
+UNSURE = 20.0
+"""Times the usual deviation of a place, beyond which the trail says nothing of it."""
+
 TRAIL = 300
 """Points of a line where something was, at most."""
 
@@ -161,10 +164,11 @@ class VehicleScene:
         self._vehicle.visible = known
         self._mark(belief.peaks if known else ())
         plane, t = mean[:, [self.east, self.north]], history.column("t")
+        std = history.column("std")[:, [self.east, self.north]]
         several = known and len(belief.peaks) > 1
         self._way.look(t, plane, belief.peaks[0].mean[[self.east, self.north]] if several else None)
         if heavy:
-            east, north = self._way.of(t, plane).T
+            east, north = self._way.of(t, where_known(plane, std)).T
             self._trail.points = segments(self._plane(east, north, 0.06))
             self._draw_truth(history)
             self._draw_readings(history)
@@ -266,6 +270,13 @@ class VehicleScene:
         if np.hypot(*step) > 0.2 * self._length:  # not so if one of the two is NaN
             self._course = float(np.arctan2(step[1], step[0]))
         return self._course
+
+
+def where_known(plane: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Places (n, 2), NaN while their deviations (n, 2) are far wider than usual: there a prior stands, no vehicle."""
+    spread = np.hypot(*std.T)
+    known = spread <= UNSURE * np.nanmedian(spread) if np.isfinite(spread).any() else np.ones(len(plane), bool)
+    return np.where(known[:, None], plane, np.nan)
 
 
 def add_body(api: viser.SceneApi, name: str, size: tuple[float, float, float], palette: Palette) -> None:

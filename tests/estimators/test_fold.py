@@ -127,6 +127,21 @@ def test_rewind_far_behind_the_recent_snapshots(estimator):
     assert_same(growing.track, fold(estimator, MODEL, Tuning.of(MODEL), log.copy()))
 
 
+def test_a_fold_in_pieces_stops_no_more_often_than_one():
+    """Snapshots are dense where late readings fall: at the end of the log, whatever is folded at once."""
+    log = as_log(random_log(np.random.default_rng(5), MATRICES, 3 * RECENT).events)
+    taken = []
+    for size in (log.n, RECENT, 700):
+        growing = Fold("kf", MODEL, Tuning.of(MODEL), log)
+        remember, places = growing._remember, []
+        growing._remember = lambda pinned=False, of=growing, to=places, do=remember: (to.append(of.n), do(pinned))
+        while growing.advance(size):
+            pass
+        taken.append(places)
+    assert taken[0] == taken[1] == taken[2]
+    assert sum(place <= log.n - RECENT for place in taken[0]) == 2 * RECENT // 1024
+
+
 @pytest.mark.parametrize("late", [False, True])
 def test_follow_a_log_that_grew_meanwhile(estimator, late):
     """A refold on a copy, with another tuning, joins the live log: as if it had folded that from the start."""

@@ -176,7 +176,7 @@ def test_parts_fold_by_themselves_to_the_same_bits(estimator, start, tmp_path):
 
 
 def test_an_edit_while_a_part_is_begun_reviews_to_the_same_bits(start, tmp_path):
-    """Where the part starts was copied from the revision before, which nobody sees any more when its rows are written."""
+    """Where the part starts was copied from the revision before, which is gone when its rows are written."""
     source, engine, drawn = start(split=Split(size=50_000))
 
     def draw(stream):

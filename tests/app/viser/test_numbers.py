@@ -8,6 +8,7 @@ import pytest
 from app.drawing.geometry import ellipsoid, quaternion, round_step, segments, tick_text
 from app.viser.camera import MARGIN, Outlook, place
 from app.viser.history import History
+from app.viser.vehicle_scene import where_known
 
 
 def rotation_of(q):
@@ -100,7 +101,7 @@ def pull(first, t, fresh=False):
     n = len(t)
     column = np.arange(first, first + n, dtype=float)
     track = SimpleNamespace(
-        mean=column[:, None], nis=column, nis_mean=column, nis_low=column, nis_high=column,
+        mean=column[:, None], std=column[:, None], nis=column, nis_mean=column, nis_low=column, nis_high=column,
         verdict=np.zeros(n, np.int8),
     )  # fmt: skip
     readings = SimpleNamespace(
@@ -144,3 +145,15 @@ def test_history_starts_over_with_a_fresh_pull():
     history.take(pull(0, range(100)))
     history.take(pull(40, range(40, 60), fresh=True))
     assert (history.base, history.n) == (40, 20)
+
+
+def test_a_trail_says_nothing_of_places_that_only_a_prior_knows():
+    plane, std = np.arange(20.0).reshape(10, 2), np.full((10, 2), 0.1)
+    std[:3] = 50.0, 20.0
+    found = where_known(plane, std)
+    assert np.isnan(found[:3]).all()
+    np.testing.assert_array_equal(found[3:], plane[3:])
+    # While nothing better is known, it is drawn; and while it is lost for a while.
+    np.testing.assert_array_equal(where_known(plane[:3], std[:3]), plane[:3])
+    std[5:] *= np.linspace(1.0, 15.0, 5)[:, None]
+    np.testing.assert_array_equal(where_known(plane, std)[3:], plane[3:])
