@@ -43,6 +43,8 @@ export class Trust {
     setText($("cause"), cause + more);
     setAttribute($("cause"), "title", cause);
     this.gauge(status);
+    // What is wrong needs the room: sensors that are in order keep their light alone.
+    $("lights").dataset.brief = String(Boolean(cause));
     for (const [sensor, light] of this.lights) {
       const { state, text } = status.sensors[sensor] ?? { state: "waiting", text: "" };
       light.dataset.health = state;

@@ -30,6 +30,9 @@ from .peak_trail import PeakTrail
 UNSURE = 20.0
 """Times the usual deviation of a place, beyond which the trail says nothing of it."""
 
+LEAP = 20.0
+"""Times a usual step of the trail, beyond which it is none that a vehicle made."""
+
 TRAIL = 300
 """Points of a line where something was, at most."""
 
@@ -169,7 +172,7 @@ class VehicleScene:
         self._way.look(t, plane, belief.peaks[0].mean[[self.east, self.north]] if several else None)
         if heavy:
             east, north = self._way.of(t, where_known(plane, std)).T
-            self._trail.points = segments(self._plane(east, north, 0.06))
+            self._trail.points = segments(without_jumps(self._plane(east, north, 0.06)))
             self._draw_truth(history)
             self._draw_readings(history)
             self._draw_cloud(belief.points if known else ())
@@ -270,6 +273,14 @@ class VehicleScene:
         if np.hypot(*step) > 0.2 * self._length:  # not so if one of the two is NaN
             self._course = float(np.arctan2(step[1], step[0]))
         return self._course
+
+
+def without_jumps(way: np.ndarray) -> np.ndarray:
+    """A way (n, 3) with gaps where it leaps: a cloud found its vehicle elsewhere, which did not drive there."""
+    steps = np.hypot(*np.diff(way[:, :2], axis=0).T)
+    moving = steps[steps > 0.0]
+    leaps = np.flatnonzero(steps > LEAP * np.median(moving)) if moving.size else moving.astype(int)
+    return np.insert(way, leaps + 1, np.nan, axis=0)
 
 
 def where_known(plane: np.ndarray, std: np.ndarray) -> np.ndarray:

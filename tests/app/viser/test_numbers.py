@@ -8,7 +8,7 @@ import pytest
 from app.drawing.geometry import ellipsoid, quaternion, round_step, segments, tick_text
 from app.viser.camera import MARGIN, Outlook, place
 from app.viser.history import History
-from app.viser.vehicle_scene import where_known
+from app.viser.vehicle_scene import where_known, without_jumps
 
 
 def rotation_of(q):
@@ -157,3 +157,15 @@ def test_a_trail_says_nothing_of_places_that_only_a_prior_knows():
     np.testing.assert_array_equal(where_known(plane[:3], std[:3]), plane[:3])
     std[5:] *= np.linspace(1.0, 15.0, 5)[:, None]
     np.testing.assert_array_equal(where_known(plane, std)[3:], plane[3:])
+
+
+def test_a_trail_has_a_gap_where_the_estimate_leapt():
+    way = np.column_stack((np.arange(50.0), np.zeros(50), np.full(50, 0.06)))
+    np.testing.assert_array_equal(without_jumps(way), way)
+    way[30:, 0] += 40.0
+    found = without_jumps(way)
+    assert len(found) == 51 and np.isnan(found[30]).all()
+    np.testing.assert_array_equal(np.delete(found, 30, axis=0), way)
+    # At rest, and of nothing, there is no leap.
+    for count in (0, 1, 7):
+        assert without_jumps(np.ones((count, 3))).shape == (count, 3)
