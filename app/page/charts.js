@@ -315,6 +315,7 @@ function integrityLines(plot, charts, state) {
     ctx.beginPath();
     let open = false;
     for (let k = 0; k < x.length; k++) {
+      if (mean[k] === null) open = false; // a gap; what is undefined is a row of another table
       if (typeof mean[k] !== "number") continue;
       const [px, py] = [plot.valToPos(x[k], "x", true), plot.valToPos(mean[k] + side * found.bound, "y", true)];
       if (open) ctx.lineTo(px, py);
