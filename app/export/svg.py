@@ -12,7 +12,7 @@ import numpy as np
 WIDTH, LEFT, RIGHT, TOP, BOTTOM = 820, 58, 18, 26, 22
 """Pixels: of the whole, and of the margins around the frame."""
 
-INK, FAINT, GRID, WRONG = "#14202f", "#5b6a7d", "#e5e9ef", "#c72a08"
+INK, FAINT, GRID, WRONG, PANEL = "#14202f", "#5b6a7d", "#e5e9ef", "#c72a08", "#ffffff"
 
 APART = 7
 """Pixels from one mark at the edge to the next."""
@@ -132,6 +132,11 @@ def _outsiders(layers: Sequence[Layer], frame: Frame, x: Callable[[np.ndarray], 
             late = at > LEFT + 0.8 * (WIDTH - LEFT - RIGHT)
             side = f'x="{at - 7:.1f}" text-anchor="end"' if late else f'x="{at + 7:.1f}"'
             said = frame.says(value) if frame.says else f"{value:.4g} {frame.unit}".strip()
+            # On a plate, as there may be much beneath it.
+            wide = 6.2 * len(said) + 4
+            left = at - 7 - wide if late else at + 5
+            top = edge if above else edge - 12
+            body.append(f'<rect x="{left:.1f}" y="{top}" width="{wide:.1f}" height="12" fill="{PANEL}"/>')
             body.append(f'<text {side} y="{edge + 9 if above else edge - 1}">{escape(said)}</text>')
     return body
 
@@ -184,14 +189,15 @@ def _legend(layers: Sequence[Layer]) -> str:
 
 
 def ticks(low: float, high: float, about: float) -> list[float]:
-    """About so many round numbers from `low` to `high`."""
+    """About so many round numbers from `low` to `high`; two at least, or they would tell no scale."""
     if not high > low:
         return [low]
     rough = (high - low) / max(1.0, about)
     power = 10.0 ** math.floor(math.log10(rough))
     step = next((k * power for k in (1, 2, 5) if k * power >= rough), 10 * power)
     first = math.ceil(low / step - 1e-9)
-    return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
+    found = [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
+    return found if len(found) > 1 else ticks(low, high, 2.0 * max(1.0, about))
 
 
 def time_ticks(low: float, high: float) -> list[float]:

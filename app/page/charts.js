@@ -19,6 +19,7 @@ const DENSITY = 1.6; // px to a group of rows
 
 // The columns of a state's chart from the live lane, in the order of its series.
 const OF_STATE = ["upper", "lower", "truth", "mean"];
+const STILL = 500; // ms without a frame
 const BEFORE = 3; // which of them is that of the revision before
 const UNBOUNDED = 100; // times the band, or the value itself, from which on a bound says that nothing bounds it
 const MOST_GROWTH = 4; // halvings of the window while there is less than that to show
@@ -64,7 +65,10 @@ export class Charts {
     this.layout = new Layout(this.charts, node, $("layout"), model.twin, () => this.ask());
     view.addEventListener("change", () => this.ask());
     link.addEventListener("frames", () => this.draw());
-    link.addEventListener("episodes", (event) => (this.episodes = event.detail));
+    link.addEventListener("episodes", (event) => {
+      this.episodes = event.detail;
+      if (performance.now() - this.drawnAt > STILL) this.draw(); // of a twin that has ended, no frame would bring them
+    });
     link.addEventListener("status", (event) => this.told(event.detail));
     this.width = new ResizeObserver(() => this.ask());
     this.width.observe(node);
@@ -138,6 +142,7 @@ export class Charts {
     for (const chart of this.charts) if (!chart.node.hidden) chart.show(chart.what.data(), this.range, this.view.at);
     this.pins.show(this.range);
     this.axis.show(this.range);
+    this.drawnAt = performance.now();
     window.nisus.drawn = (window.nisus.drawn ?? 0) + 1;
     window.nisus.revision = this.live.revision;
     this.node.dataset.revision = this.live.revision;

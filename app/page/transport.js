@@ -30,7 +30,10 @@ export class Transport {
     this.canvas.addEventListener("keydown", (event) => this.keyed(event));
     link.look("overview", { columns: ["health"], points: POINTS }, (...frame) => this.lane.take(...frame));
     link.addEventListener("frames", () => this.draw());
-    link.addEventListener("episodes", (event) => (this.episodes = event.detail));
+    link.addEventListener("episodes", (event) => {
+      this.episodes = event.detail;
+      this.draw();
+    });
     link.addEventListener("status", (event) => this.show(event.detail));
     view.addEventListener("change", () => this.draw());
     new ResizeObserver(() => this.draw()).observe(this.canvas);

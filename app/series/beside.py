@@ -116,6 +116,10 @@ class Beside:
             if len(pull.events):
                 # A late reading has its rows sent again: what stood there is others now.
                 at = pull.first - log.first
+                if at > log.n:
+                    # The engine has forgotten events that were not taken yet: all of them again, from where it starts.
+                    self._cursor.log = -1
+                    return True
                 fold.rewind(at)
                 log.n = at
                 log.extend(pull.events)
@@ -136,10 +140,7 @@ class Beside:
         return len(pull.events) == MOST
 
     def _begin(self, pull: Pull) -> bool:
-        """Begin where the engine's fold does; False if that has moved, or the log has begun again."""
-        if self._fold is not None:
-            self._stopping.set()
-            return False
+        """Begin where the engine's fold does, also when the log has begun again; False if that has just moved."""
         engine, base = self._engine, self._engine.base()
         log = Log.of(engine.model)
         if base is not None:
@@ -147,10 +148,14 @@ class Beside:
         if pull.first != log.first or not len(pull.events):
             self._cursor.log = -1  # to be given all again
             return False
-        self._fold = Fold(
+        fold = Fold(
             self.run.estimator, engine.model, self.run.tuning, log,
             policy=engine.policy, base=base, expected=engine.twin.expected,
         )  # fmt: skip
+        with self._lock:
+            self._fold, self.caught_up = fold, False
+            for mark in self._marks:
+                mark.next = 0
         return True
 
 

@@ -83,8 +83,8 @@ class Lane:
         self._size = 0
         self._rows = (0, 0)
         """The rows in sight: the first, and the one after the last."""
-        self._sent = (0, 0)
-        """Numbers of the groups that the browser has: from the first to before the second."""
+        self._sent, self._end = (0, 0), 0
+        """Numbers of the groups that the browser has, from the first to before the second; the row after their last."""
         self._told: object = None
         """Which run, and which generation of it, they are of."""
         self._dirty = FOREVER
@@ -122,7 +122,11 @@ class Lane:
         """What has changed in what it looks at since the last frame, or None; the levels of the run are up to date."""
         (start, stop), size = self._rows, self._size
         told = (run, run.generation, size)
-        first, last = start // size, -(-min(stop, run.end) // size)
+        end = min(stop, run.end)
+        if end > self._end:
+            # Also rows that had come into sight only after it was looked for them.
+            self.changed(self._end)
+        first, last = start // size, -(-end // size)
         have_first, have_last = self._sent
         fresh = told != self._told or first < have_first or first > have_last
         at = first if fresh else min(have_last, self._dirty // size)
@@ -130,7 +134,7 @@ class Lane:
         if not fresh and (at >= last or self._dirty >= run.end):
             return None
         groups = run.groups(size, at, last, list(self.wanted.columns))
-        self._told, self._dirty = told, FOREVER
+        self._told, self._dirty, self._end = told, FOREVER, end
         # The last group may grow.
         self._sent = (first, groups.start + groups.n)
         return self._packed(groups, origin, fresh, first, run.revision)

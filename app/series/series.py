@@ -73,13 +73,16 @@ class Series:
             looked_at = {lane.wanted.run for lane in self._lanes}
             self._kept = {name: run for name, run in self._kept.items() if name in looked_at}
             self._leave({name.removeprefix(LESS) for name in looked_at})
-            found = [(lane, self._find(lane.wanted.run)) for lane in lanes if lane in self._lanes]
-            asked = [(lane, run) for lane, run in found if run is not None]
-            for lane, run in asked:
+            asked = [lane for lane in lanes if lane in self._lanes]
+            # Once for each name: what it stands for may change meanwhile.
+            runs = {name: self._find(name) for name in dict.fromkeys(lane.wanted.run for lane in asked)}
+            shown = [(lane, run) for lane in asked if (run := runs[lane.wanted.run]) is not None]
+            for lane, run in shown:
                 lane.look(run, origin, newest)
-            for name, run in {lane.wanted.run: run for lane, run in asked}.items():
-                self._sync(run, [lane for lane in self._lanes if lane.wanted.run == name])
-            return [frame for lane, run in asked if (frame := lane.frame(run, origin)) is not None]
+            for name, run in runs.items():
+                if run is not None:
+                    self._sync(run, [lane for lane in self._lanes if lane.wanted.run == name])
+            return [frame for lane, run in shown if (frame := lane.frame(run, origin)) is not None]
 
     def _sync(self, run: Run, lanes: list[Lane]) -> None:
         """Bring a run up to date for the lanes that show it."""

@@ -85,7 +85,8 @@ def runs(on: np.ndarray, joined: int = 0) -> Iterator[Run]:
 def standardised(course: Course, rows: np.ndarray, k: int) -> np.ndarray:
     """e of row k of the readings at `rows`, as the bank sees it; NaN where there is none."""
     track = course.track
-    e = track.innovation[rows, k] / track.innovation_std[rows, k]
+    with np.errstate(invalid="ignore", divide="ignore"):  # of an infinite variance, or of none
+        e = track.innovation[rows, k] / track.innovation_std[rows, k]
     if course.marginal:
         e = track.whitened[rows, k]
     verdict = track.verdict[rows]

@@ -55,7 +55,8 @@ def test_what_was_wrong_nearly_all_the_time_is_tinted_less_and_once():
 
 def test_what_lies_beyond_the_axis_is_marked_at_its_edge():
     x, y = np.array([100.0, 103.0, 400.0, 700.0]), np.array([12.0, 5e3, 5.0, -2.0])
-    *_, above, said_above, below, said_below = group(drawn(Layer("reading", "#d98a00", x, y, radius=2)))
+    *_, above, plate, said_above, below, _, said_below = group(drawn(Layer("reading", "#d98a00", x, y, radius=2)))
+    assert (plate.get("x"), plate.get("fill")) == ("166.0", "#ffffff")
     # Two within seven pixels are one mark, that of the further.
     assert above.get("d") == "M161.0 27L157.0 35h8Z" and above.get("fill") == "#d98a00"
     assert said_above.text == "5000 m/s" and said_above.get("x") == "168.0"
@@ -69,6 +70,11 @@ def test_ticks_are_round_and_inside(low, high):
     steps = np.diff(found)
     assert 2 <= len(found) <= 11 and low - 1e-9 * high <= found[0] and found[-1] <= high * (1 + 1e-9)
     assert np.allclose(steps, steps[0]) and re.fullmatch(r"[125]e[+-]\d+", f"{steps[0]:.0e}")
+
+
+def test_a_low_chart_has_two_ticks():
+    """About one: of a range from -2700 to 2700 that would be zero alone."""
+    assert ticks(-2700.0, 2700.0, 1.0) == [-2000.0, 0.0, 2000.0]
 
 
 def test_times():

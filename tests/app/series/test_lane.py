@@ -129,6 +129,42 @@ def test_only_what_is_far_away_has_levels(engine: FakeEngine) -> None:
     assert series._live._levels.asked == ["health"]
 
 
+@pytest.mark.parametrize("points", [40, 600])
+@pytest.mark.parametrize("wanted", [{}, {"span": 8.0}, {"since": 1.0, "until": 11.5}])
+def test_rows_that_come_while_a_frame_is_made_are_sent_with_the_next(
+    engine: FakeEngine, monkeypatch: pytest.MonkeyPatch, points: int, wanted: dict
+) -> None:
+    """Nothing comes after them, which would bring them along."""
+    series, coming = Series(engine), [readings(engine, 100, 37)]
+    lane, browser = look(series, columns=(MEAN,), points=points, **wanted)
+    engine.put(readings(engine, 0, 100))
+    pull = engine.pull
+
+    def pull_later(*given: Any, **options: Any) -> Pull:
+        if coming:
+            engine.put(coming.pop())
+        return pull(*given, **options)
+
+    monkeypatch.setattr(engine, "pull", pull_later)
+    for _ in range(2):
+        for frame in series.frames([lane]):
+            browser.take(frame)
+    assert series.frames([lane]) == []
+    again = whole(series, columns=(MEAN,), points=points, **wanted)
+    np.testing.assert_array_equal(browser.x[-len(again.x) :], again.x)
+    np.testing.assert_allclose(browser.values[MEAN][-len(again.x) :], again.values[MEAN], rtol=1e-6)
+
+
+def test_what_a_name_stands_for_may_change_while_frames_are_made(
+    engine: FakeEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    engine.put(readings(engine, 0, 5000))
+    series = Series(engine)
+    monkeypatch.setattr(engine, "previous", lambda: engine._pull(0, True))
+    lanes = [look(series, columns=(name,), run="previous", points=20)[0] for name in (MEAN, "nis")]
+    assert len(series.frames(lanes)) == 2
+
+
 def test_points_are_no_more_than_asked_for(engine: FakeEngine) -> None:
     engine.put(readings(engine, 0, 20_000))
     series = Series(engine)

@@ -5,6 +5,8 @@ import pytest
 
 from app.engine import commands
 from app.engine.engine import Engine
+from app.engine.feeder import Restarted
+from app.series.beside import Beside
 from app.series.lane import Lane, Wanted
 from app.series.series import Series
 from estimators.fold import fold
@@ -182,3 +184,56 @@ def test_while_nothing_comes_nothing_is_folded(engine):
     assert watched.until(lambda browser: len(browser.x)).size == N
     assert not watched.series._besides
     watched.close()
+
+
+@pytest.fixture
+def beside(monkeypatch):
+    """beside(engine): the fold of run 0, which is moved by hand."""
+    monkeypatch.setattr(Beside, "_run", lambda self: None)
+    return lambda engine: Beside(engine, engine.revisions.find(0))
+
+
+def caught_up(engine, beside):
+    """Let it take all that there is, and compare its events with the engine's; it."""
+    for _ in range(20):
+        beside._follow()
+    shown = beside.rows(0, 10**9)
+    there = engine.rows(0, 10**9)
+    assert shown.first == there.first and len(shown.events) == len(there.events)
+    np.testing.assert_array_equal(shown.events.t, there.events.t)
+    np.testing.assert_array_equal(shown.events.value, there.events.value)
+    return shown
+
+
+def test_a_pinned_run_outlives_events_that_were_forgotten_before_it_took_them(beside):
+    source = Scripted()
+    engine = Engine(twin(history=2048), lambda report: source)
+    engine.start()
+    try:
+        t, y = np.arange(1, 16_001) * 0.1, 40 + np.random.default_rng(4).normal(size=16_000)
+        source.put(readings(t[:1000], y[:1000]))
+        wait_for(lambda: row_count(engine) == 1000)
+        own = beside(engine)
+        assert len(caught_up(engine, own).events) == 1000
+        source.put(readings(t[1000:], y[1000:]))
+        wait_for(lambda: engine.span()[1] == round(t[-1] * 1e9))
+        shown = caught_up(engine, own)
+        assert shown.first > 2000 and np.abs(shown.track.mean[-1, 0] - 40.0) < 2.0
+        own.stop()
+    finally:
+        engine.stop()
+
+
+def test_a_pinned_run_goes_on_where_the_log_begins_again(source_and_engine, beside):
+    source, engine = source_and_engine
+    own = beside(engine)
+    assert len(caught_up(engine, own).events) == N and own.caught_up
+    engine._inbox.put(Restarted())
+    wait_for(lambda: engine.span() == (0, 0))
+    source.put(readings(*values(2 * N, seed=10)))
+    wait_for(lambda: row_count(engine) == 2 * N)
+    shown = caught_up(engine, own)
+    log = Log(MODEL.width)
+    log.extend(readings(*values(2 * N, seed=10)))
+    np.testing.assert_array_equal(shown.track.mean, fold("kf", MODEL, FIRST, log).mean)
+    own.stop()
