@@ -95,3 +95,24 @@ def test_the_last_status_is_told_again(page):
     page.evaluate("window.told = []; window.nisus.link.addEventListener('status', (e) => window.told.push(e.detail.t))")
     until(page, "window.told.length >= 3")
     assert len(set(page.evaluate("window.told"))) == 1
+
+
+def test_an_episode_that_is_told_at_rest_is_drawn(page, session):
+    """A strip on a chart of the stack, in the colour of what was wrong, once the twin has ended and no frame comes."""
+    until(page, "performance.now() - window.nisus.charts.drawnAt > 700")
+    drawn = page.evaluate("window.nisus.drawn")
+    strip = """(() => {
+      const { plot } = window.nisus.charts.charts.find((chart) => !chart.node.hidden);
+      const { left, top, width } = plot.bbox;
+      return [...plot.ctx.getImageData(Math.round(left + width / 2), Math.round(top), 1, 1).data];
+    })()"""
+    before = page.evaluate(strip)
+    page.evaluate("""(() => {
+      const { link, charts } = window.nisus;
+      const [start, end] = charts.range.map((time) => time + Number(link.status.origin) / 1e9);
+      link.episodes = [{ start, end, subject: 'tooth', cause: 'shifted', text: 'tooth is shifted' }];
+      link.tell('episodes', link.episodes);
+    })()""")
+    assert page.evaluate("window.nisus.drawn") > drawn
+    after = page.evaluate(strip)
+    assert after != before and after[0] > after[2]
