@@ -39,5 +39,7 @@ def read_text(path: Path, listing: str) -> str:
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
+        if path.suffix.lower() == ".rrd":
+            raise ConfigError(f"{shown_name}: it is a recording; `nisus review {shown_name}` opens it") from None
         line = raw.count(b"\n", 0, error.start) + 1
         raise ConfigError(f"{shown_name}:{line}: it is not UTF-8 text; is this the YAML file?") from None

@@ -32,7 +32,7 @@ export const dots = (name, size = 4, ring = false) => ({
 export class Chart {
   // what: {title, unit, note, weight, series, bands, range(self, low, high), scale, draw: [hook], values: [label of a tick],
   // sync: charts of one name share their cursor, names: what a file calls its colours, extras: more lines of a file,
-  // amount(value): a value in words, where the axis is no plain one}
+  // amount(value): a value in words, where the axis is no plain one; filled(): whether it draws beside its data}
   constructor(what, { select, home, wheel, save }) {
     this.what = what;
     this.reading = element("output", { class: "reading" });
@@ -112,7 +112,7 @@ export class Chart {
 
   draw() {
     this.waiting = false;
-    this.empty = !this.data.slice(1).some((values) => values.some((value) => typeof value === "number"));
+    this.empty = !this.what.filled?.() && !this.data.slice(1).some((values) => values.some((value) => typeof value === "number"));
     this.plot.batch(() => {
       this.plot.setData(this.data, false);
       this.plot.setScale("x", { min: this.span[0], max: this.span[1] });

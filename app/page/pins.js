@@ -22,6 +22,7 @@ export class Pins {
         key: "difference", title: "pinned − running", unit: bracketed(this.state.unit), weight: 1,
         series: [{ show: false }],
         data: () => [charts.range, [null, null]],
+        filled: () => this.pinned.some((pin) => pin.less?.x.length),
         extras: () => this.curves("less", this.state),
         over: (plot) => this.pinned.forEach((pin) => trace(plot, pin.less, this.state, pin.place)),
         range: () => {

@@ -39,9 +39,9 @@ export class Trust {
     setText($("health"), `${SIGNS[status.health] ?? "●"} ${name}${lasting ? ` ${span((status.t - since) / 1e9)}` : ""}`);
     $("health").dataset.health = lost ? "diverged" : status.health;
     const cause = lost ? "The estimate is not a number: reset it, or choose another filter" : status.cause;
-    const more = status.episodes_open > 1 && cause ? ` (+${status.episodes_open - 1})` : "";
-    setText($("cause"), cause + more);
-    setAttribute($("cause"), "title", cause);
+    const first = status.episodes_open > 1 && cause ? `1 of ${status.episodes_open}: ` : ""; // ahead, as the end may be cut
+    setText($("cause"), first + cause);
+    setAttribute($("cause"), "title", first + cause);
     this.gauge(status);
     // What is wrong needs the room: sensors that are in order keep their light alone.
     $("lights").dataset.brief = String(Boolean(cause));

@@ -3,9 +3,11 @@
 
 {
   const SCENE = 5; // drawings in one picture, at least: an empty scene has up to four
+  const AFTER = 500; // ms, in which pictures, labels and the ground come
   const LONGEST = 4000; // ms, after which it is shown whatever there is
   const hidden = document.createElement("style");
-  hidden.textContent = "body { opacity: 0; }";
+  const panel = new URLSearchParams(location.search).has("darkMode") ? "#131a23" : "#ffffff"; // of style.css
+  hidden.textContent = `:root, body { background: ${panel} !important; } body { opacity: 0; }`;
   document.head.append(hidden);
   const shown = () => hidden.remove();
   setTimeout(shown, LONGEST);
@@ -16,7 +18,7 @@
     drawing[name] = function (...place) {
       if (drawn === 0) requestAnimationFrame(() => (drawn = 0));
       drawn += 1;
-      if (drawn === SCENE) requestAnimationFrame(shown);
+      if (drawn === SCENE) setTimeout(shown, AFTER);
       return given.apply(this, place);
     };
   }
