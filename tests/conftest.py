@@ -4,14 +4,14 @@ How long each test takes is kept between runs, for `--quickest`.
 """
 
 import os
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from tests.chromium import find_chromium
+
 ROOT = Path(__file__).resolve().parent.parent
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 
 DURATIONS = "nisus/durations"
 """In pytest's cache: seconds of each test, the least of all runs, so that neither compiling nor other work counts."""
@@ -91,13 +91,6 @@ def data() -> Callable[..., Path]:
         return path
 
     return find
-
-
-def find_chromium() -> str | None:
-    """Path of a Chromium, or None."""
-    given = os.environ.get("NISUS_CHROMIUM")
-    found = given or next((path for name in BROWSERS if (path := shutil.which(name))), None)
-    return found if found and Path(found).exists() else None
 
 
 @pytest.fixture(scope="session")

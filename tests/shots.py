@@ -14,15 +14,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 from PIL import Image, ImageDraw
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 
 from app.cli.run import live_source
 from app.engine.commands import Pause, SetEstimator
 from app.session import Page as Served
 from app.session import Session
 from app.twin.twin import load_twin
-from tests.app.page.test_page import FLAGS
-from tests.conftest import find_chromium
+from tests.chromium import find_chromium, launched
 
 PICTURES = Path(__file__).resolve().parent.parent / "config" / "pictures"
 SIZE = {"width": 1440, "height": 900}
@@ -194,8 +193,7 @@ def animate(browser: Browser) -> None:
 
 def main(names: list[str]) -> None:
     """Make those that are named, or all."""
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=find_chromium(), args=FLAGS)
+    with launched(find_chromium()) as browser:
         for shot in SHOTS:
             if not names or shot.twin in names:
                 take(browser, shot)

@@ -35,7 +35,7 @@ def extent(lines: Sequence[np.ndarray], bands: Sequence[Band], dots: Sequence[np
         bands: Lower and upper edges (n,).
         dots: Values (n,) each.
     """
-    parts = [line[len(line) // round(1 / SETTLING) :] for line in lines]
+    parts = [line[int(SETTLING * len(line)) :] for line in lines]
     for lower, upper in bands:
         widths = upper - lower
         known = np.isfinite(widths)

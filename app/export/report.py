@@ -62,7 +62,7 @@ def report(run: Reported) -> list[Part]:
     model = run.twin.model
     found = score(run.track, run.events, model, run.pictures, gate=run.tuning.gate, baseline=run.tuning.baseline)
     charts = run_charts(model, run.events, run.track, run.episodes, run.smoothed)
-    said: tuple[str, ...] = ("Time counts from the first event. Red shades: episodes. Extremes are kept.",)
+    said: tuple[str, ...] = ("Time counts from the first event. Red strips: episodes. Extremes are kept.",)
     if run.smoothed is not None:
         said += ("Dark lines: the states given the readings after each moment too, with their ± 2σ.",)
     return [

@@ -9,17 +9,19 @@
   const panel = new URLSearchParams(location.search).has("darkMode") ? "#131a23" : "#ffffff"; // of style.css
   hidden.textContent = `:root, body { background: ${panel} !important; } body { opacity: 0; }`;
   document.head.append(hidden);
-  const shown = () => hidden.remove();
-  setTimeout(shown, LONGEST);
   const drawing = WebGL2RenderingContext.prototype;
+  const given = Object.fromEntries(["drawElements", "drawArrays", "drawElementsInstanced", "drawArraysInstanced"].map((name) => [name, drawing[name]]));
+  const shown = () => {
+    hidden.remove();
+    Object.assign(drawing, given);
+  };
+  setTimeout(shown, LONGEST);
   let drawn = 0;
-  for (const name of ["drawElements", "drawArrays", "drawElementsInstanced", "drawArraysInstanced"]) {
-    const given = drawing[name];
+  for (const [name, draw] of Object.entries(given))
     drawing[name] = function (...place) {
       if (drawn === 0) requestAnimationFrame(() => (drawn = 0));
       drawn += 1;
       if (drawn === SCENE) setTimeout(shown, AFTER);
-      return given.apply(this, place);
+      return draw.apply(this, place);
     };
-  }
 }

@@ -9,16 +9,11 @@ from app.engine.engine import Engine
 from app.server.private_viser import HEADER
 from app.twin.twin import load_twin
 from app.viser.view import ViserView
+from tests.app.page.browsed import PATIENCE
 from tests.app.scripted import Scripted, wait_for
 from tests.app.test_field_views import PLATE, SHAPE
 
 pytestmark = pytest.mark.browser
-
-FLAGS = (
-    "--headless=new --no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-background-networking "
-    "--disable-component-update --disable-sync --no-first-run --disable-quic"
-).split()
-PATIENCE = 60.0
 
 
 @pytest.fixture
@@ -40,19 +35,16 @@ def engine(tmp_path):
 
 
 @pytest.fixture
-def page(chromium, engine):
-    sync_api = pytest.importorskip("playwright.sync_api")
+def page(browser, engine):
     view = ViserView(engine, secret="s3cret")
     view.start()
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        page = browser.new_page(viewport={"width": 900, "height": 700}, extra_http_headers={HEADER: "s3cret"})
-        page.set_default_timeout(PATIENCE * 1000)
-        errors = []
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(f"http://127.0.0.1:{view.port}/")
-        yield page
-        browser.close()
+    page = browser.new_page(viewport={"width": 900, "height": 700}, extra_http_headers={HEADER: "s3cret"})
+    page.set_default_timeout(PATIENCE * 1000)
+    errors = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto(f"http://127.0.0.1:{view.port}/")
+    yield page
+    page.close()
     view.stop()
     assert errors == []
 

@@ -11,6 +11,7 @@ import resource
 import shutil
 import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +23,8 @@ from app.recording.reader import read_recording
 from app.session import Page, Session
 from app.twin.twin import load_twin
 from estimators.log import READING
+from tests.chromium import find_chromium, launched
 
-FLAGS = (
-    "--headless=new --no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-background-networking "
-    "--disable-component-update --disable-sync --no-first-run --disable-quic"
-).split()
 STEP = 0.003
 """Seconds between the asset's steps, each of three readings."""
 
@@ -53,14 +51,10 @@ def main() -> None:
     player = engine._feeder.source._player  # type: ignore[attr-defined]
     session.start()
     engine.submit(commands.Record(folder / "live.rrd"))
-    path = None if given.no_browser else shutil.which("chromium") or shutil.which("google-chrome")
-    playwright = browser = None
+    path = None if given.no_browser else find_chromium()
+    closing = ExitStack()
     if path is not None:
-        from playwright.sync_api import sync_playwright
-
-        playwright = sync_playwright().start()
-        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
-        page = browser.new_page(viewport={"width": 1500, "height": 950})
+        page = closing.enter_context(launched(path)).new_page(viewport={"width": 1500, "height": 950})
         page.goto(session.url)
         while not page.evaluate("window.nisus?.drawn > 0"):
             time.sleep(0.5)
@@ -122,9 +116,7 @@ def main() -> None:
     session.stop()
     recorded = read_recording(folder / "live.rrd")
     print(f"recorded readings {int(np.sum(recorded.events.kind == READING))}, health of it: {engine.status().counts}")
-    if browser is not None and playwright is not None:
-        browser.close()
-        playwright.stop()
+    closing.close()
     shutil.rmtree(folder)
 
 

@@ -11,7 +11,6 @@ import asyncio
 import json
 import os
 import re
-import shutil
 import statistics
 import subprocess
 import sys
@@ -23,7 +22,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from .live import FLAGS
+from tests.chromium import find_chromium, launched
+
 from .timing import judged
 
 MOVES = 20
@@ -99,17 +99,13 @@ def running(twin: str, *arguments: str, cache: Path | None = None) -> Iterator[R
 @contextmanager
 def browsing() -> Iterator[Any]:
     """Chromium meanwhile; None where there is none."""
-    path = shutil.which("chromium") or shutil.which("google-chrome")
+    path = find_chromium()
     if path is None:
         print("no Chromium: left out")
         yield None
         return
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
+    with launched(path) as browser:
         yield browser
-        browser.close()
 
 
 def opened(browser: Any, url: str) -> tuple[Any, float]:

@@ -7,16 +7,10 @@ from app.cli.run import live_source
 from app.session import Page, Session
 from app.twin.twin import load_twin
 from estimators.log import INPUT
+from tests.app.page.browsed import PATIENCE, until
 from tests.app.scripted import pull_all, row_count, wait_for
 
 pytestmark = pytest.mark.browser
-
-FLAGS = (
-    "--headless=new --no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-background-networking "
-    "--disable-component-update --disable-sync --no-first-run --disable-quic"
-).split()
-PATIENCE = 120.0
-"""Seconds for a step on a busy machine; a test that works takes a fraction."""
 
 
 @pytest.fixture(scope="module")
@@ -30,24 +24,16 @@ def session():
 
 
 @pytest.fixture(scope="module")
-def page(chromium, session):
-    sync_api = pytest.importorskip("playwright.sync_api")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        opened = browser.new_page(viewport={"width": 1440, "height": 900})
-        opened.set_default_timeout(PATIENCE * 1000)
-        opened.asked, opened.wrong = [], []
-        opened.on("request", lambda request: opened.asked.append(request.url))
-        opened.on("pageerror", lambda error: opened.wrong.append(str(error)))
-        opened.goto(session.url)
-        until(opened, "window.nisus?.drawn > 0")
-        yield opened
-        browser.close()
-
-
-def until(page, expression):
-    """Ask from outside: the page's own policy forbids the evaluation that waiting inside it would need."""
-    wait_for(lambda: page.evaluate(expression), PATIENCE)
+def page(browser, session):
+    opened = browser.new_page(viewport={"width": 1440, "height": 900})
+    opened.set_default_timeout(PATIENCE * 1000)
+    opened.asked, opened.wrong = [], []
+    opened.on("request", lambda request: opened.asked.append(request.url))
+    opened.on("pageerror", lambda error: opened.wrong.append(str(error)))
+    opened.goto(session.url)
+    until(opened, "window.nisus?.drawn > 0")
+    yield opened
+    opened.close()
 
 
 def questions(page, path):

@@ -10,7 +10,7 @@ from app.cli.run import live_source
 from app.engine.commands import SetTuning
 from app.session import Page, Session
 from app.twin.twin import load_twin
-from tests.app.page.test_page import PATIENCE, browser, until  # noqa: F401  the fixture
+from tests.app.page.browsed import PATIENCE, until
 from tests.app.page.test_quiet_browser import lanes
 from tests.app.scripted import pull_all, wait_for
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.browser
 
 
 @pytest.fixture
-def shown(browser, request):  # noqa: F811
+def shown(browser, request):
     """Runs a twin to its end and opens its page."""
     opened = []
 

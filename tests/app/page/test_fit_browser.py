@@ -36,8 +36,8 @@ def session(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def page(chromium, session):
-    with browsed(chromium, session) as page:
+def page(browser, session):
+    with browsed(browser, session) as page:
         yield page
 
 

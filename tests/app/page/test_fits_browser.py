@@ -5,7 +5,7 @@ import pytest
 from app.cli.run import live_source
 from app.session import Page, Session
 from app.twin.twin import load_twin
-from tests.app.page.browsed import FLAGS, PATIENCE
+from tests.app.page.browsed import PATIENCE, until
 from tests.app.scripted import wait_for
 
 pytestmark = pytest.mark.browser
@@ -44,37 +44,34 @@ WIDER = """() => {
 
 
 @pytest.mark.parametrize("name", ["motor_can", "agv_corridor", "battery_pack", "lorenz96"])
-def test_nothing_is_wider_than_its_column(name, chromium):
-    sync_api = pytest.importorskip("playwright.sync_api")
+def test_nothing_is_wider_than_its_column(name, browser):
     twin = load_twin(name)
     session = Session(twin, live_source(twin, 4.0), page=Page(0, open_browser=False))
     session.start()
     try:
-        with sync_api.sync_playwright() as playwright:
-            browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-            page = browser.new_page(viewport={"width": 1440, "height": 900})
-            page.set_default_timeout(PATIENCE * 1000)
-            page.goto(session.url)
-            wait_for(lambda: page.evaluate("window.nisus?.drawn > 3"), PATIENCE)
-            # Rows with all their buttons: a run before the one that runs, and both have a name.
-            page.evaluate("window.nisus.link.ask('UseSensor', {name: window.nisus.model.sensors[0], used: false})")
-            wait_for(lambda: session.engine.status().revision > 0, PATIENCE)
-            page.evaluate("window.nisus.link.ask('Note', {number: 0, name: 'a name of some length', note: ''})")
-            for width, height in SIZES:
-                page.set_viewport_size({"width": width, "height": height})
-                for tab in TABS:
-                    page.get_by_role("tab", name=tab, exact=True).click()
-                    if tab == "Runs":
-                        wait_for(lambda: page.locator(".runs .title").count() == 2, PATIENCE)
-                    if tab in FILLED:
-                        wait_for(lambda tab=tab: page.evaluate(FILLED[tab]), PATIENCE)
-                    # Laid out, and drawn in that layout.
-                    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-                    assert page.evaluate(WIDER) == [], (width, tab)
-                if width < 1100:
-                    page.get_by_role("button", name="Tune").first.click()
-                    assert page.evaluate(WIDER) == [], (width, "Tune")
-                    page.get_by_role("button", name="Tune").first.click()
-            browser.close()
+        page = browser.new_page(viewport={"width": 1440, "height": 900})
+        page.set_default_timeout(PATIENCE * 1000)
+        page.goto(session.url)
+        until(page, "window.nisus?.drawn > 3")
+        # Rows with all their buttons: a run before the one that runs, and both have a name.
+        page.evaluate("window.nisus.link.ask('UseSensor', {name: window.nisus.model.sensors[0], used: false})")
+        wait_for(lambda: session.engine.status().revision > 0, PATIENCE)
+        page.evaluate("window.nisus.link.ask('Note', {number: 0, name: 'a name of some length', note: ''})")
+        for width, height in SIZES:
+            page.set_viewport_size({"width": width, "height": height})
+            for tab in TABS:
+                page.get_by_role("tab", name=tab, exact=True).click()
+                if tab == "Runs":
+                    wait_for(lambda: page.locator(".runs .title").count() == 2, PATIENCE)
+                if tab in FILLED:
+                    until(page, FILLED[tab])
+                # Laid out, and drawn in that layout.
+                page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+                assert page.evaluate(WIDER) == [], (width, tab)
+            if width < 1100:
+                page.get_by_role("button", name="Tune").first.click()
+                assert page.evaluate(WIDER) == [], (width, "Tune")
+                page.get_by_role("button", name="Tune").first.click()
+        page.close()
     finally:
         session.stop()

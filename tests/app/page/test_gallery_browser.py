@@ -8,19 +8,11 @@ import pytest
 from app.engine.commands import Record
 from app.recording.reader import read_recording
 from tests.app.gallery.opened import opened
-from tests.app.page.test_page import FLAGS, PATIENCE, drawn
+from tests.app.page.browsed import PATIENCE, until
+from tests.app.page.test_page import drawn
 from tests.app.scripted import pull_all, wait_for
 
 pytestmark = pytest.mark.browser
-
-
-@pytest.fixture(scope="module")
-def browser(chromium):
-    sync_api = pytest.importorskip("playwright.sync_api")
-    with sync_api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        yield started
-        started.close()
 
 
 @pytest.fixture
@@ -43,18 +35,6 @@ def visit(browser):
     for page in pages:
         page.context.close()
     assert [line for line in wrong if "tel.rerun.io" not in line] == []
-
-
-def until(page, expression):
-    """Ask from outside; while a page is being left there is nobody to answer."""
-
-    def holds():
-        try:
-            return page.evaluate(expression)
-        except Exception:  # noqa: BLE001  the page that was asked has gone
-            return False
-
-    wait_for(holds, PATIENCE)
 
 
 def shows(page, twin):

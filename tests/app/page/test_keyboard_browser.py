@@ -7,8 +7,8 @@ import pytest
 from app.cli.run import live_source
 from app.session import Page, Session
 from app.twin.twin import load_twin
+from tests.app.page.browsed import PATIENCE, until
 from tests.app.page.test_colours import TEXT, contrast, over
-from tests.app.page.test_page import FLAGS, PATIENCE, until
 from tests.app.scripted import wait_for
 
 pytestmark = pytest.mark.browser
@@ -44,15 +44,6 @@ TEXTS = """(() => {
   }
   return seen;
 })()"""
-
-
-@pytest.fixture(scope="module")
-def browser(chromium):
-    sync_api = pytest.importorskip("playwright.sync_api")
-    with sync_api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        yield started
-        started.close()
 
 
 @pytest.fixture(scope="module")

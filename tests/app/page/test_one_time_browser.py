@@ -5,7 +5,7 @@ import pytest
 from app.cli.run import live_source
 from app.session import Page, Session
 from app.twin.twin import load_twin
-from tests.app.page.test_page import PATIENCE, browser, until  # noqa: F401  the fixture
+from tests.app.page.browsed import PATIENCE, until
 from tests.app.scripted import pull_all, wait_for
 
 pytestmark = pytest.mark.browser
@@ -33,7 +33,7 @@ def cursor_is(page, seconds, play):
     wait_for(there, PATIENCE)
 
 
-def test_page_and_rerun_show_one_time(browser):  # noqa: F811
+def test_page_and_rerun_show_one_time(browser):
     twin = load_twin("motor_winding")
     session = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
     session.start()
@@ -79,7 +79,7 @@ def test_page_and_rerun_show_one_time(browser):  # noqa: F811
         session.stop()
 
 
-def test_rerun_in_a_window_of_its_own_shares_the_time_of_the_page(browser):  # noqa: F811
+def test_rerun_in_a_window_of_its_own_shares_the_time_of_the_page(browser):
     twin = load_twin("motor_winding")
     session = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
     session.start()

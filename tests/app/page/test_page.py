@@ -10,25 +10,10 @@ from app.cli.run import live_source
 from app.recording.reader import read_recording
 from app.session import Page, Session
 from app.twin.twin import load_twin
+from tests.app.page.browsed import PATIENCE, until
 from tests.app.scripted import pull_all, wait_for
 
 pytestmark = pytest.mark.browser
-
-FLAGS = (
-    "--headless=new --no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-background-networking "
-    "--disable-component-update --disable-sync --no-first-run --disable-quic"
-).split()
-PATIENCE = 120.0
-"""Seconds for a step on a busy machine without a graphics card; a test that works takes a fraction."""
-
-
-@pytest.fixture(scope="module")
-def browser(chromium):
-    sync_api = pytest.importorskip("playwright.sync_api")
-    with sync_api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        yield started
-        started.close()
 
 
 @pytest.fixture
@@ -43,11 +28,6 @@ def served():
     yield serve
     for session in sessions:
         session.stop()
-
-
-def until(page, expression):
-    """Ask from outside: the page's own policy forbids the evaluation that waiting inside it would need."""
-    wait_for(lambda: page.evaluate(expression), PATIENCE)
 
 
 def open_page(browser, session, asked):

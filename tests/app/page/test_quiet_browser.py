@@ -6,7 +6,7 @@ from app.cli.run import live_source
 from app.engine.commands import Pin, SetTuning, UseSensor
 from app.session import Page, Session
 from app.twin.twin import load_twin
-from tests.app.page.test_page import PATIENCE, browser, until  # noqa: F401  the fixture
+from tests.app.page.browsed import PATIENCE, until
 from tests.app.scripted import wait_for
 
 pytestmark = pytest.mark.browser
@@ -23,7 +23,7 @@ def session():
 
 
 @pytest.fixture
-def page(browser, session):  # noqa: F811
+def page(browser, session):
     page = browser.new_context(viewport={"width": 1400, "height": 900}).new_page()
     page.goto(session.url, timeout=PATIENCE * 1000)
     until(page, "window.nisus?.drawn > 0")

@@ -29,8 +29,8 @@ def session(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def page(chromium, session):
-    with browsed(chromium, session) as page:
+def page(browser, session):
+    with browsed(browser, session) as page:
         wait_for(lambda: page.locator("#refit-accept").count() == 1, PATIENCE)
         yield page
 

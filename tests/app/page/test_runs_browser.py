@@ -1,6 +1,7 @@
 """Runs and curves on the page: pinned, seen over the charts, taken away; a knob's curve against folds of its own."""
 
 import io
+import re
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from app.twin.twin import load_twin
 from estimators.fold import fold
 from estimators.log import Log
 from estimators.track import GATED, USED
-from tests.app.page.browsed import PATIENCE, browsed
+from tests.app.page.browsed import PATIENCE, browsed, until
 from tests.app.scripted import pull_all, wait_for
 
 pytestmark = pytest.mark.browser
@@ -32,8 +33,8 @@ def session():
 
 
 @pytest.fixture
-def page(chromium, session):
-    with browsed(chromium, session) as page:
+def page(browser, session):
+    with browsed(browser, session) as page:
         yield page
 
 
@@ -69,17 +70,18 @@ def test_pin_overlay_and_unpin(page, session):
     knob.press("Enter")
     settled(engine, first + 1)
     wait_for(lambda: coloured(page, "#charts article") > 100, PATIENCE)
-    assert coloured(page, ".chart.difference .plot") > 100
-    assert "as it was" in page.locator(".pins").inner_text()
+    wait_for(lambda: coloured(page, ".chart.difference .plot") > 100, PATIENCE)
+    wait_for(lambda: "as it was" in page.locator(".pins").inner_text(), PATIENCE)
     # Of the rate, which nobody measures.
     kept, now = engine.revisions.find(first).track.track.mean[-1, 1], pull_all(engine).track.mean[-1, 1]
-    wait_for(lambda: page.locator(".pins output").inner_text() != "", PATIENCE)
-    assert float(page.locator(".pins output").inner_text()) == pytest.approx(kept - now, rel=0.05)
+    difference = page.locator(".pins output")
+    difference.filter(has_text=re.compile(r"\d")).wait_for()
+    wait_for(lambda: float(difference.inner_text()) == pytest.approx(kept - now, rel=0.05), PATIENCE)
 
     # The table has a score for both, and marks the better one.
     row = page.locator(f'tbody[data-number="{first}"]')
     wait_for(lambda: row.locator(".scores td").count() == 5, PATIENCE)
-    assert page.locator(".runs .best").count() > 0
+    page.locator(".runs .best").first.wait_for()
 
     # B goes back to it, and B again to the other.
     page.locator("body").press("b")
@@ -94,7 +96,7 @@ def test_pin_overlay_and_unpin(page, session):
     wait_for(lambda: not any(run.pinned for run in engine.revisions.runs), PATIENCE)
     wait_for(lambda: page.locator(".chart.difference").is_hidden(), PATIENCE)
     wait_for(lambda: coloured(page, "#charts") == 0, PATIENCE)
-    assert page.evaluate("Object.keys(window.nisus.link.lanes).filter(name => /^(run|less) /.test(name))") == []
+    until(page, "Object.keys(window.nisus.link.lanes).every(name => !/^(run|less) /.test(name))")
 
 
 def likelihood(track):

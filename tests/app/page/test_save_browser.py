@@ -11,13 +11,11 @@ from app.cli.run import live_source
 from app.engine.commands import SetTuning
 from app.session import Page, Session
 from app.twin.twin import load_twin
+from tests.app.page.browsed import PATIENCE, until
 from tests.app.scripted import pull_all, wait_for
 
 pytestmark = pytest.mark.browser
 
-FLAGS = "--headless=new --no-sandbox --disable-gpu --enable-unsafe-swiftshader --no-first-run".split()
-PATIENCE = 120.0
-"""Seconds for a step on a busy machine; a test that works takes a fraction."""
 
 SVG = "{http://www.w3.org/2000/svg}"
 ESTIMATE = "#0b62c4"
@@ -35,26 +33,24 @@ def session(request):
 
 
 @pytest.fixture
-def browser(chromium):
-    sync_api = pytest.importorskip("playwright.sync_api")
-    with sync_api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        yield started.new_context(viewport={"width": 1440, "height": 900}, color_scheme="dark")
-        started.close()
+def context(browser):
+    made = browser.new_context(viewport={"width": 1440, "height": 900}, color_scheme="dark")
+    yield made
+    made.close()
 
 
-def opened(browser, address):
-    page = browser.new_page()
+def opened(context, address):
+    page = context.new_page()
     page.set_default_timeout(PATIENCE * 1000)
     page.on("pageerror", lambda error: pytest.fail(str(error)))
     page.goto(address)
-    wait_for(lambda: page.evaluate("window.nisus?.drawn > 0 && Boolean(window.nisus.link.status.origin)"), PATIENCE)
+    until(page, "window.nisus?.drawn > 0 && Boolean(window.nisus.link.status.origin)")
     return page
 
 
 @pytest.fixture
-def page(browser, session):
-    return opened(browser, session.url)
+def page(context, session):
+    return opened(context, session.url)
 
 
 def saved(page, button, item, folder):
@@ -175,7 +171,7 @@ def test_the_track_that_is_shown(page, session, tmp_path):
     assert report.suffix == ".html" and "What the estimate was worth" in report.read_text(encoding="utf-8")
 
 
-def test_a_link_goes_to_the_moment_and_holds_it(browser, page, session):
+def test_a_link_goes_to_the_moment_and_holds_it(context, page, session):
     hidden = page.evaluate("window.nisus.charts.charts.at(-1).what.key")
     page.get_by_text("Shown", exact=True).click()
     page.locator("#layout li").last.get_by_role("checkbox").uncheck()
@@ -187,7 +183,7 @@ def test_a_link_goes_to_the_moment_and_holds_it(browser, page, session):
     assert "token" not in address and f"#twin={session.engine.twin.name}&from=1970-01-01T00:00:12.3456789Z" in address
 
     page.evaluate("localStorage.clear()")
-    other = opened(browser, address)
+    other = opened(context, address)
     wait_for(lambda: not other.evaluate("window.nisus.view.following"), PATIENCE)
     since, until = other.evaluate("window.nisus.charts.range")
     assert (since, until) == (pytest.approx(12.3456789, abs=1e-9), pytest.approx(22.5, abs=1e-8))

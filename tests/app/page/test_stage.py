@@ -3,9 +3,10 @@
 import pytest
 
 from app.cli.run import live_source
+from app.server.page_file import PAGE
 from app.session import Page, Session
 from app.twin.twin import load_twin
-from tests.app.page.test_page import FLAGS, PATIENCE, until
+from tests.app.page.browsed import PATIENCE, until
 from tests.app.scripted import wait_for
 
 pytestmark = pytest.mark.browser
@@ -21,14 +22,11 @@ def session():
 
 
 @pytest.fixture
-def context(chromium):
-    sync_api = pytest.importorskip("playwright.sync_api")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        context = browser.new_context(viewport={"width": 1400, "height": 900})
-        context.set_default_timeout(PATIENCE * 1000)
-        yield context
-        browser.close()
+def context(browser):
+    context = browser.new_context(viewport={"width": 1400, "height": 900})
+    context.set_default_timeout(PATIENCE * 1000)
+    yield context
+    context.close()
 
 
 def asked(session):
@@ -86,29 +84,76 @@ def test_rerun_has_a_window_of_its_own(context, session):
     assert errors == []
 
 
-def test_in_the_dark_the_scene_has_light_labels_on_dark(chromium, session):
+def test_in_the_dark_the_scene_has_light_labels_on_dark(browser, session):
     """Viser draws black on white: boxes of some thousand pixels. Letters alone are a few hundred."""
     import io
 
     import numpy as np
     from PIL import Image
 
-    sync_api = pytest.importorskip("playwright.sync_api")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        page = browser.new_context(viewport={"width": 1400, "height": 900}, color_scheme="dark").new_page()
-        page.goto(session.url)
-        wait_for(lambda: session.view.history.n > 0, PATIENCE)
+    page = browser.new_context(viewport={"width": 1400, "height": 900}, color_scheme="dark").new_page()
+    page.goto(session.url)
+    wait_for(lambda: session.view.history.n > 0, PATIENCE)
 
-        def share(least):
-            """Of the lower half, with a scale's numbers and the temperature in words: pixels as grey and as light."""
-            box = page.locator("#stage").bounding_box()
-            clip = box | {"y": box["y"] + box["height"] / 2, "height": box["height"] / 2}
-            image = Image.open(io.BytesIO(page.screenshot(clip=clip, timeout=PATIENCE * 1000))).convert("RGB")
-            pixels = np.asarray(image).astype(int)
-            return np.mean((pixels.min(axis=2) > least) & (np.ptp(pixels, axis=2) < 40))
+    def share(least):
+        """Of the lower half, with a scale's numbers and the temperature in words: pixels as grey and as light."""
+        box = page.locator("#stage").bounding_box()
+        clip = box | {"y": box["y"] + box["height"] / 2, "height": box["height"] / 2}
+        image = Image.open(io.BytesIO(page.screenshot(clip=clip, timeout=PATIENCE * 1000))).convert("RGB")
+        pixels = np.asarray(image).astype(int)
+        return np.mean((pixels.min(axis=2) > least) & (np.ptp(pixels, axis=2) < 40))
 
-        wait_for(lambda: share(110) > 2e-4, PATIENCE)
-        page.wait_for_timeout(2000)
-        assert share(190) < 2e-3
-        browser.close()
+    wait_for(lambda: share(110) > 2e-4, PATIENCE)
+    page.wait_for_timeout(2000)
+    assert share(190) < 2e-3
+    page.context.close()
+
+
+def opacity(page):
+    return page.evaluate("getComputedStyle(document.body).opacity")
+
+
+def draw(page, times):
+    """So many drawings of nothing, in one picture."""
+    page.evaluate(
+        "times => { const gl = document.createElement('canvas').getContext('webgl2');"
+        " for (let k = 0; k < times; k++) gl.drawArrays(gl.POINTS, 0, 0); }",
+        times,
+    )
+
+
+def counted(page):
+    return "[native code]" not in page.evaluate("WebGL2RenderingContext.prototype.drawArrays.toString()")
+
+
+@pytest.mark.parametrize("scene", [True, False], ids=["drawn", "never drawn"])
+def test_the_scene_is_hidden_until_it_is_drawn(context, scene):
+    """By a clock of the test's own: an empty scene's four drawings do not show it, a fifth does, and 4 s do alone."""
+    page = context.new_page()
+    page.clock.install()
+    page.set_content("<p>axes</p>")
+    page.add_script_tag(path=PAGE / "viser_shown.js")
+    assert opacity(page) == "0" and counted(page)
+    draw(page, 4)
+    page.clock.run_for(1000)
+    assert opacity(page) == "0"
+    if scene:
+        draw(page, 5)
+        page.clock.run_for(400)
+        assert opacity(page) == "0"
+        page.clock.run_for(200)
+    else:
+        page.clock.run_for(2900)
+        assert opacity(page) == "0"
+        page.clock.run_for(200)
+    assert opacity(page) == "1" and not counted(page)
+
+
+def test_the_scene_is_seen_on_the_page(context, session):
+    page = context.new_page()
+    page.goto(session.url)
+    wait_for(lambda: asked(session) != [], PATIENCE)
+    frame = page.locator("#stage").element_handle().content_frame()
+    frame.wait_for_function("document.body && getComputedStyle(document.body).opacity === '1'")
+    frame.wait_for_selector("canvas")
+    assert not counted(frame)

@@ -9,7 +9,7 @@ import pytest
 from app.engine import commands
 from app.engine.engine import Engine
 from app.server.server import PageServer
-from tests.app.page.test_page import PATIENCE, browser, until  # noqa: F401  the fixture
+from tests.app.page.browsed import PATIENCE, until
 from tests.app.scripted import Scripted, readings, wait_for
 from tests.app.served import SECRET, shown_twin
 
@@ -50,7 +50,7 @@ def at_rest(page):
     return colours(looks[-1])
 
 
-def test_the_viewer_is_covered_until_it_has_drawn_the_next(browser):  # noqa: F811
+def test_the_viewer_is_covered_until_it_has_drawn_the_next(browser):
     source = Scripted()
     engine = Engine(shown_twin(), lambda report: source)
     server = PageServer(engine, port=0, viser_port=None, secret=SECRET)

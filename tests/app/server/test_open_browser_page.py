@@ -5,14 +5,14 @@ import pytest
 from app.engine.engine import Engine
 from app.server.open_browser import Opening
 from app.server.server import PageServer
-from tests.app.page.test_page import PATIENCE, browser  # noqa: F401  the fixture
+from tests.app.page.browsed import PATIENCE
 from tests.app.scripted import Scripted, wait_for
 from tests.app.served import SECRET, shown_twin
 
 pytestmark = pytest.mark.browser
 
 
-def test_the_file_opens_the_page_and_the_next_session_asks_for_its_own_address(browser, tmp_path, monkeypatch):  # noqa: F811
+def test_the_file_opens_the_page_and_the_next_session_asks_for_its_own_address(browser, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     engine = Engine(shown_twin(), lambda report: Scripted())
     server = PageServer(engine, port=0, viser_port=None, secret=SECRET)

@@ -19,20 +19,7 @@ from tests.app.served import shown_twin
 pytestmark = pytest.mark.browser
 
 WINDING = MODELS["motor_winding"]
-FLAGS = (
-    "--headless=new --no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-background-networking "
-    "--disable-component-update --disable-sync --no-first-run --disable-quic"
-).split()
 CHARTS = "Object.values(window.__viserTestpoints?.uplots ?? {}).map(item => item.chart)"
-
-
-@pytest.fixture(scope="module")
-def browser(chromium):
-    sync_api = pytest.importorskip("playwright.sync_api")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture
