@@ -48,7 +48,7 @@ def main() -> None:
     prepare(twin)
     session = Session(twin, live_source(twin, 1.0), page=Page(0, open_browser=False))
     engine = session.engine
-    player = engine._feeder.source._player  # type: ignore[attr-defined]
+    player = engine._feeder.source._inner._player  # type: ignore[attr-defined]
     session.start()
     engine.submit(commands.Record(folder / "live.rrd"))
     path = None if given.no_browser else find_chromium()
@@ -109,10 +109,7 @@ def main() -> None:
     # Every step sends one frame of three readings, and steps are apart by a fixed time: a lost one leaves a gap.
     steps = np.unique(readings.t[readings.kind == READING])
     gaps = int(np.sum(np.diff(steps) > 1.5 * STEP * 1e9 + SLACK))
-    sent = player._simulator._k * len(twin.model.sensors)  # type: ignore[attr-defined]
-    print(
-        f"simulated {sent} readings, rows {events['readings']} (the last steps may wait to be sent), late frames {gaps}"
-    )
+    print(f"{player.sent} frames sent, {events['readings']} readings came, {gaps} steps late or lost")
     session.stop()
     recorded = read_recording(folder / "live.rrd")
     print(f"recorded readings {int(np.sum(recorded.events.kind == READING))}, health of it: {engine.status().counts}")
