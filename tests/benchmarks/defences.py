@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from types import FunctionType
 from typing import Any
 
@@ -92,7 +92,7 @@ def defences() -> None:
         rows.append((name, estimator, twin.model, tuning, log))
     for name, estimator, model, tuning, log in rows:
         folds = _pair(estimator, model, tuning, log)
-        times = np.array([[seconds(lambda f=f: _again(f)) for f in folds] for _ in range(REPETITIONS)])
+        times = np.array([[seconds(partial(_again, fold)) for fold in folds] for _ in range(REPETITIONS)])
         least = times[1:].min(axis=0) / log.n * 1e6
         ratio = least[0] / least[1]
         print(

@@ -133,10 +133,11 @@ def large_states() -> None:
     model = thermal_field(1000, 1000)
     print("One analysis, n = 1 000 000, N = 50, m = 100 (an ensemble of 400 MB)")
     print(f"  {'filter':22s} {'clock s':>8s} {'CPU s':>7s} {'memory':>7s}   wanted")
-    for title, name, options, bound in (
+    rows: tuple[tuple[str, str, dict[str, float], float], ...] = (
         ("ETKF", "etkf", {"members": 50}, 0.5),
         ("EnSRF, radius 1 m", "ensrf", {"members": 50, "radius": 1.0}, 3.0),
-    ):
+    )
+    for title, name, options, bound in rows:
         clock, cpu, memory = analysis(model, name, options, 5)
         verdict = judged(clock, bound, at_least=False), judged(memory, 1.3, at_least=False)
         print(f"  {title:22s} {clock:8.2f} {cpu:7.2f} {memory:7.2f}   <= {bound} s {verdict[0]}; <= 1.3 {verdict[1]}")
@@ -145,7 +146,7 @@ def large_states() -> None:
 def growing_ensembles() -> None:
     """An analysis against n, N and m, each doubled or quadrupled while the others stay."""
     print("One analysis of a field: ms of the processor, and ns by the expected order in brackets")
-    rows = (
+    rows: tuple[tuple[str, dict[str, float], str, Callable[[int, int, int], float]], ...] = (
         ("etkf", {}, "n N²", lambda n, members, m: n * members**2),
         ("ensrf", {"radius": 0.5}, "n N m, within the radius", lambda n, members, m: n * members * m),
         # Each cell solves for the fewer of N and the rows within the radius: 78 of 100 at n = 10,000, 20 and 5 beyond.
@@ -180,7 +181,7 @@ def thermal_cycles() -> None:
     for title, name, options in (("ETKF", "etkf", {}), ("EnSRF, 0.5 m", "ensrf", {"radius": 0.5})):
         fold = Fold(name, model, Tuning.of(model).with_options({"members": 40, **options}), log)
         fold.advance(2)
-        clock, cpu = both(lambda fold=fold: fold.advance())
+        clock, cpu = both(fold.advance)
         rate = (cycles - 2) / clock
         print(
             f"  {title:14s} {rate:6.1f} a second of the clock, {(cycles - 2) / cpu:6.1f} a second of the processor"

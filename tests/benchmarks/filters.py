@@ -263,7 +263,7 @@ def gaussian_family() -> None:
         *((name, {"period": 0.1} if name == "kf-steady" else {}) for name, entry in ESTIMATORS.items()
           if entry.family == "Gaussian"),
         ("ekf", {"joseph": 0}),
-        *((name, option) for name in ("ekf", "ukf") for option in ({"robust": 1}, {"robust": 2}, {"adapt": 1})),
+        *((name, option) for name in ("ekf", "ukf") for option in ({"robust": 1.0}, {"robust": 2.0}, {"adapt": 1.0})),
     ]  # fmt: skip
     sizes = ((2, 1), (4, 2), (8, 3), (24, 8))
     print(

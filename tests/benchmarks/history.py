@@ -27,9 +27,9 @@ def growing_history() -> None:
     print("History (KF n=2 m=1): µs an event of the whole fold, of one event appended, of one reading 100 events late")
     print(f"  {'events':>9s} {'fold':>9s} {'append':>9s} {'late':>9s}")
     for size in (1_000, 10_000, 100_000, 1_000_000):
-        log = noisy_log(model, size)
         # Room for what is appended, so that the one growth of the arrays is not in the measure.
-        log._reserve(4096)
+        log = Log.of(model, capacity=size + 4096)
+        log.extend(noisy_log(model, size).events)
         growing = Fold("kf", model, tuning, log)
         growing.advance()
 

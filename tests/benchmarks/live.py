@@ -105,11 +105,11 @@ def main() -> None:
     cursor = engine.cursor()
     readings = engine.pull(cursor).events
     engine.release(cursor)
-    events = engine.status().counts
+    came = engine.status().counts["readings"]
     # Every step sends one frame of three readings, and steps are apart by a fixed time: a lost one leaves a gap.
     steps = np.unique(readings.t[readings.kind == READING])
     gaps = int(np.sum(np.diff(steps) > 1.5 * STEP * 1e9 + SLACK))
-    print(f"{player.sent} frames sent, {events['readings']} readings came, {gaps} steps late or lost")
+    print(f"{player.sent} frames sent, {came} readings came, {gaps} steps late or lost")
     session.stop()
     recorded = read_recording(folder / "live.rrd")
     print(f"recorded readings {int(np.sum(recorded.events.kind == READING))}, health of it: {engine.status().counts}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from statistics import median
 from time import perf_counter, process_time
 from typing import NamedTuple
@@ -30,7 +30,7 @@ def both(call: Callable[[], object]) -> tuple[float, float]:
     return perf_counter() - begun, spent
 
 
-def medians(calls: list[Callable[[], object]], repetitions: int) -> list[float]:
+def medians(calls: Sequence[Callable[[], object]], repetitions: int) -> list[float]:
     """Median seconds of each call, A B C A B C …; each runs once unmeasured before."""
     for call in calls:
         call()

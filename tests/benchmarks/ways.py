@@ -123,7 +123,7 @@ def line_of(fitted: Fitted | None, name: str) -> Line | None:
 
 
 def errors(
-    model_states: tuple[str, ...], log: Log, track: Track, truth: str, start: int
+    model_states: Sequence[str], log: Log, track: Track, truth: str, start: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Error and deviation of a state whose truth is told, from row `start` on."""
     k = model_states.index(truth)

@@ -52,17 +52,17 @@ def worn(twin: Twin, log: Log, number: int, rng: np.random.Generator) -> tuple[L
     share = number / (CYCLES - 1)
     true = {name: float(tuning.get(f"p.{name}") or 0.0) * (1 + share * (WORN[name] - 1)) for name in PARAMETERS}
     p = tuning.p.copy()
-    for name, value in true.items():
-        p[[item.name for item in model.parameters].index(name)] = value
+    for name, true_value in true.items():
+        p[[item.name for item in model.parameters].index(name)] = true_value
     x, u = np.array([1.0, 0.0, 25.0]), np.array([item.default for item in model.inputs], float)
     out, clock, events = np.empty(3), int(log.t[0]), []
     scale = np.sqrt(tuning.q)
     for i in range(log.n):
-        t, kind, channel = int(log.t[i]), int(log.kind[i]), int(log.channel[i])
-        while clock < t:
-            dt = min(model.max_step, (t - clock) * 1e-9)
+        time, kind, channel = int(log.t[i]), int(log.kind[i]), int(log.channel[i])
+        while clock < time:
+            dt = min(model.max_step, (time - clock) * 1e-9)
             model.f(x, u, p, dt, out)
-            x, clock = out + scale * np.sqrt(dt) * rng.normal(size=3), min(t, clock + round(dt * 1e9))
+            x, clock = out + scale * np.sqrt(dt) * rng.normal(size=3), min(time, clock + round(dt * 1e9))
         value = log.value[i : i + 1].copy()
         if kind == INPUT:
             u = np.where(np.isfinite(value[0, : u.size]), value[0, : u.size], u)
@@ -72,7 +72,7 @@ def worn(twin: Twin, log: Log, number: int, rng: np.random.Generator) -> tuple[L
         else:
             value[0] = np.nan
             value[0, : x.size] = x
-        events.append((t, log.arrival[i], kind, channel, value[0]))
+        events.append((time, log.arrival[i], kind, channel, value[0]))
     again = Log.of(model, capacity=log.n)
     columns = [np.array(column) for column in zip(*events, strict=True)]
     t, arrival, kinds, channels = (

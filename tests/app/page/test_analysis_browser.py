@@ -23,7 +23,7 @@ def session():
     made.stop()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def page(browser, session):
     opened = browser.new_page(viewport={"width": 1440, "height": 900})
     opened.set_default_timeout(PATIENCE * 1000)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from app.cli.run import live_source
-from app.engine.commands import SetTuning
 from app.session import Page, Session
 from app.twin.twin import load_twin
 from estimators.fold import fold
@@ -22,7 +21,7 @@ PINNED = (176, 51, 143)
 """The colour of the first place, in the light theme: app/page/style.css, --pin-0."""
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def session():
     twin = load_twin("motor_winding")
     running = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
@@ -107,11 +106,6 @@ def likelihood(track):
 
 def test_the_curve_around_a_knob_shows_the_likeliest_value(page, session):
     engine = session.engine
-    # The test before left a Q that is wrong, under which no R is to be taken.
-    configured = engine.twin.tuning.q[0]
-    noise = next(item.key for item in engine.tuning.items() if item.key.startswith("Q."))
-    engine.submit(SetTuning(noise, configured))
-    wait_for(lambda: engine.status().tuning.q[0] == configured and not engine.status().refolding, PATIENCE)
     key = next(item.key for item in engine.tuning.items() if item.key.startswith("R."))
     label = page.locator(f'[data-key="{key}"] label')
     label.focus()

@@ -185,8 +185,8 @@ def test_a_link_goes_to_the_moment_and_holds_it(context, page, session):
     page.evaluate("localStorage.clear()")
     other = opened(context, address)
     wait_for(lambda: not other.evaluate("window.nisus.view.following"), PATIENCE)
-    since, until = other.evaluate("window.nisus.charts.range")
-    assert (since, until) == (pytest.approx(12.3456789, abs=1e-9), pytest.approx(22.5, abs=1e-8))
+    first, last = other.evaluate("window.nisus.charts.range")
+    assert (first, last) == (pytest.approx(12.3456789, abs=1e-9), pytest.approx(22.5, abs=1e-8))
     assert hidden not in other.evaluate("window.nisus.charts.layout.shown().map(([key]) => key)")
     # It is a guest's layout: the next visit has the reader's own.
     assert other.evaluate(f"localStorage.getItem('nisus.charts.{session.engine.twin.name}')") is None
