@@ -29,7 +29,7 @@ export function inputRow(whatif, input) {
   const back = element("button", { type: "button", class: "back", title: "As it is now", "aria-label": `${name} as it is now`, onclick: () => choose({ kind: "hold" }) }, "↺");
   const kinds = element("select", { "aria-label": `How ${name} goes on`, onchange: () => choose({ kind: kinds.value }) }, ...Object.entries(KINDS).map(([kind, text]) => element("option", { value: kind }, text)));
   const after = element("input", { type: "text", inputmode: "decimal", "aria-label": `Seconds until ${name} is there`, onchange: () => choose({ after: number(after) }) });
-  const later = element("label", { class: "later" }, element("span", {}), after, " s");
+  const later = element("label", { class: "later", hidden: true }, element("span", {}), after, " s");
   const node = element(
     "div", { class: "profile" },
     element("div", { class: "choice" }, element("span", { title: label }, name), slider, field, element("span", { class: "unit" }, input.unit), back),
