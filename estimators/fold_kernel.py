@@ -21,7 +21,7 @@ from .log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, inlined, jit, part
 from .numerics.steps import steps_of
 from .screen import pass_on, screen_reading, screen_signature
-from .track import ANCESTORS, EFFECTIVE, GATED, MISSING, NONE, SCREENED, USED, WHITENED, track_type
+from .track import ANCESTORS, EFFECTIVE, GATED, MISSING, NONE, SCREENED, USED, WHITENED, borrowed_columns, track_type
 
 
 @part
@@ -82,12 +82,9 @@ def run(
     work = borrowed(work)
     score = borrowed(score)
     value = borrowed_rows(value)
-    mean = borrowed_rows(track.mean)
-    std = borrowed_rows(track.std)
-    cross = borrowed_rows(track.cross)
-    innovation = borrowed_rows(track.innovation)
-    innovation_std = borrowed_rows(track.innovation_std)
-    whitened = borrowed_rows(track.whitened)
+    track = borrowed_columns(track)
+    mean, std, cross = track.mean, track.std, track.cross
+    innovation, innovation_std, whitened = track.innovation, track.innovation_std, track.whitened
     screened = track.screened
     for i in range(start, end):
         what = kind[i]

@@ -8,10 +8,11 @@ import numpy as np
 
 from .track import Track
 
-EVERY = 64
-"""Events between snapshots of the last `RECENT` events, where late readings fall."""
+EVERY, LATELY = 64, 1024
+"""Events between snapshots of the last `LATELY` events, where late readings fall."""
 
-RECENT = 4096
+WIDER_EVERY, RECENT = 256, 4096
+"""The same of the last `RECENT`: the later a reading, the less a few events more count beside those behind it."""
 
 SPARSE_EVERY = 1024
 """Events between the snapshots kept for ever."""
@@ -79,7 +80,7 @@ class Story(NamedTuple):
 
 
 class Snapshots:
-    """Snapshots by the absolute index of the event before which they were taken: dense lately, sparse for ever."""
+    """Snapshots by the absolute index of the event before which they were taken: the denser the later they are."""
 
     def __init__(self, nbytes: int) -> None:
         """`nbytes`: of one state. At least one old snapshot, the start, and a recent one are kept, however large."""
@@ -88,6 +89,7 @@ class Snapshots:
         while RECENT // self._every > self._most:
             self._every *= 2
         self._sparse = max(SPARSE_EVERY, self._every)
+        self._wider = max(min(WIDER_EVERY, self._sparse), self._every)
         self._kept: dict[int, Snapshot] = {}
         self._pinned: list[int] = []
 
@@ -111,19 +113,19 @@ class Snapshots:
 
     def next_stop(self, at: int, end: int) -> int:
         """The absolute index, after `at`, at which a fold on its way to `end` should take the next one."""
-        # Far before the end, only the snapshots that are kept for ever are worth stopping for.
-        stride = self._sparse if end - at > RECENT else self._every
-        return at + stride - at % stride
+        # Before the end, only the snapshots that are kept there are worth stopping for.
+        zones = (0, self._sparse), (end - RECENT, self._wider), (end - LATELY, self._every)
+        return min(-(-max(at + 1, begin) // stride) * stride for begin, stride in zones)
 
     def keep(self, at: int, first: int, snapshot: Snapshot, pinned: bool = False) -> None:
-        """Keep one; drop what is neither recent nor kept for ever. `first`: absolute index of the log's first event."""
+        """Keep one; drop what is too close to others for its age. `first`: absolute index of the log's first event."""
         self._kept[at] = snapshot
         if pinned:
             self._pinned = [key for key in (*self._pinned, at) if key in self._kept][-min(PINNED, self._most) :]
-        old = at - RECENT
-        if old % self._sparse and old in self._kept and old != first and old not in self._pinned:
-            del self._kept[old]
-        for_ever = [key for key in self._kept if key <= old and key not in self._pinned]
+        for old, stride in ((at - LATELY, self._wider), (at - RECENT, self._sparse)):
+            if old % stride and old in self._kept and old != first and old not in self._pinned:
+                del self._kept[old]
+        for_ever = [key for key in self._kept if key <= at - RECENT and key not in self._pinned]
         if len(for_ever) > self._most + 1:
             self._sparse *= 2
             for key in for_ever:

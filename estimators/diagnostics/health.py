@@ -11,7 +11,7 @@ from ..log import RESET
 from ..numerics.jit import F1, f64, i64, inlined, jit
 from ..numerics.quantiles import chi_square_quantile
 from ..numerics.simd import total as sum_of
-from ..track import DIVERGED, FAILED, GATED, TRACKING, USED
+from ..track import DIVERGED, FAILED, GATED, TRACKING, USED, borrowed_columns
 from .normal_nis import LEAST, MEAN, NORMALS, PROBABILITY, VARIANCE, free_degrees
 
 FEW = 10
@@ -115,6 +115,7 @@ def assess(first, last, t, kind, channel, track, normal, policy, bounds):
     what was normal of the NIS of each sensor, see normal_nis.py.
     """
     window = policy.window
+    track = borrowed_columns(track)
     # The window's readings, the oldest first, lie at `begin` to `end`: row, degrees of freedom (-1 if it was refused),
     # and `terms`, 0 if it was refused: NIS, then `NORMALS`. It moves up, and back to the start when it has reached the
     # end.

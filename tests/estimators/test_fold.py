@@ -142,6 +142,22 @@ def test_a_fold_in_pieces_stops_no_more_often_than_one():
     assert sum(place <= log.n - RECENT for place in taken[0]) == 2 * RECENT // 1024
 
 
+@pytest.mark.parametrize("size", [1, 50, None], ids=["event by event", "in pieces", "at once"])
+def test_snapshots_are_the_denser_the_later(size):
+    """64 events apart in the last 1,024, 256 in the last 4,096, 1,024 before; also while the log grows."""
+    events = random_log(np.random.default_rng(5), MATRICES, 3 * RECENT).events
+    log = as_log(events.select(slice(0, 0)))
+    growing = Fold("kf", MODEL, Tuning.of(MODEL), log)
+    for start in range(0, 3 * RECENT, size or 3 * RECENT):
+        log.extend(events.select(slice(start, start + (size or 3 * RECENT))))
+        growing.advance()
+    behind = log.n - np.arange(log.n + 1)
+    at = np.arange(log.n + 1)
+    wanted = (at % 1024 == 0) | (at % 256 == 0) & (behind < 4096) | (at % 64 == 0) & (behind < 1024)
+    exact = wanted | (at % 256 == 0) & (behind == 4096) | (at % 64 == 0) & (behind == 1024)
+    assert set(at[wanted]) <= set(growing.snapshots.places) <= set(at[exact])
+
+
 @pytest.mark.parametrize("late", [False, True])
 def test_follow_a_log_that_grew_meanwhile(estimator, late):
     """A refold on a copy, with another tuning, joins the live log: as if it had folded that from the start."""
