@@ -31,11 +31,11 @@ export const dots = (name, size = 4, ring = false) => ({
 
 export class Chart {
   // what: {title, unit, note, weight, series, bands, range(self, low, high), scale, draw: [hook], values: [label of a tick],
-  // sync: charts of one name share their cursor, names: what a file calls its colours, extras: more lines of a file,
+  // sync: charts of one name share their cursor, names: what a file calls its colours, help: on what it reads, extras: more lines of a file,
   // amount(value): a value in words, where the axis is no plain one; filled(): whether it draws beside its data}
   constructor(what, { select, home, wheel, save }) {
     this.what = what;
-    this.reading = element("output", { class: "reading" });
+    this.reading = element("output", { class: "reading", title: what.help });
     this.head = element(
       "header", {},
       element("b", {}, what.title), element("span", { class: "unit" }, what.unit ?? ""),

@@ -105,7 +105,8 @@ export class Charts {
     const place = { ...this.view.wanted(), points };
     const { columns } = this;
     const wanted = JSON.stringify([place, columns]);
-    if (wanted === this.asked) return;
+    // Of the same stretch another moment may be looked at.
+    if (wanted === this.asked) return this.view.following ? undefined : this.draw();
     this.asked = wanted;
     this.link.look("charts", { ...place, columns }, (...frame) => this.live.take(...frame));
     const before = this.states.map((state) => `mean:${state.name}`);
@@ -222,6 +223,7 @@ function stateChart(charts, state) {
       const drawn = { lines: others.slice(rows.length), bands: [[lower, upper]], dots: others.slice(0, rows.length) };
       return range.fit(...charts.pins.widened(...shownExtent(drawn, ...within(x, charts.range)), state.name));
     },
+    help: "± 2σ of what is modelled; unseen: how far off it may be by one fault that no alarm would tell",
     says: (value) => {
       const [upper, truth, mean] = [value(1), value(4 + rows.length), value(5 + rows.length)];
       const bound = charts.integrity?.[state.name]?.bound;

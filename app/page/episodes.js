@@ -68,7 +68,7 @@ export class Episodes {
       over.length ? element("h3", {}, `Before (${over.length})`) : "",
       list(over.slice(0, MOST), (item) => this.entry(item)),
       element("h3", {}, "Events"),
-      list(this.notices, (item) => this.event(item)),
+      element("ol", {}, ...this.notices.flatMap((item, k) => this.event(item, this.notices[k - 1]))),
     );
   }
 
@@ -87,8 +87,10 @@ export class Episodes {
     );
   }
 
-  event(notice) {
+  // The last told first. Another run folds the same time again, which a line between them says.
+  event(notice, after) {
     const when = notice.from === null ? "" : clock(notice.from);
-    return element("li", { class: "event", dataset: { level: notice.level } }, element("time", {}, when), element("span", {}, notice.text));
+    const line = element("li", { class: "event", dataset: { level: notice.level } }, element("time", {}, when), element("span", {}, notice.text));
+    return after && after.run !== notice.run ? [element("li", { class: "run-before" }, `run ${notice.run}`), line] : [line];
   }
 }

@@ -1,14 +1,16 @@
-// A link to a moment, in the fragment of the address: twin, time, span and charts. Whoever opens it sees the same.
+// A link to a moment, in the fragment of the address: twin, time, span, the moment looked at, and charts. Whoever opens
+// it sees the same.
 
 const DIGITS = 9; // of a second
 
 // The address of what is shown now.
-export function link({ model, link, charts }) {
+export function link({ model, link, view, charts }) {
   const [since, until] = charts.range;
   const parts = {
     twin: model.twin,
     from: written(BigInt(link.status.origin ?? 0) + nanoseconds(since)),
     span: String(Number((until - since).toPrecision(9))),
+    ...(view.at === null ? {} : { at: written(BigInt(link.status.origin ?? 0) + nanoseconds(view.at)) }),
     charts: charts.layout.shown().map(([key, height]) => (height ? `${key}/${height}` : key)).join(","),
   };
   const text = Object.entries(parts).map(([name, value]) => `${name}=${encodeURIComponent(value).replace(/%3A|%2C|%2F/g, decodeURIComponent)}`);
@@ -23,12 +25,13 @@ export function goTo(hash, { model, link, view, charts }) {
   const asked = new URLSearchParams(hash.replace(/^#/, ""));
   if (!asked.has("from")) return null;
   if (asked.get("twin") !== model.twin) return `the link is of ${asked.get("twin")}; ${model.twin} runs here`; // see `twinOf`
-  const [from, span] = [read(asked.get("from")), Number(asked.get("span"))];
+  const [from, span, at] = [read(asked.get("from")), Number(asked.get("span")), read(asked.get("at"))];
   if (from === null || !(span > 0)) return "the link is damaged: it has no time or no span";
-  const since = Number(from - BigInt(link.status.origin)) / 1e9;
+  const seconds = (time) => Number(time - BigInt(link.status.origin)) / 1e9;
+  const since = seconds(from);
   const layout = (asked.get("charts") ?? "").split(",").filter(Boolean).map((item) => item.split("/"));
   if (layout.length) charts.layout.use(layout.map(([key, height]) => [key, height ? Number(height) : null]));
-  view.show(since, since + span);
+  view.show(since, since + span, at === null ? null : seconds(at));
   return null;
 }
 

@@ -9,7 +9,13 @@ export class Panel {
     this.node = element("section", { id, class: "beside", popover: "manual", role: "dialog", "aria-label": title, tabindex: "-1" },
       element("header", {}, element("h2", {}, title), element("span", { class: "space" }), element("button", { type: "button", title: "Close (Esc)", "aria-label": "Close", onclick: () => this.toggle(false) }, "×")),
       ...children);
-    this.node.addEventListener("keydown", (event) => event.key === "Escape" && (event.stopPropagation(), this.toggle(false)));
+    document.addEventListener("keydown", (event) => {
+      // A button of it that is greyed while it works loses the focus to the page.
+      const { activeElement: at } = document;
+      if (event.key !== "Escape" || !this.open || !(at === document.body || at === button || this.node.contains(at))) return;
+      event.stopPropagation();
+      this.toggle(false);
+    });
     button.setAttribute("aria-haspopup", "dialog");
     button.setAttribute("aria-expanded", "false");
     button.addEventListener("click", () => this.toggle());

@@ -172,7 +172,8 @@ class PageStream:
         if notices:
             self._notice = notices[-1].number + 1
             message["notices"] = [
-                {"number": item.number, "t": item.t, "level": item.level, "text": item.text} for item in notices
+                {"number": item.number, "t": item.t, "level": item.level, "text": item.text, "run": item.revision}
+                for item in notices
             ]
         if message:
             await self._send(message)

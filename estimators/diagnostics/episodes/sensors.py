@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...log import READING
+from ...log import READING, RESET
 from ...track import GATED, REASONS, SCREENED, USED
 from .. import words
 from ..effects import KINDS, Effect, against, common_scale, effects, onset
@@ -164,7 +164,7 @@ def _shown(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, run: Run
     said = np.bitwise_or.reduce(masks[run.begin : run.end])
     if said[0] & (DISAGREEING | AGREEING) and not np.any(said & ~(DISAGREEING | AGREEING)):
         cause = "disagreeing" if said[0] & DISAGREEING else "agreeing"
-        return _together(course, rows, run, cause)
+        return _together(course, rows, masks, run, cause)
     return _most_telling(course, s, rows, masks, np.flatnonzero(said), run)
 
 
@@ -215,7 +215,7 @@ def _most_telling(course: Course, s: int, rows: np.ndarray, masks: np.ndarray, s
     What moves one way and then back has no mean over the whole: where innovations wander, the part that is shifted
     tells more.
     """
-    first = max(0, run.begin - LOOKED_AT)
+    first = _earliest(course, rows, masks, run)
     unknown = [Effect("narrow", np.nan, np.nan, np.nan, -np.inf)]
     best = int(said[0]) if said.size else 0, run.begin, run.end, unknown, np.zeros(0)
     shifted = best
@@ -270,12 +270,12 @@ def _kinds(course: Course, s: int, k: int, masks: np.ndarray) -> list[str]:
     return [kind for kind in KINDS if said & TOLD_BY[kind] or not np.any(peaks[BITS & TOLD_BY[kind] != 0] > 0.0)]
 
 
-def _together(course: Course, rows: np.ndarray, run: Run, cause: str) -> Shown:
+def _together(course: Course, rows: np.ndarray, masks: np.ndarray, run: Run, cause: str) -> Shown:
     """All rows of a sensor together are off more, or less, than their noise.
 
     The mean of a NIS is its degrees of freedom: the root of their ratio takes the place of e.
     """
-    first = max(0, run.begin - LOOKED_AT)
+    first = _earliest(course, rows, masks, run)
     nis, dof = course.track.nis[rows[first : run.end]], course.track.dof[rows[first : run.end]]
     known = np.flatnonzero(np.isfinite(nis) & (dof > 0))
     e = np.sqrt(nis[known] / dof[known])
@@ -284,6 +284,14 @@ def _together(course: Course, rows: np.ndarray, run: Run, cause: str) -> Shown:
     looked_at = slice(begun, min(over, begun + LOOKED_AT))
     _, size, low, high, _ = common_scale(e[looked_at], dof[known][looked_at])
     return Shown(0, first + int(known[begun]), first + int(known[over - 1]) + 1, cause, size, low, high)
+
+
+def _earliest(course: Course, rows: np.ndarray, masks: np.ndarray, run: Run) -> int:
+    """The first reading that can be the onset of a run of alarms: after the alarms before it, and the last reset."""
+    first = max(0, run.begin - LOOKED_AT)
+    first += _after_last(masks[first : run.begin].any(axis=1))
+    resets = np.flatnonzero(course.events.kind[rows[first] : rows[run.begin]] == RESET)
+    return int(np.searchsorted(rows, rows[first] + resets[-1])) if resets.size else first
 
 
 def _likeliest(e: np.ndarray, alarm: int, cause: str) -> tuple[int, int]:

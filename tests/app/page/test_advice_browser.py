@@ -43,7 +43,10 @@ def test_a_linear_model_is_told_its_filter_which_applies_itself(page, session): 
     settled(engine, 1)
     assert engine.estimator == "kf" and engine.revisions.runs[-1].number == 1
     wait_for(lambda: "another runs now" in page.locator("#advice-panel").inner_text(), PATIENCE)
+    # Wherever the focus went while it was measured.
+    page.evaluate("document.activeElement.blur()")
     page.keyboard.press("Escape")
+    page.locator("#advice-panel").wait_for(state="hidden")
     page.locator("body").press("u")
     settled(engine, 2)
     assert engine.estimator == "ukf"

@@ -24,6 +24,7 @@ WIDER = """() => {
     if (!column.checkVisibility({ visibilityProperty: true })) continue;
     for (const node of column.querySelectorAll("*")) {
       if (!node.checkVisibility({ visibilityProperty: true })) continue;
+      if (node.matches(".knob input[type=text]") && node.scrollWidth > node.clientWidth) found.push(`${name(node)} hides the end of ${node.value}`);
       const style = getComputedStyle(node);
       // Nothing is to be scrolled sideways to be seen.
       if (/auto|scroll/.test(style.overflowX) && node.scrollWidth > node.clientWidth + 1) found.push(`${name(node)} scrolls: ${node.scrollWidth} > ${node.clientWidth}`);
@@ -57,12 +58,18 @@ def test_nothing_is_wider_than_its_column(name, browser):
         page.evaluate("window.nisus.link.ask('UseSensor', {name: window.nisus.model.sensors[0], used: false})")
         wait_for(lambda: session.engine.status().revision > 0, PATIENCE)
         page.evaluate("window.nisus.link.ask('Note', {number: 0, name: 'a name of some length', note: ''})")
+        # A value as long as they come.
+        key = page.evaluate("document.querySelector('.knob[data-key^=\"Q.\"]').dataset.key")
+        assert page.evaluate("(key) => window.nisus.link.ask('SetTuning', { key, value: 1.008e-12 })", key) is None
+        until(page, "document.querySelector('.knob[data-key^=\"Q.\"] input[type=text]').value === '1.008e-12'")
         for width, height in SIZES:
             page.set_viewport_size({"width": width, "height": height})
             for tab in TABS:
                 page.get_by_role("tab", name=tab, exact=True).click()
                 if tab == "Runs":
-                    wait_for(lambda: page.locator(".runs .title").count() == 2, PATIENCE)
+                    wait_for(
+                        lambda: page.locator(".runs .title").count() == len(session.engine.revisions.runs), PATIENCE
+                    )
                 if tab in FILLED:
                     until(page, FILLED[tab])
                 # Laid out, and drawn in that layout.

@@ -1,5 +1,6 @@
 """What nobody looks at is not sent, and what waits for news of a twin that has ended does not wait for ever."""
 
+import numpy as np
 import pytest
 
 from app.cli.run import live_source
@@ -7,7 +8,8 @@ from app.engine.commands import Pin, SetTuning, UseSensor
 from app.session import Page, Session
 from app.twin.twin import load_twin
 from tests.app.page.browsed import PATIENCE, until
-from tests.app.scripted import wait_for
+from tests.app.scripted import pull_all, wait_for
+from tests.support import SECOND
 
 pytestmark = pytest.mark.browser
 
@@ -34,6 +36,24 @@ def page(browser, session):
 def lanes(session):
     """What the server is asked for: the columns of each lane."""
     return {lane.name: set(lane.wanted.columns) for lane in session.server._series._lanes}
+
+
+def test_the_charts_go_to_another_moment_of_the_stretch_that_they_show(page, session):
+    """Nothing else is asked for, and all the same the line above each says what it was then."""
+    until(page, "window.nisus.charts.live.x.length > 100")
+    page.evaluate("window.nisus.view.show(50, 150, 60)")
+    until(page, "window.nisus.charts.range[0] === 50 && window.nisus.charts.live.x.at(-1) < 151")
+    page.wait_for_timeout(300)  # the points of the stretch have come: nothing draws any more
+    said = page.locator("#charts article .reading").first
+    before = said.inner_text()
+    page.evaluate("window.nisus.view.goTo(140, window.nisus.charts.range)")
+    wait_for(lambda: said.inner_text() != before, PATIENCE)
+    rows = pull_all(session.engine)
+    at = int(np.searchsorted(rows.events.t, rows.events.t[0] + 140 * SECOND, side="right")) - 1
+    name = page.evaluate("window.nisus.charts.charts[0].what.key").removeprefix("state:")
+    k = list(session.engine.model.state_names).index(name)
+    mean, std = rows.track.mean[at, k], rows.track.std[at, k]
+    assert float(said.inner_text().split(" ± ")[0]) == pytest.approx(mean, abs=0.2 * std)
 
 
 def test_hidden_charts_ask_for_nothing(page, session):

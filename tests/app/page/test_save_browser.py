@@ -176,7 +176,7 @@ def test_a_link_goes_to_the_moment_and_holds_it(context, page, session):
     page.get_by_text("Shown", exact=True).click()
     page.locator("#layout li").last.get_by_role("checkbox").uncheck()
     page.keyboard.press("Escape")
-    page.evaluate("window.nisus.view.show(12.3456789, 22.5)")
+    page.evaluate("window.nisus.view.show(12.3456789, 22.5, 17.25)")
     page.locator("body").press("l")
     wait_for(lambda: "#twin=" in page.evaluate("location.href"))
     address = page.evaluate("location.href")
@@ -190,6 +190,7 @@ def test_a_link_goes_to_the_moment_and_holds_it(context, page, session):
     assert hidden not in other.evaluate("window.nisus.charts.layout.shown().map(([key]) => key)")
     # It is a guest's layout: the next visit has the reader's own.
     assert other.evaluate(f"localStorage.getItem('nisus.charts.{session.engine.twin.name}')") is None
+    assert other.evaluate("window.nisus.view.at") == 17.25
     other.locator("#follow").click()
     wait_for(lambda: other.evaluate("location.hash") == "")
 

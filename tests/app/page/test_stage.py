@@ -130,7 +130,8 @@ def counted(page):
 def test_the_scene_is_hidden_until_it_is_drawn(context, scene):
     """By a clock of the test's own: an empty scene's four drawings do not show it, a fifth does, and 4 s do alone."""
     page = context.new_page()
-    page.clock.install()
+    page.clock.install(time=0)
+    page.clock.pause_at(1000)
     page.set_content("<p>axes</p>")
     page.add_script_tag(path=PAGE / "viser_shown.js")
     assert opacity(page) == "0" and counted(page)

@@ -20,7 +20,7 @@ from estimators.diagnostics.evidence import (
 )
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold
-from estimators.log import INPUT, READING, TICK, TRUTH, Events
+from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events
 from estimators.model.state_space import Input, Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import DIVERGED, GATED, TRACKING, USED
 from estimators.tuning import Tuning
@@ -432,3 +432,22 @@ def test_a_sensor_that_moves_again_is_not_said_to_be_stuck_only():
     (each,) = [item.episode for item in found_in(course) if item.key == ("sensor", "gauge")]
     assert each.cause == "stuck" and each.end is None
     assert each.text.endswith(f"it moves again since {BEGIN + 101}.0 s")
+
+
+@pytest.mark.parametrize("begun_anew", [False, True])
+def test_the_onset_of_an_episode_is_not_before_the_reset_nor_in_the_episode_before(begun_anew):
+    """Two shifts of the gauge, the second lesser: what was off before would make an earlier start of it likelier."""
+
+    def of(shift, seconds, later):
+        events = folded(gauge=lambda x, z, rng: x + shift + 0.2 * z).log.events
+        events = events.select(np.isin(events.t, seconds * SECOND))
+        return events._replace(t=events.t + later * SECOND, arrival=events.arrival + later * SECOND)
+
+    cut, back = END + 100, BEGIN - 100
+    first, second = of(0.8, np.arange(1, cut), 0), of(0.4, np.arange(back, N + 1), cut - back)
+    parts = [first, Events.one(cut * SECOND, cut * SECOND, RESET, 0, (), MODEL.width), second]
+    fold = Fold("kf", MODEL, Tuning.of(MODEL), as_log(Events.concat(parts if begun_anew else parts[::2], MODEL.width)))
+    fold.advance()
+    found = [each for each in episodes(fold) if each.subject == "gauge"]
+    assert found[0].start == pytest.approx(BEGIN, abs=10) and found[0].end == pytest.approx(END, abs=30)
+    assert found[1].start == pytest.approx(cut + 100, abs=10)
