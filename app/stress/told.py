@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimators.diagnostics.episodes import Episode, episodes
-from estimators.diagnostics.sensitivity.nudges import SENSOR
+from estimators.diagnostics.sensitivity.nudges import DRIFT, SENSOR
 from estimators.diagnostics.sensitivity.suspects import RIDDLES, likeliest, suspects
 from estimators.errors import NisusError
 from estimators.log import READING
@@ -104,7 +104,7 @@ def accused(fold: Fold, episode: Episode, until: int) -> str:
     if not found:
         return episode.subject
     nudge = found[0].nudge
-    return nudge.name if nudge.kind == SENSOR else f"{nudge.kind} {nudge.name}"
+    return nudge.name if nudge.kind in (SENSOR, DRIFT) else f"{nudge.kind} {nudge.name}"
 
 
 def green_share(fold: Fold, start: int, end: int) -> float:

@@ -289,7 +289,7 @@ def _together(course: Course, rows: np.ndarray, masks: np.ndarray, run: Run, cau
 def _earliest(course: Course, rows: np.ndarray, masks: np.ndarray, run: Run) -> int:
     """The first reading that can be the onset of a run of alarms: after the alarms before it, and the last reset."""
     first = max(0, run.begin - LOOKED_AT)
-    first += _after_last(masks[first : run.begin].any(axis=1))
+    first += _after_last(np.any(masks[first : run.begin], axis=1))
     resets = np.flatnonzero(course.events.kind[rows[first] : rows[run.begin]] == RESET)
     return int(np.searchsorted(rows, rows[first] + resets[-1])) if resets.size else first
 

@@ -1,4 +1,4 @@
-"""Nudges: what could be off by a constant, by how much it is moved to see what follows, and how it is moved."""
+"""Nudges: what could be off or drift, by how much it is moved to see what follows, and how it is moved."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ from ...tuning import Tuning
 
 SENSOR, INPUT_, PARAMETER = KINDS = ("sensor", "input", "parameter")
 
+DRIFT = "drift"
+"""Of a sensor row, too: its readings move away from the log's first event on, by so much a second."""
+
 STEP = 1e-3
 """Of the scale of what is nudged: the error of a central difference is of the order of its square, and rounding of the
 order of 1e-16 over it."""
 
 
 class Nudge(NamedTuple):
-    """A constant added to the readings of a sensor row, to an input, or to a parameter.
+    """A constant, or a drift, added to the readings of a sensor row; a constant added to an input or a parameter.
 
     `step` is what is added and taken off for the differences, `low` and `high` the range in which a fault of this kind
     (a change from the present value) makes sense, `scale` the size by which nudges are compared: the deviation of the
@@ -42,6 +45,8 @@ class Nudge(NamedTuple):
         """A fault of a size: of a parameter in percent of its value, if it has one; else in units."""
         if self.kind == PARAMETER and self.value:
             return f"{self.name} {100.0 * size / abs(self.value):+.3g} %"
+        if self.kind == DRIFT:
+            return f"{SENSOR} {self.name} drifting by {size:+.3g} {self.unit}"
         kind = "" if self.kind == PARAMETER else f"{self.kind} "
         return f"{kind}{self.name} {size:+.3g} {self.unit}"
 
@@ -62,6 +67,7 @@ class Given(NamedTuple):
 def nudges_of(model: StateSpaceModel, tuning: Tuning, log: Log, kinds: Sequence[str] = KINDS) -> list[Nudge]:
     """Every nudge of a model: rows of sensors that speak and are used, inputs, parameters with room in their range."""
     found = []
+    seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9 if log.n else 0.0
     units = [row.unit for sensor in model.sensors for row in sensor.rows]
     kind, channel = log.kind[: log.n], log.channel[: log.n]
     speak = tuning.used & np.isin(np.arange(len(model.sensors)), channel[kind == READING])
@@ -70,6 +76,9 @@ def nudges_of(model: StateSpaceModel, tuning: Tuning, log: Log, kinds: Sequence[
         if used:
             scale = float(np.sqrt(variance)) or 1.0
             found.append(Nudge(SENSOR, name, unit, STEP * scale, -np.inf, np.inf, scale))
+            if seconds > 0.0:
+                rate = scale / seconds
+                found.append(Nudge(DRIFT, name, f"{unit}/s", STEP * rate, -np.inf, np.inf, rate))
     given = log.value[: log.n][kind == INPUT]
     for k, item in enumerate(model.inputs):
         values = given[np.isfinite(given[:, k]), k]
@@ -94,10 +103,12 @@ def nudged(given: Given, nudge: Nudge, size: float) -> Given:
         return Given(replace(tuning, p=p), log, base)
     other = log.copy()
     kind, value = other.kind[: other.n], other.value[: other.n]
-    if nudge.kind == SENSOR:
+    if nudge.kind in (SENSOR, DRIFT):
         row = model.row_names.index(nudge.name)
         sensor = int(np.searchsorted(model.row_start, row, side="right")) - 1
-        value[(kind == READING) & (other.channel[: other.n] == sensor), row - model.row_start[sensor]] += size
+        own = np.flatnonzero((kind == READING) & (other.channel[: other.n] == sensor))
+        off = size if nudge.kind == SENSOR else size * 1e-9 * (other.t[own] - other.t[0])
+        value[own, row - model.row_start[sensor]] += off
         return Given(tuning, other, base)
     k = model.input_names.index(nudge.name)
     value[kind == INPUT, k] += size

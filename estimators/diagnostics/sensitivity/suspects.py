@@ -1,12 +1,13 @@
 """Who is to blame: which single fault explains best what the innovations have shown since an episode began.
 
-A fault of size θ moves the whitened innovations by θ Δν, as a refold with that nudge shows. Against what was seen,
+A fault of size θ (what is off by a constant, or a sensor that drifts by so much a second) moves the whitened
+innovations by θ Δν, as a refold with that nudge shows. Against what was seen,
 
     θ̂ = Σ Δνᵀν / Σ ΔνᵀΔν,   log Λ = ½ (Σ Δνᵀν)² / Σ ΔνᵀΔν
 
 is its most likely size and how much likelier than no fault it makes what was seen. A size says by how much a sensor, or
-what the filter is told or believes, is off. Faults that nothing in the data
-tells apart have the same log Λ, and are named together.
+what the filter is told or believes, is off. Faults that nothing in the data tells apart have the same log Λ, and are
+named together.
 
 Source: Willsky & Jones (1976), doi:10.1109/TAC.1976.1101146, the generalised likelihood ratio of additive faults.
 """
@@ -25,7 +26,7 @@ from ...log import Log
 from ...model.state_space import StateSpaceModel
 from ...snapshots import Base
 from ...tuning import Tuning
-from .nudges import Given, Nudge, nudges_of
+from .nudges import DRIFT, KINDS, SENSOR, Given, Nudge, nudges_of
 from .responses import Start, astray, each, refold, respond, stand_in
 from .size import reason_against
 
@@ -86,7 +87,9 @@ def suspects(
         return []
     seen = np.nan_to_num(begun.track.whitened)
     found = []
-    for response in each(lambda nudge: respond(begun, nudge), nudges_of(model, tuning, begun.given.log), executor):
+    for response in each(
+        lambda nudge: respond(begun, nudge), nudges_of(model, tuning, begun.given.log, (*KINDS, DRIFT)), executor
+    ):
         moved = np.nan_to_num(response.whitened)
         power = float(np.sum(moved**2))
         if power > 0.0:
@@ -115,10 +118,18 @@ def _start(
 
 
 def likeliest(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
-    """The likeliest, and those that explain as much; none if no single fault explains anything."""
+    """The likeliest, and those that explain as much; none if no single fault explains anything.
+
+    Of a sensor that may be off or drift, only what is likelier of the two.
+    """
     if not found or found[0].gain < TELLING:
         return ()
-    return tuple(suspect for suspect in found if found[0].gain - suspect.gain < ALIKE)
+    alike: dict[tuple[str, str], Suspect] = {}
+    for suspect in found:
+        if found[0].gain - suspect.gain < ALIKE:
+            kind = SENSOR if suspect.nudge.kind == DRIFT else suspect.nudge.kind
+            alike.setdefault((kind, suspect.nudge.name), suspect)
+    return tuple(alike.values())
 
 
 def in_words(found: Sequence[Suspect], most: int = 3) -> str:

@@ -51,6 +51,20 @@ def test_the_sensor_that_is_off_by_so_much(log, sensor):
     assert in_words(blamed(wrong)).startswith(f"sensor {sensor} +")
 
 
+@pytest.mark.parametrize("sensor", MODEL.sensor_names)
+def test_the_sensor_that_drifts_by_so_much(log, sensor):
+    """It is not said to be off by a constant, nor is anything else."""
+    s, rate = MODEL.sensor_names.index(sensor), 0.05
+    wrong = log.copy()
+    t = wrong.t[: wrong.n] * 1e-9
+    late = (t >= SINCE) & (wrong.kind[: wrong.n] == READING) & (wrong.channel[: wrong.n] == s)
+    wrong.value[: wrong.n][late, 0] += rate * (t[late] - SINCE)
+    found = blamed(wrong)
+    assert (found[0].nudge.kind, found[0].nudge.name) == ("drift", sensor)
+    assert abs(found[0].size - rate) < 4.0 * found[0].deviation
+    assert in_words(found) == f"sensor {sensor} drifting by {found[0].size:+.3g} °C/s"
+
+
 def test_an_input_that_is_off(log):
     wrong = log.copy()
     k = MODEL.input_names.index("coolant")
