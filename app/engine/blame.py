@@ -13,7 +13,8 @@ import threading
 from collections.abc import Callable, Sequence
 
 from estimators.diagnostics.episodes import Episode
-from estimators.diagnostics.sensitivity.suspects import RIDDLES, in_words, suspects
+from estimators.diagnostics.sensitivity.nudges import DRIFT, SENSOR
+from estimators.diagnostics.sensitivity.suspects import RIDDLES, in_words, likeliest, suspects
 from estimators.errors import NisusError
 from estimators.log import Log
 
@@ -48,6 +49,7 @@ class Blame:
         """
         self._episodes, self._take, self._notices, self._every = episodes, take, notices, every
         self._words: dict[str, str] = {}
+        self._rows: dict[str, str] = {}
         self._seen: dict[str, float] = {}
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="blame", daemon=True)
@@ -71,11 +73,20 @@ class Blame:
         words = self.of(episode)
         return episode._replace(text=f"{episode.text}; most likely off: {words}") if words else episode
 
+    def behind(self, episode: Episode) -> Episode:
+        """The open episode of the sensor that is most likely off in this one, if that is another's; else this one.
+
+        A filter follows a sensor that is off, so that in time those that are in order contradict it.
+        """
+        row = self._rows.get(episode.subject) if _riddle(episode) else None
+        return next((other for other in self._episodes() if _riddle(other) and other.subject == row), episode)
+
     def look(self) -> None:
         """Ask for the open episode of which most is new."""
         riddles = [episode for episode in self._episodes() if _riddle(episode)]
         subjects = {episode.subject for episode in riddles}
         self._words = {subject: words for subject, words in self._words.items() if subject in subjects}
+        self._rows = {subject: row for subject, row in self._rows.items() if subject in subjects}
         self._seen = {subject: seen for subject, seen in self._seen.items() if subject in subjects}
         taken = self._take() if riddles else None
         if taken is None or reason_against(taken.tuning.model, taken.estimator):
@@ -103,6 +114,8 @@ class Blame:
         words, before = in_words(found), self.of(episode)
         if words:
             self._words[episode.subject] = words
+            first = likeliest(found)[0].nudge
+            self._rows[episode.subject] = first.name if first.kind in (SENSOR, DRIFT) else ""
             if not before:
                 self._notices.say(
                     f"{episode.subject}: most likely off: {words}", level="warn", t=int(taken.events.t[-1])

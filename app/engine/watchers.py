@@ -64,5 +64,7 @@ class Watchers:
         return tuple(map(self.blame.told, account.episodes)) if account.revision == revision else ()
 
     def cause(self, leading: Episode | None, health: int) -> str:
-        """Why the twin is not to be trusted now, by the episode that leads."""
-        return self.blame.told(leading).text if leading is not None and health not in (WAITING, TRACKING) else ""
+        """Why the twin is not to be trusted now, by the episode that leads, or that of a sensor which is behind it."""
+        if leading is None or health in (WAITING, TRACKING):
+            return ""
+        return self.blame.told(self.blame.behind(leading)).text

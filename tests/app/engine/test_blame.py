@@ -50,6 +50,19 @@ def test_the_sensor_that_is_off_is_named_once_and_in_the_text(folded):
     assert lines == [f"yoke: most likely off: {words}"]
 
 
+def test_a_consequence_leads_to_the_sensor_that_is_behind_it(folded):
+    """What tooth shows is explained best by yoke: its episode is the one to look at, while it lasts."""
+    (yoke,) = [episode for episode in episodes(folded) if (episode.subject, episode.cause) == ("yoke", "shifted")]
+    tooth = yoke._replace(subject="tooth", text="tooth reads low")
+    known = [yoke, tooth]
+    blame, _ = blame_of(folded, known)
+    assert blame.behind(tooth) is tooth  # not yet asked
+    blame.look()
+    assert blame.behind(tooth) is yoke and blame.behind(yoke) is yoke
+    known[0] = yoke._replace(end=80.0)
+    assert blame.behind(tooth) is tooth
+
+
 def test_what_is_over_or_no_riddle_is_left_alone(folded):
     over = Episode(60.0, 70.0, "yoke", "shifted", 1.0, 0.5, 1.5, "σ", "yoke reads high")
     stuck = Episode(60.0, None, "tooth", "stuck", 41.0, np.nan, np.nan, "°C", "tooth is stuck")
