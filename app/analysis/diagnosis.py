@@ -65,6 +65,7 @@ class Diagnosis:
         status = engine.status()
         marginal = find_entry(estimator).family in ("particle", "ensemble")
         slow = self._slow.of(revision) if len(events) else None
+        nis = nis_verdict(track, events, engine.model, tuning.baseline)
         return {
             "revision": revision,
             "estimator": estimator,
@@ -77,7 +78,8 @@ class Diagnosis:
             "particles": _particles(status, events, track),
             "correlation": _correlation(engine),
             "observability": _observability(engine, slow),
-            "nis": nis_verdict(track, events, engine.model, tuning.baseline).words,
+            "nis": nis.words,
+            "nis_place": nis.place,
             "cost": None if slow is None else number(slow.cost, 3),
             **_unseen(status),
         }

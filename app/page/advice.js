@@ -33,7 +33,7 @@ export class Advice {
     const busy = told.state === "running";
     if (busy && this.panel.open) this.timer = setTimeout(() => this.ask("GET"), LOOK);
     this.measure.disabled = busy;
-    setText(this.said, busy ? "folding the log by one filter after another …" : told.advice && !told.current ? `of run ${told.revision}; another runs now` : "");
+    setText(this.said, busy ? "folding the log by one filter after another …" : told.advice && !told.current ? `of run ${told.revision}; another runs now` : told.advice ? "" : "nothing measured yet: it folds the log by one filter after another");
     const key = `${told.state}/${told.revision}/${told.current}`;
     if (key === this.key) return;
     this.key = key;

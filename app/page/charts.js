@@ -1,5 +1,6 @@
 // The stack of charts: one time axis, one cursor. States that nobody measures first, then the others, NIS, innovations.
 
+import { betweenCurves, drawBetween } from "./between.js";
 import { Chart, apart, band, colour, dots, edge, line } from "./chart.js";
 import { $, setText } from "./dom.js";
 import { bracketed, clock, compact, decimals, fixed, spaced, withDeviation, words } from "./format.js";
@@ -189,6 +190,7 @@ function stateChart(charts, state) {
   const { live, previous } = charts;
   const rows = state.rows.flatMap((row) => OF_ROW.map((kind) => `${kind}:${row}`));
   const own = OF_STATE.map((kind) => `${kind}:${state.name}`);
+  const readings = state.circular ? [] : rows.filter((name) => name.startsWith("reading:"));
   const marksOf = { reading: () => dots("reading", 4), held: () => dots("reading", 5, true), refused: () => dots("refused", 6), screened: () => dots("refused", 7, true) };
   return {
     key: `state:${state.name}`,
@@ -203,9 +205,9 @@ function stateChart(charts, state) {
     ],
     bands: [band("band", [1, 2])],
     under: (plot) => marks(plot, charts.episodes, charts.view.at),
-    between: (plot, series) => series === BEFORE && (charts.smoothed.draw(plot, state), charts.pins.draw(plot, state)), // over the band, beneath the estimate
+    between: (plot, series) => series === BEFORE && (drawBetween(plot, live, readings), charts.smoothed.draw(plot, state), charts.pins.draw(plot, state)), // over the band, beneath the estimate
     over: (plot) => integrityLines(plot, charts, state),
-    extras: (chart) => [...integrityCurves(chart, charts, state), ...charts.smoothed.curves(state), ...charts.pins.curves("lane", state)],
+    extras: (chart) => [...betweenCurves(live, readings), ...integrityCurves(chart, charts, state), ...charts.smoothed.curves(state), ...charts.pins.curves("lane", state)],
     data: () => {
       let [upper, lower, truth, mean] = own.map((name) => live.column(name));
       let dotted = rows.map((name) => live.column(name));
@@ -294,6 +296,8 @@ function innovationChart(charts, row, further) {
     series: [line("bound", { width: 1, spanGaps: true }), line("bound", { width: 1, spanGaps: true }), dots("reading", 3)],
     bands: [band("bounds", [1, 2])],
     under: (plot) => marks(plot, charts.episodes, charts.view.at),
+    between: (plot, series) => series === 2 && drawBetween(plot, live, [names[2]]),
+    extras: () => betweenCurves(live, [names[2]]),
     data: () => [live.x, ...names.map((name) => live.column(name))],
     range: (chart) => {
       const [x, upper, lower, values] = chart.data;

@@ -50,13 +50,14 @@ export class Diagnose {
 
   draw(found) {
     const good = found.rows.filter((row) => row.tone === "good").length;
+    const but = good && ["above", "below"].includes(found.nis_place) ? `, but the mean NIS is ${found.nis_place} its bounds` : "";
     const left = found.rows_in_all > found.rows.length ? ` (the first of ${found.rows_in_all})` : "";
     const rows = [...found.rows].sort((a, b) => ORDER.indexOf(a.tone) - ORDER.indexOf(b.tone));
     const open = (row) => this.turned.get(row.name) ?? (found.rows.length <= FEW || row.tone === "bad");
     const focused = this.node.contains(document.activeElement) ? document.activeElement.getAttribute("aria-label") : null;
     const cost = found.cost === null ? "" : ` An event costs ${compact(found.cost, 3)} µs.`;
     this.node.replaceChildren(
-      element("p", { class: "summary" }, element("b", {}, `${good} of ${found.rows.length} sensor rows${left} are as they should be. `), `Last ${found.events.toLocaleString("en")} events, ${span(found.span)}, ${found.estimator}: ${found.nis}.${cost}`),
+      element("p", { class: "summary" }, element("b", {}, `${good} of ${found.rows.length} sensor rows${left} are as they should be${but}. `), `Last ${found.events.toLocaleString("en")} events, ${span(found.span)}, ${found.estimator}: ${found.nis}.${cost}`),
       ...rows.map((row) => rowCard(row, found.marginal, open(row), (now) => this.turned.set(row.name, now))),
       element("div", { class: "cards" }, ...[ranksCard(found), particlesCard(found), correlationCard(found), ...unseenCards(found)].filter(Boolean)),
     );

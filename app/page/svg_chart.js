@@ -58,7 +58,7 @@ export function chartSvg(chart, [title, about], episodes, tone = lightColours())
     const path = rows.length ? `<path d="M${edge(data[over], rows)}L${edge(data[under], rows.toReversed())}Z" fill="${tone(name)}"/>` : "";
     add(name, path, (at) => `<rect x="${at}" y="-8" width="15" height="8" fill="${tone(name)}"/>`);
   }
-  const curve = (xs, values, { tone: name, dash = [], width = 1.5, spanGaps }) => {
+  const curve = (xs, values, { tone: name, dash = [], width = 1.5, spanGaps, fill }) => {
     let path = "";
     let open = false;
     xs.forEach((time, k) => {
@@ -66,7 +66,8 @@ export function chartSvg(chart, [title, about], episodes, tone = lightColours())
       // What is undefined is a row of another table: the line goes on.
       open = finite(values[k]) || (open && (spanGaps || values[k] === undefined));
     });
-    const style = `fill="none" stroke="${tone(name)}" stroke-width="${width}"${dash.length ? ` stroke-dasharray="${dash.join(" ")}"` : ""}`;
+    const stroke = `fill="none" stroke="${tone(name)}" stroke-width="${width}"${dash.length ? ` stroke-dasharray="${dash.join(" ")}"` : ""}`;
+    const style = fill ? `fill="${tone(name)}" fill-opacity="${fill}"` : stroke;
     return [path && `<path d="${path}" ${style}/>`, (at) => `<path d="M${at} -4h15" ${style}/>`];
   };
   what.series.forEach((series, k) => {

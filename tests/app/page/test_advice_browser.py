@@ -27,6 +27,7 @@ def test_a_linear_model_is_told_its_filter_which_applies_itself(page, session): 
     engine = session.engine
     assert engine.estimator == "ukf"
     page.locator("#advise").click()
+    page.locator("#advice-panel").get_by_text("nothing measured yet").wait_for()
     page.locator("#advice-begin").click()
     apply = page.locator("#advice-apply")
     wait_for(lambda: apply.count() == 1, PATIENCE)

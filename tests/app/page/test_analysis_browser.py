@@ -159,6 +159,20 @@ def test_diagnose_draws_what_the_rows_say(page):
     wait_for(lambda: "µs" in page.locator("#diagnose .summary").inner_text(), PATIENCE)
 
 
+@pytest.mark.parametrize("place", ["inside", "above"])
+def test_rows_in_order_do_not_hide_a_mean_nis_that_is_not(page, place):
+    def answer(route):
+        told = route.fetch().json()
+        route.fulfill(json=told | {"rows": [row | {"tone": "good"} for row in told["rows"]], "nis_place": place})
+
+    page.route("**/api/diagnose", answer)
+    page.get_by_role("tab", name="Diagnose").click()
+    until(page, "window.nisus.diagnosed > 0")
+    said = page.locator("#diagnose .summary b").inner_text().strip()
+    but = ", but the mean NIS is above its bounds" if place == "above" else ""
+    assert said == f"3 of 3 sensor rows are as they should be{but}."
+
+
 def test_nothing_is_asked_while_both_are_hidden(page):
     page.get_by_role("tab", name="Charts").click()
     until(page, "!('whatif' in window.nisus.link.lanes) && !window.nisus.panes.whatif.busy")

@@ -56,6 +56,30 @@ def test_the_charts_go_to_another_moment_of_the_stretch_that_they_show(page, ses
     assert float(said.inner_text().split(" ± ")[0]) == pytest.approx(mean, abs=0.2 * std)
 
 
+TINTED = """() => {
+  const chart = window.nisus.charts.charts.find(({ what }) => what.key === "innovation:winding");
+  const { ctx, bbox } = chart.plot;
+  const y = chart.plot.valToPos(0, "y", true);
+  const { data } = ctx.getImageData(bbox.left, y, bbox.width, 1);
+  let tinted = 0;
+  for (let k = 0; k < data.length; k += 4) tinted += data[k] - data[k + 2] > 20;
+  return [window.nisus.charts.live.each, tinted / (data.length / 4), chart.what.extras(chart)[0].x.length];
+}"""
+
+
+def test_between_the_extremes_of_many_readings_the_others_are_seen(page):
+    """Innovations of either sign: at zero all is tinted where groups of them are shown, and little where each is."""
+    until(page, "window.nisus.charts.live.x.length > 100")
+    page.evaluate("window.nisus.view.show(20, 280)")
+    until(page, "window.nisus.charts.live.each === 2 && window.nisus.charts.live.x[0] < 25")
+    wait_for(lambda: page.evaluate(TINTED)[1] > 0.8, PATIENCE)
+    assert page.evaluate(TINTED)[2] > 100
+    page.evaluate("window.nisus.view.show(50, 60)")
+    until(page, "window.nisus.charts.live.each === 1 && window.nisus.charts.live.x[0] > 45")
+    wait_for(lambda: page.evaluate(TINTED)[1] < 0.3, PATIENCE)
+    assert page.evaluate(TINTED)[2] == 0
+
+
 def test_hidden_charts_ask_for_nothing(page, session):
     engine = session.engine
     engine.submit(Pin(0))
