@@ -31,8 +31,8 @@ def chart(page, key):  # noqa: F811
     return page.evaluate(
         """(key) => {
           const chart = window.nisus.charts.charts.find((chart) => chart.what.key === key);
-          const { min, max } = chart.plot.scales.y;
-          return { low: min, high: max, marks: chart.outsiders };
+          const { x, y } = chart.plot.scales;
+          return { low: y.min, high: y.max, marks: chart.outsiders, since: x.min, until: x.max };
         }""",
         key,
     )
@@ -47,8 +47,13 @@ def test_a_wild_reading_is_marked_at_the_edge_and_the_others_rule_the_axis(page,
     page.evaluate("window.nisus.view.follow(null)")
     wait_for(lambda: page.evaluate("window.nisus.charts.live.x[0]") < 1.0, PATIENCE)
 
-    wait_for(lambda: chart(page, "innovation:winding")["marks"], PATIENCE)
-    shown = chart(page, "innovation:winding")
+    def drawn(key):
+        """The chart, once the picture is that of all of it."""
+        found = {}
+        wait_for(lambda: found.update(chart(page, key)) or found["since"] < 1.0 and found["until"] > 590.0, PATIENCE)
+        return found
+
+    shown = drawn("innovation:winding")
     # Wide enough for all but the wild ones, and not much wider: 8 % of margin, and axes shrink when half is empty.
     assert ordinary <= shown["high"] == -shown["low"] < 3 * ordinary
     furthest = {mark["above"]: mark["value"] for mark in shown["marks"] if mark.get("furthest")}
@@ -57,7 +62,7 @@ def test_a_wild_reading_is_marked_at_the_edge_and_the_others_rule_the_axis(page,
     assert {mark["tone"] for mark in shown["marks"]} == {"reading"}
 
     # The same of the state, by the mark of a refused reading.
-    state = chart(page, "state:temperature")
+    state = drawn("state:temperature")
     assert state["high"] - state["low"] < 500.0
     assert {mark["tone"] for mark in state["marks"]} == {"refused"}
 
