@@ -12,9 +12,7 @@ export class Panel {
     document.addEventListener("keydown", (event) => {
       // A button of it that is greyed while it works loses the focus to the page.
       const { activeElement: at } = document;
-      if (event.key !== "Escape" || !this.open || !(at === document.body || at === button || this.node.contains(at))) return;
-      event.stopPropagation();
-      this.toggle(false);
+      if (event.key === "Escape" && this.open && (at === document.body || at === button || this.node.contains(at))) this.toggle(false);
     });
     button.setAttribute("aria-haspopup", "dialog");
     button.setAttribute("aria-expanded", "false");
