@@ -1,7 +1,7 @@
 // Of rows in groups only the extremes have come: a faint box from one to the other stands for the readings between, so
 // that noise does not look like two rows of marks.
 
-import { colour } from "./chart.js";
+import { clipped, colour } from "./chart.js";
 
 const FAINT = 0.22;
 
@@ -15,11 +15,7 @@ function boxes(lane, name) {
 }
 
 export function drawBetween(plot, lane, names) {
-  const { ctx, bbox } = plot;
-  ctx.save();
-  ctx.beginPath();
-  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-  ctx.clip();
+  const ctx = clipped(plot);
   ctx.globalAlpha = FAINT;
   ctx.fillStyle = colour("reading");
   for (const [since, until, one, other] of names.flatMap((name) => boxes(lane, name))) {

@@ -14,6 +14,15 @@ export const colour = (name) => styles.getPropertyValue(`--${name}`).trim();
 // A value of the value axis in words.
 export const amount = (what, value) => what.amount?.(value) ?? `${compact(value, 3)} ${what.unit.replace(/^\[|\]$/g, "")}`.trim();
 
+// The context of a plot in which nothing leaves its frame, until it is restored.
+export function clipped({ ctx, bbox }) {
+  ctx.save();
+  ctx.beginPath();
+  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
+  ctx.clip();
+  return ctx;
+}
+
 // What uPlot draws, and for a file: the name of its colour, and which mark it is.
 export const line = (name, options = {}) => ({
   mark: "line", tone: name, stroke: () => colour(name), width: 1.5, points: { show: false }, spanGaps: false, ...options,

@@ -1,7 +1,7 @@
 // The stack of charts: one time axis, one cursor. States that nobody measures first, then the others, NIS, innovations.
 
 import { betweenCurves, drawBetween } from "./between.js";
-import { Chart, apart, band, colour, dots, edge, line } from "./chart.js";
+import { Chart, apart, band, clipped, colour, dots, edge, line } from "./chart.js";
 import { $, setText } from "./dom.js";
 import { bracketed, clock, compact, decimals, fixed, spaced, withDeviation, words } from "./format.js";
 import { groupCharts, groupsOf } from "./groups.js";
@@ -312,13 +312,9 @@ function innovationChart(charts, row, further) {
 function integrityLines(plot, charts, state) {
   const found = charts.integrity?.[state.name];
   if (!found || !Number.isFinite(found.bound)) return;
-  const { ctx, bbox } = plot;
   const x = plot.data[0];
   const mean = plot.data[plot.data.length - 1];
-  ctx.save();
-  ctx.beginPath();
-  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-  ctx.clip();
+  const ctx = clipped(plot);
   ctx.strokeStyle = colour("integrity");
   ctx.lineWidth = devicePixelRatio;
   ctx.setLineDash([2 * devicePixelRatio, 3 * devicePixelRatio]);

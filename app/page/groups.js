@@ -1,7 +1,7 @@
 // Many states of one kind in one chart: a line each, the one that is furthest from the others drawn strong, with its band;
 // of a dozen and more a picture, time to the right, one row a state, and beneath it how far they are apart and how sure.
 
-import { band, edge, line } from "./chart.js";
+import { band, clipped, edge, line } from "./chart.js";
 import { bracketed, compact, spaced, words } from "./format.js";
 import { marks } from "./marks.js";
 import { Range, extent, shownExtent, within } from "./ranges.js";
@@ -125,11 +125,8 @@ function picture(charts, group) {
       if (!(to > from)) return;
       [low, high] = range.fit(...extent(columns, from, to));
       const canvas = paint(x, columns, members.length);
-      const { ctx, bbox } = plot;
-      ctx.save();
-      ctx.beginPath();
-      ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-      ctx.clip();
+      const { bbox } = plot;
+      const ctx = clipped(plot);
       ctx.imageSmoothingEnabled = false;
       for (let k = from; k <= to; k++) {
         const left = plot.valToPos(x[k], "x", true);

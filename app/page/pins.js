@@ -1,7 +1,7 @@
 // Pinned runs on the charts: their lines over those of each state, and beneath them by how much they differ from what
 // runs. The head of that chart is their legend.
 
-import { Chart, colour } from "./chart.js";
+import { Chart, clipped, colour } from "./chart.js";
 import { element, setText } from "./dom.js";
 import { bracketed, compact } from "./format.js";
 import { Lane } from "./lane.js";
@@ -162,12 +162,8 @@ function trace(plot, lane, state, place) {
   const round = 2 * Math.PI;
   const mean = lane.column(`mean:${state.name}`);
   const values = state.circular ? mean.map((value) => (typeof value === "number" ? value - round * Math.round(value / round) : value)) : mean;
-  const { ctx, bbox } = plot;
   const { min, max } = plot.scales.x;
-  ctx.save();
-  ctx.beginPath();
-  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-  ctx.clip();
+  const ctx = clipped(plot);
   ctx.strokeStyle = colour(`pin-${place}`);
   ctx.lineWidth = 1.5 * devicePixelRatio;
   ctx.setLineDash(DASHES[place].map((length) => length * devicePixelRatio));

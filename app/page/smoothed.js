@@ -1,7 +1,7 @@
 // What the readings after each moment add: the smoothed mean of a state and its band, beside the filter's. The server
 // smooths only while this is on.
 
-import { colour } from "./chart.js";
+import { clipped, colour } from "./chart.js";
 import { element } from "./dom.js";
 import { Lane } from "./lane.js";
 import { within } from "./ranges.js";
@@ -40,11 +40,7 @@ export class Smoothed {
   // Beneath the line of the estimate: a fine edge to either side, and the mean between them.
   draw(plot, state) {
     if (!this.shown || !this.lane.x.length) return;
-    const { ctx, bbox } = plot;
-    ctx.save();
-    ctx.beginPath();
-    ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-    ctx.clip();
+    const ctx = clipped(plot);
     ctx.strokeStyle = colour("smoothed");
     for (const kind of KINDS) {
       ctx.lineWidth = (kind === "mean" ? 1.25 : 0.75) * devicePixelRatio;

@@ -1,6 +1,6 @@
 // The bands of the states that charts of groups draw strong: asked for alone, as those of all would be many.
 
-import { colour } from "./chart.js";
+import { clipped, colour } from "./chart.js";
 import { Lane } from "./lane.js";
 import { bandExtent, within } from "./ranges.js";
 
@@ -39,14 +39,10 @@ export class Strong {
     const { x } = this.lane;
     if (!name || !x.length) return;
     const [upper, lower] = this.edges(name);
-    const { ctx, bbox } = plot;
     const [from, to] = within(x, [plot.scales.x.min, plot.scales.x.max]);
     const rows = [];
     for (let k = Math.max(0, from - 1); k <= Math.min(x.length - 1, to + 1); k++) if (typeof upper[k] === "number" && typeof lower[k] === "number") rows.push(k);
-    ctx.save();
-    ctx.beginPath();
-    ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-    ctx.clip();
+    const ctx = clipped(plot);
     ctx.fillStyle = colour("band");
     ctx.beginPath();
     for (const k of rows) ctx.lineTo(plot.valToPos(x[k], "x", true), plot.valToPos(upper[k], "y", true));
