@@ -95,7 +95,7 @@ class Snapshots:
 
     @property
     def every(self) -> int:
-        """Events between two recent ones: how far a late reading takes a fold back at least, at worst."""
+        """Events between two of the latest: how far a reading that is a little late takes a fold back at worst."""
         return self._every
 
     @property
