@@ -17,10 +17,10 @@ from PIL import Image, ImageDraw
 from playwright.sync_api import Browser, Page
 
 from app.cli.run import live_source
-from app.engine.commands import Pause, SetEstimator
-from app.session import Page as Served
-from app.session import Session
+from app.live.commands import Pause, SetEstimator
 from app.twin.twin import load_twin
+from app.web.session import Page as Served
+from app.web.session import Session
 from tests.chromium import find_chromium, launched
 
 PICTURES = Path(__file__).resolve().parent.parent / "config" / "pictures"

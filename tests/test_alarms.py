@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from app.engine.outputs import Status
+from app.live.outputs import Status
 from config.schema import TwinSection
 from estimators.diagnostics.episodes import CAUSES, anchor
 from estimators.diagnostics.sensor_states import STATES

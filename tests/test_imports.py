@@ -123,8 +123,8 @@ def test_circles_are_found():
 
 def test_the_reader_of_imports_sees_every_form():
     source = """
-import app.engine
-from app import engine
+import app.live
+from app import live
 from . import errors
 from .errors import ModelError
 from ..sources import can_bus
@@ -134,8 +134,8 @@ if TYPE_CHECKING:
     import config.schema as schema
 """
     assert imported(source, "estimators.models") == [
-        "app.engine",
-        "app.engine",
+        "app.live",
+        "app.live",
         "estimators.models.errors",
         "estimators.models.errors.ModelError",
         "estimators.sources.can_bus",

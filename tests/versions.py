@@ -25,8 +25,9 @@ FOLDERS = ("config", "sources")
 MODULES = (
     "test_imports.py", "test_readme.py", "test_conftest.py", "estimators/numerics/test_jit.py",
     "estimators/numerics/test_simd_rows.py", "estimators/numerics/test_simd_exp.py", "estimators/test_log.py",
-    "app/server/test_server.py", "app/server/test_door.py", "app/server/test_port.py", "app/rerun/test_feed.py",
-    "app/viser/test_view.py", "app/viser/test_numbers.py", "app/cli/test_new.py", "app/cli/test_progress.py",
+    "app/web/test_server.py", "app/web/test_door.py", "app/web/test_port.py", "app/views/rerun/test_feed.py",
+    "app/views/viser/test_view.py", "app/views/viser/test_numbers.py", "app/cli/test_new.py",
+    "app/cli/test_progress.py",
     "estimators/compiled/test_black_box.py::test_a_function_that_processes_cannot_import",
 )  # fmt: skip
 """Files under tests/; the last with one test of it."""

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 from config.loader import shipped
 from estimators.errors import ConfigError
 
-from ..advice.advice_json import advice_json
-from ..advice.lines import apply, lines
-from ..advice.measured import Measured
-from ..advice.verdict import Advice
-from ..advice.verdict import advise as verdict
+from ..studies.advice.advice_json import advice_json
+from ..studies.advice.lines import apply, lines
+from ..studies.advice.measured import Measured
+from ..studies.advice.verdict import Advice
+from ..studies.advice.verdict import advise as verdict
 from ..twin.twin import load_twin
 from .advise_text import as_text
 from .fold import read_log

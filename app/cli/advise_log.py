@@ -13,11 +13,11 @@ from rich.table import Table
 
 from estimators.errors import ConfigError
 
-from ..advice.log.draft import python_text, yaml_text
-from ..advice.log.pairs import Pair
-from ..advice.log.plan import Moves, Plan, plan
-from ..advice.log.signals import Signal, signals
-from ..advice.words import digits, percent, seconds_text
+from ..studies.advice.log.draft import python_text, yaml_text
+from ..studies.advice.log.pairs import Pair
+from ..studies.advice.log.plan import Moves, Plan, plan
+from ..studies.advice.log.signals import Signal, signals
+from ..studies.advice.words import digits, percent, seconds_text
 from .log import WIDTH, database_of, look
 from .new import check_new, model_of, write_pair
 

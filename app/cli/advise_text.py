@@ -6,8 +6,8 @@ import textwrap
 
 from estimators.log import READING, Log
 
-from ..advice.lines import lasting_lines, lines
-from ..advice.verdict import Advice
+from ..studies.advice.lines import lasting_lines, lines
+from ..studies.advice.verdict import Advice
 from ..twin.twin import Twin
 from .check_text import WIDTH
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
-from ..export.html import as_html
+from ..present.export.html import as_html
 from ..twin.twin import load_twin
 from .check_figures import figures
 from .check_tables import sections

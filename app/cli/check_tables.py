@@ -11,8 +11,8 @@ from estimators.diagnostics.sensitivity import bounds_of
 from estimators.diagnostics.sensitivity.information import directions
 from estimators.diagnostics.sensitivity.words import digits, range_text, size_text, subject_text
 
-from ..export.calibration_lines import calibration_lines
-from ..export.parts import WORSE, Bar, Part
+from ..present.export.calibration_lines import calibration_lines
+from ..present.export.parts import WORSE, Bar, Part
 from .check_list import BLAME, Line, blamed, checklist, health_shares
 from .checked import Checked
 

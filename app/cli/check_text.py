@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 
-from ..export.parts import Part
+from ..present.export.parts import Part
 
 WIDTH = 118
 

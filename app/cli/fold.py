@@ -26,13 +26,13 @@ from estimators.smoothing.smoothed import Smoothed
 from estimators.track import Track
 from sources.source import Endless
 
-from ..engine.stall import interruptible
-from ..export.html import as_html
-from ..export.report import Reported, report
-from ..export.track_file import encoded
 from ..intake import Intake
-from ..recording.format import TAKEN
+from ..live.stall import interruptible
+from ..present.export.html import as_html
+from ..present.export.report import Reported, report
+from ..present.export.track_file import encoded
 from ..twin.twin import Twin, load_twin
+from ..views.recording.format import TAKEN
 from .fold_episodes import blamed, dropped, episode_lines
 from .fold_report import as_dict, as_text, calibration_of
 from .fold_smoothed import Better
@@ -163,7 +163,7 @@ def _write(
     smoothed: Smoothed | None,
 ) -> None:
     if path.suffix == ".rrd":
-        from ..recording.writer import write_recording
+        from ..views.recording.writer import write_recording
 
         write_recording(path, twin, log, track, pictures, found, smoothed)
         return

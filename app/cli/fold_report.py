@@ -21,7 +21,7 @@ from estimators.track import FAILED, HEALTH_NAMES, REASONS, USED
 from estimators.tuning import TOGETHER
 from sources.source import WRONG_TIME
 
-from ..export.calibration_lines import calibration_lines
+from ..present.export.calibration_lines import calibration_lines
 from ..twin.twin import Twin
 from .fold_episodes import Told, as_json, dropped
 from .fold_smoothed import Better, errors_dict, number

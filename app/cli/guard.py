@@ -11,9 +11,9 @@ import numba
 from config.files import shown_path
 from estimators.errors import ConfigError, printable
 
-from ..export.parts import Part
-from ..guard.junit import Guarded, junit
-from ..guard.last import keep_last
+from ..present.export.parts import Part
+from ..studies.guard.junit import Guarded, junit
+from ..studies.guard.last import keep_last
 from .beside import beside, jobs_of
 from .check_text import as_text
 from .given import settings

@@ -16,8 +16,8 @@ from estimators.log import Log
 from estimators.registry import find_entry
 from estimators.snapshots import Base
 
-from ..recording.reader import read_recording
 from ..twin.twin import Twin, load_twin, restore_twin
+from ..views.recording.reader import read_recording
 from .compare_fold import draws
 from .fold import read_log
 

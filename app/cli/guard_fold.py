@@ -16,12 +16,12 @@ from estimators.log import Log
 from estimators.snapshots import Base
 from estimators.tuning import Tuning
 
-from ..guard.figures import allowances, measured
-from ..guard.junit import Guarded
-from ..guard.reference import fingerprint, read_reference, write_reference
-from ..guard.verdict import judge
-from ..tunings.figures import COVERAGE, RMSE
-from ..tunings.keep import now
+from ..live.tunings.figures import COVERAGE, RMSE
+from ..live.tunings.keep import now
+from ..studies.guard.figures import allowances, measured
+from ..studies.guard.junit import Guarded
+from ..studies.guard.reference import fingerprint, read_reference, write_reference
+from ..studies.guard.verdict import judge
 from ..twin.twin import Twin
 from .compare_fold import tidy
 from .guard_archive import Archived, folds_of, is_simulated, logs_of, twin_of

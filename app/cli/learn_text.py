@@ -12,8 +12,8 @@ from estimators.diagnostics.sensitivity.words import digits
 from estimators.fit.judge import Part
 from estimators.learned.judge import OnWindows
 
-from ..export.parts import Part as Section
-from ..runs.fit_json import part_json
+from ..live.runs.fit_json import part_json
+from ..present.export.parts import Part as Section
 
 TUNINGS = ("physics", "physics, its noise from the windows", "with the correction")
 

@@ -41,7 +41,7 @@ from .given import check_numbers
 def carry_out(command: Command) -> int:
     """Run one command; imports only what it needs, so that `nisus twins` answers at once."""
     if isinstance(command, Run):
-        from ..engine.compilers import first_workers
+        from ..live.compilers import first_workers
 
         workers = first_workers() if command.twin is not None and not command.headless else ()
         from .run import run_twin

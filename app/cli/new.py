@@ -137,8 +137,8 @@ def new_twin(arguments: Arguments) -> tuple[Path, Path]:
         if wanted or arguments.dbc:
             raise ConfigError("--signals and --dbc say what to take from a recording; name it with --log FILE")
         return write_twin(name, folder)
-    from ..advice.log.draft import python_text, yaml_text
-    from ..advice.log.plan import plan
+    from ..studies.advice.log.draft import python_text, yaml_text
+    from ..studies.advice.log.plan import plan
     from .log import database_of, look
 
     check_new(name, folder)

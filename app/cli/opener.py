@@ -12,24 +12,24 @@ import numpy as np
 
 from config.loader import shipped
 
-from ..gallery.api import GalleryApi
-from ..gallery.gallery import Gallery, Opener, Wanted
-from ..gallery.recordings import Recordings
-from ..gallery.saved_files import SavedFiles
-from ..recording.format import tuning_from_json
-from ..recording.reader import read_recording
-from ..recording.split import NEVER, Split
-from ..running import Opening, stamp_of
-from ..session import Page, Session
 from ..twin.twin import Twin, load_twin, restore_twin
+from ..views.recording.format import tuning_from_json
+from ..views.recording.reader import read_recording
+from ..views.recording.split import NEVER, Split
+from ..web.gallery.api import GalleryApi
+from ..web.gallery.gallery import Gallery, Opener, Wanted
+from ..web.gallery.recordings import Recordings
+from ..web.gallery.saved_files import SavedFiles
+from ..web.running import Opening, stamp_of
+from ..web.session import Page, Session
 from .prepare import begin_to_compile, compile_for, prepare_model
 from .remarks import remarking
 
 if TYPE_CHECKING:
     from sources.source import Source
 
-    from ..engine.compilers import Worker
-    from ..recording.reader import Recorded
+    from ..live.compilers import Worker
+    from ..views.recording.reader import Recorded
 
 
 def live_source(twin: Twin, speed: float | None = None) -> Callable[[Callable[[str, str], None]], Source]:

@@ -16,9 +16,9 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.registry import ESTIMATORS, unfit
 from sources.pieces import make, pieces_of
 
-from ..engine.call_watch import CallWatch
-from ..engine.compilers import Worker
-from ..engine.workshop import Workshop
+from ..live.call_watch import CallWatch
+from ..live.compilers import Worker
+from ..live.workshop import Workshop
 from ..twin.twin import Twin
 
 PATIENCE = 1.0

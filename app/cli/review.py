@@ -5,15 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..gallery.gallery import Wanted
-from ..server.port import check_port
-from ..session import Page, Session
 from ..stderr import complain
+from ..web.gallery.gallery import Wanted
+from ..web.port import check_port
+from ..web.session import Page, Session
 from .opener import FileOpener, open_session, opened_review
 from .prepare import prepare
 
 if TYPE_CHECKING:
-    from ..running import Opening
+    from ..web.running import Opening
     from .arguments import Review
 
 

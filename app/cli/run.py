@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 from estimators.errors import ConfigError
 
-from ..engine.playback import FASTEST
-from ..gallery.gallery import Wanted
-from ..recording.format import TAKEN
-from ..recording.split import NEVER, parse_split
-from ..server.port import check_port
-from ..session import Page
+from ..live.playback import FASTEST
 from ..stderr import complain
+from ..views.recording.format import TAKEN
+from ..views.recording.split import NEVER, parse_split
+from ..web.gallery.gallery import Wanted
+from ..web.port import check_port
+from ..web.session import Page
 from .given import settings
 from .opener import FileOpener, live_source, open_session, opened_twin
 from .prepare import prepare
@@ -23,7 +23,7 @@ from .prepare import prepare
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ..engine.compilers import Worker
+    from ..live.compilers import Worker
     from .arguments import Run
 
 

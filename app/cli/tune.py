@@ -14,11 +14,11 @@ from estimators.fit.aims import CRPS, ERROR
 from estimators.fit.fit import Fitted, Given, fit
 from estimators.log import Log
 
-from ..runs.fit_json import fit_json
-from ..runs.tuning_yaml import tuning_yaml
+from ..live.runs.fit_json import fit_json
+from ..live.runs.tuning_yaml import tuning_yaml
+from ..live.tunings.fitted import settings_of
+from ..live.tunings.keep import check_free, keep, version_text
 from ..stderr import complain
-from ..tunings.fitted import settings_of
-from ..tunings.keep import check_free, keep, version_text
 from ..twin.bounds import bounds_of, natural_aim
 from ..twin.twin import Twin, load_twin
 from .check_text import as_text

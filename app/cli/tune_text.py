@@ -8,8 +8,8 @@ from estimators.diagnostics.sensitivity.words import digits
 from estimators.fit.fit import Fitted, Line
 from estimators.fit.judge import Part, Prediction, Worth
 
-from ..export.parts import Part as Section
-from ..runs.fit_json import correlated
+from ..live.runs.fit_json import correlated
+from ..present.export.parts import Part as Section
 from ..twin.twin import Twin
 
 ALONE = "left alone: the data cannot tell"

@@ -16,12 +16,12 @@ from estimators.fit.aims import LIKELIHOOD
 from estimators.fit.dual import Refit, against, shift, walk
 from estimators.fit.fit import Given, Line
 
-from ..export.parts import Part as Section
-from ..runs.fit_json import fit_json
-from ..runs.tuning_yaml import tuning_yaml
+from ..live.runs.fit_json import fit_json
+from ..live.runs.tuning_yaml import tuning_yaml
+from ..live.tunings.fitted import settings_of
+from ..live.tunings.keep import keep, version_text
+from ..present.export.parts import Part as Section
 from ..stderr import complain
-from ..tunings.fitted import settings_of
-from ..tunings.keep import keep, version_text
 from ..twin.bounds import bounds_of
 from ..twin.twin import Twin
 from .check_text import as_text

@@ -11,12 +11,12 @@ from estimators.diagnostics.score import score
 from estimators.errors import ConfigError, printable
 from estimators.fold import Fold
 
-from ..engine.changes import difference
-from ..engine.stall import interruptible
-from ..export.parts import Part
-from ..tunings.figures import COVERAGE, figures
-from ..tunings.keep import Settings, accept, keep, version_text
-from ..tunings.listing import listing
+from ..live.changes import difference
+from ..live.stall import interruptible
+from ..live.tunings.figures import COVERAGE, figures
+from ..live.tunings.keep import Settings, accept, keep, version_text
+from ..live.tunings.listing import listing
+from ..present.export.parts import Part
 from ..twin.twin import load_twin
 from .check_text import as_text
 from .fold import read_log

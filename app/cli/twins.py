@@ -32,9 +32,9 @@ def show_twins(arguments: Arguments) -> int:
 
 def _drawn(name: str) -> str:
     """Fold a twin's log, draw its picture for the gallery and keep it; the file."""
-    from ..drawing.card import picture_of
-    from ..gallery.pictures import picture_file
+    from ..present.drawing.card import picture_of
     from ..twin.twin import load_twin
+    from ..web.gallery.pictures import picture_file
     from .fold import read_log
     from .prepare import prepare
 

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from app.engine.commands import Pause, Record, Restore, SetEstimator, SetOption, SetTuning, Speed, UseSensor
-from app.engine.revisions import Revisions
+from app.live.commands import Pause, Record, Restore, SetEstimator, SetOption, SetTuning, Speed, UseSensor
+from app.live.revisions import Revisions
 from config.schema import ViewSection
 from estimators.diagnostics.episodes import episodes
 from estimators.fold import Fold

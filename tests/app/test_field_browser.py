@@ -5,13 +5,13 @@ import io
 import numpy as np
 import pytest
 
-from app.engine.engine import Engine
-from app.server.private_viser import HEADER
+from app.live.engine import Engine
 from app.twin.twin import load_twin
-from app.viser.view import ViserView
-from tests.app.page.browsed import PATIENCE
+from app.views.viser.private_viser import HEADER
+from app.views.viser.view import ViserView
 from tests.app.scripted import Scripted, wait_for
 from tests.app.test_field_views import PLATE, SHAPE
+from tests.app.web.page.browsed import PATIENCE
 
 pytestmark = pytest.mark.browser
 

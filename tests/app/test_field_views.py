@@ -7,16 +7,16 @@ import pytest
 from rerun.chunk import RrdReader
 
 from app.cli.review import open_review
-from app.drawing.direct_readings import observed
-from app.drawing.heatmap import ERROR, FAR, NOTHING, ODD, QUIET, SILENT, Frame, Scale, sensor_colors
-from app.engine import commands
-from app.engine.engine import Engine
-from app.recording.writer import Recorder
-from app.rerun.feed import RerunFeed
-from app.rerun.rows import RerunRows
+from app.live import commands
+from app.live.engine import Engine
+from app.present.drawing.direct_readings import observed
+from app.present.drawing.heatmap import ERROR, FAR, NOTHING, ODD, QUIET, SILENT, Frame, Scale, sensor_colors
 from app.twin.twin import load_twin
-from app.viser import field_scene
-from app.viser.view import ViserView
+from app.views.recording.writer import Recorder
+from app.views.rerun.feed import RerunFeed
+from app.views.rerun.rows import RerunRows
+from app.views.viser import field_scene
+from app.views.viser.view import ViserView
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import READING, Log

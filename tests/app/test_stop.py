@@ -9,11 +9,11 @@ import threading
 import pytest
 
 from app.cli.run import live_source
-from app.recording.reader import finished, read_recording
-from app.recording.writer import _Part
-from app.running import Opening, RunningTwin
 from app.together import together
 from app.twin.twin import load_twin
+from app.views.recording.reader import finished, read_recording
+from app.views.recording.writer import _Part
+from app.web.running import Opening, RunningTwin
 from tests.app.scripted import row_count, wait_for
 from tests.conftest import ROOT
 

@@ -18,10 +18,10 @@ import numpy as np
 
 from app.cli.prepare import prepare
 from app.cli.run import live_source
-from app.engine import commands
-from app.recording.reader import read_recording
-from app.session import Page, Session
+from app.live import commands
 from app.twin.twin import load_twin
+from app.views.recording.reader import read_recording
+from app.web.session import Page, Session
 from estimators.log import READING
 from tests.chromium import find_chromium, launched
 

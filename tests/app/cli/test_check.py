@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from app.cli.main import main
-from app.export.html import as_html
-from app.export.parts import Bar, Part
+from app.present.export.html import as_html
+from app.present.export.parts import Bar, Part
 from estimators.diagnostics.sensitivity.words import range_text
 
 REQUIRED = {"checklist", "observability", "smallest_visible", "integrity", "held_out", "open_loop"}

@@ -1,7 +1,7 @@
 """Tables as text: what is too wide for a line is a paragraph a row, in which a value keeps the name of its column."""
 
 from app.cli.check_text import WIDTH, as_text
-from app.export.parts import Part
+from app.present.export.parts import Part
 
 
 def test_a_value_in_a_paragraph_has_the_head_of_its_column():

@@ -1,6 +1,6 @@
 """Lines of the calibration: one for a row, one for the many rows of a sensor."""
 
-from app.export.calibration_lines import calibration_lines
+from app.present.export.calibration_lines import calibration_lines
 from estimators.diagnostics.calibration import Calibration
 from estimators.diagnostics.intervals import UNKNOWN, Interval
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel

@@ -6,8 +6,8 @@ import can
 import numpy as np
 import pytest
 
-from app.advice.log.noise import noise_of
 from app.cli.main import main
+from app.studies.advice.log.noise import noise_of
 from app.twin.twin import load_twin
 from sources.survey import Series
 

@@ -9,7 +9,7 @@ import pytest
 
 import app.cli.prepare
 from app.cli.prepare import attend
-from app.engine.call_watch import CALL_PATIENCE, CallWatch
+from app.live.call_watch import CALL_PATIENCE, CallWatch
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 
 ENTERED, LEAVE = threading.Event(), threading.Event()

@@ -4,9 +4,9 @@ import pytest
 
 from app.cli.fold import read_log
 from app.cli.opener import recorded_twin
-from app.recording.reader import read_recording
-from app.recording.writer import write_recording
 from app.twin.twin import load_twin
+from app.views.recording.reader import read_recording
+from app.views.recording.writer import write_recording
 from estimators.diagnostics.episodes import episodes
 from estimators.fold import Fold
 from tests.support import assert_same

@@ -7,7 +7,7 @@ import pytest
 import app.cli.opener
 import app.cli.prepare
 from app.cli.main import main
-from app.engine.workshop import Workshop
+from app.live.workshop import Workshop
 from app.stderr import printable
 from tests.app.cli.test_fold import DRIVE, ROWS
 

@@ -8,12 +8,12 @@ import pytest
 import viser
 
 from app.cli.main import main
-from app.engine import commands
-from app.engine.engine import Engine
-from app.engine.playback import play
-from app.server.api import command_from_json, status_json
+from app.live import commands
+from app.live.engine import Engine
+from app.live.playback import play
 from app.twin.twin import load_twin, restore_twin
-from app.viser.view import ViserView
+from app.views.viser.view import ViserView
+from app.web.api import command_from_json, status_json
 from estimators.compiled.model import compile_model
 from estimators.errors import ConfigError, ModelError, NisusError
 from estimators.fold import fold

@@ -9,10 +9,10 @@ import pytest
 
 from app.cli.arguments import Fold as Arguments
 from app.cli.fold import fold_twin
-from app.engine.counts import RowCounts
-from app.engine.refusals import refusals
-from app.recording.format import base_from_json, base_to_json
+from app.live.counts import RowCounts
+from app.live.refusals import refusals
 from app.twin.twin import load_twin
+from app.views.recording.format import base_from_json, base_to_json
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import Log

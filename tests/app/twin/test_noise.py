@@ -9,11 +9,11 @@ import pytest
 
 from app.cli.arguments import Fold as Arguments
 from app.cli.fold import fold_twin, read_log
-from app.engine.commands import SetEstimator, SetOption
-from app.engine.execute import retuned
-from app.recording.format import tuning_from_json
-from app.recording.reader import read_recording
+from app.live.commands import SetEstimator, SetOption
+from app.live.execute import retuned
 from app.twin.twin import Twin, load_twin, restore_twin
+from app.views.recording.format import tuning_from_json
+from app.views.recording.reader import read_recording
 from estimators.errors import ConfigError, EstimatorError
 from estimators.fold import fold
 from estimators.log import READING, TRUTH, Log

@@ -1,0 +1,284 @@
+"""Dual estimation of a running twin: parameters fitted again now and then on its last readings, and what came of it.
+
+A thread of its own looks at the log's clock, and has the fit done by `Fitting`, beside the engine, at the lowest
+priority. What wins on the blocks held out is a proposal, which waits for whoever looks, or is adopted where the YAML
+says so. Nothing of it is silent: every fit is a line among the notices, and what is adopted a tuning version with its
+evidence. A proposal holds for the tuning that it was fitted from; one that was dismissed does not come again while the
+data say the same.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from config.schema import RefitSection
+from config.tunings import version_files
+from estimators.errors import ConfigError, NisusError
+
+from ...moment import moment
+from ..interface import Running
+from ..runs.fitting import DONE, FAILED, Attempt, Fitting
+from ..tunings.keep import keep, version_text
+from ..tunings.load import load_into
+
+if TYPE_CHECKING:
+    from estimators.fit.fit import Fitted
+
+LOOK = 0.5
+"""Seconds between two looks at the log's clock."""
+
+EDGE = ", at the edge of its range"
+
+KEPT = 50
+"""Fits of which it is told what came of them."""
+
+FITTING, OFFERED, ADOPTED, DISMISSED, OUTDATED, NOTHING, BROKEN = (
+    "fitting", "proposed", "adopted", "dismissed", "outdated", "nothing better", "failed",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Refit:
+    """One fit of a window: which, of what, and what came of it, in a line (`text`).
+
+    start and end are the window's first and last time, ns. `name` is the tuning version that was made of it.
+    """
+
+    number: int
+    start: int
+    end: int
+    attempt: Attempt
+    state: str = FITTING
+    text: str = ""
+    name: str = ""
+
+    @property
+    def fitted(self) -> Fitted | None:
+        """What was found; None while it is fitted, and if it failed."""
+        return self.attempt.fitted
+
+
+class Refits:
+    """All of a running twin, the oldest first."""
+
+    def __init__(self, engine: Running, *, look: float = LOOK) -> None:
+        """Nothing is fitted before `start`; `look` is the time between two looks, s."""
+        self._engine, self._look = engine, look
+        self._fitting = Fitting(engine)
+        self._lock = threading.RLock()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="refit", daemon=True)
+        self._passage = 0
+        self._due: int | None = None
+        self._dismissed: Fitted | None = None
+        self.known: tuple[Refit, ...] = ()
+
+    # For everybody, from any thread
+
+    @property
+    def section(self) -> RefitSection | None:
+        """What the twin's YAML says; None for nothing."""
+        return self._engine.twin.config.refit
+
+    @property
+    def open(self) -> Refit | None:
+        """What is proposed now."""
+        return next((item for item in self.known if item.state == OFFERED), None)
+
+    @property
+    def due(self) -> int | None:
+        """When the next fit begins, ns of the log; None if nothing was read, or nothing is to be fitted."""
+        return self._due
+
+    def start(self) -> None:
+        """Begin to look at the log's clock."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """The twin ends."""
+        self._stopping.set()
+        self._fitting.stop()
+        if self._thread.is_alive():
+            self._thread.join(timeout=1.0)
+
+    def now(self) -> None:
+        """Fit at once.
+
+        Raises:
+            ConfigError: If the YAML names nothing, a fit is under way, or nothing was read.
+        """
+        section = self.section
+        if section is None:
+            raise ConfigError("refit: the twin's YAML has no `refit` section; add one, or use Fit…")
+        if not self._engine.span()[1]:
+            raise ConfigError("refit: no reading has come yet; there is nothing to fit")
+        with self._lock:
+            self._begin(section)
+
+    def accept(self, number: int, *, why: str = "by hand") -> str:
+        """Keep a proposal as a tuning version with its evidence, and go on with that.
+
+        Returns:
+            The version's name.
+
+        Raises:
+            ConfigError: If it is not proposed any more, or cannot be kept or loaded.
+        """
+        # Half a second of imports, which a twin that fits nothing need not wait for.
+        from ..tunings.fitted import settings_of
+
+        with self._lock:
+            self._outdate()
+            refit = self._proposed(number)
+            assert refit.fitted is not None
+            engine, twin = self._engine, self._engine.twin
+            taken = version_files(twin.path)
+            name = next(name for k in range(1, len(taken) + 2) if (name := f"refit-{k}") not in taken)
+            attempt = refit.attempt
+            fitted_on = [f"{attempt.events} events over {attempt.seconds:.4g} s, to {moment(refit.end)}"]
+            given = settings_of(refit.fitted, fitted_on, f"dual estimation, fit {number}, adopted {why}: {refit.text}")
+            given = replace(given, model_version=engine.status().model_version)
+            keep(twin, name, version_text(twin, given))
+            load_into(engine, name, f"refit {number}, version {name}")
+            self._become(number, ADOPTED, refit.text, name)
+            engine.notices.say(f"refit {number}: adopted {why} as tuning version {name}: {refit.text}")
+        return name
+
+    def dismiss(self, number: int) -> None:
+        """Leave things as they are; it is not proposed again until the data say something else.
+
+        Raises:
+            ConfigError: If it is not proposed any more.
+        """
+        with self._lock:
+            refit = self._proposed(number)
+            self._dismissed = refit.fitted
+            self._become(number, DISMISSED, refit.text)
+            self._engine.notices.say(f"refit {number}: dismissed: {refit.text}")
+
+    # On its own thread
+
+    def _run(self) -> None:
+        while not self._stopping.wait(self._look):
+            try:
+                self.look()
+            except Exception as error:  # noqa: BLE001  the twin goes on, whatever becomes of a fit
+                self._engine.notices.report("refit", f"refit: {type(error).__name__}: {error}")
+
+    def look(self) -> None:
+        """Take what is done, and begin what is due."""
+        with self._lock:
+            last = self.known[-1] if self.known else None
+            if last is not None and last.state == FITTING:
+                if last.attempt.ended is not None:
+                    self._take(last)
+                return
+            self._outdate()
+            section = self.section
+            if section is None:
+                self._due = None
+            elif self._is_due(section):
+                self._begin(section)
+
+    def _is_due(self, section: RefitSection) -> bool:
+        begun, newest = self._engine.span()
+        passage = self._engine.notices.passage
+        if passage != self._passage:
+            self._passage, self._due = passage, None
+        if not newest:
+            return False
+        if self._due is None:
+            self._due = begun + round(section.window * 1e9)
+        # Not while a refold is under way: what it gives is what is to be fitted from.
+        return newest >= self._due and not self._engine.status().refolding
+
+    def _begin(self, section: RefitSection) -> None:
+        engine = self._engine
+        newest = engine.span()[1]
+        first = newest - round(section.window * 1e9)
+        self._due = newest + round(section.every * 1e9)
+        attempt = self._fitting.begin(section.entries, since=first)
+        number = self.known[-1].number + 1 if self.known else 1
+        self.known = (*self.known, Refit(number, first, newest, attempt))[-KEPT:]
+
+    def _take(self, refit: Refit) -> None:
+        """Say what came of a fit, and propose what won."""
+        attempt, number = refit.attempt, refit.number
+        fitted = attempt.fitted
+        if attempt.state != DONE or fitted is None:
+            reason = attempt.reason or "it was given up"
+            self._tell(number, BROKEN, reason, "warn" if attempt.state == FAILED else "info")
+        elif reasons := _against(fitted):
+            self._tell(number, NOTHING, "; ".join(reasons))
+        elif not self._current(attempt):
+            self._tell(number, OUTDATED, f"{_moves(fitted)}; but another tuning runs by now")
+        elif self._dismissed is not None and _same(fitted, self._dismissed):
+            self._tell(number, DISMISSED, f"{_moves(fitted)}; the data say what they said when it was dismissed")
+        else:
+            self._offer(refit, fitted)
+
+    def _offer(self, refit: Refit, fitted: Fitted) -> None:
+        section, before = self.section, self.open
+        if before is not None:
+            self._become(before.number, OUTDATED, f"{before.text}; fit {refit.number} took its place")
+        self._tell(refit.number, OFFERED, _moves(fitted))
+        if section is not None and section.adopt == "if better":
+            try:
+                self.accept(refit.number, why="by rule")
+            except NisusError as error:
+                self._engine.notices.say(f"refit {refit.number}: not adopted: {error}", level="warn")
+
+    def _tell(self, number: int, state: str, text: str, level: str = "info") -> None:
+        self._become(number, state, text)
+        self._engine.notices.say(f"refit {number}: {state}: {text}", level=level)
+
+    def _outdate(self) -> None:
+        """A proposal holds for the tuning that it was fitted from."""
+        refit = self.open
+        if refit is not None and not self._current(refit.attempt):
+            self._tell(refit.number, OUTDATED, f"{refit.text}; but another tuning runs by now")
+
+    def _current(self, attempt: Attempt) -> bool:
+        return self._engine.tuning is attempt.tuning and self._engine.estimator == attempt.estimator
+
+    def _proposed(self, number: int) -> Refit:
+        refit = self.open
+        if refit is None or refit.number != number:
+            state = next((item.state for item in self.known if item.number == number), "not known")
+            raise ConfigError(f"refit {number}: it is {state}; only what is proposed can be adopted or dismissed")
+        return refit
+
+    def _become(self, number: int, state: str, text: str, name: str = "") -> None:
+        # At once, so that a reader in another thread never sees half of it.
+        self.known = tuple(
+            replace(item, state=state, text=text, name=name) if item.number == number else item for item in self.known
+        )
+
+
+def _against(fitted: Fitted) -> tuple[str, ...]:
+    from estimators.fit.dual import against
+
+    return against(fitted)
+
+
+def _same(fitted: Fitted, other: Fitted) -> bool:
+    from estimators.fit.dual import agrees
+
+    return agrees(fitted, other)
+
+
+def _moves(fitted: Fitted) -> str:
+    """What moved, and what that is worth, in a line."""
+    from estimators.fit.dual import shift
+
+    moved = [
+        f"{line.key} {line.before:.4g} → {line.after:.4g}{line.unit and ' ' + line.unit} "
+        f"({shift(line):+.1f} σ{EDGE if line.edge else ''})"
+        for line in fitted.lines
+        if not line.alone
+    ]
+    verdict = fitted.verdict
+    gained = f"{verdict.gain:+.3g} ± {verdict.error:.2g} nats a reading on blocks held out"
+    return f"{', '.join(moved)}; {gained}"

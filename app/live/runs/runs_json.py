@@ -1,0 +1,127 @@
+"""Runs, and what the data say of a knob, as JSON for the page."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+from estimators.diagnostics.score import Fit
+from estimators.registry import ESTIMATORS
+
+from ..changes import difference, in_words
+from ..interface import Running
+from ..revisions import Run
+from .noise import Noise
+from .scores import RunScore, RunScores
+from .sweep import Swept
+
+
+def runs_json(scores: RunScores, engine: Running) -> list[dict[str, Any]]:
+    """Every run, oldest first, with what was changed for it and what it was worth."""
+    units = {state.name: state.unit for state in engine.model.shown_states}
+    rows = [row.unit for sensor in engine.model.sensors for row in sensor.rows]
+    units |= dict(zip(engine.model.row_names, rows, strict=True))
+    found = scores.all()
+    running = found[-1][0]
+    return [_run(run, known, run is running, units) for run, known in found]
+
+
+def _run(run: Run, known: RunScore | None, running: bool, units: dict[str, str]) -> dict[str, Any]:
+    kept = running or run.track is not None
+    return {
+        "number": run.number,
+        "estimator": run.estimator,
+        "title": ESTIMATORS[run.estimator].title,
+        "began": run.began,
+        "what": what_changed(run),
+        "running": running,
+        "loaded": run.loaded,
+        "name": run.name,
+        "note": run.note,
+        "place": run.place,
+        "kept": kept,
+        "score": None if known is None else _score(known, units),
+        "unscored": "" if known is not None else "no readings yet" if kept else "not scored: its track is gone",
+    }
+
+
+def what_changed(run: Run) -> str:
+    """What of a run differs from the one before, in words."""
+    said = ": ".join(part for part in (run.why, in_words(run.changes)) if part)
+    words = said or ("as it began" if run.loaded is None and not run.number else "as before")
+    return words if run.loaded is None else f"back to run {run.loaded}: {words}"
+
+
+def difference_json(run: Run, other: Run) -> list[dict[str, Any]]:
+    """The entries in which two runs differ, with both values."""
+    changes = difference(run.estimator, run.tuning, other.estimator, other.tuning)
+    return [{"key": key, "values": [_plain(before), _plain(after)]} for key, before, after in changes]
+
+
+def swept_json(swept: Swept) -> dict[str, Any]:
+    """A sweep as far as it has come, its most likely point, and the value at which the NIS is as it should be."""
+    best = swept.best
+    return {
+        **{key: _plain(value) for key, value in dataclasses.asdict(swept).items() if key != "points"},
+        "points": [dataclasses.asdict(point) for point in swept.points],
+        "best": None if best is None else best.value,
+        "level": _plain(swept.level),
+    }
+
+
+def noise_json(noise: Noise) -> dict[str, Any]:
+    """What the innovations say of each R, and by what all of Q would have to be scaled; `doubt` is why not to do so."""
+    estimates = {
+        key: {
+            "value": _plain(found.variance) if found.variance > 0.0 else None,
+            "std": _plain(found.std),
+            "n": found.n,
+            "doubt": noise.doubts.get(key, ""),
+        }
+        for key, found in noise.sensors.items()
+    }
+    q = swept_json(noise.q) | {"doubt": noise.doubts.get("Q", "")}
+    return {"revision": noise.revision, "R": estimates, "reason": noise.reason, "Q": q}
+
+
+def _score(known: RunScore, units: dict[str, str]) -> dict[str, Any]:
+    found = known.score
+    fits = [_fit(name, "truth", fit, units.get(name, "")) for name, fit in found.states.items()]
+    fits += [_fit(name, "held out", fit, units.get(name, "")) for name, fit in found.held_out.items()]
+    if found.field is not None:
+        fits.append(_fit("all cells", "truth", found.field, ""))
+    return {
+        "rows": known.rows,
+        "seconds": known.seconds,
+        "nis": _plain(found.nis),
+        "nis_low": _plain(found.nis_low),
+        "nis_high": _plain(found.nis_high),
+        "nis_judged": _plain(found.nis_verdict.measure),
+        "nis_place": found.nis_verdict.place,
+        "nis_words": found.nis_verdict.words,
+        "log_likelihood": _plain(found.log_likelihood),
+        "log_likelihood_reading": _plain(known.log_likelihood_reading),
+        "readings": found.readings,
+        "refused": _plain(found.refused),
+        "step_us": _plain(known.step_us),
+        "fits": fits,
+    }
+
+
+def _fit(name: str, against: str, fit: Fit, unit: str) -> dict[str, Any]:
+    return {
+        "name": name,
+        "against": against,
+        "unit": unit,
+        "rmse": _plain(fit.rmse),
+        "coverage": _plain(fit.coverage),
+        "bias": _plain(fit.bias),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """JSON has no infinity and no NaN."""
+    if isinstance(value, (str, bool, int)) or value is None:
+        return value
+    return float(value) if math.isfinite(value) else None

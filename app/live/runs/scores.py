@@ -1,0 +1,112 @@
+"""What each revision was worth, computed when somebody asks and never on the engine's thread."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from estimators.diagnostics.score import Score, score
+from estimators.errors import NisusError
+
+from ..interface import Running
+from ..outputs import Pull
+from ..revisions import Run
+from ..whole import whole
+from .window import window
+
+REST = 20.0
+"""Times as long as it took that the score of the running revision stands before it is computed again."""
+
+LEAST = 1.0
+"""Seconds that it stands at least."""
+
+TIMED, BEGUN = 2048, 64
+"""Events that are folded again to time a step; those of them that are folded before the clock starts."""
+
+LONGEST = 0.1
+"""Seconds that this takes at most."""
+
+
+@dataclass(frozen=True)
+class RunScore:
+    """Scores of one revision over the `rows` events that it had folded, `seconds` of the log.
+
+    `step_us` is the elapsed time of folding one event again, µs, beside whatever else this machine did; NaN if it could
+    not be timed.
+    """
+
+    score: Score
+    rows: int
+    seconds: float
+    step_us: float = np.nan
+
+    @property
+    def log_likelihood_reading(self) -> float:
+        """Log-likelihood of a reading, used or refused: runs of different length can be compared by it."""
+        judged = self.score.nis_readings + self.score.gated
+        return self.score.log_likelihood / judged if judged else np.nan
+
+
+class RunScores:
+    """Scores of all revisions of a twin, each computed once; of the running one again as it grows."""
+
+    def __init__(self, engine: Running) -> None:
+        self._engine = engine
+        self._lock = threading.Lock()
+        self._known: dict[int, RunScore] = {}
+        self._final: set[int] = set()
+        self._fresh_until = (-1, 0.0)
+
+    def all(self) -> list[tuple[Run, RunScore | None]]:
+        """Every revision with its scores; None where its track had gone before anybody asked."""
+        with self._lock:
+            runs = self._engine.revisions.runs
+            *left, running = runs
+            for run in left:
+                if run.track is not None and run.number not in self._final:
+                    self._known[run.number] = self._scored(run, run.track)
+                    self._final.add(run.number)
+            self._look(running)
+            numbers = {run.number for run in runs}
+            self._known = {number: known for number, known in self._known.items() if number in numbers}
+            return [(run, self._known.get(run.number)) for run in runs]
+
+    def _look(self, running: Run) -> None:
+        """Score what runs, unless that was done just now."""
+        begun = time.monotonic()
+        if self._fresh_until[0] == running.number and begun < self._fresh_until[1]:
+            return
+        pull = whole(self._engine)
+        if pull is None or pull.revision != running.number:
+            return
+        self._known[running.number] = self._scored(running, pull)
+        took = time.monotonic() - begun
+        self._fresh_until = (running.number, begun + took + max(LEAST, REST * took))
+
+    def _scored(self, run: Run, pull: Pull) -> RunScore:
+        gate, baseline, model = run.tuning.gate, run.tuning.baseline, self._engine.model
+        found = score(pull.track, pull.events, model, pull.pictures, gate=gate, baseline=baseline)
+        t, known = pull.events.t, self._known.get(run.number)
+        seconds = float(t[-1] - t[0]) * 1e-9 if t.size else 0.0
+        made = RunScore(found, len(pull.events), seconds, np.nan if known is None else known.step_us)
+        return made if np.isfinite(made.step_us) else replace(made, step_us=_step_us(self._engine, run))
+
+
+def _step_us(engine: Running, run: Run) -> float:
+    """Elapsed time of an event under a revision's settings, µs, over the last events of the log."""
+    part = window(engine, TIMED)
+    if part is None:
+        return np.nan
+    try:
+        fold = part.fold(engine, run.estimator, run.tuning)
+        fold.advance(min(BEGUN, fold.log.n // 2))
+        events, begun = 0, time.perf_counter()
+        while (done := fold.advance(BEGUN)) and time.perf_counter() - begun < LONGEST:
+            events += done
+        seconds = time.perf_counter() - begun
+    except NisusError:
+        return np.nan
+    return 1e6 * seconds / (events + done) if events + done else np.nan

@@ -1,0 +1,349 @@
+"""Around a knob: likelihood and NIS of the last events over several values of one entry of the tuning.
+
+A thread of the lowest priority folds them, one value after another, the nearest first, and gives up as soon as the
+tuning that runs is another.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from estimators.diagnostics.innovation_size import SensorNoise, mean_nis, sensor_noise
+from estimators.diagnostics.score import score
+from estimators.errors import ConfigError, NisusError
+from estimators.track import FAILED, Track
+from estimators.tuning import Tuning
+
+from ..integrity import LOWEST
+from ..interface import Running
+from .window import ALL, Window, window
+
+FACTORS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+
+MOST = 20_000
+"""Events that are folded again for every value, the last of the log."""
+
+FEWEST = 2048
+"""The same of a filter so slow that no more can be afforded."""
+
+LONGEST = 2.0
+"""Seconds that one value should take."""
+
+TOO_LONG = 10.0
+"""Seconds that the fewest events may take."""
+
+TRIED = 32
+"""Events that are folded to know how long one takes."""
+
+SETTLED = 0.3
+"""Seconds for which the tuning must rest before anything is folded around it."""
+
+CHUNK = 256
+"""Events between two looks at whether anybody still wants to know."""
+
+GROWN = 1.5
+"""Times as many events as were folded from which on a sweep is out of date."""
+
+MATCHED = "R, matched"
+"""What is folded for `matched`, among the keys."""
+
+TURNS = 5
+"""Folds after which R has come to rest, or does not."""
+
+AT_REST = 0.05
+"""Share by which R may still move then."""
+
+KEPT = 32
+GROUPS = ("Q", "R")
+"""Keys that scale all entries of a group."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One value: a `factor` of the present one, the value, and what it gave.
+
+    `log_likelihood` is that of the readings used and refused (estimators/diagnostics/refusals.py), `nis` their mean NIS
+    a degree of freedom, 1 where the filter is consistent (estimators/diagnostics/innovation_size.py). Both are None
+    where nothing can be said: a reading failed.
+    """
+
+    factor: float
+    value: float
+    log_likelihood: float | None
+    nis: float | None
+
+
+@dataclass(frozen=True)
+class Swept:
+    """The points of one key, by value, for a revision; `done` once all are there, or the `reason` why there are none.
+
+    `value` is the present one; of a group it is 1, and the points' values are their factors.
+    """
+
+    key: str
+    revision: int
+    value: float
+    events: int
+    points: tuple[Point, ...] = ()
+    done: bool = False
+    reason: str = ""
+
+    @property
+    def best(self) -> Point | None:
+        """The most likely of the points."""
+        known = [point for point in self.points if point.log_likelihood is not None]
+        return max(known, key=lambda point: point.log_likelihood or 0.0) if known else None
+
+    @property
+    def level(self) -> float | None:
+        """The value at which the innovations are as large as the filter says; None if it lies beyond the points.
+
+        Where the mean NIS a degree of freedom is 1, between two points by its logarithm over that of the value: what
+        covariance matching would choose if this entry alone were wrong.
+
+        Source: Mehra (1972), doi:10.1109/TAC.1972.1100100, section on covariance matching.
+        """
+        known = [(point.value, point.nis) for point in self.points if point.nis and point.value > 0.0]
+        for (low, above), (high, below) in zip(known, known[1:], strict=False):
+            first, second = np.log(above), np.log(below)
+            if first * second <= 0.0 and first != second:
+                return float(np.exp(np.log(low) + np.log(high / low) * first / (first - second)))
+        return None
+
+
+@dataclass(frozen=True)
+class Matched:
+    """What the innovations say of the noise of each sensor row once R is what they say, for a revision."""
+
+    revision: int
+    events: int
+    rows: dict[str, SensorNoise]
+
+
+class Sweeps:
+    """Folds what was asked for last, in a thread of its own."""
+
+    def __init__(self, engine: Running) -> None:
+        self._engine = engine
+        self._wake = threading.Condition()
+        self._wanted: list[str] = []
+        self._known: dict[str, Swept] = {}
+        self._matched: Matched | None = None
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="sweep", daemon=True)
+
+    def start(self) -> None:
+        """Wait to be asked."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Give up what is under way."""
+        with self._wake:
+            self._stopping = True
+            self._wake.notify()
+        if self._thread.is_alive():
+            self._thread.join(timeout=1.0)
+
+    def around(self, key: str) -> Swept:
+        """What is known of a key by now; the rest is folded from now on. Of several keys the last asked comes first.
+
+        Raises:
+            ConfigError: If there is no such key, or its values are no numbers.
+        """
+        value = value_of(self._engine.tuning, key)
+        known, revision = self._known.get(key), self._engine.revisions.runs[-1].number
+        if known is not None and known.revision == revision and not self._outdated(known):
+            return known
+        self._want(key)
+        # While there is another, older or of fewer events, it says more than nothing.
+        return known if known is not None and known.revision == revision else Swept(key, revision, value, 0)
+
+    def matched(self) -> Matched | None:
+        """R taken from the innovations again and again, all at once, until it rests; None as long as it is not known.
+
+        Where R alone was wrong, the innovations are white then; what else is wrong leaves them correlated.
+        """
+        known, revision = self._matched, self._engine.revisions.runs[-1].number
+        current = known is not None and known.revision == revision
+        if not current or (known is not None and known.events < self._engine.index_at(ALL) / GROWN < MOST):
+            self._want(MATCHED)
+        return known if current else None
+
+    def _want(self, key: str) -> None:
+        with self._wake:
+            self._wanted = [key, *(other for other in self._wanted if other != key)][:KEPT]
+            self._wake.notify()
+
+    def _outdated(self, known: Swept) -> bool:
+        return known.done and known.events < min(MOST - FEWEST, self._engine.index_at(ALL) / GROWN)
+
+    def _run(self) -> None:
+        if sys.platform == "linux":
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOWEST)
+        while True:
+            with self._wake:
+                while not self._wanted and not self._stopping:
+                    self._wake.wait()
+                turned = self._engine.tuning
+                # While a knob is dragged, the processors belong to what follows it.
+                self._wake.wait_for(lambda: self._stopping, SETTLED)
+                if self._stopping:
+                    return
+                if self._engine.tuning is not turned or not self._wanted:
+                    continue
+                key = self._wanted.pop(0)
+            try:
+                self.sweep(key)
+            except Exception as error:  # noqa: BLE001  a user's model may raise anything; the twin goes on
+                self._engine.notices.report("sweep", f"around {key}: {type(error).__name__}: {error}", level="error")
+
+    def sweep(self, key: str) -> None:
+        """Fold every value of a key, and leave what is found to `around`."""
+        taken = window(self._engine, FEWEST)
+        if taken is None or not self._goes_on(taken):
+            return
+        most, reason = self._affordable(taken)
+        if most > FEWEST:
+            taken = window(self._engine, most)
+            if taken is None:
+                return
+        if key == MATCHED:
+            if not reason:
+                self._match(taken)
+            return
+        value, revision = value_of(taken.tuning, key), taken.pull.revision
+        swept = Swept(key, revision, value, len(taken.pull.events))
+        values = values_around(taken.tuning, key)
+        if reason or not values:
+            swept = replace(swept, done=True, reason=reason or f"{key} is 0: nothing to scale")
+            self._known[key] = swept
+            return
+        points: list[Point] = []
+        for k, (factor, tuning) in enumerate(values):
+            point = self._point(taken, key, factor, tuning)
+            if point is None:
+                return
+            points = sorted([*points, point], key=lambda point: point.value)
+            done = k + 1 == len(values)
+            self._known[key] = Swept(key, revision, value, swept.events, tuple(points), done)
+        self._known = dict(list(self._known.items())[-KEPT:])
+
+    def _match(self, taken: Window) -> None:
+        """Fold with the R that the innovations of the fold before say, until it rests."""
+        tuning, track = taken.tuning, taken.track
+        for _ in range(TURNS):
+            said = sensor_noise(track, taken.pull.events, tuning)
+            following = _with(tuning, said)
+            moved = np.abs(np.log(following.r[following.r > 0.0] / tuning.r[following.r > 0.0]))
+            if not moved.size or moved.max() < AT_REST:
+                break
+            tuning = following
+            try:
+                fold = taken.fold(self._engine, taken.estimator, tuning)
+                while self._goes_on(taken) and fold.advance(CHUNK):
+                    pass
+            except NisusError:
+                return
+            if not self._goes_on(taken):
+                return
+            track = fold.track
+        self._matched = Matched(
+            taken.pull.revision, len(taken.pull.events), sensor_noise(track, taken.pull.events, tuning)
+        )
+
+    def _point(self, taken: Window, key: str, factor: float, tuning: Tuning) -> Point | None:
+        """One value, folded; None if nobody wants it any more."""
+        value = value_of(tuning, key) if key not in GROUPS else factor
+        try:
+            fold = taken.fold(self._engine, taken.estimator, tuning)
+            while self._goes_on(taken) and fold.advance(CHUNK):
+                pass
+        except NisusError:
+            return Point(factor, value, None, None)
+        if not self._goes_on(taken):
+            return None
+        track = fold.track
+        found = score(track, taken.pull.events, self._engine.model, gate=tuning.gate)
+        likelihood, nis = found.log_likelihood, mean_nis(track, tuning.gate)
+        failed = _failures(track) > _failures(taken.track)
+        return Point(factor, value, _number(likelihood, failed), _number(nis, failed))
+
+    def _affordable(self, taken: Window) -> tuple[int, str]:
+        """How many events can be folded in reasonable time, or why none."""
+        if self._engine.model.black_box:
+            return 0, f"{self._engine.model.name} is a black box, too slow to be folded again beside what runs"
+        fold = taken.fold(self._engine, taken.estimator, taken.tuning)
+        fold.advance(min(TRIED, fold.log.n // 2))
+        start = time.perf_counter()
+        events = fold.advance(TRIED)
+        each = (time.perf_counter() - start) / max(1, events)
+        if each * len(taken.pull.events) > TOO_LONG:
+            return 0, f"{taken.estimator} takes {each * FEWEST:.0f} s for {FEWEST} events, too slow to be folded again"
+        return int(min(MOST, max(FEWEST, LONGEST / max(each, 1e-9)))), ""
+
+    def _goes_on(self, taken: Window) -> bool:
+        return not self._stopping and self._engine.tuning is taken.tuning
+
+
+def value_of(tuning: Tuning, key: str) -> float:
+    """The present value of an entry; of a group, 1.
+
+    Raises:
+        ConfigError: If there is no such entry, or it is no number.
+    """
+    if key in GROUPS:
+        return 1.0
+    value = tuning.get(key)
+    if isinstance(value, (bool, str)) or value is None or key.startswith("gate"):
+        raise ConfigError(f"{key} is no number that can be varied; Q., R. and p. are, and Q and R as a whole")
+    return float(value)
+
+
+def values_around(tuning: Tuning, key: str, factors: Sequence[float] = FACTORS) -> list[tuple[float, Tuning]]:
+    """A tuning for each factor that the entry's range allows, the nearest to 1 first; none if it is zero."""
+    if key not in GROUPS and value_of(tuning, key) == 0.0:
+        return []
+    found = []
+    for factor in sorted(factors, key=lambda factor: (abs(np.log(factor)), factor)):
+        try:
+            found.append((factor, scaled(tuning, key, factor)))
+        except ConfigError:
+            continue
+    return found
+
+
+def scaled(tuning: Tuning, key: str, factor: float) -> Tuning:
+    """The tuning with an entry, or all of a group, times a factor.
+
+    Raises:
+        ConfigError: If the entry's range does not allow it.
+    """
+    if factor == 1.0:
+        return tuning
+    if key not in GROUPS:
+        return tuning.set(key, value_of(tuning, key) * factor)
+    return replace(tuning, q=tuning.q * factor) if key == "Q" else replace(tuning, r=tuning.r * factor)
+
+
+def _with(tuning: Tuning, said: Mapping[str, SensorNoise]) -> Tuning:
+    """A tuning with the R that is said of each row, where any is left."""
+    r = tuning.r.copy()
+    for name, noise in said.items():
+        if noise.variance > 0.0:
+            r[tuning.model.row_names.index(name)] = noise.variance
+    return replace(tuning, r=r)
+
+
+def _failures(track: Track) -> int:
+    return int(np.sum(track.verdict == FAILED))
+
+
+def _number(value: float, failed: bool) -> float | None:
+    return None if failed or not np.isfinite(value) else float(value)

@@ -1,0 +1,130 @@
+"""The settings of a run as lines that can stand in place of those in the twin's file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from config.schema import TwinSection
+from config.yaml_text import as_flow, as_section
+from estimators.errors import LARGEST
+from estimators.estimator import Estimator
+from estimators.model.coloured import disturbance_time, error_time, errors_of
+from estimators.registry import find_entry
+from estimators.tuning import REOPEN, Tuning
+
+from ...twin.bounds import bounds_of
+
+
+def tuning_yaml(
+    config: TwinSection,
+    estimator: str,
+    tuning: Tuning,
+    prior: tuple[np.ndarray, np.ndarray] | None = None,
+    *,
+    whole: bool = True,
+) -> str:
+    """The sections `estimator`, `filters`, `parameters`, `noise`, `sensors` and `gate`.
+
+    A twin whose file has these in place of its own starts with the same settings. What else a section of the file says
+    (limits of a sensor, options of other filters) is in them as it was; its comments are not. If not `whole`, they are
+    what is tuned and no more, every parameter among it: what stays as the file says is left out.
+
+    Args:
+        config: What the twin's file says.
+        estimator: Of the run.
+        tuning: The same.
+        prior: Mean (nx,) and covariance (nx, nx), diagonal, where they are not the file's: a section `prior` too.
+        whole: See above.
+    """
+    entry, first = find_entry(estimator), config.estimator
+    options = {name: _option(entry, name, value) for name, value in tuning.options.items()}
+    filters = {**config.filters, first.name: {**config.filters.get(first.name, {}), **first.options}}
+    others = {name: dict(given) for name, given in filters.items() if given and name != estimator}
+    lines = [f"estimator: {as_flow({'name': estimator, 'options': options} if options else estimator)}"]
+    lines += as_section("filters", others) if whole else []
+    model = tuning.model
+    values = dict(zip((item.name for item in model.parameters), map(float, tuning.p), strict=True))
+    noises = dict(zip((noise.name for noise in model.noises), map(float, tuning.q), strict=True))
+    known = {item.name: item.value for item in model.parameters}
+    # How long errors last stands beside their size. Of parameters that are estimated the tuning has none.
+    lasting = {name: section.over for name, section in config.noise.items() if section.over is not None}
+    erring = [sensor for sensor in model.sensors if _errs(config, sensor.name)]
+    times = {*map(disturbance_time, lasting), *(error_time(sensor.name) for sensor in erring)}
+    turned = {name: value for name, value in values.items() if name in config.parameters or value != known[name]}
+    turned = {**config.parameters, **turned} if whole else values
+    lines += as_section("parameters", {name: value for name, value in turned.items() if name not in times})
+    if prior is not None:
+        beliefs = zip(model.state_names, prior[0].tolist(), np.sqrt(np.diag(prior[1])).tolist(), strict=True)
+        lines += as_section("prior", {name: {"mean": mean, "std": std} for name, mean, std in beliefs})
+    errors = {sensor.name: [noises.pop(name) for name in errors_of(sensor)] for sensor in erring}
+    over = {name: {"over": values.get(disturbance_time(name), seconds)} for name, seconds in lasting.items()}
+    ranges = bounds_of(config, model)
+    lines += as_section(
+        "noise",
+        {name: {"variance": _within(q, ranges.get(f"Q.{name}")), **over.get(name, {})} for name, q in noises.items()},
+    )
+    lines += as_section("sensors", _sensors(config, tuning, errors, values, whole))
+    lines.append(f"gate: {as_flow(_gate(tuning))}")
+    return "\n".join(lines) + "\n"
+
+
+def _errs(config: TwinSection, sensor: str) -> bool:
+    """Whether a sensor has an error that lasts."""
+    return sensor in config.sensors and config.sensors[sensor].error is not None
+
+
+def _sensors(
+    config: TwinSection,
+    tuning: Tuning,
+    errors: Mapping[str, list[float]],
+    values: Mapping[str, float],
+    whole: bool,
+) -> dict[str, Any]:
+    """The section `sensors`: with the variances of the errors that last, by sensor, and parameters by name."""
+    found = {}
+    ranges = bounds_of(config, tuning.model)
+    for sensor, start in zip(tuning.model.sensors, tuning.model.row_start, strict=True):
+        given = config.sensors.get(sensor.name)
+        own = given.model_dump(mode="json", exclude_unset=True, exclude_none=True) if given is not None else {}
+        variances = [float(value) for value in tuning.r[start : start + len(sensor.rows)]]
+        rest = {key: value for key, value in own.items() if whole and key not in ("std", "variance", "use")}
+        if sensor.name in errors:
+            over = values.get(error_time(sensor.name), own["error"]["over"])
+            rest["error"] = {"variance": _one_or_all(errors[sensor.name]), "over": over}
+        variance = _within(_one_or_all(variances), ranges.get(f"R.{sensor.name}"))
+        found[sensor.name] = {"variance": variance, **rest}
+        used = bool(tuning.get(f"use.{sensor.name}"))
+        if not (whole and used):
+            found[sensor.name]["use"] = used
+    return found
+
+
+def _one_or_all(values: list[float]) -> float | list[float]:
+    """The value that all rows share, or one a row."""
+    return values[0] if all(value == values[0] for value in values) else values
+
+
+def _within(value: float | list[float], bounds: tuple[float, float] | None) -> Any:
+    """A variance with the range of its data sheet, unless it was turned beyond that."""
+    values = value if isinstance(value, list) else [value]
+    if bounds is None or not all(bounds[0] <= item <= bounds[1] for item in values):
+        return value
+    return {"value": value, "from": bounds[0], **({"to": bounds[1]} if bounds[1] < LARGEST else {})}
+
+
+def _gate(tuning: Tuning) -> Any:
+    if tuning.gate is None:
+        return None
+    if tuning.gate_kind == "hard" and tuning.reopen == REOPEN:
+        return tuning.gate
+    reopen = "never" if tuning.reopen is None else tuning.reopen
+    return {"probability": tuning.gate, "kind": tuning.gate_kind, "reopen": reopen}
+
+
+def _option(entry: Estimator, name: str, value: float) -> float | str:
+    """An option's value, a choice by its word."""
+    choices = next((option.choices for option in entry.options if option.name == name), ())
+    return choices[round(value)] if choices else float(value)

@@ -1,0 +1,1 @@
+"""Results as text, HTML, SVG and JSON, and what charts draw."""

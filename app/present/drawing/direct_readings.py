@@ -1,0 +1,104 @@
+"""Which sensor rows read a state as it is, so that their readings are drawn over it: charts and scene ask the same."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from estimators.model.state_space import Sensor, StateSpaceModel
+
+from ...stderr import complain
+
+NEAR, AWAY = 0.05, 0.2
+"""How far a row may be from its state, as a share: where the prior has its mean (a wheel's scale), and elsewhere, where
+a small error that the model estimates too comes on top (a GNSS receiver's)."""
+
+ARITHMETIC = (ArithmeticError, ValueError)
+"""What Python raises where machine code gives a value that is none."""
+
+STEP = 1e-3
+"""Of a state's standard deviation, for slopes."""
+
+
+@dataclass(frozen=True)
+class Observed:
+    """One row of a sensor, and the state that it reads."""
+
+    sensor: int
+    row: int
+    state: int
+
+
+def observed(model: StateSpaceModel) -> list[Observed]:
+    """The sensor rows that read one charted state, give or take a scale near one: h ≈ x_j, ∂h/∂x_j ≈ 1.
+
+    Looked at where the prior has its mean, and at two places within its standard deviation.
+    """
+    rng = np.random.default_rng(0)
+    share = np.array([NEAR, AWAY, AWAY])
+    moves = np.concatenate((np.zeros((1, model.nx)), rng.uniform(0.3, 0.9, (2, model.nx))))
+    points = model.prior_mean + moves * model.prior_std
+    charted = list(zip(model.shown.tolist(), model.shown_states, strict=True))
+    u = np.array([item.default for item in model.inputs])
+    p = np.array([parameter.value for parameter in model.parameters])
+    found = []
+    for k, sensor in enumerate(model.sensors):
+        values, there = np.full((len(points), len(sensor.rows)), np.nan), np.zeros(len(sensor.rows))
+        for x, out in zip(points, values, strict=True):
+            _expect(model, sensor, x, u, p, out)
+        slopes = np.zeros((len(sensor.rows), len(charted)))
+        for column, (j, state) in enumerate(charted):
+            moved = points[0].copy()
+            step = STEP * (state.std or 1.0)  # of a state that is certain at first, in its unit
+            moved[j] += step
+            _expect(model, sensor, moved, u, p, there)
+            slopes[:, column] = (there - values[0]) / step
+        for r, row in enumerate(sensor.rows):
+            # A distance to a wall grows as the vehicle moves, but is not where the vehicle is; and a sum of two states
+            # may be one of them by chance, as long as the other is zero.
+            likely = [
+                j
+                for column, (j, state) in enumerate(charted)
+                if state.unit == row.unit
+                and abs(slopes[r, column] - 1.0) < NEAR
+                and np.all(
+                    np.abs(values[:, r] - points[:, j]) < share * np.maximum(np.abs(points[:, j]), state.std or 1.0)
+                )
+            ]
+            likely.sort(key=lambda j: model.state_names[j] not in (row.name, sensor.name))
+            if likely:
+                found.append(Observed(k, r, likely[0]))
+    return found
+
+
+def expected(model: StateSpaceModel, sensor: Sensor, x: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """What a sensor should read, h(x, u, p) with the inputs' defaults, shape (ny,); NaN where that cannot be said."""
+    out = np.full(len(sensor.rows), np.nan)
+    _expect(model, sensor, x, np.array([item.default for item in model.inputs]), p, out)
+    return out
+
+
+def _expect(
+    model: StateSpaceModel, sensor: Sensor, x: np.ndarray, u: np.ndarray, p: np.ndarray, out: np.ndarray
+) -> None:
+    """Fill `out` with h(x, u, p); NaN, which is near nothing, where it fails.
+
+    Of a domain or a division Python says so where machine code gives NaN and the twin runs; all else is told.
+    """
+    try:
+        if model.black_box:
+            out[:] = sensor.h(x[np.newaxis], u, p)[0]
+        else:
+            sensor.h(x, u, p, out)
+    except Exception as error:  # noqa: BLE001  a user's model may raise anything; the views go on without its dots
+        out[:] = np.nan
+        if model.black_box or not isinstance(error, ARITHMETIC):
+            _tell(f"model {model.name}: h of {sensor.name} fails near the prior: {type(error).__name__}: {error}")
+
+
+@cache
+def _tell(text: str) -> None:
+    """Say it once: every view asks."""
+    complain(f"{text}; what it reads is drawn over no state")

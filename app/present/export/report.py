@@ -1,0 +1,223 @@
+"""The report of a run: what it was, what it was worth, its charts, checks, episodes and tuning, as sections."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from estimators.diagnostics.calibration import calibrations, truth_calibration
+from estimators.diagnostics.episodes import Episode
+from estimators.diagnostics.field_pictures import Picture
+from estimators.diagnostics.held_out import Offset, offsets
+from estimators.diagnostics.score import Score, score
+from estimators.diagnostics.sensitivity import Bound
+from estimators.diagnostics.sensitivity.words import digits
+from estimators.log import READING, Events
+from estimators.registry import find_entry
+from estimators.smoothing.smoothed import Smoothed
+from estimators.track import HEALTH_NAMES, VERDICT_NAMES, Track
+from estimators.tuning import GATE_KEYS, Tuning
+
+from ...live.changes import difference, in_words
+from ...moment import moment
+from ...twin.twin import Twin
+from .alarms import advice
+from .calibration_lines import calibration_lines
+from .parts import Bar, Part
+from .run_charts import run_charts
+from .svg import clock
+
+MOST = 60
+"""Rows of a table; of more the rest is counted."""
+
+
+class Reported(NamedTuple):
+    """A run to be reported: with what it was folded, its rows, and what was wrong in it.
+
+    `about` are more lines of its head, by name; `bounds` the integrity bounds of its states, where they are known;
+    `others` the runs before and after it: number, what was changed, scores in words; `before` the episodes of each
+    earlier run that had any, by its number and what it was; `smoothed` what all readings say of the states, if that was
+    asked for.
+    """
+
+    twin: Twin
+    estimator: str
+    tuning: Tuning
+    events: Events
+    track: Track
+    pictures: Sequence[Picture]
+    episodes: Sequence[Episode]
+    marginal: bool
+    about: tuple[tuple[str, str], ...] = ()
+    bounds: Mapping[str, Bound] | None = None
+    others: tuple[tuple[str, ...], ...] = ()
+    before: tuple[tuple[str, Sequence[Episode]], ...] = ()
+    smoothed: Smoothed | None = None
+
+
+def report(run: Reported) -> list[Part]:
+    """The report, from top to bottom."""
+    model = run.twin.model
+    found = score(run.track, run.events, model, run.pictures, gate=run.tuning.gate, baseline=run.tuning.baseline)
+    charts = run_charts(model, run.events, run.track, run.episodes, run.smoothed)
+    said: tuple[str, ...] = ("Time counts from the first event. Red strips: episodes. Extremes are kept.",)
+    if run.smoothed is not None:
+        said += ("Dark lines: the states given the readings after each moment too, with their ± 2σ.",)
+    return [
+        _head(run),
+        _scores(run, found),
+        _episodes(run),
+        *_before(run),
+        Part("Charts", said, drawn=tuple(charts)),
+        *_checks(run),
+        _tuning(run),
+        *([_runs(run)] if run.others else []),
+    ]
+
+
+def _head(run: Reported) -> Part:
+    twin, t = run.twin, run.events.t
+    entry = find_entry(run.estimator)
+    options = ", ".join(f"{name} {value:g}" for name, value in entry.complete(dict(run.tuning.options)).items())
+    rows = [
+        ("filter", f"{entry.title} ({run.estimator})" + (f": {options}" if options else "")),
+        ("source", _source(twin)),
+        ("log", f"{moment(int(t[0]))} to {moment(int(t[-1]))}, {(t[-1] - t[0]) * 1e-9:.6g} s, {len(t):,} events"),
+    ]
+    given = ", ".join(f"{key}={value}" for key, value in twin.overrides.items())
+    if given:
+        rows.append(("on the command line", given))
+    return Part(f"{twin.name}: {twin.title}", (), ("", ""), (*rows, *run.about))
+
+
+def _source(twin: Twin) -> str:
+    section = twin.config.source
+    files = [path.name for path in twin.plan.log_files or ()]
+    given = {name: getattr(section, name, None) for name in ("interface", "channel", "seed")}
+    told = files + [f"{name} {value}" for name, value in given.items() if value is not None]
+    return f"{section.type.replace('_', ' ')}, of {twin.path.name}" + (f": {', '.join(told)}" if told else "")
+
+
+def _scores(run: Reported, found: Score) -> Part:
+    model, track = run.twin.model, run.track
+    units = {state.name: state.unit for state in model.shown_states}
+    units |= dict(zip(model.row_names, (row.unit for sensor in model.sensors for row in sensor.rows), strict=True))
+    rows: list[tuple[str, str, str]] = []
+    marks: list[str] = []
+    if found.nis_readings:
+        verdict = found.nis_verdict
+        rows.append(("mean NIS", digits(found.nis), verdict.said))
+        marks.append("good" if verdict.place == "inside" else "bad")
+    fits = [(f"RMSE of {name}", name, fit) for name, fit in found.states.items()]
+    fits += [(f"RMSE of {name}, held out", name, fit) for name, fit in found.held_out.items()]
+    for title, name, fit in fits:
+        unit = "" if units[name] == "1" else units[name]
+        rows.append((title, f"{digits(fit.rmse)} {unit}".rstrip(), f"{100 * fit.coverage:.3g} % in the 95 % band"))
+    if found.field is not None:
+        rows.append(("RMSE of all cells", digits(found.field.rmse), f"{100 * found.field.coverage:.3g} % in the band"))
+    judged = found.nis_readings + found.gated
+    each = found.log_likelihood / judged if judged else np.nan
+    rows.append(("log-likelihood", f"{found.log_likelihood:.6g}", f"{digits(each)} a reading"))
+    counts = np.bincount(track.verdict[run.events.kind == READING], minlength=len(VERDICT_NAMES))
+    told = [f"{name} {count:,}" for name, count in zip(VERDICT_NAMES[1:], counts[1:].tolist(), strict=True) if count]
+    rows.append(("readings", f"{int(counts.sum()):,}", ", ".join(told)))
+    shares = np.bincount(track.health, minlength=len(HEALTH_NAMES)) / max(1, len(track))
+    worst = [f"{HEALTH_NAMES[k]} {100 * shares[k]:.3g} %" for k in np.argsort(-shares, kind="stable") if shares[k]]
+    rows.append(("health at the end", HEALTH_NAMES[int(track.health[-1])], ", ".join(worst)))
+    marks += [""] * (len(rows) - len(marks))
+    return Part("What the estimate was worth", (), ("", "", ""), _cut(rows), marks=_marks(marks, rows))
+
+
+def _marks(marks: Sequence[str], rows: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
+    return tuple(marks) if len(rows) <= MOST + 1 else (*marks[:MOST], "")
+
+
+def _cut(rows: Sequence[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
+    """At most `MOST` rows, and one that says how many more there are."""
+    if len(rows) <= MOST + 1:
+        return tuple(rows)
+    return (*rows[:MOST], (f"... and {len(rows) - MOST} more", *[""] * (len(rows[0]) - 1)))
+
+
+def _episodes(run: Reported) -> Part:
+    shown = tuple(f"{offset.words[0].upper()}{offset.words[1:]}." for offset in _offsets(run))
+    if not run.episodes:
+        of = " of the sensors in use" if shown else ""
+        return Part("Episodes", (f"Nothing that the tests could see was wrong{of}.", *shown))
+    rows = [_told(item, run) for item in run.episodes]
+    causes = [cause for cause in dict.fromkeys(item.cause for item in run.episodes) if advice(cause, "Response")]
+    small = tuple(
+        f"{cause.capitalize()}. Usual cause: {advice(cause, 'Usual cause')} Response: {advice(cause, 'Response')}"
+        for cause in causes
+    )
+    return Part("Episodes", shown, ("when", "who", "what", "what was said, and what to do"), _cut(rows), small=small)
+
+
+def _told(item: Episode, run: Reported) -> tuple[str, str, str, str]:
+    start = float(run.events.t[0]) * 1e-9
+    end = "the end" if item.end is None else clock(round(item.end - start, 1))
+    when = f"{clock(round(item.start - start, 1))} to {end}"
+    return when, item.subject.replace("_", " "), item.cause, item.text
+
+
+def _offsets(run: Reported) -> list[Offset]:
+    """What the sensors show that are held out."""
+    return offsets(run.events, run.track, run.tuning)
+
+
+def _before(run: Reported) -> list[Part]:
+    """What was wrong under the settings of earlier runs: what made somebody change them, and may hide now."""
+    rows = [(name, *_told(item, run)) for name, episodes in run.before for item in episodes]
+    if not rows:
+        return []
+    said = "Over the same log, with the settings of then; what a setting hides was there all the same."
+    return [Part("Episodes of the runs before", (said,), ("run", "when", "who", "what", "what was said"), _cut(rows))]
+
+
+def _checks(run: Reported) -> list[Part]:
+    model, tuning = run.twin.model, run.tuning
+    given = model, run.events, run.track
+    found = [*calibrations(*given, gate=tuning.gate, marginal=run.marginal), *truth_calibration(*given)]
+    lines = [(line,) for line in calibration_lines(found, model)]
+    parts = [Part("Can the bands be believed? 95 % intervals", (), ("",), _cut(lines))] if lines else []
+    if run.bounds:
+        title = "How wrong a state can be by one fault that nobody notices"
+        rows = [
+            (name, item.unit, digits(item.two_sigma), digits(item.bound) if np.isfinite(item.bound) else "no bound",
+             item.fault or "none")
+            for name, item in run.bounds.items()
+        ]  # fmt: skip
+        bars = tuple(Bar(name, item.unit, item.two_sigma, item.bound) for name, item in run.bounds.items())[:MOST]
+        head = ("state", "unit", "± 2 σ", "integrity bound", "by")
+        parts.append(Part(title, (), head, _cut(rows), bars, ("± 2 σ", "integrity bound")))
+    return parts
+
+
+def _tuning(run: Reported) -> Part:
+    twin, tuning = run.twin, run.tuning
+    changes = difference(twin.estimator, twin.tuning, run.estimator, tuning)
+    began = "as recorded" if twin.recorded else "as configured"
+    said = f"Changed: {in_words(changes, len(changes))}." if changes else f"All {began}."
+    first = {item.key: item.value for item in twin.tuning.items()}
+    rows, marks = [], []
+    for item in tuning.items():
+        turned = item.value != first[item.key]
+        rows.append((item.key, f"{item.value:.6g}", item.unit, f"{first[item.key]:.6g}"))
+        marks.append("partly" if turned else "")
+    for key in (*GATE_KEYS, *(f"use.{name}" for name in tuning.model.sensor_names)):
+        now, before = tuning.get(key), twin.tuning.get(key)
+        if key in GATE_KEYS or not now or now != before:
+            rows.append((key, _value(now), "", _value(before)))
+            marks.append("partly" if now != before else "")
+    return Part("Tuning", (said,), ("entry", "value", "unit", began), _cut(rows), marks=_marks(marks, rows))
+
+
+def _value(value: float | bool | str | None) -> str:
+    return "off" if value is None else ("yes" if value else "no") if isinstance(value, bool) else str(value)
+
+
+def _runs(run: Reported) -> Part:
+    head = ("run", "what was changed", "mean NIS", "log L a reading", "RMSE, or held out")
+    return Part("Runs of the session", (), head, _cut(run.others))

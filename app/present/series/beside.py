@@ -1,0 +1,199 @@
+"""A pinned run goes on beside what runs, over the same log, while somebody looks at it: else it would leave the charts.
+
+A thread of the lowest priority folds what the engine has folded with the settings of the run: from where the engine's
+own fold starts, so that its rows are those that were kept, and on from there.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from estimators.fold import Fold
+from estimators.log import Events, Log
+
+from ...live.integrity import LOWEST
+from ...live.interface import Running
+from ...live.outputs import Cursor, Pull
+from ...live.revisions import Run
+from .columns import Column
+from .difference import less
+from .pyramid import FIRST, Groups, grouped
+from .run import ROWS, Levels
+
+PERIOD = 0.1
+"""Seconds between two looks at whether something came."""
+
+MOST = 4096
+"""Events that are taken at once."""
+
+CHUNK = 64
+"""Events that are folded at once: whoever looks waits no longer."""
+
+
+class Beside:
+    """The fold of one run that is not the running one. Any thread may read its rows."""
+
+    def __init__(self, engine: Running, run: Run) -> None:
+        self._engine, self.run = engine, run
+        self._lock = threading.Lock()
+        self._cursor = engine.cursor(follows_log=True)
+        self._marks: list[Cursor] = []
+        self._fold: Fold | None = None
+        self._stopping = threading.Event()
+        self.caught_up = False
+        """Whether it has come to where the kept rows end."""
+        self._thread = threading.Thread(target=self._run, name=f"run {run.number}", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Nobody looks any more."""
+        self._stopping.set()
+        self._engine.release(self._cursor)
+
+    def mark(self) -> Cursor:
+        """A cursor for one consumer, for `pull`."""
+        mark = Cursor()
+        with self._lock:
+            self._marks.append(mark)
+        return mark
+
+    def pull(self, mark: Cursor, limit: int) -> Pull:
+        """Copies of the rows since the cursor, as the engine gives them; see `Pull`."""
+        with self._lock:
+            assert self._fold is not None
+            log = self._fold.log
+            start = max(mark.next // FIRST * FIRST, log.first)
+            pull = replace(self._rows(start, start + limit), changed=max(mark.next, log.first))
+            mark.next = pull.first + len(pull.events)
+            return pull
+
+    def rows(self, start: int, stop: int) -> Pull:
+        """Copies of the rows with these absolute indices, as far as they are there."""
+        with self._lock:
+            return self._rows(start, stop)
+
+    def index_at(self, t: int) -> int:
+        """Absolute index of the first folded event at or after a time, ns."""
+        with self._lock:
+            assert self._fold is not None
+            log = self._fold.log
+            return log.first + int(np.searchsorted(log.t[: self._fold.n], t))
+
+    def _rows(self, start: int, stop: int) -> Pull:
+        assert self._fold is not None
+        log, n = self._fold.log, self._fold.n
+        start = min(max(start, log.first), log.first + n)
+        rows = slice(start - log.first, max(start, min(stop, log.first + n)) - log.first)
+        events = Events(*(column.copy() for column in log.events.select(rows)))
+        return Pull(self.run.number, False, start, events, self._fold.track.select(rows).copy(), oldest=log.first)
+
+    def _run(self) -> None:
+        if sys.platform == "linux":
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOWEST)
+        try:
+            while not self._stopping.is_set():
+                if not self._follow():
+                    self._stopping.wait(PERIOD)
+        except Exception as error:  # noqa: BLE001  a user's model may raise anything; the kept rows stay
+            self.caught_up = False
+            text = f"page error: run {self.run.number} goes on no further: {error}"
+            self._engine.notices.report("page error", text, "error")
+
+    def _follow(self) -> bool:
+        """Fold what came; whether there was so much that there may be more."""
+        pull = self._engine.pull(self._cursor, MOST)
+        if pull.fresh and not self._begin(pull):
+            return False
+        assert self._fold is not None
+        fold, log = self._fold, self._fold.log
+        with self._lock:
+            if len(pull.events):
+                # A late reading has its rows sent again: what stood there is others now.
+                at = pull.first - log.first
+                if at > log.n:
+                    # The engine has forgotten events that were not taken yet: all of them again, from where it starts.
+                    self._cursor.log = -1
+                    return True
+                fold.rewind(at)
+                log.n = at
+                log.extend(pull.events)
+                fold.advance(at - fold.n + CHUNK)
+                for mark in self._marks:
+                    mark.next = min(mark.next, pull.first)
+        while not self._stopping.is_set():
+            with self._lock:
+                if not fold.advance(CHUNK):
+                    break
+        with self._lock:
+            if pull.oldest - log.first > log.n // 2:
+                count, _ = fold.base_at(pull.oldest - log.first)
+                fold.drop_front(count)
+                log.drop_front(count)
+        kept = self.run.track
+        self.caught_up |= kept is None or log.first + fold.n >= kept.first + len(kept.events)
+        return len(pull.events) == MOST
+
+    def _begin(self, pull: Pull) -> bool:
+        """Begin where the engine's fold does, also when the log has begun again; False if that has just moved."""
+        engine, base = self._engine, self._engine.base()
+        log = Log.of(engine.model)
+        if base is not None:
+            log.first, log.floor, log.version = base.first, base.clock, base.version
+        if pull.first != log.first or not len(pull.events):
+            self._cursor.log = -1  # to be given all again
+            return False
+        fold = Fold(
+            self.run.estimator, engine.model, self.run.tuning, log,
+            policy=engine.policy, base=base, expected=engine.twin.expected,
+        )  # fmt: skip
+        with self._lock:
+            self._fold, self.caught_up = fold, False
+            for mark in self._marks:
+                mark.next = 0
+        return True
+
+
+class BesideRun:
+    """See `series.run.Run`: the rows of a pinned run, or, with `than`, its means less those of what runs there."""
+
+    def __init__(self, beside: Beside, columns: dict[str, Column], than: Running | None = None) -> None:
+        self.beside, self._levels, self._than = beside, Levels(columns), than
+        self._mark = beside.mark()
+        self.revision = beside.run.number
+        self.generation = self.changed = self.end = 0
+
+    def sync(self, columns: Iterable[str]) -> None:
+        """See `Run`."""
+        running = self.revision if self._than is None else self._than.revisions.runs[-1].number
+        if self._levels.ask(columns) or running != self.revision:
+            self.revision = running
+            self._mark.next = 0
+            self._levels.clear()
+            self.generation += 1
+        self.changed = self.end
+        while True:
+            pull = self.beside.pull(self._mark, ROWS)
+            if len(pull.events):
+                self._levels.take(pull if self._than is None else less(pull, self._than))
+                self.changed = min(self.changed, pull.changed)
+            self.end = pull.first + len(pull.events)
+            if len(pull.events) < ROWS:
+                return
+
+    def span(self, since: int, until: int) -> tuple[int, int]:
+        """See `Run`."""
+        return self.beside.index_at(since), self.beside.index_at(until)
+
+    def groups(self, size: int, start: int, stop: int, columns: list[str]) -> Groups:
+        """See `Run`."""
+        if size >= FIRST:
+            return self._levels.part(size, start, stop, columns)
+        pull = self.beside.rows(start * size, min(stop * size, self.end))
+        pull = pull if self._than is None else less(pull, self._than)
+        return grouped(size, pull.first, pull.events.t, self._levels.values(pull, columns))

@@ -1,0 +1,147 @@
+"""The series of a running twin, for every browser that looks: one set of levels for all, and none while nobody does."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable
+
+from ...live.interface import Running
+from ...live.outputs import Pull
+from .beside import Beside, BesideRun
+from .columns import columns_of
+from .difference import DifferenceRun
+from .lane import Lane
+from .run import KeptRun, LiveRun, Run
+from .smoothed import Smoothing
+
+LIVE, PREVIOUS, SMOOTHED = "live", "previous", "smoothed"
+
+ALL = 2**62
+"""Later than every event."""
+
+LESS = "difference:"
+"""Before the name of a revision: its means less those of what runs."""
+
+
+class Series:
+    """Frames for the lanes of all browsers. Any thread may ask."""
+
+    def __init__(self, engine: Running) -> None:
+        self._engine = engine
+        self.columns = columns_of(engine.model)
+        self._lock = threading.Lock()
+        self._live: LiveRun | None = None
+        self._kept: dict[str, KeptRun | DifferenceRun | BesideRun] = {}
+        self._besides: dict[str, Beside] = {}
+        self._smoothing: Smoothing | None = None
+        self._lanes: set[Lane] = set()
+        self._origin: int | None = None
+
+    def origin(self) -> int | None:
+        """The time from which charts count seconds, ns: the start of a recording, else the first event that was seen.
+
+        None while nothing has come.
+        """
+        span = self._engine.status().span
+        first, newest = self._engine.span() if span is None else span
+        if newest and (self._origin is None or span is not None or newest < self._origin):
+            self._origin = first
+        return self._origin
+
+    def open(self, lane: Lane) -> None:
+        """A browser looks at this lane from now on."""
+        with self._lock:
+            self._lanes.add(lane)
+
+    def close(self, lane: Lane) -> None:
+        """Nobody looks at it any more."""
+        with self._lock:
+            self._lanes.discard(lane)
+            if not self._lanes:
+                self._kept.clear()
+                self._leave(set())
+                if self._live is not None:
+                    self._live.close()
+                    self._live = None
+
+    def frames(self, lanes: Iterable[Lane]) -> list[bytes]:
+        """What has changed in these lanes since they were asked last."""
+        with self._lock:
+            origin, newest = self.origin(), self._engine.span()[1]
+            if origin is None or not newest:
+                return []
+            looked_at = {lane.wanted.run for lane in self._lanes}
+            self._kept = {name: run for name, run in self._kept.items() if name in looked_at}
+            self._leave({name.removeprefix(LESS) for name in looked_at})
+            asked = [lane for lane in lanes if lane in self._lanes]
+            # Once for each name: what it stands for may change meanwhile.
+            runs = {name: self._find(name) for name in dict.fromkeys(lane.wanted.run for lane in asked)}
+            shown = [(lane, run) for lane in asked if (run := runs[lane.wanted.run]) is not None]
+            for lane, run in shown:
+                lane.look(run, origin, newest)
+            for name, run in runs.items():
+                if run is not None:
+                    self._sync(run, [lane for lane in self._lanes if lane.wanted.run == name])
+            return [frame for lane, run in shown if (frame := lane.frame(run, origin)) is not None]
+
+    def _sync(self, run: Run, lanes: list[Lane]) -> None:
+        """Bring a run up to date for the lanes that show it."""
+        run.sync({column for lane in lanes for column in lane.levelled})
+        for lane in lanes:
+            lane.changed(run.changed)
+
+    def _find(self, name: str) -> Run | None:
+        """What runs, the previous revision, what is smoothed, a pinned one, or one less what runs; None if none is."""
+        if name == LIVE:
+            if self._live is None:
+                self._live = LiveRun(self._engine, self.columns)
+            return self._live
+        pull = self._pulled(name.removeprefix(LESS))
+        kept = self._kept.get(name)
+        if pull is None:
+            self._kept.pop(name, None)
+            return None
+        beside = self._beside(name.removeprefix(LESS), pull)
+        if beside is not None and beside.caught_up:
+            if not isinstance(kept, BesideRun) or kept.beside is not beside:
+                kept = BesideRun(beside, self.columns, self._engine if name.startswith(LESS) else None)
+                self._kept[name] = kept
+            return kept
+        if isinstance(kept, BesideRun):
+            kept = None
+        if kept is None or kept.of is not pull:
+            if name.startswith(LESS):
+                kept = DifferenceRun(pull, self.columns, self._engine)
+            else:
+                kept = KeptRun(pull, self.columns)
+            self._kept[name] = kept
+        return kept
+
+    def _beside(self, name: str, pull: Pull) -> Beside | None:
+        """The fold of a pinned run that goes on; None while there is nothing that its kept rows lack."""
+        found = self._besides.get(name)
+        if (
+            found is None
+            and name not in (PREVIOUS, SMOOTHED)
+            and self._engine.index_at(ALL) > pull.first + len(pull.events)
+        ):
+            found = self._besides[name] = Beside(self._engine, self._engine.revisions.find(int(name)))
+        return found
+
+    def _leave(self, looked_at: set[str]) -> None:
+        """End the folds of pinned runs at which nobody looks, and the smoother."""
+        if self._smoothing is not None and SMOOTHED not in looked_at:
+            self._smoothing.stop()
+            self._smoothing = None
+        for name in self._besides.keys() - looked_at:
+            self._besides.pop(name).stop()
+
+    def _pulled(self, name: str) -> Pull | None:
+        if name == SMOOTHED:
+            if self._smoothing is None:
+                self._smoothing = Smoothing(self._engine)
+            return self._smoothing.latest
+        if name == PREVIOUS:
+            return self._engine.previous()
+        pinned = {str(run.number): run.track for run in self._engine.revisions.runs if run.pinned}
+        return pinned.get(name)

@@ -1,0 +1,1 @@
+"""Studies over a log: advice, analysis, stress, guard."""

@@ -1,0 +1,117 @@
+"""What is measured of a twin and its log: each thing when it is first asked for, and once."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from estimators.diagnostics.checklist.linearity import Linearity, linearity
+from estimators.diagnostics.checklist.posterior import Peaks, peaks
+from estimators.diagnostics.score import score
+from estimators.diagnostics.sensitivity import Gramian, gramian
+from estimators.diagnostics.sensitivity.responses import stand_in
+from estimators.errors import NisusError
+from estimators.fold import Fold
+from estimators.log import READING, Log
+from estimators.registry import find_entry, unfit
+
+from ...twin.twin import Twin
+
+BUDGET = 20.0
+"""Seconds of one processor for a fold; of a log that takes longer the first part is folded."""
+
+TRIED = 64
+"""Events folded at first, to know how long one takes."""
+
+
+@dataclass(frozen=True)
+class Folded:
+    """A fold over the log, or the part of it that the budget allows, and the seconds of one processor a reading."""
+
+    fold: Fold
+    seconds: float
+
+
+@dataclass
+class Measured:
+    """A twin, the log of its asset, and what has been measured of the two."""
+
+    twin: Twin
+    log: Log
+    _folds: dict[tuple[str, tuple[tuple[str, float], ...]], Folded] = field(default_factory=dict)
+
+    @cached_property
+    def rate(self) -> float:
+        """Readings a second, over the whole log."""
+        times = self.log.t[: self.log.n][self.log.kind[: self.log.n] == READING]
+        span = float(times[-1] - times[0]) * 1e-9 if times.size else 0.0
+        return (times.size - 1) / span if span > 0.0 else 0.0
+
+    @cached_property
+    def linearity(self) -> Linearity:
+        """Of the linearised filter against the unscented one."""
+        return linearity(self.twin.model, self.twin.tuning, self.log)
+
+    @cached_property
+    def gramian(self) -> Gramian:
+        """What the readings tell of each state."""
+        name = self.twin.estimator
+        if unfit(find_entry(name), self.twin.model):
+            name = stand_in("pf", self.twin.model)[0]
+        tuning = self.twin.tuning.with_options(self.twin.options_of(name))
+        return gramian(name, self.twin.model, tuning, self.log)
+
+    @cached_property
+    def peaks(self) -> Peaks:
+        """By the twin's own cloud, if it has one."""
+        own = find_entry(self.twin.estimator)
+        name = self.twin.estimator if own.peaks is not None else "pf"
+        return peaks(name, self.twin.model, self.twin.tuning.with_options(self.twin.options_of(name)), self.log)
+
+    def folded(self, estimator: str, options: Mapping[str, float] | None = None, budget: float = BUDGET) -> Folded:
+        """The log folded by a filter, with the options that the twin has for it, and these.
+
+        Raises:
+            EstimatorError: If the filter does not apply.
+        """
+        given = {**self.twin.options_of(estimator), **(options or {})}
+        key = estimator, tuple(sorted(given.items()))
+        if key not in self._folds:
+            self._folds[key] = self._fold(estimator, given, budget)
+        return self._folds[key]
+
+    def likelihood(self, estimator: str) -> float:
+        """As `likelihood_of` a fold of the log; minus infinity where it fails."""
+        try:
+            fold = self.folded(estimator).fold
+        except NisusError:
+            return -np.inf
+        return likelihood_of(fold, fold.n)
+
+    def _fold(self, estimator: str, options: Mapping[str, float], budget: float) -> Folded:
+        twin, log = self.twin, self.log
+        tuning = replace(twin.tuning, baseline=None).with_options(options)
+        fold = Fold(estimator, twin.model, tuning, log.copy(), policy=twin.policy, expected=twin.expected)
+        begun = time.process_time()
+        limit, spent = TRIED, 0.0
+        while fold.n < log.n and spent < budget and fold.advance(limit):
+            spent = time.process_time() - begun
+            left = budget / max(spent, 1e-9) - 1.0
+            limit = int(min(log.n, max(1.0, fold.n * min(left, 4.0))))
+        if fold.failure is not None:
+            raise fold.failure
+        # What the budget left over is not part of this fold.
+        fold.log.n = fold.n
+        readings = int(np.sum(log.kind[: fold.n] == READING))
+        return Folded(fold, (time.process_time() - begun) / max(1, readings))
+
+
+def likelihood_of(fold: Fold, n: int) -> float:
+    """Log-likelihood of a reading, the mean over those used and refused among the first n events, nats."""
+    part = slice(0, n)
+    found = score(fold.track.select(part), fold.log.events.select(part), fold.model, (), gate=fold.tuning.gate)
+    return found.log_likelihood / max(1, found.readings + found.gated)

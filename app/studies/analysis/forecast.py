@@ -1,0 +1,215 @@
+"""What if, of a running twin: the question as it comes, the forecast from where the filter stands, the answer."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from estimators.errors import LARGEST, ConfigError
+from estimators.forecast import Crossing, Forecast, first_time, forecast
+from estimators.model.state_space import StateSpaceModel
+
+from ...live.interface import Running
+from ...live.outputs import Here
+from .inputs import MOST_STEPS, REPEAT, TIMES, Changes, input_events, recorded, told_changes
+from .numbers import listed, number
+
+MOST_CHANGES = 200
+"""Changes of one input."""
+
+PATIENCE = 8.0
+"""Seconds that one may take to compute."""
+
+ALONE = 1.0
+"""Seconds of a step where there has been one reading only."""
+
+SHARES = (0.1, 0.5, 0.9)
+"""Probabilities of a limit of which the times are told."""
+
+
+class Question(NamedTuple):
+    """What is asked: `horizon` in seconds; by input its changes; by state, a limit in its unit.
+
+    The inputs in `repeated` do again what they did in the last seconds, as long as the horizon.
+    """
+
+    horizon: float
+    inputs: dict[str, Changes]
+    limits: dict[str, float]
+    repeated: tuple[str, ...] = ()
+
+
+def question_from_json(body: Any, model: StateSpaceModel) -> Question:
+    """The question `{"horizon": s, "inputs": {name: value | [[t, value], ...] | "repeat"}, "limits": {state: value}}`.
+
+    Raises:
+        ConfigError: If it is not that.
+    """
+    if not isinstance(body, dict) or not set(body) <= {"horizon", "inputs", "limits"}:
+        raise ConfigError("forecast: it takes horizon, inputs and limits")
+    horizon = _number("horizon", body.get("horizon"))
+    if not horizon > 0.0:
+        raise ConfigError(f"forecast: horizon is {horizon:g} s; it must be positive")
+    given = _named("inputs", body.get("inputs", {}), model.input_names)
+    repeated = tuple(name for name, value in given.items() if value == REPEAT)
+    inputs = {name: _changes(f"inputs.{name}", value, horizon) for name, value in given.items() if name not in repeated}
+    shown = [state.name for state in model.shown_states]
+    limits = _named("limits", body.get("limits", {}), shown)
+    return Question(
+        horizon, inputs, {name: _number(f"limits.{name}", value) for name, value in limits.items()}, repeated
+    )
+
+
+class Forecasts:
+    """Answers questions about one running twin; from any thread, never from the engine's."""
+
+    def __init__(self, engine: Running) -> None:
+        self._engine = engine
+
+    def may(self) -> dict[str, Any]:
+        """What may be asked: the longest horizon and the length of a step, s.
+
+        Raises:
+            ConfigError: If nothing has come yet.
+        """
+        step = _step(self._here(), 0.0, self._engine.model.max_step)
+        return {"step": step, "longest": MOST_STEPS * step}
+
+    def _here(self) -> Here:
+        here = self._engine.here()
+        if here is None:
+            raise ConfigError("forecast: no reading has come yet, so there is no estimate to go on from")
+        return here
+
+    def ask(self, question: Question) -> dict[str, Any]:
+        """What would be, see `forecast_json`.
+
+        Raises:
+            NisusError: If nothing has come yet, the question is too large, or `forecast` refuses it.
+        """
+        begun = time.monotonic()
+        here = self._here()
+        step = _step(here, question.horizon, self._engine.model.max_step)
+        inputs = question.inputs | recorded(self._engine, question.repeated, here.t, question.horizon)
+
+        def between() -> None:
+            if time.monotonic() - begun > PATIENCE:
+                raise ConfigError(
+                    f"forecast: {question.horizon:g} s in steps of {step:.3g} s take longer than {PATIENCE:g} s to "
+                    f"compute with {here.estimator}; ask for a shorter horizon"
+                )
+
+        found = forecast(
+            here.estimator,
+            self._engine.model,
+            here.tuning,
+            here.base,
+            here.t,
+            question.horizon,
+            step,
+            inputs=input_events(inputs, here.t, self._engine.model),
+            limits=question.limits,
+            most=TIMES,
+            between=between,
+        )
+        lost = (~(np.abs(found.mean) <= LARGEST) & np.isfinite(found.mean[0])).any(axis=1)
+        if lost.any():
+            raise ConfigError(
+                f"forecast: {float(found.t[np.argmax(lost)]):.4g} s from now a state is beyond {LARGEST:g}, or no "
+                "number; are the inputs possible? or ask for a shorter horizon"
+            )
+        told = forecast_json(self._engine.model, here, found)
+        chosen = {name: told_changes(changes) for name, changes in inputs.items()}
+        return {**told, "chosen": chosen, "step": step, "took": time.monotonic() - begun}
+
+
+def forecast_json(model: StateSpaceModel, here: Here, found: Forecast) -> dict[str, Any]:
+    """A forecast as JSON.
+
+    `now` is in seconds of the log, `t` in seconds from then; `states` have mean and the edges of their ± 1σ and ± 2σ
+    bands, a probability its mean alone; `inputs` are those that hold now. Of each limit: whether it is looked at from
+    below, the probability of it over the horizon and at each time, and when that is 10, 50 and 90 %.
+    """
+    bands = {}
+    for j, state in enumerate(model.shown_states):
+        spread = float(np.nanmedian(found.std[:, j])) if np.isfinite(found.std[:, j]).any() else 0.0
+        size = float(np.nanmax(np.abs(found.mean[:, j]), initial=0.0))
+        # Digits down to a hundredth of σ: a place on the earth needs more than a temperature.
+        digits = int(np.clip(3 + math.ceil(math.log10(size / spread)), 4, 14)) if spread > 0.0 < size else 8
+        edges = {} if int(model.shown[j]) == model.mode else dict(zip(_EDGES, found.bands[:, :, j].T, strict=True))
+        bands[state.name] = {
+            name: listed(values, digits) for name, values in {"mean": found.mean[:, j], **edges}.items()
+        }
+    return {
+        "now": here.t * 1e-9,
+        "revision": here.revision,
+        "estimator": here.estimator,
+        "members": found.members,
+        "method": (
+            f"share of {found.members} members that have passed the limit"
+            if found.members
+            else "probability of being beyond the limit, by mean and σ at each time"
+        ),
+        "t": listed(found.t),
+        "states": bands,
+        "inputs": dict(zip(model.input_names, listed(here.base.u), strict=True)),
+        "limits": {item.state: _crossing(item, found.t) for item in found.crossings},
+    }
+
+
+_EDGES = ("lower2", "lower1", "upper1", "upper2")
+
+
+def _crossing(item: Crossing, t: np.ndarray) -> dict[str, Any]:
+    early, middle, late = (number(first_time(t, item.probability, share)) for share in SHARES)
+    return {
+        "limit": item.limit,
+        "above": item.above,
+        "probability": listed(item.probability, 3),
+        "overall": number(np.max(item.probability), 3),
+        "early": early,
+        "middle": middle,
+        "late": late,
+    }
+
+
+def _step(here: Here, horizon: float, longest: float) -> float:
+    """As long as readings are apart, which the filter is used to; no longer than the model allows."""
+    step = min(here.step if math.isfinite(here.step) else ALONE, longest)
+    steps = math.ceil(horizon / step)
+    if steps > MOST_STEPS:
+        raise ConfigError(
+            f"forecast: horizon is {horizon:g} s, {steps:,} steps of {step:.3g} s as the readings come; it may be "
+            f"{MOST_STEPS * step:.4g} s at most"
+        )
+    return step
+
+
+def _named(where: str, given: Any, names: Any) -> dict[str, Any]:
+    if not isinstance(given, dict):
+        raise ConfigError(f"forecast: {where} is {given!r}; it must be an object of names and values")
+    unknown = next((name for name in given if name not in names), None)
+    if unknown is not None:
+        raise ConfigError(f"forecast: {where} names {unknown!r}; there are {', '.join(names) or 'none'}")
+    return given
+
+
+def _changes(where: str, given: Any, horizon: float) -> list[tuple[float, float]]:
+    if not isinstance(given, list):
+        return [(0.0, _number(where, given))]
+    if not 0 < len(given) <= MOST_CHANGES or not all(isinstance(pair, list) and len(pair) == 2 for pair in given):
+        raise ConfigError(f"forecast: {where} must be a number, or at most {MOST_CHANGES} pairs [seconds, value]")
+    pairs = [(_number(where, seconds), _number(where, value)) for seconds, value in given]
+    late = next((seconds for seconds, _ in pairs if not 0.0 <= seconds <= horizon), None)
+    if late is not None:
+        raise ConfigError(f"forecast: {where} changes at {late:g} s; it must be between 0 and the horizon")
+    return pairs
+
+
+def _number(where: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
+        raise ConfigError(f"forecast: {where} is {value!r}; it must be a finite number")
+    return float(value)

@@ -1,0 +1,171 @@
+"""The innovations of each sensor row as figures, and what they say in one sentence."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from estimators.diagnostics.calibration import LIMITS, Calibration, calibrations, standardised
+from estimators.diagnostics.calibration_words import reading_words
+from estimators.diagnostics.innovations import (
+    Autocorrelation,
+    autocorrelation,
+    histogram,
+    memory,
+    quantile_pairs,
+    rank_histogram,
+)
+from estimators.diagnostics.intervals import Interval
+from estimators.log import READING, Events
+from estimators.model.state_space import StateSpaceModel
+from estimators.numerics.quantiles import chi_square_quantile
+from estimators.track import FAILED, GATED, HELD_OUT, SCREENED, USED, Track
+from estimators.tuning import Tuning
+
+from ...present.series.columns import rows_of
+from .numbers import listed, number
+
+LAGS = 50
+
+FEW = 50
+"""Readings below which nothing is called consistent."""
+
+SLOW, SLOW_SHARE = 25, 0.02
+"""A slow error is the part of the innovations' variance that stays over so many lags; it matters from this share on."""
+
+MOST_ROWS = 24
+"""Rows that are looked at, as many as have charts."""
+
+
+def rows_json(
+    model: StateSpaceModel, events: Events, track: Track, tuning: Tuning, *, marginal: bool
+) -> list[dict[str, Any]]:
+    """Of each row its whitened innovations, how they are distributed and correlated, and a verdict in words.
+
+    `autocorrelation` is of what the gate lets count: a refused reading stands at its edge, so that one spike does not
+    hide what the others tell.
+
+    Args:
+        model: Whose sensors.
+        events: The last ones.
+        track: Their rows.
+        tuning: With which they were folded.
+        marginal: Whether `Track.whitened` holds each row by itself, as of particles and ensembles.
+    """
+    found = calibrations(model, events, track, gate=tuning.gate, marginal=marginal) if len(events) else []
+    known = {item.subject: item for item in found}
+    rows = dict(zip(model.row_names, () if tuning.baseline is None else tuning.baseline, strict=False))
+    said = []
+    for name, s, k in rows_of(model)[:MOST_ROWS]:
+        own = (events.kind == READING) & (events.channel == s)
+        judged = own & np.isin(track.verdict, (USED, GATED, HELD_OUT))
+        e = standardised(track, k, marginal)[judged]
+        edge = np.inf
+        if tuning.gate is not None:
+            edge = float(np.sqrt(chi_square_quantile(tuning.gate, len(model.sensors[s].rows))))
+        clipped = np.clip(e, -edge, edge)
+        correlated = autocorrelation(clipped, LAGS)
+        bins, pairs, ranks = histogram(e), quantile_pairs(e), rank_histogram(e)
+        n = int(np.isfinite(e).sum())
+        times = events.t[judged]
+        period = float(times[-1] - times[0]) * 1e-9 / (times.size - 1) if times.size > 1 else np.nan
+        calibration = known.get(name)
+        words, tone = verdict(name, calibration, correlated, n, period, rows.get(name))
+        said.append(
+            {
+                "name": name,
+                "sensor": model.sensor_names[s],
+                "used": bool(tuning.used[s]),
+                "n": n,
+                "period": number(period),
+                "mean": number(np.nanmean(e) if n else np.nan, 3),
+                "std": number(np.nanstd(e) if n else np.nan, 3),
+                "histogram": {"low": bins.low, "high": bins.high, "counts": bins.counts.tolist()},
+                "autocorrelation": {"r": listed(correlated.r, 3), "bound": number(correlated.bound, 3)},
+                "quantiles": listed(pairs, 4),
+                "ranks": {"counts": ranks.counts.tolist(), "low": number(ranks.low), "high": number(ranks.high)},
+                "refused": _share(track, own, (GATED, FAILED, SCREENED)),
+                **_figures(calibration),
+                "verdict": words,
+                "tone": tone,
+            }
+        )
+    return said
+
+
+def verdict(
+    name: str,
+    calibration: Calibration | None,
+    correlated: Autocorrelation,
+    n: int,
+    period: float,
+    normal: np.ndarray | None = None,
+) -> tuple[str, str]:
+    """One sentence, and whether it is good, bad or not known.
+
+    What is said is what calibration.py finds to matter; of a correlation also for how long it lasts. A row of a twin
+    that was commissioned is measured by what was normal then, as its NIS is.
+
+    Args:
+        name: Of the row.
+        calibration: Of the same readings; None if there are none.
+        correlated: Their autocorrelation.
+        n: How many readings.
+        period: Between two, s.
+        normal: Its bias, scale and correlation when the twin was commissioned, first; None if it was not.
+    """
+    if calibration is None or not n:
+        return f"{name}: no reading among the last rows", "unknown"
+    then = ""
+    if normal is not None and calibration.role == "used":
+        changed = _since(calibration, normal)
+        if not changed:
+            if n < FEW:
+                return f"{name}: {n} readings are too few to say", "unknown"
+            then = "; ".join(word.removeprefix(f"{name}: ") for word in calibration.words)
+            return f"{name}: as commissioned, as far as {n:,} readings tell{then and f' ({then})'}", "good"
+        then, calibration = "not as commissioned: ", calibration._replace(words=changed)
+    if calibration.words:
+        parts = [word.removeprefix(f"{name}: ") for word in calibration.words]
+        lag = memory(correlated.r)
+        if calibration.correlation.value > 0.0 and any("correlated" in part for part in parts) and lag > 1:
+            longer = "over " if lag == correlated.r.size else ""
+            parts.append(f"what is missing lasts {longer}{lag * period:.3g} s")
+        return f"{name}: {then}{'; '.join(parts)}", "bad"
+    r = correlated.r[:SLOW]
+    mean = float(np.mean(r)) if np.isfinite(r).all() else 0.0
+    # Of a white series the mean of K correlations has a variance of 1 / (n K), nearly.
+    if n >= FEW and mean - 2.0 / np.sqrt(n * SLOW) > SLOW_SHARE:
+        return f"{name}: innovations stay on one side for long, a slow error of about {np.sqrt(mean):.2f} σ", "bad"
+    if n < FEW:
+        return f"{name}: {n} readings are too few to say", "unknown"
+    if calibration.role == "held out":
+        return f"{name}: held out, and as the others predict it, within their bands ({n:,} readings)", "good"
+    return f"{name}: consistent, as far as {n:,} readings tell", "good"
+
+
+def _since(calibration: Calibration, normal: np.ndarray) -> tuple[str, ...]:
+    """What has changed since a row was commissioned: words on its figures against those of then."""
+    bias, scale, correlation = normal[:3].tolist()
+    return reading_words(
+        calibration.subject,
+        Interval(*(value / np.hypot(bias, scale) for value in calibration.scale)),  # root mean square
+        Interval(*((value - bias) / scale for value in calibration.bias)),
+        Interval(*(value - correlation for value in calibration.correlation)),
+        calibration.refused,
+        LIMITS,
+    )
+
+
+def _share(track: Track, own: np.ndarray, verdicts: tuple[int, ...]) -> float | None:
+    """Of a sensor's readings, those with one of these verdicts."""
+    return number(np.mean(np.isin(track.verdict[own], verdicts)), 3) if own.any() else None
+
+
+def _figures(calibration: Calibration | None) -> dict[str, Any]:
+    """Sizes of effects with their intervals: value, low, high."""
+    figures: dict[str, Interval] = {} if calibration is None else {
+        "scale": calibration.scale, "bias": calibration.bias, "correlation": calibration.correlation,
+    }  # fmt: skip
+    return {name: [number(value, 3) for value in interval] for name, interval in figures.items()}

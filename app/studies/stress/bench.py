@@ -1,0 +1,215 @@
+"""A twin's log with mistakes in it, and the folds of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from config.source_schema import AssetSection, CanSection
+from estimators.errors import SourceError
+from estimators.fold import Fold
+from estimators.log import MARK, TICK, TRUTH, Events, Log
+from estimators.snapshots import Base
+from estimators.tuning import Tuning
+from sources.faults.layer import Faults
+from sources.faults.source import with_faults
+from sources.memory import MemorySource
+from sources.simulation.simulator import Simulator
+
+from ...twin.sources.asset import make_asset
+from ...twin.twin import Twin
+from .mistake import Mistake
+from .told import first_word
+
+
+class Folded(NamedTuple):
+    """A fold of a log without its true states, the same events with them, and how many came too late for it."""
+
+    fold: Fold
+    truth: Events
+    stale: int
+
+
+def without_truth(events: Events) -> Events:
+    """Events of a log, with a question in place of each true state, so that every row stays where it is."""
+    told = events.kind == TRUTH
+    return events._replace(
+        kind=np.where(told, TICK, events.kind).astype(np.int8),
+        channel=np.where(told, 0, events.channel).astype(np.int32),
+        value=np.where(told[:, None], np.nan, events.value),
+    )
+
+
+def asset_of(twin: Twin, seed: int) -> Simulator | None:
+    """The twin's simulated asset, without an end and its seed counted up by `seed`; None if it has none."""
+    section = twin.config.source
+    found: AssetSection | None = section if isinstance(section, AssetSection) else None
+    key: tuple[str, ...] = ("source",)
+    if isinstance(section, CanSection) and section.asset is not None:
+        found, key = section.asset, ("source", "asset")
+    if found is None:
+        return None
+    changed = {"seed": found.seed + seed, "duration": None}
+    return make_asset(twin.loaded, twin.model, found.model_copy(update=changed), key)
+
+
+def plain_log(twin: Twin, seed: int, duration: float) -> Events:
+    """What the twin's source says in `duration` seconds, without stamps; of an asset with another seed.
+
+    Raises:
+        SourceError: If the source cannot be opened, or says nothing.
+    """
+    asset = asset_of(twin, seed)
+    source = with_faults(asset, twin.faults()) if asset is not None else twin.open_source(_ignore, live=False)
+    return _read(source, twin.model.width, duration)
+
+
+def _ignore(key: str, text: str) -> None:
+    """Nobody listens."""
+
+
+def _read(source: object, width: int, duration: float) -> Events:
+    parts: list[Events] = []
+    begin: int | None = None
+    try:
+        while (batch := source.read(1.0)) is not None:  # type: ignore[attr-defined]
+            if not len(batch):
+                continue
+            begin = int(batch.t[0]) if begin is None else begin
+            parts.append(batch)
+            if batch.t[-1] - begin > duration * 1e9:
+                break
+    finally:
+        source.close()  # type: ignore[attr-defined]
+    if begin is None:
+        raise SourceError("stress: the source said nothing")
+    events = Events.concat(parts, width)
+    return events.select((events.kind != MARK) & (events.t <= begin + round(duration * 1e9)))
+
+
+class Bench:
+    """A twin's log, made once, and the folds that a mistake is compared with.
+
+    Args:
+        twin: As it ships.
+        seed: Of the asset, the faults and the filter.
+        duration: Seconds of the log.
+        begin: Share of the log after which a fault of the source begins; it lasts a third of the log.
+
+    An error of the belief holds from the log's start on. What the twin says, it says without having been told the
+    truth; that is for the scores alone.
+    """
+
+    def __init__(self, twin: Twin, seed: int, duration: float, begin: float = 1.0 / 3.0) -> None:
+        self.twin, self.seed, self.duration, self.begin = twin, seed, duration, begin
+        self.events = plain_log(twin, seed, duration)
+        self.origin = int(self.events.t[0])
+        self.length = float(self.events.t.max() - self.events.t[0]) * 1e-9
+        # Folds of the log as it is, and of the mistake that is looked at, by filter and gate.
+        self._calm: dict[tuple[str, float | None], Folded] = {}
+        self._wrong: dict[tuple[str, float | None], Folded] = {}
+        self._present = ""
+
+    def window(self, mistake: Mistake) -> tuple[float, float]:
+        """When a mistake lasts, seconds after the log's first event."""
+        begin, third = (round(share * self.length, 3) for share in (self.begin, 1.0 / 3.0))
+        return (0.0, self.length) if mistake.fault is None else (begin, begin + third)
+
+    def span(self, mistake: Mistake) -> tuple[int, int]:
+        """The same in ns of the log."""
+        start, end = self.window(mistake)
+        return self.origin + round(start * 1e9), self.origin + round(end * 1e9)
+
+    def found_after(self, mistake: Mistake, estimator: str) -> float:
+        """Share of the time that a mistake lasts after which the twin says so, as it ships; or infinity.
+
+        Raises:
+            NisusError: As `fold`.
+        """
+        start, end = self.span(mistake)
+        gate = self.twin.tuning.gate
+        word = first_word(self.fold(mistake, estimator, gate).fold, start, self.fold(None, estimator, gate).fold)
+        return _share(word, end - start)
+
+    def found_within(self, mistake: Mistake, estimator: str, begin: int, end: int) -> float:
+        """The same of a wrong belief that holds from `begin` to `end`, ns of the log, after the right one.
+
+        Raises:
+            NisusError: As `fold`.
+        """
+        gate = self.twin.tuning.gate
+        calm = self.fold(None, estimator, gate).fold
+        at, base = calm.base_at(int(np.searchsorted(calm.log.t[: calm.n], begin)))
+        log = calm.log.copy()
+        log.n = int(np.searchsorted(log.t[: log.n], end))
+        log.drop_front(at)
+        fold = self._folded(estimator, self._tuning(estimator, mistake).set("gate", gate), log, base)
+        return _share(first_word(fold, begin, calm), end - begin)
+
+    def fold(self, mistake: Mistake | None, estimator: str, gate: float | None) -> Folded:
+        """The log with a mistake, or without, folded with a filter and a gate.
+
+        Raises:
+            NisusError: If the filter does not apply, or the mistake cannot be made.
+        """
+        if mistake is not None and mistake.name != self._present:
+            self._present, self._wrong = mistake.name, {}
+        made, key = self._calm if mistake is None else self._wrong, (estimator, gate)
+        if key not in made:
+            events = self.events if mistake is None else self._damaged(mistake)
+            made[key] = self._fold(estimator, self._tuning(estimator, mistake).set("gate", gate), events)
+        return made[key]
+
+    def _damaged(self, mistake: Mistake) -> Events:
+        """The log as it becomes; a change of the asset needs a run of its own."""
+        start, end = self.window(mistake)
+        if mistake.fault is None:
+            return self.events
+        faults = mistake.fault(start, end)
+        if not mistake.of_asset:
+            layer = Faults(self.twin.model, faults, seed=self.seed)
+            return _everything(with_faults(MemorySource(self.events), layer), self.twin.model.width)
+        asset = asset_of(self.twin, self.seed)
+        if asset is None:
+            raise SourceError(f"{mistake.name}: {self.twin.name} has no simulated asset")
+        layer = Faults(self.twin.model, [*self.twin.plan.scheduled, *faults], seed=self.seed)
+        layer.attach(asset)
+        return _read(with_faults(asset, layer), self.twin.model.width, self.duration)
+
+    def _tuning(self, estimator: str, mistake: Mistake | None) -> Tuning:
+        tuning = replace(self.twin.tuning.with_options(self.twin.options_of(estimator)), seed=self.seed)
+        for key, factor in mistake.belief.items() if mistake is not None else ():
+            tuning = tuning.set(key, factor * float(tuning.get(key) or 0.0))
+        return tuning
+
+    def _fold(self, estimator: str, tuning: Tuning, events: Events) -> Folded:
+        twin = self.twin
+        log = Log.of(twin.model, capacity=max(1, len(events)))
+        _, stale = log.extend(events, round(twin.config.time.horizon * 1e9))
+        truth = log.events.select(slice(None))
+        untold = Log.of(twin.model, capacity=max(1, len(truth)))
+        untold.extend(without_truth(truth))
+        return Folded(self._folded(estimator, tuning, untold), truth, stale)
+
+    def _folded(self, estimator: str, tuning: Tuning, log: Log, base: Base | None = None) -> Fold:
+        twin = self.twin
+        fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=twin.policy, base=base)
+        fold.advance()
+        fold.finish()
+        return fold
+
+
+def _share(word: float | None, length: int) -> float:
+    """Which share of a length (ns) a word came after (s); infinite if it came later, or never."""
+    share = np.inf if word is None else word * 1e9 / length
+    return share if share < 1.0 else np.inf
+
+
+def _everything(source: object, width: int) -> Events:
+    """All that a source gives, stamps included."""
+    parts = []
+    while (batch := source.read(0.0)) is not None:  # type: ignore[attr-defined]
+        parts.append(batch)
+    return Events.concat(parts, width)

@@ -1,0 +1,161 @@
+"""What the bank should see of a mistake, told before it is made: visible, invisible, or left to chance.
+
+A mistake that moves the means of the innovations moves them by as much in every log: the same noise is folded with and
+without it, by a filter without chance, and the difference is put to the criterion of the smallest visible fault
+(visibility.py). One that changes their noise, or what comes when, is rehearsed: made in other logs of the asset. Of a
+recording there is only this one: a fault is made in it at other times, a wrong belief begins later in it. What is
+found in all of them, in half the time that it lasts, is visible: the time to an alarm has an exponential tail. What is
+found in none is invisible.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from estimators.diagnostics.evidence import OUTSIDE
+from estimators.diagnostics.sensitivity.responses import SMOOTH, astray, stand_in
+from estimators.diagnostics.sensitivity.visibility import tests_of
+from estimators.fold import Fold
+from estimators.log import READING
+
+from ...twin.twin import Twin
+from .bench import Bench, asset_of
+from .mistake import Mistake
+
+VISIBLE, INVISIBLE, CHANCE = FORETOLD = ("visible", "invisible", "by chance")
+
+DETECTION = 0.95
+"""Probability with which what is visible is found, and what is invisible is not."""
+
+REHEARSALS = 5
+"""Logs in which a mistake is rehearsed."""
+
+SOON = 0.5
+"""Share of the time that a mistake lasts within which each rehearsal must find what is visible."""
+
+OTHERS = 1000
+"""Seeds from here on are of rehearsals."""
+
+
+class Foretold(NamedTuple):
+    """Whether a mistake will be seen, one of `FORETOLD`; `multiple`: of its size, from which on it would be.
+
+    Infinite where nothing moves, NaN where that is not known.
+    """
+
+    verdict: str
+    multiple: float = np.nan
+
+
+class Oracle:
+    """Foretells mistakes with a twin, each rehearsal made once.
+
+    Args:
+        twin: As it ships.
+        duration: Seconds of the logs.
+    """
+
+    def __init__(self, twin: Twin, duration: float) -> None:
+        self.twin, self.duration = twin, duration
+        self._benches: list[Bench] = []
+        self._whole: Bench | None = None
+        self._rehearsed: dict[tuple[str, str], Foretold] = {}
+
+    def foretell(self, bench: Bench, mistake: Mistake, estimator: str) -> Foretold:
+        """Whether a mistake will be seen on a bench with a filter.
+
+        Raises:
+            NisusError: As `Bench.run`.
+        """
+        if mistake.shifts:
+            shifted = shift_of(bench, mistake, estimator)
+            if shifted is not None:
+                return shifted
+        key = mistake.name, estimator
+        if key not in self._rehearsed:
+            self._rehearsed[key] = self._rehearse(mistake, estimator)
+        return self._rehearsed[key]
+
+    def _rehearse(self, mistake: Mistake, estimator: str) -> Foretold:
+        recorded = asset_of(self.twin, 0) is None
+        if mistake.fault is None and recorded:
+            after = self._later(mistake, estimator)
+        else:
+            while len(self._benches) < REHEARSALS:
+                k = len(self._benches)
+                begin = (k + 0.5) / REHEARSALS * 2.0 / 3.0 if recorded else 1.0 / 3.0
+                self._benches.append(Bench(self.twin, OTHERS + k, self.duration, begin))
+            after = [bench.found_after(mistake, estimator) for bench in self._benches]
+        if not after:
+            return Foretold(CHANCE)
+        if max(after) <= SOON:
+            return Foretold(VISIBLE)
+        return Foretold(CHANCE if min(after) < 1.0 else INVISIBLE)
+
+    def _later(self, mistake: Mistake, estimator: str) -> list[float]:
+        """When a wrong belief is found that begins later in a recording: a share for each length of the logs."""
+        if self._whole is None:
+            self._whole = Bench(self.twin, OTHERS, (REHEARSALS + 1) * self.duration)
+        whole, step = self._whole, round(self.duration * 1e9)
+        begins = [whole.origin + k * step for k in range(1, round(whole.length / self.duration))]
+        return [whole.found_within(mistake, estimator, begin, begin + step) for begin in begins]
+
+
+def shift_of(bench: Bench, mistake: Mistake, estimator: str) -> Foretold | None:
+    """By the shift of the means; None where it cannot be told so: no filter without chance holds it, or other times.
+
+    Where the twin has a gate, what this refuses goes on to be told of, so that it is looked at with and without.
+    """
+    name, _ = stand_in(estimator, bench.twin.model)
+    if name != estimator and name not in SMOOTH:
+        return None
+    calm = bench.fold(None, name, None).fold
+    if astray(estimator, name, calm.track.select(slice(0, calm.n))):
+        return None
+    seen = []
+    for gate in dict.fromkeys((None, bench.twin.tuning.gate)):
+        found = _seen(bench, bench.fold(None, name, gate).fold, bench.fold(mistake, name, gate).fold, mistake)
+        if found is None:
+            return None
+        seen.append(found)
+    likely, possible, _ = np.array(seen).max(axis=0)
+    return Foretold(VISIBLE if likely else CHANCE if possible else INVISIBLE, seen[0][2])
+
+
+def _seen(bench: Bench, clean: Fold, wrong: Fold, mistake: Mistake) -> tuple[bool, bool, float] | None:
+    """Whether the bank sees a mistake surely, or at all, and the multiple of it that it would see surely."""
+    own, other = _readings(clean), _readings(wrong)
+    if own.size != other.size or np.any(clean.log.t[own] != wrong.log.t[other]):
+        return None
+    model, (start, end) = bench.twin.model, bench.span(mistake)
+    during = (clean.log.t[own] >= start) & (clean.log.t[own] < end)
+    moved = np.where(during[:, None], wrong.track.innovation[other] - clean.track.innovation[own], 0.0)
+    for s, sensor in enumerate(model.sensors):
+        for k, row in enumerate(sensor.rows):
+            if row.circular:
+                mine = clean.log.channel[own] == s
+                moved[mine, k] = (moved[mine, k] + np.pi) % (2.0 * np.pi) - np.pi
+    standardised = np.full_like(clean.track.innovation, np.nan)
+    # The bank knows S of the fold that is wrong.
+    standardised[own] = moved / wrong.track.innovation_std[other]
+    tests = tests_of(
+        model,
+        clean.tuning,
+        clean.log,
+        clean.track,
+        every=bench.twin.policy.false_alarm_every,
+        detection=DETECTION,
+        bank=True,
+    )
+    flagged, before = wrong.track.flags[other] & OUTSIDE != 0, clean.track.flags[own] & OUTSIDE != 0
+    # A range is not left by chance: states and inputs are what they are.
+    outside = bool(np.any(flagged & ~before & during))
+    likely, possible = tests.sees(standardised)
+    multiple = np.nan if outside else tests.multiple(standardised, standardised)
+    return likely or outside, possible or outside, multiple
+
+
+def _readings(fold: Fold) -> np.ndarray:
+    return np.flatnonzero(fold.log.kind[: fold.n] == READING)

@@ -1,0 +1,1 @@
+"""Viser, Rerun and recordings."""

@@ -1,0 +1,195 @@
+"""The right side of the page: what one browser's Rerun viewer is fed.
+
+There is no Rerun server. Each browser has a feed of its own, with a cursor and a stream of its own, and asks for the
+next bytes when it has drawn the last. So a viewer that stops reading costs nothing but its own pictures: nothing is
+queued for it, and nobody waits.
+
+Each revision is another Rerun recording under the same paths. The viewer shows the newest, with the layout, zoom and
+play state that the user chose, and the page closes the one before.
+"""
+
+from __future__ import annotations
+
+import json
+import uuid
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import rerun as rr
+
+from estimators.log import Events
+from estimators.track import Track
+
+from ...live.notices import KEPT
+from ...present.drawing.palette import EITHER, Palette
+from .rows import RerunRows
+
+if TYPE_CHECKING:
+    from ...live.interface import Running
+    from ...live.notices import Notice
+    from ...live.outputs import Pull
+
+ROWS = 20_000
+"""Rows pulled at once, so that a long history does not hold the engine's lock for long."""
+
+SERIES = 3000
+"""Stretches into which a whole history is cut for drawing."""
+
+AHEAD = 1.5
+"""Windows of the charts that a new revision sends first, so that they are drawn before the rest of a long history."""
+
+FRAMES = "frame"
+"""A timeline that only counts the messages, so that the page sees how far the viewer has got with them."""
+
+Message = str | bytes
+
+
+class RerunFeed:
+    """Gives what the viewer of one browser needs next. Not to be called by two threads at once."""
+
+    def __init__(self, engine: Running, *, layout: bool = True, palette: Palette = EITHER) -> None:
+        """Prepare; nothing is pulled yet.
+
+        Args:
+            engine: Whose rows to give.
+            layout: Whether the first recording brings the blueprint; False if the viewer has it from an earlier feed.
+            palette: The colours of the viewer's theme.
+        """
+        self._engine = engine
+        self._cursor = engine.cursor()
+        self._layout, self._palette = layout, palette
+        self._frame = 0
+        self._notices: deque[Notice] = deque(maxlen=KEPT)
+        self._name = uuid.uuid4().hex[:8]
+        self.application = f"nisus_{engine.twin.name}"
+        self._stream: rr.RecordingStream | None = None
+        self._bytes: Any = None
+        self._rows: RerunRows | None = None
+        self._later: Callable[[], None] | None = None
+
+    def next(self) -> list[Message]:
+        """The next messages, none if nothing has happened: bytes for Rerun, or a line of JSON for the page.
+
+        `{"recording": id}` announces that the bytes which follow belong to another recording. The k-th bytes of a
+        recording end with row k of the timeline `FRAMES`.
+        """
+        if self._later is not None:
+            later, self._later = self._later, None
+            later()
+            return self._read()
+        pull = self._engine.pull(self._cursor, ROWS)
+        self._notices.extend(pull.notices)
+        if pull.fresh and self._rows is not None and not len(pull.events):
+            # The source has just begun again: the charts stay as they are until there is something to show.
+            self._cursor.revision = -1
+            return []
+        if pull.fresh:
+            return self._begin(self._whole(pull))
+        if self._rows is None or not (len(pull.events) or pull.notices or pull.pictures):
+            return []
+        self._rows(pull)
+        return self._read()
+
+    def close(self) -> None:
+        """Give everything back."""
+        self._engine.release(self._cursor)
+        if self._stream is not None:
+            self._stream.disconnect()
+
+    def _whole(self, pull: Pull) -> Pull:
+        """All there is of a revision that just began, pulled in pieces."""
+        parts = [pull]
+        while len(parts[-1].events) == ROWS:
+            more = self._engine.pull(self._cursor, ROWS)
+            self._notices.extend(more.notices)
+            # Another revision may begin meanwhile, or a late reading rewrite rows: those are the ones that hold.
+            parts = [more] if more.fresh else [*parts, more]
+        if len(parts) == 1:
+            return parts[0]
+        events: list[Events] = []
+        tracks: list[Track] = []
+        end = parts[0].first
+        pictures = {picture.before: picture for part in parts for picture in part.pictures}
+        for part in parts:
+            if part.first < end:
+                events, tracks = _cut(events, tracks, part.first - parts[0].first)
+            events.append(part.events)
+            tracks.append(part.track)
+            end = part.first + len(part.events)
+        return replace(
+            parts[-1],
+            fresh=True,
+            first=parts[0].first,
+            events=Events.concat(events, 0),
+            track=Track(*(np.concatenate(column) for column in zip(*tracks, strict=True))),
+            pictures=[pictures[index] for index in sorted(pictures)],
+        )
+
+    def _begin(self, pull: Pull) -> list[Message]:
+        """Another recording: first the window that the charts show, then the rest."""
+        if self._stream is not None:
+            self._stream.disconnect()
+        name = f"{self._name}-{pull.revision}"
+        self._stream = rr.RecordingStream(self.application, recording_id=name, send_properties=False)
+        self._bytes = self._stream.binary_stream()
+        rows = self._rows = RerunRows(
+            self._stream, self._engine, series=SERIES, layout=self._layout, palette=self._palette
+        )
+        self._layout = False
+        self._frame = 0
+        announcement = json.dumps({"recording": f"Recording:{self.application}:{name}", "revision": pull.revision})
+        t = pull.events.t
+        cut = int(np.searchsorted(t, t[-1] - int(AHEAD * rows.sink.window * 1e9))) if t.size and pull.revision else 0
+        before = self._engine.previous() if pull.revision and t.size else None
+        # A recording's timeline must not begin before its rows; they may have been forgotten meanwhile.
+        grey = before.events.t if before is not None else t[:0]
+        known = int(np.searchsorted(grey, t[0])) if t.size else 0
+        grey_cut = max(known, int(np.searchsorted(grey, t[cut]))) if t.size else 0
+
+        def draw(part: slice, grey_part: slice, past: bool) -> None:
+            rows.rows(pull.events.select(part), pull.track.select(part), past=past)
+            if before is not None and grey[grey_part].size:
+                rows.previous(grey[grey_part], before.track.select(grey_part))
+            begun = pull.first + cut
+            rows.pictures([item for item in pull.pictures if (item.before <= begun) == past], past=past)
+
+        if t.size:
+            rows.begin(pull)
+            draw(slice(cut, None), slice(grey_cut, None), past=False)
+        # The engine gives a line once; the viewer forgets it with the recording that it closes. Times of what was said
+        # before the source began again are yet to come.
+        here = self._engine.notices.passage
+        rows.notices([_labelled(line, pull.revision) for line in self._notices if line.passage == here])
+        if cut:
+            self._later = lambda: draw(slice(0, cut), slice(known, grey_cut), past=True)
+        return [announcement, *self._read()]
+
+    def _read(self) -> list[Message]:
+        assert self._stream is not None
+        self._frame += 1
+        self._stream.send_columns(
+            "/frame",
+            indexes=[rr.TimeColumn(FRAMES, sequence=[self._frame])],
+            columns=rr.AnyValues.columns(count=[self._frame]),
+        )
+        data = self._bytes.read()
+        return [data] if data else []
+
+
+def _labelled(line: Notice, revision: int) -> Notice:
+    """A line for the table of a revision: one of another revision says so, as its rows are no longer to be seen."""
+    return line if line.revision == revision else replace(line, text=f"revision {line.revision}: {line.text}")
+
+
+def _cut(events: list[Events], tracks: list[Track], rows: int) -> tuple[list[Events], list[Track]]:
+    """The first `rows` rows of some pieces."""
+    kept_readings, kept_tracks = [], []
+    for reading, track in zip(events, tracks, strict=True):
+        count = min(rows, len(reading))
+        kept_readings.append(reading.select(slice(0, count)))
+        kept_tracks.append(track.select(slice(0, count)))
+        rows -= count
+    return kept_readings, kept_tracks

@@ -1,0 +1,216 @@
+"""Two states of the belief as a picture: the 2σ ellipse, the mean with its numbers, the truth, the way they came."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+
+from estimators.log import RESET, Events, truth_of
+from estimators.model.state_space import StateSpaceModel
+from estimators.track import Track
+
+from ...present.drawing.palette import EITHER, Palette
+from .sink import Sink
+from .thin import last_of_stretch
+
+CORNERS = 65
+"""Points of an ellipse's line, its first one again at the end."""
+
+TRAIL = 100
+"""Points of the way behind the mean."""
+
+PICTURES = 400
+"""Ellipses in one window of the charts, or in a longer history that is drawn at once."""
+
+PANE = 2.5
+"""Width of the picture over its height, about."""
+
+ASIDE, BELOW = 0.2, 0.4
+"""Shares of the picture's width and height that the numbers take, on either side of their point and below it."""
+
+_STRIP = rr.components.LineStrip2DBatch._ARROW_DATATYPE
+_POINT = _STRIP.value_type
+_angle = np.linspace(0.0, 2.0 * np.pi, CORNERS)
+_circle = np.stack((np.cos(_angle), np.sin(_angle)), axis=1)
+
+
+def ellipse_points(mean: np.ndarray, var: np.ndarray, cross: np.ndarray) -> np.ndarray:
+    """Lines of 2σ ellipses.
+
+    m + 2 L (cos φ, sin φ),   L Lᵀ = P
+
+    Args:
+        mean: Shape (n, 2).
+        var: Diagonals of P, shape (n, 2).
+        cross: Off-diagonal entries, shape (n,).
+
+    Returns:
+        Shape (n, CORNERS, 2).
+    """
+    l11 = np.sqrt(var[:, 0])
+    l21 = np.divide(cross, l11, out=np.zeros_like(cross), where=l11 > 0)
+    l22 = np.sqrt(np.maximum(var[:, 1] - l21**2, 0.0))
+    x = l11[:, None] * _circle[:, 0]
+    y = l21[:, None] * _circle[:, 0] + l22[:, None] * _circle[:, 1]
+    return mean[:, None, :] + 2.0 * np.stack((x, y), axis=2)
+
+
+def anchors(mean: np.ndarray, ellipses: np.ndarray, ways: list[np.ndarray]) -> np.ndarray:
+    """Where the numbers stand: at the mean, but no nearer to the picture's edge than they are wide and high.
+
+    The view shows what is drawn and cuts the numbers off where it ends.
+
+    Args:
+        mean: Shape (n, 2).
+        ellipses: Shape (n, CORNERS, 2).
+        ways: n lines of shape (k, 2).
+
+    Returns:
+        Shape (n, 2).
+    """
+    low = np.stack([np.minimum(e.min(0), way.min(0)) for e, way in zip(ellipses, ways, strict=True)])
+    high = np.stack([np.maximum(e.max(0), way.max(0)) for e, way in zip(ellipses, ways, strict=True)])
+    middle, size = 0.5 * (low + high), high - low
+    # The view has one scale for both axes: the longer one fills it.
+    height = np.maximum(size[:, 1], size[:, 0] / PANE)
+    edge = np.stack(((0.5 - ASIDE) * PANE * height, (0.5 - BELOW) * height), axis=1)
+    x = np.clip(mean[:, 0], middle[:, 0] - edge[:, 0], middle[:, 0] + edge[:, 0])
+    return np.stack((x, np.maximum(mean[:, 1], middle[:, 1] - edge[:, 1])), axis=1)
+
+
+def strips(lines: list[np.ndarray]) -> pa.Array:
+    """Lines of shape (k, 2) each as Rerun holds them; its own conversion takes 50 µs a line."""
+    ends = np.cumsum([0] + [line.shape[0] for line in lines]).astype(np.int32)
+    points = pa.FixedSizeListArray.from_arrays(pa.array(np.concatenate(lines).reshape(-1)), type=_POINT)
+    return pa.ListArray.from_arrays(pa.array(ends), points, type=_STRIP)
+
+
+def _lines(lines: list[np.ndarray], color: tuple[int, int, int], width: float) -> rr.ComponentColumnList:
+    # A negative radius is in pixels.
+    radii = np.full(len(lines), -width, np.float32)
+    return rr.LineStrips2D.columns(strips=strips(lines), colors=[color] * len(lines), radii=radii)
+
+
+def axis_scales(model: StateSpaceModel, pair: np.ndarray) -> np.ndarray:
+    """Units that one length of the picture stands for: the states' own if they agree, else the priors' widths.
+
+    Rerun's view has one scale for both axes, in which a temperature and its rate would not both be seen.
+    """
+    a, b = (model.states[j] for j in pair)
+    if a.unit == b.unit:
+        return np.ones(2)
+    widths = np.array([a.std or 1.0, b.std or 1.0])
+    return 10.0 ** np.round(np.log10(widths))
+
+
+class PairDrawing:
+    """Draws one pair of states below one path."""
+
+    def __init__(
+        self, model: StateSpaceModel, index: int, pair: np.ndarray, path: str, palette: Palette = EITHER
+    ) -> None:
+        self._palette = palette
+        self._model = model
+        self._index = index
+        self._pair = pair
+        self._path = path
+        self._scale = axis_scales(model, pair)
+        # Of a large field the track keeps some cells.
+        self._columns = np.searchsorted(model.shown, pair, sorter=np.argsort(model.shown))
+        self._columns = np.argsort(model.shown)[self._columns]
+        self._last: int | None = None
+        self._way = np.zeros((0, 2), np.float32)
+        self._way_t = np.zeros(0, np.int64)
+
+    def draw(self, sink: Sink, t: np.ndarray, track: Track, events: Events, past: bool) -> None:
+        """Log the pictures of some rows of the track."""
+        step = int(max(sink.window * 1e9, int(t[-1]) - int(t[0])) / PICTURES)
+        pick = last_of_stretch(t, step)
+        if past or self._last is None:
+            self._last = None
+        else:
+            # After a reset nothing else may come.
+            pick = pick[(t[pick] >= self._last + step // 2) | (events.kind[pick] == RESET)]
+        if not pick.size:
+            return
+        columns = (
+            track.mean[pick][:, self._columns],
+            track.std[pick][:, self._columns],
+            track.cross[pick, self._index],
+        )
+        known = np.isfinite(np.column_stack(columns)).all(axis=1)
+        for run in np.split(pick, np.flatnonzero(known[1:] != known[:-1]) + 1):
+            if known[np.searchsorted(pick, run[0])]:
+                self._pictures(sink, t[run], track.select(run), past)
+            else:
+                self._blank(sink, t[run[:1]], past)
+        if not past:
+            self._last = int(t[pick[-1]])
+        self._truth(sink, events, t[pick])
+
+    def _blank(self, sink: Sink, t: np.ndarray, past: bool) -> None:
+        """Show nothing from a time (1,) on, at which the estimate is not a number."""
+        for name in ("ellipse", "mean", "numbers", "way"):
+            sink.gap(f"{self._path}/{name}", t)
+        if not past:
+            self._way, self._way_t = self._way[:0], self._way_t[:0]
+
+    def _pictures(self, sink: Sink, t: np.ndarray, track: Track, past: bool) -> None:
+        mean = track.mean[:, self._columns] / self._scale
+        var = (track.std[:, self._columns] / self._scale) ** 2
+        cross = track.cross[:, self._index] / self._scale.prod()
+        points = ellipse_points(mean, var, cross).astype(np.float32)
+        count = np.full(t.size, 1)
+        sink.columns(f"{self._path}/ellipse", t, _lines(list(points), self._palette.estimate, 1.0).partition(count))
+        dots = rr.Points2D.columns(
+            positions=mean.astype(np.float32),
+            colors=[self._palette.estimate] * t.size,
+            radii=np.full(t.size, -3.0, np.float32),
+        )
+        sink.columns(f"{self._path}/mean", t, dots.partition(count))
+        way = self._trail(sink, t, mean.astype(np.float32), past)
+        numbers = rr.Points2D.columns(
+            positions=anchors(mean, points, way).astype(np.float32), colors=[self._palette.estimate] * t.size,
+            labels=self._labels(track), radii=np.full(t.size, -0.01, np.float32),
+        )  # fmt: skip
+        sink.columns(f"{self._path}/numbers", t, numbers.partition(count))
+        sink.columns(f"{self._path}/way", t, _lines(way, self._palette.previous, 0.5).partition(count))
+
+    def _labels(self, track: Track) -> list[str]:
+        units = [self._model.states[j].unit.replace("1", "") for j in self._pair]
+        means, stds = track.mean[:, self._columns], track.std[:, self._columns]
+        return [
+            f"{m[0]:.4g} ± {s[0]:.2g} {units[0]}\n{m[1]:.4g} ± {s[1]:.2g} {units[1]}"
+            for m, s in zip(means, stds, strict=True)
+        ]
+
+    def _trail(self, sink: Sink, t: np.ndarray, mean: np.ndarray, past: bool) -> list[np.ndarray]:
+        """For each row the way that led there, within the charts' window."""
+        before, before_t = (self._way[:0], self._way_t[:0]) if past else (self._way, self._way_t)
+        keep = last_of_stretch(t, int(sink.window * 1e9 / TRAIL))
+        way = np.concatenate((before, mean[keep]))
+        way_t = np.concatenate((before_t, t[keep]))
+        start = np.searchsorted(way_t, t - int(sink.window * 1e9))
+        end = np.searchsorted(way_t, t)
+        if not past:
+            recent = way_t >= t[-1] - int(sink.window * 1e9)
+            self._way, self._way_t = way[recent], way_t[recent]
+        # A strip needs two points; the first row has nothing behind it.
+        return [
+            np.concatenate((way[max(i, j - 2 * TRAIL) : j], here[None], here[None]))
+            for i, j, here in zip(start, end, mean, strict=True)
+        ]
+
+    def _truth(self, sink: Sink, events: Events, wanted: np.ndarray) -> None:
+        (in_a, a), (in_b, b) = (truth_of(events, int(j)) for j in self._pair)
+        times, of_a, of_b = np.intersect1d(events.t[in_a], events.t[in_b], return_indices=True)
+        if not times.size:
+            return
+        near = np.unique(np.clip(np.searchsorted(times, wanted), 0, times.size - 1))
+        values = np.stack((a[of_a], b[of_b]), axis=1)[near] / self._scale
+        dots = rr.Points2D.columns(
+            positions=values.astype(np.float32), colors=[self._palette.truth] * near.size,
+            radii=np.full(near.size, -4.0, np.float32),
+        )  # fmt: skip
+        sink.columns(f"{self._path}/truth", times[near], dots.partition(np.full(near.size, 1)))

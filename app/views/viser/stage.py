@@ -1,0 +1,166 @@
+"""What stands on the stage: one scene at a time, the one that is chosen; nothing of the others is kept or sent."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import viser
+
+from estimators.model.state_space import StateSpaceModel
+
+from ...live.interface import Running
+from ...live.outputs import Belief
+from ...present.drawing.choices import AXES, NO_AXIS, SHOW, Choice, Choices
+from ...present.drawing.heatmap import kinds
+from ...present.drawing.palette import LIGHT
+from .battery_scene import BatteryScene
+from .belief_scene import BeliefScene
+from .camera import Cameras, Outlook
+from .field_scene import FieldScene
+from .field_surface_scene import FieldSurfaceScene
+from .gripper_scene import GripperScene
+from .history import History
+from .motor_scene import MotorScene
+from .vehicle_scene import VehicleScene
+
+if TYPE_CHECKING:
+    from config.schema import ViewSection
+
+BELIEF, FIELD, SURFACE = "belief", "field", "surface"
+VEHICLE, MOTOR, BATTERY, GRIPPER = "vehicle", "motor", "battery", "gripper"
+FOLLOW, STAY = "vehicle", "place"
+
+PICTURED = (FieldScene, FieldSurfaceScene)
+"""Scenes of a large field, which are drawn from its pictures."""
+
+AMBIENT, ABOVE = 2.5, 0.9
+"""Strength of the lights: π of the first alone would show each colour as it is."""
+
+HEAVY = 0.4
+"""Seconds between two redraws of what is many points."""
+
+
+class Scene(Protocol):
+    """A scene below one frame, which takes it away."""
+
+    root: viser.FrameHandle
+    outlook: Outlook
+
+    def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
+        """Send where everything is now; what is many points only if `heavy`."""
+
+
+class Stage:
+    """Builds the scene that is chosen, again where that changes, and draws it."""
+
+    def __init__(self, server: viser.ViserServer, engine: Running) -> None:
+        self._server, self._engine = server, engine
+        api = server.scene
+        api.set_up_direction("+z")
+        # Nearly the same light from everywhere: colours mean something, so shading must not change them much.
+        api.configure_default_lights(False)
+        api.configure_environment_map(None)
+        api.add_light_ambient("/light/all", intensity=AMBIENT)
+        api.add_light_directional("/light/above", intensity=ABOVE, position=(-0.5, -1.0, 1.2))
+        self.model, self._view = engine.model, engine.twin.config.view
+        self._truth = engine.model.grid is not None and engine.twin.tells_field
+        self.choices = Choices(choices_of(self.model, self._view, truth=self._truth))
+        self.cameras = Cameras(server)
+        self.palette = LIGHT
+        self.scene: Scene | None = None
+        self._built: object = None
+        self._heavy = -HEAVY
+        self._values: dict[str, str] = {}
+        self._late = False
+        """Whether something that is many points is yet to be drawn."""
+        self.prepare()
+
+    def prepare(self) -> bool:
+        """Build the scene that is chosen; whether it is another one than before."""
+        values = self.choices.values()
+        show = values.get(SHOW, "")
+        wanted = (show, *(values.get(axis) for axis in AXES if show == BELIEF), self.palette)
+        fresh = wanted != self._built
+        if fresh:
+            if self.scene is not None:
+                self.scene.root.remove()
+            self.scene = self._build(show, values)
+            self.cameras.show(self.scene.outlook)
+            self._built, self._heavy = wanted, -HEAVY
+            # Viser has a dark of its own.
+            self._server.scene.set_background_image(np.full((2, 2, 3), self.palette.panel, np.uint8), format="png")
+        self._late |= values != self._values
+        self._values = values
+        if isinstance(self.scene, PICTURED):
+            self.scene.show(values["picture"])
+        elif isinstance(self.scene, VehicleScene):
+            self.scene.follow = values["follow"] == FOLLOW
+        return fresh
+
+    @property
+    def due(self) -> bool:
+        """Whether there is something to draw though nothing new came; a field knows that itself."""
+        return self._late or isinstance(self.scene, PICTURED)
+
+    def draw(self, history: History) -> None:
+        """Send what has changed."""
+        assert self.scene is not None
+        now = time.monotonic()
+        heavy = now - self._heavy >= HEAVY
+        self._late = not heavy
+        if heavy:
+            self._heavy = now
+        # The moments of a large field are dear, and its pictures come with the rows.
+        belief = self._engine.belief() if self.model.grid is None else None
+        if isinstance(self.scene, VehicleScene):
+            self.scene.tuning = self._engine.tuning
+        self.scene.draw(history, belief, heavy)  # type: ignore[arg-type]
+
+    def _build(self, show: str, values: dict[str, str]) -> Scene:
+        api, model, section = self._server.scene, self.model, self._view.scene
+        if show == FIELD:
+            return FieldScene(api, model, self.palette, truth=self._truth)  # type: ignore[return-value]
+        if show == SURFACE:
+            return FieldSurfaceScene(api, model, self.palette, truth=self._truth)  # type: ignore[return-value]
+        if show == VEHICLE:
+            return VehicleScene(api, model, section, self.palette)
+        if show == MOTOR:
+            return MotorScene(
+                api, model, {str(part): name for part, name in (section.parts or {}).items()}, self.palette
+            )
+        if show == BATTERY:
+            return BatteryScene(api, model, section.charge or (), section.temperature, self.palette)
+        if show == GRIPPER:
+            return GripperScene(
+                api, model, {str(what): name for what, name in (section.states or {}).items()}, self.palette
+            )
+        chosen = [values[axis] for axis in AXES if values.get(axis, NO_AXIS) != NO_AXIS]
+        return BeliefScene(api, model, [model.state_names.index(name) for name in chosen], self.palette)
+
+
+def choices_of(model: StateSpaceModel, view: ViewSection, *, truth: bool) -> list[Choice]:
+    """What there is to choose from: the pictures of a twin, and what may be chosen about each.
+
+    Args:
+        model: Of the twin.
+        view: As its YAML says.
+        truth: Whether a field's true values are told.
+    """
+    if model.grid is not None:
+        titles = tuple(kind.title for kind in kinds(truth))
+        return [Choice(SHOW, "Show", (FIELD, SURFACE), FIELD), Choice("picture", "Picture", titles, titles[0])]
+    section = view.scene
+    shows = tuple(dict.fromkeys((section.kind, BELIEF)))
+    found = [Choice(SHOW, "Show", shows, shows[0])]
+    if section.kind == VEHICLE:
+        middles = (STAY, FOLLOW) if section.walls or section.beacons else (FOLLOW,)
+        found.append(Choice("follow", "Middle", middles, middles[0], VEHICLE))
+    names = [state.name for state in model.shown_states]
+    first = [*(section.axes or section.position or ()), *([section.heading] if section.heading else [])]
+    first = [*first, *(name for name in names if name not in first)][: 3 if section.axes is None else len(section.axes)]
+    for axis, name in zip(AXES, [*first, *[NO_AXIS] * 3][: min(3, len(names))], strict=False):
+        options = (*names, NO_AXIS) if axis == "z" else tuple(names)
+        found.append(Choice(axis, axis, options, name if name != NO_AXIS or axis == "z" else names[0], BELIEF))
+    return found

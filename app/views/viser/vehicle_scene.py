@@ -1,0 +1,308 @@
+"""The scene of a twin that moves on a plane: vehicle, track, walls, beams, beacons, readings, truth, particles, 2σ.
+
+The vehicle has its true size; a pointer, as thick at any distance, says where it is in a place that is large. An
+estimate with several peaks has its vehicle at the heaviest one, and a dot with its weight at each: at the mean between
+them is nobody.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import viser
+
+from estimators.log import READING, truth_of
+from estimators.model.state_space import StateSpaceModel
+from estimators.track import FAILED, GATED
+from estimators.tuning import Tuning
+
+from ...live.outputs import Belief
+from ...present.drawing.direct_readings import observed
+from ...present.drawing.geometry import about_z, circle, disc, ellipsoid, round_step, segments
+from ...present.drawing.palette import Palette, mixed
+from .beacons import Beacons, Places
+from .beams import Beams
+from .camera import Outlook
+from .history import History
+from .peak_trail import PeakTrail
+
+UNSURE = 20.0
+"""Times the usual deviation of a place, beyond which the trail says nothing of it."""
+
+LEAP = 20.0
+"""Times a usual step of the trail, beyond which it is none that a vehicle made."""
+
+TRAIL = 300
+"""Points of a line where something was, at most."""
+
+PEAKS = 4
+POINTS = 600
+"""Position readings of one sensor that are drawn at most."""
+
+SOFTNESS = 0.3
+"""Part of the way to the vehicle that the view moves in one frame."""
+
+FOV = float(np.radians(40))
+UP = np.array([0.0, 0.0, 1.0])
+
+SLANTED = np.array([0.0, -0.68, 0.73])
+"""From the vehicle to the first view of it."""
+
+ABOVE = np.array([0.0, -0.12, 0.99])
+"""From walls to the first view of them, nearly as on a plan: a corridor would else be a line."""
+
+AROUND = 4.0
+"""Lengths of the vehicle around it that the first view shows where there are no walls and no beacons."""
+
+NEAREST = 0.7
+"""Lengths of the vehicle around the middle of walls and beacons that the first view shows at least."""
+
+BESIDE = 1.2
+"""Times as far as beacons are that the first view reaches, for their names."""
+
+LARGE = 2.5
+"""Times what the first view shows from which on an ellipse has no area, which would be all that one sees."""
+
+
+class VehicleScene:
+    """The plane with east to the right and north up the screen, under a camera that the user turns freely.
+
+    In a pane that is higher than wide, long walls have their east up. The view follows by moving the world under the
+    camera, never the camera: a user's own turning and zooming is not disturbed, and coordinates near the camera stay
+    small, which single precision needs.
+    """
+
+    def __init__(self, api: viser.SceneApi, model: StateSpaceModel, scene: Any, palette: Palette) -> None:
+        names = model.state_names
+        self.east, self.north = (names.index(name) for name in scene.position)
+        self.heading = names.index(scene.heading) if scene.heading else None
+        dots = observed(model)
+        self._fixes = [
+            (dot.sensor, dot.row, other.row)
+            for dot in dots
+            for other in dots
+            if dot.sensor == other.sensor and (dot.state, other.state) == (self.east, self.north)
+        ]
+        self.tuning = Tuning.of(model)
+        walled = np.array([corner for line in scene.walls for corner in line]).reshape(-1, 2)
+        standing = Places(model, scene.beacons.values()).at(model.prior_mean, self.tuning.p)
+        corners = np.concatenate((walled, standing))
+        # Among walls and beacons the place is what matters, all of it: two peaks may be at its two ends.
+        self._home = 0.5 * (corners.min(axis=0) + corners.max(axis=0)) if corners.size else None
+        self._length = scene.size[0]
+        self._reach = AROUND * self._length
+        if self._home is not None:
+            self._reach = max(NEAREST * self._length, float(np.abs(corners - self._home).max()))
+        # Of dots, as large at any distance.
+        dot_size = self._reach / 36.0
+        self.follow = self._home is None
+        self._anchor: np.ndarray | None = None if self._home is None else self._home.copy()
+        self._course = 0.0
+        self._known = False
+        self.root = api.add_frame("/scene", show_axes=False)
+        self.world = api.add_frame("/scene/world", show_axes=False)
+        cell = round_step(0.4 * self._reach)
+        self._section = 5 * cell
+        self._grid = api.add_grid(
+            "/scene/grid", infinite_grid=True, cell_size=cell, section_size=self._section, fade_distance=90 * cell,
+            cell_color=palette.grid, section_color=palette.rule, shadow_opacity=0.0,
+        )  # fmt: skip
+        line, world = {"thickness_units": "screen"}, "/scene/world"
+        nothing = np.zeros((1, 2, 3), np.float32)
+        self._trail = api.add_line_segments(f"{world}/trail", nothing, palette.estimate, thickness=3, **line)
+        self._way = PeakTrail()
+        self._truth = api.add_line_segments(f"{world}/truth", nothing, palette.truth, thickness=2, **line)
+        dot = {"point_shape": "circle", "precision": "float32", "point_shading": "flat", "visible": False}
+        one = np.zeros((1, 3), np.float32)
+        self._readings, self._refused = (
+            api.add_point_cloud(f"{world}/{name}", one, color, point_size=dot_size, **dot)
+            for name, color in (("readings", palette.reading), ("refused", palette.refused))
+        )
+        vertices, faces = disc()
+        self._ellipse = api.add_mesh_simple(
+            f"{world}/ellipse", vertices, faces, color=palette.estimate, opacity=0.25, side="double",
+            cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+        self._rim = api.add_line_segments(f"{world}/rim", circle(), palette.estimate, thickness=2, **line)
+        walls = [segments(np.array([(*corner, 0.3) for corner in line])) for line in scene.walls]
+        if walls:
+            api.add_line_segments(f"{world}/walls", np.concatenate(walls), palette.faint, thickness=3, **line)
+        light = mixed(palette.estimate, palette.panel, 0.2)
+        self._cloud = api.add_point_cloud(f"{world}/cloud", one, light, point_size=0.3 * dot_size, **dot)
+        self._peaks = [
+            (
+                api.add_point_cloud(f"{world}/peaks/{k}/mean", one, palette.estimate, point_size=0.8 * dot_size, **dot),
+                api.add_label(f"{world}/peaks/{k}/weight", " ", visible=False, anchor="bottom-left"),
+            )
+            for k in range(PEAKS)
+        ]
+        self._vehicle = api.add_frame(f"{world}/vehicle", show_axes=False)
+        add_body(api, f"{world}/vehicle", scene.size, palette)
+        pointer = np.array([[[0.0, 0.0, 0.02], [max(0.9 * self._length, 0.12 * self._reach), 0.0, 0.02]]], np.float32)
+        api.add_line_segments(f"{world}/vehicle/pointer", pointer, palette.estimate, thickness=5, **line)
+        self._beams = self._beacons = None
+        if scene.beams:
+            self._beams = Beams(api, f"{world}/beams", model, scene.beams, palette, dot=0.5 * dot_size)
+        if scene.beacons:
+            self._beacons = Beacons(api, f"{world}/beacons", model, scene.beacons, palette, size=2 * dot_size)
+        around = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+        if self._home is None:
+            self.outlook = Outlook(self._reach * around, SLANTED, UP, FOV)
+        else:
+            outline = np.column_stack((corners - self._home, np.zeros(len(corners))))
+            outline[len(walled) :] *= BESIDE
+            self.outlook = Outlook(np.vstack((outline, NEAREST * self._length * around)), ABOVE, UP, FOV, turns=True)
+        self._move_world()
+
+    def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
+        """Send where everything is now; lines, readings and particles only if `heavy`."""
+        if not history.n:
+            return
+        mean = history.column("mean")
+        known = bool(np.isfinite(belief.mean[[self.east, self.north]]).all())
+        # What was drawn before would else stand for an estimate that is not a number.
+        heavy |= known != self._known
+        self._known = known
+        self._vehicle.visible = known
+        self._mark(belief.peaks if known else ())
+        plane, t = mean[:, [self.east, self.north]], history.column("t")
+        std = history.column("std")[:, [self.east, self.north]]
+        several = known and len(belief.peaks) > 1
+        self._way.look(t, plane, belief.peaks[0].mean[[self.east, self.north]] if several else None)
+        if heavy:
+            east, north = self._way.of(t, where_known(plane, std)).T
+            self._trail.points = segments(without_jumps(self._plane(east, north, 0.06)))
+            self._draw_truth(history)
+            self._draw_readings(history)
+            self._draw_cloud(belief.points if known else ())
+            if self._beacons is not None:
+                self._beacons.draw(history, belief.mean, self.tuning.p)
+        if known:
+            peak = belief.peaks[0] if len(belief.peaks) > 1 else belief  # a mean between two peaks is nowhere
+            self._draw_vehicle(mean, peak)
+            if self._beams is not None:
+                here = peak.mean[[self.east, self.north]]
+                self._beams.draw(history, peak.mean, here, self._course, self.tuning.p)
+        else:
+            self._draw_ellipse(np.zeros(2), np.full((2, 2), np.nan))
+            if self._beams is not None:
+                self._beams.hide()
+
+    def _draw_vehicle(self, mean: np.ndarray, peak: Any) -> None:
+        """Move the vehicle with its ellipse, and the world under the camera."""
+        here = peak.mean[[self.east, self.north]]
+        middle = here if self.follow or self._home is None else self._home
+        if self._anchor is None or np.linalg.norm(middle - self._anchor) > 200.0:
+            self._anchor = middle.copy()
+        if self.follow or self._home is not None:
+            self._anchor += SOFTNESS * (middle - self._anchor)
+        self._move_world()
+        self._vehicle.position = (*here, 0.0)
+        self._vehicle.wxyz = about_z(self._direction(peak, mean))
+        self._draw_ellipse(here, peak.cov[np.ix_([self.east, self.north], [self.east, self.north])])
+
+    def _move_world(self) -> None:
+        """Bring what is to be in the middle there."""
+        if self._anchor is None:
+            return
+        shift = np.array([*-self._anchor, 0.0])
+        self.world.position = shift
+        # The grid is endless: only where its lines fall matters.
+        self._grid.position = (*np.mod(shift[:2], self._section), 0.0)
+
+    def _draw_ellipse(self, here: np.ndarray, cov: np.ndarray) -> None:
+        known = bool(np.isfinite(cov).all())
+        self._ellipse.visible = self._rim.visible = known
+        if not known:
+            return
+        full = np.zeros((3, 3))
+        full[:2, :2] = cov
+        full[2, 2] = 2 * full.max() + 1.0  # the largest, so that the ellipse is the first two axes
+        axes, turn = ellipsoid(full)
+        self._ellipse.visible = bool(axes[1] < LARGE * self._reach)
+        for handle in (self._ellipse, self._rim):
+            handle.position, handle.wxyz = (*here, 0.04), turn
+            handle.scale = (float(axes[0]), float(axes[1]), 1.0)
+
+    def _plane(self, east: np.ndarray, north: np.ndarray, height: float) -> np.ndarray:
+        pick = np.unique(np.linspace(0, east.size - 1, min(east.size, TRAIL)).astype(int))
+        return np.stack((east[pick], north[pick], np.full(pick.size, height)), axis=1)
+
+    def _draw_truth(self, history: History) -> None:
+        events = history.events()
+        (in_east, east), (in_north, north) = (truth_of(events, j) for j in (self.east, self.north))
+        times, of_east, of_north = np.intersect1d(events.t[in_east], events.t[in_north], return_indices=True)
+        if times.size:
+            self._truth.points = segments(self._plane(east[of_east], north[of_north], 0.05))
+
+    def _draw_readings(self, history: History) -> None:
+        kind, channel, value = (history.column(name) for name in ("kind", "channel", "value"))
+        refused = np.isin(history.column("verdict"), (GATED, FAILED))
+        for handle, wanted in ((self._readings, ~refused), (self._refused, refused)):
+            parts = [np.zeros((0, 3))]
+            for sensor, row, row_n in self._fixes:
+                mine = np.flatnonzero((kind == READING) & (channel == sensor) & wanted)[-POINTS:]
+                parts.append(np.stack((value[mine, row], value[mine, row_n], np.full(mine.size, 0.1)), axis=1))
+            _put(handle, np.concatenate(parts))
+
+    def _draw_cloud(self, points: Any) -> None:
+        """The points that stand for the belief."""
+        plane = points[:, [self.east, self.north]] if len(points) else np.zeros((0, 2))
+        _put(self._cloud, np.column_stack((plane, np.full(len(plane), 0.2))))
+
+    def _mark(self, peaks: Any) -> None:
+        """A dot with its weight at each peak, where there are several."""
+        several = peaks if len(peaks) > 1 else ()
+        for k, (dot, label) in enumerate(self._peaks):
+            place = several[k].mean[[self.east, self.north]] if k < len(several) else np.full(2, np.nan)
+            shown = bool(np.isfinite(place).all())
+            if shown:
+                dot.points = np.array([(*place, 1.2)], np.float32)
+                label.position = (*(place + 0.6), 1.2)
+                # At the heaviest stand the vehicle and the end of its trail.
+                label.text = f"{100 * several[k].weight:.0f} %{' drawn' if k == 0 else ''}"
+            dot.visible = label.visible = shown
+
+    def _direction(self, peak: Any, mean: np.ndarray) -> float:
+        if self.heading is not None:
+            if np.isfinite(peak.mean[self.heading]):
+                self._course = float(peak.mean[self.heading])
+            return self._course
+        step = mean[-1, [self.east, self.north]] - mean[max(0, len(mean) - 20), [self.east, self.north]]
+        if np.hypot(*step) > 0.2 * self._length:  # not so if one of the two is NaN
+            self._course = float(np.arctan2(step[1], step[0]))
+        return self._course
+
+
+def without_jumps(way: np.ndarray) -> np.ndarray:
+    """A way (n, 3) with gaps where it leaps: a cloud found its vehicle elsewhere, which did not drive there."""
+    steps = np.hypot(*np.diff(way[:, :2], axis=0).T)
+    moving = steps[steps > 0.0]
+    leaps = np.flatnonzero(steps > LEAP * np.median(moving)) if moving.size else moving.astype(int)
+    return np.insert(way, leaps + 1, np.nan, axis=0)
+
+
+def where_known(plane: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Places (n, 2), NaN while their deviations (n, 2) are far wider than usual: there a prior stands, no vehicle."""
+    spread = np.hypot(*std.T)
+    known = spread <= UNSURE * np.nanmedian(spread) if np.isfinite(spread).any() else np.ones(len(plane), bool)
+    return np.where(known[:, None], plane, np.nan)
+
+
+def add_body(api: viser.SceneApi, name: str, size: tuple[float, float, float], palette: Palette) -> None:
+    """A body of that length, width and height, m, about a place on the ground, its front along x: its nose is pale."""
+    long, wide, tall = size
+    dark, pale = mixed(palette.estimate, palette.ink, 0.3), mixed(palette.estimate, palette.panel, 0.5)
+    flat = {"cast_shadow": False, "receive_shadow": False}
+    api.add_box(f"{name}/body", dark, (long, wide, 0.5 * tall), position=(0, 0, 0.4 * tall), **flat)
+    api.add_box(
+        f"{name}/cabin", pale, (0.5 * long, 0.9 * wide, 0.35 * tall), position=(-0.07 * long, 0, 0.825 * tall), **flat
+    )
+
+
+def _put(handle: Any, points: np.ndarray) -> None:
+    points = points[np.isfinite(points).all(axis=1)]
+    handle.visible = bool(len(points))
+    if len(points):
+        handle.points = points.astype(np.float32)

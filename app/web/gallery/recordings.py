@@ -1,0 +1,226 @@
+"""The folder of recordings and of logs that were dropped on the page: list, receive, delete.
+
+Outside it are only the files that this session itself has recorded, wherever the command line said.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from estimators.errors import ConfigError, NisusError, quoted
+from sources.can.frames import FORMATS
+
+from ...views.recording.disk import Disk
+from ...views.recording.facts import Facts, facts_of
+
+RECORDING = ".rrd"
+LOGS = tuple(dict.fromkeys([*FORMATS, ".csv", ".parquet", ".pq", ".mat", ".npz"]))
+"""File endings of what a twin can read in place of its own recording."""
+
+PART = ".part"
+"""Ending of what is still on its way here, behind a point, so that lists do not show it."""
+
+LARGEST = 256 * 2**20
+"""Bytes up to which a recording is looked through for the list."""
+
+LONGEST_NAME = 200
+"""Bytes of a file's name, so that a number and the ending of a part still fit."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One file, in a `folder` if it is elsewhere. `facts` are those of a recording, `error` says why there are none."""
+
+    name: str
+    bytes: int
+    modified: float
+    log: bool
+    facts: Facts | None = None
+    error: str | None = None
+    looking: bool = False
+    folder: str | None = None
+
+    def json(self) -> dict[str, Any]:
+        """As the page gets it."""
+        facts = self.facts
+        told: dict[str, Any] = {"twin": None, "estimator": None, "seconds": None, "summary": {}}
+        if facts is not None:
+            told |= {"twin": facts.twin, "estimator": facts.estimator, "seconds": facts.seconds}
+            told |= {"summary": facts.summary}
+        return {
+            "name": self.name,
+            "bytes": self.bytes,
+            "modified": self.modified,
+            "log": self.log,
+            "error": self.error,
+            "looking": self.looking,
+            "folder": self.folder,
+            **told,
+        }
+
+
+class Recordings:
+    """One folder. Names come from a browser, so each is checked before a file is touched.
+
+    `recorded` gives the files that the session has recorded; those outside the folder are listed by their names, too.
+    """
+
+    def __init__(self, folder: Path, recorded: Callable[[], Sequence[Path]] = lambda: ()) -> None:
+        self.folder, self._recorded = folder, recorded
+        self._known: dict[tuple[str, int, int], Facts | str] = {}
+        self._lock = threading.Lock()
+        self._looking = False
+
+    def entries(self, busy: Callable[[Path], bool] = lambda path: False) -> list[Entry]:
+        """What is there, the newest first. What a recording is, is read beside, and is there when one asks again.
+
+        Args:
+            busy: Whether a file is being written.
+        """
+        found: list[Entry] = []
+        unknown: list[tuple[Path, tuple[str, int, int]]] = []
+        inside = sorted(self.folder.iterdir()) if self.folder.is_dir() else []
+        for path in [*inside, *self._elsewhere().values()]:
+            suffix = path.suffix.lower()
+            if path.is_symlink() or not path.is_file() or path.name.startswith("."):
+                continue
+            if suffix != RECORDING and not _is_log(path.name):
+                continue
+            stat = path.stat()
+            key = (str(path), stat.st_mtime_ns, stat.st_size)
+            known = self._known.get(key)
+            log = suffix != RECORDING
+            if busy(path):
+                known = "is being recorded"
+            elif known is None and not log and stat.st_size > LARGEST:
+                known = "is large: open it to see what it holds"
+            elif known is None and not log:
+                unknown.append((path, key))
+            found.append(
+                Entry(
+                    path.name,
+                    stat.st_size,
+                    stat.st_mtime,
+                    log,
+                    facts=known if isinstance(known, Facts) else None,
+                    error=known if isinstance(known, str) else None,
+                    looking=known is None and not log,
+                    folder=None if path in inside else str(path.parent),
+                )  # fmt: skip
+            )
+        self._look(unknown)
+        return sorted(found, key=lambda entry: -entry.modified)
+
+    def _look(self, unknown: list[tuple[Path, tuple[str, int, int]]]) -> None:
+        with self._lock:
+            if self._looking or not unknown:
+                return
+            self._looking = True
+
+        def look() -> None:
+            try:
+                for path, key in unknown:
+                    try:
+                        self._known[key] = facts_of(path)
+                    except (NisusError, OSError) as error:
+                        self._known[key] = str(error).removeprefix(f"{path.name}: ")
+            finally:
+                self._looking = False
+
+        threading.Thread(target=look, name="recordings", daemon=True).start()
+
+    def _elsewhere(self) -> dict[str, Path]:
+        """Recordings of this session that are not in the folder, by name; what is in the folder goes before."""
+        home = self.folder.absolute()
+        found = {path.name: path.absolute() for path in self._recorded() if path.absolute().parent != home}
+        return {name: path for name, path in found.items() if not (self.folder / name).exists()}
+
+    def find(self, name: Any) -> Path:
+        """The file of that name.
+
+        Raises:
+            ConfigError: If the name is none of a file of this folder, or that this session has recorded.
+        """
+        path = self._elsewhere().get(name) if isinstance(name, str) else None
+        path = path or self.folder / _checked(name)
+        if path.is_symlink() or not path.is_file():
+            raise ConfigError(f"{quoted(name)}: there is no such recording")
+        return path
+
+    def delete(self, name: Any) -> None:
+        """Remove a file for good.
+
+        Raises:
+            ConfigError: If it is not there, or cannot be removed.
+        """
+        path = self.find(name)
+        try:
+            path.unlink()
+        except OSError as error:
+            raise ConfigError(f"{path.name}: {error.strerror}; it cannot be deleted") from None
+
+    def receive(self, name: Any, offset: int, data: bytes, *, last: bool) -> str | None:
+        """Take a piece of a file that a browser sends, in their order; the first begins it anew.
+
+        Returns:
+            The name under which it is here, once the last piece has come: another one if that was taken.
+
+        Raises:
+            ConfigError: If its name will not do, a piece is missing, or the disk has no room.
+        """
+        checked = _checked(name)
+        if Path(checked).suffix.lower() != RECORDING and not _is_log(checked):
+            raise ConfigError(f"{quoted(name)}: neither a recording (.rrd) nor a log ({', '.join(LOGS)})")
+        part = self.folder / f".{checked}{PART}"
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if Disk(self.folder).free() < len(data):
+                raise ConfigError(f"{checked}: the disk is nearly full; make room and drop it again")
+            if offset == 0:
+                part.unlink(missing_ok=True)
+            flags = os.O_WRONLY | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+            handle = os.open(part, flags | (os.O_CREAT | os.O_EXCL if offset == 0 else 0), 0o666)
+            with os.fdopen(handle, "ab") as file:
+                if os.fstat(file.fileno()).st_size != offset:
+                    raise ConfigError(f"{checked}: a piece of it is missing; drop it again")
+                file.write(data)
+            return self._keep(part, checked) if last else None
+        except OSError as error:
+            raise ConfigError(f"{checked}: {error.strerror}; it cannot be kept in {self.folder}") from None
+
+    def _keep(self, part: Path, name: str) -> str:
+        """Give a file that is complete its name, or the next one that is free."""
+        stem, dot, rest = name.partition(".")
+        for k in range(1, 1000):
+            free = self.folder / (name if k == 1 else f"{stem}-{k}{dot}{rest}")
+            try:
+                # A link fails where a rename would replace.
+                os.link(part, free)
+            except FileExistsError:
+                continue
+            part.unlink()
+            return free.name
+        raise ConfigError(f"{name}: there are too many of that name; delete some")
+
+
+def _is_log(name: str) -> bool:
+    return Path(name.lower().removesuffix(".gz")).suffix in LOGS
+
+
+def _checked(name: Any) -> str:
+    """A name that can only mean a file right in the folder.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    if not isinstance(name, str) or not name:
+        raise ConfigError("name is missing; give that of a file in the folder of recordings")
+    plain = name == Path(name).name and not set(name) & set('/\\:*?"<>|')
+    if not plain or name.startswith(".") or not name.isprintable() or len(os.fsencode(name)) > LONGEST_NAME:
+        raise ConfigError(f"{quoted(name)} is no name of a file in the folder of recordings")
+    return name

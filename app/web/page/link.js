@@ -1,0 +1,146 @@
+// The page's connection to the twin: what it says arrives here, what the user asks leaves here.
+
+const SLOWEST = 8000; // ms between two attempts to connect
+const QUIET = 1000; // ms without news after which the last status is told again
+const SETTLED = 700; // ms after the last edit or revision
+
+// Events: "status", "episodes", "notices", "frames", "connection"; each with `detail`.
+export class Link extends EventTarget {
+  constructor(boot) {
+    super();
+    this.boot = boot;
+    this.status = {};
+    this.episodes = [];
+    this.lanes = {}; // what was asked for, to ask again after a break
+    this.takers = {}; // by lane: take(header, seconds, columns)
+    this.delay = 250;
+    this.turned = -Infinity; // when something was edited, or folded anew
+    document.addEventListener("visibilitychange", () => (document.hidden ? this.close("hidden") : this.open()));
+    // A twin whose source has ended has no news, but ages and answers that are waited for go on.
+    setInterval(() => this.socket && this.told && performance.now() - this.told > QUIET && this.tell("status", this.status), QUIET);
+    if (!document.hidden) this.open();
+  }
+
+  open() {
+    clearTimeout(this.timer);
+    if (this.socket || document.hidden) return;
+    const socket = new WebSocket(`ws://${location.host}/api/stream`);
+    socket.binaryType = "arraybuffer";
+    this.socket = socket;
+    socket.onmessage = (event) => this.socket === socket && this.take(event.data);
+    socket.onopen = () => {
+      this.delay = 250;
+      this.tell("connection", "live");
+      this.say({ lanes: this.lanes, pair: this.pair ?? null });
+    };
+    socket.onclose = () => {
+      if (this.socket !== socket) return;
+      this.socket = null;
+      this.tell("connection", "waiting");
+      this.timer = setTimeout(() => this.open(), this.delay);
+      this.delay = Math.min(SLOWEST, 2 * this.delay);
+      this.askWhy();
+    };
+  }
+
+  // A browser does not say why a socket was refused. Each session has a token of its own: another one refuses ours.
+  async askWhy() {
+    const answer = await fetch("/api/status").catch(() => null);
+    if (answer?.status === 403) this.close("ended");
+  }
+
+  close(why) {
+    clearTimeout(this.timer);
+    const socket = this.socket;
+    this.socket = null;
+    socket?.close();
+    this.tell("connection", why);
+  }
+
+  // Whether a drag is over: what a run is worth, and what lies around a knob, is not worked out for each value on the way.
+  get settled() {
+    return performance.now() - this.turned > SETTLED;
+  }
+
+  say(message) {
+    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+  }
+
+  tell(type, detail) {
+    if (type === "status") this.told = performance.now();
+    this.dispatchEvent(new CustomEvent(type, { detail }));
+  }
+
+  // Show a lane (see app/present/series/lane.py), in place of what it was; null closes it.
+  look(name, wanted, take) {
+    if (wanted === null) {
+      delete this.lanes[name];
+      delete this.takers[name];
+    } else {
+      this.lanes[name] = wanted;
+      this.takers[name] = take;
+    }
+    this.say({ lanes: { [name]: wanted } });
+  }
+
+  // The belief over a pair of states now, told as "belief" as it changes; null for no more.
+  watch(pair) {
+    this.pair = pair;
+    this.say({ pair });
+  }
+
+  take(data) {
+    if (typeof data !== "string") {
+      const [header, seconds, columns] = unpacked(data);
+      this.takers[header.lane]?.(header, seconds, columns);
+      return;
+    }
+    const message = JSON.parse(data);
+    if (message.boot && message.boot !== this.boot) location.reload(); // another server, perhaps another twin
+    if (message.status) {
+      if ("revision" in message.status) this.turned = performance.now();
+      Object.assign(this.status, message.status);
+      this.tell("status", this.status);
+    }
+    if (message.episodes) this.tell("episodes", (this.episodes = message.episodes));
+    if (message.notices) this.tell("notices", message.notices);
+    if (message.belief) this.tell("belief", message.belief);
+    if (message.error) console.error(message.error);
+    if (message.frames) {
+      this.tell("frames", null);
+      // The next ones when these are on the screen.
+      requestAnimationFrame(() => this.say({ drawn: true }));
+    }
+  }
+
+  // Ask something of the twin. Resolves to null, or to the reason why not.
+  async ask(command, fields = {}) {
+    this.turned = performance.now();
+    try {
+      const answer = await fetch("/api/command", {
+        method: "POST",
+        headers: { "Content-Type": "application/json" },
+        body: JSON.stringify({ command, ...fields }),
+      });
+      if (answer.ok) return null;
+      const text = await answer.text();
+      return answer.headers.get("content-type")?.includes("json") ? JSON.parse(text).error : text.trim();
+    } catch {
+      return "the twin does not answer";
+    }
+  }
+}
+
+// A frame: the length of its header, the header, times in seconds, and each column around its offset.
+function unpacked(buffer) {
+  const length = new DataView(buffer).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+  const n = header.points;
+  let at = 4 + length;
+  const seconds = new Float64Array(buffer, at, n);
+  at += 8 * n;
+  const columns = [];
+  for (let left = buffer.byteLength - at; left > 0 && n; left -= 4 * n, at += 4 * n)
+    columns.push(new Float32Array(buffer, at, n));
+  return [header, seconds, columns];
+}

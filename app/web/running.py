@@ -1,0 +1,151 @@
+"""A twin that runs, with all around it: engine, recorder, and behind a page's door its scene and what serves it."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..live.dual.refits import Refits
+from ..live.engine import Engine
+from ..together import together
+from ..views.recording.split import NEVER, Split
+from ..views.recording.writer import FINE, Recorder
+from ..views.rerun.rows import RerunRows
+
+if TYPE_CHECKING:
+    from estimators.snapshots import Base
+    from sources.source import Source
+
+    from ..live.workshop import Workshop
+    from ..twin.twin import Twin
+    from .door import Door
+
+
+Stamp = tuple[tuple[int, int] | None, ...]
+"""Of some files: when each was written, ns, and how large it is; None where there is none."""
+
+
+def stamp_of(files: tuple[Path, ...]) -> Stamp:
+    """When each file was written and how large it is; None while an editor has taken it away."""
+    found: list[tuple[int, int] | None] = []
+    for file in files:
+        try:
+            stat = os.stat(file)
+            found.append((stat.st_mtime_ns, stat.st_size))
+        except OSError:
+            found.append(None)
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What is to run: a twin on its source, or a recording of one.
+
+    `open_source`, `base` and `horizon` are those of `Engine`; `review` is the recording that is reviewed, `said` what
+    its session had said, `remarks` what there is to say of it now, (level, text). `files` are those from which the twin
+    was read, `stamp` what they were then, and `again` reads them once more; none of a recording, which holds its own.
+    `workshop` compiles its filters, and stops with the engine.
+    """
+
+    twin: Twin
+    open_source: Callable[[Callable[[str, str], None]], Source]
+    base: Base | None = None
+    horizon: float | None = None
+    review: Path | None = None
+    said: Sequence[tuple[int, str, str]] = ()
+    remarks: Sequence[tuple[str, str]] = ()
+    files: tuple[Path, ...] = ()
+    stamp: Stamp = ()
+    again: Callable[[], Twin] | None = None
+    workshop: Workshop | None = None
+
+
+class RunningTwin:
+    """Starts what a twin needs, in order, and stops it in reverse."""
+
+    def __init__(
+        self, opening: Opening, *, door: Door | None, split: Split = NEVER, recordings: Path | None = None
+    ) -> None:
+        """Put it together; nothing runs yet.
+
+        Args:
+            opening: What to run.
+            door: Behind which the page shows it, once it is started; None for no page.
+            split: Into what parts to split a recording.
+            recordings: The folder of what the page records; None is the working directory.
+
+        Raises:
+            NisusError: If the source cannot be opened.
+        """
+        self.opening = opening
+        self.engine = Engine(
+            opening.twin,
+            opening.open_source,
+            base=opening.base,
+            horizon=opening.horizon,
+            workshop=opening.workshop,
+        )
+        if opening.said:
+            self.engine.notices.restore(list(opening.said))
+        for level, text in opening.remarks:
+            self.engine.notices.say(text, level=level)
+        self.recorder = Recorder(
+            self.engine, lambda stream: RerunRows(stream, self.engine, series=FINE), split, recordings or Path()
+        )
+        self.engine.recorder = self.recorder
+        self.refits = Refits(self.engine)
+        self.view: Any = None
+        self.server: Any = None
+        self.gone: threading.Event | None = None
+        """Set, once this was started, when nobody is connected any more to what the page showed before."""
+        if door is not None:
+            from ..views.viser.view import ViserView
+            from .server import PageServer
+
+            secret = secrets.token_urlsafe(24)
+            try:
+                self.view = ViserView(self.engine, secret=secret)
+                self.server = PageServer(
+                    self.engine,
+                    port=door,
+                    viser_port=self.view.port,
+                    secret=secret,
+                    review=opening.review,
+                    choices=self.view.stage.choices,
+                    refits=self.refits,
+                )
+            except BaseException:
+                self.discard()
+                raise
+
+    def discard(self) -> None:
+        """Give up what was put together and never started."""
+        self.engine.stop()
+        if self.view is not None:
+            self.view.stop()
+
+    def start(self) -> None:
+        """Start everything."""
+        self.recorder.start()
+        if self.server is not None:
+            self.view.start()
+            self.gone = self.server.start()
+        self.engine.start()
+        if self.opening.review is None:
+            # A recording is over; what it had adopted is in it.
+            self.refits.start()
+
+    def stop(self) -> None:
+        """Stop everything; a recording is finished, with the last row that there will be."""
+        self.refits.stop()
+        shown = () if self.server is None else (self.server.stop, self.view.stop)
+        together(self._close_log, *shown)
+
+    def _close_log(self) -> None:
+        self.engine.stop()
+        self.recorder.stop()

@@ -1,0 +1,269 @@
+"""The process that runs twins: one port, one twin at a time, from the start to Ctrl-C."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import sys
+import threading
+import time
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from estimators.errors import SourceError
+
+from ..live.commands import Record
+from ..signals import restore, when_asked_to_end
+from ..stderr import complain
+from ..together import together
+from ..views.recording.split import NEVER, Split
+from .door import Door
+from .open_browser import Opening as BrowserOpening
+from .running import Opening, RunningTwin
+
+if TYPE_CHECKING:
+    from sources.source import Source
+
+    from ..live.engine import Engine
+    from ..twin.twin import Twin
+    from ..views.recording.writer import Recorder
+
+PATIENCE = 3.0
+"""Seconds for the browsers to let go of a twin that was stopped."""
+
+SWITCH = 0.0005
+"""Seconds after which Python lets another thread run; its default of 5 ms is as long as a reading may take in all."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """Where the page is served, and whether to open it."""
+
+    port: int
+    open_browser: bool
+
+
+def _settle(gone: threading.Event | None = None, before: Callable[[], Engine | None] | None = None) -> None:
+    """What a start has built stays: looking through it again and again would hold readings up for milliseconds.
+
+    Not so what ran before, which is garbage once nobody is connected to it any more (`gone`) and the last request to it
+    was answered: `before` gives its engine until then.
+    """
+    end = time.monotonic() + PATIENCE
+    if gone is not None:
+        gone.wait(PATIENCE)
+    gc.unfreeze()
+    gc.collect()
+    while before is not None and before() is not None and time.monotonic() < end:
+        time.sleep(0.05)
+        gc.collect()
+    gc.freeze()
+    if gone is not None:
+        # What is free lies scattered over the arenas of threads that have ended; glibc keeps it unless it is asked.
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).malloc_trim(0)
+
+
+class Beside(Protocol):
+    """A thread of the session."""
+
+    def start(self) -> None:
+        """Begin."""
+
+    def stop(self) -> None:
+        """End."""
+
+
+class Session:
+    """A process: one page, and behind it one twin at a time, or none; `app/web/gallery` changes it.
+
+    `run` and `review` differ in what runs first.
+    """
+
+    def __init__(
+        self,
+        twin: Twin | Opening | None,
+        open_source: Callable[[Callable[[str, str], None]], Source] | None = None,
+        *,
+        page: Page | None,
+        split: Split = NEVER,
+        recordings: Path | None = None,
+    ) -> None:
+        """Put it together; nothing runs yet.
+
+        Args:
+            twin: What to run first; None for nothing.
+            open_source: See `Engine`; of a twin.
+            page: Where to serve the page; None for no page.
+            split: Into what parts to split a recording.
+            recordings: The folder of what the page records; None is the working directory.
+
+        Raises:
+            NisusError: If the source cannot be opened, or the port is in use.
+        """
+        sys.setswitchinterval(SWITCH)
+        self._page, self._split, self._recordings = page, split, recordings
+        self.door: Door | None = None
+        self.running: RunningTwin | None = None
+        self._changing = threading.RLock()
+        self._recorded: list[Path] = []
+        self.beside: list[Beside] = []
+        """What starts and stops with the session."""
+        if page is not None:
+            self.door = Door(page.port)
+        try:
+            if isinstance(twin, Opening):
+                self.running = self.prepared(twin)
+            elif twin is not None and open_source is not None:
+                self.running = self.prepared(Opening(twin, open_source))
+        except BaseException:
+            if self.door is not None:
+                self.door.stop()
+            raise
+
+    @property
+    def engine(self) -> Engine:
+        """That of the twin that runs."""
+        return self._ran.engine
+
+    @property
+    def recorder(self) -> Recorder:
+        """That of the twin that runs."""
+        return self._ran.recorder
+
+    @property
+    def view(self) -> Any:
+        """Its scene; None without a page."""
+        return self._ran.view
+
+    @property
+    def server(self) -> Any:
+        """What serves it; None without a page."""
+        return self._ran.server
+
+    @property
+    def _ran(self) -> RunningTwin:
+        assert self.running is not None, "no twin runs"
+        return self.running
+
+    @property
+    def url(self) -> str | None:
+        """Address of the page, with its token."""
+        return self.door.url if self.door is not None else None
+
+    @property
+    def recorded(self) -> list[Path]:
+        """Files that this session has recorded, wherever they are."""
+        running = self.running
+        return [*self._recorded, *([] if running is None else running.recorder.written)]
+
+    def prepared(self, opening: Opening) -> RunningTwin:
+        """A twin put together, for `change`.
+
+        Raises:
+            NisusError: If its source cannot be opened.
+        """
+        return RunningTwin(opening, door=self.door, split=self._split, recordings=self._recordings)
+
+    def change(self, make: Callable[[], RunningTwin] | None, *, stop_first: bool = False) -> None:
+        """Run another twin in place of the one that runs, or none; from any thread.
+
+        Args:
+            make: Puts it together. If that fails, what runs goes on, unless it had to be stopped first.
+            stop_first: Stop what runs before `make` is called: both would listen to one bus.
+
+        Raises:
+            NisusError: What `make` raises.
+        """
+        with self._changing:
+            before, after, stopped = self.running, None, False
+            left: Callable[[], Engine | None] | None = None
+            try:
+                if make is not None and not stop_first:
+                    after = make()
+                if before is not None:
+                    left = weakref.ref(before.engine)
+                    before.stop()
+                    self._recorded += before.recorder.written
+                stopped = True
+                if make is not None and stop_first:
+                    after = make()
+            finally:
+                # What browsers see until here is the twin that stands still.
+                if stopped:
+                    self.running = after
+                    del before
+                if after is not None:
+                    after.start()
+                    _settle(after.gone, left)
+                elif stopped and self.door is not None:
+                    self.door.show(None)
+
+    def start(self) -> None:
+        """Start everything."""
+        if self.door is not None:
+            self.door.start()
+        if self.running is not None:
+            self.running.start()
+        _settle()
+        for item in self.beside:
+            item.start()
+
+    def stop(self) -> None:
+        """Stop everything; a recording is finished."""
+        for item in self.beside:
+            item.stop()
+        with self._changing:
+            ends = [item.stop for item in (self.running, self.door) if item is not None]
+            together(*ends)
+
+    def _open(self, url: str) -> BrowserOpening | None:
+        """Open the page in a browser; where that cannot be, the printed address is there."""
+        try:
+            opening = BrowserOpening(url)
+        except OSError as error:
+            complain(f"the browser is not opened ({error.strerror}: {error.filename}); open the address above")
+            return None
+        opening.show()
+        return opening
+
+    def run(self, *, record: Path | None, duration: float | None, until_finished: bool) -> None:
+        """Run until interrupted, for `duration` seconds, or (`until_finished`) until the source has ended.
+
+        Raises:
+            NisusError: If the page cannot be served, or, in the end, that `record` could not be written.
+        """
+        done = threading.Event()
+        opening: BrowserOpening | None = None
+        previous = when_asked_to_end(done.set)
+        try:
+            self.start()
+            if record is not None:
+                self.engine.submit(Record(record))
+            if self.url is not None:
+                shown = "the gallery" if self.running is None else self.engine.twin.name
+                print(f"Nisus shows {shown} at\n\n    {self.url}\n\nCtrl-C ends it.", flush=True)
+                assert self._page is not None
+                if self._page.open_browser:
+                    opening = self._open(self.url)
+            end = time.monotonic() + duration if duration is not None else float("inf")
+            while not done.is_set() and time.monotonic() < end:
+                if until_finished and self.engine.status().finished:
+                    break
+                if opening is not None and self.door is not None and self.door.entered.is_set():
+                    opening.close()
+                    opening = None
+                done.wait(min(0.2, max(0.0, end - time.monotonic())))
+        except KeyboardInterrupt:
+            pass
+        finally:
+            if opening is not None:
+                opening.close()
+            self.stop()
+            restore(previous)
+        if record is not None and self.recorder.failure:
+            raise SourceError(self.recorder.failure)

@@ -1,0 +1,73 @@
+"""A NIS is judged alike wherever it is shown: on the strip, of a run, in the diagnosis, in the report."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from app.live.engine import Engine
+from app.live.runs.runs_json import runs_json
+from app.live.runs.scores import RunScores
+from app.present.export.report import Reported, _scores
+from app.studies.analysis.diagnosis import Diagnosis
+from app.web.api import status_json
+from estimators.diagnostics.evidence import no_baseline
+from estimators.diagnostics.score import score
+from tests.app.scripted import MODEL, Scripted, pull_all, readings
+from tests.app.served import shown_twin
+
+READINGS = 40  # fewer than the window of the strip holds, so that all judge the same ones
+BIAS, SCALE, CORRELATION = 0.2, 0.5, 0.6
+
+
+@pytest.fixture(params=[False, True], ids=["not commissioned", "commissioned"])
+def engine(request):
+    twin = shown_twin()
+    if request.param:
+        baseline = no_baseline(MODEL)
+        baseline[:, :3] = BIAS, SCALE, CORRELATION
+        twin.tuning = dataclasses.replace(twin.tuning, baseline=baseline)
+    engine = Engine(twin, lambda report: Scripted())
+    rng = np.random.default_rng(5)
+    engine._accept([readings(0.5 * np.arange(1, READINGS + 1), 40.0 + rng.normal(0, 2.0, READINGS))])
+    return engine
+
+
+def by_hand(engine):
+    """Mean NIS and bounds: chi-square, or as wide as a sum of squares of such an AR(1) series is on average."""
+    nis = pull_all(engine).track.nis.mean()
+    if engine.twin.tuning.baseline is None:
+        return nis, *chi2.ppf([0.025, 0.975], READINGS) / READINGS
+    mean = BIAS**2 + SCALE**2
+    # Σ over all lags of the covariances of e², from those of z² (2 φ^2k) and z (φ^k), k from -∞ to ∞.
+    lags = np.abs(np.arange(-200, 201))
+    variance = np.sum(2 * SCALE**4 * CORRELATION ** (2 * lags) + 4 * BIAS**2 * SCALE**2 * CORRELATION**lags)
+    free = 2 * READINGS * mean**2 / variance
+    return nis, *(mean / free * chi2.ppf([0.025, 0.975], free))
+
+
+def test_one_verdict_in_one_wording(engine):
+    status = status_json(engine)
+    run = runs_json(RunScores(engine), engine)[0]["score"]
+    nis, low, high = by_hand(engine)
+    # The strip's quantiles are between those of whole degrees of freedom, which curve little.
+    assert (status["nis"], status["nis_low"], status["nis_high"]) == pytest.approx((nis, low, high), rel=2e-3)
+    assert (run["nis"], run["nis_low"], run["nis_high"]) == pytest.approx((nis, low, high), rel=1e-6)
+    assert status["nis_judged"] == pytest.approx(run["nis_judged"], rel=1e-9) == pytest.approx(nis, rel=1e-9)
+    place = "below" if nis < low else "above" if nis > high else "inside"
+    commissioned = engine.twin.tuning.baseline is not None
+    expected = f"mean NIS {nis:.3g}, {place} its 95 % bounds {low:.3g} to {high:.3g}"
+    expected += ", as commissioned" if commissioned else ""
+    said = [status["nis_words"], run["nis_words"], Diagnosis(engine)._look()["nis"]]
+    assert said == [expected] * 3
+    assert status["nis_place"] == run["nis_place"] == place == ("above" if commissioned else "inside")
+
+
+def test_the_report_says_the_same(engine):
+    pull, run = pull_all(engine), runs_json(RunScores(engine), engine)[0]["score"]
+    twin = engine.twin
+    found = score(pull.track, pull.events, MODEL, gate=twin.tuning.gate, baseline=twin.tuning.baseline)
+    reported = Reported(twin, "kf", twin.tuning, pull.events, pull.track, (), (), False)
+    (row,) = [row for row in _scores(reported, found).rows if row[0] == "mean NIS"]
+    assert f"mean NIS {run['nis']:.3g}, {row[2]}" == run["nis_words"]

@@ -1,0 +1,92 @@
+"""Who is most likely off, found beside a running twin."""
+
+import time
+
+import numpy as np
+import pytest
+
+from app.live.blame import Blame
+from app.live.integrity import Window, window
+from app.live.notices import Notices
+from estimators.diagnostics.episodes import Episode, episodes
+from estimators.fold import Fold
+from estimators.log import READING, Log
+from estimators.models import MODELS
+from estimators.tuning import Tuning
+from sources.simulation.profile import Constant, Steps
+from sources.simulation.simulator import Simulator
+from tests.support import read_all
+
+MODEL = MODELS["motor_drive"]
+
+
+@pytest.fixture(scope="module")
+def folded():
+    """A minute and a half of a motor whose yoke reads 2 °C too high from a minute on."""
+    inputs = {"i_q": Steps((0.0, 20.0), (60.0, 200.0)), "speed": Constant(250.0), "coolant": Constant(40.0)}
+    log = Log.of(MODEL)
+    log.extend(read_all(Simulator(MODEL, seed=2, step=0.1, duration=90.0, inputs=inputs)))
+    wrong = (log.kind[: log.n] == READING) & (log.channel[: log.n] == MODEL.sensor_names.index("yoke"))
+    log.value[: log.n][wrong & (log.t[: log.n] >= 60 * 10**9), 0] += 2.0
+    fold = Fold("ekf", MODEL, Tuning.of(MODEL), log)
+    fold.advance()
+    return fold
+
+
+def blame_of(fold, known, notices=None):
+    said = notices or Notices(lambda: 0)
+    return Blame(lambda: known, lambda: window(fold, 0), said, every=0.01), said
+
+
+def test_the_sensor_that_is_off_is_named_once_and_in_the_text(folded):
+    (yoke,) = [episode for episode in episodes(folded) if (episode.subject, episode.cause) == ("yoke", "shifted")]
+    blame, notices = blame_of(folded, [yoke])
+    blame.look()
+    blame.look()
+    words = blame.of(yoke)
+    assert words.startswith("sensor yoke +")
+    assert blame.told(yoke).text == f"{yoke.text}; most likely off: {words}"
+    lines = [line.text for line in notices.since(0)]
+    assert lines == [f"yoke: most likely off: {words}"]
+
+
+def test_a_consequence_leads_to_the_sensor_that_is_behind_it(folded):
+    """What tooth shows is explained best by yoke: its episode is the one to look at, while it lasts."""
+    (yoke,) = [episode for episode in episodes(folded) if (episode.subject, episode.cause) == ("yoke", "shifted")]
+    tooth = yoke._replace(subject="tooth", text="tooth reads low")
+    known = [yoke, tooth]
+    blame, _ = blame_of(folded, known)
+    assert blame.behind(tooth) is tooth  # not yet asked
+    blame.look()
+    assert blame.behind(tooth) is yoke and blame.behind(yoke) is yoke
+    known[0] = yoke._replace(end=80.0)
+    assert blame.behind(tooth) is tooth
+
+
+def test_what_is_over_or_no_riddle_is_left_alone(folded):
+    over = Episode(60.0, 70.0, "yoke", "shifted", 1.0, 0.5, 1.5, "σ", "yoke reads high")
+    stuck = Episode(60.0, None, "tooth", "stuck", 41.0, np.nan, np.nan, "°C", "tooth is stuck")
+    blame, notices = blame_of(folded, [over, stuck])
+    blame.look()
+    assert not notices.since(0) and blame.told(over) is over and blame.told(stuck) is stuck
+
+
+def test_an_episode_older_than_the_window_is_not_guessed(folded):
+    old = Episode(60.0, None, "yoke", "shifted", 1.0, 0.5, 1.5, "σ", "yoke reads high")
+    taken = window(folded, 0)
+    late = Window(taken.estimator, taken.tuning, taken.events, taken.base._replace(clock=70 * 10**9), 0)
+    blame = Blame(lambda: [old], lambda: late, Notices(lambda: 0))
+    blame.look()
+    assert blame.of(old) == ""
+
+
+def test_the_thread_asks_and_ends(folded):
+    known = [episode for episode in episodes(folded) if episode.end is None]
+    blame, _ = blame_of(folded, known)
+    blame.start()
+    until = time.monotonic() + 60.0
+    while not any(blame.of(episode) for episode in known):
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    blame.stop()
+    assert not blame._thread.is_alive()

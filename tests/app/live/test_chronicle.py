@@ -1,0 +1,250 @@
+"""The chronicle: whatever order and pieces, its episodes are those of one fold of the log, and each is said once."""
+
+import numpy as np
+import pytest
+
+from app.live import commands
+from app.live.chronicle import Account, Chronicle, Entry
+from app.live.engine import Engine
+from estimators.diagnostics.episodes import Episode, episodes
+from estimators.fold import Fold
+from estimators.log import Log
+from estimators.track import GATED
+from estimators.tuning import Tuning
+from tests.app.scripted import MODEL, Replayed, Scripted, readings, twin, wait_for
+
+N = 1800
+"""Readings, one a second: twice as noisy from the 300th to the 500th, stuck from the 1600th on."""
+
+
+@pytest.fixture(scope="module")
+def asset():
+    rng = np.random.default_rng(7)
+    t = 1.0 + np.arange(N)
+    # As the model has it: an asset that stands still is one for which Q is too large, and that is found too.
+    rate, wander = (rng.normal(0, np.sqrt(noise.variance), N) for noise in reversed(MODEL.noises))
+    truth = 40.0 + np.cumsum(wander + np.cumsum(rate))
+    noise = rng.normal(0, np.sqrt(MODEL.sensors[0].rows[0].variance), N)
+    noise[300:500] *= 2.0
+    y = truth + noise
+    y[1600:] = y[1600]
+    return t, y
+
+
+@pytest.fixture
+def engine():
+    """One whose thread does not run: the tests hand it batches, and let the chronicle look."""
+    return Engine(twin(horizon=1000.0), lambda report: Scripted())
+
+
+def whole(engine):
+    """The episodes of one fold over the engine's log."""
+    log = Log.of(MODEL)
+    log.extend(engine._log.events)
+    fold = Fold("kf", MODEL, engine.tuning, log, pairs=engine.pairs, policy=engine.policy)
+    fold.advance()
+    return episodes(fold)
+
+
+def said(engine):
+    return [line.text for line in engine.notices.since(0)]
+
+
+def same(found, expected):
+    assert [e._replace(low=0, high=0) for e in found] == [e._replace(low=0, high=0) for e in expected]
+    for column in ("low", "high"):
+        np.testing.assert_array_equal([getattr(e, column) for e in found], [getattr(e, column) for e in expected])
+
+
+@pytest.mark.parametrize("piece", [1, 7, 250, N])
+def test_in_pieces_it_is_what_one_fold_says(engine, asset, piece):
+    t, y = asset
+    for start in range(0, N, piece):
+        engine._accept([readings(t[start : start + piece], y[start : start + piece])])
+        if piece > 1 or start % 5 == 0:
+            engine._watchers.chronicle.look()
+    engine._watchers.chronicle.look()
+    expected = whole(engine)
+    assert len(expected) >= 2 and expected[0].end is not None and expected[-1].cause == "stuck"
+    same(engine.episodes(), expected)
+
+
+def test_readings_that_come_late_take_rows_back(engine, asset):
+    t, y = asset
+    late = np.arange(280, 520, 3)
+    prompt = np.setdiff1d(np.arange(600), late)
+    for part in np.array_split(prompt, 12):
+        engine._accept([readings(t[part], y[part])])
+        engine._watchers.chronicle.look()
+    before = engine.episodes()
+    for part in np.array_split(late[::-1], 5):
+        engine._accept([readings(t[part], y[part])])
+        engine._watchers.chronicle.look()
+    same(engine.episodes(), whole(engine))
+    assert before != engine.episodes()
+    assert sum("too narrow" in text for text in said(engine)) == 1
+
+
+def test_each_is_said_once_when_it_begins_and_when_it_is_over(engine, asset):
+    t, y = asset
+    lasted = False
+    for start in range(0, 1580, 8):
+        engine._accept([readings(t[start : start + 8], y[start : start + 8])])
+        engine._watchers.chronicle.look()
+        status = engine.status()
+        engine._status = None
+        if status.episodes_open:
+            lasted = True
+        if 330 <= start < 480:
+            assert status.cause.startswith("bands of winding are too narrow")
+            assert status.sensors["winding"] == ("suspect", status.cause)
+    (first,) = [line for line in engine.notices.since(0) if "too narrow" in line.text]
+    assert first.text.startswith("health: suspect: bands of winding") and first.level == "warn"
+    narrow = engine.episodes()[0]
+    # The test of variance 2.5 needs h = 14.4 nats. A reading of variance 4 gives it 0.3 e² - 0.46 of them, with a mean
+    # of 0.74 and a deviation of 0.3 · 4 √2 = 1.7, so n readings suffice with 95 % where 0.74 n - 1.64 · 1.7 √n = 14.4.
+    assert first.t == engine._log.t[np.flatnonzero(engine._fold.track.alarms.any(axis=1))[0]]
+    assert 0 <= first.t * 1e-9 - narrow.start < 45
+    assert sum(text.startswith("winding: no longer") for text in said(engine)) == 1
+    assert lasted and engine.status().episodes_open == 0 and engine.status().cause == ""
+    assert engine.status().sensors == {"winding": ("tracking", "")}
+
+
+def test_what_began_before_the_rows_that_are_kept_is_carried_on(engine, asset):
+    """200 noisy readings, and at most 128 rows kept: the end falls where the beginning is forgotten."""
+    t, y = asset
+    chronicle, starts = Chronicle(engine, rows=128), set()
+    for start in range(0, 1580, 10):
+        engine._accept([readings(t[start : start + 10], y[start : start + 10])])
+        chronicle.look()
+        if chronicle._tail.first > 337:
+            starts.add(chronicle.account.episodes[0].start)
+    (expected,), (found,) = whole(engine), chronicle.account.episodes
+    # Its onset was sought at the first alarm, less than 64 readings later (see above), when at least 64 were kept. Of
+    # those that are forgotten since then the sums are left, on which the likelihood of each end depends.
+    assert found.subject == expected.subject and starts == {found.start}
+    assert (found.start, found.end) == (expected.start, expected.end)
+    assert chronicle._tail.n <= 128
+
+
+@pytest.mark.parametrize("rows", [65_536, 512], ids=["all rows", "few rows"])
+def test_what_lasts_hides_no_later_loss(engine, rows):
+    """A tenth of the noise that is believed, and from the 600th reading on 500 times the same; also where the beginning
+    of both is forgotten.
+    """
+    rng = np.random.default_rng(3)
+    t = 1.0 + np.arange(N)
+    y = 40.0 + rng.normal(0.0, 0.1 * np.sqrt(MODEL.sensors[0].rows[0].variance), N)
+    y[600:1100] = y[600]
+    chronicle = Chronicle(engine, rows=rows)
+    for start in range(0, N, 20):
+        engine._accept([readings(t[start : start + 20], y[start : start + 20])])
+        chronicle.look()
+        if 800 <= start < 1000:
+            lasting = {entry.key[0]: entry.episode for entry in chronicle.account.lasting}
+            assert {kind: each.cause for kind, each in lasting.items()} == {"sensor": "wide", "lost": "stuck"}
+            assert lasting["lost"].start == pytest.approx(601.0)
+            worst = chronicle.account.leading(dict(winding="degraded"))
+            assert worst is not None and worst.cause == "stuck"
+    wide, stuck = chronicle.account.episodes
+    expected = whole(engine)
+    assert [(each.cause, each.start) for each in (wide, stuck)] == [(each.cause, each.start) for each in expected]
+    assert wide.end is None and stuck.end == pytest.approx(1100.0) == expected[1].end
+    assert chronicle._tail.n <= rows
+    assert sum(text.startswith("winding: no longer stuck") for text in said(engine)) == 1
+
+
+def test_another_revision_begins_anew_and_says_nothing_twice(asset):
+    source = Scripted()
+    engine = Engine(twin(), lambda report: source)
+    engine.start()
+    try:
+        t, y = asset
+        source.put(readings(t[:400], y[:400]))
+        wait_for(lambda: any(episode.end is None for episode in engine.episodes()))
+        wait_for(lambda: any("too narrow" in text for text in said(engine)))
+        # As narrow as before, or nearly.
+        engine.submit(commands.SetTuning("R.winding", 3.0))
+        wait_for(lambda: engine.status().revision == 1)
+        wait_for(lambda: engine.episodes() and not same_as(engine, Tuning.of(MODEL)))
+        same(engine.episodes(), whole(engine))
+        assert sum("too narrow" in text for text in said(engine)) == 1
+        # Wide bands explain the readings: what was open has gone, and is not carried on.
+        engine.submit(commands.SetTuning("R.winding", 100.0))
+        wait_for(lambda: engine.status().revision == 2)
+        wait_for(lambda: all(episode.cause != "narrow" for episode in engine.episodes()))
+        same(engine.episodes(), whole(engine))
+    finally:
+        engine.stop()
+
+
+def same_as(engine, tuning):
+    log = Log.of(MODEL)
+    log.extend(engine._log.events)
+    fold = Fold("kf", MODEL, tuning, log, pairs=engine.pairs, policy=engine.policy)
+    fold.advance()
+    return engine.episodes() == episodes(fold)
+
+
+def test_a_source_that_begins_again_has_a_chronicle_of_its_own(asset):
+    source = Replayed()
+    engine = Engine(twin(), lambda report: source)
+    engine.start()
+    try:
+        t, y = asset
+        source.put(readings(t[:400], y[:400]))
+        wait_for(lambda: any(episode.end is None for episode in engine.episodes()))
+        source.restarts += 1
+        source.put(readings(t[:400], y[:400]))
+        # What lasted in the life before is said again in this one.
+        wait_for(lambda: sum("too narrow" in text for text in said(engine)) == 2)
+        same(engine.episodes(), whole(engine))
+    finally:
+        engine.stop()
+
+
+def test_a_refused_sensor_is_said_once_and_not_reading_by_reading(asset):
+    made = twin()
+    made.tuning = made.tuning.set("gate", 0.99)
+    engine = Engine(made, lambda report: Scripted())
+    t, y = asset
+    moved = y.copy()
+    moved[300:] += 100.0
+    told, refused = [], 0
+    for start in range(0, 600, 10):
+        known = "winding" in engine._watchers.chronicle.account.in_alarm
+        lines = len(engine.notices.since(0))
+        # As if each batch came a second after the one before.
+        engine.notices._last.clear()
+        engine._accept([readings(t[start : start + 10], moved[start : start + 10])])
+        new = [line.text for line in engine.notices.since(lines)]
+        if np.any(engine._fold.track.verdict[-10:] == GATED):
+            refused += known
+            told.append((known, any(text.startswith("winding: reading refused") for text in new)))
+        engine._watchers.chronicle.look()
+    assert refused > 3 and all(line != known for known, line in told)
+    assert sum("is refused by the gate" in text for text in said(engine)) == 1
+
+
+def test_the_cause_is_that_of_a_sensor_that_is_lost_before_that_of_one_that_is_noisy():
+    def entry(kind, name, cause, start):
+        return Entry((kind, name), 0, Episode(start, None, name, cause, 1.0, 0.0, 2.0, "", f"{name} {cause}"))
+
+    noisy, lost = entry("sensor", "a", "wide", 1.0), entry("sensor", "b", "narrow", 2.0)
+    account = Account((noisy.episode, lost.episode), (noisy, lost))
+    # Of two that are as bad the newest, whatever their order.
+    assert account.leading({"a": "suspect", "b": "suspect"}).text == "b narrow"
+    assert Account((), (lost, noisy)).leading({"a": "suspect", "b": "suspect"}).text == "b narrow"
+    assert account.leading({"a": "degraded", "b": "suspect"}).text == "a wide"
+    assert account.leading({"a": "suspect", "b": "degraded"}).text == "b narrow"
+    silent, gone = entry("silence", "c", "silent", 3.0), entry("twin", "diverged", "diverged", 4.0)
+    assert Account((), (noisy, silent)).leading({"a": "suspect", "c": "degraded"}).text == "c silent"
+    assert Account((), (noisy, silent, gone)).leading({"c": "stale"}).text == "diverged diverged"
+    # What a shifted sensor leads to, a state off the truth, does not hide it.
+    shifted, missed = entry("sensor", "a", "shifted", 1.0), entry("truth", "x", "missed", 2.0)
+    assert Account((), (shifted, missed)).leading({"a": "suspect"}).text == "a shifted"
+    assert Account((), (noisy, missed)).leading({"a": "suspect"}).text == "x missed"
+    # A sensor in order again has an episode that lasts until it is certain to be over: the one that is lost leads.
+    assert account.leading({"a": "tracking", "b": "suspect"}).text == "b narrow"
+    assert Account((), (noisy,)).leading({"a": "tracking"}) is noisy.episode
+    assert Account().leading({}) is None

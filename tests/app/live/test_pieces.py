@@ -1,0 +1,72 @@
+"""The lock goes to whoever waits, and pieces of a fold take a moment each."""
+
+import threading
+from types import SimpleNamespace
+
+import pytest
+
+from app.live.pieces import MOMENT, MOST, Pieces
+from app.live.turns import Turns
+from tests.app.scripted import wait_for
+
+
+@pytest.mark.parametrize("cost", [0.0, 1e-6, 1e-3, 3.0])
+def test_a_piece_takes_a_moment_or_is_one_event(cost):
+    now, left, sizes = 0.0, 100_000, []
+
+    def advance(limit):
+        nonlocal now, left
+        count = min(limit, left)
+        now, left = now + count * cost, left - count
+        sizes.append(count)
+        return count
+
+    pieces = Pieces(clock=lambda: now)
+    while len(sizes) < 200 and pieces.advance(SimpleNamespace(advance=advance)):
+        pass
+    # Those that did not take an eighth of a moment are followed by four times as many: half of one at most.
+    assert max(sizes) == 1 or max(sizes) * cost <= MOMENT
+    assert max(sizes) <= MOST and (left == 0 or cost > 1e-6)
+    assert sizes[0] == 1
+
+
+def test_a_fold_that_became_dear_is_folded_in_smaller_pieces():
+    now, cost = 0.0, 0.0
+
+    def advance(limit):
+        nonlocal now
+        now += limit * cost
+        return limit
+
+    pieces, fold = Pieces(clock=lambda: now), SimpleNamespace(advance=advance)
+    while pieces.size < MOST:
+        pieces.advance(fold)
+    cost = 1e-3
+    pieces.advance(fold)
+    assert pieces.size * cost <= MOMENT
+
+
+def test_who_waits_comes_before_who_has_just_been_there():
+    turns, order = Turns(), []
+
+    def wait():
+        with turns:
+            order.append("waited")
+
+    turns.acquire()
+    waiting = threading.Thread(target=wait, daemon=True)
+    waiting.start()
+    wait_for(turns._door.locked)
+    turns.release()
+    with turns:
+        order.append("again")
+    waiting.join()
+    assert order == ["waited", "again"]
+
+
+def test_whoever_waits_in_vain_leaves_the_door_to_others():
+    turns = Turns()
+    turns.acquire()
+    assert not turns.acquire(timeout=0.001)
+    turns.release()
+    assert turns.acquire(timeout=0.001)

@@ -1,0 +1,194 @@
+"""A model whose f never returns from some state: signals end the program, and the page names the function."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+
+import app.live.stall
+from app.live.refolder import Refolder
+from app.live.stall import LONG, PATIENCE, Stall, unanswered
+from app.views.recording.reader import finished, read_recording
+from tests.app.scripted import wait_for
+from tests.conftest import ROOT
+
+MODEL = """
+from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
+
+
+def f(x, u, p, dt, out):
+    while x[0] > 50.0 and dt > 0.0:
+        pass
+    out[0] = x[0]
+
+
+def h(x, u, p, out):
+    out[0] = x[0]
+
+
+Looping = StateSpaceModel(
+    name="looping",
+    title="A model whose f loops above 50",
+    states=(State("x", "1", mean=1.0, std=1.0),),
+    noises=(Noise("x", "1", variance=1.0),),
+    sensors=(Sensor("s", (Row("s", "1", variance=1e-4),), h=h),),
+    f=f,
+)
+"""
+TWIN = """
+model: ./looping.py:Looping
+estimator: {estimator}
+gate: null
+source:
+  type: table
+  files: log.csv
+  time: {{column: t, unit: s}}
+  sensors:
+    s: {{columns: s}}
+"""
+
+
+@pytest.fixture
+def looping(tmp_path):
+    """looping(estimator): a twin of 20 readings within 2 s, of which the eleventh leads where f loops."""
+
+    def write(estimator="ekf"):
+        (tmp_path / "looping.py").write_text(MODEL)
+        (tmp_path / "looping.yaml").write_text(TWIN.format(estimator=estimator))
+        values = [1.0] * 10 + [100.0] * 10
+        rows = "".join(f"{0.1 * k:.1f},{value}\n" for k, value in enumerate(values))
+        (tmp_path / "log.csv").write_text(f"t,s\n{rows}")
+        return tmp_path / "looping.yaml"
+
+    return write
+
+
+class Child:
+    """A command of its own process, whose lines on standard error are kept."""
+
+    def __init__(self, *words):
+        self.lines = []
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "app.cli.main", *map(str, words)],
+            cwd=ROOT,
+            stderr=subprocess.PIPE,
+            # A shell that starts the tests in the background has its children ignore Ctrl-C.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+            stdout=subprocess.DEVNULL,
+            text=True,
+        )
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self):
+        self.lines.extend(self.process.stderr)
+
+    def said(self, text):
+        return [line for line in self.lines if text in line]
+
+
+@pytest.mark.parametrize(("name", "estimator"), [("SIGINT", "ekf"), ("SIGTERM", "ukf")])
+def test_a_run_whose_f_loops_says_so_and_ends_when_asked(name, estimator, looping, tmp_path):
+    path = tmp_path / "run.rrd"
+    child = Child("run", looping(estimator), "--headless", "--record", path, "--duration", "600")
+    try:
+        wait_for(lambda: child.said("has not returned") or child.process.poll() is not None, 180.0)
+        (line,) = child.said("has not returned")
+        where = MODEL.splitlines().index("def f(x, u, p, dt, out):") + 1
+        assert (
+            f"looping.py:{where}: model looping: f(x, u, dt) at x = [" in line and "nothing more is estimated" in line
+        )
+        os.kill(child.process.pid, getattr(signal, name))
+        assert child.process.wait(60.0) == 0
+    finally:
+        child.process.kill()
+    recorded = read_recording(path)
+    assert finished(path) and recorded.rows == 11
+    assert any("has not returned" in text for _, _, text in recorded.notices)
+
+
+def test_a_fold_whose_f_loops_says_so_and_ends_when_asked(looping):
+    child = Child("fold", looping())
+    try:
+        wait_for(lambda: child.said("has not returned") or child.process.poll() is not None, 180.0)
+        assert "f(x, u, dt) at x = [" in child.said("has not returned")[0]
+        os.kill(child.process.pid, signal.SIGINT)
+        assert child.process.wait(60.0) == 130
+    finally:
+        child.process.kill()
+
+
+class Work:
+    """Stands for a fold; its model's questions are those given."""
+
+    class model:  # noqa: N801
+        black_box = False
+
+    def __init__(self, *questions):
+        self.questions = questions
+
+
+@pytest.fixture
+def asked_of_work(monkeypatch):
+    monkeypatch.setattr(app.live.stall, "questions_of", lambda work: iter(work.questions))
+
+
+def test_work_that_takes_long_is_named_only_if_a_question_is_not_answered(asked_of_work):
+    now, said, leave = 0.0, [], threading.Event()
+    stall = Stall(lambda text, level: said.append((level, text)), clock=lambda: now)
+    with stall.watched(Work(("f", lambda: None), ("h", lambda: None))):
+        now = PATIENCE + 1.0
+        stall.look()
+        assert stall.text is None
+        now = LONG + 1.0
+        stall.look()
+        assert stall.text is not None and stall.text.startswith("a fold has not returned for 61 s; ")
+    stall.look()
+    assert stall.text is None and [level for level, _ in said] == ["error", "info"]
+    with stall.watched(Work(("f", lambda: None), ("h at x", leave.wait), ("never asked", lambda: None))):
+        now += PATIENCE - 0.1
+        stall.look()
+        assert stall.text is None
+        now += 0.2
+        stall.look()
+        assert stall.text is not None and stall.text.startswith("h at x has not returned for 3 s; ")
+    leave.set()
+
+
+def test_questions_are_asked_until_one_is_not_answered():
+    asked, leave = [], threading.Event()
+    questions = [(str(k), lambda k=k: asked.append(k)) for k in range(5)]
+    assert unanswered(questions, 30.0) is None and asked == [0, 1, 2, 3, 4]
+    assert unanswered([*questions, ("loop", leave.wait), ("after", lambda: asked.append("after"))], 0.2) == "loop"
+    leave.set()
+    assert np.all(np.array(asked[:10]) == [*range(5)] * 2)
+
+
+def test_a_refold_that_never_returns_is_given_up_and_the_next_one_made(monkeypatch, asked_of_work):
+    monkeypatch.setattr(app.live.stall, "PATIENCE", 0.0)
+    monkeypatch.setattr(app.live.stall, "ANSWER", 0.1)
+    leave, answers = threading.Event(), []
+    stuck = Work(("f at x", leave.wait))
+    stuck.advance = lambda limit: leave.wait()
+    good = Work()
+    good.advance = lambda limit: 0
+    refolder = Refolder(answers.append)
+    refolder.start()
+    try:
+        refolder.request(1, lambda: stuck)
+        wait_for(lambda: answers)
+        assert (answers[0].ticket, answers[0].fold) == (1, None)
+        assert answers[0].error.startswith("f at x has not returned for ") and "what ran before" in answers[0].error
+        refolder.request(2, lambda: good)
+        wait_for(lambda: len(answers) == 2)
+        assert (answers[1].ticket, answers[1].fold, answers[1].error) == (2, good, "")
+        leave.set()
+        refolder.request(3, lambda: good)
+        wait_for(lambda: len(answers) == 3)
+        assert [answer.ticket for answer in answers] == [1, 2, 3]
+    finally:
+        leave.set()
+        refolder.stop()

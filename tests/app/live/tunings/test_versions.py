@@ -1,0 +1,245 @@
+"""Tuning versions: kept, listed, applied, accepted, named in what comes out; and what is wrong with one is said."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+
+from app.cli.arguments import Fold, Tunings
+from app.cli.fold import fold_twin, read_log
+from app.cli.main import main
+from app.cli.opener import recorded_twin
+from app.cli.tunings import tunings_of
+from app.live.tunings.keep import Settings, accept, keep, version_text
+from app.twin.twin import load_twin
+from app.views.recording.reader import read_recording
+from config.loader import TWINS, shipped
+from config.tunings import accepted_version, find_version, folders, load_version, version_files
+from estimators.errors import ConfigError
+from estimators.registry import ESTIMATORS
+
+
+@pytest.fixture
+def own(tmp_path):
+    """A twin of one's own: a copy of one that ships, which is linear and small."""
+    path = tmp_path / "winding.yaml"
+    shutil.copy(TWINS / "motor_winding.yaml", path)
+    return path
+
+
+def same(a, b):
+    for name in ("q", "r", "p", "used", "baseline"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    assert (a.gate, a.gate_kind, a.reopen, a.seed) == (b.gate, b.gate_kind, b.reopen, b.seed)
+
+
+def applied(twin, tmp_path, estimator, tuning, **more):
+    path = tmp_path / "tried.yaml"
+    path.write_text(version_text(twin, Settings(estimator, tuning, **more)), encoding="utf-8")
+    return load_twin(twin.path, overrides={"tuning": str(path)})
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_a_twin_that_ships_comes_back(name, tmp_path):
+    twin = load_twin(name)
+    back = applied(twin, tmp_path, twin.estimator, twin.tuning)
+    assert back.estimator == twin.estimator and back.tuning.name == "tried"
+    same(back.tuning, twin.tuning)
+    np.testing.assert_array_equal(back.model.prior_mean, twin.model.prior_mean)
+    for other in ESTIMATORS:
+        assert back.options_of(other) == twin.options_of(other)
+    assert back.config == twin.config.model_copy(
+        update={key: getattr(back.config, key) for key in ("parameters", "noise", "sensors", "estimator", "gate")}
+    )
+
+
+def test_what_was_turned_comes_back(tmp_path):
+    twin = load_twin("motor_can", overrides={"sensors.yoke.range": "[-40, 180]"})
+    tuning = twin.tuning.set("Q.winding", 1e-7).set("R.yoke", 0.1 + 0.2).set("use.tooth", False).set("gate", 0.99)
+    tuning = tuning.set("gate.kind", "soft").set("gate.reopen", None).set("p.iron_magnet", 0.31)
+    tuning = tuning.with_options({"adapt": 1.0, "memory": 50.0})
+    prior = {"magnet": {"mean": 55.0, "std": 2.0}}
+    back = applied(twin, tmp_path, "ekf", tuning, prior=prior)
+    same(back.tuning, tuning)
+    entry = ESTIMATORS["ekf"]
+    assert entry.complete(dict(back.tuning.options)) == entry.complete(dict(tuning.options))
+    magnet = back.model.state_names.index("magnet")
+    assert (back.model.prior_mean[magnet], back.model.prior_std[magnet]) == (55.0, 2.0)
+
+
+def test_what_a_version_does_not_say_stays_the_twins(own):
+    """A limit that was added after the version was kept holds with it."""
+    twin = load_twin(own)
+    path = keep(twin, "quiet", version_text(twin, Settings("kf", twin.tuning.set("R.winding", 0.5))))
+    own.write_text(own.read_text().replace("winding: {variance: 4}", "winding: {variance: 4, range: [0, 200]}"))
+    back = load_twin(own, overrides={"tuning": "quiet"})
+    assert path == own.with_name("winding.tunings") / "quiet.yaml"
+    assert back.tuning.get("R.winding") == 0.5 and back.config.sensors["winding"].range == ((0.0, 200.0),)
+
+
+def test_the_asset_stays_as_it_is(own):
+    """A simulator draws from the noise that the twin's file believes; what a version assumes is no other asset."""
+    twin = load_twin(own)
+    keep(twin, "quiet", version_text(twin, Settings("kf", twin.tuning.set("R.winding", 0.5).set("Q.rate", 1.0))))
+    said = [read_log(load_twin(own, overrides={"tuning": name}), None)[0] for name in ("own", "quiet")]
+    for a, b in zip(*(log.events for log in said), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_another_filter_and_no_options(tmp_path):
+    """The options of the file's own filter are kept for it; a version without options has none."""
+    twin = load_twin("lorenz63")
+    other = applied(twin, tmp_path, "ekf", twin.tuning.with_options({}))
+    assert other.estimator == "ekf" and dict(other.tuning.options) == {}
+    assert other.options_of(twin.estimator) == twin.options_of(twin.estimator)
+    bare = applied(twin, tmp_path, twin.estimator, twin.tuning.with_options({}))
+    assert dict(bare.tuning.options) == {}
+
+
+def test_the_command_line_has_the_last_word(own):
+    twin = load_twin(own)
+    keep(twin, "quiet", version_text(twin, Settings("kf", twin.tuning.set("R.winding", 0.5))))
+    for key, value in (("R.winding", 3.0), ("sensors.winding.variance", 3.0)):
+        back = load_twin(own, overrides={"tuning": "quiet", key: str(value)})
+        assert back.tuning.get("R.winding") == value and back.tuning.name == "quiet*"
+    assert load_twin(own, overrides={"tuning": "own"}).tuning.name == "own"
+    assert load_twin(own).tuning.set("R.winding", 3.0).set("R.winding", 4.0).name == "own*"
+
+
+def test_kept_listed_compared_accepted(own, capsys):
+    assert main(["tunings", str(own), "--save", "quiet", "--set", "R.winding=0.5", "--note", "a ‘quieter’ sensor"]) == 0
+    with pytest.raises(ConfigError, match=r"quiet\.yaml: there is a version of that name; choose another name"):
+        tunings_of(Tunings(str(own), save="quiet"))
+    tunings_of(Tunings(str(own), save="loud", set=("R.winding=9",)))
+    capsys.readouterr()
+    tunings_of(Tunings(str(own), json=True))
+    listed = {item["name"]: item for item in json.loads(capsys.readouterr().out)}
+    assert set(listed) == {"own", "quiet", "loud"}
+    assert listed["own"]["holds"] and listed["quiet"]["note"] == "a ‘quieter’ sensor"
+    # What the fold says of itself.
+    fold_twin(Fold(str(own), tuning="quiet", json=True))
+    told = json.loads(capsys.readouterr().out)
+    assert told["tuning"] == "quiet"
+    scores = listed["quiet"]["scores"]
+    assert scores["nis"] == pytest.approx(told["nis"]["mean"], rel=1e-7)
+    assert scores["rmse.temperature"] == pytest.approx(told["rmse"]["temperature"], rel=1e-7)
+    assert scores["coverage.rate"] == pytest.approx(told["coverage"]["rate"], rel=1e-7)
+    assert scores["log_likelihood"] * told["nis"]["n"] == pytest.approx(told["log_likelihood"], rel=1e-7)
+
+    tunings_of(Tunings(str(own), ("quiet", "loud"), json=True))
+    compared = json.loads(capsys.readouterr().out)
+    assert compared["entries"] == [{"key": "R.winding", "values": [0.5, 9.0]}]
+    assert accepted_version(own) is None
+    before = find_version(own, "quiet")
+    tunings_of(Tunings(str(own), accept="quiet", note="it is"))
+    version = accepted_version(own)
+    assert version.name == "quiet" and version.head.accepted.note == "it is"
+    assert version.head.model_copy(update={"accepted": None}) == before.head
+    assert {**version.data, "version": 0} == {**before.data, "version": 0}
+    tunings_of(Tunings(str(own)))
+    assert "quiet *" in capsys.readouterr().out
+
+
+def test_the_last_that_was_accepted_holds(own, monkeypatch):
+    twin = load_twin(own)
+    for k, name in enumerate(("b", "a")):
+        path = keep(twin, name, version_text(twin, Settings("kf", twin.tuning)))
+        monkeypatch.setattr("app.live.tunings.keep.now", lambda k=k: f"2026-11-2{k}T00:00:00Z")
+        accept(load_version(path), "")
+    assert accepted_version(own).name == "a"
+
+
+def test_versions_of_a_twin_that_ships_go_to_the_users_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    twin = load_twin("motor_winding")
+    path = keep(twin, "quiet", version_text(twin, Settings("kf", twin.tuning)))
+    assert path == tmp_path / "nisus" / "tunings" / "motor_winding" / "quiet.yaml"
+    assert version_files(twin.path)["quiet"] == path and folders(twin.path)[1].parent.name == "tunings"
+
+
+def test_the_name_is_in_every_row_and_recording(own, tmp_path):
+    text = own.read_text()
+    twin = load_twin(own)
+    tuning = replace(twin.tuning.set("Q.rate", 1e-4))
+    normal = "commissioned:\n  winding: {bias: 0.25}\n"
+    keep(twin, "tried", version_text(twin, Settings("kf", tuning, prior={"rate": {"std": 0.7}})) + normal)
+    fold_twin(Fold(str(own), tuning="tried", out=tmp_path / "a.parquet"))
+    assert set(pyarrow.parquet.read_table(tmp_path / "a.parquet").column("tuning").to_pylist()) == {"tried"}
+    fold_twin(Fold(str(own), tuning="tried", out=tmp_path / "a.rrd"))
+    # The recording holds the version whole: it is reviewed when that is gone.
+    shutil.rmtree(folders(own)[0])
+    back = recorded_twin(read_recording(tmp_path / "a.rrd"))
+    assert back.tuning.name == "tried" and back.text == text
+    assert back.model.prior_std[back.model.state_names.index("rate")] == 0.7
+    assert back.tuning.baseline[0, 0] == 0.25
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("rate: {variance", "ratee: {variance"), r"tried\.yaml:11: noise\.ratee is no noise .* did you mean rate\?"),
+        (("variance: 0.001", "varianc: 0.001"), r"tried\.yaml:11: noise\.rate\.varianc is not known; did you mean v"),
+        (
+            ("variance: 4,", "variance: -4,"),
+            r"tried\.yaml:13: sensors\.winding\.variance.* is -4; it must be zero",
+        ),
+        (("winding: {variance", "yoke: {variance"), r"tried\.yaml:13: sensors\.yoke is no sensor"),
+        (("estimator: kf", "estimator: kff"), r"tried\.yaml:8: .*kff.*did you mean kf"),
+        (("gate: null", "gate: 2"), r"tried\.yaml:14: gate.* is 2; it must be below 1"),
+        (
+            ("model: motor_winding", "model: motor_drive"),
+            r"tried\.yaml:4: version\.model is 'motor_drive'; the model",
+        ),
+        (("  saved:", "  save:"), r"tried\.yaml:5: version\.save is not known; did you mean saved"),
+        (("version:", "versio:"), r"tried\.yaml:2: versio is not known; did you mean version"),
+    ],
+)
+def test_what_is_wrong_is_said_with_its_line(own, change, said):
+    twin = load_twin(own)
+    given = Settings("kf", twin.tuning, note="tried", scores={"nis": 1.0})
+    text = version_text(twin, given)
+    assert change[0] in text
+    folder = folders(own)[0]
+    folder.mkdir()
+    (folder / "tried.yaml").write_text(text.replace(change[0], change[1], 1), encoding="utf-8")
+    with pytest.raises(ConfigError, match=said):
+        load_twin(own, overrides={"tuning": "tried"})
+
+
+@pytest.mark.parametrize(
+    ("text", "said"), [("", r":1: the file is empty; a tuning version"), ("- 1\n", r":1: the file is \[1\]; a tuning")]
+)
+def test_what_is_no_version_is_said(tmp_path, text, said):
+    path = tmp_path / "tried.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=said):
+        load_version(path)
+
+
+def test_a_version_that_is_not_there(own, tmp_path):
+    twin = load_twin(own)
+    keep(twin, "quiet", version_text(twin, Settings("kf", twin.tuning)))
+    with pytest.raises(ConfigError, match=r"--tuning quite: winding has no such version; did you mean quiet; see"):
+        load_twin(own, overrides={"tuning": "quite"})
+    with pytest.raises(ConfigError, match=r"no\.yaml: there is no such file; check the path, or see `nisus tunings"):
+        load_twin(own, overrides={"tuning": str(tmp_path / "no.yaml")})
+
+
+@pytest.mark.parametrize("name", ["own", "", "a/b", ".a", "a b", "x" * 61, "a.yaml"])
+def test_a_name_that_is_none(own, name):
+    twin = load_twin(own)
+    with pytest.raises(ConfigError, match="the version's name is"):
+        keep(twin, name, version_text(twin, Settings("kf", twin.tuning)))
+
+
+def test_one_that_cannot_be_read_is_listed_beneath_the_others(own, capsys):
+    assert main(["tunings", str(own), "--save", "good"]) == 0
+    (folders(own)[0] / "bad.yaml").write_text("- 1\n")
+    capsys.readouterr()
+    tunings_of(Tunings(str(own)))
+    table, beneath = capsys.readouterr().out.split("Cannot be read")
+    assert [line.split()[0] for line in table.splitlines()[-3:-1]] == ["own", "good"]
+    assert "bad.yaml:1: the file is [1]; a tuning version is a mapping" in " ".join(beneath.split())

@@ -1,0 +1,364 @@
+"""Recordings of long sessions: edits add no copies, parts stand for themselves, nothing is written over or through."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections import namedtuple
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+import app.views.recording.disk
+import app.views.recording.writer
+from app.cli.main import main
+from app.live import commands
+from app.live.engine import Engine
+from app.views.recording.format import tuning_from_json
+from app.views.recording.reader import finished, read_recording
+from app.views.recording.split import NEVER, Split, parse_split
+from app.views.recording.writer import Recorder
+from app.web.api import command_from_json
+from estimators.errors import ConfigError
+from estimators.fold import Fold
+from estimators.log import Log
+from sources.memory import MemorySource
+from tests.app.scripted import MODEL, Scripted, pull_all, readings, twin, wait_for
+from tests.conftest import ROOT
+from tests.support import assert_same
+
+COUNT = 6000
+TIMES = np.arange(1, COUNT + 1) * 0.01
+VALUES = 40 + np.random.default_rng(3).normal(size=COUNT)
+
+
+@pytest.fixture
+def start(monkeypatch):
+    """start(estimator, ...): an engine with its source and recorder, and the pulls that its charts were given."""
+    monkeypatch.setattr(app.views.recording.writer, "PERIOD", 0.01)
+    monkeypatch.setattr(app.views.recording.writer, "CHARTS", 0.02)
+    monkeypatch.setattr(app.views.recording.writer, "REST", 0.02)
+    running = []
+
+    def start(estimator="kf", split=NEVER, **options):
+        source, drawn = Scripted(), []
+        engine = Engine(twin(estimator=estimator, **options), lambda report: source)
+        engine.recorder = Recorder(engine, lambda stream: drawn.append, split)
+        engine.recorder.start()
+        engine.start()
+        running.append(engine)
+        return source, engine, drawn
+
+    yield start
+    for engine in running:
+        engine.stop()
+        engine.recorder.stop()
+
+
+def end_of(engine):
+    pull = pull_all(engine)
+    return pull.first + len(pull.events)
+
+
+def recorded_to(engine):
+    part = engine.recorder._open
+    return part._events.next if part is not None else 0
+
+
+def feed(source, engine, start, stop, step=200, late=()):
+    """Put readings, and let the recorder follow; those that are late come after the piece in which they belong."""
+    for begin in range(start, stop, step):
+        piece = np.arange(begin, min(stop, begin + step))
+        for part in (np.setdiff1d(piece, late), np.intersect1d(piece, late)):
+            if part.size:
+                source.put(readings(TIMES[part], VALUES[part]))
+        wait_for(lambda stop=piece[-1] + 1: end_of(engine) == stop)
+        wait_for(lambda stop=piece[-1] + 1: engine.recorder.path is None or recorded_to(engine) >= stop)
+
+
+def edit(engine, key, value):
+    revision = engine._revision
+    engine.submit(commands.SetTuning(key, value))
+    wait_for(lambda: engine._revision > revision)
+
+
+def stop_recording(engine):
+    count = len(engine.notices.since(0))
+    engine.submit(commands.Record(None))
+    wait_for(lambda: any(line.text.startswith("recorded ") for line in engine.notices.since(count)))
+
+
+def refold(recorded):
+    """The recorded readings through the fold, as a review does it."""
+    tuning, estimator = tuning_from_json(recorded.tuning, MODEL)
+    log = Log(MODEL.width)
+    log.first = recorded.first
+    log.extend(recorded.events)
+    fold = Fold(estimator, MODEL, tuning, log, pairs=np.array([[0, 1]]), base=recorded.base)
+    fold.advance()
+    return fold.track
+
+
+def reviewed(recorded):
+    """The track of an engine that folds the recorded readings, as a review's does."""
+    tuning, estimator = tuning_from_json(recorded.tuning, MODEL)
+    made = twin(estimator=estimator)
+    made.tuning = tuning
+    engine = Engine(made, lambda report: MemorySource(recorded.events), base=recorded.base, horizon=np.inf)
+    engine.start()
+    try:
+        wait_for(lambda: engine.status().finished)
+        return pull_all(engine).track
+    finally:
+        engine.stop()
+
+
+def written(path, entity="/nisus/events"):
+    """How many rows of an entity a file holds, those written anew included."""
+    with pytest.warns(match="no footer"):
+        reader = RrdReader(str(path))
+    return sum(chunk.num_rows for chunk in reader.stream() if chunk.entity_path == entity)
+
+
+def test_edits_add_their_tunings_and_one_drawing_of_the_history(start, tmp_path):
+    source, engine, drawn = start()
+    path = tmp_path / "run.rrd"
+    engine.submit(commands.Record(path))
+    feed(source, engine, 0, 2000)
+    wait_for(lambda: sum(len(pull.events) for pull in drawn) == 2000)
+    for k in range(8):
+        edit(engine, "Q.rate", 0.01 + 0.001 * k)
+        feed(source, engine, 2000 + 100 * k, 2100 + 100 * k)
+    seen = pull_all(engine)
+    stop_recording(engine)
+    assert written(path) == 2800
+    assert sum(len(pull.events) for pull in drawn) == 2 * 2800
+    # Before the end the charts went on; at the end came the last revision's, from the first row on.
+    again = [k for k, pull in enumerate(drawn) if pull.fresh]
+    assert len(again) == 2 and again[0] == 0
+    assert drawn[again[1]].first == 0 and sum(len(pull.events) for pull in drawn[again[1] :]) == 2800
+    np.testing.assert_array_equal(np.concatenate([pull.track.mean for pull in drawn[again[1] :]]), seen.track.mean)
+    recorded = read_recording(path)
+    assert recorded.tunings == 9
+    assert_same(refold(recorded), seen.track)
+
+
+@pytest.mark.parametrize("estimator", ["kf", "pf"])
+def test_parts_fold_by_themselves_to_the_same_bits(estimator, start, tmp_path):
+    """Also where a late reading belongs before the part begins, and after an edit within the last one."""
+    source, engine, _ = start(estimator, split=Split(size=50_000))
+    path = tmp_path / "run.rrd"
+    engine.submit(commands.Record(path))
+    wait_for(lambda: engine.recorder.path == path)
+    feed(source, engine, 0, 5400, late=range(150, 5400, 200))
+    first = pull_all(engine)
+    edit(engine, "Q.rate", 0.013)
+    feed(source, engine, 5400, COUNT)
+    last = pull_all(engine)
+    stop_recording(engine)
+    assert not engine.recorder.failure
+    parts = engine.recorder.finished
+    assert parts[:3] == [path, tmp_path / "run-2.rrd", tmp_path / "run-3.rrd"]
+    assert [part for part in parts if not finished(part)] == []
+    reached = 0
+    for part in parts:
+        recorded = read_recording(part)
+        assert recorded.first <= reached
+        seen = last if tuning_from_json(recorded.tuning, MODEL)[0].get("Q.rate") == 0.013 else first
+        begin, end = reached, recorded.first + recorded.rows
+        again = refold(recorded).select(slice(begin - recorded.first, None))
+        assert_same(again, seen.track.select(slice(begin, end)))
+        np.testing.assert_array_equal(recorded.events.t, last.events.t[recorded.first : end])
+        reached = end
+    assert reached == COUNT and seen is last
+
+
+def test_an_edit_while_a_part_is_begun_reviews_to_the_same_bits(start, tmp_path):
+    """Where the part starts was copied from the revision before, which is gone when its rows are written."""
+    source, engine, drawn = start(split=Split(size=50_000))
+
+    def draw(stream):
+        if len(engine.recorder.finished) == 2:
+            edit(engine, "Q.rate", 0.013)
+        return drawn.append
+
+    engine.recorder._draw = draw
+    path = tmp_path / "run.rrd"
+    engine.submit(commands.Record(path))
+    wait_for(lambda: engine.recorder.path == path)
+    feed(source, engine, 0, COUNT)
+    last = pull_all(engine)
+    stop_recording(engine)
+    third = read_recording(engine.recorder.finished[2])
+    assert engine._revision == 1 and third.first > 0
+    end = third.first + third.rows
+    # What health and age at the start look back at is in the part before.
+    assert_same(refold(third).select(slice(1000, None)), last.track.select(slice(third.first + 1000, end)))
+
+
+@pytest.mark.parametrize("estimator", ["kf", "pf"])
+def test_a_session_that_forgot_its_oldest_events_reviews_to_the_same_bits(estimator, start, tmp_path):
+    """The history is folded again from what the forgotten events left, and random numbers go by a row's own index."""
+    source, engine, _ = start(estimator, history=2048)
+    path = tmp_path / "run.rrd"
+    feed(source, engine, 0, 5400, step=100)
+    assert pull_all(engine).first > 0
+    engine.submit(commands.Record(path))
+    wait_for(lambda: engine.recorder.path == path)
+    feed(source, engine, 5400, 5600)
+    stop_recording(engine)
+    seen = pull_all(engine)
+    recorded = read_recording(path)
+    assert recorded.first == seen.first
+    # Health and age at the start look back at rows that are forgotten.
+    begin = recorded.rows - 1000
+    for track in (refold(recorded), reviewed(recorded)):
+        assert_same(track.select(slice(begin, None)), seen.track.select(slice(begin, None)))
+
+
+@pytest.mark.parametrize("estimator", ["kf", "pf"])
+def test_an_edit_after_events_were_forgotten_reviews_to_the_same_bits(estimator, start, tmp_path):
+    source, engine, _ = start(estimator, history=2048)
+    path = tmp_path / "run.rrd"
+    engine.submit(commands.Record(path))
+    feed(source, engine, 0, 5600, step=100)
+    assert pull_all(engine).first > 0
+    edit(engine, "Q.rate", 0.013)
+    feed(source, engine, 5600, 5700)
+    stop_recording(engine)
+    seen, recorded = pull_all(engine), read_recording(path)
+    assert_same(refold(recorded), seen.track)
+
+
+def test_a_link_that_leads_nowhere_is_not_followed(start, tmp_path, monkeypatch, capsys):
+    source, engine, _ = start()
+    target, link = tmp_path / "elsewhere.rrd", tmp_path / "run.rrd"
+    link.symlink_to(target)
+    engine.submit(commands.Record(link))
+    wait_for(lambda: any("is there already" in line.text for line in engine.notices.since(0)))
+    assert engine.recorder.path is None
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="is there already"):
+        command_from_json({"command": "Record", "path": "run.rrd"}, engine)
+    assert main(["run", "motor_winding", "--headless", "--record", str(link)]) == 2
+    assert "is there already" in capsys.readouterr().err
+    assert not target.exists() and link.is_symlink()
+
+
+def test_what_is_there_is_not_written_over_also_from_the_panel(start, tmp_path):
+    source, engine, _ = start()
+    path = tmp_path / "yesterday.rrd"
+    path.write_bytes(b"yesterday")
+    engine.submit(commands.Record(path))
+    wait_for(lambda: any(line.level == "error" for line in engine.notices.since(0)))
+    assert path.read_bytes() == b"yesterday"
+
+
+Usage = namedtuple("Usage", "total used free")
+
+
+def test_a_disk_that_fills_is_warned_of_and_the_recording_closed_in_time(start, tmp_path, monkeypatch):
+    free = 10**12
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(2 * 10**12, 0, free))
+    source, engine, _ = start()
+    path = tmp_path / "run.rrd"
+    engine.submit(commands.Record(path))
+    feed(source, engine, 0, 1000)
+    assert not any(line.level != "info" for line in engine.notices.since(0))
+    free = app.views.recording.disk.RESERVE + 500_000_000
+    wait_for(lambda: any("has room for 500 MB more" in line.text for line in engine.notices.since(0)))
+    assert engine.recorder.path == path
+    feed(source, engine, 1000, 1400)
+    free = app.views.recording.disk.RESERVE - 1
+    wait_for(lambda: engine.recorder.failure)
+    assert engine.recorder.failure.startswith(f"recording failed: {path}: the disk is nearly full; ")
+    texts = [line.text for line in engine.notices.since(0) if line.level != "info"]
+    assert len(texts) == 2 and texts[1] == engine.recorder.failure
+    recorded = read_recording(path)
+    assert recorded.closed and recorded.rows == 1400
+    assert_same(refold(recorded), pull_all(engine).track)
+    feed(source, engine, 1400, 1500)  # the twin goes on
+
+
+def test_a_fast_growing_file_is_warned_of_by_its_rate(tmp_path, monkeypatch):
+    now, free = 0.0, app.views.recording.disk.RESERVE + 9 * 10**9
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(0, 0, free))
+    disk = app.views.recording.disk.Disk(tmp_path, clock=lambda: now)
+    assert disk.warning(10**9) is None
+    now = app.views.recording.disk.SETTLED + 40.0
+    assert disk.warning(10**9 + 10**9 // 2) is None  # 5 MB/s fill 9 GB in 1800 s
+    now = app.views.recording.disk.SETTLED + 60.0
+    line = disk.warning(10**9 + 12 * 10**8)  # 10 MB/s in 900 s
+    assert line is not None and "9000 MB more, which lasts for about 15 min" in line
+    assert disk.warning(10**9 + 13 * 10**8) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "split"),
+    [
+        ("1GB", Split(size=1e9)),
+        ("500 mb", Split(size=5e8)),
+        ("10min", Split(seconds=600.0)),
+        ("1.5h", Split(seconds=5400.0)),
+    ],
+)
+def test_a_split_is_a_size_or_a_time(text, split):
+    assert parse_split(text) == split
+
+
+@pytest.mark.parametrize("text", ["", "10", "GB", "-1GB", "1PB", "1kB", "0s", "inf s", "1e3MB", "9" * 400 + "GB"])
+def test_what_is_no_split_is_one_line(text, capsys):
+    assert main(["run", "motor_winding", "--headless", "--record", "x.rrd", f"--record-split={text}"]) == 2
+    said = capsys.readouterr().err
+    assert "must be a size of 100kB or more" in said and said.count("\n") == 1
+
+
+GROWTH = """
+import sys
+sys.path.insert(0, {root!r})
+import numpy as np
+from pathlib import Path
+from app.live.outputs import Pull
+from app.views.recording.format import RecordingFile
+from estimators.log import READING, Events
+from estimators.track import Track
+def resident():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+file = RecordingFile(Path({path!r}), name="x", text="", twin_path=Path("x.yaml"), base=None)
+rows, width = 4, 24
+track = Track.allocate(rows, 2, 1, width)
+for k in range(7000):
+    t = np.arange(rows * k, rows * (k + 1))
+    events = Events(t, t, np.zeros(rows, np.int8), np.zeros(rows, np.int32), np.random.rand(rows, width))
+    file.write(Pull(0, k == 0, rows * k, events, track))
+    file.flush()
+    if k == 1000:
+        before = resident()
+print(resident() - before)
+file.close()
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_memory_does_not_grow_with_what_was_written(tmp_path):
+    """6000 writes are those of forty minutes; Rerun's own sink keeps 2 kB of each for the footer."""
+    code = GROWTH.format(root=str(ROOT), path=str(tmp_path / "x.rrd"))
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(child.stdout) < 2_000_000
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no SIGHUP here")
+@pytest.mark.parametrize("name", ["SIGHUP", "SIGTERM"])
+def test_a_terminal_that_closes_leaves_a_whole_recording(name, tmp_path):
+    path = tmp_path / "run.rrd"
+    words = ["run", "motor_winding", "--headless", "--record", str(path)]
+    child = subprocess.Popen([sys.executable, "-m", "app.cli.main", *words], cwd=ROOT)
+    try:
+        wait_for(lambda: path.exists() and path.stat().st_size > 2000, 120.0)
+        os.kill(child.pid, getattr(signal, name))
+        assert child.wait(60.0) == 0
+    finally:
+        child.kill()
+    assert finished(path) and read_recording(path).rows > 0

@@ -1,0 +1,176 @@
+"""Viser's own window in headless Chromium: what is drawn, and what a hand on the controls makes the engine do."""
+
+import numpy as np
+import pytest
+
+from app.live.commands import Reset, SetEstimator, SetTuning
+from app.live.engine import Engine
+from app.views.viser.camera import place
+from app.views.viser.private_viser import HEADER
+from app.views.viser.view import ViserView
+from estimators.log import READING, TRUTH, Events
+from estimators.models import MODELS
+from estimators.track import TRACKING
+from tests.app.fake_engine import FakeEngine, events
+from tests.app.live.test_reset import JUMP, RESET_AT, asset, stubborn
+from tests.app.scripted import Scripted, readings, wait_for
+from tests.app.served import shown_twin
+
+pytestmark = pytest.mark.browser
+
+WINDING = MODELS["motor_winding"]
+CHARTS = "Object.values(window.__viserTestpoints?.uplots ?? {}).map(item => item.chart)"
+
+
+@pytest.fixture
+def engine():
+    engine = FakeEngine(WINDING, "kf")
+    rng = np.random.default_rng(3)
+    t = 1.0 + np.arange(60)
+    truth = 40.0 + 0.1 * t
+    parts = [events(WINDING, READING, 0, t, truth + rng.normal(0, 2, 60)), events(WINDING, TRUTH, 0, t, truth)]
+    both = Events.concat(parts, WINDING.width)
+    engine.put(both.select(np.argsort(both.t, kind="stable")))
+    return engine
+
+
+@pytest.fixture
+def view(engine):
+    view = ViserView(engine, secret="s3cret")
+    view.start()
+    yield view
+    view.stop()
+
+
+@pytest.fixture
+def page(browser, view):
+    context = browser.new_context(viewport={"width": 900, "height": 1000}, extra_http_headers={HEADER: "s3cret"})
+    page = context.new_page()
+    page.set_default_timeout(60_000)
+    errors = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto(f"http://127.0.0.1:{view.port}/")
+    # The chart is drawn: uPlot found a range and holds the readings.
+    page.wait_for_function(f"{CHARTS}.length === 1 && {CHARTS}[0].data[0].length >= 30")
+    # It has the data before it has a size.
+    page.wait_for_function(f"{CHARTS}.every(chart => chart.ctx.canvas.width > 0)")
+    yield page
+    context.close()
+    assert errors == []
+
+
+def inputs(page):
+    """What the fields of the panel show now."""
+    return page.evaluate("[...document.querySelectorAll('input')].map(input => input.value)")
+
+
+def test_the_chart_is_drawn_with_band_and_line(page):
+    low, high = page.evaluate(f"(() => {{ const y = {CHARTS}[0].scales.y; return [y.min, y.max]; }})()")
+    assert low <= 0.0 and 1.3 < high < 20.0
+    colours = page.evaluate(
+        f"""(() => {{
+            const canvas = {CHARTS}[0].ctx.canvas;
+            const data = {CHARTS}[0].ctx.getImageData(0, 0, canvas.width, canvas.height).data;
+            const count = {{estimate: 0, band: 0}};
+            for (let i = 0; i < data.length; i += 4) {{
+                const [r, g, b, a] = data.slice(i, i + 4);
+                if (a > 200 && b > 180 && r < 60) count.estimate++;
+                if (a > 30 && a < 90 && Math.abs(r - b) < 60) count.band++;
+            }}
+            return count;
+        }})()"""
+    )
+    assert colours["estimate"] > 100 and colours["band"] > 1000
+
+
+def test_typed_variance_reaches_the_engine(page, engine):
+    field = page.locator("input[value='0.01']")
+    field.fill("0.5")
+    wait_for(lambda: engine.commands)
+    assert engine.commands == [SetTuning("Q.temperature", 0.5)]
+    page.get_by_text("revision 1").wait_for()
+
+
+def test_a_chosen_axis_is_drawn_and_the_other_takes_its_place(page, view):
+    before = view.stage.scene
+    page.get_by_role("combobox", name="x", exact=True).click()
+    page.get_by_role("option", name="rate", exact=True).click()
+    wait_for(lambda: view.stage.scene is not before)
+    assert [axis.state for axis in view.stage.scene.axes] == [1, 0]
+    wait_for(lambda: view.panel.choices["y"].handle.value == "temperature")
+
+
+def test_each_pane_gets_a_camera_that_fills_it(page, view):
+    """A pane that grows higher moves its camera; one whose user turns it is left alone."""
+    (client,) = view.server.get_clients().values()
+    wait_for(lambda: np.allclose(client.camera.position, place(view.stage.scene.outlook, client.camera.aspect)[0]))
+    wide = client.camera.position.copy()
+    page.set_viewport_size({"width": 600, "height": 1000})
+    wait_for(lambda: np.linalg.norm(client.camera.position) > 1.3 * np.linalg.norm(wide))
+    page.mouse.move(100, 500)
+    page.mouse.wheel(0, -400)
+    fitted = place(view.stage.scene.outlook, client.camera.aspect)[0]
+    wait_for(lambda: np.linalg.norm(client.camera.position) < 0.98 * np.linalg.norm(fitted))
+
+
+def test_dragged_slider_reaches_the_engine(page, engine):
+    thumb = page.get_by_role("slider").first
+    box = thumb.bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    for step in range(1, 31):
+        page.mouse.move(x + 2 * step, y)
+    page.mouse.up()
+    # More commands may come while this one is looked at: what counts is where engine and panel come to agree.
+    wait_for(lambda: engine.status().tuning.get("Q.temperature") > 0.05)
+    wait_for(lambda: f"{engine.status().tuning.get('Q.temperature'):.4g}" in inputs(page))
+    assert all(isinstance(command, SetTuning) and command.key == "Q.temperature" for command in engine.commands)
+
+
+def test_chosen_estimator_reaches_the_engine(page, engine):
+    page.get_by_role("combobox", name="Estimator").click()
+    page.get_by_role("option", name="Unscented Kalman filter", exact=True).click()
+    wait_for(lambda: engine.commands)
+    assert engine.commands == [SetEstimator("ukf")]
+    page.get_by_text("revision 1").wait_for()
+
+
+def test_two_browsers_show_the_same(page, browser, view, engine):
+    other = browser.new_context(viewport={"width": 900, "height": 1000}, extra_http_headers={HEADER: "s3cret"})
+    second = other.new_page()
+    second.goto(f"http://127.0.0.1:{view.port}/")
+    second.wait_for_function(f"{CHARTS}.length === 1 && {CHARTS}[0].data[0].length >= 30")
+    engine.submit(SetTuning("R.winding", 0.25))
+    for one in (page, second):
+        one.wait_for_function("[...document.querySelectorAll('input')].some(input => input.value === '0.25')")
+    other.close()
+    assert engine.commands == [SetTuning("R.winding", 0.25)]
+
+
+def test_a_lost_filter_says_since_when_and_what_to_do(browser):
+    made, plain = stubborn("kf"), shown_twin()
+    made.config = plain.config
+    source = Scripted()
+    engine = Engine(made, lambda report: source)
+    view = ViserView(engine, secret="s3cret")
+    engine.start()
+    view.start()
+    context = browser.new_context(viewport={"width": 900, "height": 1000}, extra_http_headers={HEADER: "s3cret"})
+    try:
+        t, y = asset(RESET_AT + 10)
+        source.put(readings(t[:RESET_AT], y[:RESET_AT]))
+        page = context.new_page()
+        page.set_default_timeout(60_000)
+        page.goto(f"http://127.0.0.1:{view.port}/")
+        # The 26th refused reading is more than half of the last fifty.
+        page.get_by_text(f"diverged since {JUMP + 25}.0 s").wait_for()
+        page.get_by_text("winding contradicts it still: look at the sensor, and Reset").wait_for()
+        engine.submit(Reset())
+        page.get_by_text("tracking", exact=False).first.wait_for()
+        assert engine.status().health == TRACKING
+        assert page.get_by_text("diverged since").count() == 0 and page.get_by_text("Reset where").count() == 0
+    finally:
+        context.close()
+        view.stop()
+        engine.stop()

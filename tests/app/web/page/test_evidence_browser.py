@@ -1,0 +1,167 @@
+"""What the page says of a sensor that is held out, of R where the innovations are correlated, and of many states."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from app.cli.run import live_source
+from app.live.commands import SetTuning
+from app.twin.twin import load_twin
+from app.web.session import Page, Session
+from tests.app.scripted import pull_all, wait_for
+from tests.app.web.page.browsed import PATIENCE, until
+from tests.app.web.page.test_quiet_browser import lanes
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture
+def shown(browser, request):
+    """Runs a twin to its end and opens its page."""
+    opened = []
+
+    def show(name, **overrides):
+        twin = load_twin(name, overrides=overrides)
+        session = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
+        session.start()
+        opened.append(session)
+        wait_for(lambda: session.engine.status().finished, PATIENCE)
+        page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
+        page.set_default_timeout(PATIENCE * 1000)
+        page.goto(session.url)
+        until(page, "window.nisus?.drawn > 0")
+        return page, session
+
+    yield show
+    for session in opened:
+        session.stop()
+
+
+def test_a_sensor_that_is_held_out_is_not_passed_over_in_silence(shown):
+    fault = "[{kind: bias, sensor: yoke, size: 6, start: 100}]"
+    page, session = shown("motor_joint", **{"source.duration": "200.0", "faults": fault})
+    page.get_by_role("tab", name="Episodes").click()
+    page.get_by_text("Now (").wait_for()
+    session.engine.submit(SetTuning("use.yoke", False))
+    page.get_by_text("Now: nothing is wrong with the sensors in use").wait_for()
+    text = session.engine.status().sensors["yoke"][1]
+    assert re.fullmatch(r"yoke, held out, reads [\d.]+ °C above what the others say, beyond the .* leave open", text)
+    page.locator("#episodes .held-out").get_by_text(text, exact=True).wait_for()
+    until(
+        page,
+        f"[...document.querySelectorAll('#lights .light')].some((light) => light.title.includes({json.dumps(text)}))",
+    )
+
+
+def test_where_the_innovations_are_correlated_no_value_of_r_is_offered_and_it_says_why(shown):
+    """The same page with and without a doubt: the mark takes the value, or gives the reason and takes none."""
+    page, session = shown("motor_joint", **{"source.duration": "100.0"})
+    doubt = "the innovations are correlated (+0.86 with the next, where chance allows ±0.03): look elsewhere"
+    told = {
+        key: {"value": 0.5, "std": 0.01, "n": 900, "doubt": doubt if key == "R.yoke" else ""}
+        for key in ("R.yoke", "R.tooth")
+    }
+    q = {"key": "Q", "revision": 0, "level": 0.3, "done": True, "points": [], "doubt": doubt}
+    body = {"revision": 0, "R": told, "reason": "", "Q": q}
+    page.route("**/api/noise", lambda route: route.fulfill(json=body))
+    page.reload()
+    mark = page.locator('[data-key="R.yoke"] .data-says')
+    until(page, """document.querySelector('[data-key="R.yoke"] .data-says')?.textContent === "◇" """)
+    assert mark.get_attribute("title") == f"No value from the data: {doubt}"
+    before = session.engine.revisions.runs[-1].number
+    mark.click(force=True)
+    # Another one, of which nothing speaks against it, is taken: then the first would have been, too.
+    page.locator('[data-key="R.tooth"] .data-says').click(force=True)
+    wait_for(lambda: session.engine.revisions.runs[-1].number > before, PATIENCE)
+    assert session.engine.tuning.get("R.tooth") == 0.5 and session.engine.tuning.get("R.yoke") != 0.5
+    assert page.locator("#scale-Q").is_disabled() and doubt in page.locator("#scale-Q").get_attribute("title")
+    page.locator('[data-key="R.yoke"] label').click()
+    curve = page.locator('[data-key="R.yoke"] .around')
+    until(page, """document.querySelector('[data-key="R.yoke"] .around')?.dataset.done === "true" """)
+    assert curve.locator(".takes").inner_text() == doubt and curve.locator(".takes button:not([hidden])").count() == 0
+
+
+def test_many_states_of_a_kind_are_one_chart_in_which_the_odd_one_stands_out(shown):
+    page, session = shown("battery_pack", **{"source.duration": "600"})
+    until(page, "window.nisus.charts.live.x.length > 0")
+    keys = [key for key, _ in page.evaluate("window.nisus.charts.layout.shown()")]
+    assert keys[:3] == ["group:soc", "group:v1", "group:temperature"] and not [key for key in keys if "state:" in key]
+    wanted = {column for column in lanes(session)["charts"] if column.startswith(("mean:", "upper:"))}
+    states = [state.name for state in session.engine.model.shown_states]
+    assert wanted == {f"mean:{name}" for name in states}  # and none of the bands of charts that are hidden
+    last = pull_all(session.engine).track.mean[-1]
+    soc = {name: last[k] for k, name in enumerate(states) if name.startswith("soc")}
+    lowest, highest = min(soc, key=soc.get), max(soc, key=soc.get)
+    assert lowest == "soc_5"  # the weak cell
+    text = page.locator("#charts article").first.locator(".reading").inner_text()
+    low, median, high = (float(number) for number in re.findall(r"(?<=[ ])(\d\.\d+)", text))
+    assert text.startswith(lowest.replace("_", " ")) and highest.replace("_", " ") in text
+    assert (low, median, high) == pytest.approx(
+        (soc[lowest], float(np.median(list(soc.values()))), soc[highest]), abs=1e-4
+    )
+    strong = page.evaluate("window.nisus.charts.charts[0].data.at(-1).at(-1)")
+    assert strong == pytest.approx(soc[lowest], rel=1e-6)
+    # The band is that of the strong one alone, and no other is asked for.
+    until(page, "window.nisus.charts.strong.edges('soc_5')[0].length > 0")
+    assert {column for column in lanes(session)["strong"] if "soc" in column} == {"upper:soc_5", "lower:soc_5"}
+    upper, lower = page.evaluate("window.nisus.charts.strong.edges('soc_5').map((values) => values.at(-1))")
+    half = 2 * pull_all(session.engine).track.std[-1, states.index("soc_5")]
+    assert (upper, lower) == pytest.approx((soc[lowest] + half, soc[lowest] - half), rel=1e-5)
+    blue = page.evaluate(
+        """() => {
+            const { plot, what } = window.nisus.charts.charts[0];
+            const { ctx, bbox } = plot;
+            const [x] = plot.data;
+            const middle = x[Math.floor(0.7 * x.length)];
+            const { x: times } = window.nisus.charts.strong.lane;
+            const at = times.findLastIndex((time) => time <= middle);
+            const lower = window.nisus.charts.strong.edges("soc_5")[1][at]; // beneath it there is no other line
+            const strong = what.data().at(-1)[Math.floor(0.7 * x.length)];
+            const left = plot.valToPos(middle, "x", true);
+            const place = (value) => ctx.getImageData(left, plot.valToPos(value, "y", true), 1, 1).data;
+            const [inside, outside] = [(lower + strong) / 2, lower - (strong - lower) / 2].map(place);
+            return [inside[2] - inside[0], outside[2] - outside[0]];
+        }"""
+    )
+    assert blue[0] > blue[1] + 15
+    # Each of them can be had.
+    page.get_by_text("Shown", exact=True).click()
+    page.locator("#layout li").filter(has_text="soc 5").first.get_by_role("checkbox").check()
+    wait_for(lambda: "upper:soc_5" in lanes(session)["charts"], PATIENCE)
+
+
+def test_a_dozen_states_and_more_are_a_picture_of_space_and_time(shown):
+    page, session = shown("lorenz96", **{"source.duration": "20"})
+    until(page, "window.nisus.charts.live.x.length > 100")
+    assert page.evaluate("window.nisus.charts.layout.shown()[0][0]") == "group:x"
+    pixels = page.evaluate(
+        """async () => {
+            const { groups, live } = window.nisus.charts;
+            const image = new Image();
+            image.src = groups[0].image().url;
+            await image.decode();
+            const canvas = document.createElement("canvas");
+            [canvas.width, canvas.height] = [image.width, image.height];
+            const context = canvas.getContext("2d");
+            context.drawImage(image, 0, 0);
+            const { data } = context.getImageData(image.width - 1, 0, 1, image.height);
+            const values = groups[0].columns.map((name) => live.column(name).at(-1));
+            return [[...data], values, image.width === live.x.length];
+        }"""
+    )
+    data, values, wide = pixels
+    assert wide and len(values) == 40
+    np.testing.assert_allclose(values, pull_all(session.engine).track.mean[-1], rtol=1e-5, atol=1e-6)
+    light = np.array(data).reshape(-1, 4)[::-1, :3].sum(axis=1)  # the first state below
+    # The scale goes from dark to light: lightness has the order of the values.
+    assert np.all(np.diff(light[np.argsort(values)]) >= 0)
+    # Beneath it how far they are apart, and how sure the estimate is of one.
+    assert page.evaluate("window.nisus.charts.layout.shown()[1][0]") == "spread:x"
+    until(page, "window.nisus.charts.charts[1].data[3].at(-1) !== null")
+    rows = page.evaluate("window.nisus.charts.charts[1].data.slice(1).map((values) => values.at(-1))")
+    track = pull_all(session.engine).track
+    mean, half = track.mean[-1].mean(), 2 * np.sqrt(np.mean(track.std[-1] ** 2))
+    expected = (track.mean[-1].max(), track.mean[-1].min(), mean + half, mean - half, mean)
+    np.testing.assert_allclose(rows, expected, rtol=1e-4, atol=1e-4)

@@ -1,0 +1,255 @@
+"""The gallery in headless Chromium: choose, switch and come back, two browsers in step, recordings, files dropped."""
+
+import base64
+
+import numpy as np
+import pytest
+
+from app.live.commands import Record
+from app.views.recording.reader import read_recording
+from tests.app.scripted import pull_all, wait_for
+from tests.app.web.gallery.opened import opened
+from tests.app.web.page.browsed import PATIENCE, until
+from tests.app.web.page.test_page import drawn
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture
+def visit(browser):
+    """Opens a page of a session; fails if one asked a stranger for anything, or an exception was raised in it."""
+    pages, wrong = [], []
+
+    def visit(session):
+        page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
+        page.set_default_timeout(PATIENCE * 1000)
+        names = [f"http://{name}:{session.session.door.port}/" for name in ("127.0.0.1", "localhost")]
+        own = (*names, "blob:", "data:")
+        page.on("request", lambda request: None if request.url.startswith(own) else wrong.append(request.url))
+        page.on("pageerror", lambda error: wrong.append(f"{error} {error.stack}"))
+        page.goto(session.session.url)
+        pages.append(page)
+        return page
+
+    yield visit
+    for page in pages:
+        page.context.close()
+    assert [line for line in wrong if "tel.rerun.io" not in line] == []
+
+
+def shows(page, twin):
+    """A twin's page, with charts that draw."""
+    until(page, f"window.nisus?.model?.twin === '{twin}' && window.nisus.drawn > 0")
+
+
+def card(page, name):
+    return page.locator(f"[data-name='{name}']")
+
+
+def test_two_browsers_start_switch_and_come_back(browser, visit, tmp_path):
+    with opened(tmp_path / "recordings") as session:
+        first, second = visit(session), visit(session)
+        address = first.url
+        for page in (first, second):
+            page.get_by_text("How do I know that my filter works?").wait_for()
+            until(
+                page, "document.querySelectorAll('.picture svg').length === document.querySelectorAll('.card').length"
+            )
+        # Found by a word of what it teaches, and started.
+        first.keyboard.press("/")
+        first.keyboard.type("thermometer kalman")
+        assert first.locator(".card:visible").count() == 1
+        card(first, "motor_winding").get_by_role("button", name="Start").click()
+        for page in (first, second):
+            shows(page, "motor_winding")
+            assert page.url == address
+        wait_for(lambda: drawn(first, "#charts")["estimate"] > 200, PATIENCE)
+
+        # Back to the gallery while it goes on; the other browser stays where it is.
+        first.keyboard.press("g")
+        first.get_by_text("motor_winding runs").wait_for()
+        assert first.url.endswith("/gallery") and second.url == address
+        before = session.engine.status().counts["readings"]
+        wait_for(lambda: session.engine.status().counts["readings"] > before, PATIENCE)
+        card(first, "motor_winding").get_by_role("button", name="Back to").click()
+        shows(first, "motor_winding")
+
+        # Another one, by the palette: both are taken along, and the engine of the first is still.
+        left = session.engine
+        first.locator("#others").click()
+        until(first, "window.nisus?.cards > 0")
+        first.keyboard.press("Control+k")
+        first.keyboard.type("start motor_can")
+        first.keyboard.press("Enter")
+        for page in (first, second):
+            shows(page, "motor_can")
+            assert page.url == address
+        rows = left.status().counts["readings"]
+        wait_for(lambda: drawn(second, "#charts")["reading"] > 30, PATIENCE)
+        assert left.status().counts["readings"] == rows
+        second.frame_locator("#stage").locator("canvas").first.wait_for()
+
+        # What fails is said where it was asked, and what runs goes on.
+        until(first, "window.nisus.link.status.twin === 'motor_can'")
+        first.evaluate("location.assign('/gallery')")
+        first.get_by_role("button", name="Stop").wait_for()
+        session.post("/api/gallery/recordings/open", {"name": "gone.rrd"})
+        first.get_by_role("button", name="Stop").click()
+        for page in (first, second):
+            page.get_by_text("How do I know that my filter works?").wait_for()
+            wait_for(lambda page=page: page.locator("#now").inner_text() == "", PATIENCE)
+        assert session.state()["running"] is None
+
+
+def test_a_twin_that_lacks_its_data_is_grey_and_says_how_to_get_it(visit, tmp_path, monkeypatch):
+    monkeypatch.setenv("NISUS_DATA", str(tmp_path))
+    with opened(tmp_path / "recordings") as session:
+        page = visit(session)
+        card(page, "road_car").wait_for()
+        assert card(page, "road_car").get_attribute("data-ready") == "false"
+        assert card(page, "road_car").get_by_role("button").count() == 0
+        card(page, "road_car").get_by_text("how to get it").click()
+        assert "csselectronics" in card(page, "road_car").inner_text().lower().replace("-", "")
+
+
+def test_a_mistake_in_a_file_is_on_the_page_until_it_is_mended(visit, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    yaml = tmp_path / "pump.yaml"
+    good = (
+        "model: motor_winding\nsensors:\n  winding: {variance: 4}\nestimator: kf\n"
+        "source: {type: simulator, step: 0.1, sensors: {winding: {every: 1}}}\n"
+    )
+    yaml.write_text(good)
+    with opened(tmp_path / "recordings", yaml) as session:
+        page = visit(session)
+        shows(page, "pump")
+        yaml.write_text(good.replace("variance: 4", "variance: -44"))
+        page.locator("#unread").wait_for()
+        assert page.locator("#unread").inner_text().startswith("pump.yaml:3: ")
+        yaml.write_text(good.replace("variance: 4", "variance: 400"))
+        page.locator("#unread").wait_for(state="hidden")
+        until(page, "window.nisus.revision === 1")
+        field = page.get_by_label("winding, value")
+        wait_for(lambda: field.input_value() == "400", PATIENCE)
+        # That is what is configured now: nothing is turned.
+        wait_for(lambda: page.locator("[data-key='R.winding'][data-turned]").count() == 0, PATIENCE)
+        # Saved with another shape, it is started anew, which the page says.
+        yaml.write_text(good.replace("step: 0.1", "step: 0.05"))
+        page.get_by_role("tab", name="Episodes").click()
+        wait_for(lambda: "started anew" in page.locator("body").inner_text(), PATIENCE)
+
+
+DROP = """([name, data, target]) => {
+  const bytes = Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
+  const moved = new DataTransfer();
+  moved.items.add(new File([bytes], name));
+  for (const type of ["dragenter", "dragover", "drop"])
+    document.querySelector(target).dispatchEvent(
+      new DragEvent(type, {bubbles: true, cancelable: true, dataTransfer: moved}));
+}"""
+
+
+def drop(page, name, data, target="body"):
+    page.evaluate(DROP, [name, base64.b64encode(data).decode(), target])
+
+
+def test_record_review_drop_and_delete(visit, tmp_path):
+    folder = tmp_path / "recordings"
+    with opened(folder, "motor_winding", speed=1e6) as session:
+        page = visit(session)
+        shows(page, "motor_winding")
+        wait_for(lambda: session.engine.status().finished, PATIENCE)
+        page.keyboard.press("r")
+        until(page, "window.nisus.link.status.recording !== null")
+        page.keyboard.press("r")
+        wait_for(lambda: session.session.recorder.finished, PATIENCE)
+        (path,) = folder.glob("motor_winding-*.rrd")
+        live = pull_all(session.engine)
+        page.keyboard.press("g")
+        row = page.locator(f".file[data-name='{path.name}']")
+        row.get_by_text("motor_winding · ").wait_for()
+        row.get_by_text("RMSE temperature 1.04 °C").wait_for()
+        with page.expect_download() as download:
+            row.get_by_label(f"Download {path.name}").click()
+        assert download.value.path().read_bytes() == path.read_bytes()
+
+        # Open is review: the same page, the same bits.
+        row.locator(".name").click()
+        until(page, "window.nisus?.link?.status.began_as === 'recorded'")
+        wait_for(lambda: session.engine.status().finished, PATIENCE)
+        np.testing.assert_array_equal(pull_all(session.engine).track.mean, live.track.mean)
+        wait_for(lambda: drawn(page, "#charts")["estimate"] > 200, PATIENCE)
+
+        # Dropped on a twin's page it is kept under a name of its own, and opens.
+        drop(page, path.name, path.read_bytes())
+        kept = folder / path.name.replace(".rrd", "-2.rrd")
+        wait_for(lambda: session.state()["running"]["title"] == kept.name, PATIENCE)
+        assert kept.read_bytes() == path.read_bytes() and read_recording(kept).name == "motor_winding"
+        until(page, f"window.nisus?.link?.boot === '{session.settled()['boot']}' && window.nisus.drawn > 0")
+        drop(page, "broken.rrd", b"RRF2 and no more")
+        page.locator("#toast[data-wrong=true]").wait_for()
+        assert "broken.rrd" in page.locator("#toast").inner_text()
+        assert session.state()["running"]["title"] == kept.name
+
+        # A log asks which twin; one that is dropped on a card does not.
+        page.keyboard.press("g")
+        card(page, "motor_winding").wait_for()
+        drop(page, "drive.csv", b"t,T\n0,1\n")
+        page.get_by_role("dialog").get_by_role("button", name="motor_bench Traction").wait_for()
+        page.get_by_role("button", name="Cancel").click()
+        drop(page, "other.csv", b"t,T\n0,1\n", "[data-name=motor_bench] h2")
+        page.locator("#failed").wait_for()
+        wait_for(lambda: "other.csv" in page.locator("#failed").inner_text(), PATIENCE)
+
+        # Delete asks first.
+        row = page.locator(".file[data-name='drive.csv']")
+        row.get_by_label("Delete drive.csv").click()
+        page.get_by_role("button", name="Keep").click()
+        assert (folder / "drive.csv").exists()
+        row.get_by_label("Delete drive.csv").click()
+        page.get_by_role("button", name="Delete for good").click()
+        row.wait_for(state="detached")
+        assert not (folder / "drive.csv").exists() and (folder / "other.csv").exists() and path.exists()
+
+
+def test_a_link_of_another_twin_offers_to_start_it_and_goes_to_its_moment(visit, tmp_path):
+    moment = "#twin=motor_joint&from=1970-01-01T00:00:05Z&span=10"
+    with opened(tmp_path / "recordings", "motor_winding") as session:
+        page = visit(session)
+        shows(page, "motor_winding")
+        page.evaluate(f"location.hash = '{moment}'")
+        page.locator("#toast").get_by_text("the link is of motor_joint; motor_winding runs here").wait_for()
+        page.get_by_role("button", name="Stay with motor_winding").click()
+        until(page, "document.getElementById('toast').hidden && location.hash === ''")
+        page.evaluate(f"location.hash = '{moment}'")
+        page.get_by_role("button", name="Start motor_joint").click()
+        shows(page, "motor_joint")
+        assert session.state()["running"]["name"] == "motor_joint"
+        until(page, "window.nisus.charts.range[0] === 5 && window.nisus.charts.range[1] === 15")
+        # One that is unknown here is no offer.
+        page.evaluate("location.hash = '#twin=elsewhere&from=1970-01-01T00:00:05Z&span=10'")
+        page.locator("#toast").get_by_text("No twin of that name can be started here").wait_for()
+        assert page.locator("#toast button").count() == 0
+
+        # Where nothing runs the gallery has the offer; the name of a card starts it, too.
+        session.post("/api/gallery/stop", {})
+        until(page, "window.nisus?.cards > 0")
+        page.goto(f"{page.url.split('#')[0].rstrip('/')}/gallery{moment}")
+        page.get_by_text("The link is of motor_joint: start it to go there").wait_for()
+        card(page, "motor_joint").get_by_role("button", name="motor_joint", exact=True).click()
+        shows(page, "motor_joint")
+        until(page, "window.nisus.charts.range[0] === 5")
+
+
+def test_what_is_recorded_is_named_in_the_bar(visit, tmp_path):
+    with opened(tmp_path / "recordings", "motor_winding") as session:
+        page = visit(session)
+        shows(page, "motor_winding")
+        assert page.locator("#recording").is_hidden()
+        session.engine.submit(Record(tmp_path / "evidence.rrd"))
+        page.locator("#recording").get_by_text("evidence.rrd").wait_for()
+        title = f"Recording evidence.rrd into {tmp_path}"
+        assert page.locator("#recording").get_attribute("title") == title
+        assert page.locator("#record").get_attribute("title") == f"{title}: end it (R)"
+        session.engine.submit(Record(None))
+        until(page, "document.getElementById('recording').hidden")

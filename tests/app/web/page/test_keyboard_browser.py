@@ -1,0 +1,156 @@
+"""In headless Chromium: all that can be done is reached by the keyboard and has a name, and all text can be read."""
+
+import re
+
+import pytest
+
+from app.cli.run import live_source
+from app.twin.twin import load_twin
+from app.web.session import Page, Session
+from tests.app.scripted import wait_for
+from tests.app.web.page.browsed import PATIENCE, until
+from tests.app.web.page.test_colours import TEXT, contrast, over
+
+pytestmark = pytest.mark.browser
+
+SIZE = {"width": 1440, "height": 900}
+MOST = 400
+"""Presses of Tab until every control had its turn, at most."""
+
+CONTROLS = """(() => {
+  const all = document.querySelectorAll(
+    "button, select, input, textarea, a[href], summary, [tabindex='0'], [role=slider]",
+  );
+  const seen = (node) => node.checkVisibility({ visibilityProperty: true }) && !node.closest("[inert]");
+  const usable = (node) => !node.disabled && seen(node);
+  return [...all].filter(usable).map((node) => {
+    node.dataset.testNumber ??= String((window.testCount = (window.testCount ?? 0) + 1));
+    const list = node.getAttribute("role") === "tab" ? node.parentElement.id : null;
+    return [node.dataset.testNumber, list, node.outerHTML.slice(0, 160)];
+  });
+})()"""
+
+TEXTS = """(() => {
+  const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  const seen = [];
+  while (walker.nextNode()) {
+    const node = walker.currentNode.parentElement;
+    const text = walker.currentNode.textContent.trim();
+    if (!text || !node.checkVisibility({ visibilityProperty: true, opacityProperty: true })) continue;
+    if (node.closest(":disabled, [aria-hidden=true], option, script")) continue;
+    const layers = [];
+    for (let at = node; at; at = at.parentElement) layers.push(getComputedStyle(at).backgroundColor);
+    seen.push([text.slice(0, 40), getComputedStyle(node).color, layers]);
+  }
+  return seen;
+})()"""
+
+
+@pytest.fixture(scope="module")
+def session():
+    twin = load_twin("motor_winding")
+    session = Session(twin, live_source(twin, 4.0), page=Page(0, open_browser=False))
+    session.start()
+    yield session
+    session.stop()
+
+
+def opened(browser, session, scheme="light", size=SIZE):
+    context = browser.new_context(viewport=size, color_scheme=scheme)
+    page = context.new_page()
+    page.set_default_timeout(PATIENCE * 1000)
+    page.goto(session.url)
+    until(page, "window.nisus?.drawn > 0")
+    page.get_by_text("Process noise Q").wait_for()
+    return page
+
+
+def names_of(page):
+    """What Chromium tells a screen reader of each numbered control."""
+    client = page.context.new_cdp_session(page)
+    root = client.send("DOM.getDocument", {"depth": 0})["root"]["nodeId"]
+    found = {}
+    for node in client.send("DOM.querySelectorAll", {"nodeId": root, "selector": "[data-test-number]"})["nodeIds"]:
+        attributes = client.send("DOM.getAttributes", {"nodeId": node})["attributes"]
+        number = dict(zip(attributes[::2], attributes[1::2], strict=True))["data-test-number"]
+        told = client.send("Accessibility.getPartialAXTree", {"nodeId": node, "fetchRelatives": False})["nodes"][0]
+        found[number] = told.get("name", {}).get("value", "")
+    return found
+
+
+def walked(page):
+    """The numbers of the controls that Tab comes to, until it has been everywhere."""
+    reached = []
+    page.evaluate("document.activeElement?.blur()")
+    for _ in range(MOST):
+        page.keyboard.press("Tab")
+        number = page.evaluate("document.activeElement?.dataset?.testNumber ?? null")
+        if number is not None and reached and number == reached[0]:
+            break
+        if number is not None and number not in reached:
+            reached.append(number)
+    return set(reached)
+
+
+@pytest.mark.parametrize("show", [[], ["Runs", "What if"], ["Episodes", "Diagnose"]])
+def test_every_control_is_reached_by_tab_and_has_a_name(browser, session, show):
+    page = opened(browser, session)
+    # Paused, nothing comes or goes on the way; and the scene is Viser's, with focus of its own.
+    page.get_by_role("tab", name="XY").click()
+    page.get_by_label("Pause or go on").click()
+    wait_for(lambda: session.engine.status().paused, PATIENCE)
+    try:
+        for tab in show:
+            page.get_by_role("tab", name=tab, exact=True).click()
+        page.evaluate("for (const item of document.querySelectorAll('#left details')) item.open = true")
+        page.wait_for_timeout(500)
+        controls = page.evaluate(CONTROLS)
+        assert len(controls) > 40
+        names, reached = names_of(page), walked(page)
+        nameless = [html for number, _, html in controls if not names.get(number, "").strip()]
+        assert nameless == []
+        # One tab of a list has its turn, and arrows go on from it.
+        listed = {tabs for number, tabs, _ in controls if tabs and number in reached}
+        missed = [html for number, tabs, html in controls if number not in reached and tabs not in listed]
+        assert missed == []
+        first = page.locator("#middle-tabs [aria-selected=true]")
+        first.focus()
+        chosen = first.inner_text()
+        page.keyboard.press("ArrowRight")
+        until(page, f"document.activeElement.textContent !== {chosen!r}")
+        assert page.evaluate("document.activeElement.getAttribute('aria-selected')") == "true"
+    finally:
+        page.get_by_label("Pause or go on").click()
+        wait_for(lambda: not session.engine.status().paused, PATIENCE)
+        page.context.close()
+
+
+def color(text):
+    """What a browser computes: rgb(a), or color(srgb …) of a mixture."""
+    import numpy as np
+
+    numbers = [float(part) for part in re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", text.removeprefix("color(srgb"))]
+    parts = np.array(numbers[:3]) / (1.0 if text.startswith("color(srgb") else 255.0)
+    return np.append(parts, numbers[3] if len(numbers) > 3 else 1.0)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("tabs", [["Runs"], ["Episodes", "What if"], ["XY", "Diagnose"]])
+def test_all_text_can_be_read(browser, session, scheme, tabs):
+    """As Chromium computes it: the colour of each text, on all backgrounds beneath it."""
+    page = opened(browser, session, scheme)
+    for tab in tabs:
+        page.get_by_role("tab", name=tab, exact=True).click()
+    wait_for(lambda: page.evaluate("document.getElementById('health').textContent.length > 3"), PATIENCE)
+    wait_for(lambda: len(page.evaluate(TEXTS)) > 60, PATIENCE)
+    texts = page.evaluate(TEXTS)
+    faint = []
+    for text, ink, layers in texts:
+        ground = color("rgb(255, 255, 255)")
+        for layer in reversed(layers):
+            ground = over(color(layer), ground)
+        found = contrast(over(color(ink), ground), ground)
+        if found < TEXT:
+            faint.append(f"{text!r}: {found:.2f}")
+    assert faint == []
+    page.context.close()

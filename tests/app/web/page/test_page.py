@@ -1,0 +1,196 @@
+"""The whole program in headless Chromium: what a person does on the page, what the engine and the files made of it."""
+
+import io
+
+import numpy as np
+import pytest
+
+from app.cli.review import open_review
+from app.cli.run import live_source
+from app.twin.twin import load_twin
+from app.views.recording.reader import read_recording
+from app.web.session import Page, Session
+from tests.app.scripted import pull_all, wait_for
+from tests.app.web.page.browsed import PATIENCE, until
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture
+def served():
+    sessions = []
+
+    def serve(session):
+        sessions.append(session)
+        session.start()
+        return session
+
+    yield serve
+    for session in sessions:
+        session.stop()
+
+
+def open_page(browser, session, asked):
+    context = browser.new_context(viewport={"width": 1500, "height": 950})
+    page = context.new_page()
+    page.set_default_timeout(PATIENCE * 1000)
+    page.on("request", lambda request: asked.append(request.url))
+    page.on("pageerror", lambda error: asked.append(f"error: {error}"))
+    page.goto(session.url)
+    until(page, "window.nisus?.drawn > 0")
+    page.get_by_text("Process noise Q").wait_for()
+    return page
+
+
+def drawn(page, selector):
+    """How much of an element is estimate (blue) and reading (orange)."""
+    from PIL import Image
+
+    picture = page.screenshot(clip=page.locator(selector).bounding_box(), timeout=PATIENCE * 1000)
+    colours = np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
+    red, green, blue = colours[..., 0], colours[..., 1], colours[..., 2]
+    return {
+        "estimate": int(np.sum((blue > 150) & (red < 90) & (green < 150))),
+        "reading": int(np.sum((red > 190) & (green > 110) & (green < 180) & (blue < 80))),
+    }
+
+
+def settled(engine):
+    """No refold is waited for."""
+    wait_for(lambda: not engine.status().refolding, PATIENCE)
+
+
+def test_a_session_on_the_page(browser, served, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    twin = load_twin("motor_winding")
+    session = served(Session(twin, live_source(twin, 2.0), page=Page(0, open_browser=False)))
+    engine = session.engine
+    asked: list[str] = []
+    page = open_page(browser, session, asked)
+
+    # The charts draw, not only exist; and so does the scene.
+    wait_for(lambda: drawn(page, "#charts")["estimate"] > 200, PATIENCE)
+    wait_for(lambda: drawn(page, "#charts")["reading"] > 30, PATIENCE)
+    page.frame_locator("#stage").locator("canvas").first.wait_for()
+
+    # Record from the strip.
+    page.get_by_role("button", name="Record").click()
+    wait_for(lambda: engine.status().recording is not None, PATIENCE)
+    path = tmp_path / engine.status().recording
+    assert path.name.startswith("motor_winding") and path.suffix == ".rrd"
+
+    # Swap the filter.
+    page.get_by_label("Estimator", exact=True).select_option("ukf")
+    wait_for(lambda: engine.status().estimator == "ukf" and engine.status().revision == 1, PATIENCE)
+    settled(engine)
+    until(page, "window.nisus.revision === 1")
+
+    # Turn Q by its slider's keys: larger process noise must make a wider band on every row of the history.
+    before = pull_all(engine)
+    slider = page.locator('[data-key="Q.temperature"] input[type=range]')
+    slider.focus()
+    for _ in range(5):
+        page.keyboard.press("PageUp")
+    wait_for(lambda: engine.status().tuning.get("Q.temperature") > 0.05, PATIENCE)
+    settled(engine)
+    after = pull_all(engine)
+    assert after.revision > before.revision
+    rows = len(before.events)
+    assert np.all(after.track.std[10:rows, 0] > before.track.std[10:rows, 0])
+    until(page, f"window.nisus.revision >= {after.revision}")
+
+    # A number that is none is said at once, under its field; one that is, is taken; and it is undone and done again.
+    field = page.get_by_label("rate, value")
+    field.fill("much")
+    field.press("Enter")
+    page.get_by_text("it must be a number").wait_for()
+    field.fill("0,002")
+    field.press("Enter")
+    wait_for(lambda: engine.status().tuning.get("Q.rate") == 0.002, PATIENCE)
+    page.locator("#undo").click()
+    wait_for(lambda: engine.status().tuning.get("Q.rate") == twin.tuning.get("Q.rate"), PATIENCE)
+    page.locator("#redo").click()
+    wait_for(lambda: engine.status().tuning.get("Q.rate") == 0.002, PATIENCE)
+
+    # Hold the sensor out, and use it again.
+    box = page.locator(".sensor input").first
+    box.uncheck()
+    wait_for(lambda: not engine.status().tuning.used[0], PATIENCE)
+    box.check()
+    wait_for(lambda: engine.status().tuning.used[0], PATIENCE)
+    page.get_by_label("Gate", exact=True).select_option("0.9999")
+    wait_for(lambda: engine.status().tuning.gate == 0.9999, PATIENCE)
+    settled(engine)
+
+    # Time: pause, go on, look at a part, follow again.
+    page.get_by_label("Pause or go on").click()
+    wait_for(lambda: engine.status().paused, PATIENCE)
+    page.keyboard.press("Escape")
+    chart = page.locator(".u-over").first.bounding_box()
+    page.mouse.move(chart["x"] + 100, chart["y"] + 20)
+    page.mouse.down()
+    page.mouse.move(chart["x"] + 300, chart["y"] + 20, steps=5)
+    page.mouse.up()
+    until(page, "!window.nisus.view.following")
+    since, until_ = page.evaluate("[window.nisus.view.since, window.nisus.view.until]")
+    assert 0 < until_ - since < twin.config.view.window / 2
+    page.locator("#follow").click()
+    until(page, "window.nisus.view.following")
+    page.get_by_label("Speed").select_option("inf")
+    page.get_by_label("Pause or go on").click()
+    wait_for(lambda: engine.status().finished, PATIENCE)
+
+    # Stop the recording once the source has ended, so that it holds everything.
+    settled(engine)
+    final = pull_all(engine)
+    page.get_by_role("button", name="Record").click()
+    wait_for(lambda: engine.status().recording is None and session.recorder.finished, PATIENCE)
+    recorded = read_recording(path)
+    np.testing.assert_array_equal(recorded.events.value, final.events.value)
+    page.get_by_role("link", name=path.name).wait_for()
+
+    # Nothing was asked of anybody else, and nothing failed.
+    own = tuple(f"http://{name}:{session.server.port}/" for name in ("127.0.0.1", "localhost"))
+    strangers = [url for url in asked if not url.startswith((*own, "blob:", "data:", "https://tel.rerun.io/"))]
+    assert strangers == []
+    page.context.close()
+
+    # Review: the same program over the recorded readings, to the same bits, and it draws.
+    review, _ = open_review(path, Page(0, open_browser=False))
+    served(review)
+    wait_for(lambda: review.engine.status().finished, PATIENCE)
+    np.testing.assert_array_equal(pull_all(review.engine).track.mean, final.track.mean)
+    page = open_page(browser, review, asked)
+    wait_for(lambda: drawn(page, "#charts")["estimate"] > 200, PATIENCE)
+    assert page.get_by_label("Estimator", exact=True).input_value() == "ukf"
+    page.get_by_label("Estimator", exact=True).select_option("kf")
+    wait_for(lambda: review.engine.status().estimator == "kf", PATIENCE)
+    settled(review.engine)
+    until(page, "window.nisus.revision >= 1")
+    page.context.close()
+
+
+def test_two_browsers_see_the_same_fault(browser, served):
+    """Put in from one page, said on both with its cause; a reload keeps it; taken away, it is over on both."""
+    twin = load_twin("motor_can")
+    session = served(Session(twin, live_source(twin, 1.0), page=Page(0, open_browser=False)))
+    asked: list[str] = []
+    first, second = (open_page(browser, session, asked) for _ in range(2))
+    wait_for(lambda: session.engine.status().counts.get("readings", 0) > 150, PATIENCE)
+    first.get_by_text("Faults on demand").click()
+    first.get_by_label("Fault", exact=True).select_option("bias")
+    first.get_by_label("Of what").select_option("yoke")
+    first.get_by_label("size").fill("2.5")
+    first.locator("#inject").click()
+    for page in (first, second):
+        wait_for(lambda page=page: "yoke" in page.locator("#cause").inner_text(), PATIENCE)
+        until(page, "document.getElementById('health').dataset.health === 'suspect'")
+    second.reload()
+    wait_for(lambda: "yoke" in second.locator("#cause").inner_text(), PATIENCE)
+    second.get_by_role("tab", name="Episodes").click()
+    assert "yoke" in second.locator(".episode[data-open=true]").first.inner_text()
+    first.get_by_role("button", name="stop", exact=True).click()
+    wait_for(lambda: not session.engine.status().faults, PATIENCE)
+    assert not [line for line in asked if line.startswith("error")]
+    for page in (first, second):
+        page.context.close()

@@ -1,0 +1,162 @@
+"""What nobody looks at is not sent, and what waits for news of a twin that has ended does not wait for ever."""
+
+import numpy as np
+import pytest
+
+from app.cli.run import live_source
+from app.live.commands import Pin, SetTuning, UseSensor
+from app.twin.twin import load_twin
+from app.web.session import Page, Session
+from tests.app.scripted import pull_all, wait_for
+from tests.app.web.page.browsed import PATIENCE, until
+from tests.support import SECOND
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture
+def session():
+    twin = load_twin("motor_joint", overrides={"source.duration": "300"})
+    running = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
+    running.start()
+    wait_for(lambda: running.engine.status().finished, PATIENCE)
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def page(browser, session):
+    page = browser.new_context(viewport={"width": 1400, "height": 900}).new_page()
+    page.goto(session.url, timeout=PATIENCE * 1000)
+    until(page, "window.nisus?.drawn > 0")
+    yield page
+    page.context.close()
+
+
+def lanes(session):
+    """What the server is asked for: the columns of each lane."""
+    return {lane.name: set(lane.wanted.columns) for lane in session.server._series._lanes}
+
+
+def test_the_charts_go_to_another_moment_of_the_stretch_that_they_show(page, session):
+    """Nothing else is asked for, and all the same the line above each says what it was then."""
+    until(page, "window.nisus.charts.live.x.length > 100")
+    page.evaluate("window.nisus.view.show(50, 150, 60)")
+    until(page, "window.nisus.charts.range[0] === 50 && window.nisus.charts.live.x.at(-1) < 151")
+    page.wait_for_timeout(300)  # the points of the stretch have come: nothing draws any more
+    said = page.locator("#charts article .reading").first
+    before = said.inner_text()
+    page.evaluate("window.nisus.view.goTo(140, window.nisus.charts.range)")
+    wait_for(lambda: said.inner_text() != before, PATIENCE)
+    rows = pull_all(session.engine)
+    at = int(np.searchsorted(rows.events.t, rows.events.t[0] + 140 * SECOND, side="right")) - 1
+    name = page.evaluate("window.nisus.charts.charts[0].what.key").removeprefix("state:")
+    k = list(session.engine.model.state_names).index(name)
+    mean, std = rows.track.mean[at, k], rows.track.std[at, k]
+    assert float(said.inner_text().split(" ± ")[0]) == pytest.approx(mean, abs=0.2 * std)
+
+
+TINTED = """() => {
+  const chart = window.nisus.charts.charts.find(({ what }) => what.key === "innovation:winding");
+  const { ctx, bbox } = chart.plot;
+  const y = chart.plot.valToPos(0, "y", true);
+  const { data } = ctx.getImageData(bbox.left, y, bbox.width, 1);
+  let tinted = 0;
+  for (let k = 0; k < data.length; k += 4) tinted += data[k] - data[k + 2] > 20;
+  return [window.nisus.charts.live.each, tinted / (data.length / 4), chart.what.extras(chart)[0].x.length];
+}"""
+
+
+def test_between_the_extremes_of_many_readings_the_others_are_seen(page):
+    """Innovations of either sign: at zero all is tinted where groups of them are shown, and little where each is."""
+    until(page, "window.nisus.charts.live.x.length > 100")
+    page.evaluate("window.nisus.view.show(20, 280)")
+    until(page, "window.nisus.charts.live.each === 2 && window.nisus.charts.live.x[0] < 25")
+    wait_for(lambda: page.evaluate(TINTED)[1] > 0.8, PATIENCE)
+    assert page.evaluate(TINTED)[2] > 100
+    page.evaluate("window.nisus.view.show(50, 60)")
+    until(page, "window.nisus.charts.live.each === 1 && window.nisus.charts.live.x[0] > 45")
+    wait_for(lambda: page.evaluate(TINTED)[1] < 0.3, PATIENCE)
+    assert page.evaluate(TINTED)[2] == 0
+
+
+def test_hidden_charts_ask_for_nothing(page, session):
+    engine = session.engine
+    engine.submit(Pin(0))
+    engine.submit(SetTuning("Q.winding", 0.5))
+    wait_for(lambda: {"overview", "charts", "previous", "run 0", "less 0"} == lanes(session).keys(), PATIENCE)
+    page.get_by_role("tab", name="Diagnose").click()
+    wait_for(lambda: lanes(session).keys() == {"overview"}, PATIENCE)
+    # The bar of time goes on, and knows what the charts would show.
+    page.evaluate("window.nisus.view.show(10, 20)")
+    assert page.evaluate("window.nisus.charts.range") == [10, 20]
+    page.locator("#follow").click()
+    assert page.evaluate("window.nisus.charts.range[1]") == pytest.approx(300, rel=0.01)
+    drawn = page.evaluate("window.nisus.drawn")
+    page.get_by_role("tab", name="Charts").click()
+    wait_for(lambda: lanes(session).keys() == {"overview", "charts", "previous", "run 0", "less 0"}, PATIENCE)
+    until(page, f"window.nisus.drawn > {drawn} && window.nisus.revision === 1")
+
+
+def test_a_chart_that_is_not_chosen_is_not_sent(page, session):
+    wait_for(lambda: "innovation:yoke" in lanes(session).get("charts", ()), PATIENCE)
+    page.get_by_text("Shown", exact=True).click()
+    for name in ("yoke", "magnet"):
+        page.locator("#layout li", has_text=name).last.get_by_role("checkbox").uncheck()
+    wait_for(lambda: "innovation:yoke" not in lanes(session)["charts"], PATIENCE)
+    assert "mean:magnet" not in lanes(session)["charts"] and "mean:yoke" in lanes(session)["charts"]
+
+
+def test_all_of_q_is_one_command_one_revision_and_one_undo(page, session):
+    engine = session.engine
+    before, first = engine.status().tuning, engine.revisions.runs[-1].number
+    page.get_by_role("button", name="×10", exact=True).first.click()
+    wait_for(lambda: engine.revisions.runs[-1].number == first + 1 and not engine.status().refolding, PATIENCE)
+    assert engine.tuning.q.tolist() == [pytest.approx(10 * value, rel=1e-5) for value in before.q]
+    assert {change.key for change in engine.revisions.runs[-1].changes} == {f"Q.{n.name}" for n in engine.model.noises}
+    page.locator("#undo").click()
+    wait_for(lambda: engine.revisions.runs[-1].number == first + 2 and not engine.status().refolding, PATIENCE)
+    assert engine.tuning.q.tolist() == before.q.tolist()
+    page.locator("#redo").click()
+    wait_for(lambda: engine.revisions.runs[-1].number == first + 3 and not engine.status().refolding, PATIENCE)
+    assert engine.tuning.q[0] == pytest.approx(10 * before.q[0], rel=1e-5)
+    assert page.locator("#undo").is_enabled() and page.locator("#redo").is_disabled()
+
+
+def test_what_became_of_the_readings_is_told(page, session):
+    session.engine.submit(UseSensor("yoke", False))
+    wait_for(lambda: session.engine.status().counts.get("held out"), PATIENCE)
+    page.get_by_role("tab", name="Episodes").click()
+    told = page.locator(".counts")
+    wait_for(lambda: "held out" in told.inner_text(), PATIENCE)
+    counts = session.engine.status().counts
+    words = told.inner_text().split("\n")
+    assert words[:4] == ["readings", f"{counts['readings']:,}", "used", f"{counts['used']:,}"]
+    assert words[words.index("held out") + 1] == f"{counts['held out']} (33 %)"
+
+
+def test_the_last_status_is_told_again(page):
+    page.evaluate("window.told = []; window.nisus.link.addEventListener('status', (e) => window.told.push(e.detail.t))")
+    until(page, "window.told.length >= 3")
+    assert len(set(page.evaluate("window.told"))) == 1
+
+
+def test_an_episode_that_is_told_at_rest_is_drawn(page, session):
+    """A strip on a chart of the stack, in the colour of what was wrong, once the twin has ended and no frame comes."""
+    until(page, "performance.now() - window.nisus.charts.drawnAt > 700")
+    drawn = page.evaluate("window.nisus.drawn")
+    strip = """(() => {
+      const { plot } = window.nisus.charts.charts.find((chart) => !chart.node.hidden);
+      const { left, top, width } = plot.bbox;
+      return [...plot.ctx.getImageData(Math.round(left + width / 2), Math.round(top), 1, 1).data];
+    })()"""
+    before = page.evaluate(strip)
+    page.evaluate("""(() => {
+      const { link, charts } = window.nisus;
+      const [start, end] = charts.range.map((time) => time + Number(link.status.origin) / 1e9);
+      link.episodes = [{ start, end, subject: 'tooth', cause: 'shifted', text: 'tooth is shifted' }];
+      link.tell('episodes', link.episodes);
+    })()""")
+    assert page.evaluate("window.nisus.drawn") > drawn
+    after = page.evaluate(strip)
+    assert after != before and after[0] > after[2]

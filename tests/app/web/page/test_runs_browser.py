@@ -1,0 +1,129 @@
+"""Runs and curves on the page: pinned, seen over the charts, taken away; a knob's curve against folds of its own."""
+
+import io
+import re
+
+import numpy as np
+import pytest
+
+from app.cli.run import live_source
+from app.twin.twin import load_twin
+from app.web.session import Page, Session
+from estimators.fold import fold
+from estimators.log import Log
+from estimators.track import GATED, USED
+from tests.app.scripted import pull_all, wait_for
+from tests.app.web.page.browsed import PATIENCE, browsed, until
+
+pytestmark = pytest.mark.browser
+
+PINNED = (176, 51, 143)
+"""The colour of the first place, in the light theme: app/web/page/style.css, --pin-0."""
+
+
+@pytest.fixture
+def session():
+    twin = load_twin("motor_winding")
+    running = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
+    running.start()
+    wait_for(lambda: running.engine.status().finished, PATIENCE)
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def page(browser, session):
+    with browsed(browser, session) as page:
+        yield page
+
+
+def coloured(page, selector):
+    """Pixels of the first pin's colour in an element."""
+    from PIL import Image
+
+    picture = page.screenshot(clip=page.locator(selector).first.bounding_box())
+    pixels = np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
+    return int(np.sum(np.abs(pixels - PINNED).sum(axis=2) < 60))
+
+
+def settled(engine, revision):
+    wait_for(lambda: engine.revisions.runs[-1].number >= revision and not engine.status().refolding, PATIENCE)
+
+
+def test_pin_overlay_and_unpin(page, session):
+    engine = session.engine
+    page.get_by_role("tab", name="Runs").click()
+    first = engine.revisions.runs[-1].number
+    page.get_by_role("button", name=f"Pin run {first}", exact=True).click()
+    wait_for(lambda: engine.revisions.find(first).pinned, PATIENCE)
+    wait_for(lambda: coloured(page, "#charts") == 0, PATIENCE)
+
+    name = page.get_by_role("textbox", name=f"Name of run {first}")
+    name.fill("as it was")
+    name.press("Enter")
+    wait_for(lambda: engine.revisions.find(first).name == "as it was", PATIENCE)
+
+    # Another filter tuning: the pinned run stays where it was, beside the new estimate.
+    knob = page.locator('[data-key^="Q."] input[type=text]').first
+    knob.fill("100")
+    knob.press("Enter")
+    settled(engine, first + 1)
+    wait_for(lambda: coloured(page, "#charts article") > 100, PATIENCE)
+    wait_for(lambda: coloured(page, ".chart.difference .plot") > 100, PATIENCE)
+    wait_for(lambda: "as it was" in page.locator(".pins").inner_text(), PATIENCE)
+    # Of the rate, which nobody measures.
+    kept, now = engine.revisions.find(first).track.track.mean[-1, 1], pull_all(engine).track.mean[-1, 1]
+    difference = page.locator(".pins output")
+    difference.filter(has_text=re.compile(r"\d")).wait_for()
+    wait_for(lambda: float(difference.inner_text()) == pytest.approx(kept - now, rel=0.05), PATIENCE)
+
+    # The table has a score for both, and marks the better one.
+    row = page.locator(f'tbody[data-number="{first}"]')
+    wait_for(lambda: row.locator(".scores td").count() == 5, PATIENCE)
+    page.locator(".runs .best").first.wait_for()
+
+    # B goes back to it, and B again to the other.
+    page.locator("body").press("b")
+    settled(engine, first + 2)
+    assert engine.status().tuning is engine.revisions.find(first).tuning
+    wait_for(lambda: page.evaluate("window.nisus.link.status.runs.last") == first + 1, PATIENCE)
+    page.locator("body").press("b")
+    settled(engine, first + 3)
+    assert engine.status().tuning.q[0] == 100.0
+
+    page.locator(".pins").get_by_role("button", name=f"Unpin run {first}").click()
+    wait_for(lambda: not any(run.pinned for run in engine.revisions.runs), PATIENCE)
+    wait_for(lambda: page.locator(".chart.difference").is_hidden(), PATIENCE)
+    wait_for(lambda: coloured(page, "#charts") == 0, PATIENCE)
+    until(page, "Object.keys(window.nisus.link.lanes).every(name => !/^(run|less) /.test(name))")
+
+
+def likelihood(track):
+    used = track.verdict == USED
+    assert not np.any(track.verdict == GATED)
+    return track.log_likelihood[used].sum()
+
+
+def test_the_curve_around_a_knob_shows_the_likeliest_value(page, session):
+    engine = session.engine
+    key = next(item.key for item in engine.tuning.items() if item.key.startswith("R."))
+    label = page.locator(f'[data-key="{key}"] label')
+    label.focus()
+    label.press("Enter")
+    curve = page.locator(f'[data-key="{key}"] .around')
+    wait_for(lambda: curve.get_attribute("data-done") == "true", PATIENCE)
+    assert curve.locator("circle").count() == 7
+
+    status, model, log = engine.status(), engine.model, Log.of(engine.model)
+    log.extend(pull_all(engine).events)
+    value = status.tuning.get(key)
+    values = [value * factor for factor in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)]
+    ungated = [status.tuning.set(key, item).set("gate", None) for item in values]
+    best = values[int(np.argmax([likelihood(fold(status.estimator, model, tuning, log)) for tuning in ungated]))]
+    said = curve.locator("output").inner_text()
+    assert float(said.split("likeliest at ")[1].split(",")[0]) == pytest.approx(best, rel=0.01)
+
+    take = curve.locator(".takes button:not([hidden])").last
+    wanted = float(take.inner_text().split()[-1])
+    take.click()
+    wait_for(lambda: engine.status().tuning.get(key) == pytest.approx(wanted, rel=0.01), PATIENCE)

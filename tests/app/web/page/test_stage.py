@@ -1,0 +1,160 @@
+"""The scene on the page in headless Chromium: chosen, large, and each view in a window of its own."""
+
+import pytest
+
+from app.cli.run import live_source
+from app.twin.twin import load_twin
+from app.web.page_file import PAGE
+from app.web.session import Page, Session
+from tests.app.scripted import wait_for
+from tests.app.web.page.browsed import PATIENCE, until
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture
+def session():
+    twin = load_twin("motor_winding")
+    session = Session(twin, live_source(twin, 4.0), page=Page(0, open_browser=False))
+    session.start()
+    yield session
+    session.stop()
+
+
+@pytest.fixture
+def context(browser):
+    context = browser.new_context(viewport={"width": 1400, "height": 900})
+    context.set_default_timeout(PATIENCE * 1000)
+    yield context
+    context.close()
+
+
+def asked(session):
+    """The queries of the browsers' sockets, as Viser's server knows them."""
+    from app.views.viser.private_viser import addresses
+
+    return sorted(addresses(session.view.server))
+
+
+def test_the_scene_is_chosen_enlarged_and_opened_alone(context, session):
+    assert asked(session) == [] and session.view.history.n == 0
+    page = context.new_page()
+    page.goto(session.url)
+    wait_for(lambda: asked(session) == ["theme=light&part=scene"], PATIENCE)
+    wait_for(lambda: session.view.history.n > 0, PATIENCE)
+    # Its panel is not kept up while only the page shows the scene.
+    assert session.view.panel.status.content == ""
+
+    select = page.get_by_label("Scene: Show")
+    select.select_option("belief")
+    wait_for(lambda: session.view.stage.choices.values()["show"] == "belief", PATIENCE)
+    page.get_by_label("Scene: x", exact=True).select_option("rate")
+    wait_for(lambda: session.view.stage.choices.values()["y"] == "temperature", PATIENCE)
+    until(page, "document.querySelector('[aria-label=\"Scene: y\"]').value === 'temperature'")
+
+    # Once more S: the scene is larger than the charts, and stays so over a reload.
+    assert page.evaluate("document.getElementById('stage').clientWidth") < 400
+    page.locator("body").press("s")
+    until(page, "document.getElementById('stage').clientWidth > document.getElementById('charts').clientWidth")
+    page.reload()
+    until(page, "document.getElementById('stage').clientWidth > document.getElementById('charts').clientWidth")
+
+    # Hidden, nothing is sent for it.
+    page.get_by_role("tab", name="Runs").click()
+    wait_for(lambda: asked(session) == [], PATIENCE)
+    page.get_by_role("tab", name="Scene").click()
+
+    with context.expect_page() as opened:
+        page.get_by_label("Scene in a window of its own").click()
+    alone = opened.value
+    alone.get_by_text("Process noise Q").wait_for()
+    wait_for(lambda: asked(session) == ["theme=light", "theme=light&part=scene"], PATIENCE)
+    wait_for(lambda: "revision 0" in session.view.panel.status.content, PATIENCE)
+
+
+def test_rerun_has_a_window_of_its_own(context, session):
+    page = context.new_page()
+    errors = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto(session.url)
+    page.goto(f"{session.url.partition('?')[0]}explore")
+    until(page, "window.nisus?.explored > 0")
+    assert page.evaluate("document.getElementById('notice').hidden")
+    assert page.evaluate("document.getElementById('rerun').clientHeight") > 700
+    assert errors == []
+
+
+def test_in_the_dark_the_scene_has_light_labels_on_dark(browser, session):
+    """Viser draws black on white: boxes of some thousand pixels. Letters alone are a few hundred."""
+    import io
+
+    import numpy as np
+    from PIL import Image
+
+    page = browser.new_context(viewport={"width": 1400, "height": 900}, color_scheme="dark").new_page()
+    page.goto(session.url)
+    wait_for(lambda: session.view.history.n > 0, PATIENCE)
+
+    def share(least):
+        """Of the lower half, with a scale's numbers and the temperature in words: pixels as grey and as light."""
+        box = page.locator("#stage").bounding_box()
+        clip = box | {"y": box["y"] + box["height"] / 2, "height": box["height"] / 2}
+        image = Image.open(io.BytesIO(page.screenshot(clip=clip, timeout=PATIENCE * 1000))).convert("RGB")
+        pixels = np.asarray(image).astype(int)
+        return np.mean((pixels.min(axis=2) > least) & (np.ptp(pixels, axis=2) < 40))
+
+    wait_for(lambda: share(110) > 2e-4, PATIENCE)
+    page.wait_for_timeout(2000)
+    assert share(190) < 2e-3
+    page.context.close()
+
+
+def opacity(page):
+    return page.evaluate("getComputedStyle(document.body).opacity")
+
+
+def draw(page, times):
+    """So many drawings of nothing, in one picture."""
+    page.evaluate(
+        "times => { const gl = document.createElement('canvas').getContext('webgl2');"
+        " for (let k = 0; k < times; k++) gl.drawArrays(gl.POINTS, 0, 0); }",
+        times,
+    )
+
+
+def counted(page):
+    return "[native code]" not in page.evaluate("WebGL2RenderingContext.prototype.drawArrays.toString()")
+
+
+@pytest.mark.parametrize("scene", [True, False], ids=["drawn", "never drawn"])
+def test_the_scene_is_hidden_until_it_is_drawn(context, scene):
+    """By a clock of the test's own: an empty scene's four drawings do not show it, a fifth does, and 4 s do alone."""
+    page = context.new_page()
+    page.clock.install(time=0)
+    page.clock.pause_at(1000)
+    page.set_content("<p>axes</p>")
+    page.add_script_tag(path=PAGE / "viser_shown.js")
+    assert opacity(page) == "0" and counted(page)
+    draw(page, 4)
+    page.clock.run_for(1000)
+    assert opacity(page) == "0"
+    if scene:
+        draw(page, 5)
+        page.clock.run_for(400)
+        assert opacity(page) == "0"
+        page.clock.run_for(200)
+    else:
+        page.clock.run_for(2900)
+        assert opacity(page) == "0"
+        page.clock.run_for(200)
+    assert opacity(page) == "1" and not counted(page)
+
+
+def test_the_scene_is_seen_on_the_page(context, session):
+    page = context.new_page()
+    page.goto(session.url)
+    wait_for(lambda: asked(session) != [], PATIENCE)
+    frame = page.locator("#stage").element_handle().content_frame()
+    frame.wait_for_function("document.body && getComputedStyle(document.body).opacity === '1'")
+    frame.wait_for_selector("canvas")
+    assert not counted(frame)

@@ -1,0 +1,75 @@
+"""A real browser that is suspended in the midst of drawing: it costs neither readings nor recorded rows."""
+
+import os
+import signal
+import subprocess
+
+import numpy as np
+import pytest
+
+from app.cli.run import live_source
+from app.live.commands import Record
+from app.twin.twin import load_twin
+from app.views.recording.reader import read_recording
+from app.web.session import Page, Session
+from estimators.log import READING
+from tests.app.scripted import wait_for
+
+pytestmark = pytest.mark.browser
+
+FLAGS = (
+    "--headless=new --no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-background-networking "
+    "--disable-component-update --disable-sync --no-first-run --disable-quic --remote-debugging-port=0"
+).split()
+PATIENCE = 120.0
+LIVED = 300
+"""Events, one a second of the twin, that come while the browser is suspended."""
+
+
+@pytest.fixture
+def suspendable(chromium, tmp_path):
+    """A Chromium in a process group of its own, and the port on which it can be told what to do."""
+    profile = tmp_path / "profile"
+    process = subprocess.Popen(
+        [chromium, *FLAGS, f"--user-data-dir={profile}", "about:blank"],
+        start_new_session=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    port = profile / "DevToolsActivePort"
+    wait_for(lambda: port.is_file() and port.read_text().count("\n") > 0, PATIENCE)
+    yield process, int(port.read_text().split()[0])
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="this system cannot suspend a process")
+def test_a_suspended_browser_costs_nothing(suspendable, tmp_path):
+    sync_api = pytest.importorskip("playwright.sync_api")
+    process, port = suspendable
+    twin = load_twin("motor_winding", overrides={"source.duration": "1000000"})
+    session = Session(twin, live_source(twin, 60.0), page=Page(0, open_browser=False))
+    path = tmp_path / "suspended.rrd"
+    session.start()
+    try:
+        session.engine.submit(Record(path))
+        with sync_api.sync_playwright() as playwright:
+            page = playwright.chromium.connect_over_cdp(f"http://127.0.0.1:{port}").contexts[0].new_page()
+            page.goto(session.url, timeout=PATIENCE * 1000)
+            wait_for(lambda: page.evaluate("window.nisus?.drawn > 0"), PATIENCE)
+            before = session.engine.status().counts["readings"]
+            os.killpg(process.pid, signal.SIGSTOP)
+            wait_for(lambda: session.engine.status().counts["readings"] > before + LIVED, PATIENCE)
+            during = session.engine.status().counts["readings"]
+            os.killpg(process.pid, signal.SIGCONT)
+            drawn = page.evaluate("window.nisus.drawn")
+            # It goes on where it is now, without anybody's help.
+            wait_for(lambda: page.evaluate("window.nisus.drawn") > drawn, PATIENCE)
+        session.engine.submit(Record(None))
+        wait_for(lambda: session.recorder.finished, PATIENCE)
+    finally:
+        session.stop()
+    recorded = read_recording(path)
+    rows = recorded.events.t[recorded.events.kind == READING]
+    assert rows.size > during
+    np.testing.assert_array_equal(np.diff(rows), 1_000_000_000)

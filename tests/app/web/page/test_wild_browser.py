@@ -1,0 +1,95 @@
+"""One wild reading does not flatten a chart: the axis is that of the others, and the wild one is marked at its edge."""
+
+import numpy as np
+import pytest
+
+from app.cli.run import live_source
+from app.twin.twin import load_twin
+from app.web.session import Page, Session
+from estimators.log import READING
+from tests.app.scripted import pull_all, wait_for
+from tests.app.web.page.browsed import PATIENCE
+from tests.app.web.page.test_runs_browser import page  # noqa: F401  fixture
+
+pytestmark = pytest.mark.browser
+
+SPIKES = "[{kind: spike, sensor: winding, size: 6000.0, rate: 0.01}]"
+
+
+@pytest.fixture(scope="module")
+def session():
+    twin = load_twin("motor_winding", overrides={"faults": SPIKES, "gate": "0.9999", "source.duration": "600"})
+    running = Session(twin, live_source(twin, float("inf")), page=Page(0, open_browser=False))
+    running.start()
+    wait_for(lambda: running.engine.status().finished, PATIENCE)
+    yield running
+    running.stop()
+
+
+def chart(page, key):  # noqa: F811
+    """The value axis of a chart, and what is marked at its edges."""
+    return page.evaluate(
+        """(key) => {
+          const chart = window.nisus.charts.charts.find((chart) => chart.what.key === key);
+          const { x, y } = chart.plot.scales;
+          return { low: y.min, high: y.max, marks: chart.outsiders, since: x.min, until: x.max };
+        }""",
+        key,
+    )
+
+
+def test_a_wild_reading_is_marked_at_the_edge_and_the_others_rule_the_axis(page, session):  # noqa: F811
+    pull = pull_all(session.engine)
+    innovation = pull.track.innovation[pull.events.kind == READING, 0]
+    innovation = innovation[np.isfinite(innovation)]  # without those beyond what the sensor can say at all
+    ordinary = np.abs(innovation[np.abs(innovation) < 30.0]).max()
+    assert np.abs(innovation).max() > 20 * ordinary
+    page.evaluate("window.nisus.view.follow(null)")
+    wait_for(lambda: page.evaluate("window.nisus.charts.live.x[0]") < 1.0, PATIENCE)
+
+    def drawn(key):
+        """The chart, once the picture is that of all of it."""
+        found = {}
+        wait_for(lambda: found.update(chart(page, key)) or found["since"] < 1.0 and found["until"] > 590.0, PATIENCE)
+        return found
+
+    shown = drawn("innovation:winding")
+    # Wide enough for all but the wild ones, and not much wider: 8 % of margin, and axes shrink when half is empty.
+    assert ordinary <= shown["high"] == -shown["low"] < 3 * ordinary
+    furthest = {mark["above"]: mark["value"] for mark in shown["marks"] if mark.get("furthest")}
+    assert furthest[True] == pytest.approx(innovation.max(), rel=1e-6)
+    assert furthest[False] == pytest.approx(innovation.min(), rel=1e-6)
+    assert {mark["tone"] for mark in shown["marks"]} == {"reading"}
+
+    # The same of the state, by the mark of a refused reading.
+    state = drawn("state:temperature")
+    assert state["high"] - state["low"] < 500.0
+    assert {mark["tone"] for mark in state["marks"]} == {"refused"}
+
+
+def test_what_an_axis_spans(page):  # noqa: F811
+    """Of columns whose answer is plain."""
+    found = page.evaluate(
+        """async () => {
+          const { shownExtent } = await import("/page/ranges.js");
+          const ramp = Array.from({ length: 100 }, (_, k) => k / 100);
+          const wild = ramp.map((value, k) => (k === 50 ? 1e6 : value));
+          const settling = ramp.map((value, k) => (k < 5 ? -1e4 : value));
+          const step = ramp.map((value, k) => (k < 98 ? 0 : 7));
+          const few = ramp.map((value, k) => (k % 10 ? null : k === 50 ? 1e6 : value));
+          const flat = ramp.map((value, k) => (k === 50 ? 3 : 0));
+          const none = ramp.map(() => null);
+          const of = (drawn) => shownExtent(drawn, 0, 99);
+          return {
+            wild: of({ dots: [wild] }), settling: of({ lines: [settling] }), step: of({ lines: [step] }),
+            few: of({ dots: [few] }), flat: of({ dots: [flat] }), none: of({ lines: [none], dots: [none] }),
+            both: of({ lines: [ramp], dots: [wild] }), part: shownExtent({ lines: [ramp] }, 20, 30),
+          };
+        }"""
+    )
+    assert found["wild"] == [0.0, 0.99] and found["both"] == [0.0, 0.99]
+    assert found["settling"] == pytest.approx([0.05, 0.99])
+    # A line that has just moved is in view, a handful of dots too, and what is alone beside nothing.
+    assert found["step"] == [0, 7] and found["few"] == [0, 1e6] and found["flat"] == [0, 3]
+    assert found["none"][0] > found["none"][1]
+    assert found["part"] == pytest.approx([0.2, 0.3])

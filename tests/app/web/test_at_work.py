@@ -1,0 +1,148 @@
+"""A fold that takes long: the page answers meanwhile, with what is known; what reads rows waits for a piece of it.
+
+The model's solver is let on by the test, step by step, so that the fold stands where the test wants it.
+"""
+
+import json
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from websockets.sync.client import connect
+
+import app.live.stall
+from app.live.commands import SetTuning
+from app.live.engine import Engine
+from app.web.server import PageServer
+from tests.app.scripted import MODEL, Scripted, readings, row_count, wait_for
+from tests.app.served import PATIENCE, SECRET, Client, shown_twin
+from tests.support import SECOND
+
+READINGS = 40
+
+
+class Solver:
+    """The motor's winding behind a solver that answers as often as it is let."""
+
+    def __init__(self):
+        self.at_work, self.left = threading.Event(), threading.Semaphore(0)
+        self.held = ""
+        """The thread that it holds up."""
+
+    def f(self, X, u, p, dt):
+        if dt > 0.0 and threading.current_thread().name == self.held:
+            self.at_work.set()
+            self.left.acquire()
+        return X @ np.array([[1.0, dt], [0.0, 1.0]]).T
+
+    def h(self, X, u, p):
+        return X[:, :1]
+
+    def hold(self, thread):
+        self.at_work.clear()
+        self.held = thread
+
+    def let_go(self):
+        self.held = ""
+        self.left.release(1000)
+
+    def model(self):
+        sensors = tuple(replace(sensor, h=self.h, H=None) for sensor in MODEL.sensors)
+        return replace(MODEL, f=self.f, F=None, linear=False, sensors=sensors, black_box=True)
+
+
+@pytest.fixture
+def running(monkeypatch, tmp_path):
+    """An engine behind its page whose solver stands still, in the fold of the second reading."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr("app.web.server.viewer_assets", lambda progress: tmp_path)
+    # Nobody gives the solver up.
+    monkeypatch.setattr(app.live.stall, "PATIENCE", float("inf"))
+    solver, source = Solver(), Scripted()
+    engine = Engine(shown_twin(model=solver.model(), estimator="filterpy-ukf"), lambda report: source)
+    server = PageServer(engine, port=0, viser_port=None, secret=SECRET)
+    server.start()
+    engine.start()
+    solver.hold("engine")
+    times = np.arange(1, READINGS + 1) * 0.5
+    source.put(readings(times, 40.0 + times))
+    assert solver.at_work.wait(PATIENCE)
+    yield engine, server, solver
+    solver.let_go()
+    server.stop()
+    engine.stop()
+
+
+def test_the_page_and_what_it_asks_are_answered_while_the_fold_is_at_work(running):
+    engine, server, solver = running
+    client = Client(server)
+    # What needs the fold waits in a thread of its own; nothing else waits for that.
+    waiting = threading.Thread(target=client.get, args=("/api/fit",), daemon=True)
+    waiting.start()
+    for target in ("/", "/api/status", "/api/model", "/api/episodes", "/api/faults", "/api/recordings"):
+        assert client.get(target).status == 200, target
+    assert client.post("/api/command", {"command": "SetTuning", "key": "Q.rate", "value": 0.5}).status == 202
+    assert waiting.is_alive()
+    assert engine.span()[0] <= 0.5e9
+    told = json.loads(client.get("/api/status").text)
+    assert told["twin"] == "scripted" and told["tuning"]["Q.rate"] == engine.twin.tuning.get("Q.rate")
+    # The engine takes the command once the fold returns.
+    solver.let_go()
+    waiting.join(PATIENCE)
+    assert not waiting.is_alive()
+    wait_for(lambda: engine.status().revision == 1 and not engine.status().refolding)
+    assert row_count(engine) == READINGS
+
+
+def test_a_page_that_looks_at_charts_is_told_of_the_twin_while_the_fold_is_at_work(running):
+    _, server, _ = running
+    client = Client(server)
+    with connect(
+        f"ws://{client.host}/api/stream", origin=client.origin, additional_headers={"Cookie": client.cookie}
+    ) as stream:
+        assert "boot" in json.loads(stream.recv(PATIENCE))
+        lane = {"columns": ["mean:winding"], "points": 100}
+        stream.send(json.dumps({"lanes": {"charts": lane}, "pair": ["winding", "rate"]}))
+        said = ""
+        # Every word on the twin, though its rows are asked for and do not come.
+        while "the readings that came so far are being folded (" not in said:
+            said = stream.recv(PATIENCE)
+        stream.send(json.dumps({"lanes": {"charts": None}}))
+    with connect(
+        f"ws://{client.host}/api/stream", origin=client.origin, additional_headers={"Cookie": client.cookie}
+    ) as stream:
+        said = [json.loads(stream.recv(PATIENCE)) for _ in range(2)]
+    assert any("status" in message for message in said)
+
+
+def test_rows_can_be_read_between_the_pieces_of_a_fold(running):
+    engine, _, solver = running
+    found: list[int] = []
+    reader = threading.Thread(target=lambda: found.append(row_count(engine)), daemon=True)
+    reader.start()
+    while reader.is_alive():
+        solver.left.release()
+        reader.join(0.01)
+    # The first reading is a piece, as nothing is known of the fold; four times as many are the next at most.
+    assert 2 <= found[0] <= 5 and engine.span()[1] == READINGS * SECOND // 2
+
+
+def test_a_refold_catches_up_beside_the_fold_that_is_shown(running):
+    engine, _, solver = running
+    solver.let_go()
+    wait_for(lambda: row_count(engine) == READINGS)
+    solver.left = threading.Semaphore(0)
+    solver.hold("refold")
+    engine.submit(SetTuning("Q.rate", 0.5))
+    assert solver.at_work.wait(PATIENCE)
+    engine.source.put(readings([20.5, 21.0], [60.0, 61.0]))
+    wait_for(lambda: row_count(engine) == READINGS + 2)
+    # Now the engine stands still in what the refold has not seen, and the rows of before can be read all the same.
+    solver.hold("engine")
+    solver.left.release()
+    assert solver.at_work.wait(PATIENCE)
+    assert row_count(engine) == READINGS + 2 and engine.status().refolding and engine.status().revision == 0
+    solver.let_go()
+    wait_for(lambda: engine.status().revision == 1 and not engine.status().refolding)
+    assert row_count(engine) == READINGS + 2

@@ -1,0 +1,501 @@
+"""The one port of the page, as a stranger meets it: who is refused, what is served, who waits for whom."""
+
+import json
+import socket
+import time
+from urllib.parse import quote
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from app.live import commands
+from app.live.engine import Engine
+from app.present.drawing.choices import Choice, Choices
+from app.web.door import Door
+from app.web.server import PageServer
+from estimators.errors import ConfigError
+from tests.app.scripted import Scripted, pull_all, readings, wait_for
+from tests.app.served import PATIENCE, SECRET, Client, FakeViser, shown_twin
+
+STREAM = "/rerun/stream"
+
+
+class Page:
+    """All that runs behind one port."""
+
+    def __init__(self, tmp_path, review=None, behind=lambda source: source):
+        self.source = Scripted()
+        self.engine = Engine(shown_twin(), lambda report: behind(self.source))
+        self.viser = FakeViser()
+        self.choices = Choices([Choice("x", "x", ("temperature", "rate"), "temperature")])
+        self.server = PageServer(
+            self.engine, port=0, viser_port=self.viser.port, secret=SECRET, review=review, choices=self.choices
+        )
+        self.server.start()
+        self.engine.start()
+        self.client = Client(self.server)
+
+    def stop(self):
+        self.engine.stop()
+        self.server.stop()
+        self.viser.stop()
+
+    def connect(self, path, **options):
+        headers = {"Cookie": self.client.cookie}
+        return connect(
+            f"ws://{self.client.host}{path}", origin=self.client.origin, additional_headers=headers,
+            compression=None, max_size=None, proxy=None, open_timeout=PATIENCE, close_timeout=0.5,
+            ping_interval=None, **options,
+        )  # fmt: skip
+
+    def rows(self):
+        return self.engine.status().counts["readings"]
+
+
+@pytest.fixture
+def page(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    # What the viewer's files are is tested elsewhere; to make them takes a while.
+    monkeypatch.setattr("app.web.server.viewer_assets", lambda progress: tmp_path)
+    recording = tmp_path / "reviewed.rrd"
+    recording.write_bytes(b"RRF2 and so on")
+    (tmp_path / "private.rrd").write_bytes(b"nobody's business")
+    page = Page(tmp_path, review=recording)
+    yield page
+    page.stop()
+
+
+# Who is refused
+
+
+def refused(answer, text=""):
+    assert answer.status == 403
+    assert answer.text.count("\n") == 1 and answer.text.endswith("\n")
+    assert text in answer.text
+
+
+@pytest.mark.parametrize(
+    "hosts",
+    [[], ["evil.example"], ["evil.example:{port}"], ["127.0.0.1.evil.example:{port}"], ["192.168.1.7:{port}"],
+     ["127.0.0.1:{port}", "evil.example"]],
+    ids=str,
+)  # fmt: skip
+@pytest.mark.parametrize("upgrade", [False, True])
+def test_foreign_host_is_refused(page, hosts, upgrade):
+    client = page.client
+    headers = [("Host", host.format(port=client.port)) for host in hosts]
+    headers += [("Cookie", client.cookie)]
+    headers += [("Origin", f"http://{headers[0][1]}")] if hosts else []
+    answer = client.raw("GET", STREAM if upgrade else "/", headers, upgrade=upgrade)
+    # Without one Host, or with two, it is no HTTP request at all.
+    assert answer.status in ((400, 403) if len(hosts) != 1 else (403,))
+    assert not page.viser.requests
+
+
+@pytest.mark.parametrize(
+    "origin",
+    ["http://evil.example", "https://127.0.0.1:{port}", "http://127.0.0.1:1", "http://localhost:{port}", "null"],
+)
+@pytest.mark.parametrize(
+    "method, path",
+    [
+        ("GET", "/"),
+        ("POST", "/api/command"),
+        ("POST", "/api/scene"),
+        ("GET", "/viser/"),
+        ("WS", STREAM),
+        ("WS", "/viser/"),
+    ],
+)
+def test_foreign_origin_is_refused(page, origin, method, path):
+    client = page.client
+    headers = [("Host", client.host), ("Cookie", client.cookie), ("Origin", origin.format(port=client.port))]
+    answer = client.raw("GET" if method == "WS" else method, path, headers, upgrade=method == "WS")
+    refused(answer)
+    assert not page.viser.requests
+
+
+@pytest.mark.parametrize("path", [STREAM, "/viser/"])
+def test_websocket_without_origin_is_refused(page, path):
+    client = page.client
+    refused(client.raw("GET", path, [("Host", client.host), ("Cookie", client.cookie)], upgrade=True))
+    assert not page.viser.requests
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/",
+        "/explore",
+        "/api/status",
+        "/api/scene",
+        "/api/track.csv",
+        "/api/report.html",
+        "/alarms",
+        "/api/recordings",
+        "/rec/reviewed.rrd",
+        "/page/style.css",
+        "/viser/",
+        "/nothing",
+    ],
+)
+def test_no_token_no_answer(page, path):
+    client = page.client
+    refused(client.raw("GET", path, [("Host", client.host)]), "token")
+    refused(client.raw("GET", path + "?token=" + "x" * 43, [("Host", client.host)]), "token")
+    name = client.cookie.partition("=")[0]
+    refused(client.raw("GET", path, [("Host", client.host), ("Cookie", f"{name}=" + "0" * 64)]), "token")
+    assert not page.viser.requests
+
+
+@pytest.mark.parametrize("path", [STREAM, "/viser/"])
+def test_no_token_no_websocket(page, path):
+    client = page.client
+    refused(client.raw("GET", path, [("Host", client.host), ("Origin", client.origin)], upgrade=True), "token")
+    assert not page.viser.requests
+
+
+def test_token_is_exchanged_for_a_cookie(page):
+    client = page.client
+    answer = client.raw("GET", f"/?token={client.token}", [("Host", client.host)])
+    assert answer.status == 303
+    assert answer.headers["location"] == "/"
+    marks = {part.strip() for part in answer.headers["set-cookie"].split(";")[1:]}
+    assert {"HttpOnly", "SameSite=Strict", "Path=/"} <= marks
+    assert client.token not in answer.text
+    opened = client.get("/")
+    assert opened.status == 200 and "<title>" in opened.text
+    assert client.token not in opened.text
+
+
+def test_localhost_is_the_same_page(page):
+    client = page.client
+    host = f"localhost:{client.port}"
+    headers = [("Host", host), ("Origin", f"http://{host}"), ("Cookie", client.cookie)]
+    assert client.raw("GET", "/", headers).status == 200
+
+
+def test_a_port_in_use_is_one_line(page):
+    with pytest.raises(ConfigError, match=f"port {page.server.port}.* in use.* --port"):
+        PageServer(page.engine, port=page.server.port, viser_port=None, secret=SECRET)
+
+
+def test_it_listens_on_loopback_only(page):
+    assert {listener.getsockname()[0] for listener in page.server.door._listening.sockets} <= {"127.0.0.1", "::1"}
+
+
+# The stage, framed under the other name of this machine, where the browser sends no cookie
+
+
+def framed(page, path, given, *, upgrade=False, origin="http://localhost:{port}"):
+    headers = [("Host", f"localhost:{page.client.port}"), ("Sec-Fetch-Site", "cross-site")]
+    headers += [("Origin", origin.format(port=page.client.port))] if upgrade else []
+    return page.client.raw("GET", path + (f"?pass={given}" if given is not None else ""), headers, upgrade=upgrade)
+
+
+def test_a_pass_opens_the_stage_without_a_cookie(page):
+    given = page.server.door.stage_pass
+    assert framed(page, "/viser/", given).status == 200
+    here = f"localhost:{page.client.port}"
+    with connect(
+        f"ws://{here}/viser/?pass={given}&part=scene", origin=f"http://{here}", subprotocols=["viser-test"], proxy=None
+    ) as viser:
+        viser.send("text")
+        assert viser.recv(timeout=PATIENCE) == "text"
+    assert page.viser.requests and not any(given in str(request) for request in page.viser.requests)
+
+
+@pytest.mark.parametrize("path", ["/", "/api/status", "/api/model", "/viser/assets", "/page/page.js", STREAM])
+@pytest.mark.parametrize("upgrade", [False, True])
+def test_a_pass_opens_nothing_else(page, path, upgrade):
+    refused(framed(page, path, page.server.door.stage_pass, upgrade=upgrade))
+
+
+@pytest.mark.parametrize("given", [None, "", "x", "é", "{cookie}", "{token}x"])
+@pytest.mark.parametrize("upgrade", [False, True])
+def test_without_its_pass_the_stage_is_closed(page, given, upgrade):
+    given = given and given.format(cookie=page.client.cookie, token=page.client.token)
+    refused(framed(page, "/viser/", given and quote(given), upgrade=upgrade))
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:{port}", "null"])
+def test_a_pass_does_not_let_another_site_connect(page, origin):
+    refused(framed(page, "/viser/", page.server.door.stage_pass, upgrade=True, origin=origin))
+
+
+def test_where_localhost_may_be_another_program_the_stage_stays_here():
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    with socket.create_server(("::1", port), family=socket.AF_INET6):
+        door = Door(port)
+    try:
+        assert door.stage_pass is None
+    finally:
+        door.stop()
+
+
+# What is served
+
+
+@pytest.mark.parametrize(
+    "target",
+    ["/rec/private.rrd", "/rec/..%2fprivate.rrd", "/rec/../private.rrd", "/rec/%2e%2e/private.rrd", "/rec/", "/rec/.",
+     "/page/../server.py", "/page/%2e%2e/server.py", "/page/..%5cserver.py", "/page//etc/passwd",
+     "/page/__init__.py/..",     "/viewer/../../private.rrd", "/viewer/0.0.0/re_viewer.js"],
+)  # fmt: skip
+def test_nothing_else_of_the_disk_is_served(page, target):
+    answer = page.client.get(target)
+    assert answer.status in (400, 404, 405), answer.text
+    assert "nobody's business" not in answer.text and "import" not in answer.text
+
+
+def test_the_reviewed_recording_is_served(page):
+    assert page.client.get("/rec/reviewed.rrd").body == b"RRF2 and so on"
+    assert "reviewed.rrd" in json.loads(page.client.get("/api/status").text)["recordings"]
+    assert json.loads(page.client.get("/api/recordings").text) == [{"name": "reviewed.rrd", "bytes": 14}]
+
+
+def test_every_answer_forbids_to_leave_the_machine(page):
+    for path in ("/", "/explore", "/api/status", "/page/style.css", "/viser/", "/nothing"):
+        policy = page.client.get(path).headers["content-security-policy"]
+        rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+        for name, sources in rules.items():
+            allowed = {"'self'", "'none'", "data:", "blob:", "'unsafe-inline'", "'unsafe-eval'", "'wasm-unsafe-eval'"}
+            allowed |= {f"ws://127.0.0.1:{page.server.port}", f"ws://localhost:{page.server.port}"}
+            own = {f"http://127.0.0.1:{page.server.port}", f"http://localhost:{page.server.port}"}
+            framing = own if name in ("frame-src", "frame-ancestors") else set()
+            assert set(sources.split()) <= allowed | framing, name
+        assert {"default-src", "connect-src", "script-src", "frame-ancestors"} <= rules.keys()
+
+
+def test_status_is_strict_json_and_counts(page):
+    page.source.put(readings([1.0, 2.0, 3.0], [40.0, np.nan, 41.0]))
+    wait_for(lambda: page.rows() == 3)
+
+    def strict(name):
+        raise AssertionError(f"{name} is not JSON")
+
+    wait_for(lambda: json.loads(page.client.get("/api/status").text)["counts"]["readings"] == 3)
+    status = json.loads(page.client.get("/api/status").text, parse_constant=strict)
+    assert status["counts"]["missing"] == 1
+    assert (status["twin"], status["estimator"], status["revision"]) == ("scripted", "kf", 0)
+    assert status["t"] == 3_000_000_000
+
+
+def test_commands_reach_the_engine(page):
+    page.source.put(readings([1.0, 2.0], [40.0, 41.0]))
+    wait_for(lambda: page.rows() == 2)
+    assert page.client.post("/api/command", {"command": "SetTuning", "key": "Q.rate", "value": 0.25}).status < 300
+    wait_for(lambda: page.engine.folded_with()[0].get("Q.rate") == 0.25)
+    assert page.client.post("/api/command", {"command": "SetEstimator", "name": "ukf"}).status < 300
+    wait_for(lambda: page.engine.folded_with()[1] == "ukf")
+    assert page.client.post("/api/command", {"command": "UseSensor", "name": "temperature", "used": False}).status in (
+        (202,) if "temperature" in page.engine.model.sensor_names else (400,)
+    )
+
+
+@pytest.mark.parametrize(
+    "body, says",
+    [
+        (b"{", ""),
+        (b"[]", "command"),
+        (b"[" * 60_000, ""),
+        ({"command": {"a": 1}}, "command"),
+        ({"command": ["Reset"]}, "command"),
+        ({"command": "SetOption", "name": "alpha", "value": "much"}, "alpha"),
+        ({"command": "Shutdown"}, "Shutdown"),
+        ({"command": "SetTuning", "key": "Q.rate"}, "value"),
+        ({"command": "SetTuning", "key": "Q.rate", "value": "much"}, "much"),
+        ({"command": "SetTuning", "key": "Q.rate", "value": True}, "true"),
+        ({"command": "SetTuning", "key": "Q.rate", "value": -1.0}, "Q.rate"),
+        ({"command": "SetTuning", "key": "Q.rat", "value": 1.0}, "Q.rate"),
+        (b'{"command": "SetTuning", "key": "Q.rate", "value": NaN}', "NaN"),
+        ({"command": "SetEstimator", "name": "kalman"}, "kalman"),
+        ({"command": "SetOption", "name": "alpha", "value": 1.0}, "alpha"),
+        ({"command": "UseSensor", "name": "nose", "used": True}, "nose"),
+        ({"command": "Speed", "factor": 0.0}, "factor"),
+        ({"command": "Pause", "paused": True}, "live source"),
+        ({"command": "Record", "path": "/tmp/somewhere.rrd"}, "somewhere"),
+        ({"command": "Record", "path": "../up.rrd"}, "up.rrd"),
+        ({"command": "Record", "path": "x.txt"}, ".rrd"),
+        ({"command": "Reset", "hard": True}, "hard"),
+    ],
+    ids=lambda value: str(value)[:80],
+)
+def test_a_bad_command_is_answered_with_one_line(page, body, says):
+    answer = page.client.post("/api/command", body)
+    assert answer.status == 400
+    said = json.loads(answer.text)["error"] if answer.text.startswith("{") else answer.text.strip()
+    assert "\n" not in said and says in said
+    assert "Traceback" not in answer.text
+
+
+# Viser behind it
+
+
+def test_the_scene_is_chosen_and_the_status_tells_it(page):
+    offered = json.loads(page.client.get("/api/scene").text)
+    assert offered == [{"key": "x", "label": "x", "options": ["temperature", "rate"], "value": "temperature"}]
+    assert json.loads(page.client.post("/api/scene", {"key": "x", "value": "rate"}).text)[0]["value"] == "rate"
+    assert page.choices.values() == {"x": "rate"}
+    assert json.loads(page.client.get("/api/status").text)["scene"][0]["value"] == "rate"
+    for body in ({"key": "x", "value": "mass"}, {"key": "w", "value": "rate"}, {}, [], 7):
+        answer = page.client.post("/api/scene", body)
+        assert answer.status == 400 and answer.text.count("\n") == 0 and json.loads(answer.text)["error"]
+    assert page.choices.values() == {"x": "rate"}
+
+
+def test_each_view_has_a_page_of_its_own(page):
+    """Rerun's is without the rest of the page; Viser's is Viser's own, whose socket passes on what it is asked for."""
+    alone = page.client.get("/explore").text
+    assert 'id="rerun"' in alone and 'id="tune"' not in alone and "{{settings}}" not in alone
+    with page.connect("/viser/?part=scene&theme=dark", subprotocols=["viser-test"]) as socket:
+        socket.send("hello")
+        assert socket.recv(timeout=PATIENCE) == "hello"
+    assert page.viser.requests[-1] == ("/?part=scene&theme=dark", [SECRET])
+
+
+def test_viser_files_pass_without_prefix_and_with_the_secret(page):
+    answer = page.client.get("/viser/assets/a.js?v=1")
+    assert json.loads(answer.text)["path"].partition("?")[0] == "/assets/a.js"
+    assert json.loads(answer.text)["secret"] == [SECRET]
+
+
+def test_a_secret_of_the_browser_is_not_passed_on(page):
+    client = page.client
+    headers = [("Host", client.host), ("Cookie", client.cookie), ("X-Nisus-Secret", "guess")]
+    assert json.loads(client.raw("GET", "/viser/", headers).text)["secret"] == [SECRET]
+
+
+def test_viser_messages_pass_both_ways(page):
+    with page.connect("/viser/?a=b", subprotocols=["viser-test"]) as viser:
+        assert viser.subprotocol == "viser-test"
+        big = bytes(3_000_000)
+        for message in ("text", b"bytes", big):
+            viser.send(message)
+            assert viser.recv(timeout=PATIENCE) == message
+    assert page.viser.requests[-1] == ("/?a=b", [SECRET])
+
+
+# The feed of the Rerun viewer
+
+
+class Viewer:
+    """What a browser does: takes bytes of each recording, and says that it has drawn them."""
+
+    def __init__(self, connection, tmp_path):
+        self.connection = connection
+        self.file = tmp_path / "piece.rrd"
+        self.names = []
+        self.recordings = []
+        self.statuses = []
+
+    def take(self):
+        message = self.connection.recv(timeout=PATIENCE)
+        if isinstance(message, bytes):
+            self.decode(message)
+            self.connection.send("drawn")
+            return
+        said = json.loads(message)
+        if "recording" in said:
+            self.names.append(said["recording"])
+            self.recordings.append({})
+        if "status" in said:
+            self.statuses.append(said["status"])
+
+    def decode(self, data):
+        self.file.write_bytes(data)
+        for chunk in RrdReader(str(self.file)).stream():
+            batch = chunk.to_record_batch()
+            columns = batch.schema.names
+            if chunk.is_static or "Scalars:scalars" not in columns:
+                continue
+            t = batch.column(columns.index("time")).cast("int64").to_numpy()
+            values = batch.column(columns.index("Scalars:scalars")).flatten().to_numpy().reshape(t.size, -1)
+            self.recordings[-1].setdefault(chunk.entity_path, []).append((t, values))
+
+    def until(self, condition):
+        end = time.monotonic() + 3 * PATIENCE
+        while not condition():
+            assert time.monotonic() < end, "waited in vain"
+            self.take()
+
+    def column(self, path, which=-1):
+        """Times (ns) and values that came under a path of one recording."""
+        parts = self.recordings[which].get(path, []) if self.recordings else []
+        if not parts:
+            return np.zeros(0, np.int64), np.zeros((0, 1))
+        t = np.concatenate([part[0] for part in parts])
+        order = np.argsort(t, kind="stable")
+        return t[order], np.concatenate([part[1] for part in parts])[order]
+
+
+def test_the_feed_holds_the_track_and_the_next_revision_replaces_it(page, tmp_path):
+    t = np.arange(1, 51) * 0.5
+    page.source.put(readings(t, 40 + t))
+    wait_for(lambda: page.rows() == 50)
+    state = f"/state/{page.engine.model.state_names[0]}"
+    with page.connect(STREAM) as connection:
+        viewer = Viewer(connection, tmp_path)
+        viewer.until(lambda: viewer.column(state)[0].size >= 50)
+        times, values = viewer.column(state)
+        pull = pull_all(page.engine)
+        np.testing.assert_array_equal(times, pull.events.t)
+        np.testing.assert_array_equal(values[:, 0], pull.track.mean[:, 0])
+        # Two roundings of numbers below 100 lie between the bounds and the standard deviation.
+        np.testing.assert_allclose(values[:, 1] - values[:, 2], 4 * pull.track.std[:, 0], rtol=0, atol=1e-13)
+        np.testing.assert_array_equal(viewer.column("/nis/reading")[1][:, 0], pull.track.nis)
+
+        page.source.put(readings(t + 25.0, 65 + t))
+        viewer.until(lambda: viewer.column(state)[0].size >= 100)
+        assert len(viewer.recordings) == 1
+
+        page.engine.submit(commands.SetTuning("Q.rate", 3.0))
+        viewer.until(lambda: len(viewer.recordings) == 2 and viewer.column(state)[0].size >= 100)
+        assert viewer.names[0] != viewer.names[1]
+        np.testing.assert_array_equal(viewer.column(state)[1][:, 0], pull_all(page.engine).track.mean[:, 0])
+        viewer.until(lambda: viewer.column(f"/previous{state}")[0].size >= 100)
+        grey, old = viewer.column(f"/previous{state}")[1], viewer.column(state, which=0)[1]
+        np.testing.assert_array_equal(grey[:, 0], old[:, 0])
+        assert not np.array_equal(grey[:, 0], viewer.column(state)[1][:, 0])
+        viewer.until(lambda: viewer.statuses and viewer.statuses[-1]["revision"] == 1)
+
+
+def test_a_viewer_that_stops_reading_costs_nobody_anything(page, tmp_path):
+    state = f"/state/{page.engine.model.state_names[0]}"
+    with page.connect(STREAM) as stuck, page.connect(STREAM) as connection:
+        viewer = Viewer(connection, tmp_path)
+        sent = 0
+        for _ in range(20):
+            batch = readings((sent + np.arange(1, 2001)) * 0.001, 40 + np.zeros(2000))
+            page.source.put(batch)
+            sent += len(batch)
+            viewer.until(lambda: (t := viewer.column(state)[0]).size and t[-1] == batch.t[-1])  # noqa: B023
+        assert len(pull_all(page.engine).events) == sent
+        # The stuck one was given one picture, and asked for no other: there is no queue for it that grows.
+        pictures = 0
+        while True:
+            try:
+                pictures += isinstance(stuck.recv(timeout=0), bytes)
+            except TimeoutError:
+                break
+        assert pictures <= 1
+
+
+def test_a_viewer_that_leaves_is_forgotten(page, tmp_path):
+    page.source.put(readings([1.0], [40.0]))
+    wait_for(lambda: page.rows() == 1)
+    with page.connect(STREAM) as connection:
+        Viewer(connection, tmp_path).take()
+        wait_for(lambda: len(page.engine._cursors) == 2)
+    # What is left is the engine's own, of its chronicle.
+    wait_for(lambda: len(page.engine._cursors) == 1)
+
+
+def test_streams_are_refused_after_the_head_not_after_the_work(page):
+    with pytest.raises(InvalidStatus):
+        connect(f"ws://{page.client.host}{STREAM}", origin="http://evil.example", proxy=None)
+    assert len(page.engine._cursors) == 1

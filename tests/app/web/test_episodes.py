@@ -1,0 +1,46 @@
+"""What the API says of health: episodes with a place in ALARMS.md, the cause, and the state of each sensor."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.live.engine import Engine
+from app.web.api import episodes_json, status_json
+from tests.app.scripted import Scripted, readings
+from tests.app.served import shown_twin
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def engine():
+    return Engine(shown_twin(), lambda report: Scripted())
+
+
+def strict(content):
+    """As the page gets it: NaN and infinity are no JSON."""
+    return json.loads(json.dumps(content, allow_nan=False))
+
+
+def test_a_stuck_sensor_in_the_api(engine):
+    said = strict(status_json(engine))
+    assert (said["health"], said["cause"], said["episodes_open"]) == ("waiting", "", 0)
+    assert said["sensors"] == {"winding": {"state": "waiting", "text": ""}} and episodes_json(engine) == []
+    y = 40.0 + np.random.default_rng(5).normal(0, 2, 200)
+    y[100:] = 41.5
+    engine._accept([readings(1.0 + np.arange(200), y)])
+    engine._watchers.chronicle.look()
+    engine._status = None
+    (episode,) = strict(episodes_json(engine))
+    assert list(episode) == ["start", "end", "subject", "cause", "size", "low", "high", "unit", "text", "help"]
+    # The first of the equal readings is that at 101 s; what is stuck has a value, and no interval of it.
+    assert (episode["start"], episode["end"], episode["subject"], episode["cause"]) == (101.0, None, "winding", "stuck")
+    assert (episode["size"], episode["low"], episode["high"], episode["unit"]) == (41.5, None, None, "°C")
+    file, _, heading = episode["help"].partition("#")
+    assert re.search(rf"^## {heading}$", (ROOT / file).read_text(), re.MULTILINE | re.IGNORECASE)
+    said = strict(status_json(engine))
+    assert said["health"] == "degraded" and said["cause"] == episode["text"] and said["episodes_open"] == 1
+    assert said["sensors"] == {"winding": {"state": "degraded", "text": episode["text"]}}

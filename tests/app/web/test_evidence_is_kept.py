@@ -1,0 +1,63 @@
+"""A sensor that lies is held out: what gave it away stays in the report, and what it reads is said."""
+
+import re
+
+import numpy as np
+import pytest
+
+from app.cli.run import live_source
+from app.live.commands import SetTuning
+from app.present.export.report import Reported, report
+from app.present.export.run_rows import rows_of_run
+from app.twin.twin import load_twin
+from app.web.session import Page, Session
+from estimators.log import READING
+from tests.app.cli.test_check import parsed
+from tests.app.scripted import wait_for
+from tests.app.served import Client
+
+FAULT = "[{kind: bias, sensor: yoke, size: 6, start: 100}]"
+
+
+@pytest.fixture(scope="module")
+def session():
+    twin = load_twin("motor_joint", overrides={"source.duration": "200.0", "faults": FAULT})
+    running = Session(twin, live_source(twin, np.inf), page=Page(0, open_browser=False))
+    running.start()
+    engine = running.engine
+    wait_for(lambda: engine.status().finished)
+    wait_for(lambda: any(item.subject == "yoke" for item in engine.episodes()))
+    for revision, (key, value) in enumerate((("use.yoke", False), ("Q.winding", 0.02)), start=1):
+        engine.submit(SetTuning(key, value))
+        wait_for(lambda n=revision: engine.status().revision == n and engine._watchers.chronicle.account.revision == n)
+    yield running
+    running.stop()
+
+
+def test_what_it_reads_is_said_beside_the_light_and_is_the_mean_of_its_last_innovations(session):
+    wait_for(lambda: session.engine.status().sensors["yoke"][1])
+    state, text = session.engine.status().sensors["yoke"]
+    taken = rows_of_run(session.engine)
+    model, pull = session.engine.model, taken.pull
+    own = (pull.events.kind == READING) & (pull.events.channel == model.sensor_names.index("yoke"))
+    innovations = pull.track.innovation[own & np.isfinite(pull.track.innovation[:, 0]), 0][-200:]
+    assert state == "held out" and text.startswith("yoke, held out, reads ")
+    said = float(re.search(r"reads ([\d.]+) °C above what the others say, beyond", text)[1])
+    assert said == pytest.approx(float(np.mean(innovations)), rel=0.06)  # two figures are said
+
+
+def test_the_report_has_the_episode_of_the_run_before_though_two_edits_came_since(session):
+    assert not any(item.subject == "yoke" for item in session.engine.episodes())
+    first = session.engine.revisions.find(0)
+    assert first.track is None and any(item.subject == "yoke" for item in first.episodes)
+    text = " ".join(parsed(Client(session.server).get("/api/report.html").text).text)
+    assert "Episodes of the runs before" in text and "0: as it began" in text
+    for item in first.episodes:
+        assert item.text in text
+    assert "Yoke, held out, reads" in text
+
+
+def test_the_report_of_the_first_run_has_nothing_from_before(session):
+    taken = rows_of_run(session.engine)
+    said = Reported(session.engine.twin, "ekf", taken.run.tuning, taken.pull.events, taken.pull.track, (), (), False)
+    assert not [part for part in report(said) if "runs before" in part.title]

@@ -1,0 +1,154 @@
+"""Faults over the API: put into the running source, listed, stamped, ended; what cannot be is one line."""
+
+import json
+
+import pytest
+
+from app.web.api import command_from_json
+from estimators.errors import NisusError
+from estimators.log import MARK, READING
+from sources.faults.kinds import KINDS
+from sources.faults.layer import Faults
+from sources.faults.source import with_faults
+from tests.app.scripted import MODEL, pull_all, readings, wait_for
+from tests.app.web.test_bounds import NASTY
+from tests.app.web.test_door import Page
+
+
+@pytest.fixture
+def page(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr("app.web.server.viewer_assets", lambda progress: tmp_path)
+    page = Page(tmp_path, behind=lambda source: with_faults(source, Faults(MODEL)))
+    yield page
+    page.stop()
+
+
+def ask(page, **body):
+    return page.client.post("/api/command", body)
+
+
+def active(page):
+    return json.loads(page.client.get("/api/status").text)["faults"]
+
+
+def test_a_fault_begins_and_ends_by_command(page):
+    page.source.put(readings([1.0], [40.0]))
+    wait_for(lambda: page.rows() == 1)
+    assert active(page) == []
+    assert ask(page, command="InjectFault", kind="bias", target="winding", size=2.5).status == 202
+    wait_for(lambda: len(active(page)) == 1)
+    page.source.put(readings([2.0, 3.0], [40.0, 41.0]))
+    wait_for(lambda: page.rows() == 3)
+    wait_for(lambda: active(page)[0]["touched"] == 2)
+    (told,) = active(page)
+    assert told == {
+        "number": 0, "kind": "bias", "target": "winding", "text": "bias of winding, size 2.5 °C",
+        "since": told["since"], "touched": 2, "lost": 0,
+    }  # fmt: skip
+    assert told["since"] == 2_000_000_000
+    assert ask(page, command="ClearFault", number=0).status == 202
+    wait_for(lambda: active(page) == [])
+    page.source.put(readings([4.0], [42.0]))
+    wait_for(lambda: page.rows() == 4)
+    events = pull_all(page.engine).events
+    code = KINDS["bias"].code
+    assert [(t / 1e9, value) for t, value in zip(events.t, events.value[:, 0])] == [
+        (1.0, 40.0), (2.0, 42.5), (2.0, code), (3.0, 43.5), (4.0, 42.0), (4.0, -code),
+    ]  # fmt: skip
+    assert events.kind.tolist() == [READING, READING, MARK, READING, READING, MARK]
+    said = [notice.text for notice in page.engine.notices.since(0)]
+    assert "fault 0 begins: bias of winding, size 2.5 °C" in said and "1 fault(s) end" in said
+
+
+def test_all_end_together_and_what_is_swallowed_is_counted(page):
+    page.source.put(readings([1.0], [40.0]))
+    wait_for(lambda: page.rows() == 1)
+    assert ask(page, command="InjectFault", kind="silence").status == 202
+    assert ask(page, command="InjectFault", kind="stuck", target="winding", duration=60).status == 202
+    wait_for(lambda: len(active(page)) == 2)
+    page.source.put(readings([2.0, 3.0], [40.0, 41.0]))
+    wait_for(lambda: json.loads(page.client.get("/api/status").text)["counts"].get("silenced") == 2)
+    assert ask(page, command="ClearFault").status == 202
+    wait_for(lambda: active(page) == [])
+
+
+def test_the_catalogue_says_what_a_kind_takes(page):
+    found = json.loads(page.client.get("/api/faults").text)
+    assert found["available"] and found["sensors"] == {"winding": [{"name": "winding", "unit": "°C"}]}
+    kinds = {kind["name"]: kind for kind in found["kinds"]}
+    # The scripted source is no asset whose parameters could change.
+    assert set(kinds) == set(KINDS) - {"model"}
+    assert kinds["spike"]["parameters"][1] == {
+        "name": "rate", "unit": "1", "help": "probability, a reading", "default": None,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("body", "says"),
+    [
+        ({"kind": "bend", "target": "winding"}, "InjectFault: kind is 'bend'; "),
+        ({"kind": "bias", "target": "windin", "size": 1}, "InjectFault: target is 'windin', no sensor or input of"),
+        ({"kind": "bias", "target": "winding"}, "InjectFault: size is missing; a fault of kind bias needs it"),
+        ({"kind": "bias", "size": 1}, "InjectFault: target is missing; a fault of kind bias needs the name"),
+        ({"kind": "stuck", "target": "winding", "size": 1}, "size means nothing to a fault of kind stuck"),
+        ({"kind": "spike", "target": "winding", "size": 1, "rate": 2}, "rate is 2; it is a probability"),
+        ({"kind": "delay", "size": 1e30}, "size is 1e+30; it must be positive, and 1e+06 s at most"),
+        ({"kind": "duplicate", "count": 0}, "count is 0; it must be a whole number from 1 to 1000"),
+        ({"kind": "stuck", "target": "winding", "row": "top"}, "row is 'top', no row of winding"),
+        ({"kind": "stuck", "target": "winding", "duration": -1}, "duration is -1 s; it must be positive"),
+        ({"kind": "model", "target": "winding", "size": 2}, "no parameter of motor_winding; there is none"),
+        ({"kind": "swap", "target": "winding", "other": "winding"}, "other is 'winding'; it must be another sensor"),
+        ({"kind": "bias", "sensor": "winding"}, "sensor is not known; choose from kind, target"),
+        ({}, "kind is missing; it takes kind, target"),
+    ],
+    ids=str,
+)
+def test_a_fault_that_cannot_be_is_one_line(page, body, says):
+    answer = ask(page, command="InjectFault", **body)
+    assert answer.status == 400
+    text = json.loads(answer.text)["error"]
+    assert says in text and "\n" not in text
+
+
+def test_ending_a_fault_that_there_is_not_is_one_line(page):
+    answer = ask(page, command="ClearFault", number=4)
+    assert answer.status == 400 and "number is 4; there is no such fault" in answer.text
+
+
+def test_nothing_that_is_asked_for_stops_the_source(page):
+    page.source.put(readings([1.0], [40.0]))
+    wait_for(lambda: page.rows() == 1)
+    taken = 0
+    for kind in [*KINDS, "outliers"]:
+        for target in (None, "winding"):
+            for field in ("size", "rate", "every", "count", "duration", "row", "other"):
+                for value in NASTY:
+                    body = {"command": "InjectFault", "kind": kind, "target": target, "size": 1e3, field: value}
+                    try:
+                        page.engine.submit(command_from_json(body, page.engine))
+                    except NisusError as error:
+                        assert str(error).startswith("InjectFault: ")
+                        continue
+                    taken += 1
+    assert taken > 100
+    page.source.put(readings([2.0, 3.0], [40.0, 41.0]))
+    ask(page, command="ClearFault")
+    wait_for(lambda: active(page) == [])
+    before = page.rows()
+    page.source.put(readings([4.0], [42.0]))
+    wait_for(lambda: page.rows() == before + 1)
+    counts = json.loads(page.client.get("/api/status").text)["counts"]
+    assert not counts.get("engine error") and not counts.get("source failed")
+
+
+def test_a_recording_takes_no_faults(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr("app.web.server.viewer_assets", lambda progress: tmp_path)
+    page = Page(tmp_path)
+    try:
+        answer = ask(page, command="InjectFault", kind="stuck", target="winding")
+        assert answer.status == 400 and "holds what came, faults included" in answer.text
+        assert not json.loads(page.client.get("/api/faults").text)["available"]
+    finally:
+        page.stop()

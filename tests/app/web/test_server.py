@@ -1,0 +1,148 @@
+"""What the black-box tests of the page do not reach: the token's file, browsers' own hints, the viewer's files."""
+
+import asyncio
+import gzip
+
+import pytest
+
+from app.live.engine import Engine
+from app.web import viewer_assets as assets_module
+from app.web.gate import Gate
+from app.web.server import PageServer
+from app.web.viewer_assets import FILES, viewer_assets, viewer_version
+from estimators.errors import ConfigError
+from tests.app.scripted import Scripted
+from tests.app.served import SECRET, Client, shown_twin
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "nisus"
+
+
+def served(monkeypatch, prepare):
+    monkeypatch.setattr("app.web.server.viewer_assets", prepare)
+    engine = Engine(shown_twin(), lambda report: Scripted())
+    server = PageServer(engine, port=0, viser_port=None, secret=SECRET)
+    server.start()
+    return server
+
+
+def test_each_session_has_a_token_of_its_own(cache):
+    engine = Engine(shown_twin(), lambda report: Scripted())
+    tokens = {PageServer(engine, port=0, viser_port=None, secret=SECRET).url.partition("token=")[2] for _ in range(3)}
+    assert len(tokens) == 3 and all(len(token) >= 32 for token in tokens)
+    # Nothing of it stays: what the last session's browsers know opens nothing.
+    assert not cache.exists()
+
+
+def test_a_session_keeps_its_token_and_its_cookie(monkeypatch, tmp_path):
+    server = served(monkeypatch, lambda progress: tmp_path)
+    client = Client(server)
+    first = client.cookie
+    client._cookie = None
+    assert client.cookie == first and client.get("/").status == 200
+    assert client.token == Client(server).token
+    # It ends with the browser, as it is of no use to the next session.
+    marks = client.raw("GET", f"/?token={client.token}", [("Host", client.host)]).headers["set-cookie"].lower()
+    assert "max-age" not in marks and "expires" not in marks
+    server.stop()
+
+
+def ask(gate, path="/", query="", **headers):
+    """Status and headers that a gate answers a GET with; 299 is the application behind it."""
+    sent = []
+
+    async def send(message):
+        sent.append(message)
+
+    raw = [(name.replace("_", "-").encode(), value.encode()) for name, value in headers.items()]
+    scope = {"type": "http", "method": "GET", "path": path, "query_string": query.encode(), "headers": raw}
+    asyncio.run(gate(scope, None, send))
+    return sent[0]["status"], dict(sent[0]["headers"]), sent[1]["body"] if len(sent) > 1 else b""
+
+
+async def behind(scope, receive, send):
+    await send({"type": "http.response.start", "status": 299, "headers": []})
+
+
+@pytest.mark.parametrize("site, status", [("same-origin", 299), ("none", 299), ("same-site", 403), ("cross-site", 403)])
+def test_what_the_browser_says_of_a_request_without_origin_is_heard(site, status):
+    gate = Gate(behind, "t" * 40, 9900)
+    _, headers, _ = ask(gate, query="token=" + "t" * 40, host="127.0.0.1:9900")
+    cookie = headers[b"set-cookie"].decode().partition(";")[0]
+    asked = ask(gate, "/rec/a.rrd", host="127.0.0.1:9900", cookie=cookie, sec_fetch_site=site)
+    assert asked[0] == status
+
+
+def test_a_link_from_elsewhere_opens_the_page_without_a_redirect():
+    # A strict cookie is not sent along a redirect that another site began.
+    gate = Gate(behind, "t" * 40, 9900)
+    status, headers, body = ask(gate, query="token=" + "t" * 40, host="localhost:9900", sec_fetch_site="cross-site")
+    assert status == 200 and b"set-cookie" in headers and b"refresh" in body and b"t" * 40 not in body
+
+
+def test_a_script_may_send_the_token_as_a_header():
+    gate = Gate(behind, "t" * 40, 9900)
+    assert ask(gate, "/api/status", host="127.0.0.1:9900", authorization="Bearer " + "t" * 40)[0] == 299
+    assert ask(gate, "/api/status", host="127.0.0.1:9900", authorization="Bearer " + "x" * 40)[0] == 403
+
+
+def test_the_cookie_of_one_port_does_not_open_another():
+    token = "t" * 40
+    _, headers, _ = ask(Gate(behind, token, 9900), query=f"token={token}", host="127.0.0.1:9900")
+    value = headers[b"set-cookie"].decode().partition(";")[0].partition("=")[2]
+    assert ask(Gate(behind, token, 9901), host="127.0.0.1:9901", cookie=f"nisus_9901={value}")[0] == 403
+
+
+def test_viewer_files_are_compressed_and_kept_for_ever(tmp_path, monkeypatch):
+    for name in FILES:
+        (tmp_path / f"{name}.gz").write_bytes(gzip.compress(name.encode() * 1000))
+    server = served(monkeypatch, lambda progress: tmp_path)
+    client = Client(server)
+    path = f"/viewer/{viewer_version()}/re_viewer_bg.wasm"
+    head = [("Host", client.host), ("Cookie", client.cookie)]
+    packed = client.raw("GET", path, [*head, ("Accept-Encoding", "gzip, br")])
+    assert packed.headers["content-encoding"] == "gzip" and "immutable" in packed.headers["cache-control"]
+    assert packed.headers["content-type"] == "application/wasm"
+    assert gzip.decompress(packed.body) == b"re_viewer_bg.wasm" * 1000
+    plain = client.raw("GET", path, head)
+    assert plain.body == b"re_viewer_bg.wasm" * 1000 and "content-encoding" not in plain.headers
+    server.stop()
+
+
+def test_a_viewer_that_cannot_be_had_is_said_to_the_page(monkeypatch):
+    def fail(progress):
+        raise ConfigError("rerun-sdk: its viewer program is missing; install it")
+
+    server = served(monkeypatch, fail)
+    answer = Client(server).get(f"/viewer/{viewer_version()}/re_viewer.js")
+    assert answer.status == 503 and answer.text == "rerun-sdk: its viewer program is missing; install it\n"
+    server.stop()
+
+
+def test_the_installed_viewer_is_unpacked_without_a_trace(tmp_path, monkeypatch, cache):
+    home = tmp_path / "home"
+    home.mkdir()
+    for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME"):
+        monkeypatch.setenv(name, str(home))
+    said = []
+    folder = viewer_assets(said.append)
+    assert folder == cache / f"rerun-{viewer_version()}" and len(said) == 1
+    assert gzip.decompress((folder / "re_viewer_bg.wasm.gz").read_bytes()).startswith(b"\0asm")
+    assert b"class WebHandle" in gzip.decompress((folder / "re_viewer.js.gz").read_bytes())
+    assert not list(home.iterdir()), "an analytics identity, for example"
+    # From the cache the second time.
+    monkeypatch.setattr(assets_module, "_served_files", None)
+    assert viewer_assets(said.append) == folder and len(said) == 1
+
+
+def test_a_viewer_that_does_not_start_is_one_line(tmp_path, monkeypatch):
+    program = tmp_path / "rerun"
+    program.write_text("#!/bin/sh\necho it is broken\nexit 3\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(assets_module, "_program", lambda: program)
+    with pytest.raises(ConfigError, match="did not start.*it is broken") as error:
+        viewer_assets()
+    assert "\n" not in str(error.value)
