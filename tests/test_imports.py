@@ -17,6 +17,7 @@ IMPURE = {"os", "io", "time", "datetime", "logging", "socket", "subprocess", "th
 """What the numerics may not touch: files, clocks, logs, threads."""
 IMPURE_HERE = {
     "numerics/cache.py": {"os"},  # where the compile cache is
+    "numerics/cache_entries.py": {"os"},  # reads and writes the compile cache
     "numerics/jit.py": {"os"},  # whether the user says where, and how threads wait
     "numerics/threads.py": {"os"},  # how many processors there are
     "compiled/orphan.py": {"os", "threading"},  # a worker that ends with its parent

@@ -18,6 +18,7 @@ from numba.experimental.function_type import _get_jit_address
 from numba.extending import intrinsic, register_jitable
 
 from .cache import cache_folder
+from .cache_entries import use_entries
 from .threads import threaded
 
 F1 = types.float64[::1]
@@ -33,6 +34,7 @@ i64 = types.int64
 
 if "NUMBA_CACHE_DIR" not in os.environ:
     numba.config.CACHE_DIR = str(cache_folder())
+use_entries()
 
 # Vectors of a few entries lose more to the set-up of a vectorised loop than they gain: without it the filters take 20
 # to 30 % less time at n = 2 to 4, and no more at n = 48.

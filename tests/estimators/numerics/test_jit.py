@@ -1,5 +1,6 @@
 """Compiled code in a process that finds it in the cache."""
 
+import os
 import subprocess
 import sys
 
@@ -17,3 +18,34 @@ def test_code_from_the_cache_finds_the_threads_that_it_may_call():
     """What LLVM does not find when it loads such code ends the process, whatever filter came first."""
     run = subprocess.run([sys.executable, "-c", LOADED], cwd=ROOT, capture_output=True, text=True, check=True)
     assert run.stdout.split() == ["True", "True"]
+
+
+def kf_code(cache) -> subprocess.CompletedProcess[str]:
+    """Load the functions of one filter in another process, with a cache of its own."""
+    code = "from estimators.registry import ESTIMATORS; print(len(ESTIMATORS['kf'].code()))"
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        env=environment | {"XDG_CACHE_HOME": str(cache)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+
+
+def test_a_damaged_entry_is_discarded_and_compiled_again(tmp_path):
+    """Index files cut in half, and a machine code with one byte changed, which unpickling would not notice."""
+    said = kf_code(tmp_path)
+    assert said.stderr == ""
+    damaged = sorted(tmp_path.rglob("*.nbi"))
+    damaged += sorted(tmp_path.rglob("*gaussian/kf.predict*.nbc"))
+    for path in damaged:
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2] ^= 1
+        path.write_bytes(content[: len(content) // 2] if path.suffix == ".nbi" else content)
+    again = kf_code(tmp_path)
+    assert again.stdout == said.stdout
+    (line,) = again.stderr.splitlines()
+    assert line.endswith("damaged entries of the compile cache discarded; compiling them again")
+    assert kf_code(tmp_path).stderr == ""
