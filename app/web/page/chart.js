@@ -129,11 +129,12 @@ export class Chart {
     this.pointed(this.plot);
   }
 
+  // uPlot fires this hook for every chart that shares the cursor; only the dragged one has a pointer event.
   selected(self) {
     const { left, width } = self.select;
-    if (width < 4) return;
     const ends = [self.posToVal(left, "x"), self.posToVal(left + width, "x")];
     self.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
+    if (width < 4 || !self.cursor.event) return;
     this.actions.select(...ends);
   }
 

@@ -80,6 +80,23 @@ def test_between_the_extremes_of_many_readings_the_others_are_seen(page):
     assert page.evaluate(TINTED)[2] == 0
 
 
+def test_dragging_across_a_part_of_a_chart_zooms_to_exactly_that_part(page):
+    """All charts share the selection, and only the one that was dragged may act on it."""
+    page.evaluate("window.nisus.view.show(50, 250)")
+    until(page, "window.nisus.charts.range[0] === 50")
+    assert page.evaluate("window.nisus.charts.charts.filter((chart) => !chart.node.hidden).length") > 8
+    box = page.locator("#charts .u-over").first.bounding_box()
+    start, y = box["x"] + 0.4 * box["width"], box["y"] + box["height"] / 2
+    page.mouse.move(start, y)
+    page.mouse.down()
+    page.mouse.move(start + 0.3 * box["width"], y, steps=5)
+    page.mouse.up()
+    until(page, "window.nisus.view.since !== 50")
+    since, until_ = page.evaluate("[window.nisus.view.since, window.nisus.view.until]")
+    pixel = 200 / box["width"]
+    assert [since, until_] == pytest.approx([50 + 0.4 * 200, 50 + 0.7 * 200], abs=pixel)
+
+
 def test_hidden_charts_ask_for_nothing(page, session):
     engine = session.engine
     engine.submit(Pin(0))
