@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
 import can
@@ -19,29 +23,49 @@ from .heard import Heard
 MOST_FRAMES = 4096
 """Frames taken at once; what is queued beyond them comes next."""
 
+IP_MULTICAST_ALL = (socket.IPPROTO_IP, 49)
+IPV6_MULTICAST_ALL = (socket.IPPROTO_IPV6, 29)
+"""Socket options of Linux (linux/in.h, linux/in6.h), which Python does not name."""
+
 WAITS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 """Seconds before each attempt to open a bus again; the last for all that follow."""
 
 
 def open_bus(interface: str, channel: str | int, options: Mapping[str, Any], filters: list | None = None) -> Any:
-    """A bus of python-can's.
+    """Open a bus through python-can.
 
     Raises:
         SourceError: If it cannot be opened.
     """
     options = dict(options)
     if interface == "udp_multicast":
-        # Frames must not leave this machine unless somebody asks for it: with 0 hops the kernel keeps them here.
+        # Frames must not leave this machine unless the user asks for it: with 0 hops the kernel keeps them here.
         options.setdefault("hop_limit", 0)
     if filters is not None:
         options.setdefault("can_filters", filters)
     try:
-        return can.Bus(channel=channel, interface=interface, **options)
+        bus = can.Bus(channel=channel, interface=interface, **options)
+        if interface == "udp_multicast" and sys.platform == "linux":
+            _keep_own_group(bus)
+        return bus
     except Exception as error:  # noqa: BLE001  drivers raise anything: OSError, ValueError, ImportError, their own
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise SourceError(
             f"CAN bus {interface}:{channel}: it cannot be opened ({reason}); check interface, channel and options"
         ) from None
+
+
+def _keep_own_group(bus: Any) -> None:
+    """Restrict a multicast bus to the frames of its own group.
+
+    python-can binds its socket to the port alone. Linux then delivers the frames of every group that any process of the
+    host has joined on that port, so that two channels would be one bus.
+    """
+    with socket.socket(fileno=os.dup(bus.fileno())) as sock:
+        sock.setsockopt(*(IPV6_MULTICAST_ALL if sock.family == socket.AF_INET6 else IP_MULTICAST_ALL), 0)
+        with suppress(BlockingIOError):
+            while True:  # Frames of other groups may have arrived since the socket was bound.
+                sock.recv(1, socket.MSG_DONTWAIT)
 
 
 class CanBus:

@@ -1,5 +1,6 @@
 """Live buses: frames arrive decoded; a bus that fails is reported and opened again, and `read` never raises."""
 
+import sys
 import time
 import uuid
 
@@ -139,18 +140,46 @@ def test_error_frames_are_counted_and_give_no_event(decoder):
     assert reports.counts == {"error frame": 1}
 
 
-def test_multicast_stays_on_this_machine_and_arrives(decoder):
-    try:
-        sender = open_bus("udp_multicast", GROUP, {"port": 43999})
-        source = CanBus("udp_multicast", GROUP, decoder, bus_options={"port": 43999})
-        sender.send(frame(256, DATA))
-    except (SourceError, can.CanError) as error:
-        pytest.skip(f"no multicast here: {error}")
+@pytest.fixture
+def multicast():
+    """Open real multicast buses on a port of this test, by group; they are closed at the end."""
+    opened = []
+
+    def connect(group, **arguments):
+        try:
+            opened.append(open_bus("udp_multicast", group, {"port": 43999}, **arguments))
+            opened[-1].send(frame(2047, b"probe"))
+        except (SourceError, can.CanError) as error:
+            pytest.skip(f"no multicast here: {error}")
+        return opened[-1]
+
+    yield connect
+    for bus in opened:
+        bus.shutdown()
+
+
+def test_multicast_stays_on_this_machine_and_arrives(decoder, multicast):
+    source = CanBus("udp_multicast", GROUP, decoder, connect=lambda: multicast(GROUP, filters=decoder.filters))
+    sender = multicast(GROUP)
+    sender.send(frame(256, DATA))
     assert sender._multicast.hop_limit == 0
-    got = listen(source, 1)
-    assert got.value[0, 0] == 10.0
-    sender.shutdown()
-    source.close()
+    assert listen(source, 1).value[0, 0] == 10.0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a socket option of Linux")
+@pytest.mark.parametrize("groups", [(GROUP, "239.74.163.3"), ("ff15::4e49:1", "ff15::4e49:2")], ids=["IPv4", "IPv6"])
+def test_two_groups_on_one_host_are_two_buses(multicast, groups):
+    listeners = [multicast(group) for group in groups]
+    senders = [multicast(group) for group in groups]
+    for k, sender in enumerate(senders):
+        for count in range(3):
+            sender.send(frame(256 + k, bytes([count])))
+    for k, listener in enumerate(listeners):
+        received = []
+        while len(received) < 3 and (message := listener.recv(5.0)) is not None:
+            received += [(message.arbitration_id, *message.data)] if message.arbitration_id != 2047 else []
+        assert received == [(256 + k, 0), (256 + k, 1), (256 + k, 2)]
+        assert all(other.arbitration_id == 2047 for other in iter(lambda bus=listener: bus.recv(0.0), None))
 
 
 def test_a_message_that_never_comes_is_named_once(tmp_path):
