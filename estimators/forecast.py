@@ -162,10 +162,7 @@ def _future(model: StateSpaceModel, base: Base, instants: np.ndarray, inputs: Ev
     n = instants.size
     nothing = np.full((n, model.width), np.nan)
     steps = Events(instants, instants, np.full(n, INPUT, np.int8), np.zeros(n, np.int32), nothing)
-    log = Log.of(model, capacity=n + (len(inputs) if inputs is not None else 0))
-    log.first, log.floor, log.version = base.first, base.clock, base.version
-    log.extend(steps if inputs is None else Events.concat([steps, inputs], model.width))
-    return log
+    return Log.resume(model, base, steps if inputs is None else Events.concat([steps, inputs], model.width))
 
 
 def _quantiles(points: np.ndarray, mean: np.ndarray, model: StateSpaceModel) -> np.ndarray:

@@ -27,6 +27,7 @@ from .events.order import in_order, sorted_order
 
 if TYPE_CHECKING:
     from .model.state_space import StateSpaceModel
+    from .snapshots import Base
 
 __all__ = [
     "BEFORE", "INPUT", "KIND_NAMES", "MAINTENANCE", "MARK", "READING", "RESET", "TICK", "TRUTH", "Log", "Events",
@@ -72,6 +73,26 @@ class Log:
         log.model, log.layout = model, model.layout
         if start is not None:
             log.start = log.floor = int(arrays.nanoseconds("start", start)[0])
+        return log
+
+    @staticmethod
+    def resume(model: StateSpaceModel, base: Base | None, events: Events | None = None, *, capacity: int = 1) -> Log:
+        """Return a log of a model that continues where a fold left a base.
+
+        Args:
+            model: The model whose sensors, inputs and states the events are of.
+            base: Where the fold of this log begins; None for the prior.
+            events: The events from there on; None for none yet.
+            capacity: Events that fit before it grows, at least.
+
+        Raises:
+            EventError: If an event does not fit the model.
+        """
+        log = Log.of(model, capacity=max(1, capacity, 0 if events is None else len(events)))
+        if base is not None:
+            log.first, log.floor, log.version = base.first, base.clock, base.version
+        if events is not None:
+            log.extend(events)
         return log
 
     def _allocate(self, capacity: int, columns: int) -> None:

@@ -140,8 +140,7 @@ def logs_of(archived: Archived, twin: Twin, span: float | None) -> Iterator[tupl
     """
     if archived.recording is not None:
         recorded = read_recording(archived.recording)
-        log = Log.of(twin.model, capacity=max(1, recorded.rows))
-        log.extend(recorded.events)
+        log = Log.resume(twin.model, recorded.base, recorded.events)
         _cut(log, span)
         yield log, recorded.base
         return

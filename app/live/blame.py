@@ -101,9 +101,7 @@ class Blame:
 
     def _ask(self, episode: Episode, taken: Window) -> None:
         model = taken.tuning.model
-        log = Log.of(model, capacity=len(taken.events))
-        log.first, log.floor = taken.base.first, taken.base.clock
-        log.extend(taken.events)
+        log = Log.resume(model, taken.base, taken.events)
         executor = Unhurried(self._stopping)
         try:
             found = suspects(

@@ -138,9 +138,7 @@ class IntegrityWatch:
 
     def _compute(self, taken: Window) -> Sensitivity:
         model = taken.tuning.model
-        log = Log.of(model, capacity=len(taken.events))
-        log.first, log.floor = taken.base.first, taken.base.clock
-        log.extend(taken.events)
+        log = Log.resume(model, taken.base, taken.events)
         return sensitivity(
             taken.estimator,
             model,

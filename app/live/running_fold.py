@@ -236,9 +236,7 @@ class RunningFold:
 
     def _clear(self, base: Base | None) -> None:
         """An empty log and the fold that follows it."""
-        self._log = Log.of(self.model, capacity=self._history + 4 * SPARSE_EVERY)
-        if base is not None:
-            self._log.first, self._log.floor, self._log.version = base.first, base.clock, base.version
+        self._log = Log.resume(self.model, base, capacity=self._history + 4 * SPARSE_EVERY)
         self._logs += 1
         self._base = base
         idle = not self._ready(self.estimator)

@@ -142,12 +142,9 @@ def tail(fold: Fold, start: int, base: Base | None = None) -> tuple[Log, Base | 
         base = fold.base_here()
         fold.advance(stop - fold.n)
     log = fold.log
-    part = Log.of(fold.model, capacity=stop - start)
-    if base is not None:
-        part.first, part.floor, part.version = base.first, base.clock, base.version
-    else:
-        part.first, part.floor, part.start, part.version = log.first, log.floor, log.start, log.version
-    part.extend(log.events.select(slice(start, stop)))
+    part = Log.resume(fold.model, base, log.events.select(slice(start, stop)))
+    if base is None:
+        part.start, part.floor = log.start, log.floor
     return part, base
 
 

@@ -153,6 +153,22 @@ def test_a_base_knows_its_version():
     assert at == 2048 and base.version == 3 and made.base_at(10)[1].version == 1
 
 
+def test_a_log_that_resumes_from_a_base_counts_versions_on():
+    """`Log.resume` restores index, floor and version, so its rows carry the numbers of the log it continues."""
+    log = log_of(stream(3000, at=(100, 200, 2500)))
+    made = Fold("kf", MODEL, Tuning.of(MODEL), log)
+    made.advance()
+    at, base = made.base_at(2048)
+    part = Log.resume(MODEL, base, log.events.select(slice(at, None)))
+    np.testing.assert_array_equal(model_versions(part.events, part.version), model_versions(log.events)[at:])
+    again = Fold("kf", MODEL, Tuning.of(MODEL), part, base=base)
+    again.advance()
+    assert (again.base_here().version, again.base_here().first) == (4, log.n)
+    np.testing.assert_array_equal(again.track.mean, made.track.mean[at:])
+    _, stale = part.extend(log.events.select(slice(0, 1)))
+    assert stale == 1, "an event before the base cannot change what the base already contains"
+
+
 def test_before_anything_was_said_it_starts_at_the_prior():
     log = log_of(Events.concat([maintained(0, 0, [0], MODEL.width), stream(10, at=())], MODEL.width))
     track = fold("kf", MODEL, Tuning.of(MODEL), log)

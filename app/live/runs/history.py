@@ -41,10 +41,7 @@ def history(
         if not go():
             break
     events = Events.concat(pieces, engine.model.width)
-    log = Log.of(engine.model, capacity=max(1, len(events)))
-    if base is not None:
-        log.first, log.floor, log.version = base.first, base.clock, base.version
-    log.extend(events)
+    log = Log.resume(engine.model, base, events)
     if not (log.kind[: log.n] == READING).any():
         raise ConfigError("no reading has come yet; there is nothing to fold")
     return log, base

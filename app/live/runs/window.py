@@ -32,10 +32,7 @@ class Window(NamedTuple):
 
     def fold(self, engine: Running, estimator: str, tuning: Tuning) -> Fold:
         """A fold over these events, of any estimator and tuning; nothing is folded yet."""
-        log = Log.of(engine.model, capacity=len(self.pull.events))
-        if self.base is not None:
-            log.first, log.floor, log.version = self.base.first, self.base.clock, self.base.version
-        log.extend(self.pull.events)
+        log = Log.resume(engine.model, self.base, self.pull.events)
         return Fold(estimator, engine.model, tuning, log, policy=engine.policy, base=self.base)
 
 

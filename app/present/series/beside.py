@@ -142,9 +142,7 @@ class Beside:
     def _begin(self, pull: Pull) -> bool:
         """Begin where the engine's fold does, also when the log has begun again; False if that has just moved."""
         engine, base = self._engine, self._engine.base()
-        log = Log.of(engine.model)
-        if base is not None:
-            log.first, log.floor, log.version = base.first, base.clock, base.version
+        log = Log.resume(engine.model, base, capacity=1024)
         if pull.first != log.first or not len(pull.events):
             self._cursor.log = -1  # to be given all again
             return False

@@ -91,11 +91,9 @@ class Smoothing:
 def _smoothed(taken: Window) -> Pull:
     """The rows of a window, with smoothed moments."""
     model, base = taken.tuning.model, taken.base
-    log = Log.of(model, capacity=len(taken.events))
-    log.first, log.floor = base.first, base.clock
-    log.extend(taken.events)
+    log = Log.resume(model, base, taken.events)
     fold = Fold(taken.estimator, model, taken.tuning, log, base=base)
     check_smooth(fold.estimator, model, fold.options)
     fold.advance()
     track = smooth(fold).instead_of(fold.track)
-    return Pull(taken.revision, False, base.first, log.events, track, oldest=base.first)
+    return Pull(taken.revision, False, base.first, log.events, track, oldest=base.first, version=log.version)

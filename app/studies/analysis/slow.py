@@ -93,10 +93,7 @@ class Slow:
         return Found(taken.revision, cost, found.whole, found.reason, found.note)
 
     def _log(self, taken: Window) -> Log:
-        log = Log.of(self._engine.model, capacity=len(taken.events))
-        log.first, log.floor = taken.base.first, taken.base.clock
-        log.extend(taken.events)
-        return log
+        return Log.resume(self._engine.model, taken.base, taken.events)
 
     def _cost(self, taken: Window) -> float:
         """Microseconds of an event."""

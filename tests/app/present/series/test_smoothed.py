@@ -1,14 +1,21 @@
 """The lane of what runs, smoothed: against a fold of the same log, again when something came, and never in silence."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from app.live import commands
 from app.live.engine import Engine
+from app.live.integrity import window
+from app.live.notices import Notices
 from app.present.series.lane import Lane, Wanted
 from app.present.series.series import SMOOTHED, Series
+from app.present.series.smoothed import Smoothing
 from estimators import fold
-from estimators.log import Log
+from estimators.events.maintenance import maintained
+from estimators.fold import Fold
+from estimators.log import Events, Log
 from estimators.tuning import Tuning
 from tests.app.live.runs.test_scores import carry_out
 from tests.app.present.series.test_pinned import MEAN, N, taken, values
@@ -47,6 +54,22 @@ def shown(series, lane, wanted):
 
     wait_for(there, seconds=120.0)
     return last[0]
+
+
+def test_smoothed_rows_carry_the_version_of_the_model():
+    """After a maintenance before the window; its log once restarted at version 1."""
+    log = Log.of(MODEL)
+    t, y = values(N)
+    log.extend(Events.concat([readings(t, y), maintained(int(t[10]), int(t[10]), [0], MODEL.width)], MODEL.width))
+    fold = Fold("kf", MODEL, Tuning.of(MODEL), log)
+    fold.advance()
+    engine = SimpleNamespace(
+        last_events=lambda most: window(fold, 1, most=N // 2), estimator="kf", notices=Notices(lambda: 0)
+    )
+    smoothing = Smoothing(engine)
+    wait_for(lambda: smoothing.latest is not None, seconds=120.0)
+    smoothing.stop()
+    assert smoothing.latest.version == 2
 
 
 def test_it_is_the_smoothed_fold_and_follows_what_runs(source_and_engine):
