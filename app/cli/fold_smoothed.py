@@ -9,7 +9,7 @@ import numpy as np
 
 from estimators.diagnostics.score import Fit, score
 from estimators.fold import Fold
-from estimators.smoothing.consistency import consistency
+from estimators.smoothing.smooth import consistency
 from estimators.smoothing.smoothed import Smoothed
 
 

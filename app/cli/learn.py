@@ -11,13 +11,11 @@ from typing import TYPE_CHECKING
 
 from config.files import shown_path
 from estimators.errors import ConfigError
-from estimators.fit.aims import Recording
-from estimators.fit.blocks import held_out_rows
 from estimators.fit.entries import Setting
 from estimators.fit.judge import Part, worths
+from estimators.fit.recording import Recording, held_out_rows
 from estimators.fold import Fold
-from estimators.learned.judge import against, known, on_held_out, on_windows
-from estimators.learned.train import NET, Trained, train
+from estimators.learned.train import NET, Trained, against, known, on_held_out, on_windows, train
 from estimators.learned.windows import Windows, known_states, windows
 from estimators.model.hybrid import check_places
 from estimators.model.state_space import StateSpaceModel

@@ -10,7 +10,7 @@ import numpy as np
 
 from estimators.diagnostics.sensitivity.words import digits
 from estimators.fit.judge import Part
-from estimators.learned.judge import OnWindows
+from estimators.learned.train import OnWindows
 
 from ..live.runs.fit_json import part_json
 from ..present.export.parts import Part as Section

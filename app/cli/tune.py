@@ -11,7 +11,8 @@ from config.loader import find
 from config.source_schema import SimulatorSection
 from estimators.errors import ConfigError, printable
 from estimators.fit.aims import CRPS, ERROR
-from estimators.fit.fit import Fitted, Given, fit
+from estimators.fit.fit import Fitted, fit
+from estimators.fit.recording import Recording
 from estimators.log import Log
 
 from ..live.runs.fit_json import fit_json
@@ -85,20 +86,20 @@ def tune_twin(arguments: Arguments) -> int:
     return 0 if found.proposed else 1
 
 
-def _recordings(arguments: Arguments) -> tuple[Twin, list[Given]]:
+def _recordings(arguments: Arguments) -> tuple[Twin, list[Recording]]:
     """The twin, and what it is fitted to: recordings, logs of its simulator, or its own log."""
     overrides = settings(arguments.set, arguments.estimator)
     if not arguments.log:
         twin = load_twin(arguments.twin, overrides=overrides)
         prepare(twin)
-        return twin, [Given(log) for log in _own(twin, arguments, overrides)]
+        return twin, [Recording(log) for log in _own(twin, arguments, overrides)]
     if arguments.logs != 1:
         raise ConfigError("--logs: is for a simulated twin; a recording is named by --log, once each")
     named = [_named(text) for text in arguments.log]
     twins = [load_twin(arguments.twin, log_files=files, overrides=overrides) for files, _ in named]
     prepare(twins[0])
     logs = [read_log(twin, arguments.duration)[0] for twin in twins]
-    return twins[0], [Given(log, weight) for log, (_, weight) in zip(logs, named, strict=True)]
+    return twins[0], [Recording(log, weight) for log, (_, weight) in zip(logs, named, strict=True)]
 
 
 def _named(text: str) -> tuple[list[Path], float]:

@@ -14,7 +14,8 @@ from config.files import shown_path
 from estimators.errors import ConfigError, printable
 from estimators.fit.aims import LIKELIHOOD
 from estimators.fit.dual import Refit, against, shift, walk
-from estimators.fit.fit import Given, Line
+from estimators.fit.fit import Line
+from estimators.fit.recording import Recording
 
 from ..live.runs.fit_json import fit_json
 from ..live.runs.tuning_yaml import tuning_yaml
@@ -31,7 +32,7 @@ from .tune_text import heading
 if TYPE_CHECKING:
     from .arguments import Tune as Arguments
 
-Recordings = Callable[["Arguments"], tuple[Twin, list[Given]]]
+Recordings = Callable[["Arguments"], tuple[Twin, list[Recording]]]
 
 UNSEEN = 0.05
 """Share of a window up to which nobody need be told that the end of a log is in none."""

@@ -27,12 +27,11 @@ from scipy.special import ndtr
 from ..diagnostics.refusals import log_density
 from ..errors import EstimatorError, nearest, quoted
 from ..fold import Fold
-from ..log import READING, Log
+from ..log import READING, Log, truth_of
 from ..model.state_space import StateSpaceModel
-from ..snapshots import Base
-from ..track import FAILED, GATED, USED, Track
+from ..track import FAILED, GATED, HELD_OUT, USED, Track
 from .entries import Setting
-from .witnesses import correlation_time, of_sensor, witnesses
+from .recording import Recording
 
 PRICE = 1e3
 """Nats that a reading costs which failed."""
@@ -41,15 +40,6 @@ LIKELIHOOD, WITNESSES, CRPS, ERROR = AIMS = ("likelihood", "witnesses", "crps", 
 
 FARTHEST = 5.0
 """Root mean squares beyond which an error counts as this for how long errors last: one peak must not hide that."""
-
-
-class Recording(NamedTuple):
-    """A log, how much its readings weigh, the events (n,) that take no part in the fit, and where it starts."""
-
-    log: Log
-    weight: float
-    held_out: np.ndarray
-    base: Base | None = None
 
 
 @dataclass(frozen=True)
@@ -205,3 +195,67 @@ def crps(error: np.ndarray, std: np.ndarray) -> np.ndarray:
     density = np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
     found: np.ndarray = std * (z * (2.0 * ndtr(z) - 1.0) + 2.0 * density - 1.0 / np.sqrt(np.pi))
     return found
+
+
+class Witness(NamedTuple):
+    """What a fold said of something that it was not told.
+
+    At the events `rows` (n,): `error` (n,), what was true less what was said, and `std` (n,), in `unit`. `truth` is
+    whether it is a true state, or else a row of a sensor held out.
+    """
+
+    name: str
+    unit: str
+    truth: bool
+    rows: np.ndarray
+    error: np.ndarray
+    std: np.ndarray
+
+    @property
+    def log_density(self) -> np.ndarray:
+        """Of what was true, as it was said, (n,)."""
+        found: np.ndarray = -0.5 * (self.error / self.std) ** 2 - np.log(self.std) - 0.5 * np.log(2.0 * np.pi)
+        return found
+
+
+def witnesses(model: StateSpaceModel, log: Log, track: Track) -> list[Witness]:
+    """The witnesses that a log has, of a fold of it: true states first."""
+    found = []
+    for column, (j, state) in enumerate(zip(model.shown, model.shown_states, strict=True)):
+        rows, true = truth_of(log.events, int(j))
+        error, std = true - track.mean[rows, column], track.std[rows, column]
+        if state.circular:
+            error = (error + np.pi) % (2.0 * np.pi) - np.pi
+        found.append(_told(state.name, state.unit, True, rows, error, std))
+    for s in range(len(model.sensors)):
+        found += of_sensor(model, log, track, s)
+    return [item for item in found if item.rows.size]
+
+
+def of_sensor(model: StateSpaceModel, log: Log, track: Track, s: int) -> list[Witness]:
+    """Of each row of a sensor that a fold held out."""
+    own = np.flatnonzero((log.kind[: log.n] == READING) & (log.channel[: log.n] == s) & (track.verdict == HELD_OUT))
+    first = model.row_start[s]
+    return [
+        _told(model.row_names[first + k], row.unit, False, own, track.innovation[own, k], track.innovation_std[own, k])
+        for k, row in enumerate(model.sensors[s].rows)
+    ]
+
+
+def _told(name: str, unit: str, truth: bool, rows: np.ndarray, error: np.ndarray, std: np.ndarray) -> Witness:
+    kept = np.isfinite(error) & (std > 0.0)
+    return Witness(name, unit, truth, rows[kept], error[kept], std[kept])
+
+
+def correlation_time(values: np.ndarray) -> float:
+    """τ of a series (n,), at least 1: how many of its values tell as much as one that is independent."""
+    n = values.size
+    centred = values - values.mean() if n else values
+    power = np.abs(np.fft.rfft(centred, 2 * n)) ** 2 if n else np.zeros(1)
+    covariance = np.fft.irfft(power)[:n] if n else np.zeros(1)
+    if not n or not covariance[0] > 0.0:
+        return 1.0
+    rho = covariance / covariance[0]
+    pairs = rho[: n - n % 2].reshape(-1, 2).sum(axis=1)
+    ends = np.flatnonzero(pairs <= 0.0)
+    return max(1.0, 2.0 * float(pairs[: ends[0] if ends.size else pairs.size].sum()) - 1.0)

@@ -24,10 +24,10 @@ from ..log import Log
 from ..snapshots import Base
 from ..track import Track
 from ..tuning import Tuning
-from .blocks import BLOCKS
 from .entries import check_key
-from .fit import Fitted, Given, Line, fit
+from .fit import Fitted, Line, fit
 from .objective import Go
+from .recording import BLOCKS, Recording
 
 Z = 1.959963984540054
 """Deviations from a rejected value within which the data say what they said then."""
@@ -114,7 +114,7 @@ def walk(
         fitted, reason = None, ""
         try:
             fitted = fit(
-                estimator, tuning, [Given(part, base=base)], wanted=wanted, bounds=bounds, blocks=blocks, go=go
+                estimator, tuning, [Recording(part, base=base)], wanted=wanted, bounds=bounds, blocks=blocks, go=go
             )
         except NisusError as error:
             reason = str(error)

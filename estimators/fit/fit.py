@@ -16,21 +16,16 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import EstimatorError
-from ..log import READING, Log
+from ..log import READING
 from ..registry import find_estimator
-from ..snapshots import Base
 from ..tuning import Tuning
-from .aims import LIKELIHOOD, WITNESSES, Recording, aim_of
-from .blocks import BLOCKS, held_out_rows
+from .aims import LIKELIHOOD, WITNESSES, aim_of
 from .entries import Entry, Setting, Skipped, entries_of, with_values
-from .judge import Worth, worths
-from .laplace import Curvature, curvature
-from .objective import ALONE, Cancelled, Go, Objective, only_told
-from .optimise import maximise, search
-from .profile import Z, intervals
-from .stuck import unstuck
+from .judge import Verdict, Worth, worths
+from .objective import ALONE, Go, Objective, maximise, search
+from .recording import BLOCKS, Recording, held_out_rows, without_queries, without_stuck
 from .tempered import POWERS, Tempered, tempered
-from .verdict import Verdict
+from .uncertainty import Curvature, Z, curvature, intervals
 
 TOLD = 0.25
 """Share of the weak belief's deviation, up to which an entry counts as told by the data: of a variance a factor of 3 in
@@ -41,16 +36,6 @@ CHEAP = 2.0
 
 PASSES = 3
 """Times that entries are left alone and the others fitted again."""
-
-__all__ = ["Cancelled", "Fitted", "Given", "Line", "Verdict", "fit"]
-
-
-class Given(NamedTuple):
-    """A recording to fit to: its log, how much its readings weigh, and where it starts (None: the prior)."""
-
-    log: Log
-    weight: float = 1.0
-    base: Base | None = None
 
 
 class Line(NamedTuple):
@@ -106,7 +91,7 @@ class Fitted:
 def fit(
     estimator: str,
     tuning: Tuning,
-    recordings: Sequence[Given],
+    recordings: Sequence[Recording],
     *,
     wanted: Sequence[str] = ("Q", "R"),
     bounds: Mapping[str, tuple[float, float]] | None = None,
@@ -146,10 +131,9 @@ def fit(
     logs = [given.log for given in recordings]
     entries, skipped = entries_of(estimator, tuning, logs, wanted, bounds, witnesses=aim == WITNESSES)
     recordings, left_out = _unstuck(tuning, recordings)
-    whole = [Recording(g.log, g.weight, held_out_rows(g.log, blocks), g.base) for g in recordings]
+    whole = [_held_out(item, blocks) for item in recordings]
     lean = [
-        Recording(log, g.weight, held_out_rows(log, blocks), g.base)
-        for g, log in _lean(recordings, truth=aim == WITNESSES)
+        _held_out(item._replace(log=without_queries(item.log, truth=aim == WITNESSES)), blocks) for item in recordings
     ]
     aimed = aim_of(aim, estimator, Setting(tuning, None), lean, tuple(predict))
     objective = Objective(estimator, tuning, tuple(entries), tuple(lean), aim=aimed, go=count)
@@ -199,17 +183,17 @@ def fit(
     )
 
 
-def _unstuck(tuning: Tuning, recordings: Sequence[Given]) -> tuple[list[Given], dict[str, int]]:
+def _unstuck(tuning: Tuning, recordings: Sequence[Recording]) -> tuple[list[Recording], dict[str, int]]:
     found, left_out = [], Counter[str]()
     for given in recordings:
-        log, repetitions = unstuck(tuning, given.log)
+        log, repetitions = without_stuck(tuning, given.log)
         found.append(given._replace(log=log))
         left_out.update(repetitions)
     return found, dict(left_out)
 
 
-def _lean(recordings: Sequence[Given], *, truth: bool) -> list[tuple[Given, Log]]:
-    return [(given, only_told(given.log, truth=truth)) for given in recordings]
+def _held_out(recording: Recording, blocks: int) -> Recording:
+    return recording._replace(held_out=held_out_rows(recording.log, blocks))
 
 
 def _told(objective: Objective, shape: Curvature) -> np.ndarray:

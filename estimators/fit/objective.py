@@ -19,14 +19,15 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import minimize
 
 from ..diagnostics.sensitivity.responses import each
 from ..errors import NisusError
-from ..log import INPUT, MAINTENANCE, READING, RESET, TRUTH, Log
 from ..registry import find_estimator
 from ..tuning import Tuning
-from .aims import Aim, Recording
+from .aims import Aim
 from .entries import Entry, Setting, setting
+from .recording import Recording
 
 HOPELESS = -1e12
 """Nats of a point at which nothing can be folded."""
@@ -137,21 +138,65 @@ class Objective:
         return float(here.sum()) - self.penalty(x), slopes.sum(axis=1) - self.precision * (x - self.start)
 
 
-def only_told(log: Log, *, truth: bool = False) -> Log:
-    """The same log without queries, which never change the estimate; true states stay if `truth`.
-
-    The first event stays in any case: it is where the prior holds.
-    """
-    kind = log.kind[: log.n]
-    says = np.isin(kind, (READING, INPUT, RESET, MAINTENANCE, *((TRUTH,) if truth else ())))
-    if not says.any():
-        return log
-    says[0] = True
-    kept = log.copy()
-    kept.n = 0
-    kept._insert(log.events.select(says))
-    return kept
-
-
 def _inward(item: Entry, value: float) -> float:
     return item.inward(value) if value > 0.0 or not item.log else -np.inf
+
+
+ROUNDS = 8
+"""Times that the scale is taken anew, at most."""
+
+STEPS = 15
+"""Steps of the optimiser between."""
+
+GRADIENT = 0.02
+"""Gradient in deviations of an estimate at which the maximum is reached: half its square is what is left, in nats."""
+
+GAIN = 0.01
+"""Nats that a round must bring for another one."""
+
+EVALUATIONS = 60
+"""Folds an entry without derivatives, at most."""
+
+REACH = 1.0
+"""First step without derivatives, in logarithms."""
+
+
+def maximise(objective: Objective, x: np.ndarray, *, rounds: int = ROUNDS) -> tuple[np.ndarray, float]:
+    """The point (k,) of the maximum nearest to x, and the value there."""
+    low, high = np.array(objective.limits).T
+    value = -np.inf
+    for _ in range(rounds):
+        _, slopes = objective.slopes(x)
+        unit = 1.0 / np.sqrt(np.sum(slopes**2, axis=1) + objective.precision)
+
+        def down(z: np.ndarray, x: np.ndarray = x, unit: np.ndarray = unit) -> tuple[float, np.ndarray]:
+            found, gradient = objective.gradient(np.clip(x + unit * z, low, high))
+            return -found, -gradient * unit
+
+        found = minimize(
+            down,
+            np.zeros_like(x),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=list(zip((low - x) / unit, (high - x) / unit, strict=True)),
+            options={"maxiter": STEPS, "maxfun": 2 * STEPS, "gtol": GRADIENT, "ftol": 1e-12},
+        )
+        gained, value = -found.fun - value, float(-found.fun)
+        x = np.clip(x + unit * found.x, low, high)
+        if gained < GAIN or found.status == 0:
+            break
+    return x, value
+
+
+def search(objective: Objective, x: np.ndarray) -> tuple[np.ndarray, float]:
+    """The same without derivatives, for a filter that draws by chance."""
+    low, high = np.array(objective.limits).T
+    unit = np.array([REACH if item.log else item.deviation for item in objective.entries])
+    found = minimize(
+        lambda z: -objective.value(np.clip(x + unit * z, low, high)),
+        np.zeros_like(x),
+        method="COBYQA",
+        bounds=list(zip((low - x) / unit, (high - x) / unit, strict=True)),
+        options={"maxfev": EVALUATIONS * x.size, "final_tr_radius": 0.02},
+    )
+    return np.clip(x + unit * found.x, low, high), float(-found.fun)

@@ -29,10 +29,9 @@ import numpy as np
 
 from .aims import LIKELIHOOD, Aim
 from .entries import Setting
-from .judge import Worth, gain
-from .laplace import Curvature
+from .judge import COVERED, SURE, Verdict, Worth, gain, verdict
 from .objective import Objective
-from .verdict import COVERED, SURE, Verdict, verdict
+from .uncertainty import Curvature
 
 POWERS = tuple(0.25**k for k in range(9))
 """Powers that are tried: at the last, what 65,536 readings say counts as what one would."""

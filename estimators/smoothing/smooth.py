@@ -7,10 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from ..errors import EstimatorError
 from ..estimator import Estimator
 from ..fold import Fold
 from ..model.state_space import StateSpaceModel
+from ..track import Track
 from .cross_covariance import CONSTANT, POINTS, TANGENT
 from .moments_back import MomentsBack
 from .recorder import COVARIANCE, FACTOR, MEMBERS, Kind
@@ -68,3 +71,28 @@ def smooth(fold: Fold) -> Smoothed:
         notes: Notes = TrajectoriesBack(fold, out) if kind is None else MomentsBack(fold, kind, out)
         Walk(fold, notes).back()
     return out
+
+
+LEAST = 1e-3
+"""Share of a variance that later readings must take; of less, rounding makes the most."""
+
+
+def consistency(track: Track, smoothed: Smoothed, model: StateSpaceModel) -> dict[str, float]:
+    """Of each shown state the mean of (x - xˢ)² / (σ² - σˢ²); NaN where later readings say nothing of it.
+
+    Args:
+        track: The filter's.
+        smoothed: What came of it.
+        model: The model.
+    """
+    moved = track.mean - smoothed.mean
+    turns = np.array([state.circular for state in model.shown_states], bool)
+    moved[:, turns] = (moved[:, turns] + np.pi) % (2.0 * np.pi) - np.pi
+    before = track.std**2
+    taken = before - smoothed.std**2
+    told = taken > LEAST * before
+    ratios = np.where(told, moved**2 / np.where(told, taken, 1.0), np.nan)
+    return {
+        state.name: float(np.nanmean(ratios[:, k])) if told[:, k].any() else np.nan
+        for k, state in enumerate(model.shown_states)
+    }

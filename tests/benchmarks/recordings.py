@@ -20,11 +20,11 @@ from app.cli.fold import read_log
 from app.twin.bounds import bounds_of
 from app.twin.twin import Twin, load_twin
 from estimators.errors import NisusError
-from estimators.fit.aims import AIMS, WITNESSES, Recording, track_of
+from estimators.fit.aims import AIMS, WITNESSES, correlation_time, track_of, witnesses
 from estimators.fit.entries import Setting
-from estimators.fit.fit import Given, fit
+from estimators.fit.fit import fit
 from estimators.fit.judge import Part, Z, worths
-from estimators.fit.witnesses import correlation_time, witnesses
+from estimators.fit.recording import Recording
 from estimators.log import Log
 from estimators.registry import find_entry, unfit
 
@@ -108,7 +108,7 @@ def show(case: Case, wanted: Sequence[str], aim: str) -> None:
     print(f"{case.twin}, {twin.estimator}: {first.n:,} events fitted, {int(second.sum()):,} scored", flush=True)
     print(line("as shipped", scored(twin, twin.estimator, own, log, second)), flush=True)
     bounds = bounds_of(twin.config, twin.model)
-    found = fit(twin.estimator, twin.tuning, [Given(first)], wanted=wanted, bounds=bounds, aim=aim)
+    found = fit(twin.estimator, twin.tuning, [Recording(first)], wanted=wanted, bounds=bounds, aim=aim)
     for item in found.lines:
         what = (
             "left alone" if item.alone else f"{item.before:.3g} -> {item.after:.3g} ({item.low:.2g} to {item.high:.2g})"

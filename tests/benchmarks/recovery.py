@@ -28,7 +28,8 @@ from app.cli.fold import read_log
 from app.twin.twin import Twin, load_twin
 from estimators.diagnostics.score import score
 from estimators.fit.entries import Entry, entries_of, with_values
-from estimators.fit.fit import Fitted, Given, fit
+from estimators.fit.fit import Fitted, fit
+from estimators.fit.recording import Recording
 from estimators.fold import Fold
 from estimators.log import Log
 from estimators.track import USED
@@ -160,7 +161,7 @@ def recover(case: Case, count: int) -> Recovered:
     twin, logs = logs_of(case, count)
     found = Recovered(logs=count)
     for k, log in enumerate(logs):
-        fitted = fit(twin.estimator, twin.tuning, [Given(log)], wanted=list(case.truth), blocks=0)
+        fitted = fit(twin.estimator, twin.tuning, [Recording(log)], wanted=list(case.truth), blocks=0)
         found.folds += fitted.folds
         for line in fitted.lines:
             truth = case.truth[line.key]

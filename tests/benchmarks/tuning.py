@@ -18,7 +18,8 @@ from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from scipy.optimize import minimize
 
 from app.twin.twin import Twin
-from estimators.fit.fit import Given, fit
+from estimators.fit.fit import fit
+from estimators.fit.recording import Recording
 from estimators.log import INPUT, READING, Log
 
 from .recovery import CASES, logs_of
@@ -42,7 +43,7 @@ def tuning() -> None:
     for readings, bound in SIZES:
         log = _first(logs[0], readings)
         done: list[int] = []
-        fit(twin.estimator, twin.tuning, [Given(_first(logs[0], 300))])
+        fit(twin.estimator, twin.tuning, [Recording(_first(logs[0], 300))])
         clock, spent = both(lambda log=log, done=done: done.append(_folds(twin, log)))  # type: ignore[misc]
         print(
             f"  {readings:7,} readings ({log.n:,} events): {clock:6.2f} s by the clock, {spent / 2:6.2f} s of each of "
@@ -65,7 +66,7 @@ def _first(log: Log, readings: int) -> Log:
 
 
 def _folds(twin: Twin, log: Log) -> int:
-    return fit(twin.estimator, twin.tuning, [Given(log)]).folds
+    return fit(twin.estimator, twin.tuning, [Recording(log)]).folds
 
 
 def _theirs(twin: Twin, log: Log) -> tuple[float, int]:

@@ -124,7 +124,9 @@ class Fitting:
             # What this thread starts to fold side by side takes after it.
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOWEST)
         # Half a second of imports, which a twin that nobody fits need not wait for.
-        from estimators.fit.fit import Cancelled, Given, fit
+        from estimators.fit.fit import fit
+        from estimators.fit.objective import Cancelled
+        from estimators.fit.recording import Recording
 
         state, reason, fitted = DONE, "", None
         try:
@@ -134,7 +136,7 @@ class Fitting:
             fitted = fit(
                 attempt.estimator,
                 attempt.tuning,
-                [Given(log, base=base)],
+                [Recording(log, base=base)],
                 wanted=attempt.wanted,
                 bounds=bounds_of(self._engine.twin.config, self._engine.model),
                 aim=natural_aim(self._engine.twin.config),

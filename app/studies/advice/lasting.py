@@ -16,10 +16,9 @@ import numpy as np
 
 from estimators.diagnostics.calibration import LIMITS, Calibration, calibrations
 from estimators.errors import ModelError, NisusError
-from estimators.fit.aims import Recording
 from estimators.fit.entries import entries_of
-from estimators.fit.objective import Cancelled, Objective, only_told
-from estimators.fit.optimise import maximise
+from estimators.fit.objective import Cancelled, Objective, maximise
+from estimators.fit.recording import Recording, without_queries
 from estimators.fold import Fold
 from estimators.log import READING, Log
 from estimators.model.coloured import Lasting, coloured, disturbance_time, error_time, errors_of
@@ -132,7 +131,7 @@ def _related(trial: _Trial) -> list[Calibration]:
 
 def _explained(model: StateSpaceModel, estimator: str, begun: _Trial) -> _Trial:
     """Append what explains the row that follows itself most, and again, until the budget is spent."""
-    log, best, given_up = only_told(begun.fold.log), begun, set[str]()
+    log, best, given_up = without_queries(begun.fold.log), begun, set[str]()
     end = time.thread_time() + BUDGET
     while len(best.appended) < MOST and time.thread_time() < end:
         rows = [entry for entry in _related(best) if entry.subject not in given_up]

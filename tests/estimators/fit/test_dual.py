@@ -7,7 +7,9 @@ import pytest
 
 from estimators.errors import EstimatorError
 from estimators.fit.dual import against, agrees, shift, tail, walk
-from estimators.fit.fit import Cancelled, Given, fit
+from estimators.fit.fit import fit
+from estimators.fit.objective import Cancelled
+from estimators.fit.recording import Recording
 from estimators.fold import Fold
 from estimators.tuning import Tuning
 from tests.estimators.fit.test_fit import MODEL, log_of
@@ -134,23 +136,23 @@ def test_two_fits_agree_while_the_data_say_the_same():
     readings = wearing(7, [0.3]).value[:WINDOW, 0]
     # The same window a while later, and one of another asset.
     one, later, worn = (
-        fit("kf", believed(), [Given(log)], wanted=["p.rate"])
+        fit("kf", believed(), [Recording(log)], wanted=["p.rate"])
         for log in (log_of(readings), log_of(readings[150:]), wearing(9, [0.6]))
     )
     assert agrees(one, one) and agrees(later, one) and not agrees(worn, one) and not agrees(one, worn)
     (line,) = worn.lines
     assert shift(line) == pytest.approx(np.log(line.after / 0.2) / line.deviation)
     # Other entries are another statement.
-    both = fit("kf", believed(), [Given(log_of(readings))], wanted=["p.rate", "R.float"])
+    both = fit("kf", believed(), [Recording(log_of(readings))], wanted=["p.rate", "R.float"])
     assert not agrees(both, one)
 
 
 def test_a_value_that_lies_in_its_interval_has_nothing_against_it():
-    won = fit("kf", believed(), [Given(wearing(9, [0.6]))], wanted=["p.rate", "R.float"])
+    won = fit("kf", believed(), [Recording(wearing(9, [0.6]))], wanted=["p.rate", "R.float"])
     assert won.proposed and against(won) == ()
     inside = tuple(line if line.alone else line._replace(before=line.after) for line in won.lines)
     assert against(replace(won, lines=inside)) == ("every value of the day lies in its 95 % interval",)
     # One that has left it is enough.
     assert against(replace(won, lines=(won.lines[0], inside[1]))) == ()
-    lost = fit("kf", believed(), [Given(wearing(10, [0.2]))], wanted=["p.rate"])
+    lost = fit("kf", believed(), [Recording(wearing(10, [0.2]))], wanted=["p.rate"])
     assert not lost.proposed and against(lost) == lost.verdict.reasons

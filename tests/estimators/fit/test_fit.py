@@ -9,11 +9,10 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import brentq, minimize
 
 from estimators.errors import ConfigError
-from estimators.fit.aims import Recording
-from estimators.fit.blocks import held_out_rows
 from estimators.fit.entries import entries_of
-from estimators.fit.fit import Cancelled, Given, fit
-from estimators.fit.objective import Objective, only_told
+from estimators.fit.fit import fit
+from estimators.fit.objective import Cancelled, Objective
+from estimators.fit.recording import Recording, held_out_rows, without_queries
 from estimators.log import READING, Log
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
@@ -92,7 +91,7 @@ def best(ys):
 
 @pytest.fixture(scope="module")
 def fitted(ys):
-    return fit("kf", Tuning.of(MODEL), [Given(log_of(ys))], wanted=("Q", "R"), blocks=0)
+    return fit("kf", Tuning.of(MODEL), [Recording(log_of(ys))], wanted=("Q", "R"), blocks=0)
 
 
 def test_the_objective_is_the_joint_density(ys):
@@ -132,7 +131,7 @@ def test_a_sensor_that_says_nothing_is_not_fitted(fitted):
 
 def test_what_the_data_cannot_tell_is_left_alone(ys):
     # Twelve readings of a walk say next to nothing of the rate at which it returns.
-    found = fit("kf", Tuning.of(MODEL), [Given(log_of(ys[:12]))], wanted=("Q", "p.rate"), blocks=0)
+    found = fit("kf", Tuning.of(MODEL), [Recording(log_of(ys[:12]))], wanted=("Q", "p.rate"), blocks=0)
     line = {line.key: line for line in found.lines}["p.rate"]
     assert line.alone and not line.told and line.after == line.before
 
@@ -143,7 +142,7 @@ def test_without_blocks_held_out_nothing_is_proposed(fitted):
 
 def test_a_tuning_that_is_wrong_is_replaced():
     wrong = Tuning.of(MODEL).set("Q.level", 0.005).set("R.float", 8.0)
-    found = fit("kf", wrong, [Given(log_of(simulated(2, 600)))], wanted=("Q", "R"))
+    found = fit("kf", wrong, [Recording(log_of(simulated(2, 600)))], wanted=("Q", "R"))
     assert found.proposed
     assert found.after.held_out.log_density > found.before.held_out.log_density
     for line, truth in zip(found.lines, (0.2, 0.5), strict=True):
@@ -152,7 +151,7 @@ def test_a_tuning_that_is_wrong_is_replaced():
 
 def test_a_tuning_that_is_right_stays():
     right = Tuning.of(MODEL).set("Q.level", 0.2).set("R.float", 0.5)
-    proposed = [fit("kf", right, [Given(log_of(simulated(seed, 300)))]).proposed for seed in range(10)]
+    proposed = [fit("kf", right, [Recording(log_of(simulated(seed, 300)))]).proposed for seed in range(10)]
     # Two standard errors are exceeded by chance once in 40.
     assert sum(proposed) <= 1
 
@@ -166,8 +165,8 @@ def test_a_sensor_that_is_stuck_tells_no_noise(ys):
 
 
 def test_several_logs_weigh_as_they_should(ys):
-    one = fit("kf", Tuning.of(MODEL), [Given(log_of(ys), 2.0)], blocks=0)
-    two = fit("kf", Tuning.of(MODEL), [Given(log_of(ys)), Given(log_of(ys))], blocks=0)
+    one = fit("kf", Tuning.of(MODEL), [Recording(log_of(ys), 2.0)], blocks=0)
+    two = fit("kf", Tuning.of(MODEL), [Recording(log_of(ys)), Recording(log_of(ys))], blocks=0)
     for line, other in zip(one.lines, two.lines, strict=True):
         # Each is within 0.02 deviations of the one maximum.
         assert abs(np.log(line.after / other.after)) < 0.05 * line.deviation
@@ -181,7 +180,7 @@ def test_a_fit_can_be_cancelled(ys):
         return len(told) < 5
 
     with pytest.raises(Cancelled):
-        fit("kf", Tuning.of(MODEL), [Given(log_of(ys))], go=go)
+        fit("kf", Tuning.of(MODEL), [Recording(log_of(ys))], go=go)
     # Those under way on other threads may still say so.
     assert len(told) < 15
 
@@ -198,10 +197,10 @@ def test_blocks_are_of_one_length_and_the_last_is_held_out(ys):
 def test_queries_are_no_part_of_what_is_folded_again(ys):
     log = log_of(ys)
     log.add_truth(np.arange(150.0) + 0.5, level=ys)
-    lean = only_told(log)
+    lean = without_queries(log)
     assert lean.n == 150 and np.all(lean.kind[:150] == READING) and log.n == 300
 
 
 def test_an_entry_that_is_none_is_refused(ys):
     with pytest.raises(ConfigError, match="R.flot is no entry that can be fitted; did you mean R.float"):
-        fit("kf", Tuning.of(MODEL), [Given(log_of(ys))], wanted=("R.flot",))
+        fit("kf", Tuning.of(MODEL), [Recording(log_of(ys))], wanted=("R.flot",))

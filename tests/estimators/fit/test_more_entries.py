@@ -5,11 +5,10 @@ import pytest
 from scipy.optimize import minimize, minimize_scalar
 
 from estimators.errors import ConfigError
-from estimators.fit.aims import Recording
 from estimators.fit.entries import entries_of
-from estimators.fit.fit import Given, fit
-from estimators.fit.objective import Objective
-from estimators.fit.optimise import maximise, search
+from estimators.fit.fit import fit
+from estimators.fit.objective import Objective, maximise, search
+from estimators.fit.recording import Recording
 from estimators.model.coloured import Lasting, coloured
 from estimators.tuning import Tuning
 from tests.estimators.fit.test_fit import DECADES, MODEL, log_of, simulated
@@ -33,7 +32,7 @@ def test_an_option_is_found_at_the_maximum_of_its_likelihood():
     """The walk moves more than Q says, and the inflation makes up for that."""
     ys = simulated(4, 400, q=1.0)
     tuning = Tuning.of(MODEL).set("Q.level", 0.05).set("R.float", 0.5)
-    found = fit("kf", tuning, [Given(log_of(ys))], wanted=("options.inflation",), blocks=0)
+    found = fit("kf", tuning, [Recording(log_of(ys))], wanted=("options.inflation",), blocks=0)
     (line,) = found.lines
 
     def loss(x):
@@ -51,7 +50,7 @@ def test_the_prior_is_found_from_many_starts():
     logs = [3.0 + simulated(seed, 2) for seed in range(40)]
     wanted = ("prior.level.mean", "prior.level.std")
     tuning = Tuning.of(MODEL).set("Q.level", 0.2).set("R.float", 0.5)
-    found = fit("kf", tuning, [Given(log_of(ys)) for ys in logs], wanted=wanted, blocks=0)
+    found = fit("kf", tuning, [Recording(log_of(ys)) for ys in logs], wanted=wanted, blocks=0)
     mean, std = found.lines
 
     def loss(x):
@@ -97,9 +96,11 @@ def test_a_filter_that_draws_is_fitted_without_slopes(monkeypatch):
     """Its members stand for the Kalman filter's moments: 400 of them to 1 / √200 of a variance."""
     ys = simulated(1, 150)
     tuning = Tuning.of(MODEL)
-    exact = fit("kf", tuning, [Given(log_of(ys))], wanted=("Q", "R.float"), blocks=0)
+    exact = fit("kf", tuning, [Recording(log_of(ys))], wanted=("Q", "R.float"), blocks=0)
     monkeypatch.setattr("estimators.fit.fit.maximise", lambda *_: pytest.fail("by slopes"))
-    drawn = fit("enkf", tuning.with_options({"members": 400.0}), [Given(log_of(ys))], wanted=("Q", "R.float"), blocks=0)
+    drawn = fit(
+        "enkf", tuning.with_options({"members": 400.0}), [Recording(log_of(ys))], wanted=("Q", "R.float"), blocks=0
+    )
     for line, other in zip(exact.lines, drawn.lines, strict=True):
         # Chance of the members moves the maximum by much less than the data leave open.
         assert abs(np.log(other.after / line.after)) < line.deviation

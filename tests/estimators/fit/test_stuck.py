@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from estimators.fit.fit import Given, fit
-from estimators.fit.stuck import repeated, unstuck
+from estimators.fit.fit import fit
+from estimators.fit.recording import Recording, repeated, without_stuck
 from estimators.tuning import Tuning
 from tests.estimators.fit.test_fit import MODEL, log_of, simulated
 
@@ -18,14 +18,14 @@ def stuck_for(share: float) -> np.ndarray:
 
 def test_its_noise_is_that_of_the_rest():
     """A fifth of the readings repeat one; left in, they take R to half of what made the others."""
-    found = fit("kf", RIGHT, [Given(log_of(stuck_for(0.2)))], wanted=("R",), blocks=0)
+    found = fit("kf", RIGHT, [Recording(log_of(stuck_for(0.2)))], wanted=("R",), blocks=0)
     assert found.left_out == {"float": 79}
     (line,) = found.lines
     assert line.low < 0.5 < line.high
 
 
 def test_it_is_left_out_of_the_judgement_too():
-    found = fit("kf", RIGHT, [Given(log_of(stuck_for(0.2)))], wanted=("R",))
+    found = fit("kf", RIGHT, [Recording(log_of(stuck_for(0.2)))], wanted=("R",))
     assert found.before.fitted.n + found.before.held_out.n == 400 - 79
 
 
@@ -52,7 +52,7 @@ def test_what_is_missing_does_not_interrupt():
 
 def test_a_short_run_stays():
     log = log_of(stuck_for(0.03))
-    same, found = unstuck(RIGHT, log)
+    same, found = without_stuck(RIGHT, log)
     assert found == {} and same is log
 
 

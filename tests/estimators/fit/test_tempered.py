@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from estimators.fit.aims import Aim, Recording
+from estimators.fit.aims import Aim
 from estimators.fit.entries import entries_of
-from estimators.fit.fit import Given, fit
-from estimators.fit.judge import Part, Worth
-from estimators.fit.laplace import curvature
-from estimators.fit.objective import Objective
-from estimators.fit.optimise import maximise
+from estimators.fit.fit import fit
+from estimators.fit.judge import Part, Worth, verdict
+from estimators.fit.objective import Objective, maximise
+from estimators.fit.recording import Recording
 from estimators.fit.tempered import POWERS, at_power
-from estimators.fit.verdict import verdict
+from estimators.fit.uncertainty import curvature
 from estimators.tuning import Tuning
 from tests.estimators.fit.test_fit import DECADES, MODEL, dense, log_of, simulated
 
@@ -50,13 +49,13 @@ def test_the_powers_lead_back_to_the_start(climbed):
 def test_a_model_that_is_right_is_believed():
     """Its readings are independent news, and the blocks held out say so."""
     wrong = Tuning.of(MODEL).set("Q.level", 0.005).set("R.float", 8.0)
-    found = fit("kf", wrong, [Given(log_of(simulated(2, 600)))], wanted=("Q", "R"))
+    found = fit("kf", wrong, [Recording(log_of(simulated(2, 600)))], wanted=("Q", "R"))
     assert found.proposed and found.power >= POWERS[3]
 
 
 def test_what_is_not_proposed_is_told_of_the_whole_likelihood():
     right = Tuning.of(MODEL).set("Q.level", 0.2).set("R.float", 0.5)
-    found = fit("kf", right, [Given(log_of(simulated(0, 300)))])
+    found = fit("kf", right, [Recording(log_of(simulated(0, 300)))])
     assert not found.proposed and found.power == 1.0 and found.verdict.reasons
 
 

@@ -5,11 +5,11 @@ import pytest
 from scipy.stats import norm
 
 from estimators.errors import ConfigError
-from estimators.fit.aims import LIKELIHOOD, WITNESSES, Recording, aim_of
+from estimators.fit.aims import LIKELIHOOD, WITNESSES, aim_of, correlation_time, witnesses
 from estimators.fit.entries import Setting
-from estimators.fit.fit import Given, fit
+from estimators.fit.fit import fit
 from estimators.fit.judge import worths
-from estimators.fit.witnesses import correlation_time, witnesses
+from estimators.fit.recording import Recording
 from estimators.fold import Fold
 from estimators.log import Log
 from estimators.tuning import Tuning
@@ -82,7 +82,7 @@ def test_a_fit_that_aims_at_them_keeps_its_band_better_than_the_likelihood_alone
     for seed in range(6):
         first, second = known(*lasting_errors(seed)), known(*lasting_errors(100 + seed))
         for aim in inside:
-            found = fit("kf", Tuning.of(MODEL).set("R.float", 0.25), [Given(first)], aim=aim, blocks=0)
+            found = fit("kf", Tuning.of(MODEL).set("R.float", 0.25), [Recording(first)], aim=aim, blocks=0)
             unseen = Recording(second, 1.0, np.ones(second.n, bool))
             (worth,) = worths("kf", [found.setting], [unseen], lambda folds: True)
             inside[aim].append(worth.held_out.states["level"].coverage)
@@ -94,7 +94,7 @@ def test_a_fit_that_aims_at_them_keeps_its_band_better_than_the_likelihood_alone
 
 def test_without_a_witness_it_is_the_likelihood():
     ys = simulated(3, 200)
-    one, other = (fit("kf", Tuning.of(MODEL), [Given(log_of(ys))], aim=aim) for aim in (LIKELIHOOD, WITNESSES))
+    one, other = (fit("kf", Tuning.of(MODEL), [Recording(log_of(ys))], aim=aim) for aim in (LIKELIHOOD, WITNESSES))
     assert [line.after for line in one.lines] == [line.after for line in other.lines]
 
 
@@ -105,8 +105,8 @@ def test_the_noise_of_a_sensor_that_is_held_out_is_told_by_its_own_prediction():
     log.add("silent", np.arange(xs.size, dtype=float), xs + rng.normal(0.0, 2.0, xs.size))
     tuning = Tuning.of(MODEL).set("use.silent", False)
     with pytest.raises(ConfigError, match="R.silent is of a sensor that is held out"):
-        fit("kf", tuning, [Given(log)], wanted=("R.silent",))
-    found = fit("kf", tuning, [Given(log)], wanted=("Q", "R"), aim=WITNESSES)
+        fit("kf", tuning, [Recording(log)], wanted=("R.silent",))
+    found = fit("kf", tuning, [Recording(log)], wanted=("Q", "R"), aim=WITNESSES)
     # It reads with a variance of 4, beside what the estimate is off by, about 1.
     (line,) = [line for line in found.lines if line.key == "R.silent"]
     assert found.proposed and abs(np.log(line.after / 4.0)) < np.log(1.5)

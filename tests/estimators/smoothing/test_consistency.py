@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from estimators import fold
-from estimators.smoothing.consistency import consistency
+from estimators.smoothing.smooth import consistency
 from estimators.smoothing.smoothed import Smoothed
 from tests.estimators.smoothing.test_textbook import CAR, car
 

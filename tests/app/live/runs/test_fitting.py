@@ -10,7 +10,8 @@ from app.live.engine import Engine
 from app.live.runs.fitting import CANCELLED, DONE, FAILED, Fitting
 from app.live.runs.history import PIECE
 from estimators.errors import ConfigError
-from estimators.fit.fit import Given, fit
+from estimators.fit.fit import fit
+from estimators.fit.recording import Recording
 from estimators.log import Log
 from estimators.tuning import Tuning
 from tests.app.scripted import MODEL, Scripted, readings, row_count, twin, wait_for
@@ -52,7 +53,7 @@ def ended(fitting):
 def alone(n):
     log = Log(MODEL.width)
     log.extend(readings(*series(n)))
-    return fit("kf", FIRST, [Given(log)], wanted=WANTED)
+    return fit("kf", FIRST, [Recording(log)], wanted=WANTED)
 
 
 def test_what_is_fitted_beside_the_twin_is_the_fit_of_its_log(started):
