@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from estimators.errors import ConfigError
 
-from ..signals import restore, when_asked_to_end
-from ..stderr import complain
+from ..terminal import complain, restore, when_asked_to_end
 from ..twin.twin import Twin, load_twin
 from .given import settings
 

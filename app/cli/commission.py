@@ -13,8 +13,8 @@ from estimators.fold import Fold
 from estimators.log import READING
 from estimators.track import DIVERGED, FAILED, GATED, SCREENED, STALE
 
-from ..live.stall import interruptible
-from ..live.tunings.section_text import write_section
+from ..live.tunings.versions import write_section
+from ..live.watchdog import interruptible
 from ..twin.twin import load_twin
 from .fold import read_log
 from .given import settings

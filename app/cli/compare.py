@@ -17,7 +17,7 @@ from estimators.errors import ConfigError, SourceError
 from estimators.log import MARK, Events
 from estimators.registry import ESTIMATORS, find_estimator, unfit
 
-from ..stderr import complain
+from ..terminal import complain
 from ..twin.twin import Twin, load_twin
 from .beside import beside, jobs_of
 from .compare_fold import BUDGET, Row, fold_row

@@ -27,7 +27,7 @@ from estimators.track import Track
 from sources.source import Endless
 
 from ..intake import Intake
-from ..live.stall import interruptible
+from ..live.watchdog import interruptible
 from ..present.export.html import as_html
 from ..present.export.report import Reported, report
 from ..present.export.track_file import encoded

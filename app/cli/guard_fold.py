@@ -16,8 +16,7 @@ from estimators.log import Log
 from estimators.snapshots import Base
 from estimators.tuning import Tuning
 
-from ..live.tunings.figures import COVERAGE, RMSE
-from ..live.tunings.keep import now
+from ..live.tunings.versions import COVERAGE, RMSE, now
 from ..studies.guard.figures import allowances, measured
 from ..studies.guard.junit import Guarded
 from ..studies.guard.reference import fingerprint, read_reference, write_reference

@@ -23,7 +23,7 @@ from estimators.registry import find_estimator
 from estimators.smoothing.smooth import check_smooth
 from estimators.tuning import Tuning
 
-from ..stderr import complain
+from ..terminal import complain
 from ..twin.learned import run_net
 from ..twin.model import physics_of
 from ..twin.twin import Twin, load_twin

@@ -11,7 +11,7 @@ from estimators.learned.train import Trained
 from estimators.model.correction import Correction, GaussianProcess, Net, Ridge
 from estimators.model.state_space import StateSpaceModel
 
-from ..live.tunings.keep import now
+from ..live.tunings.versions import now
 from ..twin.twin import Twin
 
 DIGITS = 8

@@ -12,7 +12,7 @@ from estimators.diagnostics.sensitivity.words import digits
 from estimators.fit.judge import Part
 from estimators.learned.train import OnWindows
 
-from ..live.runs.fit_json import part_json
+from ..live.runs.runs_json import part_json
 from ..present.export.parts import Part as Section
 
 TUNINGS = ("physics", "physics, its noise from the windows", "with the correction")

@@ -18,8 +18,8 @@ from sources.can.unseen import shown_id
 from sources.survey import Message, Series, Survey, survey
 from sources.tables.time_column import UNITS
 
-from ..moment import LATER_THAN, moment
-from ..stderr import complain
+from ..format_time import FIRST_DATED_NS, format_time
+from ..terminal import complain
 
 if TYPE_CHECKING:
     from .arguments import Log as Arguments
@@ -94,7 +94,7 @@ def _head(found: Survey) -> list[str]:
     name = found.files[0].name + (f" and {len(found.files) - 1} more" if len(found.files) > 1 else "")
     what = "frames" if found.kind == "can_log" else "rows"
     span = (end - start) * 1e-9
-    when = f", from {moment(start)}" if start >= LATER_THAN else ""
+    when = f", from {format_time(start)}" if start >= FIRST_DATED_NS else ""
     lines = [f"{name}: {found.t.size} {what} in {span:.1f} s{when}"]
     gaps = found.holes
     if gaps:

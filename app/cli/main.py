@@ -13,7 +13,7 @@ import tyro
 
 from estimators.errors import NisusError
 
-from ..stderr import complain
+from ..terminal import complain
 from .arguments import (
     COMMANDS,
     Advise,

@@ -16,8 +16,8 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.registry import ESTIMATORS, unfit
 from sources.pieces import make, pieces_of
 
-from ..live.call_watch import CallWatch
 from ..live.compilers import Worker
+from ..live.watchdog import CallWatch
 from ..live.workshop import Workshop
 from ..twin.twin import Twin
 

@@ -8,7 +8,7 @@ from sources.source import NEVER, TRUNCATED, WRONG_TIME
 from sources.tables.order import REMARKS as ORDER
 
 from ..intake import CLOCK_MOVED
-from ..stderr import complain
+from ..terminal import complain
 
 REMARKS = (*ORDER, NEVER, TRUNCATED, CLOCK_MOVED)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..stderr import complain
+from ..terminal import complain
 from ..web.gallery.gallery import Wanted
 from ..web.port import check_port
 from ..web.session import Page, Session

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from estimators.errors import ConfigError
 
-from ..live.playback import FASTEST
-from ..stderr import complain
+from ..live.execute import MAX_SPEED
+from ..terminal import complain
 from ..views.recording.format import TAKEN
 from ..views.recording.split import NEVER, parse_split
 from ..web.gallery.gallery import Wanted
@@ -36,9 +36,9 @@ SAID = 5
 def run_twin(arguments: Run, workers: Sequence[Worker] = ()) -> int:
     """Carry the command out; `workers` are processes that wait for something to compile."""
     speed = arguments.speed
-    if speed is not None and not (0.0 < speed <= FASTEST or speed == math.inf):
+    if speed is not None and not (0.0 < speed <= MAX_SPEED or speed == math.inf):
         raise ConfigError(
-            f"--speed {speed:g}: must be positive and at most {FASTEST:g}, or inf for as fast as possible"
+            f"--speed {speed:g}: must be positive and at most {MAX_SPEED:g}, or inf for as fast as possible"
         )
     if arguments.record is not None and arguments.record.suffix != ".rrd":
         raise ConfigError(f"--record {arguments.record}: must end in .rrd")

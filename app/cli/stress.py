@@ -15,12 +15,12 @@ from rich.table import Table
 from estimators.errors import ConfigError, NisusError
 from estimators.registry import find_estimator
 
-from ..stderr import complain
 from ..studies.stress.bench import Bench, asset_of
 from ..studies.stress.foretold import CHANCE, INVISIBLE, Oracle
 from ..studies.stress.matrix import matrix
 from ..studies.stress.mistake import Mistake
 from ..studies.stress.trial import FALSE, MISNAMED, MISSED, NAMED, UNSEEN, Trial, make
+from ..terminal import complain
 from ..twin.twin import load_twin
 from .given import settings
 from .prepare import prepare

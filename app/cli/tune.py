@@ -15,11 +15,11 @@ from estimators.fit.fit import Fitted, fit
 from estimators.fit.recording import Recording
 from estimators.log import Log
 
-from ..live.runs.fit_json import fit_json
-from ..live.runs.tuning_yaml import tuning_yaml
+from ..live.runs.runs_json import fit_json
 from ..live.tunings.fitted import settings_of
-from ..live.tunings.keep import check_free, keep, version_text
-from ..stderr import complain
+from ..live.tunings.tuning_yaml import tuning_yaml
+from ..live.tunings.versions import check_free, keep, version_text
+from ..terminal import complain
 from ..twin.bounds import bounds_of, natural_aim
 from ..twin.twin import Twin, load_twin
 from .check_text import as_text

@@ -8,7 +8,7 @@ from estimators.diagnostics.sensitivity.words import digits
 from estimators.fit.fit import Fitted, Line
 from estimators.fit.judge import Part, Prediction, Worth
 
-from ..live.runs.fit_json import correlated
+from ..live.runs.runs_json import correlated
 from ..present.export.parts import Part as Section
 from ..twin.twin import Twin
 

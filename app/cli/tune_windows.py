@@ -17,12 +17,12 @@ from estimators.fit.dual import Refit, against, shift, walk
 from estimators.fit.fit import Line
 from estimators.fit.recording import Recording
 
-from ..live.runs.fit_json import fit_json
-from ..live.runs.tuning_yaml import tuning_yaml
+from ..live.runs.runs_json import fit_json
 from ..live.tunings.fitted import settings_of
-from ..live.tunings.keep import keep, version_text
+from ..live.tunings.tuning_yaml import tuning_yaml
+from ..live.tunings.versions import keep, version_text
 from ..present.export.parts import Part as Section
-from ..stderr import complain
+from ..terminal import complain
 from ..twin.bounds import bounds_of
 from ..twin.twin import Twin
 from .check_text import as_text

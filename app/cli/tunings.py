@@ -12,10 +12,8 @@ from estimators.errors import ConfigError, printable
 from estimators.fold import Fold
 
 from ..live.changes import difference
-from ..live.stall import interruptible
-from ..live.tunings.figures import COVERAGE, figures
-from ..live.tunings.keep import Settings, accept, keep, version_text
-from ..live.tunings.listing import listing
+from ..live.tunings.versions import COVERAGE, Settings, accept, figures, keep, listing, version_text
+from ..live.watchdog import interruptible
 from ..present.export.parts import Part
 from ..twin.twin import load_twin
 from .check_text import as_text

@@ -12,9 +12,8 @@ from estimators.fold_failures import cause_of
 from estimators.gate.stories import AGREES
 from estimators.track import estimated_rows
 
-from .counts import UNSETTLED, complaints
+from .counts import UNSETTLED, complaints, refusals
 from .notices import Notices
-from .refusals import refusals
 
 TRIES = 3
 """Failures of one fold whose cause is sought; a reading of 1e300 has none in the model, so more than one."""

@@ -20,22 +20,21 @@ from estimators.late import inflated
 from estimators.log import TICK, Events
 from estimators.snapshots import SPARSE_EVERY, Base
 
+from ..concurrency import run_all
 from ..intake import Intake
-from ..stderr import complain
-from ..together import together
+from ..terminal import complain
 from . import commands
+from .changes import Reloaded, merged
 from .counts import RowCounts
 from .execute import Remembered, execute
 from .feeder import Feeder, Finished, Restarted
-from .idle_ticks import IdleTicks
 from .interface import Records
 from .outputs import Status
 from .refolder import Refolded, Refolder
-from .reload import Reloaded, merged
 from .running_fold import RunningFold
-from .stall import Stall
 from .status import Asked, kept_status, status_of
-from .watchers import Watchers
+from .watchdog import Watchdog
+from .watchers import IdleTicks, Watchers
 from .workshop import Workshop
 
 if TYPE_CHECKING:
@@ -88,7 +87,7 @@ class Engine(RunningFold):
         """
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._workshop = workshop or Workshop()
-        super().__init__(twin, Stall(self._say_stalled), base, self._workshop.ready)
+        super().__init__(twin, Watchdog(self._say_stalled), base, self._workshop.ready)
         self._awaited = self.estimator if self._fold.idle else None
         section = twin.config.time
         allowed = section.horizon if horizon is None else horizon
@@ -119,7 +118,7 @@ class Engine(RunningFold):
 
     def start(self) -> None:
         """Begin to read and fold."""
-        self._stall.start()
+        self._watchdog.start()
         self._refolder.start()
         self._thread.start()
         self._feeder.start()
@@ -130,14 +129,14 @@ class Engine(RunningFold):
     def stop(self) -> None:
         """Stop reading and folding."""
         self._stopping.set()
-        together(self._fold_last, self._feeder.stop, self._workshop.stop, self._refolder.stop, *self._watchers.resting)
+        run_all(self._fold_last, self._feeder.stop, self._workshop.stop, self._refolder.stop, *self._watchers.resting)
         self._watchers.stop()
-        self._stall.stop()
+        self._watchdog.stop()
 
     def _fold_last(self) -> None:
         """Wait for the piece that is being folded."""
         if self._thread.is_alive():
-            self._thread.join(timeout=5.0 if self._stall.text is None else 0.1)
+            self._thread.join(timeout=5.0 if self._watchdog.text is None else 0.1)
 
     def submit(self, command: commands.Command) -> None:
         """Queue a command."""
@@ -187,7 +186,7 @@ class Engine(RunningFold):
     def _status_kept(self, kept: Status) -> Status:
         """That of a fold that is at work; a refold is waited for until the revision that came of it is shown."""
         asked = self._asked(self._requests.waiting or kept.revision != self._revision)
-        return kept_status(kept, asked, self.model, self.source, self._stall.busy)
+        return kept_status(kept, asked, self.model, self.source, self._watchdog.busy)
 
     def _asked(self, refolding: bool) -> Asked:
         return Asked(
@@ -271,7 +270,7 @@ class Engine(RunningFold):
         while self._behind and not self._stopping.is_set():
             with self._moving():
                 before = self._fold.n
-                self._pieces.advance(self._fold)
+                self._batches.advance(self._fold)
                 self._watchers.alerts.look(self._fold, before)
 
     def _when_silent(self) -> None:

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from estimators.errors import ConfigError, nearest, quoted
+from estimators.errors import ConfigError, nearest, printable, quoted
 from estimators.estimator import Estimator
 from estimators.events.maintenance import maintained
 from estimators.fold_checks import check_variances
 from estimators.log import RESET, Events
+from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_estimator
+from sources.source import Paced, Source, span_of
 
 from ..intake import maintenance_text
 from . import commands
 from .faults import carry_out
 from .interface import Running
-from .maintenance import check_maintenance
-from .playback import PLAYBACK, play
 
 if TYPE_CHECKING:
     from estimators.tuning import Tuning
@@ -151,3 +152,84 @@ class Remembered:
     def of(self, estimator: str) -> Mapping[str, float]:
         """What a filter starts with."""
         return self._left.get(estimator, self._twin.options_of(estimator))
+
+
+MAX_MAINTENANCE_TEXT = 200
+"""Characters that say what was done."""
+
+
+def check_maintenance(what: str, states: Sequence[str], model: StateSpaceModel) -> list[int]:
+    """The indices of the states, ascending.
+
+    Raises:
+        ConfigError: If nothing says what was done, or a state is missing, unknown or named twice.
+    """
+    if not what.strip() or len(what) > MAX_MAINTENANCE_TEXT or printable(what) != what or "\n" in what:
+        raise ConfigError(
+            f"Maintenance: what is {quoted(what)}; say what was changed, in 1 to {MAX_MAINTENANCE_TEXT} characters"
+        )
+    if not states:
+        raise ConfigError("Maintenance: states is empty; name the states that it concerns")
+    for name in states:
+        if name not in model.state_names:
+            raise ConfigError(
+                f"Maintenance: {model.name} has no state {quoted(name)}; {nearest(name, model.state_names[:1000])}"
+            )
+    if len(set(states)) != len(states):
+        raise ConfigError("Maintenance: states names one twice; name each once")
+    return sorted(model.state_names.index(name) for name in states)
+
+
+MAX_SEEK_S = 1e9
+"""Seconds that a seek may go, 32 years; times are int64 nanoseconds."""
+
+MAX_SPEED = 1e9
+"""Times real time; faster is as fast as possible, which is said as infinity."""
+
+PLAYBACK = (commands.Pause, commands.Speed, commands.Step, commands.Seek)
+
+
+def check_playback(command: Any) -> None:
+    """Refuse a speed or a place that cannot be.
+
+    Raises:
+        ConfigError: If the speed is not positive or too large, or the place too far.
+    """
+    if isinstance(command, commands.Speed) and not (0.0 < command.factor <= MAX_SPEED or command.factor == math.inf):
+        raise ConfigError(
+            f"Speed: factor is {command.factor:g}; it must be positive and at most {MAX_SPEED:g}, or inf for as fast "
+            "as possible"
+        )
+    if isinstance(command, commands.Seek) and not abs(command.seconds) <= MAX_SEEK_S:
+        raise ConfigError(f"Seek: seconds is {command.seconds:g}; it must lie within {MAX_SEEK_S:g} s")
+
+
+def playback_status(source: Source) -> dict[str, Any]:
+    """What a panel shows of it: paused, speed, seekable, span (ns)."""
+    paced = source if isinstance(source, Paced) else None
+    return {
+        "paused": paced is not None and paced.paused,
+        "speed": paced.speed if paced is not None else None,
+        "seekable": paced is not None,
+        "span": span_of(source),
+    }
+
+
+def play(source: Source, command: Any, first: int) -> None:
+    """Carry one of `PLAYBACK` out; `first` is the time of the first event, ns.
+
+    Raises:
+        ConfigError: If the source cannot be paused or sought, or as `check_playback`.
+    """
+    check_playback(command)
+    if not isinstance(source, Paced):
+        raise ConfigError("a live source cannot be paused, stepped or sought; only a replay or a simulation can")
+    if isinstance(command, commands.Pause):
+        source.pause() if command.paused else source.resume()
+    elif isinstance(command, commands.Speed):
+        source.set_speed(command.factor)
+    elif isinstance(command, commands.Step):
+        source.step()
+    else:
+        span = source.span
+        source.seek((span[0] if span else first) + round(command.seconds * 1e9))

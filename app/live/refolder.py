@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -11,8 +12,7 @@ from typing import Any
 from estimators.errors import NisusError
 from estimators.fold import Fold
 
-from .pieces import Pieces
-from .stall import Stall
+from .watchdog import Watchdog
 
 
 @dataclass(frozen=True)
@@ -77,13 +77,13 @@ class Refolder:
         self._stopping = False
         self._ticket = 0
         # A long history may take minutes: only a function that does not answer ends a refold.
-        self._stall = Stall(self._give_up, then=GIVEN_UP, long=math.inf)
+        self._watchdog = Watchdog(self._give_up, then=GIVEN_UP, long=math.inf)
         self._thread = threading.Thread(target=self._run, name="refold", daemon=True)
 
     def start(self) -> None:
         """Wait for requests."""
         self._thread.start()
-        self._stall.start()
+        self._watchdog.start()
 
     def stop(self) -> None:
         """Give up what is under way."""
@@ -92,7 +92,7 @@ class Refolder:
             self._wake.notify()
         if self._thread.is_alive():
             self._thread.join(timeout=2.0)
-        self._stall.stop()
+        self._watchdog.stop()
 
     def _give_up(self, text: str, level: str) -> None:
         """A function of the model never returns: leave the thread in it, and go on with another."""
@@ -135,12 +135,43 @@ class Refolder:
 
     def _fold(self, ticket: int, make: Callable[[], Any]) -> Refolded:
         try:
-            fold, pieces = make(), Pieces()
-            with self._stall.watched(fold):
-                while pieces.advance(fold) and not self._stopping:
+            fold, batches = make(), BatchSizer()
+            with self._watchdog.watched(fold):
+                while batches.advance(fold) and not self._stopping:
                     pass
         except NisusError as error:
             return Refolded(ticket, None, str(error))
         except Exception as error:  # noqa: BLE001  a user's model may raise anything; the running fold goes on
             return Refolded(ticket, None, f"{type(error).__name__}: {error}")
         return Refolded(ticket, fold, "")
+
+
+BATCH_PERIOD_S = 0.02
+"""Seconds that a piece should take; one event of a large field may take longer."""
+
+MAX_BATCH_EVENTS = 16_384
+"""Events of a piece."""
+
+
+class BatchSizer:
+    """Folds in pieces whose size follows from what the last ones took. The rows are the same in whatever pieces."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        """`clock` gives seconds that only rise."""
+        self._clock = clock
+        self.begin()
+
+    def begin(self) -> None:
+        """Another fold, of which nothing is known."""
+        self.size = 1
+
+    def advance(self, fold: Fold) -> int:
+        """Fold the next piece; how many events it had."""
+        begun = self._clock()
+        count = fold.advance(self.size)
+        took = self._clock() - begun
+        if took > BATCH_PERIOD_S:
+            self.size = max(1, int(self.size * BATCH_PERIOD_S / took))
+        elif took < BATCH_PERIOD_S / 8 and count == self.size:
+            self.size = min(MAX_BATCH_EVENTS, 4 * self.size)
+        return count

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,11 +22,9 @@ from .counts import RowCounts
 from .integrity import MOST, Window, window
 from .notices import Notices
 from .outputs import Belief, Cursor, Here, Pull
-from .pieces import Pieces
-from .refolder import Requests
+from .refolder import BatchSizer, Requests
 from .revisions import Revisions
-from .stall import Stall
-from .turns import Turns
+from .watchdog import Watchdog
 
 if TYPE_CHECKING:
     from estimators.diagnostics.field_pictures import Picture
@@ -45,12 +43,12 @@ class RunningFold:
     for no longer than copying takes. In between the log may have events that are not folded yet: nobody is shown them.
     """
 
-    def __init__(self, twin: Twin, stall: Stall, base: Base | None, ready: Callable[[str], bool]) -> None:
+    def __init__(self, twin: Twin, watchdog: Watchdog, base: Base | None, ready: Callable[[str], bool]) -> None:
         """Prepare the fold.
 
         Args:
             twin: What to fold.
-            stall: Watches the thread that folds.
+            watchdog: Watches the thread that folds.
             base: Where the fold starts; None: the prior.
             ready: Whether a filter is compiled; while the first is not, an idle fold stands in its place.
         """
@@ -60,9 +58,9 @@ class RunningFold:
         self._policy = twin.policy
         self._history = max(2 * SPARSE_EVERY, twin.config.history)
         self.estimator, self.tuning = twin.estimator, twin.tuning
-        self._lock = Turns()
-        self._stall, self._ready = stall, ready
-        self._pieces = Pieces()
+        self._lock = FairLock()
+        self._watchdog, self._ready = watchdog, ready
+        self._batches = BatchSizer()
         self._cursors: tuple[Cursor, ...] = ()
         self._changing_cursors = threading.Lock()
         self._requests = Requests()
@@ -80,10 +78,10 @@ class RunningFold:
         """
         end = time.monotonic() + patience
         while not (held := self._lock.acquire(timeout=min(0.05, patience))):
-            if self._stall.text is not None or time.monotonic() >= end:
+            if self._watchdog.text is not None or time.monotonic() >= end:
                 break
         try:
-            yield held or self._stall.text is not None
+            yield held or self._watchdog.text is not None
         finally:
             if held:
                 self._lock.release()
@@ -227,7 +225,7 @@ class RunningFold:
     @contextmanager
     def _moving(self) -> Iterator[None]:
         """Nobody reads meanwhile; a fold that does not return is noticed."""
-        with self._lock, self._stall.watched(self._fold):
+        with self._lock, self._watchdog.watched(self._fold):
             try:
                 yield
             finally:
@@ -243,7 +241,7 @@ class RunningFold:
         self._fold = self._make_fold(self.estimator, self.tuning, self._log, base, idle=idle)
         self._row_counts = RowCounts(self.model)
         self._span = (0, 0)
-        self._pieces.begin()
+        self._batches.begin()
 
     def _make_fold(self, estimator: str, tuning: Tuning, log: Log, base: Base | None, *, idle: bool = False) -> Fold:
         period = self.twin.picture if self.model.grid is not None else None
@@ -273,7 +271,7 @@ class RunningFold:
             self._go_back(first)
             again = int(np.searchsorted(self._log.t[: self._log.n], newest, side="right"))
             self._fold.advance(again - self._fold.n)
-        self._pieces.advance(self._fold)
+        self._batches.advance(self._fold)
         return min(first, shown), stale
 
     @property
@@ -312,7 +310,7 @@ class RunningFold:
     def _become(self, fold: Fold, row_counts: RowCounts) -> None:
         """Go on with another fold of the same log, which has caught up with it: a new revision."""
         old, log = self._fold, self._log
-        self._pieces.begin()
+        self._batches.begin()
         if old.idle:  # the first
             self._fold, self._row_counts = fold, row_counts
             self.revisions.began_with(fold.estimator.name, fold.tuning)
@@ -349,9 +347,9 @@ class RunningFold:
             fold.follow(log, changed_from)
         except EstimatorError:
             return None
-        pieces = Pieces()
-        with self._stall.watched(fold):
-            while pieces.advance(fold):
+        batches = BatchSizer()
+        with self._watchdog.watched(fold):
+            while batches.advance(fold):
                 if stopping.is_set():
                     return None
         return row_counts
@@ -366,3 +364,29 @@ def _since(fold: Fold, index: int, end: int) -> list[Picture]:
     if fold.pictures is None:
         return []
     return [picture for picture in fold.pictures.taken if index < picture.before <= end]
+
+
+class FairLock:
+    """Held by one thread at a time. Whoever is next stands at the door, and all others behind."""
+
+    def __init__(self) -> None:
+        self._door, self._lock = threading.Lock(), threading.Lock()
+
+    def acquire(self, timeout: float = -1) -> bool:
+        """Take it, within so many seconds at the door and as many before it; whether that was possible."""
+        if not self._door.acquire(timeout=timeout):
+            return False
+        try:
+            return self._lock.acquire(timeout=timeout)
+        finally:
+            self._door.release()
+
+    def release(self) -> None:
+        """Let it go."""
+        self._lock.release()
+
+    def __enter__(self) -> None:
+        self.acquire()
+
+    def __exit__(self, *_: Any) -> None:
+        self.release()

@@ -21,9 +21,9 @@ from estimators.versions import model_version_at
 from sources.source import Source
 
 from .counts import RowCounts, last_run
+from .execute import playback_status
 from .faults import Faulty
 from .outputs import Status
-from .playback import playback_status
 from .watchers import Watchers
 
 if TYPE_CHECKING:

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from estimators.log import Events
+import numpy as np
+
+from estimators.diagnostics.clock_fit import ClockFit, LeastDelays
+from estimators.log import INPUT, READING, Events
 from estimators.track import TRACKING, WAITING
+from sources.source import Paced, Source
 
 from .alerts import Alerts
 from .blame import Blame
 from .chronicle import Chronicle
 from .counts import Latency
-from .host_clock import HostClock
 from .integrity import IntegrityWatch
 from .interface import Running
+from .notices import Notices
 from .silence import Silence
 
 if TYPE_CHECKING:
@@ -68,3 +74,95 @@ class Watchers:
         if leading is None or health in (WAITING, TRACKING):
             return ""
         return self.blame.told(self.blame.behind(leading)).text
+
+
+class IdleTicks:
+    """How long the source has said nothing, and when to ask."""
+
+    def __init__(self, tick: float) -> None:
+        """`tick`: seconds of silence after which to ask first."""
+        self._tick = tick
+        self._since = time.monotonic()
+        self._newest: int | None = None
+
+    def broken(self, newest: int) -> None:
+        """Something arrived; `newest` is the time of the log's newest event, ns."""
+        self._since = time.monotonic()
+        self._newest = newest
+
+    def asks(self, source: Source, last: int) -> int | None:
+        """The time (ns) for which to ask now, after the log's last event at `last`; None for not yet."""
+        silent = time.monotonic() - self._since
+        if silent < self._tick:
+            return None
+        if source.live:
+            assert self._newest is not None
+            # Counted from the newest reading: a driver's clock need not be this machine's.
+            now: int | None = self._newest + int(silent * 1e9)
+        elif isinstance(source, Paced) and (source.paused or source.speed == np.inf):
+            # As fast as possible, the playhead is ahead of what has been read.
+            now = None
+        else:
+            now = source.now()
+        # The longer the silence, the rarer the question: a night of it must not fill the log.
+        apart = max(self._tick, silent / 20)
+        return None if now is None or now <= last + apart * 0.9e9 else now
+
+
+MAX_DRIFT_PPM = 200.0
+"""Parts per million beyond which a drift is told; a crystal stays within 100."""
+
+
+FIT_PERIOD_NS = 2 * 10**9
+"""Nanoseconds of arrival between two fits, which take a millisecond."""
+
+
+class HostClock:
+    """Follows t - arrival of what was let in; a clock that was found to be set has been corrected there."""
+
+    def __init__(self, notices: Notices, horizon: float) -> None:
+        """`horizon`: seconds of lateness allowed, beyond which an offset is told."""
+        self._notices, self._horizon = notices, horizon
+        self._delays = LeastDelays()
+        self._due = 0
+        self._told: set[str] = set()
+        self.estimate: ClockFit | None = None
+
+    def note(self, events: Events) -> None:
+        """These have come."""
+        stamped = (events.kind == READING) | (events.kind == INPUT)
+        if not stamped.any():
+            return
+        arrival = events.arrival[stamped]
+        self._delays.note(events.t[stamped], arrival)
+        if abs(int(arrival[-1]) - self._due) >= FIT_PERIOD_NS:
+            self._due = int(arrival[-1])
+            self.estimate = self._delays.fit()
+            self._look(self.estimate)
+
+    def _look(self, fit: ClockFit | None) -> None:
+        if fit is None or math.isnan(fit.drift_ppm):
+            return
+        if "offset" not in self._told and abs(fit.offset) > max(1.0, self._horizon):
+            self._told.add("offset")
+            side = "ahead of" if fit.offset > 0 else "behind"
+            self._notices.say(
+                f"the source's clock is {abs(fit.offset):.6g} s {side} this machine's, or its readings take that long; "
+                "times shown are the source's",
+                level="warn",
+            )
+        if "drift" not in self._told and abs(fit.drift_ppm) - fit.drift_error_ppm > MAX_DRIFT_PPM:
+            self._told.add("drift")
+            self._notices.say(
+                f"the source's clock drifts by {fit.drift_ppm:+.0f} ± {fit.drift_error_ppm:.0f} ppm against this "
+                "machine's; synchronise them",
+                level="warn",
+            )
+
+
+def clock_text(fit: ClockFit) -> str:
+    """Offset and drift in a few words; what rounds to zero is not negative."""
+    offset = f"{fit.offset:+z.3f} s"
+    if math.isnan(fit.drift_ppm):
+        return offset
+    return f"{offset}, {fit.drift_ppm:+z.1f} ± {fit.drift_error_ppm:.1g} ppm"

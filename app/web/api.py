@@ -21,11 +21,9 @@ from estimators.track import HEALTH_NAMES
 
 from ..live import commands, faults
 from ..live.changes import began_as, turned
-from ..live.execute import Refolding, retuned
+from ..live.execute import PLAYBACK, Refolding, check_maintenance, check_playback, retuned
 from ..live.interface import Running
-from ..live.maintenance import check_maintenance
 from ..live.outputs import Status
-from ..live.playback import PLAYBACK, check_playback
 from ..live.revisions import Revisions
 
 LONGEST_NAME = 255

@@ -12,12 +12,12 @@ from starlette.routing import Route
 
 from estimators.errors import ConfigError, printable
 
+from ..live.history_copy import END_OF_TIME
 from ..live.interface import Running
 from ..live.revisions import LONGEST_NOTE
 from ..live.runs.fitting import Attempt, Fitting
-from ..live.runs.window import ALL
 from ..live.tunings.fitted import settings_of
-from ..live.tunings.keep import keep, version_text
+from ..live.tunings.versions import keep, version_text
 from ..studies.advice.advising import DONE, Advising
 from .answer import answered
 from .api import Json, one_line
@@ -102,7 +102,7 @@ class FitApi:
     def _state(self) -> dict[str, Any]:
         """`available` events there are to fit to; `current` is whether what runs is what it was fitted from."""
         engine, attempt = self._engine, self.fitting.latest
-        there = {"available": engine.index_at(ALL) - engine.rows(0, 0).first}
+        there = {"available": engine.index_at(END_OF_TIME) - engine.rows(0, 0).first}
         if attempt is None:
             return {"state": "none"} | there
         return attempt_json(attempt) | there | {"current": engine.folded_with()[0] is attempt.tuning}
@@ -124,7 +124,7 @@ def attempt_json(attempt: Attempt) -> dict[str, Any]:
     }
     if attempt.fitted is None:
         return told
-    from ..live.runs.fit_json import fit_json
+    from ..live.runs.runs_json import fit_json
 
     values = {line.key: line.after for line in attempt.fitted.lines if not line.alone}
     return told | {"result": fit_json(attempt.fitted), "values": values}

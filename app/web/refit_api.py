@@ -9,7 +9,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from ..live.dual.refits import FITTING, Refit, Refits
+from ..live.runs.refits import FITTING, Refit, Refits
 from .answer import answered
 from .api import Json, one_line
 from .tunings_api import fields_of
@@ -101,6 +101,6 @@ def refit_json(refit: Refit) -> dict[str, Any]:
     }
     if refit.fitted is None or refit.state == FITTING:
         return told
-    from ..live.runs.fit_json import fit_json
+    from ..live.runs.runs_json import fit_json
 
     return told | {"result": fit_json(refit.fitted)}

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..live.dual.refits import Refits
+from ..concurrency import run_all
 from ..live.engine import Engine
-from ..together import together
+from ..live.runs.refits import Refits
 from ..views.recording.split import NEVER, Split
 from ..views.recording.writer import FINE, Recorder
 from ..views.rerun.rows import RerunRows
@@ -144,7 +144,7 @@ class RunningTwin:
         """Stop everything; a recording is finished, with the last row that there will be."""
         self.refits.stop()
         shown = () if self.server is None else (self.server.stop, self.view.stop)
-        together(self._close_log, *shown)
+        run_all(self._close_log, *shown)
 
     def _close_log(self) -> None:
         self.engine.stop()

@@ -16,7 +16,7 @@ from ..live.runs.noise import noise
 from ..live.runs.runs_json import difference_json, noise_json, runs_json, swept_json
 from ..live.runs.scores import RunScores
 from ..live.runs.sweep import Sweeps
-from ..live.runs.tuning_yaml import tuning_yaml
+from ..live.tunings.tuning_yaml import tuning_yaml
 from .api import Json, one_line
 
 

@@ -24,8 +24,8 @@ from starlette.websockets import WebSocket
 
 from estimators.errors import ConfigError, NisusError
 
-from ..live.dual.refits import Refits
 from ..live.interface import Running
+from ..live.runs.refits import Refits
 from ..present.drawing.choices import Choices
 from ..present.drawing.palette import EITHER, THEMES
 from ..present.export import markdown

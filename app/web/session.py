@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from estimators.errors import SourceError
 
+from ..concurrency import run_all
 from ..live.commands import Record
-from ..signals import restore, when_asked_to_end
-from ..stderr import complain
-from ..together import together
+from ..terminal import complain, restore, when_asked_to_end
 from ..views.recording.split import NEVER, Split
 from .door import Door
 from .open_browser import Opening as BrowserOpening
@@ -219,7 +218,7 @@ class Session:
             item.stop()
         with self._changing:
             ends = [item.stop for item in (self.running, self.door) if item is not None]
-            together(*ends)
+            run_all(*ends)
 
     def _open(self, url: str) -> BrowserOpening | None:
         """Open the page in a browser; where that cannot be, the printed address is there."""

@@ -16,10 +16,7 @@ from ..live.changes import difference
 from ..live.interface import Running
 from ..live.revisions import LONGEST_NOTE
 from ..live.runs.scores import RunScores
-from ..live.tunings.figures import figures
-from ..live.tunings.keep import Settings, keep, version_text
-from ..live.tunings.listing import listing
-from ..live.tunings.load import load_into
+from ..live.tunings.versions import Settings, figures, keep, listing, load_into, version_text
 from ..studies.guard.last import last
 from ..twin.twin import with_version
 from .answer import answered

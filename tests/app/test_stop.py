@@ -9,7 +9,7 @@ import threading
 import pytest
 
 from app.cli.run import live_source
-from app.together import together
+from app.concurrency import run_all
 from app.twin.twin import load_twin
 from app.views.recording.reader import finished, read_recording
 from app.views.recording.writer import _Part
@@ -27,9 +27,9 @@ def test_works_are_done_side_by_side_and_all_before_it_returns():
         meeting.wait(PATIENCE)
         done.append(threading.current_thread())
 
-    together(work, work, work)
+    run_all(work, work, work)
     assert len(set(done)) == 3 and threading.current_thread() in done
-    together()
+    run_all()
 
 
 def test_what_fails_is_raised_once_all_are_done():
@@ -44,7 +44,7 @@ def test_what_fails_is_raised_once_all_are_done():
         done.append(True)
 
     with pytest.raises(OSError, match="it cannot be closed"):
-        together(work, fail, work)
+        run_all(work, fail, work)
     assert done == [True, True]
 
 

@@ -23,10 +23,9 @@ from estimators.snapshots import Base
 from estimators.tuning import Tuning
 
 from ...twin.bounds import bounds_of, natural_aim
+from ..history_copy import END_OF_TIME, copy_log
 from ..integrity import LOWEST
 from ..interface import Running
-from .history import history
-from .window import ALL
 
 if TYPE_CHECKING:
     from estimators.fit.fit import Fitted
@@ -158,8 +157,8 @@ class Fitting:
 
         engine = self._engine
         if since is not None:
-            most = engine.index_at(ALL) - engine.index_at(since)
-        log, base = history(engine, attempt.tuning, most, lambda: self._count(attempt, 0))
+            most = engine.index_at(END_OF_TIME) - engine.index_at(since)
+        log, base = copy_log(engine, attempt.tuning, most, lambda: self._count(attempt, 0))
         if since is None:
             return log, base
         # A copy starts at a snapshot, which may be long before.

@@ -10,9 +10,9 @@ import numpy as np
 from estimators.diagnostics.innovation_size import SensorNoise, sensor_noise
 from estimators.tuning import Tuning
 
+from ..history_copy import recent_rows
 from ..interface import Running
 from .sweep import MOST, Sweeps, Swept
-from .window import window
 
 CHANCE = 1e-3
 """Of innovations as correlated as they are, were the filter right, below which they are called so."""
@@ -34,7 +34,7 @@ class Noise:
 
 def noise(engine: Running, sweeps: Sweeps) -> Noise:
     """What the last events of the running twin say."""
-    taken, q = window(engine, MOST), sweeps.around("Q")
+    taken, q = recent_rows(engine, MOST), sweeps.around("Q")
     if taken is None:
         return Noise(q.revision, {}, "no readings yet", q, {})
     reason = _reason_against(engine, taken.tuning.options.get("adapt", 0.0))

@@ -11,11 +11,10 @@ import numpy as np
 from estimators.diagnostics.score import Score, score
 from estimators.errors import NisusError
 
+from ..history_copy import copy_rows, recent_rows
 from ..interface import Running
 from ..outputs import Pull
 from ..revisions import Run
-from ..whole import whole
-from .window import window
 
 REST = 20.0
 """Times as long as it took that the score of the running revision stands before it is computed again."""
@@ -79,7 +78,7 @@ class RunScores:
         begun = time.monotonic()
         if self._fresh_until[0] == running.number and begun < self._fresh_until[1]:
             return
-        pull = whole(self._engine)
+        pull = copy_rows(self._engine)
         if pull is None or pull.revision != running.number:
             return
         self._known[running.number] = self._scored(running, pull)
@@ -97,7 +96,7 @@ class RunScores:
 
 def _step_us(engine: Running, run: Run) -> float:
     """Elapsed time of an event under a revision's settings, µs, over the last events of the log."""
-    part = window(engine, TIMED)
+    part = recent_rows(engine, TIMED)
     if part is None:
         return np.nan
     try:

@@ -21,9 +21,9 @@ from estimators.errors import ConfigError, NisusError
 from estimators.track import FAILED, Track
 from estimators.tuning import Tuning
 
+from ..history_copy import END_OF_TIME, RecentRows, recent_rows
 from ..integrity import LOWEST
 from ..interface import Running
-from .window import ALL, Window, window
 
 FACTORS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 
@@ -172,7 +172,7 @@ class Sweeps:
         """
         known, revision = self._matched, self._engine.revisions.runs[-1].number
         current = known is not None and known.revision == revision
-        if not current or (known is not None and known.events < self._engine.index_at(ALL) / GROWN < MOST):
+        if not current or (known is not None and known.events < self._engine.index_at(END_OF_TIME) / GROWN < MOST):
             self._want(MATCHED)
         return known if current else None
 
@@ -182,7 +182,7 @@ class Sweeps:
             self._wake.notify()
 
     def _outdated(self, known: Swept) -> bool:
-        return known.done and known.events < min(MOST - FEWEST, self._engine.index_at(ALL) / GROWN)
+        return known.done and known.events < min(MOST - FEWEST, self._engine.index_at(END_OF_TIME) / GROWN)
 
     def _run(self) -> None:
         if sys.platform == "linux":
@@ -206,12 +206,12 @@ class Sweeps:
 
     def sweep(self, key: str) -> None:
         """Fold every value of a key, and leave what is found to `around`."""
-        taken = window(self._engine, FEWEST)
+        taken = recent_rows(self._engine, FEWEST)
         if taken is None or not self._goes_on(taken):
             return
         most, reason = self._affordable(taken)
         if most > FEWEST:
-            taken = window(self._engine, most)
+            taken = recent_rows(self._engine, most)
             if taken is None:
                 return
         if key == MATCHED:
@@ -235,7 +235,7 @@ class Sweeps:
             self._known[key] = Swept(key, revision, value, swept.events, tuple(points), done)
         self._known = dict(list(self._known.items())[-KEPT:])
 
-    def _match(self, taken: Window) -> None:
+    def _match(self, taken: RecentRows) -> None:
         """Fold with the R that the innovations of the fold before say, until it rests."""
         tuning, track = taken.tuning, taken.track
         for _ in range(TURNS):
@@ -258,7 +258,7 @@ class Sweeps:
             taken.pull.revision, len(taken.pull.events), sensor_noise(track, taken.pull.events, tuning)
         )
 
-    def _point(self, taken: Window, key: str, factor: float, tuning: Tuning) -> Point | None:
+    def _point(self, taken: RecentRows, key: str, factor: float, tuning: Tuning) -> Point | None:
         """One value, folded; None if nobody wants it any more."""
         value = value_of(tuning, key) if key not in GROUPS else factor
         try:
@@ -275,7 +275,7 @@ class Sweeps:
         failed = _failures(track) > _failures(taken.track)
         return Point(factor, value, _number(likelihood, failed), _number(nis, failed))
 
-    def _affordable(self, taken: Window) -> tuple[int, str]:
+    def _affordable(self, taken: RecentRows) -> tuple[int, str]:
         """How many events can be folded in reasonable time, or why none."""
         if self._engine.model.black_box:
             return 0, f"{self._engine.model.name} is a black box, too slow to be folded again beside what runs"
@@ -288,7 +288,7 @@ class Sweeps:
             return 0, f"{taken.estimator} takes {each * FEWEST:.0f} s for {FEWEST} events, too slow to be folded again"
         return int(min(MOST, max(FEWEST, LONGEST / max(each, 1e-9)))), ""
 
-    def _goes_on(self, taken: Window) -> bool:
+    def _goes_on(self, taken: RecentRows) -> bool:
         return not self._stopping and self._engine.tuning is taken.tuning
 
 

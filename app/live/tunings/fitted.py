@@ -12,8 +12,7 @@ from estimators.fit.dual import shift
 from estimators.fit.fit import Fitted, Line
 from estimators.fit.judge import Part
 
-from .figures import COVERAGE, LIKELIHOOD, NIS, RMSE
-from .keep import DIGITS, Settings
+from .versions import COVERAGE, DIGITS, LIKELIHOOD, NIS, RMSE, Settings
 
 
 def settings_of(found: Fitted, fitted_on: Sequence[str], note: str = "") -> Settings:

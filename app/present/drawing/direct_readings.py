@@ -9,7 +9,7 @@ import numpy as np
 
 from estimators.model.state_space import Sensor, StateSpaceModel
 
-from ...stderr import complain
+from ...terminal import complain
 
 NEAR, AWAY = 0.05, 0.2
 """How far a row may be from its state, as a share: where the prior has its mean (a wheel's scale), and elsewhere, where

@@ -20,8 +20,8 @@ from estimators.smoothing.smoothed import Smoothed
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES, Track
 from estimators.tuning import GATE_KEYS, Tuning
 
+from ...format_time import format_time
 from ...live.changes import difference, in_words
-from ...moment import moment
 from ...twin.twin import Twin
 from .alarms import advice
 from .calibration_lines import calibration_lines
@@ -84,7 +84,10 @@ def _head(run: Reported) -> Part:
     rows = [
         ("filter", f"{entry.title} ({run.estimator})" + (f": {options}" if options else "")),
         ("source", _source(twin)),
-        ("log", f"{moment(int(t[0]))} to {moment(int(t[-1]))}, {(t[-1] - t[0]) * 1e-9:.6g} s, {len(t):,} events"),
+        (
+            "log",
+            f"{format_time(int(t[0]))} to {format_time(int(t[-1]))}, {(t[-1] - t[0]) * 1e-9:.6g} s, {len(t):,} events",
+        ),
     ]
     given = ", ".join(f"{key}={value}" for key, value in twin.overrides.items())
     if given:

@@ -10,10 +10,10 @@ from estimators.diagnostics.episodes import Course, Episode, found_in
 from estimators.errors import ConfigError
 from estimators.registry import find_entry
 
+from ...live.history_copy import copy_rows
 from ...live.interface import Running
 from ...live.outputs import Pull
 from ...live.revisions import Run
-from ...live.whole import whole
 
 TRIES = 20
 """Times that the rows are copied while a late reading, or another revision, comes in between."""
@@ -64,7 +64,7 @@ def rows_of_run(engine: Running, number: int | None = None) -> RunRows:
             return RunRows(run, run.track)
         if not engine.span()[1]:
             raise ConfigError(f"run {run.number}: no reading has come yet")
-        pull = whole(engine)
+        pull = copy_rows(engine)
         if pull is not None and pull.revision == run.number:
             return RunRows(run, pull)
     raise ConfigError("its rows change while they are copied; ask again")

@@ -11,9 +11,9 @@ from typing import Any
 
 from estimators.errors import ConfigError, NisusError
 
+from ...live.history_copy import copy_log
 from ...live.integrity import LOWEST
 from ...live.interface import Running
-from ...live.runs.history import history
 
 RUNNING, FAILED, DONE = "running", "failed", "done"
 
@@ -57,7 +57,7 @@ class Advising:
         state = DONE
         try:
             tuning, estimator = self.engine.folded_with()
-            log, _ = history(self.engine, tuning)
+            log, _ = copy_log(self.engine, tuning)
             twin = replace(self.engine.twin, tuning=tuning, estimator=estimator)
             self.told = advice_json(twin, log, advise(Measured(twin, log)))
         except NisusError as error:

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from estimators.errors import LARGEST, ConfigError
 from estimators.forecast import Crossing, Forecast, first_time, forecast
+from estimators.log import INPUT, Events
 from estimators.model.state_space import StateSpaceModel
 
 from ...live.interface import Running
 from ...live.outputs import Here
-from .inputs import MOST_STEPS, REPEAT, TIMES, Changes, input_events, recorded, told_changes
 from .numbers import listed, number
 
-MOST_CHANGES = 200
+MAX_CHANGES = 200
 """Changes of one input."""
 
 PATIENCE = 8.0
@@ -76,7 +77,7 @@ class Forecasts:
             ConfigError: If nothing has come yet.
         """
         step = _step(self._here(), 0.0, self._engine.model.max_step)
-        return {"step": step, "longest": MOST_STEPS * step}
+        return {"step": step, "longest": MAX_STEPS * step}
 
     def _here(self) -> Here:
         here = self._engine.here()
@@ -112,7 +113,7 @@ class Forecasts:
             step,
             inputs=input_events(inputs, here.t, self._engine.model),
             limits=question.limits,
-            most=TIMES,
+            most=MAX_TIMES,
             between=between,
         )
         lost = (~(np.abs(found.mean) <= LARGEST) & np.isfinite(found.mean[0])).any(axis=1)
@@ -180,10 +181,10 @@ def _step(here: Here, horizon: float, longest: float) -> float:
     """As long as readings are apart, which the filter is used to; no longer than the model allows."""
     step = min(here.step if math.isfinite(here.step) else ALONE, longest)
     steps = math.ceil(horizon / step)
-    if steps > MOST_STEPS:
+    if steps > MAX_STEPS:
         raise ConfigError(
             f"forecast: horizon is {horizon:g} s, {steps:,} steps of {step:.3g} s as the readings come; it may be "
-            f"{MOST_STEPS * step:.4g} s at most"
+            f"{MAX_STEPS * step:.4g} s at most"
         )
     return step
 
@@ -200,8 +201,8 @@ def _named(where: str, given: Any, names: Any) -> dict[str, Any]:
 def _changes(where: str, given: Any, horizon: float) -> list[tuple[float, float]]:
     if not isinstance(given, list):
         return [(0.0, _number(where, given))]
-    if not 0 < len(given) <= MOST_CHANGES or not all(isinstance(pair, list) and len(pair) == 2 for pair in given):
-        raise ConfigError(f"forecast: {where} must be a number, or at most {MOST_CHANGES} pairs [seconds, value]")
+    if not 0 < len(given) <= MAX_CHANGES or not all(isinstance(pair, list) and len(pair) == 2 for pair in given):
+        raise ConfigError(f"forecast: {where} must be a number, or at most {MAX_CHANGES} pairs [seconds, value]")
     pairs = [(_number(where, seconds), _number(where, value)) for seconds, value in given]
     late = next((seconds for seconds, _ in pairs if not 0.0 <= seconds <= horizon), None)
     if late is not None:
@@ -213,3 +214,85 @@ def _number(where: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
         raise ConfigError(f"forecast: {where} is {value!r}; it must be a finite number")
     return float(value)
+
+
+REPEAT = "repeat"
+"""In place of an input's values: what it was, once more."""
+
+Changes = list[tuple[float, float]]
+"""Of one input: seconds from now, and the value from then on."""
+
+MAX_STEPS = 20_000
+"""Steps of a forecast; each is as long as readings are apart."""
+
+MAX_TIMES = 160
+"""Times that are told of."""
+
+COPY_ROWS = 16_384
+"""Rows copied at once, so that a long history does not hold the engine's lock for long."""
+
+
+def recorded(engine: Running, names: Sequence[str], now: int, horizon: float) -> dict[str, Changes]:
+    """What inputs did in the last `horizon` seconds before `now` (ns), from now on; of a shorter log again and again.
+
+    Raises:
+        ConfigError: If they changed too often.
+    """
+    if not names:
+        return {}
+    model = engine.model
+    since = max(engine.span()[0], now - round(horizon * 1e9))
+    length = max(1, now - since)
+    places = {name: model.input_names.index(name) for name in names}
+    before: dict[str, float] = {}
+    found: dict[str, Changes] = {name: [] for name in names}
+    # From some rows before, for what held at first.
+    at, end = max(0, engine.index_at(since) - COPY_ROWS), engine.index_at(now + 1)
+    while at < end:
+        events = engine.rows(at, min(end, at + COPY_ROWS)).events
+        at += COPY_ROWS
+        for row in np.flatnonzero(events.kind == INPUT):
+            for name, place in places.items():
+                value = float(events.value[row, place])
+                if math.isnan(value):
+                    continue
+                if events.t[row] <= since:
+                    before[name] = value
+                else:
+                    found[name].append(((int(events.t[row]) - since) * 1e-9, value))
+    times = math.ceil(horizon * 1e9 / length)
+    for name, changes in found.items():
+        changes[:0] = [(0.0, before[name])] if name in before else []
+        if len(changes) * times > MAX_STEPS:
+            raise ConfigError(
+                f"forecast: {name} changed {len(changes):,} times in {length * 1e-9:.4g} s, too often to be repeated "
+                f"for {horizon:g} s; ask for a shorter horizon"
+            )
+    return {
+        name: [
+            (t + k * length * 1e-9, value)
+            for k in range(times)
+            for t, value in changes
+            if t + k * length * 1e-9 <= horizon
+        ]
+        for name, changes in found.items()
+        if changes
+    }
+
+
+def told_changes(changes: Changes) -> dict[str, list[Any]]:
+    """What an input does from now on, as some points to draw."""
+    few = changes[:: max(1, math.ceil(len(changes) / (2 * MAX_TIMES)))]
+    return {"t": listed(np.array([t for t, _ in few])), "value": listed(np.array([value for _, value in few]))}
+
+
+def input_events(inputs: Mapping[str, Changes], now: int, model: StateSpaceModel) -> Events | None:
+    """The changes of the inputs as events."""
+    batch = []
+    for name, changes in inputs.items():
+        n = len(changes)
+        t = np.array([now + round(seconds * 1e9) for seconds, _ in changes], np.int64)
+        rows = np.full((n, model.width), np.nan)
+        rows[:, model.input_names.index(name)] = [value for _, value in changes]
+        batch.append(Events(t, t.copy(), np.full(n, INPUT, np.int8), np.zeros(n, np.int32), rows))
+    return Events.concat(batch, model.width) if batch else None

@@ -26,7 +26,7 @@ from estimators.events.batch import truth_of
 from estimators.fold import Fold
 from estimators.track import DIVERGED, HELD_OUT, USED
 
-from ...live.tunings.figures import COVERAGE, LIKELIHOOD, NIS, REFUSED, RMSE, figures
+from ...live.tunings.versions import COVERAGE, LIKELIHOOD, NIS, REFUSED, RMSE, figures
 
 BLOCKS = 20
 """Of a log, of as many events each."""

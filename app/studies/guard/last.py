@@ -11,7 +11,7 @@ from typing import Any
 
 from config.tunings import folders
 
-from ...live.tunings.keep import now
+from ...live.tunings.versions import now
 from .junit import Guarded, in_words
 
 FILE = "guard.json"

@@ -14,8 +14,8 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.track import Track
 from estimators.tuning import Tuning
 
+from ...live.history_copy import copy_rows
 from ...live.interface import Running
-from ...live.whole import whole
 
 
 def summary_of(engine: Running) -> dict[str, Any]:
@@ -24,7 +24,7 @@ def summary_of(engine: Running) -> dict[str, Any]:
     `error` is {name, rmse, unit, coverage, against}: of the first state with a truth, else of a sensor held out.
     """
     try:
-        pull = whole(engine)
+        pull = copy_rows(engine)
         tuning, estimator = engine.folded_with()
         if pull is None:
             return {"estimator": estimator}

@@ -15,7 +15,7 @@ from config.loader import shown_path
 from config.tunings import OWN
 from estimators.errors import NisusError
 
-from ...live.reload import obstacle
+from ...live.changes import obstacle
 from ...twin.twin import VERSION, Twin, with_version
 from ..running import RunningTwin, Stamp, stamp_of
 from .gallery import Gallery

@@ -9,7 +9,7 @@ import pytest
 from app.cli.arguments import Commission
 from app.cli.commission import commission_twin, lines
 from app.cli.fold import read_log
-from app.live.tunings.section_text import write_section
+from app.live.tunings.versions import write_section
 from app.twin.twin import load_twin
 from estimators.diagnostics.commission import Normal, baseline_of, lost_from
 from estimators.diagnostics.evidence import CAUSES

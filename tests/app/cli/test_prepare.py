@@ -9,7 +9,7 @@ import pytest
 
 import app.cli.prepare
 from app.cli.prepare import attend
-from app.live.call_watch import CALL_PATIENCE, CallWatch
+from app.live.watchdog import CALL_TIMEOUT_S, CallWatch
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 
 ENTERED, LEAVE = threading.Event(), threading.Event()
@@ -50,9 +50,9 @@ def test_a_call_that_does_not_return_is_named_once():
     thread = call()
     try:
         assert watch.look() is None
-        now = CALL_PATIENCE - 0.1
+        now = CALL_TIMEOUT_S - 0.1
         assert watch.look() is None
-        now = CALL_PATIENCE
+        now = CALL_TIMEOUT_S
         line = watch.look()
         assert line is not None and "\n" not in line
         place, rest = line.split(": ", 1)
@@ -71,7 +71,7 @@ def test_calls_that_return_are_not():
     for _ in range(3):  # each of them looked at twice, and longer than the patience in sum
         thread = call()
         assert watch.look() is None
-        now += 0.6 * CALL_PATIENCE
+        now += 0.6 * CALL_TIMEOUT_S
         assert watch.look() is None
         LEAVE.set()
         thread.join()

@@ -8,7 +8,7 @@ import app.cli.opener
 import app.cli.prepare
 from app.cli.main import main
 from app.live.workshop import Workshop
-from app.stderr import printable
+from app.terminal import printable
 from tests.app.cli.test_fold import DRIVE, ROWS
 
 

@@ -10,7 +10,7 @@ from app.cli.main import main
 from app.twin.bounds import natural_aim
 from app.twin.twin import load_twin
 from config.loader import TWINS
-from tests.app.live.runs.test_tuning_yaml import pasted
+from tests.app.live.tunings.test_tuning_yaml import pasted
 
 WRONG = ["--set", "R.winding=0.2", "--set", "source.duration=300"]
 

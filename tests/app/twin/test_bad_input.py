@@ -10,7 +10,7 @@ import viser
 from app.cli.main import main
 from app.live import commands
 from app.live.engine import Engine
-from app.live.playback import play
+from app.live.execute import play
 from app.twin.twin import load_twin, restore_twin
 from app.views.viser.view import ViserView
 from app.web.api import command_from_json, status_json

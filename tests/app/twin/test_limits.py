@@ -9,8 +9,7 @@ import pytest
 
 from app.cli.arguments import Fold as Arguments
 from app.cli.fold import fold_twin
-from app.live.counts import RowCounts
-from app.live.refusals import refusals
+from app.live.counts import RowCounts, refusals
 from app.twin.twin import load_twin
 from app.views.recording.format import base_from_json, base_to_json
 from estimators.errors import ConfigError

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from app.live.engine import Engine
+from app.live.history_copy import COPY_EVENTS
 from app.live.runs.fitting import CANCELLED, DONE, FAILED, Fitting
-from app.live.runs.history import PIECE
 from estimators.errors import ConfigError
 from estimators.fit.fit import fit
 from estimators.fit.recording import Recording
@@ -58,7 +58,7 @@ def alone(n):
 
 def test_what_is_fitted_beside_the_twin_is_the_fit_of_its_log(started):
     # More than one piece is copied.
-    n = PIECE + 900
+    n = COPY_EVENTS + 900
     engine = started(n)
     fitting = Fitting(engine)
     fitting.begin(WANTED)

@@ -5,8 +5,8 @@ import pytest
 
 from app.live import commands
 from app.live.engine import Engine
+from app.live.history_copy import COPY_ROWS
 from app.live.runs.scores import RunScores
-from app.live.whole import ROWS
 from estimators.fold import fold
 from estimators.log import Log
 from estimators.track import HELD_OUT, USED
@@ -31,7 +31,7 @@ def started():
         engines.append(engine)
         engine.start()
         source.put(readings(*series(n)))
-        wait_for(lambda: row_count(engine) == n if n < ROWS else engine.index_at(2**62) == n)
+        wait_for(lambda: row_count(engine) == n if n < COPY_ROWS else engine.index_at(2**62) == n)
         return engine
 
     yield start
@@ -93,7 +93,7 @@ def test_what_was_scored_stays_known_when_its_track_goes(started):
 
 
 def test_a_history_of_several_pieces_is_scored_whole(started):
-    n = 2 * ROWS + 100
+    n = 2 * COPY_ROWS + 100
     engine = started(n)
     ((_, known),) = RunScores(engine).all()
     assert known.rows == n and known.score.readings == n

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from app.live.engine import Engine
+from app.live.history_copy import recent_rows
 from app.live.runs.noise import noise
 from app.live.runs.sweep import AT_REST, FACTORS, MATCHED, Point, Sweeps, Swept, scaled, value_of, values_around
-from app.live.runs.window import window
 from estimators.errors import ConfigError
 from estimators.fold import Fold, fold
 from estimators.log import Log
@@ -71,7 +71,7 @@ def test_every_point_is_a_fold_and_the_best_is_the_best(started, key):
 
 def test_a_window_goes_on_from_a_snapshot_as_the_whole_fold_did(started):
     engine = started(6000)
-    taken = window(engine, 3000)
+    taken = recent_rows(engine, 3000)
     assert len(taken.pull.events) <= 3000 and taken.pull.first % 1024 == 0
     again = taken.fold(engine, taken.estimator, taken.tuning)
     again.advance()
@@ -86,7 +86,7 @@ def test_a_window_goes_on_from_a_snapshot_as_the_whole_fold_did(started):
 def test_another_tuning_ends_a_sweep(started):
     engine = started(1500)
     sweeps = Sweeps(engine)
-    taken = window(engine, 2048)
+    taken = recent_rows(engine, 2048)
     engine.tuning = FIRST.set("Q.rate", 0.5)
     assert sweeps._point(taken, "Q.rate", 1.0, taken.tuning) is None
     sweeps.sweep("Q.rate")
@@ -156,7 +156,7 @@ def test_what_the_innovations_say_of_r_is_given_by_key(started):
     found = noise(engine, Sweeps(engine))
     # The readings are of a random walk with noise of variance 1.
     estimate = found.sensors["R.winding"]
-    track = window(engine, 2048).track
+    track = recent_rows(engine, 2048).track
     weight = track.innovation_std[:, 0] ** -4
     excess = np.sum(weight * (track.innovation[:, 0] ** 2 - track.innovation_std[:, 0] ** 2)) / np.sum(weight)
     assert found.reason == "" and estimate.n == 1500

@@ -13,7 +13,7 @@ from app.cli.fold import fold_twin, read_log
 from app.cli.main import main
 from app.cli.opener import recorded_twin
 from app.cli.tunings import tunings_of
-from app.live.tunings.keep import Settings, accept, keep, version_text
+from app.live.tunings.versions import Settings, accept, keep, version_text
 from app.twin.twin import load_twin
 from app.views.recording.reader import read_recording
 from config.loader import TWINS, shipped
@@ -147,7 +147,7 @@ def test_the_last_that_was_accepted_holds(own, monkeypatch):
     twin = load_twin(own)
     for k, name in enumerate(("b", "a")):
         path = keep(twin, name, version_text(twin, Settings("kf", twin.tuning)))
-        monkeypatch.setattr("app.live.tunings.keep.now", lambda k=k: f"2026-11-2{k}T00:00:00Z")
+        monkeypatch.setattr("app.live.tunings.versions.now", lambda k=k: f"2026-11-2{k}T00:00:00Z")
         accept(load_version(path), "")
     assert accepted_version(own).name == "a"
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from app.live.engine import Engine
-from app.studies.analysis.forecast import Forecasts, forecast_json, question_from_json
-from app.studies.analysis.inputs import recorded
+from app.studies.analysis.forecast import Forecasts, forecast_json, question_from_json, recorded
 from app.web.one_at_a_time import OneAtATime
 from app.web.server import PageServer
 from estimators.errors import ConfigError

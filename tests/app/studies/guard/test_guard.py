@@ -17,7 +17,7 @@ from app.cli.fold import fold_twin, read_log
 from app.cli.guard import guard
 from app.cli.guard_archive import of_twin
 from app.cli.main import main
-from app.live.tunings.keep import Settings, accept, keep, version_text
+from app.live.tunings.versions import Settings, accept, keep, version_text
 from app.studies.guard.figures import MOST, SHARE, allowances, measured
 from app.studies.guard.last import last
 from app.studies.guard.reference import read_reference

@@ -5,8 +5,8 @@ import os
 import numpy as np
 import pytest
 
+from app.live.changes import merged, obstacle
 from app.live.commands import SetEstimator, SetTuning
-from app.live.reload import merged, obstacle
 from app.twin.twin import load_twin
 from app.views.recording.reader import read_recording
 from app.web.gallery.saved_files import SavedFiles

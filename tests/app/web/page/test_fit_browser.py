@@ -5,7 +5,7 @@ import json
 import pytest
 
 from app.cli.run import live_source
-from app.live.tunings.listing import listing
+from app.live.tunings.versions import listing
 from app.studies.guard.junit import Guarded
 from app.studies.guard.last import keep_last
 from app.studies.guard.verdict import Judged

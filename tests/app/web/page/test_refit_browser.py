@@ -3,7 +3,7 @@
 import pytest
 
 from app.cli.run import live_source
-from app.live.tunings.listing import listing
+from app.live.tunings.versions import listing
 from app.twin.twin import load_twin
 from app.web.session import Page, Session
 from tests.app.scripted import wait_for

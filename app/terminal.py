@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import signal
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any
+
+from estimators.errors import printable
 
 ENDING = ("SIGTERM", "SIGHUP")
 """From a service manager, and from a terminal that closes; Windows has the first only."""
@@ -27,3 +30,8 @@ def restore(previous: Mapping[int, Any]) -> None:
     """Handle them as before."""
     for number, handler in previous.items():
         signal.signal(number, handler)
+
+
+def complain(text: object) -> None:
+    """Say what is wrong."""
+    print(f"nisus: {printable(str(text))}", file=sys.stderr, flush=True)

@@ -17,11 +17,10 @@ from config.schema import RefitSection
 from config.tunings import version_files
 from estimators.errors import ConfigError, NisusError
 
-from ...moment import moment
+from ...format_time import format_time
 from ..interface import Running
-from ..runs.fitting import DONE, FAILED, Attempt, Fitting
-from ..tunings.keep import keep, version_text
-from ..tunings.load import load_into
+from ..tunings.versions import keep, load_into, version_text
+from .fitting import DONE, FAILED, Attempt, Fitting
 
 if TYPE_CHECKING:
     from estimators.fit.fit import Fitted
@@ -137,7 +136,7 @@ class Refits:
             taken = version_files(twin.path)
             name = next(name for k in range(1, len(taken) + 2) if (name := f"refit-{k}") not in taken)
             attempt = refit.attempt
-            fitted_on = [f"{attempt.events} events over {attempt.seconds:.4g} s, to {moment(refit.end)}"]
+            fitted_on = [f"{attempt.events} events over {attempt.seconds:.4g} s, to {format_time(refit.end)}"]
             given = settings_of(refit.fitted, fitted_on, f"dual estimation, fit {number}, adopted {why}: {refit.text}")
             given = replace(given, model_version=engine.status().model_version)
             keep(twin, name, version_text(twin, given))

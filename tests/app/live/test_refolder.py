@@ -1,12 +1,12 @@
-"""The lock goes to whoever waits, and pieces of a fold take a moment each."""
+"""The lock goes to whoever waits, and batches of a fold take a moment each."""
 
 import threading
 from types import SimpleNamespace
 
 import pytest
 
-from app.live.pieces import MOMENT, MOST, Pieces
-from app.live.turns import Turns
+from app.live.refolder import BATCH_PERIOD_S, MAX_BATCH_EVENTS, BatchSizer
+from app.live.running_fold import FairLock
 from tests.app.scripted import wait_for
 
 
@@ -21,12 +21,12 @@ def test_a_piece_takes_a_moment_or_is_one_event(cost):
         sizes.append(count)
         return count
 
-    pieces = Pieces(clock=lambda: now)
-    while len(sizes) < 200 and pieces.advance(SimpleNamespace(advance=advance)):
+    batches = BatchSizer(clock=lambda: now)
+    while len(sizes) < 200 and batches.advance(SimpleNamespace(advance=advance)):
         pass
     # Those that did not take an eighth of a moment are followed by four times as many: half of one at most.
-    assert max(sizes) == 1 or max(sizes) * cost <= MOMENT
-    assert max(sizes) <= MOST and (left == 0 or cost > 1e-6)
+    assert max(sizes) == 1 or max(sizes) * cost <= BATCH_PERIOD_S
+    assert max(sizes) <= MAX_BATCH_EVENTS and (left == 0 or cost > 1e-6)
     assert sizes[0] == 1
 
 
@@ -38,16 +38,16 @@ def test_a_fold_that_became_dear_is_folded_in_smaller_pieces():
         now += limit * cost
         return limit
 
-    pieces, fold = Pieces(clock=lambda: now), SimpleNamespace(advance=advance)
-    while pieces.size < MOST:
-        pieces.advance(fold)
+    batches, fold = BatchSizer(clock=lambda: now), SimpleNamespace(advance=advance)
+    while batches.size < MAX_BATCH_EVENTS:
+        batches.advance(fold)
     cost = 1e-3
-    pieces.advance(fold)
-    assert pieces.size * cost <= MOMENT
+    batches.advance(fold)
+    assert batches.size * cost <= BATCH_PERIOD_S
 
 
 def test_who_waits_comes_before_who_has_just_been_there():
-    turns, order = Turns(), []
+    turns, order = FairLock(), []
 
     def wait():
         with turns:
@@ -65,7 +65,7 @@ def test_who_waits_comes_before_who_has_just_been_there():
 
 
 def test_whoever_waits_in_vain_leaves_the_door_to_others():
-    turns = Turns()
+    turns = FairLock()
     turns.acquire()
     assert not turns.acquire(timeout=0.001)
     turns.release()

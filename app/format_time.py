@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import time
 
-LATER_THAN = 10**18
+FIRST_DATED_NS = 10**18
 """Nanoseconds since 1970 from which on a time is one of this century, and has a date."""
 
 
-def moment(t: int) -> str:
+def format_time(t: int) -> str:
     """A time of the log (ns): with its date where it has one, else in seconds."""
-    if t < LATER_THAN:
+    if t < FIRST_DATED_NS:
         return f"{t * 1e-9:.6g} s"
     return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(t // 10**9))

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 
-def together(*works: Callable[[], Any]) -> None:
+def run_all(*works: Callable[[], Any]) -> None:
     """Do all of these, each in a thread of its own but the first, and wait for them.
 
     Raises:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from app.live.runs.tuning_yaml import tuning_yaml
+from app.live.tunings.tuning_yaml import tuning_yaml
 from app.twin.twin import load_twin, restore_twin
 from estimators.registry import ESTIMATORS
 

@@ -10,10 +10,10 @@ from app.cli.main import main
 from app.cli.opener import recorded_twin
 from app.cli.run import live_source
 from app.live.commands import Record, SetTuning
-from app.live.dual.refits import ADOPTED, BROKEN, DISMISSED, FITTING, NOTHING, OFFERED, OUTDATED, Refits
 from app.live.engine import Engine
 from app.live.feeder import Restarted
 from app.live.runs.fitting import Fitting
+from app.live.runs.refits import ADOPTED, BROKEN, DISMISSED, FITTING, NOTHING, OFFERED, OUTDATED, Refits
 from app.twin.twin import load_twin
 from app.views.recording.reader import read_recording
 from app.web.session import Session

@@ -1,47 +1,101 @@
-"""A fold that does not return: which function of the model keeps it, said while everything else goes on.
-
-Compiled code cannot be interrupted, so the engine's thread is lost then. It holds no interpreter lock, so signals,
-page and recorder still run; they read what stood before, which nobody changes any more.
-"""
+"""Looks for a call of a model's function that does not return, in whatever thread it is."""
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from config.loader import shown_path
 from estimators.fold_failures import questions_of
+from estimators.model.state_space import StateSpaceModel
+from estimators.numerics.jit import plain
 
-from ..stderr import complain
-from .call_watch import CallWatch
+from ..terminal import complain
+
+CALL_TIMEOUT_S = 10.0
+"""Seconds that one call of a model's function may take before a line names it."""
+
+
+class CallWatch:
+    """Looks at what all threads are doing, for a call of a model's function that does not return."""
+
+    def __init__(self, model: StateSpaceModel, clock: Callable[[], float] = time.monotonic) -> None:
+        functions = [("f", model.f), ("F", model.F), ("Q", model.Q), ("shape", model.shape)]
+        for sensor in model.sensors:
+            for what in ("h", "H", "log_likelihood"):
+                functions.append((f"{what} of sensor {sensor.name}", getattr(sensor, what)))
+        if model.jump is not None:
+            functions.append(("jump.chances", model.jump.chances))
+        codes = ((getattr(plain(item), "__code__", None), what) for what, item in functions)
+        self._names = {code: what for code, what in codes if code is not None}
+        self._model = model.name
+        self._clock = clock
+        self._seen: tuple[Any, float] | None = None
+
+    def look(self) -> str | None:
+        """One line when a call has been under way for CALL_TIMEOUT_S, the first time that it has."""
+        frame = self._call()
+        if frame is None:
+            self._seen = None
+        elif self._seen is None or self._seen[0] is not frame:
+            self._seen = (frame, self._clock())
+        elif self._clock() - self._seen[1] >= CALL_TIMEOUT_S:
+            self._seen = (frame, float("inf"))
+            return (
+                f"{self._said(frame)} has not returned for {CALL_TIMEOUT_S:g} s; if it loops for ever, Ctrl-C ends the "
+                "program"
+            )
+        return None
+
+    def where(self) -> str | None:
+        """The call that is under way now, and where it is."""
+        frame = self._call()
+        return None if frame is None else self._said(frame)
+
+    def _said(self, frame: Any) -> str:
+        code = frame.f_code
+        return f"{shown_path(Path(code.co_filename))}:{frame.f_lineno}: {self._names[code]} of the model {self._model}"
+
+    def _call(self) -> Any:
+        for thread_frame in sys._current_frames().values():
+            frame: Any = thread_frame
+            while frame is not None:
+                if frame.f_code in self._names:
+                    return frame
+                frame = frame.f_back
+        return None
+
 
 if TYPE_CHECKING:
     from estimators.fold import Fold
 
-PATIENCE = 3.0
+CHECK_AFTER_S = 3.0
 """Seconds that a fold may take before the functions of its model are asked one by one."""
 
-LONG = 60.0
+STALLED_AFTER_S = 60.0
 """Seconds after which a fold is said not to return although each of them answers."""
 
-ANSWER = 1.0
+ANSWER_TIMEOUT_S = 1.0
 """Seconds for one of them to answer."""
 
 
-LOST = "nothing more is estimated. Ctrl-C ends the program; mend the model"
+STALLED_REMEDY = "nothing more is estimated. Ctrl-C ends the program; mend the model"
 
 
-class Stall:
+class Watchdog:
     """Watches the work of one thread from another."""
 
     def __init__(
         self,
         say: Callable[[str, str], Any],
         *,
-        then: str = LOST,
-        long: float = LONG,
+        then: str = STALLED_REMEDY,
+        long: float = STALLED_AFTER_S,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Begin to watch.
@@ -98,7 +152,7 @@ class Stall:
                 self.text = None
                 self._say("the fold has returned, and goes on", "info")
             self._asked = None
-        if work is None or self.text is not None or (gone := self._clock() - work[0]) < PATIENCE:
+        if work is None or self.text is not None or (gone := self._clock() - work[0]) < CHECK_AFTER_S:
             return
         if self._asked is None:
             self._asked = work
@@ -123,11 +177,11 @@ def interruptible(fold: Fold, work: Callable[[], Any]) -> None:
         BaseException: What the work raises.
     """
     failure: list[BaseException] = []
-    stall = Stall(lambda text, level: complain(text))
+    watchdog = Watchdog(lambda text, level: complain(text))
 
     def run() -> None:
         try:
-            with stall.watched(fold):
+            with watchdog.watched(fold):
                 work()
         except BaseException as error:  # noqa: BLE001  raised again below, in the caller's thread
             failure.append(error)
@@ -136,7 +190,7 @@ def interruptible(fold: Fold, work: Callable[[], Any]) -> None:
     thread.start()
     while thread.is_alive():
         thread.join(0.5)
-        stall.look()
+        watchdog.look()
     if failure:
         raise failure[0]
 
@@ -147,7 +201,7 @@ def _in_python(fold: Fold) -> str | None:
 
 
 def unanswered(questions: Iterable[tuple[str, Callable[[], Any]]], patience: float | None = None) -> str | None:
-    """The first question that is not answered within `patience` seconds (default: `ANSWER`); None if all are.
+    """The first question that is not answered within `patience` seconds (default: `ANSWER_TIMEOUT_S`); None if all are.
 
     They are asked in a thread of its own, which is lost with the one that is not.
     """
@@ -164,7 +218,7 @@ def unanswered(questions: Iterable[tuple[str, Callable[[], Any]]], patience: flo
 
     threading.Thread(target=ask, name="asking", daemon=True).start()
     known = -1
-    while not over.wait(ANSWER if patience is None else patience):
+    while not over.wait(ANSWER_TIMEOUT_S if patience is None else patience):
         if asking and len(asking) == known:
             return asking[-1]
         known = len(asking)

@@ -9,9 +9,9 @@ import threading
 import numpy as np
 import pytest
 
-import app.live.stall
+import app.live.watchdog
 from app.live.refolder import Refolder
-from app.live.stall import LONG, PATIENCE, Stall, unanswered
+from app.live.watchdog import CHECK_AFTER_S, STALLED_AFTER_S, Watchdog, unanswered
 from app.views.recording.reader import finished, read_recording
 from tests.app.scripted import wait_for
 from tests.conftest import ROOT
@@ -133,28 +133,28 @@ class Work:
 
 @pytest.fixture
 def asked_of_work(monkeypatch):
-    monkeypatch.setattr(app.live.stall, "questions_of", lambda work: iter(work.questions))
+    monkeypatch.setattr(app.live.watchdog, "questions_of", lambda work: iter(work.questions))
 
 
 def test_work_that_takes_long_is_named_only_if_a_question_is_not_answered(asked_of_work):
     now, said, leave = 0.0, [], threading.Event()
-    stall = Stall(lambda text, level: said.append((level, text)), clock=lambda: now)
-    with stall.watched(Work(("f", lambda: None), ("h", lambda: None))):
-        now = PATIENCE + 1.0
-        stall.look()
-        assert stall.text is None
-        now = LONG + 1.0
-        stall.look()
-        assert stall.text is not None and stall.text.startswith("a fold has not returned for 61 s; ")
-    stall.look()
-    assert stall.text is None and [level for level, _ in said] == ["error", "info"]
-    with stall.watched(Work(("f", lambda: None), ("h at x", leave.wait), ("never asked", lambda: None))):
-        now += PATIENCE - 0.1
-        stall.look()
-        assert stall.text is None
+    watchdog = Watchdog(lambda text, level: said.append((level, text)), clock=lambda: now)
+    with watchdog.watched(Work(("f", lambda: None), ("h", lambda: None))):
+        now = CHECK_AFTER_S + 1.0
+        watchdog.look()
+        assert watchdog.text is None
+        now = STALLED_AFTER_S + 1.0
+        watchdog.look()
+        assert watchdog.text is not None and watchdog.text.startswith("a fold has not returned for 61 s; ")
+    watchdog.look()
+    assert watchdog.text is None and [level for level, _ in said] == ["error", "info"]
+    with watchdog.watched(Work(("f", lambda: None), ("h at x", leave.wait), ("never asked", lambda: None))):
+        now += CHECK_AFTER_S - 0.1
+        watchdog.look()
+        assert watchdog.text is None
         now += 0.2
-        stall.look()
-        assert stall.text is not None and stall.text.startswith("h at x has not returned for 3 s; ")
+        watchdog.look()
+        assert watchdog.text is not None and watchdog.text.startswith("h at x has not returned for 3 s; ")
     leave.set()
 
 
@@ -168,8 +168,8 @@ def test_questions_are_asked_until_one_is_not_answered():
 
 
 def test_a_refold_that_never_returns_is_given_up_and_the_next_one_made(monkeypatch, asked_of_work):
-    monkeypatch.setattr(app.live.stall, "PATIENCE", 0.0)
-    monkeypatch.setattr(app.live.stall, "ANSWER", 0.1)
+    monkeypatch.setattr(app.live.watchdog, "CHECK_AFTER_S", 0.0)
+    monkeypatch.setattr(app.live.watchdog, "ANSWER_TIMEOUT_S", 0.1)
     leave, answers = threading.Event(), []
     stuck = Work(("f at x", leave.wait))
     stuck.advance = lambda limit: leave.wait()

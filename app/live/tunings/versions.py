@@ -1,0 +1,217 @@
+"""One section of a YAML file put in place of the one that is there; the rest of the text stays as it is."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from config.files import shown_path
+from config.tuning_schema import AcceptedSection, EvidenceSection, VersionSection
+from config.tunings import OWN, Version, check_name, folders, load_version, version_files, version_of
+from config.yaml_text import as_section
+from estimators.diagnostics.score import Score
+from estimators.errors import ConfigError
+from estimators.fold import Fold
+from estimators.log import Log
+from estimators.tuning import Tuning
+
+from ...twin.twin import Twin, with_version
+from ..changes import obstacle
+from ..interface import Running
+from .tuning_yaml import tuning_yaml
+
+
+def write_section(path: Path, key: str, section: str) -> None:
+    """Put the section `key`, whole lines, into a YAML file, in place of the one that is there, or at its end.
+
+    Raises:
+        ConfigError: If the file cannot be written.
+    """
+    # The key and the lines under it, to the last that is indented; a comment after that belongs to what follows.
+    pattern = re.compile(
+        rf"^{re.escape(key)}:.*(?:\n|\Z)(?:(?:[ \t]*(?:#.*)?\r?\n)*[ \t]+[^\s#].*(?:\n|\Z))*", re.MULTILINE
+    )
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            text = file.read()
+        end = "\r\n" if "\r\n" in text else "\n"
+        section = section.replace("\n", end)
+        kept, found = pattern.subn(lambda _: section, text, count=1)
+        path.write_text(kept if found else text.rstrip("\r\n") + 2 * end + section, encoding="utf-8", newline="")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def listing(twin: Twin) -> list[dict[str, Any]]:
+    """What the twin's file says, then its versions as they were saved, the oldest first.
+
+    Each has `name`, `estimator`, `holds` (whether guards go by it) and what its file says of it; one that cannot be
+    read has `name` and `error`.
+    """
+    versions: list[Version] = []
+    broken: list[dict[str, Any]] = []
+    for name, path in version_files(twin.path).items():
+        try:
+            versions.append(load_version(path))
+        except ConfigError as error:
+            broken.append({"name": name, "error": str(error)})
+    versions.sort(key=lambda version: (version.head.saved, version.name))
+    accepted = max((v.head.accepted.at for v in versions if v.head.accepted is not None), default=None)
+    own = twin.loaded.without or twin.loaded
+    found: list[dict[str, Any]] = [{"name": OWN, "estimator": own.config.estimator.name, "holds": accepted is None}]
+    for version in versions:
+        estimator = version.section.estimator or own.config.estimator
+        holds = version.head.accepted is not None and version.head.accepted.at == accepted
+        head = version.head.model_dump(mode="json")
+        found.append({"name": version.name, "estimator": estimator.name, "holds": holds, **head})
+    return found + broken
+
+
+NIS, LIKELIHOOD, RMSE, COVERAGE, REFUSED = "nis", "log_likelihood", "rmse", "coverage", "refused"
+
+
+def figures(found: Score) -> dict[str, float]:
+    """Sum a score up; only what is a number: a fold without truth, and without a sensor held out, has no RMSE.
+
+    Returns:
+        `nis`, `log_likelihood` of a reading, `refused` (a share), and for each state whose truth is known and each
+        sensor row held out `rmse.NAME` in its unit and `coverage.NAME` as a share; `rmse.field` for all cells of a
+        large field.
+    """
+    judged = found.nis_readings + found.gated
+    fits = {**found.states, **found.held_out, **({"field": found.field} if found.field is not None else {})}
+    known = {
+        NIS: found.nis,
+        LIKELIHOOD: found.log_likelihood / judged if judged else np.nan,
+        REFUSED: found.refused,
+        **{f"{RMSE}.{name}": fit.rmse for name, fit in fits.items()},
+        **{f"{COVERAGE}.{name}": fit.coverage for name, fit in fits.items()},
+    }
+    return {name: float(value) for name, value in known.items() if np.isfinite(value)}
+
+
+DIGITS = 8
+"""Significant digits of a score: what other processors make of it differs far behind them."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a version is made of: the filter, the tuning, and what is known of them.
+
+    `prior` has mean and std by state where that was fitted; `scores` are those of `figures`; `evidence` is why a fit
+    proposed it.
+    """
+
+    estimator: str
+    tuning: Tuning
+    note: str = ""
+    fitted_on: Sequence[str] = ()
+    scores: Mapping[str, float] = field(default_factory=dict)
+    prior: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    model_version: int = 1
+    evidence: EvidenceSection | None = None
+
+
+def version_text(twin: Twin, given: Settings) -> str:
+    """The YAML of a version."""
+    head = VersionSection(
+        twin=twin.name,
+        model=twin.model.name,
+        model_version=given.model_version,
+        saved=now(),
+        note=given.note,
+        fitted_on=tuple(given.fitted_on),
+        scores={name: float(f"{value:.{DIGITS}g}") for name, value in given.scores.items()},
+        evidence=given.evidence,
+    )
+    heading = f"# A tuning version of {twin.name}; `nisus tunings` lists, compares and accepts them.\n"
+    normal = {}
+    if given.tuning.baseline is not None:
+        normal = {
+            name: section.model_dump(mode="json", exclude_unset=True)
+            for name, section in twin.config.commissioned.items()
+        }
+    more = [*as_section("prior", given.prior), *as_section("commissioned", normal)]
+    values = tuning_yaml(twin.config, given.estimator, given.tuning, whole=False)
+    return heading + _header(head) + values + "".join(f"{line}\n" for line in more)
+
+
+def check_free(twin: Path, name: str) -> Path:
+    """The file that a version of this name would have, of a twin's YAML.
+
+    Raises:
+        ConfigError: If the name is none or taken.
+    """
+    path = folders(twin)[0] / f"{check_name(name)}.yaml"
+    if path.exists():
+        raise _taken(path)
+    return path
+
+
+def _taken(path: Path) -> ConfigError:
+    return ConfigError(f"{shown_path(path)}: there is a version of that name; choose another name")
+
+
+def keep(twin: Twin, name: str, text: str) -> Path:
+    """Write a version beside its twin.
+
+    Returns:
+        The file.
+
+    Raises:
+        ConfigError: If the name is none or taken, the text is wrong, or the file cannot be written.
+    """
+    path = check_free(twin.path, name)
+    version_of(name, text, path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise _taken(path) from None
+    except OSError as error:
+        raise ConfigError(f"{shown_path(path)}: {error.strerror}; the version cannot be written there") from None
+    return path
+
+
+def accept(version: Version, note: str) -> None:
+    """Note in a version's file that it is accepted; raises as `write_section`."""
+    head = version.head.model_copy(update={"accepted": AcceptedSection(at=now(), note=note)})
+    write_section(version.path, "version", _header(head))
+    load_version(version.path)
+
+
+def now() -> str:
+    """The present time, as versions have it."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+
+
+def _header(head: VersionSection) -> str:
+    given = head.model_dump(mode="json", exclude_defaults=True)
+    return "".join(f"{line}\n" for line in as_section("version", given))
+
+
+def load_into(engine: Running, name: str, why: str | None = None) -> None:
+    """Queue going on with a version of the twin; the history is folded again with it.
+
+    Args:
+        engine: What runs.
+        name: Of the version, or `own`.
+        why: What is said of the run that begins; None for the version's name.
+
+    Raises:
+        ConfigError: If there is no such version, it is wrong, or it does not fit what runs.
+    """
+    twin = with_version(engine.twin, name)
+    reason = obstacle(engine.twin, twin)
+    if reason is not None:
+        raise ConfigError(f"{name}: {reason}; start the twin with --tuning {name}")
+    # Compiled before the engine's thread asks for it.
+    Fold(twin.estimator, twin.model, twin.tuning, Log.of(twin.model), pairs=twin.pairs, idle=True)
+    engine.reload(twin, f"version {name}" if why is None else why, exact=True)
