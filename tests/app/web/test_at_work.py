@@ -16,7 +16,7 @@ from app.live.commands import SetTuning
 from app.live.engine import Engine
 from app.web.server import PageServer
 from tests.app.scripted import MODEL, Scripted, readings, row_count, wait_for
-from tests.app.served import CHECK_AFTER_S, SECRET, Client, shown_twin
+from tests.app.served import PATIENCE, SECRET, Client, shown_twin
 from tests.support import SECOND
 
 READINGS = 40
@@ -67,7 +67,7 @@ def running(monkeypatch, tmp_path):
     solver.hold("engine")
     times = np.arange(1, READINGS + 1) * 0.5
     source.put(readings(times, 40.0 + times))
-    assert solver.at_work.wait(CHECK_AFTER_S)
+    assert solver.at_work.wait(PATIENCE)
     yield engine, server, solver
     solver.let_go()
     server.stop()
@@ -89,7 +89,7 @@ def test_the_page_and_what_it_asks_are_answered_while_the_fold_is_at_work(runnin
     assert told["twin"] == "scripted" and told["tuning"]["Q.rate"] == engine.twin.tuning.get("Q.rate")
     # The engine takes the command once the fold returns.
     solver.let_go()
-    waiting.join(CHECK_AFTER_S)
+    waiting.join(PATIENCE)
     assert not waiting.is_alive()
     wait_for(lambda: engine.status().revision == 1 and not engine.status().refolding)
     assert row_count(engine) == READINGS
@@ -101,18 +101,18 @@ def test_a_page_that_looks_at_charts_is_told_of_the_twin_while_the_fold_is_at_wo
     with connect(
         f"ws://{client.host}/api/stream", origin=client.origin, additional_headers={"Cookie": client.cookie}
     ) as stream:
-        assert "boot" in json.loads(stream.recv(CHECK_AFTER_S))
+        assert "boot" in json.loads(stream.recv(PATIENCE))
         lane = {"columns": ["mean:winding"], "points": 100}
         stream.send(json.dumps({"lanes": {"charts": lane}, "pair": ["winding", "rate"]}))
         said = ""
         # Every word on the twin, though its rows are asked for and do not come.
         while "the readings that came so far are being folded (" not in said:
-            said = stream.recv(CHECK_AFTER_S)
+            said = stream.recv(PATIENCE)
         stream.send(json.dumps({"lanes": {"charts": None}}))
     with connect(
         f"ws://{client.host}/api/stream", origin=client.origin, additional_headers={"Cookie": client.cookie}
     ) as stream:
-        said = [json.loads(stream.recv(CHECK_AFTER_S)) for _ in range(2)]
+        said = [json.loads(stream.recv(PATIENCE)) for _ in range(2)]
     assert any("status" in message for message in said)
 
 
@@ -135,13 +135,13 @@ def test_a_refold_catches_up_beside_the_fold_that_is_shown(running):
     solver.left = threading.Semaphore(0)
     solver.hold("refold")
     engine.submit(SetTuning("Q.rate", 0.5))
-    assert solver.at_work.wait(CHECK_AFTER_S)
+    assert solver.at_work.wait(PATIENCE)
     engine.source.put(readings([20.5, 21.0], [60.0, 61.0]))
     wait_for(lambda: row_count(engine) == READINGS + 2)
     # Now the engine stands still in what the refold has not seen, and the rows of before can be read all the same.
     solver.hold("engine")
     solver.left.release()
-    assert solver.at_work.wait(CHECK_AFTER_S)
+    assert solver.at_work.wait(PATIENCE)
     assert row_count(engine) == READINGS + 2 and engine.status().refolding and engine.status().revision == 0
     solver.let_go()
     wait_for(lambda: engine.status().revision == 1 and not engine.status().refolding)
