@@ -23,6 +23,7 @@ from estimators.errors import NisusError, SourceError
 from ...live.notices import Notice
 from ...live.outputs import Cursor, Pull
 from ..rerun.rows import RerunRows
+from ..rerun.sink import free_closed_streams
 from .disk import Disk
 from .format import RecordingFile
 from .split import NEVER, Split, part_path
@@ -69,6 +70,8 @@ class Recorder:
         self._taken: Path | None = None
         self._stopping = False
         self._open: _Part | None = None
+        self._closed = False
+        """Whether a stream was closed whose threads are still to be ended."""
         self.finished: list[Path] = []
         self.failure = ""
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
@@ -130,6 +133,9 @@ class Recorder:
             except Exception as error:  # noqa: BLE001  a full disk or a driver's fault must not stop the twin
                 self._taken = None
                 self._fail(self._reason(error))
+            if self._closed:
+                self._closed = False
+                free_closed_streams()
             if self._asked:
                 continue
             if self._stopping and self._open is None:
@@ -154,7 +160,7 @@ class Recorder:
         part.end(short=short)
         # In this order, so that whoever lists the files meanwhile never misses it.
         self.finished.append(part.file.path)
-        self._open = None
+        self._open, self._closed = None, True
         if not goes_on:
             part.release()
         self._engine.notices.say(f"recorded {part.file.rows} rows into {part.file.path}")
@@ -173,7 +179,7 @@ class Recorder:
             self._wanted = None
         if self._open is not None:
             self._open.abandon()
-            self._open = None
+            self._open, self._closed = None, True
 
 
 class _Part:
@@ -354,5 +360,7 @@ def write_recording(
             file.flush()
         file.summary(summary(twin.estimator, twin.tuning, log.events, track, pictures))
         file.close()
+        del file, drawing
+        free_closed_streams()
     except OSError as error:
         raise SourceError(f"recording {path}: {error.strerror}; choose a place that can be written") from None

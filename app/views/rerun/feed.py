@@ -26,6 +26,7 @@ from estimators.track import Track
 from ...live.notices import KEPT
 from ...present.drawing.palette import EITHER, Palette
 from .rows import RerunRows
+from .sink import free_closed_streams
 
 if TYPE_CHECKING:
     from ...live.interface import Running
@@ -96,8 +97,14 @@ class RerunFeed:
     def close(self) -> None:
         """Give everything back."""
         self._engine.release(self._cursor)
+        self._end()
+
+    def _end(self) -> None:
+        """Close the stream of the recording so far, if there is one."""
         if self._stream is not None:
             self._stream.disconnect()
+            self._stream = self._bytes = self._rows = self._later = None
+            free_closed_streams()
 
     def _whole(self, pull: Pull) -> Pull:
         """All there is of a revision that just began, pulled in pieces."""
@@ -130,8 +137,7 @@ class RerunFeed:
 
     def _begin(self, pull: Pull) -> list[Message]:
         """Another recording: first the window that the charts show, then the rest."""
-        if self._stream is not None:
-            self._stream.disconnect()
+        self._end()
         name = f"{self._name}-{pull.revision}"
         self._stream = rr.RecordingStream(self.application, recording_id=name, send_properties=False)
         self._bytes = self._stream.binary_stream()

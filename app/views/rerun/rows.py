@@ -18,7 +18,7 @@ from ...present.drawing.palette import EITHER, Palette
 from .field import FieldDrawing
 from .layout import LANES, blueprint, styles
 from .pairs import PairDrawing
-from .sink import Sink
+from .sink import Sink, send_blueprint
 from .style import EVENTS, pair_name, state_colors
 from .thin import last_of_each_time
 
@@ -94,7 +94,7 @@ class RerunRows:
             )
         if self._layout:
             layout = blueprint(self.model, self.pairs, window=self.sink.window, root=root, truth=self._tells_field)
-            self.sink.stream.send_blueprint(layout)
+            send_blueprint(self.sink.stream, layout)
         self._field: FieldDrawing | None = None
         if self.model.grid is not None:
             self._field = FieldDrawing(self.model, truth=self._tells_field, theme=self._palette)

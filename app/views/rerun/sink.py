@@ -6,12 +6,42 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
+import rerun_bindings
 
 from .style import TIMELINE
 from .thin import thin
 
 CALENDAR = 10**18
 """Nanoseconds from which on times are dates (this one is in 2001), and before which they are durations."""
+
+
+def send_blueprint(stream: rr.RecordingStream, layout: rrb.Blueprint) -> None:
+    """Send a layout into a stream.
+
+    `RecordingStream.send_blueprint` (Rerun 0.41) does the same but never disconnects the stream that it makes for the
+    layout, which then refers to itself: two threads are left each time.
+    """
+    application = stream.get_application_id()
+    made = rerun_bindings.new_blueprint(
+        application_id=application, make_default=False, make_thread_default=False, default_enabled=True
+    )
+    blueprint = rr.RecordingStream._from_native(made)
+    blueprint.set_time("blueprint", sequence=0)
+    layout._log_to_stream(blueprint)
+    storage = blueprint.memory_recording().storage
+    rerun_bindings.send_blueprint(storage, True, True, recording=stream.to_native())
+    blueprint.disconnect()
+
+
+def free_closed_streams() -> None:
+    """End the threads and free the memory of every stream to which nothing refers any more.
+
+    Rerun keeps each stream in a list of its own, with two threads and about 3 MB, also after `disconnect`. This flushes
+    all streams, so that none loses a row, and drops those that only that list refers to
+    (`rerun_py/src/python_bridge.rs` of Rerun 0.41). So call it after the last reference to a stream is gone.
+    """
+    rerun_bindings.flush_and_cleanup_orphaned_recordings()
 
 
 class Sink:

@@ -1,6 +1,7 @@
 """What one browser's Rerun viewer is fed, read back with Rerun's own reader."""
 
 import json
+import os
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ from rerun.chunk import RrdReader
 
 from app.live import commands
 from app.live.engine import Engine
+from app.views.recording.reader import read_recording
 from app.views.recording.writer import Recorder
 from app.views.rerun import feed
 from app.views.rerun.feed import AHEAD, RerunFeed
@@ -489,3 +491,47 @@ def test_a_recording_shows_its_events_whatever_was_turned_since(fed, tmp_path):
 def all_views(container):
     for item in container.contents:
         yield from all_views(item) if hasattr(item, "contents") and hasattr(item, "kind") else [item]
+
+
+def test_closed_streams_end_their_threads_while_another_goes_on_unharmed(tmp_path):
+    """A feed a revision and thirty recordings leave no thread, and a recording beside them misses no row."""
+    fed = Fed(tmp_path)
+    other, recorder = (Recorder(fed.engine, lambda stream: RerunRows(stream, fed.engine, series=None)) for _ in "ab")
+    other.start()
+    recorder.start()
+    try:
+        fed.put(readings(np.arange(1, 51) * 0.1, np.full(50, 40.0)))
+        fed.next()
+        other.record(tmp_path / "long.rrd")
+        wait_for(lambda: other.writing is not None)
+        before = threads()
+        for k in range(30):
+            recorder.record(tmp_path / f"{k}.rrd")
+            recorder.record(None)
+            fed.submit(commands.SetTuning("Q.rate", 0.01 * (k + 1)))
+            fed.put(readings(5.1 + np.arange(20 * k, 20 * k + 20) * 0.1, np.full(20, 40.0)))
+            fed.next()
+            with_layout = RerunFeed(fed.engine)
+            assert with_layout.next()
+            with_layout.close()
+        wait_for(lambda: len(recorder.finished) == 30)
+        wait_for(lambda: threads() <= before)
+        last = fed.track().events
+        other.record(None)
+        wait_for(lambda: other.finished)
+    finally:
+        fed.feed.close()
+        fed.engine.stop()
+        other.stop()
+        recorder.stop()
+    assert not other.failure and not recorder.failure
+    recorded = read_recording(tmp_path / "long.rrd")
+    assert recorded.closed and len(last) == 50 + 30 * 20
+    np.testing.assert_array_equal(recorded.events.t, last.t)
+    np.testing.assert_array_equal(recorded.events.value, last.value)
+    assert all(read_recording(path).closed for path in recorder.finished)
+
+
+def threads():
+    """Threads of this process, those of compiled libraries too."""
+    return len(os.listdir("/proc/self/task"))
