@@ -6,10 +6,10 @@ import textwrap
 
 from estimators.log import READING, Log
 
+from ..present.result import WIDTH
 from ..studies.advice.lines import lasting_lines, lines
 from ..studies.advice.verdict import Advice
 from ..twin.twin import Twin
-from .check_text import WIDTH
 
 
 def as_text(twin: Twin, log: Log, told: Advice) -> list[str]:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
-from ..present.export.html import as_html
+from ..present.result import to_html, to_text
 from ..twin.twin import load_twin
 from .check_figures import figures
 from .check_tables import sections
-from .check_text import as_text
 from .checked import Checked, check
 from .fold import read_log
 from .given import settings
@@ -31,9 +30,9 @@ def check_twin(arguments: Arguments) -> int:
     checked: Checked = attend(twin.model, lambda: check(twin, log, counts), "checking")
     parts = sections(checked)
     if arguments.html is not None:
-        arguments.html.write_text(as_html(f"nisus check {twin.name}", parts), encoding="utf-8")
+        arguments.html.write_text(to_html(f"nisus check {twin.name}", parts), encoding="utf-8")
     if arguments.json:
         print(json.dumps(figures(checked), allow_nan=False))
     else:
-        print("\n".join(as_text(parts)))
+        print("\n".join(to_text(parts)))
     return 0

@@ -11,6 +11,7 @@ from estimators.diagnostics.episodes import episode_json
 from estimators.diagnostics.sensitivity import Sensitivity, View, bounds_of
 from estimators.track import HEALTH_NAMES
 
+from ..present.result import plain
 from .check_list import blamed, checklist, stamps
 from .checked import Checked
 from .fold_report import calibration_dict
@@ -41,24 +42,9 @@ def figures(checked: Checked) -> dict[str, Any]:
         "calibration": [calibration_dict(entry) for entry in checked.calibration],
         "posterior": _posterior(checked),
         "linearity": _linearity(checked),
-        "dimension": _plain(checked.dimension._asdict()),
+        "dimension": plain(checked.dimension._asdict()),
         "health": _health(checked),
     }
-
-
-def _plain(value: Any) -> Any:
-    """Arrays as lists, tuples as lists, numbers that are none as null."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if hasattr(value, "_asdict"):
-        return _plain(value._asdict())
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [_plain(item) for item in value]
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, (int, np.integer)):
-        return int(value)
-    return number(float(value)) if isinstance(value, (float, np.floating)) else value
 
 
 def _observability(checked: Checked) -> dict[str, Any]:
@@ -84,7 +70,7 @@ def _view(checked: Checked, view: View) -> dict[str, Any]:
         "end": view.end * 1e-9,
         "rank": view.rank,
         "conditioning": number(view.conditioning),
-        "eigenvalues": _plain(view.eigenvalues),
+        "eigenvalues": plain(view.eigenvalues),
         "left": {name: number(value) for name, value in zip(names, view.deviation, strict=True)},
         "weakest": view.text,
     }
@@ -112,7 +98,7 @@ def _integrity(checked: Checked) -> dict[str, Any]:
     if found.reason:
         return {"reason": found.reason, "states": {}}
     states = {
-        name: {**_plain(bound), "fault": bound.fault or None}
+        name: {**plain(bound), "fault": bound.fault or None}
         for name, bound in bounds_of(checked.twin.model, found).items()
     }
     return {"reason": "", "note": found.note, "estimator": found.estimator, "states": states}
@@ -161,21 +147,21 @@ def _timing(checked: Checked) -> dict[str, Any]:
         "degraded_after": number(policy.degraded_after),
         "stale_after": number(policy.stale_after),
         "stale": checked.counts["stale"],
-        "sensors": {item.sensor: _plain(item) for item in checked.arrivals},
+        "sensors": {item.sensor: plain(item) for item in checked.arrivals},
     }
 
 
 def _posterior(checked: Checked) -> dict[str, Any]:
-    return {"peaks": _plain(checked.peaks), "tails": {tail.row: _plain(tail) for tail in checked.tails}}
+    return {"peaks": plain(checked.peaks), "tails": {tail.row: plain(tail) for tail in checked.tails}}
 
 
 def _linearity(checked: Checked) -> dict[str, Any]:
     found = checked.linearity
     return {
         **{name: getattr(found, name) for name in ("reason", "exact", "passes", "white", "text")},
-        "states": {item.name: _plain(item) for item in found.states},
-        "rows": {item.name: _plain(item) for item in found.rows},
-        "whiteness": {item.row: _plain(item) for item in found.whiteness},
+        "states": {item.name: plain(item) for item in found.states},
+        "rows": {item.name: plain(item) for item in found.rows},
+        "whiteness": {item.row: plain(item) for item in found.whiteness},
     }
 
 

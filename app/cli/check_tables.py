@@ -12,7 +12,7 @@ from estimators.diagnostics.sensitivity.information import directions
 from estimators.diagnostics.sensitivity.words import digits, range_text, size_text, subject_text
 
 from ..present.export.calibration_lines import calibration_lines
-from ..present.export.parts import WORSE, Bar, Part
+from ..present.result import WORSE, Bar, Topic
 from .check_list import BLAME, Line, blamed, checklist, health_shares
 from .checked import Checked
 
@@ -22,7 +22,7 @@ MOST = 12
 UNKNOWN = "How late readings come is not known: the log has one time for each, that at which it was measured."
 
 
-def sections(checked: Checked) -> list[Part]:
+def sections(checked: Checked) -> list[Topic]:
     """The page, from top to bottom."""
     return [
         _title(checked),
@@ -49,19 +49,19 @@ def _cut(rows: Sequence[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
     return (*rows[:MOST], (f"... and {len(rows) - MOST} more, see --json", *[""] * (len(rows[0]) - 1)))
 
 
-def _title(checked: Checked) -> Part:
+def _title(checked: Checked) -> Topic:
     twin, log = checked.twin, checked.log
     seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9
     part = "the first" if checked.span is not None else "all"
     said = f"{twin.estimator} over {part} {seconds:.4g} s of its log, {log.n:,} events, {checked.dimension.nx:,} states"
-    return Part(f"{twin.name}: {twin.title}", (said,))
+    return Topic(f"{twin.name}: {twin.title}", (said,))
 
 
-def _checklist(checked: Checked) -> Part:
+def _checklist(checked: Checked) -> Topic:
     lines = checklist(checked)
     rows = tuple((line.question, line.answer, line.figures, line.remedy) for line in lines)
     head = ("question", "answer", "figures", "remedy")
-    return Part("Checklist", (), head, rows, marks=tuple(map(_mark, lines)))
+    return Topic("Checklist", (), head, rows, marks=tuple(map(_mark, lines)))
 
 
 def _mark(line: Line) -> str:
@@ -70,11 +70,11 @@ def _mark(line: Line) -> str:
     return {good: "good", bad: "bad", "not told": ""}.get(line.answer, "partly")
 
 
-def _integrity(checked: Checked) -> Part:
+def _integrity(checked: Checked) -> Topic:
     found = checked.sensitivity
     title = "How wrong a state can be by one fault that nobody notices"
     if found.reason:
-        return Part(title, (f"Not computed: {found.reason}.",))
+        return Topic(title, (f"Not computed: {found.reason}.",))
     bounds = bounds_of(checked.twin.model, found)
     rows = [
         (name, item.unit, _number(item.two_sigma), _number(item.bound), item.fault or "none")
@@ -83,14 +83,14 @@ def _integrity(checked: Checked) -> Part:
     bars = [Bar(name, item.unit, item.two_sigma, item.bound) for name, item in bounds.items()]
     said = (f"{found.note}.",) if found.note else ()
     head = ("state", "unit", "± 2 σ", "integrity bound", "by")
-    return Part(title, said, head, _cut(rows), tuple(bars[:MOST]), ("± 2 σ", "integrity bound"))
+    return Topic(title, said, head, _cut(rows), tuple(bars[:MOST]), ("± 2 σ", "integrity bound"))
 
 
-def _visible(checked: Checked) -> Part:
+def _visible(checked: Checked) -> Topic:
     found = checked.sensitivity
     title = "How large a fault must be to be noticed"
     if found.reason:
-        return Part(title, (f"Not computed: {found.reason}.",))
+        return Topic(title, (f"Not computed: {found.reason}.",))
     seconds = float(found.t[-1] - found.t[0]) * 1e-9
     rows = []
     for nudge, size, (low, high) in zip(found.nudges, found.smallest_visible, found.unseen, strict=True):
@@ -98,14 +98,14 @@ def _visible(checked: Checked) -> Part:
         rows.append((subject_text(nudge), seen, range_text(nudge, low, high)))
     said = [f"{found.note}."] if found.note else []
     said.append(f"A constant fault, there for all of {seconds:.4g} s, seen with a probability of 95 %.")
-    return Part(title, tuple(said), ("fault", "smallest visible", "passes unseen"), _cut(rows))
+    return Topic(title, tuple(said), ("fault", "smallest visible", "passes unseen"), _cut(rows))
 
 
-def _observability(checked: Checked) -> Part:
+def _observability(checked: Checked) -> Topic:
     found = checked.gramian
     title = "What the readings can tell"
     if found.whole is None:
-        return Part(title, (f"Not computed: {found.reason}.",))
+        return Topic(title, (f"Not computed: {found.reason}.",))
     begin = float(found.whole.begin)
     rows = [
         (
@@ -117,14 +117,14 @@ def _observability(checked: Checked) -> Part:
         for view in (found.whole, *found.windows)
     ]
     said = (f"{found.note}.",) if found.note else ()
-    return Part(title, said, ("part of the log", "rank", "conditioning", "weakest direction"), _cut(rows))
+    return Topic(title, said, ("part of the log", "rank", "conditioning", "weakest direction"), _cut(rows))
 
 
-def _blame(checked: Checked) -> Part:
+def _blame(checked: Checked) -> Topic:
     told = checked.sensitivity
     title = "Who takes the blame for whom"
     if told.reason:
-        return Part(title, (f"Not computed: {told.reason}.",))
+        return Topic(title, (f"Not computed: {told.reason}.",))
     said = [f"{told.note}."] if told.note else []
     rows = [(one, other, f"{value:+.2f}") for one, other, value in blamed(told)]
     said.append(
@@ -135,10 +135,10 @@ def _blame(checked: Checked) -> Part:
     untold = [item for item in directions(told.fisher, told.nudges) if not item.deviation < 1.0] if told.nudges else []
     if untold:
         said.append(f"With all unknown together {len(untold)} combination(s) cannot be told, first {untold[0].text}.")
-    return Part(title, tuple(said), ("one", "other", "correlation") if rows else (), _cut(rows) if rows else ())
+    return Topic(title, tuple(said), ("one", "other", "correlation") if rows else (), _cut(rows) if rows else ())
 
 
-def _held_out(checked: Checked) -> Part:
+def _held_out(checked: Checked) -> Topic:
     title = "Each sensor held out, and predicted by the others"
     found = checked.held_out.rows
     rows, bars = [], []
@@ -155,14 +155,14 @@ def _held_out(checked: Checked) -> Part:
     bands = tuple(f"in {100 * band:.0f} %" for band in BANDS)
     head = ("sensor row", "unit", "RMS", "bias", *bands, "open loop", "")
     legend = ("RMS by the other sensors", "RMS without any reading")
-    return Part(title, tuple(said[:MOST]), head, _cut(rows), tuple(bars[:MOST]), legend)
+    return Topic(title, tuple(said[:MOST]), head, _cut(rows), tuple(bars[:MOST]), legend)
 
 
-def _open_loop(checked: Checked) -> Part:
+def _open_loop(checked: Checked) -> Topic:
     title = "The estimate against no filter at all, where the truth is known"
     found = checked.held_out.states
     if not found:
-        return Part(title, ("The log tells no truth: see the sensors held out.",))
+        return Topic(title, ("The log tells no truth: see the sensors held out.",))
     said = tuple(
         f"The filter makes {item.state} {WORSE}: RMS {_number(item.filter)} {item.unit} with its readings, "
         f"{_number(item.open_loop)} without any."
@@ -173,10 +173,10 @@ def _open_loop(checked: Checked) -> Part:
             for item in found]  # fmt: skip
     bars = tuple(Bar(item.state, item.unit, item.filter, item.open_loop) for item in found[:MOST])
     head = ("state", "unit", "RMS of the filter", "RMS of the open loop", "")
-    return Part(title, said, head, _cut(rows), bars, ("filter", "open loop"))
+    return Topic(title, said, head, _cut(rows), bars, ("filter", "open loop"))
 
 
-def _timing(checked: Checked) -> Part:
+def _timing(checked: Checked) -> Topic:
     known = any(np.isfinite(item.lateness).any() for item in checked.arrivals)
     rows = [
         (
@@ -191,13 +191,13 @@ def _timing(checked: Checked) -> Part:
     ]
     head = ("sensor", "readings", "a second", "longest gap, s", "missing, %", "lateness, s: half, 99 %, worst")
     said = () if known else (UNKNOWN,)
-    return Part("When readings come", said, head, _cut(rows))
+    return Topic("When readings come", said, head, _cut(rows))
 
 
-def _health(checked: Checked) -> Part:
+def _health(checked: Checked) -> Topic:
     said = [f"{health_shares(checked.fold.track)}."]
     said += [episode.text for episode in checked.episodes[:MOST]]
     if len(checked.episodes) > MOST:
         said.append(f"... and {len(checked.episodes) - MOST} more episodes.")
     said += calibration_lines(checked.calibration, checked.twin.model)[: 2 * MOST]
-    return Part("Health and calibration", tuple(said))
+    return Topic("Health and calibration", tuple(said))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import asdict
@@ -17,6 +16,7 @@ from estimators.errors import ConfigError, SourceError
 from estimators.log import MARK, Events
 from estimators.registry import ESTIMATORS, find_estimator, unfit
 
+from ..present.result import to_json
 from ..terminal import complain
 from ..twin.twin import Twin, load_twin
 from .beside import beside, jobs_of
@@ -82,7 +82,7 @@ def _compare(arguments: Arguments, name: str) -> None:
     seconds = float(logs[0].t[-1] - logs[0].t[0]) * 1e-9
     lines = cells(rows, len(logs[0]), seconds)
     if arguments.json:
-        print(json.dumps([_plain(row) for row in rows]))
+        print(to_json([row_json(row) for row in rows]))
     else:
         print("\n".join(printed(twin.path.stem, lines, len(logs))))
     if arguments.write:
@@ -107,19 +107,13 @@ def events_of(twin: Twin, duration: float | None = None) -> Events:
     return events.select(events.kind != MARK)
 
 
-def _plain(row: Row) -> dict[str, Any]:
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {name: plain(entry) for name, entry in value.items()}
-        if isinstance(value, (tuple, list)):
-            return [plain(entry) for entry in value]
-        return None if isinstance(value, float) and not np.isfinite(value) else value
-
-    figures = {"rmse": {unit: figure.value for unit, figure in row.rmse.items()}}
-    spreads = {"rmse": {unit: figure.spread for unit, figure in row.rmse.items()}}
+def row_json(row: Row) -> dict[str, Any]:
+    """Return a row for scripts: every figure is its mean, with the standard deviations under `spread`."""
+    figures: dict[str, Any] = {"rmse": {unit: figure.value for unit, figure in row.rmse.items()}}
+    spreads: dict[str, Any] = {"rmse": {unit: figure.spread for unit, figure in row.rmse.items()}}
     for name in ("nis", "coverage"):
         figures[name], spreads[name] = getattr(row, name)
-    return plain({**asdict(row), **figures, "spread": spreads})  # type: ignore[no-any-return]
+    return {**asdict(row), **figures, "spread": spreads}
 
 
 def _chosen(twin: Twin, wanted: Sequence[str]) -> list[str]:

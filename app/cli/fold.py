@@ -28,9 +28,9 @@ from sources.source import Endless
 
 from ..intake import Intake
 from ..live.watchdog import interruptible
-from ..present.export.html import as_html
 from ..present.export.report import Reported, report
 from ..present.export.track_file import encoded
+from ..present.result import to_html
 from ..twin.twin import Twin, load_twin
 from ..views.recording.format import TAKEN
 from .fold_episodes import blamed, dropped, episode_lines
@@ -145,7 +145,7 @@ def fold_twin(arguments: Arguments) -> int:
             twin, twin.estimator, twin.tuning, log.events, fold.track, pictures, [item.episode for item in told],
             fold.marginal, smoothed=smoothed,
         )  # fmt: skip
-        arguments.html.write_text(as_html(f"{twin.name}, {twin.estimator}", report(run)), encoding="utf-8")
+        arguments.html.write_text(to_html(f"{twin.name}, {twin.estimator}", report(run)), encoding="utf-8")
     if arguments.json:
         print(json.dumps(as_dict(twin, result, found, seconds, counts, fold, told, better)))
     else:

@@ -11,11 +11,10 @@ import numba
 from config.files import shown_path
 from estimators.errors import ConfigError, printable
 
-from ..present.export.parts import Part
+from ..present.result import Topic, to_text
 from ..studies.guard.junit import Guarded, junit
 from ..studies.guard.last import keep_last
 from .beside import beside, jobs_of
-from .check_text import as_text
 from .given import settings
 from .guard_archive import Archived, chosen
 from .guard_fold import Wanted, guarded
@@ -46,7 +45,7 @@ def guard(arguments: Arguments) -> int:
             raise ConfigError(
                 f"--junit {shown_path(arguments.junit)}: {error.strerror}; choose another place"
             ) from None
-    print("\n".join(as_text(_parts(found, must))))
+    print("\n".join(to_text(_parts(found, must))))
     if any(each.failure or (each.absent and must) for each in found):
         return 2
     return 0 if arguments.accept else int(any(judged.worse for each in found for judged in each.judged))
@@ -68,7 +67,7 @@ def _all(archive: Sequence[Archived], wanted: Wanted, jobs: int | None) -> list[
             return [future.result() for future in futures]
 
 
-def _parts(found: Sequence[Guarded], must: bool) -> list[Part]:
+def _parts(found: Sequence[Guarded], must: bool) -> list[Topic]:
     """What got worse, what could not be folded, what is absent, and the sum."""
     worse = [(each, judged) for each in found for judged in each.judged if judged.worse]
     better = [(each, judged) for each in found for judged in each.judged if judged.better]
@@ -79,7 +78,7 @@ def _parts(found: Sequence[Guarded], must: bool) -> list[Part]:
     said = [f"{len(folded)} recordings, {figures} figures: {len(worse)} worse, {len(better)} better"]
     if better and not worse:
         said.append("What got better is guarded once it is recorded: --accept --note ...")
-    parts = [Part("Guard", tuple(said))]
+    parts = [Topic("Guard", tuple(said))]
     for title, some in (("Worse than recorded", worse), ("Better than recorded", better)):
         if some:
             head = ("recording", "tuning", "figure", "was", "is", "change", "allowed")
@@ -95,10 +94,10 @@ def _parts(found: Sequence[Guarded], must: bool) -> list[Part]:
                 )
                 for each, judged in some
             )
-            parts.append(Part(title, (), head, rows))
+            parts.append(Topic(title, (), head, rows))
     if failures:
-        parts.append(Part("Could not be folded", tuple(failures)))
+        parts.append(Topic("Could not be folded", tuple(failures)))
     if absent:
         title = "Absent, which CI=true makes an error" if must else "Absent, and left out"
-        parts.append(Part(title, tuple(absent)))
+        parts.append(Topic(title, tuple(absent)))
     return parts

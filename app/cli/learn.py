@@ -23,11 +23,11 @@ from estimators.registry import find_estimator
 from estimators.smoothing.smooth import check_smooth
 from estimators.tuning import Tuning
 
+from ..present.result import to_text
 from ..terminal import complain
 from ..twin.learned import run_net
 from ..twin.model import physics_of
 from ..twin.twin import Twin, load_twin
-from .check_text import as_text
 from .fold import read_log
 from .given import settings
 from .learn_file import correction_text, noises_of
@@ -120,7 +120,7 @@ def learn_correction(arguments: Arguments) -> int:
     if arguments.json:
         print(json.dumps({"twin": twin.name, **as_dict(lesson)}, allow_nan=False))
     else:
-        print("\n".join(as_text(sections(twin.name, arguments.window, lesson, arguments.keep))))
+        print("\n".join(to_text(sections(twin.name, arguments.window, lesson, arguments.keep))))
     if lesson.better and arguments.keep is not None:
         arguments.keep.write_text(text(_beside(arguments.net, arguments.keep), scores_of(lesson)), encoding="utf-8")
         complain(f"{shown_path(arguments.keep)}: kept")

@@ -13,7 +13,7 @@ from estimators.fit.judge import Part
 from estimators.learned.train import OnWindows
 
 from ..live.runs.runs_json import part_json
-from ..present.export.parts import Part as Section
+from ..present.result import Topic
 
 TUNINGS = ("physics", "physics, its noise from the windows", "with the correction")
 
@@ -40,7 +40,7 @@ class Lesson(NamedTuple):
         return not self.reasons
 
 
-def sections(name: str, window: float, lesson: Lesson, keep: Path | None) -> list[Section]:
+def sections(name: str, window: float, lesson: Lesson, keep: Path | None) -> list[Topic]:
     """From top to bottom."""
     return [_windows(name, window, lesson), _folds(lesson), _verdict(lesson, keep)]
 
@@ -82,7 +82,7 @@ def _of_windows(lesson: Lesson, part: OnWindows) -> dict[str, Any]:
     return {"windows": part.n, "known": part.known, "states": states}
 
 
-def _windows(name: str, window: float, lesson: Lesson) -> Section:
+def _windows(name: str, window: float, lesson: Lesson) -> Topic:
     rows: list[tuple[str, ...]] = []
     parts = (("learned from, each block without itself", lesson.learned_from), ("held out", lesson.held_out))
     for what, part in parts:
@@ -100,10 +100,10 @@ def _windows(name: str, window: float, lesson: Lesson) -> Section:
                 )
             )
     head = ("windows", "", "", "rate by which the model is wrong, RMS", "drift of a minute, RMS", "known")
-    return Section(f"{name}: windows of {window:g} s, {lesson.words}", (), head, tuple(rows))
+    return Topic(f"{name}: windows of {window:g} s, {lesson.words}", (), head, tuple(rows))
 
 
-def _folds(lesson: Lesson) -> Section:
+def _folds(lesson: Lesson) -> Topic:
     first = lesson.parts[0]
     rows: list[tuple[str, ...]] = []
     for kind, group in (("true", "states"), ("sensor", "sensors")):
@@ -120,13 +120,13 @@ def _folds(lesson: Lesson) -> Section:
         ("log density of a reading, nats", *(f"{part.log_density:.4f}" for part in lesson.parts)),
     ]
     said = (f"{first.n:,} readings; sensors are each held out in turn.",)
-    return Section("Blocks held out, folded", said, ("", *TUNINGS), tuple(rows))
+    return Topic("Blocks held out, folded", said, ("", *TUNINGS), tuple(rows))
 
 
-def _verdict(lesson: Lesson, keep: Path | None) -> Section:
+def _verdict(lesson: Lesson, keep: Path | None) -> Topic:
     if not lesson.better:
-        return Section("Verdict", ("Not better than the physics alone, so nothing is kept:", *lesson.reasons))
+        return Topic("Verdict", ("Not better than the physics alone, so nothing is kept:", *lesson.reasons))
     noise = ", ".join(f"{name}: {{variance: {value:g}}}" for name, value in lesson.noise.items())
     file = keep.name if keep else "FILE"
     lines = f"In the twin's YAML: learned: {file}" + (f", and noise: {{{noise}}}" if noise else "")
-    return Section("Verdict", ("Better on blocks from which it did not learn.", lines))
+    return Topic("Verdict", ("Better on blocks from which it did not learn.", lines))

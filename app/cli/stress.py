@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
@@ -15,6 +13,7 @@ from rich.table import Table
 from estimators.errors import ConfigError, NisusError
 from estimators.registry import find_estimator
 
+from ..present.result import to_json
 from ..studies.stress.bench import Bench, asset_of
 from ..studies.stress.foretold import CHANCE, INVISIBLE, Oracle
 from ..studies.stress.matrix import matrix
@@ -71,7 +70,7 @@ def stress_twin(arguments: Arguments) -> int:
     for text in failed:
         complain(text)
     if arguments.json:
-        print(json.dumps([_plain(asdict(trial)) for trial in trials]))
+        print(to_json(trials))
     else:
         _print(trials, mistakes, names)
     return 0
@@ -83,12 +82,6 @@ def _chosen(mistakes: Sequence[Mistake], only: Sequence[str]) -> list[Mistake]:
     if not found:
         raise ConfigError(f"--only {' '.join(only)}: no mistake has that in its name; see --list")
     return found
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _print(trials: Sequence[Trial], mistakes: Sequence[Mistake], names: Sequence[str]) -> None:

@@ -19,10 +19,10 @@ from ..live.runs.runs_json import fit_json
 from ..live.tunings.fitted import settings_of
 from ..live.tunings.tuning_yaml import tuning_yaml
 from ..live.tunings.versions import check_free, keep, version_text
+from ..present.result import to_text
 from ..terminal import complain
 from ..twin.bounds import bounds_of, natural_aim
 from ..twin.twin import Twin, load_twin
-from .check_text import as_text
 from .fold import read_log
 from .given import settings
 from .places import check_place
@@ -75,7 +75,7 @@ def tune_twin(arguments: Arguments) -> int:
     if arguments.json:
         print(json.dumps({"twin": twin.name, **fit_json(found)}, allow_nan=False))
     else:
-        print("\n".join(as_text(sections(twin, found))))
+        print("\n".join(to_text(sections(twin, found))))
     if arguments.save is not None and found.proposed:
         text = heading(twin, found) + tuning_yaml(twin.config, twin.estimator, *found.setting)
         arguments.save.write_text(text, encoding="utf-8")

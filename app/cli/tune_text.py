@@ -9,7 +9,7 @@ from estimators.fit.fit import Fitted, Line
 from estimators.fit.judge import Part, Prediction, Worth
 
 from ..live.runs.runs_json import correlated
-from ..present.export.parts import Part as Section
+from ..present.result import Topic
 from ..twin.twin import Twin
 
 ALONE = "left alone: the data cannot tell"
@@ -20,7 +20,7 @@ TEMPERED = (
 )
 
 
-def sections(twin: Twin, fitted: Fitted) -> list[Section]:
+def sections(twin: Twin, fitted: Fitted) -> list[Topic]:
     """From top to bottom."""
     held_out = _held_out(fitted)
     return [_entries(twin, fitted), _scores(fitted), *([held_out] if held_out.rows else []), _verdict(fitted)]
@@ -42,7 +42,7 @@ def _pair(before: float, after: float, form: str, unit: str = "") -> str:
     return f"{old} -> {new}{unit if np.isfinite(after) else ''}"
 
 
-def _entries(twin: Twin, fitted: Fitted) -> Section:
+def _entries(twin: Twin, fitted: Fitted) -> Topic:
     rows = [
         (
             line.key,
@@ -61,7 +61,7 @@ def _entries(twin: Twin, fitted: Fitted) -> Section:
     said = [f"Hardly told apart: {', '.join(pairs)}."] if pairs else []
     said += [f"{name} was stuck: {n:,} of its readings were left out." for name, n in fitted.left_out.items()]
     head = ("entry", "before", "after", "95 % interval", "unit", "")
-    return Section(f"{twin.name}: {fitted.estimator}, {fitted.folds} folds", tuple(said), head, tuple(rows))
+    return Topic(f"{twin.name}: {fitted.estimator}, {fitted.folds} folds", tuple(said), head, tuple(rows))
 
 
 def _remark(line: Line) -> str:
@@ -72,7 +72,7 @@ def _remark(line: Line) -> str:
     return BOUND if not line.told else ""
 
 
-def _scores(fitted: Fitted) -> Section:
+def _scores(fitted: Fitted) -> Topic:
     def row(what: str, before: Part, after: Part) -> tuple[str, ...]:
         return (
             what,
@@ -86,15 +86,15 @@ def _scores(fitted: Fitted) -> Section:
     if fitted.before.held_out.n:
         rows.append(row("held out", fitted.before.held_out, fitted.after.held_out))
     head = ("blocks", "readings", "log density of a reading, nats", "NIS / dof", "in the 95 % band")
-    return Section("Predictions of the next reading, before and after", (), head, tuple(rows))
+    return Topic("Predictions of the next reading, before and after", (), head, tuple(rows))
 
 
-def _held_out(fitted: Fitted) -> Section:
+def _held_out(fitted: Fitted) -> Topic:
     rows: list[tuple[str, ...]] = []
     for kind, group in (("sensor", "sensors"), ("never used", "withheld"), ("truth", "states")):
         rows += _rows(kind, group, fitted.before, fitted.after)
     head = ("", "", "unit", "RMS", "in the 95 % band", "RMS, blocks held out", "in the 95 % band")
-    return Section("Sensors held out in turn, and what is known to be true, before and after", (), head, tuple(rows))
+    return Topic("Sensors held out in turn, and what is known to be true, before and after", (), head, tuple(rows))
 
 
 def _rows(kind: str, group: str, before: Worth, after: Worth) -> list[tuple[str, ...]]:
@@ -114,9 +114,9 @@ def _gained(fitted: Fitted) -> str:
     return f"{fitted.verdict.gain:+.3g} ± {fitted.verdict.error:.2g} nats {fitted.verdict.each}"
 
 
-def _verdict(fitted: Fitted) -> Section:
+def _verdict(fitted: Fitted) -> Topic:
     verdict = fitted.verdict
     if verdict.proposed:
         said = f"Proposed: {_gained(fitted)} on the blocks held out."
-        return Section("Verdict", (said, *([] if fitted.power == 1.0 else [TEMPERED.format(fitted.power)])))
-    return Section("Verdict", ("Not proposed:", *verdict.reasons))
+        return Topic("Verdict", (said, *([] if fitted.power == 1.0 else [TEMPERED.format(fitted.power)])))
+    return Topic("Verdict", ("Not proposed:", *verdict.reasons))

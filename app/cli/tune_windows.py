@@ -21,11 +21,10 @@ from ..live.runs.runs_json import fit_json
 from ..live.tunings.fitted import settings_of
 from ..live.tunings.tuning_yaml import tuning_yaml
 from ..live.tunings.versions import keep, version_text
-from ..present.export.parts import Part as Section
+from ..present.result import Topic, to_text
 from ..terminal import complain
 from ..twin.bounds import bounds_of
 from ..twin.twin import Twin
-from .check_text import as_text
 from .prepare import attend
 from .tune_text import heading
 
@@ -79,7 +78,7 @@ def tune_windows(arguments: Arguments, wanted: Sequence[str], recordings: Record
         told = [window_json(k, refit, origins[k]) for k, refit in found]
         print(json.dumps({"twin": twin.name, "window": window, "every": every, "windows": told}, allow_nan=False))
     else:
-        print("\n".join(as_text([*_sections(found, origins), _verdict(twin, found, origins, ends)])))
+        print("\n".join(to_text([*_sections(found, origins), _verdict(twin, found, origins, ends)])))
     adopted = [refit.fitted for _, refit in found if refit.fitted is not None and refit.proposed]
     if not adopted:
         return 1
@@ -122,7 +121,7 @@ def window_json(recording: int, refit: Refit, origin: int) -> dict[str, Any]:
     return told | ({} if refit.fitted is None else {"result": fit_json(refit.fitted)})
 
 
-def _sections(found: Sequence[tuple[int, Refit]], origins: Sequence[int]) -> list[Section]:
+def _sections(found: Sequence[tuple[int, Refit]], origins: Sequence[int]) -> list[Topic]:
     """For every entry a table: its value and interval of each window, and what the twin went on with."""
     keys = dict.fromkeys(line.key for _, refit in found if refit.fitted is not None for line in refit.fitted.lines)
     head = (
@@ -137,7 +136,7 @@ def _sections(found: Sequence[tuple[int, Refit]], origins: Sequence[int]) -> lis
             unit = unit or ("" if line is None else line.unit)
             rows.append((*_place(k, refit, origins), *_row(refit, line)))
         title = f"{key}{f', {unit}' if unit else ''}"
-        sections.append(Section(title, (), head, tuple(rows)))
+        sections.append(Topic(title, (), head, tuple(rows)))
     return sections
 
 
@@ -167,7 +166,7 @@ def _row(refit: Refit, line: Line | None) -> tuple[str, ...]:
     return (f"{line.after:.4g}", f"{line.low:.4g} to {line.high:.4g}{bound}", f"{shift(line):+.1f}", gain, kept)
 
 
-def _verdict(twin: Twin, found: Sequence[tuple[int, Refit]], origins: Sequence[int], ends: Sequence[int]) -> Section:
+def _verdict(twin: Twin, found: Sequence[tuple[int, Refit]], origins: Sequence[int], ends: Sequence[int]) -> Topic:
     """How many were adopted, of each other one why not, and what no window looked at."""
     adopted = sum(refit.proposed for _, refit in found)
     folds = sum(refit.fitted.folds for _, refit in found if refit.fitted is not None)
@@ -184,4 +183,4 @@ def _verdict(twin: Twin, found: Sequence[tuple[int, Refit]], origins: Sequence[i
         if left > UNSEEN * max((refit.end - refit.start for refit in own), default=0) * 1e-9:
             which = f"Of recording {k + 1} the" if len(ends) > 1 else "The"
             said.append(f"{which} last {left:,.0f} s are less than half a window, or half a step, and were not fitted.")
-    return Section("Verdict", tuple(said))
+    return Topic("Verdict", tuple(said))

@@ -14,9 +14,8 @@ from estimators.fold import Fold
 from ..live.changes import difference
 from ..live.tunings.versions import COVERAGE, Settings, accept, figures, keep, listing, version_text
 from ..live.watchdog import interruptible
-from ..present.export.parts import Part
+from ..present.result import Topic, to_text
 from ..twin.twin import load_twin
-from .check_text import as_text
 from .fold import read_log
 from .given import settings
 from .prepare import prepare
@@ -92,10 +91,10 @@ def _list(arguments: Arguments) -> None:
     )
     head = ("version", "saved", "filter", "NIS", "log L", "in 95 %", "fitted on", "note")
     said = ("*: holds; `nisus guard` folds with it.",)
-    parts = [Part(f"Tuning versions of {twin.name}", said, head, rows)]
+    parts = [Topic(f"Tuning versions of {twin.name}", said, head, rows)]
     if broken:
-        parts.append(Part("Cannot be read", broken))
-    print("\n".join(as_text(parts)))
+        parts.append(Topic("Cannot be read", broken))
+    print("\n".join(to_text(parts)))
 
 
 def _scored(scores: dict[str, float]) -> tuple[str, str, str]:
@@ -125,11 +124,11 @@ def _compare(arguments: Arguments) -> None:
     names = tuple(arguments.names)
     entries_of = tuple((key, _shown(before), _shown(after)) for key, before, after in differ)
     parts = [
-        Part("Entries that differ", () if entries_of else ("None.",), ("entry", *names), entries_of),
-        Part("Scores", () if both else ("Not both were scored.",), ("score", *names),
+        Topic("Entries that differ", () if entries_of else ("None.",), ("entry", *names), entries_of),
+        Topic("Scores", () if both else ("Not both were scored.",), ("score", *names),
              tuple((name, *(f"{each[name]:.6g}" for each in scores)) for name in both)),
     ]  # fmt: skip
-    print("\n".join(as_text(parts)))
+    print("\n".join(to_text(parts)))
 
 
 def _shown(value: float | bool | str | None) -> str:

@@ -18,10 +18,10 @@ from ..live.interface import Running
 from ..live.revisions import Run
 from ..live.runs.runs_json import what_changed
 from ..live.runs.scores import RunScore, RunScores
-from ..present.export.html import as_html
 from ..present.export.report import Reported, report
 from ..present.export.run_rows import RunRows, rows_of_run
 from ..present.export.track_file import KINDS, encoded, tables
+from ..present.result import to_html
 from ..present.series.series import Series
 from .api import Json, one_line
 from .one_at_a_time import OneAtATime
@@ -82,7 +82,7 @@ class ExportApi:
             engine.twin, run.estimator, run.tuning, pull.events, pull.track, pull.pictures, episodes,
             taken.marginal, tuple(about), bounds, _others(self._scores), self._before(run, episodes),
         )  # fmt: skip
-        return taken, as_html(f"{engine.twin.name}, run {run.number}", report(said))
+        return taken, to_html(f"{engine.twin.name}, run {run.number}", report(said))
 
     def _before(self, run: Run, now: Sequence[Episode]) -> tuple[tuple[str, Sequence[Episode]], ...]:
         """The episodes of earlier runs that this one, or a later of them, does not have as well, newest run first."""

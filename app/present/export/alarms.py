@@ -12,7 +12,7 @@ from estimators.errors import ConfigError
 
 NAME = "ALARMS.md"
 
-PLACES = (Path(__file__).resolve().parents[2] / NAME, Path(sysconfig.get_path("data")) / "share" / "nisus" / NAME)
+PLACES = (Path(__file__).resolve().parents[3] / NAME, Path(sysconfig.get_path("data")) / "share" / "nisus" / NAME)
 """Beside the packages, or where an installation puts it."""
 
 

@@ -23,9 +23,9 @@ from estimators.tuning import GATE_KEYS, Tuning
 from ...format_time import format_time
 from ...live.changes import difference, in_words
 from ...twin.twin import Twin
+from ..result import Bar, Topic
 from .alarms import advice
 from .calibration_lines import calibration_lines
-from .parts import Bar, Part
 from .run_charts import run_charts
 from .svg import clock
 
@@ -57,7 +57,7 @@ class Reported(NamedTuple):
     smoothed: Smoothed | None = None
 
 
-def report(run: Reported) -> list[Part]:
+def report(run: Reported) -> list[Topic]:
     """The report, from top to bottom."""
     model = run.twin.model
     found = score(run.track, run.events, model, run.pictures, gate=run.tuning.gate, baseline=run.tuning.baseline)
@@ -70,14 +70,14 @@ def report(run: Reported) -> list[Part]:
         _scores(run, found),
         _episodes(run),
         *_before(run),
-        Part("Charts", said, drawn=tuple(charts)),
+        Topic("Charts", said, svgs=tuple(charts)),
         *_checks(run),
         _tuning(run),
         *([_runs(run)] if run.others else []),
     ]
 
 
-def _head(run: Reported) -> Part:
+def _head(run: Reported) -> Topic:
     twin, t = run.twin, run.events.t
     entry = find_entry(run.estimator)
     options = ", ".join(f"{name} {value:g}" for name, value in entry.complete(dict(run.tuning.options)).items())
@@ -92,7 +92,7 @@ def _head(run: Reported) -> Part:
     given = ", ".join(f"{key}={value}" for key, value in twin.overrides.items())
     if given:
         rows.append(("on the command line", given))
-    return Part(f"{twin.name}: {twin.title}", (), ("", ""), (*rows, *run.about))
+    return Topic(f"{twin.name}: {twin.title}", (), ("", ""), (*rows, *run.about))
 
 
 def _source(twin: Twin) -> str:
@@ -103,7 +103,7 @@ def _source(twin: Twin) -> str:
     return f"{section.type.replace('_', ' ')}, of {twin.path.name}" + (f": {', '.join(told)}" if told else "")
 
 
-def _scores(run: Reported, found: Score) -> Part:
+def _scores(run: Reported, found: Score) -> Topic:
     model, track = run.twin.model, run.track
     units = {state.name: state.unit for state in model.shown_states}
     units |= dict(zip(model.row_names, (row.unit for sensor in model.sensors for row in sensor.rows), strict=True))
@@ -130,7 +130,7 @@ def _scores(run: Reported, found: Score) -> Part:
     worst = [f"{HEALTH_NAMES[k]} {100 * shares[k]:.3g} %" for k in np.argsort(-shares, kind="stable") if shares[k]]
     rows.append(("health at the end", HEALTH_NAMES[int(track.health[-1])], ", ".join(worst)))
     marks += [""] * (len(rows) - len(marks))
-    return Part("What the estimate was worth", (), ("", "", ""), _cut(rows), marks=_marks(marks, rows))
+    return Topic("What the estimate was worth", (), ("", "", ""), _cut(rows), marks=_marks(marks, rows))
 
 
 def _marks(marks: Sequence[str], rows: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
@@ -144,18 +144,18 @@ def _cut(rows: Sequence[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
     return (*rows[:MOST], (f"... and {len(rows) - MOST} more", *[""] * (len(rows[0]) - 1)))
 
 
-def _episodes(run: Reported) -> Part:
+def _episodes(run: Reported) -> Topic:
     shown = tuple(f"{offset.words[0].upper()}{offset.words[1:]}." for offset in _offsets(run))
     if not run.episodes:
         of = " of the sensors in use" if shown else ""
-        return Part("Episodes", (f"Nothing that the tests could see was wrong{of}.", *shown))
+        return Topic("Episodes", (f"Nothing that the tests could see was wrong{of}.", *shown))
     rows = [_told(item, run) for item in run.episodes]
     causes = [cause for cause in dict.fromkeys(item.cause for item in run.episodes) if advice(cause, "Response")]
     small = tuple(
         f"{cause.capitalize()}. Usual cause: {advice(cause, 'Usual cause')} Response: {advice(cause, 'Response')}"
         for cause in causes
     )
-    return Part("Episodes", shown, ("when", "who", "what", "what was said, and what to do"), _cut(rows), small=small)
+    return Topic("Episodes", shown, ("when", "who", "what", "what was said, and what to do"), _cut(rows), notes=small)
 
 
 def _told(item: Episode, run: Reported) -> tuple[str, str, str, str]:
@@ -170,21 +170,21 @@ def _offsets(run: Reported) -> list[Offset]:
     return offsets(run.events, run.track, run.tuning)
 
 
-def _before(run: Reported) -> list[Part]:
+def _before(run: Reported) -> list[Topic]:
     """What was wrong under the settings of earlier runs: what made somebody change them, and may hide now."""
     rows = [(name, *_told(item, run)) for name, episodes in run.before for item in episodes]
     if not rows:
         return []
     said = "Over the same log, with the settings of then; what a setting hides was there all the same."
-    return [Part("Episodes of the runs before", (said,), ("run", "when", "who", "what", "what was said"), _cut(rows))]
+    return [Topic("Episodes of the runs before", (said,), ("run", "when", "who", "what", "what was said"), _cut(rows))]
 
 
-def _checks(run: Reported) -> list[Part]:
+def _checks(run: Reported) -> list[Topic]:
     model, tuning = run.twin.model, run.tuning
     given = model, run.events, run.track
     found = [*calibrations(*given, gate=tuning.gate, marginal=run.marginal), *truth_calibration(*given)]
     lines = [(line,) for line in calibration_lines(found, model)]
-    parts = [Part("Can the bands be believed? 95 % intervals", (), ("",), _cut(lines))] if lines else []
+    parts = [Topic("Can the bands be believed? 95 % intervals", (), ("",), _cut(lines))] if lines else []
     if run.bounds:
         title = "How wrong a state can be by one fault that nobody notices"
         rows = [
@@ -194,11 +194,11 @@ def _checks(run: Reported) -> list[Part]:
         ]  # fmt: skip
         bars = tuple(Bar(name, item.unit, item.two_sigma, item.bound) for name, item in run.bounds.items())[:MOST]
         head = ("state", "unit", "± 2 σ", "integrity bound", "by")
-        parts.append(Part(title, (), head, _cut(rows), bars, ("± 2 σ", "integrity bound")))
+        parts.append(Topic(title, (), head, _cut(rows), bars, ("± 2 σ", "integrity bound")))
     return parts
 
 
-def _tuning(run: Reported) -> Part:
+def _tuning(run: Reported) -> Topic:
     twin, tuning = run.twin, run.tuning
     changes = difference(twin.estimator, twin.tuning, run.estimator, tuning)
     began = "as recorded" if twin.recorded else "as configured"
@@ -214,13 +214,13 @@ def _tuning(run: Reported) -> Part:
         if key in GATE_KEYS or not now or now != before:
             rows.append((key, _value(now), "", _value(before)))
             marks.append("partly" if now != before else "")
-    return Part("Tuning", (said,), ("entry", "value", "unit", began), _cut(rows), marks=_marks(marks, rows))
+    return Topic("Tuning", (said,), ("entry", "value", "unit", began), _cut(rows), marks=_marks(marks, rows))
 
 
 def _value(value: float | bool | str | None) -> str:
     return "off" if value is None else ("yes" if value else "no") if isinstance(value, bool) else str(value)
 
 
-def _runs(run: Reported) -> Part:
+def _runs(run: Reported) -> Topic:
     head = ("run", "what was changed", "mean NIS", "log L a reading", "RMSE, or held out")
-    return Part("Runs of the session", (), head, _cut(run.others))
+    return Topic("Runs of the session", (), head, _cut(run.others))

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from app.cli.main import main
-from app.present.export.html import as_html
-from app.present.export.parts import Bar, Part
+from app.present.result import Bar, Topic, to_html
 from estimators.diagnostics.sensitivity.words import range_text
 
 REQUIRED = {"checklist", "observability", "smallest_visible", "integrity", "held_out", "open_loop"}
@@ -111,10 +110,10 @@ def test_html_is_one_file_without_scripts(checked):
 
 
 def test_html_escapes_what_users_name():
-    part = Part(
-        'a <b> & "c"', ("<script>alert(1)</script>",), ("<i>",), (("<u>", "yes"),), (Bar("<s>", "°C", 1.0, np.nan),)
+    part = Topic(
+        'a <b> & "c"', ("<script>alert(1)</script>",), ("<i>", ""), (("<u>", "yes"),), (Bar("<s>", "°C", 1.0, np.nan),)
     )
-    page = parsed(as_html("<title>", [Part("head", ()), part]))
+    page = parsed(to_html("<title>", [Topic("head", ()), part]))
     assert not page.tags & {"script", "b", "i", "u", "s"}
     assert "<script>alert(1)</script>" in page.text and "<u>" in page.text and "no number" in page.text
 
@@ -122,7 +121,7 @@ def test_html_escapes_what_users_name():
 def test_a_mark_says_whether_the_answer_is_good_news():
     """Asked for peaks and heavy tails, a twin does well to say no."""
     rows = (("all well?", "yes"), ("anything wrong?", "no"))
-    page = parsed(as_html("t", [Part("head", ()), Part("b", (), ("q", "a"), rows, marks=("good", "good"))]))
+    page = parsed(to_html("t", [Topic("head", ()), Topic("b", (), ("q", "a"), rows, marks=("good", "good"))]))
     marks = [value for tag, name, value in page.attributes if (tag, name) == ("td", "class")]
     assert marks == ["short", "good short", "short", "good short"]
 
