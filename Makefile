@@ -9,7 +9,7 @@ PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist lo
 # Tests of what is written in vector instructions, which LLVM splits where a processor's vectors are shorter.
 VECTORS := simd_rows simd_exp linalg inverse_root symmetric
 
-.PHONY: run test fast generic versions bench shots clean
+.PHONY: run test fast generic versions bench shots docs size clean
 
 run: $(VENV)/.installed
 	$(BIN)/nisus run motor_can
@@ -20,6 +20,7 @@ test: $(VENV)/.installed-dev
 	$(BIN)/mypy
 	$(BIN)/python -m tests.warm
 	$(BIN)/nisus guard --junit guard.xml
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs build/docs
 	$(PYTEST)
 
 # The quickest tests, so many that they take 100 s of a processor by the runs before; all, if there was none.
@@ -40,6 +41,14 @@ bench: $(VENV)/.installed-dev
 # The README's pictures, from the running page.
 shots: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.shots
+
+# The guides as a site in build/docs; a broken link or reference is an error. Their examples run in tests/docs.
+docs: $(VENV)/.installed-dev
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs build/docs
+
+# Lines and files per package; of another revision: `python -m tests.size REVISION`.
+size: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.size
 
 $(VENV)/bin/python:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Nisus needs Python 3.11 or later; try: make PYTHON=python3.11")'

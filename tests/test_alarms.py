@@ -1,4 +1,4 @@
-"""ALARMS.md: every cause that the code can name, and every state, has its heading, with what to look at and to do."""
+"""docs/alarms.md: every cause that the code can name, and every state, has its heading, with what to look at and to do."""
 
 import ast
 import re
@@ -13,7 +13,7 @@ from estimators.diagnostics.sensor_states import STATES
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES
 
 ROOT = Path(__file__).parents[1]
-TEXT = (ROOT / "ALARMS.md").read_text()
+TEXT = (ROOT / "docs/alarms.md").read_text()
 
 
 def sections():
@@ -136,4 +136,4 @@ def test_nothing_is_explained_that_is_never_said():
 
 
 def test_the_readme_leads_there():
-    assert "ALARMS.md" in (ROOT / "README.md").read_text()
+    assert "docs/alarms.md" in (ROOT / "README.md").read_text()

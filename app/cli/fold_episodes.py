@@ -90,7 +90,7 @@ def episode_lines(told: Sequence[Told]) -> Iterator[str]:
     if not told:
         yield "no episodes: nothing that the tests could see was wrong"
         return
-    yield f"{len(told)} episode(s); ALARMS.md says what each cause means"
+    yield f"{len(told)} episode(s); docs/alarms.md says what each cause means"
     for episode, found in told[:SHOWN]:
         lasted = "at the end" if episode.end is None else f"for {episode.end - episode.start:.3g} s"
         yield f"  {episode.cause}, {lasted}: {episode.text}"

@@ -180,7 +180,7 @@ class PageServer:
         return page_file(name, settings)
 
     async def _alarms(self, request: Request) -> Response:
-        """ALARMS.md, to which episodes refer."""
+        """docs/alarms.md, to which episodes refer."""
         try:
             text = markdown.as_html(alarms_text())
         except ConfigError as error:

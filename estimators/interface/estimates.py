@@ -98,7 +98,7 @@ class Estimates:
         return table_of(self.model, self.events, self.track, self.episodes())
 
     def episodes(self) -> list[Episode]:
-        """What was wrong from when to when, with whom, by how much, and what to do: see ALARMS.md."""
+        """What was wrong from when to when, with whom, by how much, and what to do: see docs/alarms.md."""
         marginal = find_estimator(self.estimator, self.model).family in ("particle", "ensemble")
         course = Course(self.model, self.tuning, marginal, self.events, self.track)
         return [found.episode for found in found_in(course)]

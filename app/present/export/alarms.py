@@ -1,4 +1,4 @@
-"""ALARMS.md, as it is read beside the page: each cause with what usually is behind it, and how to respond."""
+"""docs/alarms.md, as it is read beside the page: each cause with what usually is behind it, and how to respond."""
 
 from __future__ import annotations
 
@@ -10,9 +10,12 @@ from pathlib import Path
 from estimators.diagnostics.episodes import anchor
 from estimators.errors import ConfigError
 
-NAME = "ALARMS.md"
+NAME = "docs/alarms.md"
 
-PLACES = (Path(__file__).resolve().parents[3] / NAME, Path(sysconfig.get_path("data")) / "share" / "nisus" / NAME)
+PLACES = (
+    Path(__file__).resolve().parents[3] / NAME,
+    Path(sysconfig.get_path("data")) / "share" / "nisus" / Path(NAME).name,
+)
 """Beside the packages, or where an installation puts it."""
 
 

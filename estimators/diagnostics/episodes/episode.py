@@ -10,7 +10,7 @@ CAUSES = (
     "shifted", "narrow", "wide", "correlated", "alternating", "spiky", "refused", "screened", "stuck", "disagreeing",
     "agreeing", "silent", "never heard", "missed", "outside", "impoverished", "stale", "diverged", "dropped",
 )  # fmt: skip
-"""Of episodes; each has its heading in ALARMS.md, which says what it means and what to do."""
+"""Of episodes; each has its heading in docs/alarms.md, which says what it means and what to do."""
 
 
 class Episode(NamedTuple):
@@ -51,5 +51,5 @@ def episode_json(episode: Episode) -> dict[str, float | str | None]:
 
 
 def anchor(cause: str) -> str:
-    """Of its heading in ALARMS.md, as GitHub makes it."""
+    """Of its heading in docs/alarms.md, as GitHub makes it."""
     return cause.replace(" ", "-")

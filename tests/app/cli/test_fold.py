@@ -66,7 +66,7 @@ def test_episodes_are_printed_told_to_scripts_and_kept(tmp_path: Path, capsys: p
     twin, out = str(stuck_drive(tmp_path)), tmp_path / "track.parquet"
     assert fold_twin(Fold(twin, out=out)) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert "1 episode(s); ALARMS.md says what each cause means" in lines
+    assert "1 episode(s); docs/alarms.md says what each cause means" in lines
     assert lines[-1].startswith("  stuck, at the end: winding is stuck at 41.5 °C since 100.0 s")
     assert fold_twin(Fold(twin, json=True)) == 0
     (episode,) = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)["episodes"]

@@ -1,4 +1,4 @@
-"""What the API says of health: episodes with a place in ALARMS.md, the cause, and the state of each sensor."""
+"""What the API says of health: episodes with a place in docs/alarms.md, the cause, and the state of each sensor."""
 
 import json
 import re

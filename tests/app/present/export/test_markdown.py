@@ -1,4 +1,4 @@
-"""ALARMS.md as a page: every heading that an episode names is there, and nothing of the markup is left."""
+"""docs/alarms.md as a page: every heading that an episode names is there, and nothing of the markup is left."""
 
 import re
 from html.parser import HTMLParser
