@@ -1,4 +1,4 @@
-"""docs/alarms.md: every cause that the code can name, and every state, has its heading, with what to look at and to do."""
+"""docs/alarms.md has a heading for every cause and every state, with diagnosis and response."""
 
 import ast
 import re

@@ -25,5 +25,5 @@ def test_python_of_the_readme_runs(capsys):
 
 def test_pictures_of_the_readme_are_there():
     pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", README)
-    assert len(pictures) >= 4
+    assert len(pictures) == 2
     assert all((Path(__file__).parent.parent / picture).stat().st_size > 10_000 for picture in pictures)

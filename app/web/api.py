@@ -121,7 +121,9 @@ def _runs(revisions: Revisions) -> dict[str, Any]:
 
 def episodes_json(engine: Running) -> list[dict[str, Any]]:
     """What was and is wrong, in the order of its start: times in seconds of the log, `help` in docs/alarms.md."""
-    return [episode_json(episode) | {"help": f"docs/alarms.md#{anchor(episode.cause)}"} for episode in engine.episodes()]
+    return [
+        episode_json(episode) | {"help": f"docs/alarms.md#{anchor(episode.cause)}"} for episode in engine.episodes()
+    ]
 
 
 def faults_json(engine: Running) -> dict[str, Any]:

@@ -95,4 +95,6 @@ class VerifiedCacheFile(caching.IndexDataCacheFile):  # type: ignore[misc]
 def use_entries() -> None:
     """Make Numba keep its cache in such entries, in this process."""
     caching.IndexDataCacheFile = VerifiedCacheFile
-    caching.CompileResultCacheImpl._locator_classes = [ContentLocator]
+    # Numba's own locators serve functions that are in no file, as in a notebook.
+    others = [found for found in caching.CompileResultCacheImpl._locator_classes if found is not ContentLocator]
+    caching.CompileResultCacheImpl._locator_classes = [ContentLocator, *others]
