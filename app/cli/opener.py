@@ -15,7 +15,7 @@ from config.loader import shipped
 from ..twin.twin import Twin, load_twin, restore_twin
 from ..views.recording.format import tuning_from_json
 from ..views.recording.reader import read_recording
-from ..views.recording.split import NEVER, Split
+from ..views.recording.rrd_file import NEVER, Split
 from ..web.gallery.api import GalleryApi
 from ..web.gallery.gallery import Gallery, Opener, Wanted
 from ..web.gallery.recordings import Recordings

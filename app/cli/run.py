@@ -12,7 +12,7 @@ from estimators.errors import ConfigError
 from ..live.execute import MAX_SPEED
 from ..terminal import complain
 from ..views.recording.format import TAKEN
-from ..views.recording.split import NEVER, parse_split
+from ..views.recording.rrd_file import NEVER, parse_split
 from ..web.gallery.gallery import Wanted
 from ..web.port import check_port
 from ..web.session import Page

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ..concurrency import run_all
 from ..live.engine import Engine
 from ..live.runs.refits import Refits
-from ..views.recording.split import NEVER, Split
+from ..views.recording.rrd_file import NEVER, Split
 from ..views.recording.writer import FINE, Recorder
 from ..views.rerun.rows import RerunRows
 

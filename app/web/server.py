@@ -13,7 +13,7 @@ import uuid
 from collections.abc import AsyncIterator
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starlette.applications import Starlette
 from starlette.requests import Request
@@ -26,8 +26,7 @@ from estimators.errors import ConfigError, NisusError
 
 from ..live.interface import Running
 from ..live.runs.refits import Refits
-from ..present.drawing.choices import Choices
-from ..present.drawing.palette import EITHER, THEMES
+from ..present.drawing.colors import EITHER, THEMES
 from ..present.export import markdown
 from ..present.export.alarms import alarms_text
 from ..present.series.series import Series
@@ -49,6 +48,9 @@ from .runs_api import RunsApi
 from .tunings_api import TuningsApi
 from .viewer_assets import FILES, viewer_assets, viewer_version
 from .viser_proxy import ViserProxy
+
+if TYPE_CHECKING:
+    from ..views.viser.stage import Choices
 
 PERIOD = 0.2
 """Seconds between two frames that one Rerun viewer is fed, at least."""

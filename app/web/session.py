@@ -19,7 +19,7 @@ from estimators.errors import SourceError
 from ..concurrency import run_all
 from ..live.commands import Record
 from ..terminal import complain, restore, when_asked_to_end
-from ..views.recording.split import NEVER, Split
+from ..views.recording.rrd_file import NEVER, Split
 from .door import Door
 from .open_browser import Opening as BrowserOpening
 from .running import Opening, RunningTwin

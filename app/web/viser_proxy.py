@@ -13,7 +13,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from websockets.asyncio.client import ClientConnection, connect
 
-from ..views.viser.private_viser import HEADER
+from ..views.viser.guarded_server import HEADER
 from .page_file import PAGE
 
 PASSED_ON = ("content-type", "content-encoding", "etag", "last-modified", "cache-control")

@@ -13,7 +13,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Response
 from websockets.sync.server import serve
 
-from app.views.viser.private_viser import HEADER
+from app.views.viser.guarded_server import HEADER
 from tests.app.scripted import twin
 
 SECRET = "the secret between the servers"

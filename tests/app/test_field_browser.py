@@ -7,7 +7,7 @@ import pytest
 
 from app.live.engine import Engine
 from app.twin.twin import load_twin
-from app.views.viser.private_viser import HEADER
+from app.views.viser.guarded_server import HEADER
 from app.views.viser.view import ViserView
 from tests.app.scripted import Scripted, wait_for
 from tests.app.test_field_views import PLATE, SHAPE

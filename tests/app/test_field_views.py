@@ -9,13 +9,13 @@ from rerun.chunk import RrdReader
 from app.cli.review import open_review
 from app.live import commands
 from app.live.engine import Engine
+from app.present.drawing.colors import ERROR, FAR, NOTHING, ODD, QUIET, SILENT, Frame, Scale, sensor_colors
 from app.present.drawing.direct_readings import observed
-from app.present.drawing.heatmap import ERROR, FAR, NOTHING, ODD, QUIET, SILENT, Frame, Scale, sensor_colors
 from app.twin.twin import load_twin
 from app.views.recording.writer import Recorder
 from app.views.rerun.feed import RerunFeed
 from app.views.rerun.rows import RerunRows
-from app.views.viser import field_scene
+from app.views.viser import field_scenes as field_scene
 from app.views.viser.view import ViserView
 from estimators.errors import ConfigError
 from estimators.fold import Fold
@@ -297,7 +297,7 @@ def test_the_scene_shows_the_picture_that_is_chosen_and_the_sensor_that_is_off(r
         view.frame()
         monkeypatch.undo()
         monkeypatch.setattr(field_scene.time, "monotonic", lambda: clock.now)
-        clock.now += field_scene.EVERY
+        clock.now += field_scene.PICTURE_PERIOD_S
         view.stage.choices.choose("picture", ERROR.title)
         view.frame()
         assert scene._title.text == "temperature: estimate − truth [°C]"

@@ -22,8 +22,8 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.track import Track
 
 from ..series.columns import Column, columns_of
+from .colors import DEVIATION, ERROR, ESTIMATE, Kind, Scale, gradient, image_of
 from .direct_readings import Observed, observed
-from .heatmap import DEVIATION, ERROR, ESTIMATE, Kind, Scale, gradient, image_of
 
 WIDTH, HEIGHT, MARGIN = 320, 140, 8
 POINTS = 150

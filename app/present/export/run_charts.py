@@ -12,8 +12,8 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.smoothing.smoothed import Smoothed
 from estimators.track import Track
 
+from ..drawing.colors import LIGHT, RGB
 from ..drawing.direct_readings import observed
-from ..drawing.palette import LIGHT, RGB
 from ..series.columns import columns_of, rows_of
 from ..series.lane import drawn
 from ..series.pyramid import Groups, grouped

@@ -24,10 +24,8 @@ from ...live.notices import Notice
 from ...live.outputs import Cursor, Pull
 from ..rerun.rows import RerunRows
 from ..rerun.sink import free_closed_streams
-from .disk import Disk
-from .format import RecordingFile
-from .split import NEVER, Split, part_path
-from .summary import summary, summary_of
+from .format import RecordingFile, summary, summary_of
+from .rrd_file import NEVER, Disk, Split, part_path
 
 if TYPE_CHECKING:
     from estimators.diagnostics.episodes import Episode

@@ -24,7 +24,7 @@ from estimators.log import Events
 from estimators.track import Track
 
 from ...live.notices import KEPT
-from ...present.drawing.palette import EITHER, Palette
+from ...present.drawing.colors import EITHER, Palette
 from .rows import RerunRows
 from .sink import free_closed_streams
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,9 @@ import rerun.blueprint as rrb
 from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.quantiles import chi_square_quantile
 
+from ...present.drawing.colors import EITHER, RGB, Frame, Palette, kinds
 from ...present.drawing.direct_readings import observed
-from ...present.drawing.palette import EITHER, RGB, Palette
-from . import layout_field
-from .style import EVENTS, TIMELINE, band_color, pair_name, row_title, with_unit
+from .sink import EVENTS, GAP, TIMELINE, band_color, pair_name, row_title, with_unit
 
 LANES = 6
 """Sensors at most whose states are drawn, below the twin's health."""
@@ -61,7 +61,7 @@ def blueprint(
         contents = [*over, *lines, f"/truth/{state.name}"]
         states.append(chart(with_unit(model.label(state.name), state.unit), contents))
     if model.grid is not None:
-        innovations = layout_field.sums(model, chart, truth=truth)
+        innovations = field_charts(model, chart, truth=truth)
     else:
         innovations = [
             chart(f"innovation: {row_title(model, k, r)}", [f"/innovation/{model.row_names[model.row_start[k] + r]}"])
@@ -93,7 +93,7 @@ def blueprint(
     bottom = rrb.Horizontal(*_tabs(ellipses), events, column_shares=[1.0] * (bool(ellipses) + 1))
     if model.grid is not None:
         above = [
-            layout_field.pictures(model, root, truth=truth),
+            field_pictures(model, root, truth=truth),
             rrb.Horizontal(*_tabs(states), innovations[0]),
             rrb.Horizontal(nis, *_tabs(innovations[1:])),
         ]
@@ -167,7 +167,7 @@ def styles(
         if model.grid is None:
             style(f"/innovation/{name}", band("innovation", palette.reading))
     if model.grid is not None:
-        layout_field.styles(style, model, palette)
+        field_styles(style, model, palette)
     style("/nis/reading", rr.SeriesPoints(colors=[light], names=["NIS of a reading"], marker_sizes=[1.5]))
     nis = {"names": ["windowed mean", "95 % low", "95 % high"], "widths": [2.0, 1.0, 1.0]}
     style("/nis/window", rr.SeriesLines(colors=[palette.estimate, palette.bound, palette.bound], **nis))
@@ -175,3 +175,47 @@ def styles(
     for pair in pairs:
         # Rerun's 2D view has y downwards.
         style(f"/pair/{pair_name(model, pair)}/up", rr.Transform3D(scale=[1.0, -1.0, 1.0]))
+
+
+def field_pictures(model: StateSpaceModel, root: str, *, truth: bool) -> rrb.Horizontal:
+    """Estimate, deviation, and error with the truth behind it in a tab."""
+    grid = model.grid
+    assert grid is not None
+    frame = Frame.of(grid)
+    bounds = rrb.VisualBounds2D(
+        x_range=(-0.04 * frame.width, (1.2 + 2 * GAP) * frame.width),
+        y_range=(-0.06 * frame.height, 1.06 * frame.height),
+    )
+    views = {
+        kind.name: rrb.Spatial2DView(
+            origin=f"{root}/field/{kind.name}",
+            name=f"{kind.brief} [{grid.unit}]",
+            visual_bounds=bounds,
+        )
+        for kind in kinds(truth)
+    }
+    if not truth:
+        return rrb.Horizontal(*views.values())
+    return rrb.Horizontal(views["estimate"], views["std"], rrb.Tabs(views["error"], views["truth"]))
+
+
+def field_charts(model: StateSpaceModel, chart: Callable[..., Any], *, truth: bool) -> list[Any]:
+    """Charts of what all cells, and all rows of each sensor, come to."""
+    assert model.grid is not None
+    title = "RMSE, spread of all cells" if truth else "spread of all cells"
+    found = [chart(f"{title} [{model.grid.unit}]", ["/field/rmse", "/field/spread"])]
+    for sensor in model.sensors:
+        words = f"{sensor.name.replace('_', ' ')}: " if len(model.sensors) > 1 else ""
+        found.append(chart(f"{words}innovations / σ: rms, largest", [f"/innovation/{sensor.name}"]))
+    return found
+
+
+def field_styles(style: Callable[[str, Any], None], model: StateSpaceModel, palette: Palette) -> None:
+    """How the lines of a field are drawn."""
+    style("/field/rmse", rr.SeriesLines(colors=[palette.truth], names=["RMSE"], widths=[2.0]))
+    style("/field/spread", rr.SeriesLines(colors=[palette.estimate], names=["spread"], widths=[2.0]))
+    for sensor in model.sensors:
+        style(
+            f"/innovation/{sensor.name}",
+            rr.SeriesLines(colors=[palette.reading, palette.refused], names=["rms", "largest"], widths=[2.0, 1.0]),
+        )

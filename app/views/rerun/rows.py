@@ -13,14 +13,11 @@ from estimators.track import FAILED, GATED, HEALTH_NAMES, Track, estimated_rows
 from ...live.interface import Running
 from ...live.notices import Notice
 from ...live.outputs import Pull
+from ...present.drawing.colors import EITHER, Palette
 from ...present.drawing.direct_readings import observed
-from ...present.drawing.palette import EITHER, Palette
-from .field import FieldDrawing
 from .layout import LANES, blueprint, styles
-from .pairs import PairDrawing
-from .sink import Sink, send_blueprint
-from .style import EVENTS, pair_name, state_colors
-from .thin import last_of_each_time
+from .pictures import FieldDrawing, PairDrawing
+from .sink import EVENTS, Sink, last_of_each_time, pair_name, send_blueprint, state_colors
 
 PIXELS = 1200
 """Stretches into which the charts' window is cut; each is drawn by its extremes."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 import rerun_bindings
 
-from .style import TIMELINE
-from .thin import thin
+from estimators.model.state_space import StateSpaceModel
+
+from ...present.drawing.colors import RGB, Palette, mixed
 
 CALENDAR = 10**18
 """Nanoseconds from which on times are dates (this one is in 2001), and before which they are durations."""
@@ -101,3 +103,76 @@ class Sink:
     def columns(self, path: str, t: np.ndarray, what: Any) -> None:
         """Log columns of one component, a row for each time."""
         self.stream.send_columns(f"{self.root}{path}", indexes=[self.times(t)], columns=what)
+
+
+EVENTS = "/events"
+"""Where the lines for people are, whichever revision the charts show."""
+
+TIMELINE = "time"
+
+GAP = 0.05
+"""Between the picture of a field and its scale, and the width of the scale, of the picture's width."""
+
+
+def state_colors(names: Sequence[str], palette: Palette) -> np.ndarray:
+    """Colours of states of health, as Rerun packs them (n,) uint32; what is no health is grey."""
+    colors = [palette.health.get(name, palette.faint) for name in names]
+    return np.array([(r << 24) | (g << 16) | (b << 8) | 255 for r, g, b in colors], np.uint32)
+
+
+def band_color(palette: Palette) -> RGB:
+    """Of the lines at ± 2 σ, and of what else belongs to the estimate but is not the line itself."""
+    return mixed(palette.estimate, palette.panel, 0.45)
+
+
+def with_unit(name: str, unit: str) -> str:
+    """`gnss_speed`, `m/s` as a chart's title."""
+    words = name.replace("_", " ").replace(".", " ")
+    return words if unit in ("", "1") else f"{words} [{unit}]"
+
+
+def row_title(model: StateSpaceModel, sensor: int, row: int) -> str:
+    """Title of one sensor row."""
+    return with_unit(model.row_names[model.row_start[sensor] + row], model.sensors[sensor].rows[row].unit)
+
+
+def pair_name(model: StateSpaceModel, pair: Any) -> str:
+    """Name of the entity of one pair of states."""
+    return f"{model.state_names[pair[0]]}_{model.state_names[pair[1]]}"
+
+
+def last_of_each_time(t: np.ndarray) -> np.ndarray:
+    """Indices of the last row of each distinct time, of times in order."""
+    return np.flatnonzero(np.append(t[1:] != t[:-1], np.ones(min(t.size, 1), bool)))
+
+
+def thin(t: np.ndarray, low: np.ndarray, high: np.ndarray, width: int) -> np.ndarray:
+    """Rows to draw, at most two of each stretch of `width` nanoseconds, and the last row of all.
+
+    Args:
+        t: Times in order, shape (n,).
+        low: The lowest row of each stretch by this is kept, shape (n,); finite.
+        high: The highest by this too.
+        width: Nanoseconds; zero keeps every row.
+    """
+    if width <= 0 or t.size <= 2:
+        return np.arange(t.size)
+    stretch = t // width
+    starts = np.flatnonzero(np.append(True, stretch[1:] != stretch[:-1]))
+    if 2 * starts.size >= t.size:
+        return np.arange(t.size)
+    group = np.cumsum(np.append(0, stretch[1:] != stretch[:-1]))
+    lowest = _first_of_groups(group, low == np.minimum.reduceat(low, starts)[group])
+    highest = _first_of_groups(group, high == np.maximum.reduceat(high, starts)[group])
+    return np.unique(np.concatenate((lowest, highest, [t.size - 1])))
+
+
+def _first_of_groups(group: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Index of the first row of each group in which the mask holds."""
+    rows = np.flatnonzero(mask)
+    return rows[np.append(True, group[rows[1:]] != group[rows[:-1]])]
+
+
+def last_of_stretch(t: np.ndarray, width: int) -> np.ndarray:
+    """Indices of the last row of each stretch of `width` nanoseconds, of times in order."""
+    return last_of_each_time(t // width if width > 0 else t)

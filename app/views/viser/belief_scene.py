@@ -12,10 +12,8 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.peaks import Peak
 
 from ...live.outputs import Belief
-from ...present.drawing.geometry import circle, disc, ellipsoid, round_step, segments, tick_text
-from ...present.drawing.palette import Palette, mixed
-from .camera import Outlook
-from .history import History
+from ...present.drawing.colors import Palette, mixed, round_step, tick_text
+from .scene import History, Outlook, circle, disc, ellipsoid, segments
 
 TRAIL = 80
 """Rows of the track that are drawn behind the point."""

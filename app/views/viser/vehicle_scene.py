@@ -18,14 +18,10 @@ from estimators.track import FAILED, GATED
 from estimators.tuning import Tuning
 
 from ...live.outputs import Belief
+from ...present.drawing.colors import Palette, mixed, round_step
 from ...present.drawing.direct_readings import observed
-from ...present.drawing.geometry import about_z, circle, disc, ellipsoid, round_step, segments
-from ...present.drawing.palette import Palette, mixed
-from .beacons import Beacons, Places
-from .beams import Beams
-from .camera import Outlook
-from .history import History
-from .peak_trail import PeakTrail
+from .scene import History, Outlook, about_z, circle, disc, ellipsoid, segments
+from .vehicle_parts import Beacons, Beams, PeakTrail, Places
 
 UNSURE = 20.0
 """Times the usual deviation of a place, beyond which the trail says nothing of it."""

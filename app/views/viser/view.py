@@ -9,12 +9,12 @@ from typing import Any
 from urllib.parse import parse_qs
 
 from ...live.interface import Running
-from ...present.drawing.palette import THEMES
+from ...present.drawing.colors import THEMES
 from ...present.series.series import Series
 from .coalescer import Coalescer
-from .history import History
+from .guarded_server import addresses, guarded_server, unprinted
 from .panel import Panel
-from .private_viser import addresses, guarded_server, unprinted
+from .scene import History
 from .stage import PICTURED, Stage
 
 FRAME = 0.1

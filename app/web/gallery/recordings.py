@@ -15,8 +15,8 @@ from typing import Any
 from estimators.errors import ConfigError, NisusError, quoted
 from sources.can.frames import FORMATS
 
-from ...views.recording.disk import Disk
-from ...views.recording.facts import Facts, facts_of
+from ...views.recording.reader import Facts, facts_of
+from ...views.recording.rrd_file import Disk
 
 RECORDING = ".rrd"
 LOGS = tuple(dict.fromkeys([*FORMATS, ".csv", ".parquet", ".pq", ".mat", ".npz"]))

@@ -15,12 +15,11 @@ from rerun.chunk import RrdReader
 
 from app.live.commands import SetEstimator
 from app.live.engine import Engine
-from app.present.drawing.heatmap import ESTIMATE, NOTHING, Scale
+from app.present.drawing.colors import ESTIMATE, NOTHING, Scale
 from app.views.rerun.feed import RerunFeed
-from app.views.rerun.field import FieldDrawing
-from app.views.rerun.sink import Sink
-from app.views.rerun.style import pair_name
-from app.views.viser.status import status_html
+from app.views.rerun.pictures import FieldDrawing
+from app.views.rerun.sink import Sink, pair_name
+from app.views.viser.panel import status_html
 from app.views.viser.view import ViserView
 from app.web.api import status_json
 from config.schema import SceneSection, ViewSection

@@ -10,7 +10,7 @@ from app.twin.twin import load_twin
 from app.views.recording.format import tuning_from_json
 from app.views.recording.reader import read_recording
 from app.views.recording.writer import Recorder
-from app.views.viser.status import status_html
+from app.views.viser.panel import status_html
 from app.web.api import command_from_json, status_json
 from estimators.errors import EstimatorError
 from estimators.fold import Fold

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from app.views.viser import private_viser
+from app.views.viser import guarded_server as private_viser
 from app.web import bounds
 from app.web.bounds import BODY, CONNECTIONS
 from tests.app.scripted import readings, wait_for

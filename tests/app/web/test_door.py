@@ -13,7 +13,7 @@ from websockets.sync.client import connect
 
 from app.live import commands
 from app.live.engine import Engine
-from app.present.drawing.choices import Choice, Choices
+from app.views.viser.stage import Choice, Choices
 from app.web.door import Door
 from app.web.server import PageServer
 from estimators.errors import ConfigError

@@ -11,7 +11,7 @@ import pytest
 from app.cli.fold import read_log
 from app.cli.main import main
 from app.present.drawing import card
-from app.present.drawing.heatmap import ESTIMATE, gradient
+from app.present.drawing.colors import ESTIMATE, gradient
 from app.twin.twin import load_twin
 from app.web.gallery.pictures import picture_file
 from config.loader import find, shipped

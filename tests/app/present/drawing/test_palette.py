@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from app.present.drawing.palette import THEMES, mixed, rgb
+from app.present.drawing.colors import THEMES, mixed, rgb
 
 STYLE = Path("app/web/page/style.css")
 

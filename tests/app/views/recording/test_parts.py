@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-import app.views.recording.disk
+import app.views.recording.rrd_file
 import app.views.recording.writer
 from app.cli.main import main
 from app.live import commands
 from app.live.engine import Engine
 from app.views.recording.format import tuning_from_json
 from app.views.recording.reader import finished, read_recording
-from app.views.recording.split import NEVER, Split, parse_split
+from app.views.recording.rrd_file import NEVER, Split, parse_split
 from app.views.recording.writer import Recorder
 from app.web.api import command_from_json
 from estimators.errors import ConfigError
@@ -267,11 +267,11 @@ def test_a_disk_that_fills_is_warned_of_and_the_recording_closed_in_time(start, 
     engine.submit(commands.Record(path))
     feed(source, engine, 0, 1000)
     assert not any(line.level != "info" for line in engine.notices.since(0))
-    free = app.views.recording.disk.RESERVE + 500_000_000
+    free = app.views.recording.rrd_file.RESERVE + 500_000_000
     wait_for(lambda: any("has room for 500 MB more" in line.text for line in engine.notices.since(0)))
     assert engine.recorder.path == path
     feed(source, engine, 1000, 1400)
-    free = app.views.recording.disk.RESERVE - 1
+    free = app.views.recording.rrd_file.RESERVE - 1
     wait_for(lambda: engine.recorder.failure)
     assert engine.recorder.failure.startswith(f"recording failed: {path}: the disk is nearly full; ")
     texts = [line.text for line in engine.notices.since(0) if line.level != "info"]
@@ -283,13 +283,13 @@ def test_a_disk_that_fills_is_warned_of_and_the_recording_closed_in_time(start, 
 
 
 def test_a_fast_growing_file_is_warned_of_by_its_rate(tmp_path, monkeypatch):
-    now, free = 0.0, app.views.recording.disk.RESERVE + 9 * 10**9
+    now, free = 0.0, app.views.recording.rrd_file.RESERVE + 9 * 10**9
     monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(0, 0, free))
-    disk = app.views.recording.disk.Disk(tmp_path, clock=lambda: now)
+    disk = app.views.recording.rrd_file.Disk(tmp_path, clock=lambda: now)
     assert disk.warning(10**9) is None
-    now = app.views.recording.disk.SETTLED + 40.0
+    now = app.views.recording.rrd_file.SETTLED + 40.0
     assert disk.warning(10**9 + 10**9 // 2) is None  # 5 MB/s fill 9 GB in 1800 s
-    now = app.views.recording.disk.SETTLED + 60.0
+    now = app.views.recording.rrd_file.SETTLED + 60.0
     line = disk.warning(10**9 + 12 * 10**8)  # 10 MB/s in 900 s
     assert line is not None and "9000 MB more, which lasts for about 15 min" in line
     assert disk.warning(10**9 + 13 * 10**8) is None

@@ -19,7 +19,7 @@ from app.views.recording import writer
 from app.views.recording.format import RecordingFile, tuning_from_json
 from app.views.recording.reader import finished, read_recording
 from app.views.recording.writer import Recorder
-from app.views.viser.history import History
+from app.views.viser.scene import History
 from estimators.diagnostics.score import score
 from estimators.errors import SourceError
 from estimators.fold import Fold, fold

@@ -16,11 +16,9 @@ from app.views.recording.writer import Recorder
 from app.views.rerun import feed
 from app.views.rerun.feed import AHEAD, RerunFeed
 from app.views.rerun.layout import blueprint
-from app.views.rerun.pairs import ASIDE, BELOW, PANE, anchors, axis_scales, ellipse_points
+from app.views.rerun.pictures import ASIDE, BELOW, PANE, anchors, axis_scales, ellipse_points
 from app.views.rerun.rows import RerunRows
-from app.views.rerun.sink import CALENDAR
-from app.views.rerun.style import pair_name
-from app.views.rerun.thin import last_of_each_time, thin
+from app.views.rerun.sink import CALENDAR, last_of_each_time, pair_name, thin
 from estimators.log import READING, TRUTH, Events
 from estimators.track import HEALTH_NAMES
 from tests.app.scripted import Replayed, readings, twin, wait_for

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 import viser
 
-from app.present.drawing.heatmap import ESTIMATE, gradient
-from app.present.drawing.palette import LIGHT
-from app.views.viser.battery_scene import HEIGHT, BatteryScene
-from app.views.viser.motor_scene import MotorScene, mesh, sectors
+from app.present.drawing.colors import ESTIMATE, LIGHT, gradient
+from app.views.viser.machine_scenes import HEIGHT, BatteryScene, MotorScene, mesh, sectors
 from app.views.viser.stage import choices_of
 from config.schema import SceneSection, ViewSection
 from estimators.models import MODELS

@@ -5,8 +5,8 @@ import pytest
 
 from app.live.commands import Reset, SetEstimator, SetTuning
 from app.live.engine import Engine
-from app.views.viser.camera import place
-from app.views.viser.private_viser import HEADER
+from app.views.viser.guarded_server import HEADER
+from app.views.viser.scene import place
 from app.views.viser.view import ViserView
 from estimators.log import READING, TRUTH, Events
 from estimators.models import MODELS

@@ -5,9 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from app.present.drawing.geometry import ellipsoid, quaternion, round_step, segments, tick_text
-from app.views.viser.camera import MARGIN, Outlook, place
-from app.views.viser.history import History
+from app.present.drawing.colors import round_step, tick_text
+from app.views.viser.scene import MARGIN, History, Outlook, ellipsoid, place, quaternion, segments
 from app.views.viser.vehicle_scene import where_known, without_jumps
 
 

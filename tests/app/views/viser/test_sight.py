@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import viser
 
-from app.present.drawing.palette import LIGHT
-from app.views.viser.beacons import FADING, Beacons
-from app.views.viser.beams import RECENT, Beams
-from app.views.viser.field_surface_scene import TALL, FieldSurfaceScene
-from app.views.viser.gripper_scene import FINGER, PAD, PART, GripperScene
-from app.views.viser.history import History
+from app.present.drawing.colors import LIGHT
+from app.views.viser.field_scenes import TALL, FieldSurfaceScene
+from app.views.viser.machine_scenes import FINGER, PAD, PART, GripperScene
+from app.views.viser.scene import History
+from app.views.viser.vehicle_parts import FADING, RECENT, Beacons, Beams
 from app.views.viser.vehicle_scene import VehicleScene
 from config.schema import SceneSection
 from estimators.diagnostics.field_pictures import Picture

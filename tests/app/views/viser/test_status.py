@@ -2,7 +2,7 @@
 
 import re
 
-from app.views.viser.status import SIGNS, note_html, status_html
+from app.views.viser.panel import SIGNS, note_html, status_html
 from estimators.models import MODELS
 from estimators.track import DIVERGED, HEALTH_NAMES, SUSPECT
 from tests.app.fake_engine import FakeEngine

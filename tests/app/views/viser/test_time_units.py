@@ -2,7 +2,7 @@
 
 import pytest
 
-from app.views.viser.time_units import unit_for
+from app.views.viser.panel import unit_for
 
 DAY = 86400.0
 

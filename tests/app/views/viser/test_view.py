@@ -16,11 +16,11 @@ import websockets
 from viser import _messages
 
 from app.live.commands import SetEstimator, SetTuning
-from app.present.drawing.palette import DARK, LIGHT
+from app.present.drawing.colors import DARK, LIGHT
 from app.views.viser.coalescer import DRAG_INTERVAL, TYPING_PAUSE
-from app.views.viser.history import History
-from app.views.viser.private_viser import HEADER, addresses, guarded_server
+from app.views.viser.guarded_server import HEADER, addresses, guarded_server
 from app.views.viser.rows import PATIENCE
+from app.views.viser.scene import History
 from app.views.viser.vehicle_scene import VehicleScene
 from app.views.viser.view import RESTED, ViserView
 from config.schema import SceneSection, ViewSection

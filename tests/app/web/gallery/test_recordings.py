@@ -9,8 +9,7 @@ import pytest
 
 from app.cli.main import main
 from app.live.commands import Record
-from app.views.recording.facts import facts_of
-from app.views.recording.reader import read_recording
+from app.views.recording.reader import facts_of, read_recording
 from app.web.gallery.recordings import Recordings
 from estimators.errors import ConfigError, SourceError
 from estimators.track import USED

@@ -31,7 +31,7 @@ def context(browser):
 
 def asked(session):
     """The queries of the browsers' sockets, as Viser's server knows them."""
-    from app.views.viser.private_viser import addresses
+    from app.views.viser.guarded_server import addresses
 
     return sorted(addresses(session.view.server))
 

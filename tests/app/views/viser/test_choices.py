@@ -2,7 +2,7 @@
 
 import pytest
 
-from app.present.drawing.choices import NO_AXIS, Choice, Choices
+from app.views.viser.stage import NO_AXIS, Choice, Choices
 from estimators.errors import ConfigError
 
 STATES = ("a", "b", "c")

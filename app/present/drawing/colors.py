@@ -1,8 +1,12 @@
-"""Pictures of a field: values to colours, a scale with round numbers beside them."""
+"""The colours of the page, for Viser's scenes and Rerun's charts: one meaning each, in light and in dark.
+
+`app/web/page/style.css` has the same under the same names (a test compares them), chosen so that who sees no red or no
+green tells them apart (after Okabe and Ito, 2008).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from typing import NamedTuple
 
 import numpy as np
@@ -11,8 +15,76 @@ from estimators.diagnostics.field_pictures import Picture, plane_shape, reductio
 from estimators.model.field import Field
 from estimators.model.state_space import StateSpaceModel
 
-from .geometry import round_step, tick_text
-from .palette import EITHER
+RGB = tuple[int, int, int]
+
+
+def rgb(color: str) -> RGB:
+    """`#rrggbb` as three numbers from 0 to 255."""
+    return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)
+
+
+def mixed(a: RGB, b: RGB, share: float) -> RGB:
+    """A colour between two: `share` of the second."""
+    x, y, z = (round(p + share * (q - p)) for p, q in zip(a, b, strict=True))
+    return x, y, z
+
+
+@dataclass(frozen=True)
+class Palette:
+    """One theme; `health` is by the names of `HEALTH_NAMES`."""
+
+    ground: RGB
+    panel: RGB
+    ink: RGB
+    faint: RGB
+    rule: RGB
+    grid: RGB
+    estimate: RGB
+    truth: RGB
+    reading: RGB
+    refused: RGB
+    previous: RGB
+    bound: RGB
+    smoothed: RGB
+    health: dict[str, RGB] = field(hash=False)
+
+
+LIGHT = Palette(
+    ground=rgb("#f3f5f8"), panel=rgb("#ffffff"), ink=rgb("#14202f"), faint=rgb("#5b6a7d"), rule=rgb("#d9dfe8"),
+    grid=rgb("#edf0f4"), estimate=rgb("#0b62c4"), truth=rgb("#111827"), reading=rgb("#c47b00"), refused=rgb("#c72a08"),
+    previous=rgb("#808b98"), bound=rgb("#8390a1"), smoothed=rgb("#264c46"),
+    health={
+        "waiting": rgb("#7b8798"), "tracking": rgb("#007d57"), "suspect": rgb("#c08200"), "degraded": rgb("#ab3f00"),
+        "diverged": rgb("#7d1224"), "stale": rgb("#7b8798"),
+    },
+)  # fmt: skip
+
+DARK = Palette(
+    ground=rgb("#0c1118"), panel=rgb("#131a23"), ink=rgb("#e4eaf2"), faint=rgb("#94a3b5"), rule=rgb("#273242"),
+    grid=rgb("#1c2531"), estimate=rgb("#69b1ff"), truth=rgb("#f3f4f6"), reading=rgb("#f2b134"), refused=rgb("#f0592c"),
+    previous=rgb("#6c7788"), bound=rgb("#7d8b9e"), smoothed=rgb("#a8d293"),
+    health={
+        "waiting": rgb("#8a97a8"), "tracking": rgb("#2ecd9b"), "suspect": rgb("#ffe066"), "degraded": rgb("#d98a2d"),
+        "diverged": rgb("#e85a6e"), "stale": rgb("#8a97a8"),
+    },
+)  # fmt: skip
+
+THEMES = {"light": LIGHT, "dark": DARK}
+
+
+def between(a: Palette, b: Palette) -> Palette:
+    """The palette halfway between two."""
+    both = {
+        item.name: mixed(getattr(a, item.name), getattr(b, item.name), 0.5)
+        for item in fields(Palette)
+        if item.name != "health"
+    }
+    return Palette(**both, health={name: mixed(color, b.health[name], 0.5) for name, color in a.health.items()})
+
+
+EITHER = between(LIGHT, DARK)
+"""For files: nobody knows on what ground their viewer draws."""
+
 
 WARM = ("#0b1354", "#3b2e8c", "#7b2f8d", "#b73779", "#e8604c", "#f9a03f", "#fcf3a6")
 """Low to high values of a quantity."""
@@ -181,3 +253,29 @@ def sensor_colors(normalised: np.ndarray) -> np.ndarray:
     colors[(size >= 2.0) & (size < 3.0)] = ODD
     colors[size >= 3.0] = FAR
     return colors
+
+
+def round_step(span: float) -> float:
+    """The smallest of 1, 2, 5 · 10ᵏ that is at least `span`."""
+    exponent = np.floor(np.log10(span))
+    for factor in (1.0, 2.0, 5.0, 10.0):
+        step = factor * 10.0**exponent
+        if step >= span * (1 - 1e-9):
+            return float(step)
+    return float(10.0 ** (exponent + 1))
+
+
+def tick_text(value: float, step: float) -> str:
+    """A tick's number with the decimals that its step needs."""
+    if step < 1e-4 or abs(value) >= 1e6:
+        return f"{value:.4g}"
+    decimals = max(0, int(-np.floor(np.log10(step) + 1e-9)))
+    return f"{value + 0.0:.{decimals}f}"
+
+
+def with_deviation(value: float, deviation: float) -> str:
+    """A value with its deviation, to one decimal or two digits of the deviation, as the page writes them."""
+    if not deviation > 0 or not np.isfinite(deviation):
+        return f"{value:.4g}"
+    decimals = min(8, max(1, int(1 - np.floor(np.log10(deviation)))))
+    return f"{value + 0.0:.{decimals}f} ± {deviation:.{decimals}f}"

@@ -1,0 +1,423 @@
+"""Cells of a battery: filled as high as they are charged, in the colour of their temperature, the doubt as a slab."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import viser
+
+from estimators.log import truth_of
+from estimators.model.state_space import StateSpaceModel
+
+from ...live.outputs import Belief
+from ...present.drawing.colors import ESTIMATE, NOTHING, RGB, Palette, Scale, gradient, mixed, with_deviation
+from .scene import History, Outlook, about_z, segments
+
+HEIGHT, RADIUS, PITCH = 1.4, 0.3, 0.78
+IN_A_ROW = 4
+THINNEST = 0.004
+"""Height of what would else be flat."""
+
+
+class BatteryScene:
+    """The cells side by side, and below them the scale of their temperatures."""
+
+    def __init__(
+        self, api: viser.SceneApi, model: StateSpaceModel, charge: tuple[str, ...], temperature: tuple[str, ...],
+        palette: Palette,
+    ) -> None:  # fmt: skip
+        names = model.state_names
+        self._charge = [names.index(name) for name in charge]
+        self._temperature = [names.index(name) for name in temperature]
+        self.root = api.add_frame("/scene", show_axes=False)
+        flat = {"cast_shadow": False, "receive_shadow": False}
+        columns = min(IN_A_ROW, len(charge))
+        self._feet = np.array([
+            [(k % columns - 0.5 * (columns - 1)) * PITCH, 0.0, -(k // columns) * (HEIGHT + 0.5)]
+            for k in range(len(charge))
+        ])  # fmt: skip
+        self._fills, self._doubts, self._texts = [], [], []
+        for k, foot in enumerate(self._feet):
+            cell = f"/scene/cells/{k}"
+            middle = foot + [0.0, 0.0, 0.5 * HEIGHT]
+            api.add_cylinder(f"{cell}/can", RADIUS + 0.02, HEIGHT, palette.bound, opacity=0.16, position=middle, **flat)
+            self._fills.append(api.add_cylinder(f"{cell}/fill", RADIUS, 1.0, palette.previous, position=middle, **flat))
+            self._doubts.append(
+                api.add_cylinder(f"{cell}/doubt", RADIUS + 0.03, 1.0, palette.estimate, opacity=0.4, position=middle,
+                                 **flat)
+            )  # fmt: skip
+            self._texts.append(
+                api.add_label(f"{cell}/text", " ", position=foot + [0.0, 0.0, HEIGHT + 0.08], anchor="bottom-center",
+                              font_screen_scale=0.85)
+            )  # fmt: skip
+        low = float(self._feet[:, 2].min())
+        self._bar = None
+        if temperature:
+            labels = [f"cell {k + 1}" for k in range(len(temperature))] if len(temperature) > 1 else ["temperature"]
+            unit = model.states[self._temperature[0]].unit
+            self._bar = ScaleBar(api, "/scene/scale", labels, unit, palette, y=0.0, top=low - 0.15)
+            low = self._bar.bottom
+        top, wide = HEIGHT + 0.3, max(1.05, 0.5 * columns * PITCH)
+        middle = np.array([0.0, 0.0, 0.5 * (low + top)])
+        corners = np.array([[x, 0.0, z] for x in (-wide, wide) for z in (low, top)])
+        self.root.position = -middle
+        self.outlook = Outlook(
+            corners - middle, np.array([0.0, -1.0, 0.16]), np.array([0.0, 0.0, 1.0]), float(np.radians(20))
+        )
+
+    def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
+        """Send how full and how warm the cells are now."""
+        if not heavy:
+            return
+        mean, std = belief.mean, np.sqrt(np.maximum(np.diag(belief.cov), 0.0))
+        if self._bar is not None:
+            self._bar.fit(mean[self._temperature], std[self._temperature])
+            for fill, j in zip(self._fills, self._temperature, strict=True):
+                color = self._bar.color(mean[j])
+                if tuple(fill.color) != color:
+                    fill.color = color
+        for k, j in enumerate(self._charge):
+            low, middle, high = (float(np.clip(mean[j] + s * std[j], 0.0, 1.0)) for s in (-2, 0, 2))
+            known = bool(np.isfinite(mean[j]) and np.isfinite(std[j]))
+            self._fills[k].visible = self._doubts[k].visible = known
+            text = f"{100 * mean[j]:.0f} ± {200 * std[j]:.0f} %" if known else "–"
+            if self._texts[k].text != text:
+                self._texts[k].text = text
+            if known:
+                self._stand(self._fills[k], k, 0.0, middle)
+                self._stand(self._doubts[k], k, low, high)
+
+    def _stand(self, handle: viser.CylinderHandle, k: int, low: float, high: float) -> None:
+        """Let a cylinder reach from one share of a cell's height to another."""
+        tall = max(HEIGHT * (high - low), THINNEST)
+        handle.scale = (1.0, 1.0, tall)
+        handle.position = self._feet[k] + [0.0, 0.0, HEIGHT * low + 0.5 * tall]
+
+
+PART, DEEP, TALL = 30.0, 10.0, 12.0
+"""Width of the part, and half of its depth and of its height, mm."""
+
+FINGER, PAD = 7.0, 4.0
+"""Thickness of a finger and of its pad, mm."""
+
+ABOVE, RISE = 34.0, 8.0
+"""Where the fingers end, and the height of what carries them, mm above the part's middle."""
+
+SHARE = 0.25
+"""Part of the way to the estimate that the middle of the view moves in one frame."""
+
+
+class GripperScene:
+    """Across is the finger's way, in mm, from where it begins on the left to the part on the right."""
+
+    def __init__(
+        self, api: viser.SceneApi, model: StateSpaceModel, states: Mapping[str, str], palette: Palette
+    ) -> None:
+        self._surface, self._depth, self._contact = (
+            model.state_names.index(states[name]) for name in ("surface", "depth", "contact")
+        )
+        self._unit = model.states[self._depth].unit
+        self._apart, self._touching = palette.previous, palette.estimate
+        self.root = api.add_frame("/scene", show_axes=False)
+        self.world = api.add_frame("/scene/world", show_axes=False)
+        flat = {"cast_shadow": False, "receive_shadow": False}
+        line, world = {"thickness_units": "screen"}, "/scene/world"
+        nothing = np.zeros((1, 2, 3), np.float32)
+        steel, body = mixed(palette.faint, palette.panel, 0.25), mixed(palette.bound, palette.panel, 0.45)
+        self._part = api.add_box(f"{world}/part", body, (PART, 2 * DEEP, 2 * TALL), **flat)
+        tall = TALL + 2.0 + ABOVE
+        self._fingers = [
+            (
+                api.add_box(f"{world}/fingers/{k}/steel", steel, (FINGER, 1.4 * DEEP, tall), **flat),
+                api.add_box(f"{world}/fingers/{k}/pad", self._apart, (1.0, 1.4 * DEEP, 2 * TALL), **flat),
+            )
+            for k in range(2)
+        ]
+        self._palm = api.add_box(f"{world}/palm", steel, (1.0, 1.4 * DEEP, RISE), **flat)
+        self._doubts = [
+            api.add_box(
+                f"{world}/doubt/{name}", palette.estimate, (1.0, 2.3 * DEEP, 2 * TALL + 2.0), opacity=0.3, **flat
+            )
+            for name in ("surface", "finger")
+        ]
+        self._gap = api.add_line_segments(f"{world}/gap", nothing, palette.ink, thickness=2, **line)
+        self._truth = api.add_line_segments(f"{world}/truth", nothing, palette.truth, thickness=3, **line)
+        self._cloud = api.add_point_cloud(
+            f"{world}/cloud", np.zeros((1, 3), np.float32), palette.estimate, point_size=0.35, point_shape="circle",
+            precision="float32", point_shading="flat", visible=False,
+        )  # fmt: skip
+        text = {"font_screen_scale": 0.9}
+        self._says = api.add_label(f"{world}/says", " ", anchor="bottom-center", **text)
+        self._between = api.add_label(f"{world}/between", " ", anchor="bottom-center", **text)
+        self._where = api.add_label(f"{world}/where", " ", anchor="top-center", **text)
+        # The gripper closes about the part's middle, which is where the view has its own.
+        prior = model.prior_mean
+        self._middle = float(prior[self._surface]) + 0.5 * PART
+        across = 0.5 * PART + abs(float(prior[self._depth])) + PAD + FINGER + 8.0
+        low, high = -2.0 * TALL, ABOVE + RISE + 8.0
+        self._height = 0.5 * (low + high)
+        self._look_at(self._middle)
+        corners = np.array([[x, y, z] for x in (-across, across) for y in (-DEEP, DEEP) for z in (low, high)])
+        self.outlook = Outlook(
+            corners - [0.0, 0.0, self._height], np.array([-0.2, -1.0, 0.22]), np.array([0.0, 0.0, 1.0]),
+            float(np.radians(20)),
+        )  # fmt: skip
+
+    def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
+        """Send where finger and part are and whether they touch; particles and truth only if `heavy`."""
+        pick = [self._surface, self._depth]
+        surface, depth = belief.mean[pick]
+        contact = float(belief.mean[self._contact])
+        known = bool(np.isfinite([surface, depth, contact]).all())
+        for handle in (self._part, self._palm, *self._doubts, *(one for pair in self._fingers for one in pair)):
+            handle.visible = known
+        for label in (self._says, self._between, self._where):
+            label.visible = known
+        if not known:
+            self._gap.visible = self._cloud.visible = self._truth.visible = False
+            return
+        contact = float(np.clip(contact, 0.0, 1.0))
+        cov = belief.cov[np.ix_(pick, pick)]
+        spread = 2 * np.sqrt(np.maximum([cov[0, 0], cov.sum(), cov[1, 1]], 0.0))
+        self._look_at(self._middle + SHARE * (float(surface) + 0.5 * PART - self._middle))
+        self._part.position = (surface + 0.5 * PART, 0.0, 0.0)
+        self._move_fingers(surface, depth, contact)
+        for handle, at, around in zip(self._doubts, (surface, surface + depth), spread, strict=False):
+            handle.position = (at, 0.0, 0.0)
+            handle.scale = (max(2 * float(around), 0.02), 1.0, 1.0)
+        self._measure(surface, depth, contact, spread)
+        if heavy:
+            self._draw_cloud(belief.points)
+            self._draw_truth(history)
+
+    def _move_fingers(self, surface: float, depth: float, contact: float) -> None:
+        """The finger and its mirror image on the part's far side; a pad gives way by as much as the finger is deep."""
+        face = surface + depth - contact * max(depth, 0.0)
+        back = surface + depth - PAD
+        color = mixed(self._apart, self._touching, contact)
+        tall = TALL + 2.0 + ABOVE
+        for (steel, pad), mirrored in zip(self._fingers, (False, True), strict=True):
+            ends = [2 * surface + PART - x if mirrored else x for x in (back - FINGER, back, face)]
+            steel.position = (0.5 * (ends[0] + ends[1]), 0.0, ABOVE - 0.5 * tall)
+            pad.position = (0.5 * (ends[1] + ends[2]), 0.0, 0.0)
+            pad.scale = (max(abs(ends[2] - ends[1]), 0.1), 1.0, 1.0)
+            if tuple(pad.color) != color:
+                pad.color = color
+        self._palm.position = (surface + 0.5 * PART, 0.0, ABOVE + 0.5 * RISE)
+        self._palm.scale = (PART + 2 * (surface - back + FINGER), 1.0, 1.0)
+
+    def _measure(self, surface: float, depth: float, contact: float, spread: np.ndarray) -> None:
+        """What is between finger and part, as a measure line, and in words."""
+        height = TALL + 4.0
+        ends = np.array([surface + depth, surface])
+        self._gap.visible = True
+        self._gap.points = np.array(
+            [[[ends[0], -DEEP, height], [ends[1], -DEEP, height]]]
+            + [[[x, -DEEP, height - 2.0], [x, -DEEP, height + 2.0]] for x in ends],
+            np.float32,
+        )
+        middle, unit = surface + 0.5 * PART, self._unit
+        texts = (
+            (self._between, f"depth {with_deviation(depth, spread[2])} {unit}", (min(ends), height + 2.5)),
+            (self._says, f"contact {100 * contact:.0f} %", (middle, ABOVE + RISE + 2.0)),
+            (self._where, f"part at {with_deviation(surface, spread[0])} {unit}", (middle, -TALL - 5.0)),
+        )
+        for label, text, (x, z) in texts:
+            if label.text != text:
+                label.text = text
+            label.position = (x, -DEEP, z)
+
+    def _draw_cloud(self, points: np.ndarray) -> None:
+        """Where the particles have the part begin."""
+        at = points[:, self._surface] if len(points) else np.zeros(0)
+        at = at[np.isfinite(at)]
+        self._cloud.visible = bool(at.size)
+        if at.size:
+            rows = np.linspace(-DEEP, DEEP, at.size)
+            self._cloud.points = np.column_stack((at, rows, np.full(at.size, -TALL - 2.0))).astype(np.float32)
+
+    def _draw_truth(self, history: History) -> None:
+        """Where the part begins and the finger is, in truth."""
+        events = history.events()
+        told = [truth_of(events, j)[1] for j in (self._surface, self._depth)]
+        surface, depth = (values[-1] if values.size else np.nan for values in told)
+        lines = [[x, -1.15 * DEEP, z] for x in (surface, surface + depth) for z in (-TALL - 1.0, TALL + 1.0)]
+        self._truth.visible = bool(np.isfinite(surface))
+        self._truth.points = segments(np.insert(np.array(lines), 2, np.nan, axis=0))
+
+    def _look_at(self, middle: float) -> None:
+        """Move the world so that a place on the finger's way is in the middle of the view."""
+        self._middle = middle
+        self.world.position = (-middle, 0.0, -self._height)
+
+
+SLOTS, MAGNETS = 12, 8
+CUT = 90.0
+"""Degrees that are cut out of what stands still, up and to the right."""
+
+TURNED = 0.3
+"""Radians by which its axis is turned away from who looks."""
+
+SIGMAS = (-2.0, 0.0, 2.0)
+
+Sector = tuple[float, float, float, float, float]
+"""Inner and outer radius, from which angle to which in degrees, half the length."""
+
+
+def sectors(part: str) -> list[Sector]:
+    """The slices of a part of the motor, whose outer radius is 1 and whose axis is y."""
+    pitch, pole = 360.0 / SLOTS, 360.0 / MAGNETS
+    if part == "yoke":
+        return [(0.78, 1.0, angle, angle + 10.0, 0.6) for angle in np.arange(CUT, 360.0, 10.0)]
+    if part == "tooth":
+        middles = pitch * np.arange(SLOTS) + 0.5 * pitch
+        return [(0.52, 0.78, a - 6.0, a + 6.0, 0.6) for a in middles if a > CUT]
+    if part == "winding":
+        # Coils are longer than the iron: their ends stand out.
+        middles = pitch * np.arange(SLOTS + 1)
+        return [(0.55, 0.76, max(CUT, a - 8.0), min(360.0, a + 8.0), 0.78) for a in middles if a >= CUT]
+    return [(0.36, 0.47, pole * k + 4.0, pole * (k + 1) - 4.0, 0.6) for k in range(MAGNETS)]
+
+
+def mesh(parts: list[Sector]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) and triangles (m, 3) of some sectors of a ring about the y axis."""
+    vertices, faces, count = [], [], 0
+    for inner, outer, start, end, half in parts:
+        angles = np.radians(np.linspace(start, end, max(2, int((end - start) / 4) + 1)))
+        around = np.stack((np.cos(angles), np.zeros(angles.size), np.sin(angles)), axis=1)
+        n, along = angles.size, np.array([0.0, half, 0.0])
+        # Rings of points: inner front, outer front, outer back, inner back.
+        vertices += [inner * around - along, outer * around - along, outer * around + along, inner * around + along]
+        k = np.arange(n - 1)
+        for ring in range(4):
+            a, b = count + ring * n + k, count + (ring + 1) % 4 * n + k
+            faces += [np.stack((a, b, b + 1), axis=1), np.stack((a, b + 1, a + 1), axis=1)]
+        for side in (0, n - 1):
+            corners = count + np.arange(4) * n + side
+            faces.append(corners[[[0, 1, 2], [0, 2, 3]]])
+        count += 4 * n
+    return np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32)
+
+
+class MotorScene:
+    """The motor, and below it the scale of its colours with each part's temperature."""
+
+    def __init__(self, api: viser.SceneApi, model: StateSpaceModel, parts: Mapping[str, str], palette: Palette) -> None:
+        self._states = [model.state_names.index(name) for name in parts.values()]
+        self.root = api.add_frame("/scene", show_axes=False)
+        api.add_frame("/scene/motor", show_axes=False, wxyz=about_z(TURNED))
+        flat = {"cast_shadow": False, "receive_shadow": False, "side": "double", "flat_shading": True}
+        iron = mixed(palette.faint, palette.panel, 0.35)
+        for name, solid in {
+            "shaft": (0.0, 0.13, 0.0, 360.0, 1.0),
+            "rotor": (0.13, 0.36, 0.0, 360.0, 0.6),
+        }.items():
+            api.add_mesh_simple(f"/scene/motor/{name}", *mesh([solid]), color=iron, **flat)
+        self._parts: list[list[viser.MeshHandle]] = []
+        for part in ("yoke", "tooth", "winding", "magnet"):
+            slices = sectors(part)
+            if part not in parts:
+                api.add_mesh_simple(f"/scene/motor/{part}", *mesh(slices), color=iron, **flat)
+        for part in parts:
+            slices = sectors(part)
+            self._parts.append([
+                api.add_mesh_simple(f"/scene/motor/{part}/{k}", *mesh(slices[k :: len(SIGMAS)]), color=iron, **flat)
+                for k in range(len(SIGMAS))
+            ])  # fmt: skip
+        unit = model.states[self._states[0]].unit
+        self._bar = ScaleBar(api, "/scene/scale", list(parts), unit, palette, y=-0.8, top=-1.15)
+        corners = np.array([[x, y, z] for x in (-1.05, 1.05) for y in (-0.8, 0.8) for z in (self._bar.bottom, 1.02)])
+        middle = np.array([0.0, 0.0, 0.5 * (self._bar.bottom + 1.02)])
+        self.root.position = -middle
+        self.outlook = Outlook(
+            corners - middle, np.array([0.0, -1.0, 0.28]), np.array([0.0, 0.0, 1.0]), float(np.radians(20))
+        )
+
+    def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
+        """Send the colours of now."""
+        if not heavy:
+            return
+        mean = belief.mean[self._states]
+        std = np.sqrt(np.maximum(belief.cov[self._states, self._states], 0.0))
+        self._bar.fit(mean, std)
+        for handles, at, spread in zip(self._parts, mean, std, strict=True):
+            for handle, sigmas in zip(handles, SIGMAS, strict=True):
+                color = self._bar.color(at + sigmas * spread)
+                if tuple(handle.color) != color:
+                    handle.color = color
+
+
+TICKS = 9
+ROW = 0.26
+"""Height of a quantity's line and its text."""
+
+
+class ScaleBar:
+    """Stands upright, x from -1 to 1, its top at z = `top`, facing who looks north."""
+
+    def __init__(
+        self, api: viser.SceneApi, name: str, labels: Sequence[str], unit: str, theme: Palette, *, y: float, top: float
+    ) -> None:
+        self._labels, self._unit, self._y, self._top = labels, unit, y, top
+        self._scale, self._colors = Scale(ESTIMATE), gradient(ESTIMATE.colors)
+        strip = np.repeat(self._colors[:NOTHING][None], 8, axis=0)
+        # An image lies in the plane of x and y, its top at -y: up it goes by a right angle about x.
+        half = float(np.sqrt(0.5))
+        api.add_image(
+            f"{name}/strip", strip, 2.0, 0.09, format="png", wxyz=(half, -half, 0.0, 0.0),
+            position=(0.0, y, top - 0.05), cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+        self._ticks = [
+            api.add_label(f"{name}/ticks/{k}", " ", anchor="top-center", font_screen_scale=0.75, visible=False)
+            for k in range(TICKS)
+        ]
+        line = {"thickness_units": "screen"}
+        nothing = np.zeros((1, 2, 3), np.float32)
+        self._bands = api.add_line_segments(f"{name}/bands", nothing, theme.estimate, thickness=4, **line)
+        self._means = api.add_line_segments(f"{name}/means", nothing, theme.ink, thickness=3, **line)
+        self._texts = [
+            api.add_label(f"{name}/text/{k}", label, position=(-1.0, y, self._row(k) + 0.05), anchor="bottom-left",
+                          font_screen_scale=0.85)
+            for k, label in enumerate(labels)
+        ]  # fmt: skip
+        self.bottom = self._row(len(labels) - 1) - 0.05
+
+    def fit(self, mean: np.ndarray, std: np.ndarray) -> None:
+        """Show these quantities; both (k,), NaN where one is not known."""
+        self._scale.fit(np.concatenate((mean - 2 * std, mean + 2 * std)))
+        for k, (label, place) in enumerate(zip(self._labels, zip(mean, std, strict=True), strict=True)):
+            at, spread = place
+            known = f"{label}  {with_deviation(at, 2 * spread)} {self._unit}"
+            text = known if np.isfinite(at + spread) else f"{label}  –"
+            if self._texts[k].text != text:
+                self._texts[k].text = text
+        ticks = self._scale.ticks()
+        for label, tick in zip(self._ticks, [*ticks, *[None] * TICKS], strict=False):
+            if label.visible != (tick is not None):
+                label.visible = tick is not None
+            if tick is not None and label.text != tick[1]:
+                label.text = tick[1]
+            if tick is not None:
+                label.position = (2 * tick[0] - 1, self._y, self._top - 0.1)
+        rows = np.array([self._row(k) for k in range(len(mean))])
+        self._bands.points = self._lines(mean - 2 * std, mean + 2 * std, rows, rows)
+        self._means.points = self._lines(mean, mean, rows - 0.04, rows + 0.04)
+
+    def color(self, value: float) -> RGB:
+        """The colour of a value; grey if it is not known."""
+        red, green, blue = self._colors[self._scale.indices(np.array([value]))[0]]
+        return int(red), int(green), int(blue)
+
+    def _row(self, k: int) -> float:
+        return self._top - 0.34 - ROW * (k + 1) + 0.06
+
+    def _lines(self, start: np.ndarray, end: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Lines in the plane of the bar between values, at heights."""
+        width = self._scale.high - self._scale.low
+        gap = np.full(3, np.nan)
+        points = []
+        for a, b, c, d in zip(start, end, low, high, strict=True):
+            x = np.clip((np.array([a, b]) - self._scale.low) / width, 0.0, 1.0) * 2 - 1
+            points += [[x[0], self._y, c], [x[1], self._y, d], gap]
+        return segments(np.array(points))

@@ -1,0 +1,284 @@
+"""Shapes and numbers for the scene: ellipsoids of a covariance, polylines, round ticks."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import viser
+
+from estimators.log import Events
+
+from ...live.outputs import Pull
+
+
+def ellipsoid(cov: np.ndarray, sigmas: float = 2.0) -> tuple[np.ndarray, tuple[float, float, float, float]]:
+    """The ellipsoid x' cov⁻¹ x = sigmas² as a unit sphere, scaled and turned.
+
+    Args:
+        cov: Symmetric positive semidefinite, shape (3, 3).
+        sigmas: Mahalanobis distance of its surface.
+
+    Returns:
+        Lengths of the half axes (3,), and the unit quaternion (w, x, y, z) that turns the axes into place.
+    """
+    values, vectors = np.linalg.eigh(cov)
+    if np.linalg.det(vectors) < 0:
+        vectors[:, 0] = -vectors[:, 0]
+    return sigmas * np.sqrt(np.maximum(values, 0.0)), quaternion(vectors)
+
+
+def quaternion(rotation: np.ndarray) -> tuple[float, float, float, float]:
+    """The unit quaternion (w, x, y, z) of a rotation matrix, from its largest component, which is never near zero.
+
+    Source: Shepperd (1978), doi:10.2514/3.55767b.
+    """
+    m = rotation
+    trace = np.trace(m)
+    k = int(np.argmax([trace, m[0, 0], m[1, 1], m[2, 2]]))
+    if k == 0:
+        q = np.array([1 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
+    else:
+        a, b, c = (k - 1, k % 3, (k + 1) % 3)
+        q = np.zeros(4)
+        q[0] = m[c, b] - m[b, c]
+        q[1 + a] = 1 + m[a, a] - m[b, b] - m[c, c]
+        q[1 + b] = m[a, b] + m[b, a]
+        q[1 + c] = m[a, c] + m[c, a]
+    w, x, y, z = q / np.linalg.norm(q)
+    return float(w), float(x), float(y), float(z)
+
+
+def about_z(angle: float) -> tuple[float, float, float, float]:
+    """The quaternion of a turn to the left about the vertical, in radians."""
+    return float(np.cos(angle / 2)), 0.0, 0.0, float(np.sin(angle / 2))
+
+
+def segments(points: np.ndarray) -> np.ndarray:
+    """A polyline (n, 3) as segments (n - 1, 2, 3); the gaps at rows that are not finite stay open."""
+    pairs = np.stack((points[:-1], points[1:]), axis=1) if len(points) > 1 else np.zeros((0, 2, 3))
+    pairs = pairs[np.isfinite(pairs).all(axis=(1, 2))]
+    # Viser draws nothing sensible of an empty array; a segment without length is invisible.
+    return pairs.astype(np.float32) if len(pairs) else np.zeros((1, 2, 3), np.float32)
+
+
+def disc(sides: int = 64) -> tuple[np.ndarray, np.ndarray]:
+    """A flat disc of radius 1 in the plane z = 0: vertices and triangles."""
+    angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)
+    rim = np.stack((np.cos(angle), np.sin(angle), np.zeros(sides)), axis=1)
+    k = np.arange(sides)
+    faces = np.stack((np.full(sides, sides), k, (k + 1) % sides), axis=1)
+    return np.vstack((rim, np.zeros(3))).astype(np.float32), faces.astype(np.uint32)
+
+
+def circle(sides: int = 64) -> np.ndarray:
+    """The rim of that disc as segments (sides, 2, 3)."""
+    angle = np.linspace(0, 2 * np.pi, sides + 1)
+    return segments(np.stack((np.cos(angle), np.sin(angle), np.zeros(sides + 1)), axis=1))
+
+
+_EVENTS = ("t", "kind", "channel", "value")
+_COLUMNS = (*_EVENTS, "mean", "std", "nis", "nis_mean", "nis_low", "nis_high", "verdict")
+
+
+class History:
+    """A sliding copy of the track: the last `span` nanoseconds, and never more than `2 * limit` rows.
+
+    Row i of the arrays is event `base + i` of the log. Rows that a late reading or another revision rewrites are
+    simply pulled again, and overwrite what is here from there on.
+    """
+
+    def __init__(self, nx: int, width: int, limit: int = 32_768) -> None:
+        self.limit = limit
+        self.span: int | None = None
+        self.base = 0
+        self.n = 0
+        shapes = {"value": (width,), "mean": (nx,), "std": (nx,)}
+        kinds = {"t": np.int64, "kind": np.int8, "channel": np.int32, "verdict": np.int8}
+        # Filled, not empty: the pages are paid for now, and memory stays flat.
+        self._columns = {
+            name: np.full((2 * limit, *shapes.get(name, ())), 0, kinds.get(name, np.float64)) for name in _COLUMNS
+        }
+
+    def column(self, name: str) -> np.ndarray:
+        """The valid rows of one column, as a view."""
+        return self._columns[name][: self.n]
+
+    def events(self, rows: slice = slice(None)) -> Events:
+        """Some of the valid rows as events, as views; each as if it had arrived when it was measured."""
+        t, kind, channel, value = (self.column(name)[rows] for name in ("t", "kind", "channel", "value"))
+        return Events(t, t, kind, channel, value)
+
+    def settled(self, name: str, rows: int) -> np.ndarray:
+        """The newest rows of a column, only the last one of each time: what all sensors together made of it."""
+        t = self.column("t")[-4 * rows :]
+        last = np.append(t[1:] != t[:-1], [True] * bool(t.size))
+        return self.column(name)[-4 * rows :][last.astype(bool)][-rows:]
+
+    def clear(self) -> None:
+        """Forget all rows."""
+        self.base, self.n = 0, 0
+
+    def take(self, pull: Pull) -> int:
+        """Write a pull of at most `limit` rows into the arrays.
+
+        Returns:
+            The first row that changed; all after it did too.
+        """
+        count = len(pull.events)
+        if pull.fresh or not self.n or not self.base <= pull.first <= self.base + self.n:
+            self.base, self.n = pull.first, 0
+        if not count:
+            return self.n
+        start = pull.first - self.base
+        if start + count > 2 * self.limit:
+            start -= self._drop(start - self.limit)
+        for name, column in self._columns.items():
+            batch = getattr(pull.events if name in _EVENTS else pull.track, name)
+            # Pictures have no use for the variances that readings bring, in columns after the values.
+            column[start : start + count] = batch[:, : column.shape[1]] if column.ndim > 1 else batch
+        self.n = start + count
+        return start
+
+    def trim(self) -> int:
+        """Drop what is older than the span, once that is a third of what is here.
+
+        Returns:
+            How many rows went, by which all row numbers fall.
+        """
+        if self.span is None or not self.n:
+            return 0
+        drop = int(np.searchsorted(self.column("t"), self._columns["t"][self.n - 1] - self.span))
+        return self._drop(drop) if drop * 3 >= self.n else 0
+
+    def _drop(self, rows: int) -> int:
+        for column in self._columns.values():
+            column[: self.n - rows] = column[rows : self.n].copy()
+        self.base += rows
+        self.n -= rows
+        return rows
+
+
+MARGIN = 0.94
+"""Part of the view that is filled by what is to be seen."""
+
+WORTH = 0.75
+"""A scene is turned by a right angle if it then can be seen from that share of the distance."""
+
+FAR = 20_000.0
+"""Up to where a camera sees; a road may be long."""
+
+SAME = 0.02
+"""Relative change of a pane's aspect from which on it is another pane."""
+
+
+class Outlook(NamedTuple):
+    """What a camera is to see.
+
+    points: What must be in the view, about the origin, shape (n, 3).
+    direction: From the origin to the camera, shape (3,).
+    up: What is up on the screen, shape (3,), not along the direction.
+    fov: Angle from top to bottom, radians.
+    turns: Whether the scene may be seen from its other side, a right angle about z to the right.
+    """
+
+    points: np.ndarray
+    direction: np.ndarray
+    up: np.ndarray
+    fov: float
+    turns: bool = False
+
+
+def place(outlook: Outlook, aspect: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where a camera stands that looks at the origin, and its up: both (3,).
+
+    Args:
+        outlook: What it is to see.
+        aspect: Width of the pane over its height.
+    """
+    straight = _distance(outlook, aspect)
+    if outlook.turns:
+        turned = outlook._replace(direction=_turned(outlook.direction), up=_turned(outlook.up))
+        distance = _distance(turned, aspect)
+        if distance < WORTH * straight:
+            return _unit(turned.direction) * distance, turned.up
+    return _unit(outlook.direction) * straight, outlook.up
+
+
+def _distance(outlook: Outlook, aspect: float) -> float:
+    """How far away a camera must stand to see the points, with a margin.
+
+    A point c is seen if |c · r| <= tan(h/2) (d + c · f), with f forward, r to the right and h the angle across; so for
+    what is up, with the angle from top to bottom.
+    """
+    forward = -_unit(outlook.direction)
+    right = _unit(np.cross(forward, outlook.up))
+    upright = np.tan(outlook.fov / 2)
+    tangents = np.array([upright * max(aspect, 0.05), upright])
+    aside = np.abs(outlook.points @ np.stack((right, np.cross(right, forward)), axis=1)) / (MARGIN * tangents)
+    return float((aside.max(axis=1) - outlook.points @ forward).max())
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def _turned(vector: np.ndarray) -> np.ndarray:
+    """A right angle to the right about z: what was north on the screen is to the left, east is up."""
+    return np.array([vector[1], -vector[0], vector[2]])
+
+
+class Cameras:
+    """Gives each browser's camera its place: when it comes, when its pane changes its shape, and for another scene.
+
+    Otherwise a camera is its user's, who turns it freely.
+    """
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._outlook: Outlook | None = None
+        self._first: np.ndarray | None = None
+        self._aspects: dict[int, float] = {}
+
+        async def connected(client: viser.ClientHandle) -> None:
+            client.camera.on_update(updated)
+            self._fit(client.camera)
+
+        async def updated(camera: viser.CameraHandle) -> None:
+            known = self._aspects.get(camera.client.client_id)
+            # A browser may come to where all of them begin only after it got a place of its own.
+            begins = self._first is not None and np.allclose(camera.position, self._first, rtol=1e-4)
+            if known is None or abs(camera.aspect - known) > SAME * known or begins:
+                self._fit(camera)
+
+        async def gone(client: viser.ClientHandle) -> None:
+            self._aspects.pop(client.client_id, None)
+
+        server.on_client_connect(connected)
+        server.on_client_disconnect(gone)
+
+    def show(self, outlook: Outlook) -> None:
+        """Look at another scene."""
+        if self._outlook is None:
+            # Once only: it would move the cameras of browsers that are there.
+            camera = self._server.initial_camera
+            self._first, camera.up = place(outlook, 1.0)
+            camera.position = self._first
+            camera.look_at, camera.fov, camera.far = np.zeros(3), outlook.fov, FAR
+        self._outlook = outlook
+        for client in self._server.get_clients().values():
+            self._fit(client.camera)
+
+    def _fit(self, camera: viser.CameraHandle) -> None:
+        self._aspects[camera.client.client_id] = camera.aspect
+        if self._outlook is None:
+            return
+        position, up = place(self._outlook, camera.aspect)
+        with camera.client.atomic():
+            camera.fov = self._outlook.fov
+            camera.position = position
+            camera.look_at = np.zeros(3)
+            # Viser sends no direction that it takes to be the browser's already, and it takes one for it that a browser
+            # which came to where all of them begin has lost again: so another one first.
+            camera.up_direction = np.roll(up, 1)
+            camera.up_direction = up
