@@ -73,8 +73,8 @@ class Intake:
     def _told(self, passed: Passed) -> Passed:
         for refused in passed.refused:
             self._report(WRONG_TIME, self._refusal(refused))
-        for moved in passed.moved:
-            self._report(CLOCK_MOVED, self._move(moved))
+        for by in dict.fromkeys(moved.by for moved in passed.moved):
+            self._report(CLOCK_MOVED, self._move([moved for moved in passed.moved if moved.by == by]))
         while self._planned and len(passed.events) and self._planned[0].at <= passed.events.t.max():
             passed = self._maintain(passed, self._planned.pop(0))
         return passed
@@ -99,9 +99,13 @@ class Intake:
             "the newest, and what came next does not agree; refused"
         )
 
-    def _move(self, moved: Moved) -> str:
-        by = f"{abs(moved.by) * 1e-9:.6g} s {'ahead' if moved.by > 0 else 'back'}"
+    def _move(self, moved: Sequence[Moved]) -> str:
+        """Return the line for channels whose clock made one step; all of one source share its clock."""
+        by, begun = moved[0].by * 1e-9, min(item.t for item in moved) * 1e-9
+        names = [self._named(item.kind, item.channel) for item in moved]
+        named = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+        whose, where = "its" if len(names) == 1 else "their", "ahead" if by > 0 else "back"
         return (
-            f"{self._named(moved.kind, moved.channel)}: its clock was set {by} at {moved.t * 1e-9:.9g} s; times from "
-            "there on are corrected by it (if the rows are out of order, sort them by time)"
+            f"{named}: {whose} clock was set {abs(by):.6g} s {where} at {begun:.9g} s; times from there on are "
+            "corrected by it (if the rows are out of order, sort them by time)"
         )

@@ -243,7 +243,10 @@ def as_text(
         *((f"at {decision.time:.1f} s", decision.text) for decision in fold.decisions[-DECISIONS:]),
         (
             "health at the end",
-            f"{HEALTH_NAMES[int(track.health[-1])]}{' in what was not dropped' if dropped(counts, fold) else ''}",
+            # The track has no rows of measurements that never reached the log, so its health cannot show them.
+            f"degraded: {lost[0].size:.0%} of the measurements were dropped"
+            if (lost := dropped(counts, fold))
+            else HEALTH_NAMES[int(track.health[-1])],
         ),
         ("time per event", f"{1e6 * seconds:.2f} µs"),
     ]

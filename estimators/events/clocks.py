@@ -43,6 +43,7 @@ from .clock_expected import (
     LAST,
     LIVE,
     OFFSET,
+    PERIODS,
     SECOND,
     SEEN,
     STEPS,
@@ -53,6 +54,9 @@ from .clock_work import Moved, Passed, Refused, Run, Work, plain_events
 
 SETTLED = 2 * SECOND
 """Of the source's own time for which they must agree at least."""
+
+ZONE = 900 * SECOND
+"""Time zones, and daylight saving time, differ by a multiple of 15 minutes."""
 
 MOST, MOST_LIVE = 1 << 17, 4096
 """Events that are held of one channel, without and with known arrivals; more that never settle are no clock."""
@@ -113,7 +117,8 @@ class ClockGuard:
             if row in self._runs:
                 run = self._runs[row]
                 first, last = (int(self._state[self._everything, k]) for k in (FIRST, LAST))
-                if run.ahead and (len(run.at) > 1 or run.t[0] - last <= last - first):
+                lone = len(run.at) == 1 and run.t[0] - last > last - first
+                if not lone if run.ahead else not run.live and self._shows_a_step(run, row, ended=True):
                     self._anchor(work, row)
                 else:
                     self._dissolve(work, row)
@@ -179,7 +184,7 @@ class ClockGuard:
             self._state[row, HOLDING] = 1
         for k in (*rest, i):
             run.add(k, int(work.t[k]), int(work.arrival[k]))
-        if len(run.at) >= ENOUGH and run.span >= self._settled and self._overlaps(run, row):
+        if self._shows_a_step(run, row):
             self._anchor(work, row)
 
     def _is_live(self, work: Work, i: int) -> bool:
@@ -213,12 +218,48 @@ class ClockGuard:
         reach = int(self._reach(self._state, work.rows[i], self._horizon, False))
         return run.ahead or reach < 0 or t <= run.t[-1] + reach
 
-    def _overlaps(self, run: Run, row: int) -> bool:
-        """Whether those that are held back reach into what was measured already, if only that tells of a clock.
+    def _shows_a_step(self, run: Run, row: int, ended: bool = False) -> bool:
+        """Return whether held events agree for long enough, and show a step of their clock.
 
-        Without arrivals a block that ends where the channel begins is one of files in a wrong order.
+        Events of a table that went back may also be files in the wrong order. They show a step if they reach into what
+        was measured before, if another channel's clock made the same step, or if the step is a change of time zone or
+        daylight saving time. Files of whole quarter-hours in the wrong order look like that too; those end where the
+        channel begins, which is known once the source has `ended`.
         """
-        return run.ahead or run.live or run.highest > self._state[row, FIRST] + self._horizon
+        if len(run.at) < ENOUGH or run.span < self._settled:
+            return False
+        begin = int(self._state[row, FIRST])
+        if run.ahead or run.live or run.highest > begin + self._horizon:
+            return True
+        step = self._step_back(run, row)
+        if any(abs(abs(known) - step) <= self._agree for known in self._steps):
+            return True
+        if step % ZONE:
+            return False
+        near = self._precision(row)
+        if ended:
+            return begin - run.highest > self._horizon + PERIODS * near
+        return abs(begin - run.t[0] - self._zone(begin - run.t[0])) > near
+
+    def _step_back(self, run: Run, row: int) -> int:
+        """Return the step (ns) by which a table's clock went back if its channel went on at its own pace.
+
+        The exact change of a time zone where it is near one: irregular samples do not tell their pace exactly.
+        """
+        step = int(self._state[row, LAST]) + self._period(row) - run.t[0]
+        near = self._zone(step)
+        return near if near and abs(near - step) <= self._precision(row) else step
+
+    def _period(self, row: int) -> int:
+        return int(self._state[row, TOTAL] // max(1, self._state[row, STEPS]))
+
+    def _precision(self, row: int) -> int:
+        """Return how exactly (ns) the times of a channel show a step of its clock."""
+        return min(max(self._agree, self._period(row)), ZONE // 15)
+
+    def _zone(self, step: int) -> int:
+        """Return the nearest multiple of `ZONE`."""
+        return (step + ZONE // 2) // ZONE * ZONE
 
     def _can_be_set_back(self, work: Work, i: int) -> bool:
         """Whether a time that went back may be a clock's, and not a block of late readings, or files in a wrong order.
@@ -241,7 +282,7 @@ class ClockGuard:
             known = row if state[SEEN] else self._everything
             step = int(self._state[known, OFFSET]) - run.top
         elif not run.ahead:
-            step = int(state[LAST] + state[TOTAL] // max(1, state[STEPS])) - run.t[0]
+            step = self._step_back(run, row)
         elif now > run.begin:
             # The others went on meanwhile, so this was no gap.
             step = run.begin - run.t[0]

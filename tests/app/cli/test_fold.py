@@ -52,6 +52,31 @@ def test_true_states_have_columns_of_their_own(tmp_path: Path) -> None:
     np.testing.assert_array_equal(table["value_1"].to_numpy(), log.events.value[:, 1])
 
 
+DROPS = pytest.mark.parametrize(("back", "dropped_rows"), [(3600.0, 0), (1234.0, 100)])
+
+
+@DROPS
+def test_a_clock_that_steps_back_is_bridged_or_named_and_never_called_tracking(
+    tmp_path: Path, capsys: pytest.CaptureFixture, back: float, dropped_rows: int
+) -> None:
+    """One line names it. Daylight saving time is bridged; any other step before the first row may be files reversed."""
+    y = 40.0 + np.random.default_rng(5).normal(0, 2, 200)
+    rows = [f"{k - back * (k >= 100)},{value}\n" for k, value in enumerate(y)]
+    (tmp_path / "drive.csv").write_text("t,y\n" + "".join(rows))
+    (tmp_path / "drive.yaml").write_text(DRIVE.replace(DRIVE[DRIVE.index("  truth") :], ""))
+    assert fold_twin(Fold(str(tmp_path / "drive.yaml"))) == 0
+    said = capsys.readouterr()
+    health = re.search(r"health at the end +(.*)", said.out)
+    assert health is not None and re.search(r"readings +(\d+)", said.out)[1] == str(200 - dropped_rows)
+    if dropped_rows:
+        assert "degraded" in health[1] and "50%" in health[1] and "tracking" not in health[1]
+        assert re.search(r"drive.csv:102: t is 1233 s before .* sort the rows", said.err)
+        return
+    assert health[1] == "tracking"
+    (line,) = [line for line in said.err.splitlines() if "clock was set" in line]
+    assert "winding" in line and "3600 s back" in line
+
+
 def stuck_drive(tmp_path: Path) -> Path:
     """200 readings, one a second, of which the last 100 are equal."""
     y = 40.0 + np.random.default_rng(5).normal(0, 2, 200)

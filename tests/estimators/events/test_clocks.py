@@ -110,6 +110,28 @@ def test_a_table_whose_clock_is_set_back_before_its_first_time_goes_on_once_it_o
     assert [move.by for move in made.moved] == [-round(back * SECOND)] and made.stale == 0
 
 
+@pytest.mark.parametrize("after", [300, 1000])
+@pytest.mark.parametrize("back", [900.0, HOUR, 5.5 * HOUR, 24 * HOUR])
+def test_a_table_that_changes_its_time_zone_before_it_overlaps_goes_on(after, back):
+    """The step is exact, though the samples are irregular; a slow channel follows the others."""
+    t = T + np.random.default_rng(6).uniform(0.0, 0.6, T.size)
+    slow = np.r_[np.arange(0.0, 2000.0, 60.0) + 0.5]
+    t, channel = np.r_[t, slow], np.r_[np.zeros(t.size), np.ones(slow.size)].astype(np.int32)
+    order = np.argsort(t)
+    t, channel = t[order], channel[order]
+    made = Outcome(events(t - np.where(t >= after, back, 0.0), channel=channel))
+    np.testing.assert_allclose(made.seconds, t, atol=1e-6)
+    assert {move.by for move in made.moved} == {-round(back * SECOND)} and made.stale == 0
+
+
+@pytest.mark.parametrize("hours", [1, 3])
+def test_files_of_whole_hours_in_the_wrong_order_are_no_change_of_time_zone(hours):
+    t = np.arange(0.0, 2 * hours * HOUR, 10.0)
+    half = t.size // 2
+    made = Outcome(events(np.concatenate((t[half:], t[:half]))))
+    assert made.stale == half and not made.moved
+
+
 def test_sensors_of_one_clock_keep_their_times_to_each_other():
     """Two sensors at 1 and 4 Hz: alone each would go on at its own pace, apart by up to a period of the slower."""
     t = np.concatenate((T, np.sort(np.random.default_rng(9).uniform(0.0, 500.0, T.size))))
