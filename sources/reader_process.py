@@ -1,6 +1,7 @@
-"""Files of other programs are read in a process of their own.
+"""Read files of other programs in a process of their own.
 
-A damaged file can make the library that reads it abort, or run for ever, and neither may happen to the twin.
+A damaged file can make the library that reads it abort, run for ever, or take all memory. None of these may happen to
+the twin.
 """
 
 from __future__ import annotations
@@ -21,19 +22,23 @@ from typing import Any
 
 from estimators.errors import NisusError, SourceError
 
-PATIENCE = 30.0
+ITEM_TIMEOUT_S = 30.0
 """Seconds that a reader may take for its next item, and one more for each `BYTES_A_SECOND` of the file."""
 
 BYTES_A_SECOND = 2**20
 
-SHORTEST = 0.005
-"""Seconds of the shortest wait, so that who asks without waiting does not spin."""
+MEMORY_BASE = 2**30
+MEMORY_PER_BYTE = 16
+"""Bytes of memory that a reader may take: the base, and so many for each byte of the file."""
 
-DRAIN = 0.1
-"""Seconds within which a reader that nobody listens to any more may come to its end and be used again."""
+MIN_WAIT_S = 0.005
+"""Seconds of the shortest wait, so that a caller without a timeout does not spin."""
 
-SPARE = 2
-"""Readers without work that are kept; each has loaded its libraries, which takes longer than most files."""
+DRAIN_S = 0.1
+"""Seconds within which a reader that was closed may come to its end and be used again."""
+
+MAX_IDLE_WORKERS = 2
+"""Idle readers that are kept; each has loaded its libraries, which takes longer than most files."""
 
 _BOOT = f"""
 import pickle, sys
@@ -42,14 +47,14 @@ from {__name__} import serve
 serve(lifeline)
 """
 
-GRACE = 5.0
+EXIT_TIMEOUT_S = 5.0
 """Seconds between the end of a process's pipe and its own."""
 
 _ITEM, _END, _FAULT = range(3)
 
 
 class ReaderError(SourceError):
-    """The reader of a file crashed, hung, or raised what is no error of ours."""
+    """The reader of a file crashed, hung, took too much memory, or raised an error of its library."""
 
 
 class _Worker:
@@ -78,10 +83,10 @@ class _Worker:
                 pickle.dump(item, self._requests)
             self._requests.flush()
 
-    def ask(self, function: Callable[..., Iterator[Any]], args: tuple[Any, ...]) -> None:
-        """Have it run `function(*args)`, which must be importable by name."""
-        # Where this process is now comes first and by itself: a function may be from a folder that was added since.
-        self._write((list(sys.path), os.getcwd()), (function, args))
+    def ask(self, function: Callable[..., Iterator[Any]], args: tuple[Any, ...], memory: tuple[str, int]) -> None:
+        """Run `function(*args)`, which must be importable by name, with so many bytes of memory for the named file."""
+        # The folder comes first and by itself: a function may be from a folder that was added since.
+        self._write((list(sys.path), os.getcwd(), memory), (function, args))
 
     def answer(self, timeout: float) -> tuple[int, Any] | None:
         """The next answer; None if none comes in time.
@@ -120,7 +125,7 @@ class _Worker:
             return f"was ended by signal {-code}"
 
 
-_spare: list[_Worker] = []
+_idle: list[_Worker] = []
 _busy: set[_Worker] = set()
 """Held here too: a source that is left open is collected with all it holds in any order, and then closes its reader."""
 
@@ -128,7 +133,7 @@ _lock = threading.RLock()  # A collection may close a reader wherever it happens
 
 
 def _forget() -> None:
-    _spare.clear()
+    _idle.clear()
     _busy.clear()
 
 
@@ -139,8 +144,8 @@ if hasattr(os, "register_at_fork"):
 
 def _hire() -> _Worker:
     with _lock:
-        while _spare:
-            worker = _spare.pop()
+        while _idle:
+            worker = _idle.pop()
             if worker.alive:
                 break
             worker.end()
@@ -154,34 +159,38 @@ def _dismiss(worker: _Worker) -> None:
     """Keep it for the next file, unless enough wait."""
     with _lock:
         _busy.discard(worker)
-        if len(_spare) < SPARE:
-            _spare.append(worker)
+        if len(_idle) < MAX_IDLE_WORKERS:
+            _idle.append(worker)
             return
     worker.end()
 
 
 @atexit.register
-def _end_spare() -> None:
+def _end_idle() -> None:
     with _lock:
-        for worker in (*_spare, *_busy):
+        for worker in (*_idle, *_busy):
             worker.end()
-        _spare.clear()
+        _idle.clear()
 
 
-class Apart:
-    """The items of a generator that runs in a process of its own.
+class IsolatedReader:
+    """The items of a generator that reads a file in a process of its own.
 
     Args:
         function: A generator function, importable by name, whose arguments and items can be pickled.
-        args: What it is called with.
-        patience: Seconds to wait for an item before the process is taken to hang.
+        path: The file; first argument of the function.
+        args: Its further arguments.
+        timeout: Seconds to wait for an item before the process is taken to hang; by default by the size of the file.
     """
 
-    def __init__(self, function: Callable[..., Iterator[Any]], *args: Any, patience: float = PATIENCE) -> None:
-        self._patience = patience
+    def __init__(
+        self, function: Callable[..., Iterator[Any]], path: Path, *args: Any, timeout: float | None = None
+    ) -> None:
+        size = path.stat().st_size if path.is_file() else 0
+        self._timeout = ITEM_TIMEOUT_S + size / BYTES_A_SECOND if timeout is None else timeout
         self._waited = 0.0
         self._worker: _Worker | None = _hire()
-        self._worker.ask(function, args)
+        self._worker.ask(function, (path, *args), (str(path), memory_limit(path)))
 
     @property
     def ended(self) -> bool:
@@ -198,20 +207,20 @@ class Apart:
         worker = self._worker
         if worker is None:
             return None
-        timeout = max(timeout, SHORTEST)
+        timeout = max(timeout, MIN_WAIT_S)
         begun = time.monotonic()
         try:
             answer = worker.answer(timeout)
         except EOFError:
             self._worker = None
-            raise ReaderError(f"its reader {worker.end(GRACE)}") from None
+            raise ReaderError(f"its reader {worker.end(EXIT_TIMEOUT_S)}") from None
         if answer is None:
             # No more than was meant to be waited: a machine that was suspended meanwhile has not hung.
             self._waited += min(time.monotonic() - begun, timeout)
-            if self._waited >= self._patience:
+            if self._waited >= self._timeout:
                 self._worker = None
                 worker.end()
-                raise ReaderError(f"its reader gave nothing for {self._patience:.0f} s and was ended")
+                raise ReaderError(f"its reader gave nothing for {self._timeout:.0f} s and was ended")
             return None
         self._waited = 0.0
         kind, item = answer
@@ -228,7 +237,7 @@ class Apart:
         worker, self._worker = self._worker, None
         if worker is None:
             return
-        limit = time.monotonic() + DRAIN
+        limit = time.monotonic() + DRAIN_S
         with suppress(EOFError):
             while (left := limit - time.monotonic()) > 0:
                 answer = worker.answer(left)
@@ -238,38 +247,49 @@ class Apart:
         worker.end()
 
 
-def patience_for(path: Path) -> float:
-    """Seconds that the reader of a file may take for its next item."""
-    return PATIENCE + path.stat().st_size / BYTES_A_SECOND
+def memory_limit(path: Path) -> int:
+    """Bytes of memory that the reader of a file may take."""
+    return MEMORY_BASE + MEMORY_PER_BYTE * (path.stat().st_size if path.is_file() else 0)
 
 
-def ask(function: Callable[..., Iterator[Any]], *args: Any, patience: float = PATIENCE) -> list[Any]:
-    """All items at once.
+def memory_error(path: Path | str, needed: str, limit: int) -> ReaderError:
+    """Return the error of a file whose content does not fit; `needed` is a clause, as "its arrays take 3.0 GiB"."""
+    return ReaderError(
+        f"{path}: {needed}, and a file of this size may take {limit / 2**30:.1f} GiB; save it uncompressed, or in "
+        "smaller files"
+    )
+
+
+def read_isolated(
+    function: Callable[..., Iterator[Any]], path: Path, *args: Any, timeout: float | None = None
+) -> list[Any]:
+    """Return all items of an `IsolatedReader`.
 
     Raises:
-        ReaderError: See `Apart.take`.
+        ReaderError: See `IsolatedReader.take`.
     """
-    apart = Apart(function, *args, patience=patience)
+    reader = IsolatedReader(function, path, *args, timeout=timeout)
     items = []
     try:
-        while not apart.ended:
-            if (item := apart.take(1.0)) is not None:
+        while not reader.ended:
+            if (item := reader.take(1.0)) is not None:
                 items.append(item)
     finally:
-        apart.close()
+        reader.close()
     return items
 
 
 def serve(lifeline: int) -> None:
-    """In the worker: run what is asked until the process that asks has gone."""
+    """Run requests in the worker until the process that sends them has gone."""
     _end_with_parent(lifeline)
     answers = Connection(os.dup(1), readable=False)
     os.dup2(2, 1)  # What libraries print is no answer.
     requests = sys.stdin.buffer
     with suppress(EOFError, BrokenPipeError, KeyboardInterrupt):
         while True:
-            sys.path[:], folder = pickle.load(requests)
+            sys.path[:], folder, (path, limit) = pickle.load(requests)
             os.chdir(folder)
+            _limit_memory(limit)
             function, args = pickle.load(requests)
             try:
                 for item in function(*args):
@@ -279,6 +299,9 @@ def serve(lifeline: int) -> None:
                 answers.send((_FAULT, error))
             except (BrokenPipeError, KeyboardInterrupt):
                 raise
+            except MemoryError:
+                _limit_memory(None)
+                answers.send((_FAULT, memory_error(path, "its content takes more", limit)))
             except BaseException as error:  # noqa: BLE001  libraries raise anything, some of it no Exception
                 gist = " ".join(str(error).split())[:160] or type(error).__name__
                 answers.send((_FAULT, ReaderError(gist)))
@@ -298,12 +321,21 @@ def _end_with_parent(lifeline: int) -> None:
 
         if select.select([lifeline], [], [], 0)[0]:
             os._exit(1)
+    with suppress(OSError):
+        # If memory runs out all the same, this process ends first, not the twin.
+        Path("/proc/self/oom_score_adj").write_text("1000")
+
+
+def _limit_memory(allowance: int | None) -> None:
+    """Let this process allocate at most `allowance` bytes more than it holds now; None lifts the limit."""
     with suppress(ImportError, OSError, ValueError):
-        # A damaged file may ask for all memory there is.
         import resource
 
-        most = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 4 * 3
-        resource.setrlimit(resource.RLIMIT_DATA, (most, resource.getrlimit(resource.RLIMIT_DATA)[1]))
-    with suppress(OSError):
-        # And where that is more than is left, this process goes first, not the twin.
-        Path("/proc/self/oom_score_adj").write_text("1000")
+        hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+        if allowance is None:
+            limit = hard
+        else:
+            status = Path("/proc/self/status").read_text()
+            held = 1024 * int(next(line.split()[1] for line in status.splitlines() if line.startswith("VmData")))
+            limit = held + min(allowance, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 4 * 3)
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))

@@ -15,8 +15,8 @@ from rich.table import Table
 from estimators.errors import ConfigError
 from sources.can.frames import EXTENDED, BusName
 from sources.can.unseen import shown_id
-from sources.survey import Message, Series, Survey, survey
-from sources.tables.time_column import UNITS
+from sources.inspect import Message, RecordingContents, Series, inspect_recordings
+from sources.tables.rows import UNITS
 
 from ..format_time import FIRST_DATED_NS, format_time
 from ..terminal import complain
@@ -50,7 +50,7 @@ def show_log(arguments: Arguments) -> int:
     return 0
 
 
-def look(files: tuple[Path, ...], dbc: tuple[str, ...], time: str | None, unit: str) -> Survey:
+def look(files: tuple[Path, ...], dbc: tuple[str, ...], time: str | None, unit: str) -> RecordingContents:
     """What the recordings hold.
 
     Args:
@@ -67,7 +67,7 @@ def look(files: tuple[Path, ...], dbc: tuple[str, ...], time: str | None, unit: 
         raise ConfigError("no recording is named; give at least one")
     if unit not in UNITS:
         raise ConfigError(f"--time-unit {unit}: is no unit of time; choose from {', '.join(UNITS)}")
-    return survey([file.expanduser() for file in files], [database_of(text) for text in dbc], time, unit)
+    return inspect_recordings([file.expanduser() for file in files], [database_of(text) for text in dbc], time, unit)
 
 
 def database_of(text: str) -> tuple[Path, BusName]:
@@ -89,7 +89,7 @@ def _seconds(t: int, start: int) -> float:
     return (t - start) * 1e-9
 
 
-def _head(found: Survey) -> list[str]:
+def _head(found: RecordingContents) -> list[str]:
     start, end = int(found.t[0]), int(found.t[-1])
     name = found.files[0].name + (f" and {len(found.files) - 1} more" if len(found.files) > 1 else "")
     what = "frames" if found.kind == "can_log" else "rows"
@@ -112,7 +112,7 @@ def _plain(value: float) -> str:
     return "" if math.isnan(value) else f"{value:.5g}"
 
 
-def _messages(found: Survey) -> Table:
+def _messages(found: RecordingContents) -> Table:
     table = Table()
     for title in ("bus", "id", "message, signals", "unit"):
         table.add_column(title, no_wrap=True)
@@ -130,7 +130,7 @@ def _messages(found: Survey) -> Table:
     return table
 
 
-def _columns(found: Survey) -> Table:
+def _columns(found: RecordingContents) -> Table:
     table = Table()
     table.add_column("column", no_wrap=True)
     for title in ("values", "a second", "from s", "to s", "longest gap s", "lowest", "highest"):
@@ -153,7 +153,7 @@ def _values(series: Series, start: int) -> list[str]:
     return [*_times(series.t, start), _plain(float(series.values.min())), _plain(float(series.values.max()))]
 
 
-def _as_dict(found: Survey) -> dict[str, Any]:
+def _as_dict(found: RecordingContents) -> dict[str, Any]:
     return {
         "files": [str(path) for path in found.files],
         "kind": found.kind,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,12 +9,12 @@ import numpy as np
 
 from estimators.errors import SourceError
 
+from ..formats import suffix_of
+
 EXTENDED = 1 << 31
 """Added to the arbitration id of an extended frame, so that one number names it."""
 
 CHUNK = 8192
-
-FORMATS = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")
 
 BusName = int | str | None
 
@@ -42,11 +41,6 @@ class Found(NamedTuple):
     seen: dict[tuple[BusName, int], int]
     errors: int
     fault: str
-
-
-def suffix_of(path: Path) -> str:
-    """The ending that says the format."""
-    return os.path.splitext(path.name.lower().removesuffix(".gz"))[1]
 
 
 def unreadable(path: Path, reason: object) -> SourceError:

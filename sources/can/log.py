@@ -11,10 +11,11 @@ from pathlib import Path
 from estimators.errors import SourceError
 from estimators.log import Events
 
-from ..reader_process import Apart, patience_for
+from ..formats import CAN_LOGS, is_compressed, suffix_of
+from ..reader_process import IsolatedReader
 from ..source import NEVER, TRUNCATED, Report, ignore
 from .decoder import Decoder
-from .frames import FORMATS, BusName, Found, Raw, suffix_of, unreadable
+from .frames import BusName, Found, Raw, unreadable
 from .readers import open_reader, read_frames
 from .span import log_span
 
@@ -63,11 +64,11 @@ class CanLog:
 
     def _one(self, path: Path) -> Generator[Events, None, None]:
         before = self.frames
-        apart = Apart(read_frames, path, self._decoder.wanted, self._decoder.longest, patience=patience_for(path))
+        reader = IsolatedReader(read_frames, path, self._decoder.wanted, self._decoder.longest)
         fault = ""
         try:
-            while not apart.ended:
-                item = apart.take(self._timeout)
+            while not reader.ended:
+                item = reader.take(self._timeout)
                 if isinstance(item, Raw):
                     self.frames += item.total
                     batch = self._decoder.decode(self._decoder.frames_of(item))
@@ -78,7 +79,7 @@ class CanLog:
                     for _ in range(item.errors):
                         self._report("error frame", f"{path.name}: error frame")
                     fault = item.fault
-                elif not apart.ended:
+                elif not reader.ended:
                     yield Events.empty(self._decoder.width)
         except SourceError as error:
             if self.frames == before and path == self._files[0]:
@@ -86,7 +87,7 @@ class CanLog:
                 raise error if str(path) in str(error) else unreadable(path, error) from None
             fault = str(error).removeprefix(f"{path}: ")
         finally:
-            apart.close()
+            reader.close()
         count = self.frames - before
         if fault or not count:
             fault = fault or "it holds none"
@@ -116,9 +117,9 @@ def check_log(path: Path) -> None:
         raise SourceError(f"{path}: there is no such file; check the path of the recording")
     if path.stat().st_size == 0:
         raise SourceError(f"{path}: the file is empty; record it again")
-    if suffix_of(path) not in FORMATS:
+    if suffix_of(path) not in CAN_LOGS or (is_compressed(path) and path.suffix.lower() != ".gz"):
         raise SourceError(
-            f"{path}: {path.suffix or 'a bare name'} is not a CAN log format; choose from {', '.join(FORMATS)}"
+            f"{path}: {path.suffix or 'a bare name'} is not a CAN log format; choose from {', '.join(CAN_LOGS)}"
         )
     if suffix_of(path) == ".mf4":
         with path.open("rb") as file:

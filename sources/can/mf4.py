@@ -42,6 +42,8 @@ def _open(path: Path) -> tuple[Any, BytesIO]:
     content = BytesIO(path.read_bytes())
     try:
         return MDF(content), content
+    except MemoryError:
+        raise
     except Exception as error:  # noqa: BLE001  a damaged file makes asammdf raise anything
         fault = unreadable(path, error)
     # What was half opened complains when it is let go of, so that is done here, where nobody listens.
@@ -106,7 +108,9 @@ def _read(path: Path, mdf: Any, content: BytesIO, wanted: frozenset[int] | None,
             signal = mdf.get("CAN_DataFrame", group=index)
             keys, buses = _names(signal)
             part = _wanted(signal, keys, buses, start, wanted, longest)
-        except Exception as error:  # noqa: BLE001  as above; the other groups may be whole
+        except MemoryError:
+            raise
+        except Exception as error:  # noqa: BLE001  as above; the other groups may be complete
             gist = " ".join(f"{error}".split())[:100] or type(error).__name__
             fault = fault or f"{cycles} frames cannot be read: {gist}"
             continue

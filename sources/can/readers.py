@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from ..clock import second_ns
-from .frames import CHUNK, EXTENDED, BusName, Found, Raw, suffix_of, unreadable
+from ..formats import suffix_of
+from .frames import CHUNK, EXTENDED, BusName, Found, Raw, unreadable
 
 FIRST_CHUNK = 256
 """Frames read before the first are given, so that they come at once."""

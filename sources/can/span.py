@@ -11,11 +11,11 @@ import can
 from estimators.errors import SourceError
 
 from ..clock import second_ns
-from ..reader_process import ask
+from ..reader_process import read_isolated
 from .mf4 import mf4_span
 
-PATIENCE = 5.0
-"""Seconds; who asks draws a slider, and can do without."""
+SPAN_TIMEOUT_S = 5.0
+"""Seconds to wait for the span, which only draws a slider."""
 
 TAIL = 4096
 """Bytes at the end of a text log that hold its last lines."""
@@ -49,7 +49,7 @@ def _span(path: Path) -> tuple[int, int] | None:
 @lru_cache(maxsize=64)
 def _mf4(path: Path, stamp: int, size: int) -> tuple[int, int] | None:
     """Kept while the file is unchanged: a replay that is sought back asks again."""
-    return next(iter(ask(mf4_span, path, patience=PATIENCE)), None)
+    return next(iter(read_isolated(mf4_span, path, timeout=SPAN_TIMEOUT_S)), None)
 
 
 def _candump(path: Path) -> tuple[int, int] | None:

@@ -11,12 +11,12 @@ import numpy as np
 from estimators.errors import SourceError, nearest
 from estimators.log import Events
 
+from ..formats import suffix_of
 from ..mapping import ABSENT, PRESENT, Mapping
 from ..source import NEVER, TRUNCATED, Channel, Report, ignore
-from .files import find_decimal_comma, is_text
 from .order import Order
-from .rows import Rows, names_of, rows_of
-from .time_column import UNITS
+from .rows import UNITS, Rows, is_text, names_of, rows_of
+from .text import find_decimal_comma, has_rows
 
 
 class Table:
@@ -156,7 +156,7 @@ def _check(path: Path, wanted: Sequence[str]) -> None:
         if len(at) > 1:
             places = " and ".join(f"the {_ordinal(k)}" for k in at[:2])
             raise SourceError(f"{path}: there are {len(at)} columns {name!r}, {places}; give each its own name")
-    if path.suffix.lower() == ".csv" and not _has_rows(path):
+    if suffix_of(path) == ".csv" and not has_rows(path):
         raise SourceError(f"{path}: it has a header and no rows; record it again")
     if is_text(path):
         comma = find_decimal_comma(path, wanted)
@@ -169,10 +169,3 @@ def _check(path: Path, wanted: Sequence[str]) -> None:
 
 def _ordinal(k: int) -> str:
     return f"{k}{'th' if k % 100 in (11, 12, 13) else {1: 'st', 2: 'nd', 3: 'rd'}.get(k % 10, 'th')}"
-
-
-def _has_rows(path: Path) -> bool:
-    """Whether anything follows the first line of a CSV."""
-    with path.open("rb") as file:
-        file.readline()
-        return any(line.strip() for line in file)

@@ -4,15 +4,19 @@ import ctypes
 import os
 
 
-def counting(n):
+def counting(path, n):
     yield from range(n)
 
 
-def folder():
+def allocate(path):
+    yield bytearray(2**32)
+
+
+def folder(path):
     yield os.getcwd()
 
 
-def pid_then(function):
+def pid_then(path, function):
     """The process's id, then whatever `function` does."""
     yield os.getpid()
     function()

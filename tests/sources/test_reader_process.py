@@ -7,19 +7,22 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
 from estimators.errors import SourceError
 from sources import reader_process as module
-from sources.reader_process import Apart, ReaderError, ask
-from tests.sources.readers_that_fail import abort, counting, fail, folder, hang, leave, pid_then, shout
+from sources.reader_process import IsolatedReader, ReaderError, read_isolated
+from tests.sources.readers_that_fail import abort, allocate, counting, fail, folder, hang, leave, pid_then, shout
+
+PATH = Path("recording")  # the functions do not read it
 
 
-def item_of(apart):
+def item_of(reader):
     """The next item, however long this machine takes to start a process."""
-    while (item := apart.take(1.0)) is None:
-        assert not apart.ended
+    while (item := reader.take(1.0)) is None:
+        assert not reader.ended
     return item
 
 
@@ -38,8 +41,8 @@ def gone(pid):
 
 
 def test_items_come_in_order_and_the_end_is_known():
-    assert ask(counting, 10_000) == list(range(10_000))
-    assert ask(counting, 0) == []
+    assert read_isolated(counting, PATH, 10_000) == list(range(10_000))
+    assert read_isolated(counting, PATH, 0) == []
 
 
 @pytest.mark.parametrize(
@@ -47,29 +50,37 @@ def test_items_come_in_order_and_the_end_is_known():
     [(abort, "its reader was ended by SIGABRT"), (leave, "its reader ended with status 3"), (fail, "wants to leave")],
 )
 def test_a_reader_that_ends_is_an_error_of_the_file_alone(failure, expected):
-    apart = Apart(pid_then, failure)
-    pid = item_of(apart)
+    reader = IsolatedReader(pid_then, PATH, failure)
+    pid = item_of(reader)
     assert pid != os.getpid()
     with pytest.raises(ReaderError, match=expected):
-        item_of(apart)
-    assert apart.ended and apart.take(0.0) is None
+        item_of(reader)
+    assert reader.ended and reader.take(0.0) is None
     assert isinstance(ReaderError(""), SourceError)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="a limit of the Linux kernel")
+def test_a_reader_that_takes_too_much_memory_is_refused_and_used_again():
+    pid = read_isolated(pid_then, PATH, print)[0]
+    with pytest.raises(ReaderError, match=r"recording: .*1\.0 GiB; save it uncompressed, or in smaller files"):
+        read_isolated(allocate, PATH)
+    assert read_isolated(pid_then, PATH, print)[0] == pid
+
+
 def test_a_reader_that_hangs_is_ended():
-    apart = Apart(pid_then, hang)
-    pid = item_of(apart)
-    apart._patience = 0.05
+    reader = IsolatedReader(pid_then, PATH, hang)
+    pid = item_of(reader)
+    reader._timeout = 0.05
     with pytest.raises(ReaderError, match=r"gave nothing for 0 s and was ended"):
         while True:
-            assert apart.take(0.01) is None
+            assert reader.take(0.01) is None
     assert gone(pid)
 
 
 def test_time_in_which_nobody_waits_does_not_count(monkeypatch):
     """A machine that was suspended, or a twin that was paused, has no reader that hangs."""
-    apart = Apart(pid_then, hang, patience=3600.0)
-    item_of(apart)
+    reader = IsolatedReader(pid_then, PATH, hang, timeout=3600.0)
+    item_of(reader)
     now = [0.0]
 
     class Slow:
@@ -80,35 +91,35 @@ def test_time_in_which_nobody_waits_does_not_count(monkeypatch):
 
     monkeypatch.setattr(module, "time", Slow)
     for _ in range(5):
-        assert apart.take(0.01) is None
+        assert reader.take(0.01) is None
     monkeypatch.undo()
-    apart.close()
+    reader.close()
 
 
 def test_what_a_library_prints_is_no_item():
-    apart = Apart(pid_then, shout)
-    item_of(apart)
-    while not apart.ended:
-        assert apart.take(1.0) is None
+    reader = IsolatedReader(pid_then, PATH, shout)
+    item_of(reader)
+    while not reader.ended:
+        assert reader.take(1.0) is None
 
 
 def test_a_reader_is_used_again_and_one_that_is_left_is_not_waited_for():
-    first, second = (ask(pid_then, print)[0] for _ in range(2))
+    first, second = (read_isolated(pid_then, PATH, print)[0] for _ in range(2))
     assert first == second
-    apart = Apart(pid_then, hang)
-    pid = item_of(apart)
-    apart.close()
-    assert gone(pid) and apart.ended
-    endless = Apart(counting, 10**12)
+    reader = IsolatedReader(pid_then, PATH, hang)
+    pid = item_of(reader)
+    reader.close()
+    assert gone(pid) and reader.ended
+    endless = IsolatedReader(counting, PATH, 10**12)
     item_of(endless)
     endless.close()
-    assert ask(counting, 3) == [0, 1, 2]
+    assert read_isolated(counting, PATH, 3) == [0, 1, 2]
 
 
 def test_a_reader_that_is_used_again_follows_its_parent_to_another_folder(tmp_path, monkeypatch):
-    ask(folder)
+    read_isolated(folder, PATH)
     monkeypatch.chdir(tmp_path)
-    assert ask(folder) == [str(tmp_path)]
+    assert read_isolated(folder, PATH) == [str(tmp_path)]
 
 
 def test_a_reader_that_is_left_with_its_source_is_ended():
@@ -116,8 +127,8 @@ def test_a_reader_that_is_left_with_its_source_is_ended():
 
     class Source:
         def __init__(self):
-            self.apart = Apart(pid_then, hang)
-            self.pid = item_of(self.apart)
+            self.reader = IsolatedReader(pid_then, PATH, hang)
+            self.pid = item_of(self.reader)
             self.batches = self.all()
             next(self.batches)
 
@@ -125,48 +136,49 @@ def test_a_reader_that_is_left_with_its_source_is_ended():
             try:
                 yield self
             finally:
-                self.apart.close()
+                self.reader.close()
 
     pids = [Source().pid for _ in range(3)]
     gc.collect()
-    assert all(map(gone, pids)) and ask(counting, 2) == [0, 1]
+    assert all(map(gone, pids)) and read_isolated(counting, PATH, 2) == [0, 1]
 
 
 def test_a_spare_reader_that_died_is_replaced():
-    pid = ask(pid_then, print)[0]
+    pid = read_isolated(pid_then, PATH, print)[0]
     os.kill(pid, signal.SIGKILL)
     assert gone(pid)
-    assert ask(counting, 2) == [0, 1]
+    assert read_isolated(counting, PATH, 2) == [0, 1]
 
 
 def _ask(connection):
-    connection.send(ask(pid_then, print)[0])
+    connection.send(read_isolated(pid_then, PATH, print)[0])
 
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="there is no fork here")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_a_process_that_forks_keeps_its_readers():
-    mine = ask(pid_then, print)[0]
+    mine = read_isolated(pid_then, PATH, print)[0]
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe()
     child = context.Process(target=_ask, args=(there,))
     child.start()
     theirs = here.recv()
     child.join()
-    assert theirs != mine and ask(pid_then, print)[0] == mine
+    assert theirs != mine and read_isolated(pid_then, PATH, print)[0] == mine
 
 
 PARENT = """
 import sys
 sys.path[:0] = {paths!r}
 from tests.sources.readers_that_fail import hang, pid_then
-from sources.reader_process import Apart
-apart = Apart(pid_then, hang)
-while (pid := apart.take(1.0)) is None:
+from pathlib import Path
+from sources.reader_process import IsolatedReader
+reader = IsolatedReader(pid_then, Path('recording'), hang)
+while (pid := reader.take(1.0)) is None:
     pass
 print(pid, flush=True)
 while True:
-    apart.take(1.0)
+    reader.take(1.0)
 """
 
 

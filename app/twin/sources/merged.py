@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from config.source_schema import CanLogSection, MergedSection, TableSection
 from config.yaml_lines import Key
 from estimators.errors import SourceError
+from sources.formats import TABLES, suffix_of
 
 from .can_log import CAN_LOG
 from .kind import Kind, Opening, closed
@@ -20,9 +21,6 @@ if TYPE_CHECKING:
 
 PARTS: dict[type, Kind] = {CanLogSection: CAN_LOG, TableSection: TABLE}
 """What may be merged: recordings, whose clocks agree."""
-
-TABLES = (".csv", ".parquet", ".pq", ".mat", ".npz")
-"""File endings that `--log` gives to the tables."""
 
 
 def _open(opening: Opening) -> Source:
@@ -51,7 +49,7 @@ def _shares(opening: Opening) -> list[list[Path] | None]:
             if any(fnmatch.fnmatch(file.name, Path(pattern).name) for pattern in part.files)
         ]
         if not fits:
-            kind = TableSection if file.suffix.lower() in TABLES else CanLogSection
+            kind = TableSection if suffix_of(file) in TABLES else CanLogSection
             fits = [k for k, part in enumerate(section.parts) if isinstance(part, kind)]
         if len(fits) != 1:
             raise SourceError(

@@ -13,15 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from estimators.errors import ConfigError, NisusError, quoted
-from sources.can.frames import FORMATS
+from sources.formats import CAN_LOGS, TABLES, is_recording
 
 from ...views.recording.reader import Facts, facts_of
 from ...views.recording.rrd_file import Disk
 
 RECORDING = ".rrd"
-LOGS = tuple(dict.fromkeys([*FORMATS, ".csv", ".parquet", ".pq", ".mat", ".npz"]))
-"""File endings of what a twin can read in place of its own recording."""
-
+LOGS = tuple(dict.fromkeys((*CAN_LOGS, *TABLES)))
+"""Endings of files that can replace a twin's own recording."""
 PART = ".part"
 """Ending of what is still on its way here, behind a point, so that lists do not show it."""
 
@@ -89,7 +88,7 @@ class Recordings:
             suffix = path.suffix.lower()
             if path.is_symlink() or not path.is_file() or path.name.startswith("."):
                 continue
-            if suffix != RECORDING and not _is_log(path.name):
+            if suffix != RECORDING and not is_recording(path.name):
                 continue
             stat = path.stat()
             key = (str(path), stat.st_mtime_ns, stat.st_size)
@@ -174,7 +173,7 @@ class Recordings:
             ConfigError: If its name will not do, a piece is missing, or the disk has no room.
         """
         checked = _checked(name)
-        if Path(checked).suffix.lower() != RECORDING and not _is_log(checked):
+        if Path(checked).suffix.lower() != RECORDING and not is_recording(checked):
             raise ConfigError(f"{quoted(name)}: neither a recording (.rrd) nor a log ({', '.join(LOGS)})")
         part = self.folder / f".{checked}{PART}"
         try:
@@ -206,10 +205,6 @@ class Recordings:
             part.unlink()
             return free.name
         raise ConfigError(f"{name}: there are too many of that name; delete some")
-
-
-def _is_log(name: str) -> bool:
-    return Path(name.lower().removesuffix(".gz")).suffix in LOGS
 
 
 def _checked(name: Any) -> str:

@@ -9,7 +9,7 @@ import pytest
 from app.cli.main import main
 from app.studies.advice.log.noise import noise_of
 from app.twin.twin import load_twin
-from sources.survey import Series
+from sources.inspect import Series
 
 DBC = """VERSION ""
 

@@ -7,7 +7,7 @@ from scipy.io import savemat
 from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TRUTH
 from sources.source import Channel
-from sources.tables.mat import read_mat
+from sources.tables.binary import read_mat
 from sources.tables.table import Table
 from tests.sources.can.can_tools import same
 from tests.support import read_all

@@ -7,7 +7,7 @@ from app.twin.twin import load_twin
 from estimators.errors import ConfigError, SourceError
 from estimators.log import READING, TRUTH
 from sources.source import Channel
-from sources.tables import npz
+from sources.tables import binary
 from sources.tables.rows import read_rows
 from sources.tables.table import Table
 from tests.support import read_all
@@ -33,8 +33,8 @@ def table(path, columns, kind=READING):
 
 
 def test_cells_and_vectors_come_as_they_were_saved(archive, monkeypatch):
-    monkeypatch.setattr(npz, "VALUES", 6)  # two rows at once, so that there are several chunks
-    assert len(npz.npz_names(archive)) == 12 + 3
+    monkeypatch.setattr(binary, "CHUNK_VALUES", 6)  # two rows at once, so that there are several chunks
+    assert len(binary.npz_names(archive)) == 12 + 3
     columns = ("t[2,1]", "one", "t[0,3]")
     chunks = list(read_rows(archive, "time", "s", columns))
     assert [chunk.t.size for chunk in chunks] == [2, 2, 2, 1]

@@ -8,8 +8,8 @@ import pytest
 from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TRUTH
 from sources.source import Channel, Condition
+from sources.tables.rows import column_ns
 from sources.tables.table import Table
-from sources.tables.time_column import column_ns
 from tests.sources.can.can_tools import Reports, same
 from tests.support import read_all
 

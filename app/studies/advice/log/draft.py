@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sources.can.frames import BusName
-from sources.survey import Survey
+from sources.inspect import RecordingContents
 
 from .plan import Moves, Plan, Reads
 from .signals import Signal
@@ -164,7 +164,7 @@ def yaml_text(
     name: str,
     model: str,
     plan: Plan,
-    found: Survey,
+    found: RecordingContents,
     databases: Sequence[tuple[Path, BusName]],
     unit: str,
     folder: Path,

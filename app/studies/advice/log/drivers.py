@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
-from sources.survey import Series
+from sources.inspect import Series
 
 from .grid import common
 from .signals import Signal

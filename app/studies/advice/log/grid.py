@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sources.survey import Series
+from sources.inspect import Series
 
 MOST = 4000
 """Times of a grid, at most."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sources.survey import Series
+from sources.inspect import Series
 
 from .signals import rough, step_of
 

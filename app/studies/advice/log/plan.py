@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from estimators.errors import ConfigError, nearest
-from sources.survey import Survey
+from sources.inspect import RecordingContents
 
 from .drivers import Driven, driven, simulated
 from .noise import noise_of, walk_of
@@ -64,7 +64,7 @@ class Plan:
     pairs: tuple[Pair, ...]
 
 
-def plan(found: Survey, wanted: Sequence[str]) -> Plan:
+def plan(found: RecordingContents, wanted: Sequence[str]) -> Plan:
     """The signals that are named, or those that vary most finely, each in its role.
 
     Raises:
@@ -138,7 +138,7 @@ def _reads(name: str, lead: Signal, one: Signal, pair: Pair) -> Reads:
     return Reads(name, one, r, pair.gain, pair.offset)
 
 
-def _finest(found: Survey, every: Sequence[Signal]) -> list[Signal]:
+def _finest(found: RecordingContents, every: Sequence[Signal]) -> list[Signal]:
     """Those of the most levels, in the order of the recording."""
     fine = [one for one in every if one.kind == "signal"] or [
         one for one in every if one.kind == "switch" and one.levels > 2
@@ -149,7 +149,7 @@ def _finest(found: Survey, every: Sequence[Signal]) -> list[Signal]:
     return [fine[k] for k in sorted(kept)]
 
 
-def _named(name: str, found: Survey, every: Sequence[Signal]) -> Signal:
+def _named(name: str, found: RecordingContents, every: Sequence[Signal]) -> Signal:
     """SIGNAL or MESSAGE.SIGNAL, or a column."""
     fits = [one for one in every if name in (one.name, f"{one.message}.{one.name}")]
     silent = [s for m in found.messages for s in m.signals if name in (s.name, f"{m.name}.{s.name}")]

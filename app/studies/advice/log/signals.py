@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sources.survey import Series, Survey, holes
+from sources.inspect import RecordingContents, Series, holes
 
 FEWEST = 20
 """Values needed to estimate a noise."""
@@ -47,7 +47,7 @@ class Signal(NamedTuple):
     wraps: bool = False
 
 
-def signals(found: Survey) -> list[Signal]:
+def signals(found: RecordingContents) -> list[Signal]:
     """All signals with values, in the order of the recording."""
     offers: list[tuple[str | None, Series]] = [(m.name, series) for m in found.messages for series in m.signals]
     offers += [(None, series) for series in found.columns]

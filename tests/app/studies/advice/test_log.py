@@ -9,7 +9,7 @@ from app.cli.main import main
 from app.studies.advice.log.drivers import driven
 from app.studies.advice.log.pairs import pairs
 from app.studies.advice.log.signals import rough, signal
-from sources.survey import Series
+from sources.inspect import Series
 
 
 def series(name, values, dt=0.1, start=0.0):

@@ -14,13 +14,14 @@ from estimators.log import READING
 
 from .can.databases import load_database, same_bus
 from .can.decoder import Decoder
-from .can.frames import EXTENDED, FORMATS, BusName, Found, Raw, suffix_of
+from .can.frames import EXTENDED, BusName, Found, Raw
 from .can.log import CanLog, check_log
 from .can.readers import read_frames
-from .reader_process import Apart, patience_for
+from .formats import CAN_LOGS, suffix_of
+from .reader_process import IsolatedReader
 from .source import Channel
-from .tables.files import UNREADABLE
 from .tables.rows import Rows, names_of, rows_of
+from .tables.text import UNREADABLE, csv_header
 
 LONGEST = 64
 """Bytes of the longest frame, of CAN FD."""
@@ -57,7 +58,7 @@ class Message:
 
 
 @dataclass
-class Survey:
+class RecordingContents:
     """What recordings of one kind hold; `t` (ns) is when anything was recorded, in order."""
 
     files: list[Path]
@@ -85,17 +86,16 @@ def holes(t: np.ndarray) -> list[tuple[int, int]]:
 
 def is_table(path: Path) -> bool:
     """Whether a file is read as a table; a CSV is a CAN log if it looks like one of python-can's."""
-    if suffix_of(path) not in FORMATS:
+    if suffix_of(path) not in CAN_LOGS:
         return True
     if suffix_of(path) != ".csv":
         return False
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        return not file.readline().startswith("timestamp,arbitration_id,")
+    return csv_header(path)[0][:2] != ["timestamp", "arbitration_id"]
 
 
-def survey(
+def inspect_recordings(
     files: Sequence[Path], databases: Sequence[tuple[Path, BusName]] = (), time: str | None = None, unit: str = "s"
-) -> Survey:
+) -> RecordingContents:
     """What recordings hold, all of one kind: CAN logs or tables.
 
     Args:
@@ -122,16 +122,16 @@ def survey(
     return _logs(list(files), list(databases))
 
 
-def _logs(files: list[Path], databases: list[tuple[Path, BusName]]) -> Survey:
+def _logs(files: list[Path], databases: list[tuple[Path, BusName]]) -> RecordingContents:
     found: dict[tuple[BusName, int], list[np.ndarray]] = defaultdict(list)
     faults = []
     errors = 0
     for path in files:
         check_log(path)
-        apart = Apart(read_frames, path, None, LONGEST, patience=patience_for(path))
+        reader = IsolatedReader(read_frames, path, None, LONGEST)
         try:
-            while not apart.ended:
-                item = apart.take(1.0)
+            while not reader.ended:
+                item = reader.take(1.0)
                 if isinstance(item, Raw):
                     for place, bus in enumerate(item.buses):
                         rows = np.flatnonzero(item.bus == place)
@@ -145,7 +145,7 @@ def _logs(files: list[Path], databases: list[tuple[Path, BusName]]) -> Survey:
             text = str(error).removeprefix(f"{path}: ")
             faults.append(f"{path.name}: {text}")
         finally:
-            apart.close()
+            reader.close()
     if not found:
         raise SourceError("; ".join(faults) or f"{files[0]}: it holds no frames")
     if errors:
@@ -157,7 +157,7 @@ def _logs(files: list[Path], databases: list[tuple[Path, BusName]]) -> Survey:
     if databases:
         messages = _named(files, databases, messages, faults)
     t = np.sort(np.concatenate([message.t for message in messages]))
-    return Survey(files, "can_log", t, messages, faults=faults)
+    return RecordingContents(files, "can_log", t, messages, faults=faults)
 
 
 def _named(
@@ -218,7 +218,7 @@ def _series(name: str, unit: str, t: np.ndarray, values: np.ndarray) -> Series:
     return Series(name, unit, t[known], values[known], int(np.sum(~known)))
 
 
-def _tables(files: list[Path], time: str | None, unit: str) -> Survey:
+def _tables(files: list[Path], time: str | None, unit: str) -> RecordingContents:
     names = names_of(files[0])
     chosen = time if time is not None else _time_of(names)
     if chosen is None or chosen not in names:
@@ -245,7 +245,7 @@ def _tables(files: list[Path], time: str | None, unit: str) -> Survey:
     order = np.argsort(t, kind="stable")
     t, v = t[order], v[order]
     found = [_series(name, "", t, v[:, k]) for k, name in enumerate(columns)]
-    return Survey(files, "table", t, columns=found, time=chosen, faults=faults)
+    return RecordingContents(files, "table", t, columns=found, time=chosen, faults=faults)
 
 
 def _rows(path: Path, time: str, unit: str, columns: list[str], faults: list[str]) -> Iterator[Rows]:
