@@ -11,8 +11,8 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .diagnostics.consistency import mean_nees as mean_nees
     from .diagnostics.health import HealthPolicy as HealthPolicy
-    from .diagnostics.nees import mean_nees as mean_nees
     from .errors import NisusError as NisusError
     from .interface.by_name import fold as fold
     from .interface.by_name import fold_many as fold_many
@@ -40,7 +40,7 @@ _HOMES = {
     "NisusError": "errors",
     "Tuning": "tuning",
     "fold_many": "interface.by_name",
-    "mean_nees": "diagnostics.nees",
+    "mean_nees": "diagnostics.consistency",
     **dict.fromkeys(("Field", "Input", "Jump", "Limits", "Noise", "Parameter", "Row", "Sensor", "State"), "model"),
     **dict.fromkeys(("StateSpaceModel", "Stuck"), "model"),
 }

@@ -11,15 +11,15 @@ from __future__ import annotations
 import numpy as np
 
 from .compiled.model import CompiledModel
-from .diagnostics.account import spread_ratio
 from .diagnostics.field_pictures import Pictures
 from .diagnostics.health import HealthPolicy
+from .diagnostics.score import spread_ratio
 from .errors import EstimatorError, ModelError
 from .estimator import Estimator
 from .events.maintenance import versions_dropped
 from .fold_checks import check_base, check_log, check_pairs, check_prior, check_soft, check_tuning
 from .fold_machine import Machine, Moments, variances_of
-from .gate.reopening import Decision, decide
+from .gate.isolation import Decision, decide
 from .log import BEFORE, MAINTENANCE, MARK, TICK, TRUTH, Log
 from .model.state_space import StateSpaceModel
 from .numerics.peaks import Peak

@@ -19,7 +19,7 @@ from .estimator import Code, Estimator, Options
 from .events.maintenance import without
 from .fold_kernel import compiled
 from .gate import doubt
-from .gate.stories import widening
+from .gate.isolation import widening
 from .interpreted import fold_loop
 from .interpreted.black_box_filters import driven
 from .interpreted.fold_loop import UNSET

@@ -80,7 +80,7 @@ def constants_of(path):
 
 def outcomes():
     """What is decided of sensors that stay refused."""
-    (found,) = (names for names in constants_of(ROOT / "estimators/gate/stories.py") if "DOUBTED" in names)
+    (found,) = (names for names in constants_of(ROOT / "estimators/gate/isolation.py") if "DOUBTED" in names)
     return set(found.values())
 
 

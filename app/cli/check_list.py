@@ -8,10 +8,10 @@ import numpy as np
 
 from config.source_schema import CanLogSection, CanSection, MergedSection
 from estimators.diagnostics.calibration import LIMITS
-from estimators.diagnostics.checklist.dimension import BUSY, spread_error
-from estimators.diagnostics.checklist.posterior import OFTEN
 from estimators.diagnostics.sensitivity import Sensitivity
-from estimators.diagnostics.sensitivity.words import digits, subject_text
+from estimators.diagnostics.sensitivity.checklist import BUSY, spread_error
+from estimators.diagnostics.sensitivity.posterior import OFTEN
+from estimators.diagnostics.sensitivity.responses import digits, subject_text
 from estimators.log import MAINTENANCE
 from estimators.track import HEALTH_NAMES, Track
 

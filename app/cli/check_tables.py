@@ -8,8 +8,8 @@ import numpy as np
 
 from estimators.diagnostics.calibration import BANDS
 from estimators.diagnostics.sensitivity import bounds_of
-from estimators.diagnostics.sensitivity.information import directions
-from estimators.diagnostics.sensitivity.words import digits, range_text, size_text, subject_text
+from estimators.diagnostics.sensitivity.gramian import directions
+from estimators.diagnostics.sensitivity.responses import digits, range_text, size_text, subject_text
 
 from ..present.export.calibration_lines import calibration_lines
 from ..present.result import WORSE, Bar, Topic

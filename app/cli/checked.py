@@ -8,13 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimators.diagnostics.calibration import Calibration
-from estimators.diagnostics.checklist.arrivals import Arrivals, arrivals
-from estimators.diagnostics.checklist.dimension import Dimension, dimension
-from estimators.diagnostics.checklist.held_out import HeldOut, held_out
-from estimators.diagnostics.checklist.linearity import Linearity, linearity
-from estimators.diagnostics.checklist.posterior import Peaks, Tail, peaks, tails
 from estimators.diagnostics.episodes import Episode, episodes
 from estimators.diagnostics.sensitivity import Gramian, Sensitivity, gramian, sensitivity
+from estimators.diagnostics.sensitivity.checklist import Arrivals, Dimension, Linearity, arrivals, dimension, linearity
+from estimators.diagnostics.sensitivity.held_out import HeldOut, held_out
+from estimators.diagnostics.sensitivity.posterior import Peaks, Tail, peaks, tails
 from estimators.fold import Fold
 from estimators.log import READING, Log
 from estimators.registry import find_entry

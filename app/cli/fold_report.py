@@ -14,8 +14,7 @@ from estimators.diagnostics.intervals import Interval
 from estimators.diagnostics.score import Score
 from estimators.fold import Fold
 from estimators.fold_failures import cause_of
-from estimators.gate.reopening import Decision
-from estimators.gate.stories import softened
+from estimators.gate.isolation import Decision, softened
 from estimators.screen import reasons_by_sensor
 from estimators.track import FAILED, HEALTH_NAMES, REASONS, USED
 from estimators.tuning import TOGETHER

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from estimators.diagnostics.sensitivity.words import digits
+from estimators.diagnostics.sensitivity.responses import digits
 from estimators.fit.judge import Part
 from estimators.learned.train import OnWindows
 

@@ -14,11 +14,9 @@ from estimators.errors import ConfigError, NisusError
 from estimators.registry import find_estimator
 
 from ..present.result import to_json
-from ..studies.stress.bench import Bench, asset_of
-from ..studies.stress.foretold import CHANCE, INVISIBLE, Oracle
+from ..studies.stress.detection import CHANCE, FALSE, INVISIBLE, MISNAMED, MISSED, NAMED, UNSEEN, Oracle, Trial, make
 from ..studies.stress.matrix import matrix
-from ..studies.stress.mistake import Mistake
-from ..studies.stress.trial import FALSE, MISNAMED, MISSED, NAMED, UNSEEN, Trial, make
+from ..studies.stress.scenario import Bench, Mistake, asset_of
 from ..terminal import complain
 from ..twin.twin import load_twin
 from .given import settings

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimators.diagnostics.sensitivity.words import digits
+from estimators.diagnostics.sensitivity.responses import digits
 from estimators.fit.fit import Fitted, Line
 from estimators.fit.judge import Part, Prediction, Worth
 

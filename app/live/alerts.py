@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -9,8 +10,8 @@ import numpy as np
 from estimators.diagnostics.failure_cause import failures
 from estimators.fold import Fold
 from estimators.fold_failures import cause_of
-from estimators.gate.stories import AGREES
-from estimators.track import estimated_rows
+from estimators.gate.isolation import AGREES
+from estimators.track import STALE, WAITING, estimated_rows
 
 from .counts import UNSETTLED, complaints, refusals
 from .notices import Notices
@@ -123,3 +124,39 @@ class Alerts:
             if text is not None:
                 self._tries = TRIES
                 self._notices.say(text, level="error", t=int(fold.log.t[rows[0]]))
+
+
+class Silence:
+    """From the opening of the source to the first of its events."""
+
+    def __init__(self, notices: Notices, stale_after: float, clock: Callable[[], float] = time.monotonic) -> None:
+        """`stale_after`: seconds after which a live source that says nothing is stale; `clock` gives seconds."""
+        self._notices, self._after, self._clock = notices, stale_after, clock
+        self._since = clock()
+        self._told = False
+
+    @property
+    def health(self) -> int:
+        """Of a twin that has heard nothing."""
+        return STALE if self._told else WAITING
+
+    @property
+    def cause(self) -> str:
+        """Why the twin is stale that has heard nothing; nothing while it waits."""
+        if not self._told:
+            return ""
+        return f"nothing has come since the twin started, {self._clock() - self._since:.0f} s ago; check the source"
+
+    def look(self, *, live: bool) -> None:
+        """Nothing has come yet. A recording may be held; of a bus that is silent so long people are told, once."""
+        if live and not self._told and self._clock() - self._since > self._after:
+            self._told = True
+            text = f"stale: nothing has come since the twin started, {self._after:g} s ago; check the source"
+            self._notices.say(text, level="warn")
+
+    def broken(self) -> None:
+        """Something has come."""
+        if self._told:
+            self._told = False
+            silent = self._clock() - self._since
+            self._notices.say(f"the source speaks, {silent:.0f} s after the twin started")

@@ -14,14 +14,13 @@ from estimators.log import INPUT, READING, Events
 from estimators.track import TRACKING, WAITING
 from sources.source import Paced, Source
 
-from .alerts import Alerts
-from .blame import Blame
-from .chronicle import Chronicle
+from .alerts import Alerts, Silence
 from .counts import Latency
+from .episode_log import Chronicle
 from .integrity import IntegrityWatch
 from .interface import Running
 from .notices import Notices
-from .silence import Silence
+from .root_cause import Blame
 
 if TYPE_CHECKING:
     from estimators.diagnostics.episodes import Episode

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from estimators.diagnostics.sensitivity.words import digits
+from estimators.diagnostics.sensitivity.responses import digits
 
 WORSE = "worse than no filter"
 """Text that HTML shows in red."""

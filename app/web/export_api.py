@@ -11,7 +11,7 @@ from starlette.responses import HTMLResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from estimators.diagnostics.episodes import Episode
-from estimators.diagnostics.sensitivity.words import digits
+from estimators.diagnostics.sensitivity.responses import digits
 from estimators.errors import ConfigError
 
 from ..live.interface import Running

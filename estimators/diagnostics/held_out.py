@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..events.batch import READING, Events
+from ..events.batch import Events
+from ..log import READING
 from ..numerics.quantiles import normal_quantile
 from ..track import HELD_OUT, Track
 from ..tuning import Tuning

@@ -9,9 +9,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtr, ndtri
+from scipy.special import chdtr, chdtrc, fdtr, fdtrc, ndtr, ndtri
 
-from ..numerics.quantiles import normal_quantile
+from ..log import READING, Events
+from ..numerics.quantiles import chi_square_quantile, normal_quantile
+from ..track import GATED, USED, Track
+from ..tuning import Tuning
+from .intervals import correlation_interval
 
 TWO_SIDED = normal_quantile(0.975)
 """Standard errors to either side of a 95 % interval."""
@@ -106,3 +110,183 @@ def memory(r: np.ndarray) -> int:
     """After how many readings a correlation has fallen to a third of the first; as many as are known if it has not."""
     fallen = np.flatnonzero(r < r[0] / 3.0) if r.size else np.zeros(0, int)
     return int(fallen[0]) + 1 if fallen.size else r.size
+
+
+FEWEST = 50
+"""Readings of a row from which on its noise is estimated."""
+
+
+class SensorNoise(NamedTuple):
+    """Variance of the noise of one sensor row as its innovations have it, in the square of the row's unit.
+
+    `variance` is not positive where the innovations are smaller than the process noise and the model alone explain;
+    `std` is its standard deviation, were the innovations white and normal, `n` how many there are. `correlation` is
+    that of each with the next, and `chance` that of innovations as correlated as these in a filter that is right (a
+    Ljung-Box test): where it is small, the innovations are no noise, and the variance of none.
+    """
+
+    variance: float
+    std: float
+    n: int
+    correlation: float = 0.0
+    chance: float = 1.0
+
+
+def mean_nis(track: Track, gate: float | None) -> float:
+    """Mean NIS a degree of freedom of the readings used and refused, 1 if the filter is consistent; NaN without any.
+
+    Args:
+        track: What was concluded.
+        gate: That of the tuning; None where nothing is refused.
+    """
+    judged = (track.verdict == USED) | (track.verdict == GATED)
+    nis, dof = track.nis[judged], track.dof[judged]
+    m, g = _gates(gate, dof)
+    expected = _expected(g, m)[dof].sum()
+    return float(np.minimum(nis, g[dof]).sum() / expected) if expected > 0.0 else np.nan
+
+
+def sensor_noise(track: Track, events: Events, tuning: Tuning) -> dict[str, SensorNoise]:
+    """Noise of the sensor rows with enough readings, as their innovations ν have it.
+
+    R̂ = mean ν² - (S - R), the innovations' covariance less what of it the filter lays to its own prediction, H P⁻ Hᵀ.
+    Each reading counts by 1 / S², the inverse of the variance of ν²: where S is settled, as in the source, all count
+    alike, and the first ones, predicted from a wide prior, do not spoil it. All that the innovations have too much or
+    too little is laid to R, so it means something only where they are white: with a Q too small it is too large, and
+    an error that lasts, of the model or of the sensor, is taken for one that the next reading averages away. P⁻
+    follows from R; taken again and again the estimate comes to rest.
+
+    Args:
+        track: What was concluded, under `tuning`.
+        events: Of what.
+        tuning: Its R held as it is: nothing brought variances, and the filter adapted none.
+
+    Source: Mohamed & Schwarz (1999), doi:10.1007/s001900050236, the R of the innovation-based filter; after Mehra
+    (1970), doi:10.1109/TAC.1970.1099422.
+    """
+    model, found = tuning.model, dict[str, SensorNoise]()
+    judged = (events.kind == READING) & ((track.verdict == USED) | (track.verdict == GATED))
+    for s, sensor in enumerate(model.sensors):
+        rows = np.flatnonzero(judged & (events.channel == s))
+        dof = track.dof[rows]
+        _, g = _gates(tuning.gate, dof)
+        expected = _expected(g, np.ones(len(g)))
+        for k in range(len(sensor.rows)):
+            nu, S = track.innovation[rows, k], track.innovation_std[rows, k] ** 2
+            known = np.isfinite(nu) & np.isfinite(S) & (S > 0.0)
+            n = int(known.sum())
+            if n < FEWEST:
+                continue
+            nu, S, m = nu[known], S[known], dof[known]
+            R = float(tuning.r[model.row_start[s] + k])
+            square = np.minimum(nu**2, g[m] * S) / expected[m]
+            weight = S**-2
+            excess = float(np.sum(weight * (square - S)) / np.sum(weight))
+            std = float(np.sqrt(2.0 / np.sum(weight)))
+            e = np.where(known, track.innovation[rows, k], np.nan) / track.innovation_std[rows, k]
+            limit = np.sqrt(g[dof])
+            e = np.clip(e, -limit, limit)
+            correlation, chance = correlation_interval(e[known]).value, ljung_box(e).p_value
+            found[model.row_names[model.row_start[s] + k]] = SensorNoise(R + excess, std, n, correlation, chance)
+    return found
+
+
+def _gates(gate: float | None, dof: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Every number of degrees of freedom up to the largest, and its gate: quantiles are dear, and few differ."""
+    m = np.arange(1.0 + dof.max(initial=0))
+    return m, np.full(m.size, np.inf) if gate is None else chi_square_quantile(gate, m)
+
+
+def _expected(g: np.ndarray, m: np.ndarray) -> np.ndarray:
+    """E min(χ²_m, g) of each; m where there is no gate."""
+    finite = np.isfinite(g)
+    limit = np.where(finite, g, 1.0)
+    return np.where(finite, m * chdtr(m + 2.0, limit) + limit * chdtrc(m, limit), m)
+
+
+class WhitenessTest(NamedTuple):
+    """A statistic, the chance of one as large under the null, and the degrees of freedom of its distribution.
+
+    `dof` has one number for a chi-square, two (numerator, denominator) for an F. Statistic and p-value are NaN where
+    the series is too short, or constant.
+    """
+
+    statistic: float
+    p_value: float
+    dof: tuple[int, ...]
+
+
+def ljung_box(innovations: np.ndarray, lags: int | None = None) -> WhitenessTest:
+    """Whether a series is correlated at lags 1 to `lags`.
+
+    Q = n (n + 2) Σ_k r_k² / n_k,  r_k = Σ z_t z_{t+k} / Σ z_t²,  chi-square with `lags` degrees of freedom,
+
+    z being the series less its mean (0 where missing), n its values that are there and n_k the pairs, k apart, of which
+    both are: under the null the variance of r_k is n_k / (n (n + 2)). Where nothing is missing n_k is n - k.
+
+    Args:
+        innovations: Standardised innovations, (T,); NaN is a missing one.
+        lags: How many; None for 10, or a fifth of the values where that is less.
+
+    Raises:
+        ValueError: If `lags` is not positive.
+
+    Source: Ljung & Box (1978), doi:10.1093/biomet/65.2.297.
+    """
+    there = np.isfinite(innovations)
+    n = int(there.sum())
+    lags = max(1, min(10, n // 5)) if lags is None else lags
+    if lags < 1:
+        raise ValueError(f"lags is {lags}; it must be 1 or more")
+    z = np.where(there, innovations - np.mean(innovations[there]), 0.0) if n else np.zeros(len(innovations))
+    square = float(z @ z)
+    pairs = np.array([np.sum(there[k:] & there[:-k]) for k in range(1, lags + 1)])
+    if not square > 0.0 or not np.all(pairs):
+        return WhitenessTest(np.nan, np.nan, (lags,))
+    r = np.array([z[k:] @ z[:-k] for k in range(1, lags + 1)]) / square
+    statistic = float(n * (n + 2) * np.sum(r**2 / pairs))
+    return WhitenessTest(statistic, float(chdtrc(lags, statistic)), (lags,))
+
+
+def jarque_bera(innovations: np.ndarray) -> WhitenessTest:
+    """Whether the values are normal, by skewness S and kurtosis K of those that are there.
+
+    JB = n (S² / 6 + (K - 3)² / 24),  chi-square with 2 degrees of freedom
+
+    Args:
+        innovations: Standardised innovations, (T,); NaN is a missing one.
+
+    Source: Jarque & Bera (1980), doi:10.1016/0165-1765(80)90024-5.
+    """
+    z = innovations[np.isfinite(innovations)]
+    z = z - np.mean(z) if z.size else z
+    variance = float(np.mean(z**2)) if z.size else 0.0
+    if not variance > 0.0:
+        return WhitenessTest(np.nan, np.nan, (2,))
+    skewness, kurtosis = np.mean(z**3) / variance**1.5, np.mean(z**4) / variance**2
+    statistic = float(z.size * (skewness**2 / 6.0 + (kurtosis - 3.0) ** 2 / 24.0))
+    return WhitenessTest(statistic, float(chdtrc(2, statistic)), (2,))
+
+
+def heteroscedasticity(innovations: np.ndarray) -> WhitenessTest:
+    """Whether the last third of a series has another variance than the first ("breakvar"), two-sided.
+
+    H = Σ e_t² of the last h / Σ e_t² of the first h,  h = T / 3;  (n_first / n_last) H is F(n_last, n_first),
+
+    n_first and n_last being the values that are there; about zero, not about their mean.
+
+    Args:
+        innovations: Standardised innovations, (T,); NaN is a missing one.
+
+    Source: Harvey, Forecasting, Structural Time Series Models and the Kalman Filter (1989), 5.4.2.
+    """
+    third = round(len(innovations) / 3)
+    first, last = innovations[:third], innovations[len(innovations) - third :]
+    n_first, n_last = int(np.isfinite(first).sum()), int(np.isfinite(last).sum())
+    before = float(np.nansum(first**2))
+    if min(n_first, n_last) < 2 or not before > 0.0:
+        return WhitenessTest(np.nan, np.nan, (n_last, n_first))
+    statistic = float(np.nansum(last**2)) / before
+    ratio = statistic * n_first / n_last
+    tails = fdtr(n_last, n_first, ratio), fdtrc(n_last, n_first, ratio)
+    return WhitenessTest(statistic, 2.0 * float(min(tails)), (n_last, n_first))

@@ -10,15 +10,16 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import betainc, gammaln
 
 from ..log import READING, Events, truth_of
 from ..model.state_space import StateSpaceModel
-from ..numerics.quantiles import normal_quantile
+from ..numerics.quantiles import chi_square_quantile, normal_quantile
 from ..track import GATED, HELD_OUT, MISSING, USED, VERDICT_NAMES, Track
 from .consistency import NisVerdict
 from .field_pictures import Picture
+from .health import FAR
 from .normal_nis import PROBABILITY, nis_bounds, normal_nis
-from .refusals import log_density
 
 FARTHEST = 6.0
 """σ from which on a row counts no more for what is normal (commission.py)."""
@@ -170,3 +171,37 @@ def _fit(error: np.ndarray, std: np.ndarray) -> Fit:
     half = normal_quantile(0.5 + PROBABILITY / 2.0)
     inside = float(np.mean(np.abs(error) <= half * std))
     return Fit(float(np.sqrt(np.mean(error**2))), inside, float(np.mean(error)))
+
+
+def log_density(refused: Track, gate: float | None) -> np.ndarray:
+    """Log of p at refused readings, (N,), in the units of the rows; -inf where a NIS is not finite, NaN without a gate.
+
+    Args:
+        refused: Rows of a track whose verdict is that the gate refused the reading.
+        gate: P, as the tuning has it.
+    """
+    if gate is None:
+        return np.full(len(refused), np.nan)
+    m = np.asarray(refused.dof, float)
+    # Of t: log Γ((m + 1) / 2) - ½ log π - ½ m log π - ½ log |S| - ½ (m + 1) log(1 + NIS)
+    constant = gammaln(0.5 * (m + 1.0)) - 0.5 * (m + 1.0) * np.log(np.pi)
+    with np.errstate(all="ignore"):
+        log_scale = np.nansum(np.log(refused.innovation_std), axis=1)
+        cauchy = constant - log_scale - 0.5 * (m + 1.0) * np.log1p(refused.nis)
+    # F(m, 1) exceeds g / m with the probability I(1 / (1 + g); ½, m / 2).
+    beyond = betainc(0.5, 0.5 * m, 1.0 / (1.0 + chi_square_quantile(gate, m)))
+    found = np.log1p(-gate) + cauchy - np.log(beyond)
+    return np.where(np.isfinite(found), found, -np.inf)
+
+
+def spread_ratio(track: Track, window: int) -> float:
+    """Predicted over actual variance of the innovations, over the last `window` readings that were used or gated.
+
+    1 / mean(ν² / S) over their rows: below 1 the spread is too small, above 1 too large. NaN where there is none.
+    """
+    verdict = track.verdict[-FAR * window :]
+    rows = np.flatnonzero((verdict == USED) | (verdict == GATED))[-window:] + len(track) - verdict.size
+    e = track.innovation[rows] / track.innovation_std[rows]
+    e = e[np.isfinite(e)]
+    square = float(np.mean(e * e)) if e.size else np.nan
+    return 1.0 / square if square > 0.0 else np.nan

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from ..diagnostics.refusals import log_density
+from ..diagnostics.score import log_density
 from ..errors import EstimatorError, nearest, quoted
 from ..fold import Fold
 from ..log import READING, Log, truth_of

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..diagnostics.innovation_size import mean_nis
+from ..diagnostics.innovations import mean_nis
 from ..diagnostics.sensitivity.responses import each
 from ..log import READING, TRUTH
 from ..model.state_space import StateSpaceModel

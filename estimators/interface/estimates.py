@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from ..diagnostics.consistency import Nees, nees
 from ..diagnostics.episodes import Course, Episode, found_in
-from ..diagnostics.nees import Nees, nees
 from ..diagnostics.score import Score, score
 from ..errors import EstimatorError
 from ..events.batch import READING, Events

@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from ..fold import Fold
-from ..gate.stories import BELIEVED, REOPENED
+from ..gate.isolation import BELIEVED, REOPENED
 from ..log import MAINTENANCE, MARK, TICK, TRUTH
 from ..snapshots import Snapshot
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.studies.stress.bench import plain_log
+from app.studies.stress.scenario import plain_log
 from app.twin.twin import load_twin
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log

@@ -14,9 +14,9 @@ import time
 
 import numpy as np
 
-from app.live.chronicle import SLOWEST
 from app.live.engine import Engine
-from app.studies.stress.bench import asset_of
+from app.live.episode_log import SLOWEST
+from app.studies.stress.scenario import asset_of
 from app.twin.twin import Twin, load_twin
 from estimators.log import MARK, Events
 from estimators.track import HEALTH_NAMES, SUSPECT, TRACKING, VERDICT_NAMES

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from estimators.fold import fold
-from estimators.gate.stories import degrees
+from estimators.gate.isolation import degrees
 from estimators.log import READING, Events, Log
 from estimators.model import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning

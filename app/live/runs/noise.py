@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimators.diagnostics.innovation_size import SensorNoise, sensor_noise
+from estimators.diagnostics.innovations import SensorNoise, sensor_noise
 from estimators.tuning import Tuning
 
 from ..history_copy import recent_rows

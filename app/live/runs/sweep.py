@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimators.diagnostics.innovation_size import SensorNoise, mean_nis, sensor_noise
+from estimators.diagnostics.innovations import SensorNoise, mean_nis, sensor_noise
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError, NisusError
 from estimators.track import FAILED, Track

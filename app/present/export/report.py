@@ -13,7 +13,7 @@ from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.held_out import Offset, offsets
 from estimators.diagnostics.score import Score, score
 from estimators.diagnostics.sensitivity import Bound
-from estimators.diagnostics.sensitivity.words import digits
+from estimators.diagnostics.sensitivity.responses import digits
 from estimators.log import READING, Events
 from estimators.registry import find_entry
 from estimators.smoothing.smoothed import Smoothed

@@ -6,7 +6,7 @@ import numpy as np
 
 from config.tunings import named
 from estimators.diagnostics.calibration import LIMITS, calibrations
-from estimators.diagnostics.innovation_size import mean_nis
+from estimators.diagnostics.innovations import mean_nis
 
 from .claim import NO, UNTOLD, YES, Claim
 from .measured import Measured

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from estimators.diagnostics.calibration import LIMITS
-from estimators.diagnostics.checklist.linearity import QUANTILE, Linearity
+from estimators.diagnostics.sensitivity.checklist import QUANTILE, Linearity
 from estimators.errors import EstimatorError
 from estimators.log import READING
 from estimators.registry import find_entry, unfit

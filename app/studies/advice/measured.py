@@ -9,10 +9,10 @@ from functools import cached_property
 
 import numpy as np
 
-from estimators.diagnostics.checklist.linearity import Linearity, linearity
-from estimators.diagnostics.checklist.posterior import Peaks, peaks
 from estimators.diagnostics.score import score
 from estimators.diagnostics.sensitivity import Gramian, gramian
+from estimators.diagnostics.sensitivity.checklist import Linearity, linearity
+from estimators.diagnostics.sensitivity.posterior import Peaks, peaks
 from estimators.diagnostics.sensitivity.responses import stand_in
 from estimators.errors import NisusError
 from estimators.fold import Fold

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from estimators.diagnostics.checklist.posterior import MOST_STATES, OFTEN
+from estimators.diagnostics.sensitivity.posterior import MOST_STATES, OFTEN
 
 from .claim import NO, UNTOLD, YES, Claim
 from .measured import Measured

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from estimators.diagnostics.calibration import LIMITS, calibrations
-from estimators.diagnostics.checklist.posterior import FAR, HEAVY, OFTEN, Tail
-from estimators.diagnostics.checklist.posterior import tails as measure
+from estimators.diagnostics.sensitivity.posterior import FAR, HEAVY, OFTEN, Tail
+from estimators.diagnostics.sensitivity.posterior import tails as measure
 from estimators.registry import find_entry
 
 from .claim import NO, UNTOLD, YES, Claim

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from estimators.diagnostics.checklist.linearity import LEAST
-from estimators.diagnostics.sensitivity.words import digits
+from estimators.diagnostics.sensitivity.checklist import LEAST
+from estimators.diagnostics.sensitivity.responses import digits
 
 __all__ = ["apart_text", "bytes_text", "digits", "percent", "seconds_text"]
 

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from estimators.diagnostics.calibration import LIMITS, Calibration, calibrations, standardised
-from estimators.diagnostics.calibration_words import reading_words
+from estimators.diagnostics.calibration import LIMITS, Calibration, calibrations, reading_words, standardised
 from estimators.diagnostics.innovations import (
     Autocorrelation,
     autocorrelation,

@@ -13,7 +13,7 @@ from estimators.model.state_space import Sensor, StateSpaceModel
 from estimators.tuning import Tuning
 from sources.faults.fault import Fault
 
-from .mistake import Mistake
+from .scenario import Mistake
 
 SMALL_BANDS = frozenset({"narrow", "correlated", "shifted"})
 """What shows where the filter believes itself too much."""

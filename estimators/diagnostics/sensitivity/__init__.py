@@ -1,10 +1,8 @@
 """What could be wrong without anyone noticing: sensitivities, smallest visible faults, integrity, observability."""
 
-from .bounds import Bound, Smallest, bounds_of, smallest_of
 from .gramian import Gramian, View, gramian
-from .nudges import Nudge
-from .responses import Response
-from .sensitivity import Sensitivity, sensitivity
+from .responses import Nudge, Response
+from .sensitivity import Bound, Sensitivity, Smallest, bounds_of, sensitivity, smallest_of
 
 __all__ = [
     "Bound", "Gramian", "Nudge", "Response", "Sensitivity", "Smallest", "View", "bounds_of", "gramian", "sensitivity",

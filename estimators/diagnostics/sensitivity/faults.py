@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .nudges import nudged
-from .responses import Response, Start, moved, refold
+from .responses import Response, Start, moved, nudged, refold
 from .visibility import Witness
 
 NEAR = 0.05

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
@@ -12,13 +12,12 @@ import numba
 import numpy as np
 
 from ...fold import Fold
-from ...log import READING, Log
+from ...log import INPUT, READING, Log
 from ...model.state_space import StateSpaceModel
 from ...registry import find_entry, find_estimator, unfit
 from ...snapshots import Base
 from ...track import DIVERGED, MISSING, NONE, USED, Track
 from ...tuning import Tuning
-from .nudges import Given, Nudge, nudged
 
 SMOOTH = ("ekf", "ukf", "kf")
 """Filters that stand in for one that draws at random, the first that applies."""
@@ -160,3 +159,174 @@ def each(work: Callable[[T], R], items: Iterable[T], executor: Executor | str | 
     own: Any = ThreadPoolExecutor(THREADS) if executor == "threads" else nullcontext(executor)
     with own as pool:
         return list(map(work, items) if pool is None else pool.map(work, items))
+
+
+SENSOR, INPUT_, PARAMETER = KINDS = ("sensor", "input", "parameter")
+
+DRIFT = "drift"
+"""Of a sensor row, too: its readings move away from the log's first event on, by so much a second."""
+
+STEP = 1e-3
+"""Of the scale of what is nudged: the error of a central difference is of the order of its square, and rounding of the
+order of 1e-16 over it."""
+
+
+class Nudge(NamedTuple):
+    """A constant, or a drift, added to the readings of a sensor row; a constant added to an input or a parameter.
+
+    `step` is what is added and taken off for the differences, `low` and `high` the range in which a fault of this kind
+    (a change from the present value) makes sense, `scale` the size by which nudges are compared: the deviation of the
+    sensor's noise, the spread of the input in the log, the parameter's value, or its range where that is 0. `value` is
+    a parameter's own. All in `unit`.
+    """
+
+    kind: str
+    name: str
+    unit: str
+    step: float
+    low: float
+    high: float
+    scale: float
+    value: float = np.nan
+
+    def in_words(self, size: float) -> str:
+        """A fault of a size: of a parameter in percent of its value, if it has one; else in units."""
+        if self.kind == PARAMETER and self.value:
+            return f"{self.name} {100.0 * size / abs(self.value):+.3g} %"
+        if self.kind == DRIFT:
+            return f"{SENSOR} {self.name} drifting by {size:+.3g} {self.unit}"
+        kind = "" if self.kind == PARAMETER else f"{self.kind} "
+        return f"{kind}{self.name} {size:+.3g} {self.unit}"
+
+    @property
+    def largest(self) -> float:
+        """Size of the largest fault within the range."""
+        return max(abs(self.low), abs(self.high))
+
+
+class Given(NamedTuple):
+    """What a fold is given: any of it may be nudged."""
+
+    tuning: Tuning
+    log: Log
+    base: Base
+
+
+def nudges_of(model: StateSpaceModel, tuning: Tuning, log: Log, kinds: Sequence[str] = KINDS) -> list[Nudge]:
+    """Every nudge of a model: rows of sensors that speak and are used, inputs, parameters with room in their range."""
+    found = []
+    seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9 if log.n else 0.0
+    units = [row.unit for sensor in model.sensors for row in sensor.rows]
+    kind, channel = log.kind[: log.n], log.channel[: log.n]
+    speak = tuning.used & np.isin(np.arange(len(model.sensors)), channel[kind == READING])
+    in_use = np.repeat(speak, [len(sensor.rows) for sensor in model.sensors])
+    for name, unit, variance, used in zip(model.row_names, units, tuning.r, in_use, strict=True):
+        if used:
+            scale = float(np.sqrt(variance)) or 1.0
+            found.append(Nudge(SENSOR, name, unit, STEP * scale, -np.inf, np.inf, scale))
+            if seconds > 0.0:
+                rate = scale / seconds
+                found.append(Nudge(DRIFT, name, f"{unit}/s", STEP * rate, -np.inf, np.inf, rate))
+    given = log.value[: log.n][kind == INPUT]
+    for k, item in enumerate(model.inputs):
+        values = given[np.isfinite(given[:, k]), k]
+        values = values if values.size else np.array([item.default])
+        scale = float(np.std(values)) or float(np.abs(values[0])) or 1.0
+        found.append(Nudge(INPUT_, item.name, item.unit, STEP * scale, -np.inf, np.inf, scale))
+    for parameter, value in zip(model.parameters, tuning.p.tolist(), strict=True):
+        low, high = parameter.low - value, parameter.high - value
+        scale = abs(value) or (high - low if np.isfinite(high - low) else 1.0)
+        if low < high:
+            found.append(Nudge(PARAMETER, parameter.name, parameter.unit, STEP * scale, low, high, scale, value))
+    return [nudge for nudge in found if nudge.kind in kinds]
+
+
+def nudged(given: Given, nudge: Nudge, size: float) -> Given:
+    """What a fold is given, with `size` added to what the nudge names; nothing that was given changes."""
+    tuning, log, base = given
+    model = tuning.model
+    if nudge.kind == PARAMETER:
+        p = tuning.p.copy()
+        p[[item.name for item in model.parameters].index(nudge.name)] += size
+        return Given(replace(tuning, p=p), log, base)
+    other = log.copy()
+    kind, value = other.kind[: other.n], other.value[: other.n]
+    if nudge.kind in (SENSOR, DRIFT):
+        row = model.row_names.index(nudge.name)
+        sensor = int(np.searchsorted(model.row_start, row, side="right")) - 1
+        own = np.flatnonzero((kind == READING) & (other.channel[: other.n] == sensor))
+        off = size if nudge.kind == SENSOR else size * 1e-9 * (other.t[own] - other.t[0])
+        value[own, row - model.row_start[sensor]] += off
+        return Given(tuning, other, base)
+    k = model.input_names.index(nudge.name)
+    value[kind == INPUT, k] += size
+    u = base.u.copy()
+    u[k] += size
+    return Given(tuning, other, base._replace(u=u))
+
+
+def digits(value: float, sign: str = "") -> str:
+    """A number to three digits, with an exponent only where it would be longer without: `2,280`, `0.0375`, `1.8e+10`.
+
+    `sign`: "+" shows that of a positive number too. Zero has none.
+    """
+    value = value or 0.0
+    if 1e3 <= abs(value) < 1e6:
+        return f"{float(f'{value:.3g}'):{sign},.0f}"
+    return f"{value:{sign if value else ''}.3g}"
+
+
+def subject_text(nudge: Nudge) -> str:
+    """What is nudged."""
+    return f"{nudge.kind} {nudge.name}"
+
+
+def size_text(nudge: Nudge, size: float) -> str:
+    """The size of a fault without its sign: of a parameter in percent of its value, if it has one; else in its unit."""
+    if nudge.kind == PARAMETER and nudge.value:
+        return f"{digits(100.0 * size / abs(nudge.value))} %"
+    return f"{digits(size)} {nudge.unit}".rstrip()
+
+
+def range_text(nudge: Nudge, low: float, high: float) -> str:
+    """From where to where a fault passes unseen: `-31 to +92 %`, or `± 2.51 °C`."""
+    if not (np.isfinite(low) and np.isfinite(high)):
+        return "any size"
+    percent = nudge.kind == PARAMETER and bool(nudge.value)
+    scale, unit = (100.0 / abs(nudge.value), "%") if percent else (1.0, nudge.unit)
+    first, last = digits(scale * low, "+"), digits(scale * high, "+")
+    both = f"± {last[1:]}" if first[1:] == last[1:] and first != last else f"{first} to {last}"
+    return f"{both} {unit}".rstrip()
+
+
+def fault_text(nudge: Nudge, low: float, high: float) -> str:
+    """A fault that passes unseen: `parameter magnet_ambient, -31 to +92 %`."""
+    return f"{subject_text(nudge)}, {range_text(nudge, low, high)}"
+
+
+MOST_STATES = 64
+"""States beyond which a model is too large to be folded again for each of its nudges."""
+
+MOST_EVENTS = 20_000
+"""Events that are folded again; of a longer log the last."""
+
+MOST_NUMBERS = 32_000_000
+"""Numbers that the responses may take together."""
+
+MOST_WORK = 2_000_000_000
+"""Events times nudges times nx³, as a covariance costs: some ten seconds."""
+
+
+def reason_against(model: StateSpaceModel, log: Log) -> str:
+    """Why sensitivities are not computed, in words, or nothing."""
+    if model.grid is not None or model.nx > MOST_STATES:
+        return f"{model.name} has {model.nx:,} states; sensitivities are computed up to {MOST_STATES}"
+    if not (log.kind[: log.n] == READING).any():
+        return "the log has no reading, so nothing can be seen"
+    return ""
+
+
+def most_events(model: StateSpaceModel, nudges: int) -> int:
+    """How many events are folded again for so many nudges, by what that takes."""
+    numbers = nudges * (2 * model.ny + 2 * len(model.shown))
+    return max(1, min(MOST_EVENTS, MOST_NUMBERS // numbers, MOST_WORK // (nudges * model.nx**3)))

@@ -15,17 +15,30 @@ import numpy as np
 from ...errors import EstimatorError
 from ...log import Log
 from ...model.state_space import StateSpaceModel
+from ...numerics.quantiles import normal_quantile
 from ...registry import find_estimator
 from ...snapshots import Base
 from ...track import USED
 from ...tuning import Tuning
 from ..health import HealthPolicy
 from .faults import fault
-from .information import Uncertainty, information, uncertainty
-from .integrity import Integrity, integrity
-from .nudges import KINDS, Nudge, nudges_of
-from .responses import Response, astray, each, respond, start
-from .size import most_events, reason_against
+from .gramian import Uncertainty, information, uncertainty
+from .responses import (
+    KINDS,
+    Nudge,
+    Response,
+    astray,
+    each,
+    fault_text,
+    most_events,
+    nudges_of,
+    range_text,
+    reason_against,
+    respond,
+    size_text,
+    start,
+    subject_text,
+)
 from .visibility import tests_of
 
 CURVED = 0.5
@@ -215,4 +228,91 @@ def _nothing(estimator: str, reason: str, shown: int) -> Sensitivity:
         integrity=unknown,
         integrity_cause=cause,
         over_time=Integrity(rows, rows, np.zeros((0, shown), int)),
+    )
+
+
+PROBABILITY = 0.95
+"""That an error stays below the bound, under the fault that is worst for it."""
+
+
+class Integrity(NamedTuple):
+    """Bounds of the error of each state, row by row, under one fault that was there from the first row on and unseen.
+
+    bias (N, shown): the largest |dx| by any fault as large as can pass unseen. bound (N, shown): bias + 1.96 σ, what
+    the error stays below with 95 % at least. cause (N, shown): the index of the nudge that causes it, -1 for none.
+    """
+
+    bias: np.ndarray
+    bound: np.ndarray
+    cause: np.ndarray
+
+
+def integrity(errors: Sequence[np.ndarray], std: np.ndarray) -> Integrity:
+    """Bounds from the error (N, shown) by the largest unseen fault of each nudge, and σ (N, shown)."""
+    bias = np.zeros(std.shape)
+    cause = np.full(std.shape, -1)
+    for k, error in enumerate(errors):
+        worse = error > bias
+        bias[worse], cause[worse] = error[worse], k
+    return Integrity(bias, bias + normal_quantile(0.5 + PROBABILITY / 2.0) * std, cause)
+
+
+TWO_SIGMA = normal_quantile(0.5 + PROBABILITY / 2.0)
+"""Standard deviations to either side in a band of 95 %, "± 2 σ", as the integrity bound has it."""
+
+
+class Bound(NamedTuple):
+    """Of one state, in `unit`: below which its error stays with 95 %.
+
+    `two_sigma` by the covariance, if nothing is wrong; `bound` under the one unseen fault that is worst for it, which
+    moves it by `bias`. `fault` says which that is and from where to where it passes unseen; empty if none moves it.
+    """
+
+    unit: str
+    bound: float
+    bias: float
+    two_sigma: float
+    fault: str
+
+
+def bounds_of(model: StateSpaceModel, found: Sensitivity) -> dict[str, Bound]:
+    """By state, at the end of what was folded; none where there is a reason against it."""
+    if found.reason:
+        return {}
+    bounds = {}
+    for k, state in enumerate(model.shown_states):
+        cause = int(found.integrity_cause[k])
+        bounds[state.name] = Bound(
+            unit=state.unit,
+            bound=float(found.integrity[k]),
+            bias=float(found.integrity_bias[k]),
+            two_sigma=TWO_SIGMA * float(found.std[-1, k]),
+            fault=fault_text(found.nudges[cause], *found.unseen[cause]) if cause >= 0 else "",
+        )
+    return bounds
+
+
+class Smallest(NamedTuple):
+    """The smallest fault of one sensor row, input or parameter that is seen, in words: `2.1 °C`, or `none`.
+
+    `share` is its size in units of the nudge's scale (a sensor's σ, an input's spread, a parameter's value), infinite
+    if none is seen; `unseen` says from where to where a fault passes.
+    """
+
+    subject: str
+    size: str
+    share: float
+    unseen: str
+
+
+def smallest_of(found: Sensitivity) -> tuple[Smallest, ...]:
+    """Of every nudge; none where there is a reason against it."""
+    return tuple(
+        Smallest(
+            subject_text(nudge),
+            size_text(nudge, float(size)) if np.isfinite(size) else "none",
+            float(size) / nudge.scale,
+            range_text(nudge, float(low), float(high)),
+        )
+        for nudge, size, (low, high) in zip(found.nudges, found.smallest_visible, found.unseen, strict=True)
     )

@@ -26,9 +26,21 @@ from ...log import Log
 from ...model.state_space import StateSpaceModel
 from ...snapshots import Base
 from ...tuning import Tuning
-from .nudges import DRIFT, KINDS, SENSOR, Given, Nudge, nudges_of
-from .responses import Start, astray, each, refold, respond, stand_in
-from .size import reason_against
+from .responses import (
+    DRIFT,
+    KINDS,
+    SENSOR,
+    Given,
+    Nudge,
+    Start,
+    astray,
+    each,
+    nudges_of,
+    reason_against,
+    refold,
+    respond,
+    stand_in,
+)
 
 RIDDLES = ("shifted", "refused")
 """Causes of episodes that leave open who is to blame."""

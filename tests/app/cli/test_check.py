@@ -10,7 +10,7 @@ import pytest
 
 from app.cli.main import main
 from app.present.result import Bar, Topic, to_html
-from estimators.diagnostics.sensitivity.words import range_text
+from estimators.diagnostics.sensitivity.responses import range_text
 
 REQUIRED = {"checklist", "observability", "smallest_visible", "integrity", "held_out", "open_loop"}
 MORE = {"twin", "estimator", "span", "timing", "calibration", "posterior", "linearity", "dimension", "health"}

@@ -7,9 +7,9 @@ import pytest
 
 from app.intake import CLOCK_MOVED, Planned
 from app.live import commands
+from app.live.alerts import Silence
 from app.live.engine import Engine
 from app.live.notices import Notices
-from app.live.silence import Silence
 from app.live.watchers import HostClock, clock_text
 from app.views.recording.reader import read_recording
 from app.views.recording.writer import Recorder

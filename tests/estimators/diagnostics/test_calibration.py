@@ -5,8 +5,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import chi2, norm
 
-from estimators.diagnostics.calibration import calibrations, truth_calibration
-from estimators.diagnostics.calibration_words import Limits
+from estimators.diagnostics.calibration import Limits, calibrations, truth_calibration
 from estimators.events.batch import READING, TRUTH, Events
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import GATED, HELD_OUT, MISSING, USED, Track

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimators.diagnostics.innovation_size import mean_nis, sensor_noise
+from estimators.diagnostics.innovations import mean_nis, sensor_noise
 from estimators.fold import fold
 from estimators.log import READING, Events, Log
 from estimators.models import MODELS

@@ -5,8 +5,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import chi2, f, multivariate_t, norm
 
-from estimators.diagnostics.refusals import log_density
-from estimators.diagnostics.score import score
+from estimators.diagnostics.score import log_density, score
 from estimators.fold import fold
 from estimators.log import READING, Events
 from estimators.models import MODELS

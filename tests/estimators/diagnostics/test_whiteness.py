@@ -8,7 +8,7 @@ from statsmodels.stats.diagnostic import acorr_ljungbox
 from statsmodels.stats.stattools import jarque_bera as their_jarque_bera
 from statsmodels.tsa.stattools import breakvar_heteroskedasticity_test
 
-from estimators.diagnostics.whiteness import heteroscedasticity, jarque_bera, ljung_box
+from estimators.diagnostics.innovations import heteroscedasticity, jarque_bera, ljung_box
 from estimators.fold import fold
 from estimators.log import READING, Events
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel

@@ -5,7 +5,7 @@ import pytest
 
 from estimators.fold import Fold
 from estimators.gate.doubt import CHANCE, FEWEST, rule_of
-from estimators.gate.stories import SHARE, Evidence, cost, decided, widening
+from estimators.gate.isolation import SHARE, Evidence, cost, decided, widening
 from estimators.log import READING, RESET, Events, Log
 from estimators.track import GATED, USED
 from tests.support import SECOND, as_log, assert_same

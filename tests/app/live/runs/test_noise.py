@@ -7,7 +7,7 @@ from app.cli.fold import read_log
 from app.cli.prepare import prepare
 from app.live.runs.noise import doubts
 from app.twin.twin import load_twin
-from estimators.diagnostics.innovation_size import SensorNoise, sensor_noise
+from estimators.diagnostics.innovations import SensorNoise, sensor_noise
 from estimators.diagnostics.score import score
 from estimators.fold import Fold
 

@@ -8,12 +8,18 @@ import pytest
 from scipy.stats import binom
 
 from app.cli.main import main
-from app.studies.stress.bench import Bench, without_truth
-from app.studies.stress.foretold import CHANCE, DETECTION, INVISIBLE, VISIBLE, Foretold, Oracle
+from app.studies.stress.detection import CHANCE, DETECTION, INVISIBLE, MISNAMED, NAMED, VISIBLE, Foretold, Oracle, make
 from app.studies.stress.matrix import matrix
-from app.studies.stress.mistake import Mistake
-from app.studies.stress.told import accused, first_word, green_share, recovery, said_at
-from app.studies.stress.trial import MISNAMED, NAMED, make
+from app.studies.stress.scenario import (
+    Bench,
+    Mistake,
+    accused,
+    first_word,
+    green_share,
+    recovery,
+    said_at,
+    without_truth,
+)
 from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import Episode
 from estimators.log import INPUT, READING, TICK, TRUTH, Log

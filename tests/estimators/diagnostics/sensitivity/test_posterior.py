@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimators.diagnostics.checklist.posterior import FAR, peaks, tails
+from estimators.diagnostics.sensitivity.posterior import FAR, peaks, tails
 from estimators.fold import fold
 from estimators.log import Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel

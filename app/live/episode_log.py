@@ -24,7 +24,7 @@ from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING, WAITING, estimate
 
 from .counts import last_run
 from .interface import Running
-from .tail import ROWS, Tail
+from .recent_rows import ROWS, Tail
 
 PERIOD = 0.4
 """Seconds between two looks, when they are cheap."""

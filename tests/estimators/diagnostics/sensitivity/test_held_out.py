@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from estimators.diagnostics.calibration import BANDS
-from estimators.diagnostics.checklist.held_out import held_out
+from estimators.diagnostics.sensitivity.held_out import held_out
 from estimators.log import Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from estimators.diagnostics.checklist.arrivals import arrivals
-from estimators.diagnostics.checklist.dimension import dimension, spread_error
+from estimators.diagnostics.sensitivity.checklist import arrivals, dimension, spread_error
 from estimators.log import READING, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 

@@ -20,7 +20,7 @@ from ...snapshots import Base
 from ...track import GATED, USED, Track
 from ...tuning import Tuning
 from ..calibration import standardised
-from ..whiteness import jarque_bera
+from ..innovations import jarque_bera
 
 LOOKS = 150
 """Times at which the cloud is looked at; finding its peaks takes milliseconds."""

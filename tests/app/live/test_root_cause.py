@@ -5,9 +5,9 @@ import time
 import numpy as np
 import pytest
 
-from app.live.blame import Blame
 from app.live.integrity import Window, window
 from app.live.notices import Notices
+from app.live.root_cause import Blame
 from estimators.diagnostics.episodes import Episode, episodes
 from estimators.fold import Fold
 from estimators.log import READING, Log

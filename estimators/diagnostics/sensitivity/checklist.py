@@ -1,10 +1,4 @@
-"""Does a linearised model pass? The filter that linearises beside one that does not, over the same log.
-
-The extended Kalman filter sees f and h as straight lines through its mean, the unscented one as they are over the
-spread of the state. Where both conclude the same, the curvature over the spread does not matter. Whether the
-innovations are white says something else: whether model and noise fit. Only if those of the linearised filter are
-correlated and those of the other are not, linearising is to blame.
-"""
+"""Is the state small enough for a covariance, or is an ensemble needed? Arithmetic."""
 
 from __future__ import annotations
 
@@ -15,17 +9,126 @@ import numpy as np
 
 from ...fold import Fold
 from ...log import READING, Log
-from ...model.state_space import StateSpaceModel
+from ...model.state_space import LARGE, StateSpaceModel
 from ...registry import find_entry, unfit
 from ...snapshots import Base
 from ...track import GATED, USED, Track
 from ...tuning import Tuning
 from ..calibration import LIMITS, standardised
+from ..innovations import ljung_box
 from ..intervals import Interval, correlation_interval
-from ..sensitivity.responses import each
-from ..sensitivity.size import MOST_STATES
-from ..sensitivity.words import digits
-from ..whiteness import ljung_box
+from .responses import MOST_STATES, digits, each
+
+CLOSE = 0.1
+"""Share by which the standard deviations of an ensemble may be off by chance."""
+
+BUSY = 0.5
+"""Share of one processor that an estimate may take: the rest is for late readings and for refolds."""
+
+
+class Dimension(NamedTuple):
+    """What a step costs, and what it would cost otherwise.
+
+    `flops` are those of a covariance step of n states and m rows, 4 n³ for F P Fᵀ and 6 m n² for the update; `memory`
+    is the covariance's, bytes. `share` of one processor is taken at `rate` readings a second by the filter in use, at
+    `seconds` a reading. `largest` is the n at which a covariance would take all of the processor, if n³ were all.
+    `members` is the ensemble whose σ is within 10 %: one of m members is off by 1 / √(2 (m - 1)). `passes`: `share` is
+    not above a half, and no covariance is needed that cannot be formed.
+    """
+
+    nx: int
+    rows: int
+    flops: float
+    memory: float
+    rate: float
+    seconds: float
+    share: float
+    largest: float
+    members: int
+    passes: bool
+
+
+def dimension(model: StateSpaceModel, rate: float, seconds: float, *, covariance: bool) -> Dimension:
+    """The arithmetic of one twin.
+
+    Args:
+        model: Whose states.
+        rate: Readings a second.
+        seconds: That the filter in use takes for each reading, with what comes between two, measured.
+        covariance: Whether that filter carries one.
+    """
+    n = model.nx
+    rows = max(len(sensor.rows) for sensor in model.sensors)
+    share = rate * seconds
+    members = int(np.ceil(1.0 + 0.5 / CLOSE**2))
+    return Dimension(
+        nx=n,
+        rows=rows,
+        flops=4.0 * n**3 + 6.0 * rows * n**2,
+        memory=8.0 * n**2,
+        rate=rate,
+        seconds=seconds,
+        share=share,
+        largest=n * share ** (-1.0 / 3.0) if covariance and share > 0.0 else np.nan,
+        members=members,
+        passes=share <= BUSY and (n <= LARGE or not covariance),
+    )
+
+
+def spread_error(members: float) -> float:
+    """Standard error of a standard deviation of so many normal members, as a share: 1 / √(2 (m - 1))."""
+    return float(1.0 / np.sqrt(2.0 * (members - 1.0))) if members > 1.0 else np.inf
+
+
+QUANTILES = (0.5, 0.99, 1.0)
+"""Of lateness."""
+
+
+class Arrivals(NamedTuple):
+    """The readings of one sensor.
+
+    `period` is the median time between two, s, and `rate` readings a second by it. `gap` is the longest time without
+    one, s, which began at `gap_at` (s of the log); `missing` the share of readings that are not there, if the period
+    always held, or that have no finite value. lateness (3,) holds the quantiles `QUANTILES` of arrival less measured
+    time, s; NaN where arrivals are not known.
+    """
+
+    sensor: str
+    n: int
+    period: float
+    rate: float
+    gap: float
+    gap_at: float
+    missing: float
+    lateness: np.ndarray
+
+
+def arrivals(model: StateSpaceModel, log: Log) -> tuple[Arrivals, ...]:
+    """Of every sensor of a model, also those that never speak (n = 0)."""
+    t, kind, channel = log.t[: log.n], log.kind[: log.n], log.channel[: log.n]
+    reading = kind == READING
+    # A file says when something was measured; what arrives at the very time at which it was measured came from one.
+    known = bool(np.any(log.arrival[: log.n][reading] != t[reading]))
+    found = []
+    for s, sensor in enumerate(model.sensors):
+        own = np.flatnonzero(reading & (channel == s))
+        there = np.isfinite(log.value[own, : len(sensor.rows)]).any(axis=1)
+        times = np.unique(t[own[there]])
+        apart = np.diff(times) * 1e-9
+        late = np.full(len(QUANTILES), np.nan)
+        if known and own.size:
+            late = np.quantile((log.arrival[own] - t[own]) * 1e-9, QUANTILES)
+        period, gap, at, missing = np.nan, np.nan, np.nan, np.nan
+        if apart.size:
+            period = float(np.median(apart))
+            longest = int(np.argmax(apart))
+            gap, at = float(apart[longest]), float(times[longest]) * 1e-9
+            expected = np.round(apart.sum() / period) + 1.0
+            missing = float(max(0.0, 1.0 - times.size / expected))
+        rate = 1.0 / period if period > 0.0 else np.nan
+        found.append(Arrivals(sensor.name, int(there.sum()), period, rate, gap, at, missing, late))
+    return tuple(found)
+
 
 LEAST = 0.001
 """Of a σ; what is smaller is said to be."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimators.diagnostics.checklist.linearity import linearity
+from estimators.diagnostics.sensitivity.checklist import linearity
 from estimators.fold import fold
 from estimators.log import Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel

@@ -1,8 +1,4 @@
-"""Each sensor held out in turn, and predicted by the others; and no reading at all, which is the floor.
-
-A filter earns its place where it predicts a sensor that it does not see, or a state whose truth is known, better than
-the model alone does from its prior and inputs: the open loop.
-"""
+"""Predict each sensor from the others: fold the log with one sensor held out at a time, and once without any."""
 
 from __future__ import annotations
 
@@ -21,7 +17,7 @@ from ...track import HELD_OUT
 from ...tuning import Tuning
 from ..calibration import BANDS, calibrations
 from ..score import Fit, Score, score
-from ..sensitivity.responses import each
+from .responses import each
 
 MARGIN = 0.05
 """Share by which an error must exceed that of the open loop before the filter is said to make it worse."""

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from app.live import commands
-from app.live.chronicle import Account, Chronicle, Entry
 from app.live.engine import Engine
+from app.live.episode_log import Account, Chronicle, Entry
 from estimators.diagnostics.episodes import Episode, episodes
 from estimators.fold import Fold
 from estimators.log import Log

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Sequence
 
 from estimators.diagnostics.episodes import Episode
-from estimators.diagnostics.sensitivity.nudges import DRIFT, SENSOR
+from estimators.diagnostics.sensitivity.responses import DRIFT, SENSOR
 from estimators.diagnostics.sensitivity.suspects import RIDDLES, in_words, likeliest, suspects
 from estimators.errors import NisusError
 from estimators.log import Log

@@ -1,1 +1,0 @@
-"""The checklist of a twin, measured: linearity, dimension, shape of the posterior, arrivals, sensors held out."""
