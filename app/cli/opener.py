@@ -17,9 +17,8 @@ from ..views.recording.format import tuning_from_json
 from ..views.recording.reader import read_recording
 from ..views.recording.rrd_file import NEVER, Split
 from ..web.gallery.api import GalleryApi
-from ..web.gallery.gallery import Gallery, Opener, Wanted
+from ..web.gallery.gallery import Gallery, Opener, SavedFiles, StartRequest
 from ..web.gallery.recordings import Recordings
-from ..web.gallery.saved_files import SavedFiles
 from ..web.running import Opening, stamp_of
 from ..web.session import Page, Session
 from .prepare import begin_to_compile, compile_for, prepare_model
@@ -109,7 +108,7 @@ class FileOpener:
         self._given = dict(given or {})
         self._workers = workers
 
-    def open(self, wanted: Wanted) -> Opening:
+    def open(self, wanted: StartRequest) -> Opening:
         """See `Opener`. A log is folded as fast as it can be: it is there to be looked at from its beginning."""
         if wanted.recording is not None:
             return opened_review(wanted.recording)
@@ -137,7 +136,7 @@ class FileOpener:
 
 def open_session(
     opening: Opening | None,
-    wanted: Wanted | None,
+    wanted: StartRequest | None,
     opener: Opener,
     *,
     page: Page | None,

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..terminal import complain
-from ..web.gallery.gallery import Wanted
+from ..web.gallery.gallery import StartRequest
 from ..web.port import check_port
 from ..web.session import Page, Session
 from .opener import FileOpener, open_session, opened_review
@@ -30,7 +30,7 @@ def open_review(path: Path, page: Page | None, recordings: Path = Path()) -> tup
     for level, text in opening.remarks:
         if level == "warn":
             complain(text)
-    return open_session(opening, Wanted(recording=path), FileOpener(), page=page, recordings=recordings), opening
+    return open_session(opening, StartRequest(recording=path), FileOpener(), page=page, recordings=recordings), opening
 
 
 def review_recording(arguments: Review) -> int:

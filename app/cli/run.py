@@ -13,7 +13,7 @@ from ..live.execute import MAX_SPEED
 from ..terminal import complain
 from ..views.recording.format import TAKEN
 from ..views.recording.rrd_file import NEVER, parse_split
-from ..web.gallery.gallery import Wanted
+from ..web.gallery.gallery import StartRequest
 from ..web.port import check_port
 from ..web.session import Page
 from .given import settings
@@ -48,7 +48,7 @@ def run_twin(arguments: Run, workers: Sequence[Worker] = ()) -> int:
     page = None if arguments.headless else Page(arguments.port, not arguments.no_browser)
     opening, wanted, opener = None, None, FileOpener()
     if arguments.twin is not None:
-        wanted = Wanted(arguments.twin)
+        wanted = StartRequest(arguments.twin)
         read = functools.partial(
             opened_twin,
             arguments.twin,

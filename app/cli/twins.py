@@ -34,7 +34,7 @@ def _drawn(name: str) -> str:
     """Fold a twin's log, draw its picture for the gallery and keep it; the file."""
     from ..present.drawing.card import picture_of
     from ..twin.twin import load_twin
-    from ..web.gallery.pictures import picture_file
+    from ..web.gallery.cards import picture_file
     from .fold import read_log
     from .prepare import prepare
 

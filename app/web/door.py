@@ -14,13 +14,14 @@ import uuid
 from collections.abc import Sequence
 from typing import Any
 
+import h11
 import uvicorn
 from starlette.applications import Starlette
 from starlette.responses import JSONResponse, PlainTextResponse
 from starlette.routing import BaseRoute
 from starlette.websockets import WebSocket
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from .bounds import bounds
 from .gate import App, Gate, Receive, Scope, Send, session_token
 from .port import listen
 
@@ -28,6 +29,16 @@ GONE = 1012
 """WebSocket's code for a service that starts anew."""
 
 NOTHING = "no twin runs; choose one in the gallery"
+
+CONNECTIONS = 96
+"""Open at a time. A page holds up to eight; each of its Viser panes costs one more descriptor within the process, and
+some systems allow 256 in all."""
+
+BACKLOG = 64
+"""Connections that are accepted at once, before the first of them can be refused."""
+
+REQUEST_TIMEOUT_S = 10.0
+"""From the first byte of a request, or the connection, to the last byte of its body."""
 
 
 def _policy(port: int, scripts: str) -> str:
@@ -97,7 +108,8 @@ class Door:
         """What lets a frame under the other loopback name see the stage; None where that name may not be ours."""
         config = uvicorn.Config(
             gate, log_config=None, log_level="critical", access_log=False,
-            server_header=False, lifespan="off", ws_per_message_deflate=False, timeout_graceful_shutdown=1, **bounds(),
+            server_header=False, lifespan="off", ws_per_message_deflate=False, timeout_graceful_shutdown=1, 
+            http=BoundedProtocol, backlog=BACKLOG,
         )  # fmt: skip
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(
@@ -221,3 +233,50 @@ class _WithHeaders:
             await send(message)
 
         await self._application(scope, receive, send_more)
+
+
+class BoundedProtocol(H11Protocol):
+    """uvicorn's HTTP, with a time for each request and a number of connections, neither of which uvicorn bounds."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Take the connection; if there are too many, the one that has been silent longest makes room."""
+        super().connection_made(transport)
+        self._since = self.loop.time()
+        self._deadline: asyncio.TimerHandle | None = None
+        self._watch()
+        there = [other for other in self.connections if not other.transport.is_closing()]  # type: ignore[union-attr]
+        if len(there) > CONNECTIONS:
+            idle = [other for other in there if isinstance(other, BoundedProtocol) and other._idle(self)]
+            min(idle, key=lambda other: other._since, default=self).transport.abort()
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes of a request."""
+        super().data_received(data)
+        self._watch()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The connection is gone."""
+        self._done()
+        super().connection_lost(exc)
+
+    def on_response_complete(self) -> None:
+        """The next request may begin; what it began with may be here already."""
+        self._since = self.loop.time()
+        super().on_response_complete()
+
+    def _idle(self, newcomer: BoundedProtocol) -> bool:
+        """Whether no request of this connection is being answered; it may be closed then."""
+        return self is not newcomer and (self.cycle is None or self.cycle.response_complete)
+
+    def _watch(self) -> None:
+        """Set a deadline while a request is expected or incomplete; between two, uvicorn closes by itself."""
+        upgraded = self.transport.get_protocol() is not self
+        if upgraded or self.conn.their_state not in (h11.IDLE, h11.SEND_BODY):
+            self._done()
+        elif self._deadline is None:
+            self._deadline = self.loop.call_later(REQUEST_TIMEOUT_S, self.transport.close)
+
+    def _done(self) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()
+            self._deadline = None

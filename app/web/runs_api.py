@@ -1,85 +1,213 @@
-"""Runs over HTTP: their scores, what differs between two, their tuning as YAML, and what the data say of a knob."""
+"""Runs over HTTP: scores, differences, tuning versions, the likelihood around a parameter, tables and reports."""
 
 from __future__ import annotations
 
-import asyncio
+import re
+from collections.abc import Sequence
+from typing import Any
 
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse, Response
+from starlette.responses import HTMLResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from estimators.errors import ConfigError
+from config.tunings import NAME
+from estimators.diagnostics.episodes import Episode
+from estimators.diagnostics.sensitivity.responses import digits
+from estimators.errors import ConfigError, printable
 
+from ..live.changes import difference
 from ..live.interface import Running
-from ..live.revisions import Run
+from ..live.revisions import LONGEST_NOTE, Run
 from ..live.runs.noise import noise
-from ..live.runs.runs_json import difference_json, noise_json, runs_json, swept_json
-from ..live.runs.scores import RunScores
+from ..live.runs.runs_json import difference_json, noise_json, runs_json, swept_json, what_changed
+from ..live.runs.scores import RunScore, RunScores
 from ..live.runs.sweep import Sweeps
 from ..live.tunings.tuning_yaml import tuning_yaml
-from .api import Json, one_line
+from ..live.tunings.versions import Settings, figures, keep, listing, load_into, version_text
+from ..present.export.report import Reported, report
+from ..present.export.track_file import KINDS, RunRows, encoded, rows_of_run, tables
+from ..present.result import to_html
+from ..present.series.series import Series
+from ..studies.guard.last import last
+from ..twin.twin import with_version
+from .http import OneAtATime, get, post
+
+MAX_SECONDS = 1e9
+"""Of a time that can be asked for, to either side."""
+
+MAX_ERRORS = 6
+"""States whose error the report gives for each run."""
 
 
 class RunsApi:
-    """The routes, and the threads behind them. What nobody asks for is not computed."""
+    """Routes for runs and tuning versions. Scores and sweeps are computed when somebody asks for them."""
 
-    def __init__(self, engine: Running) -> None:
-        self._engine = engine
+    def __init__(self, engine: Running, series: Series) -> None:
+        self._engine, self._series = engine, series
         self.scores = RunScores(engine)
         self._sweeps = Sweeps(engine)
 
     def start(self) -> None:
-        """Be ready to sweep."""
+        """Start the thread that sweeps."""
         self._sweeps.start()
 
     def stop(self) -> None:
-        """End what is under way."""
+        """Stop it."""
         self._sweeps.stop()
 
     def routes(self) -> list[Route]:
-        """What is served."""
+        """Return the routes."""
+        copying = OneAtATime("export")
         return [
-            Route("/api/runs", self._runs),
-            Route("/api/runs/{number:int}.yaml", self._yaml),
-            Route("/api/runs/{number:int}/against/{other:int}", self._difference),
-            Route("/api/around", self._around),
-            Route("/api/noise", self._noise),
+            Route("/api/runs", get(self._runs)),
+            Route("/api/runs/{number:int}.yaml", get(self._yaml, refused=404)),
+            Route("/api/runs/{number:int}/against/{other:int}", get(self._difference, refused=404)),
+            Route("/api/around", get(self._around)),
+            Route("/api/noise", get(self._noise)),
+            Route("/api/tunings", get(self._tunings)),
+            Route("/api/tunings", post(self._keep), methods=["POST"]),
+            Route("/api/tunings/load", post(self._load), methods=["POST"]),
+            Route("/api/tunings/{name}/against", get(self._against, refused=404)),
+            *(Route(f"/api/track.{kind}", get(self._track, refused=409, run=copying)) for kind in KINDS),
+            Route("/api/report.html", get(self._report, refused=409, run=copying)),
         ]
 
-    async def _runs(self, request: Request) -> Response:
-        return Json(await asyncio.to_thread(runs_json, self.scores, self._engine))
+    def _runs(self) -> Any:
+        return runs_json(self.scores, self._engine)
 
-    async def _yaml(self, request: Request) -> Response:
-        try:
-            run = self._run(request, "number")
-        except ConfigError as error:
-            return _refused(error, 404)
-        twin = self._engine.twin
+    def _yaml(self, number: int) -> Response:
+        run, twin = self._engine.revisions.find(number), self._engine.twin
         heading = f"# {twin.name}, run {run.number}" + (f": {run.name}" if run.name else "")
         notes = "".join(f"# {line}\n" for line in run.note.splitlines())
         text = f"{heading}\n{notes}{tuning_yaml(twin.config, run.estimator, run.tuning)}"
-        name = f"{twin.name}-run{run.number}.yaml"
-        return PlainTextResponse(text, headers={"Content-Disposition": f'attachment; filename="{name}"'})
+        return PlainTextResponse(text, headers=_attachment(f"{twin.name}-run{run.number}.yaml"))
 
-    async def _difference(self, request: Request) -> Response:
-        try:
-            return Json(difference_json(self._run(request, "number"), self._run(request, "other")))
-        except ConfigError as error:
-            return _refused(error, 404)
+    def _difference(self, number: int, other: int) -> Any:
+        return difference_json(self._engine.revisions.find(number), self._engine.revisions.find(other))
 
-    async def _around(self, request: Request) -> Response:
-        try:
-            swept = await asyncio.to_thread(self._sweeps.around, request.query_params.get("key", ""))
-            return Json(swept_json(swept))
-        except ConfigError as error:
-            return _refused(error, 400)
+    def _around(self, key: str = "") -> Any:
+        return swept_json(self._sweeps.around(key))
 
-    async def _noise(self, request: Request) -> Response:
-        return Json(noise_json(await asyncio.to_thread(noise, self._engine, self._sweeps)))
+    def _noise(self) -> Any:
+        return noise_json(noise(self._engine, self._sweeps))
 
-    def _run(self, request: Request, name: str) -> Run:
-        return self._engine.revisions.find(request.path_params[name])
+    # Tuning versions
+
+    def _tunings(self) -> Any:
+        twin = self._engine.twin
+        return {"running": self._engine.status().tuning.name, "versions": listing(twin), "guard": last(twin.path)}
+
+    def _keep(self, run: int, name: str, note: str) -> Any:
+        """Keep a run as a version, with its scores."""
+        kept, twin = self._engine.revisions.find(run), self._engine.twin
+        known = next((known for other, known in self.scores.all() if other.number == run), None)
+        settings = Settings(
+            kept.estimator,
+            kept.tuning,
+            note=checked_note(note),
+            scores={} if known is None else figures(known.score),
+            model_version=self._engine.status().model_version,
+        )
+        keep(twin, name, version_text(twin, settings))
+        return {"name": name}
+
+    def _load(self, name: str) -> Any:
+        """Go on with a version; the history is folded again with it."""
+        load_into(self._engine, _listed(name))
+        return {"name": name}
+
+    def _against(self, name: str) -> Any:
+        """List the entries in which a version differs from the running tuning."""
+        tuning, estimator = self._engine.folded_with()
+        twin = with_version(self._engine.twin, _listed(name))
+        changes = difference(twin.estimator, twin.tuning, estimator, tuning)
+        return [{"key": change.key, "values": [change.before, change.after]} for change in changes]
+
+    # Files. A copy of the rows is taken first, in pieces, so that writing holds nobody up.
+
+    def _track(
+        self, request: Request, run: int | None = None, since: float | None = None, until: float | None = None
+    ) -> Response:
+        """Answer with the rows of a run (default: the running one) between two times of the charts, s."""
+        rows = rows_of_run(self._engine, run)
+        kind = request.url.path.rpartition(".")[2]
+        parts = encoded(kind, tables(rows, rows.between(self._instant("since", since), self._instant("until", until))))
+        ends = (request.query_params.get(name, "") for name in ("since", "until"))
+        span = f"-{'-to-'.join(ends)}s" if {"since", "until"} & request.query_params.keys() else ""
+        return StreamingResponse(parts, media_type=KINDS[kind], headers=_attachment(f"{self._name(rows)}{span}.{kind}"))
+
+    def _report(self, run: int | None = None) -> Response:
+        """Answer with the report of a run (default: the running one) as one file."""
+        engine, rows = self._engine, rows_of_run(self._engine, run)
+        found, pull = rows
+        status = engine.status().integrity
+        bounds = status.bounds if status is not None and status.revision == found.number else None
+        about = [("run", f"{found.number}" + (f", {found.name}" if found.name else "") + f": {what_changed(found)}")]
+        if found.note:
+            about.append(("note", found.note))
+        # The running one's episodes name the most likely cause, as the page does.
+        episodes = engine.episodes() if found is engine.revisions.runs[-1] else rows.episodes()
+        reported = Reported(
+            engine.twin, found.estimator, found.tuning, pull.events, pull.track, pull.pictures, episodes,
+            rows.marginal, tuple(about), bounds, _scored(self.scores), self._earlier(found, episodes),
+        )  # fmt: skip
+        text = to_html(f"{engine.twin.name}, run {found.number}", report(reported))
+        return HTMLResponse(text, headers=_attachment(f"{self._name(rows)}.html"))
+
+    def _earlier(self, run: Run, now: Sequence[Episode]) -> tuple[tuple[str, Sequence[Episode]], ...]:
+        """Return the episodes of earlier runs that no later run has as well, newest run first."""
+        known, found = {(item.subject, item.cause) for item in now}, []
+        for other in reversed(self._engine.revisions.runs):
+            new = [item for item in other.episodes if (item.subject, item.cause) not in known]
+            if new and other.number < run.number:
+                known |= {(item.subject, item.cause) for item in new}
+                found.append((f"{other.number} {other.name}".rstrip() + f": {what_changed(other)}", new))
+        return tuple(found)
+
+    def _instant(self, name: str, seconds: float | None) -> int | None:
+        """Return a time of the charts as one of the log, ns."""
+        if seconds is None:
+            return None
+        if not abs(seconds) < MAX_SECONDS:
+            raise ConfigError(f"track: {name} is {seconds}; it must be a number of seconds")
+        return (self._series.origin() or 0) + round(seconds * 1e9)
+
+    def _name(self, rows: RunRows) -> str:
+        return f"{self._engine.twin.name}-run{rows.run.number}"
 
 
-def _refused(error: ConfigError, status: int) -> Response:
-    return Json({"error": one_line(str(error))}, status)
+def checked_note(note: str) -> str:
+    """Return a note without control characters.
+
+    Raises:
+        ConfigError: If it is too long.
+    """
+    if len(note) > LONGEST_NOTE:
+        raise ConfigError(f"note: it has {len(note)} characters; it may have {LONGEST_NOTE}")
+    return printable(note)
+
+
+def _listed(name: str) -> str:
+    """Check that it is a name, not a path: a page chooses among the versions beside the twin."""
+    if not NAME.fullmatch(name) or name.endswith((".yaml", ".yml")):
+        raise ConfigError(f"{name}: no version is read from there; name one that /api/tunings lists")
+    return name
+
+
+def _attachment(name: str) -> dict[str, str]:
+    safe = re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII)
+    return {"Content-Disposition": f'attachment; filename="{safe}"'}
+
+
+def _scored(scores: RunScores) -> tuple[tuple[str, ...], ...]:
+    """Return a line for each run: name, change, NIS, log-likelihood, errors."""
+
+    def line(run: Run, known: RunScore | None) -> tuple[str, ...]:
+        name = f"{run.number} {run.name}".rstrip()
+        if known is None:
+            return name, what_changed(run), "", "", "not scored: its track is gone"
+        fits = {**known.score.states, **known.score.held_out}
+        errors = ", ".join(f"{subject} {digits(fit.rmse)}" for subject, fit in list(fits.items())[:MAX_ERRORS])
+        return name, what_changed(run), digits(known.score.nis), f"{known.log_likelihood_reading:.4g}", errors
+
+    return tuple(line(run, known) for run, known in scores.all())

@@ -1,21 +1,18 @@
-"""What is served of a running twin: the page, its API, its streams, recordings, and Viser behind it."""
+"""Page server of a running twin: the page, its API, its streams, recordings, and Viser behind it."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import gzip
-import json
 import sys
 import threading
-import time
 import uuid
-from collections.abc import AsyncIterator
 from concurrent.futures import Future
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
@@ -27,39 +24,29 @@ from estimators.errors import ConfigError, NisusError
 from ..live.interface import Running
 from ..live.runs.refits import Refits
 from ..present.drawing.colors import EITHER, THEMES
-from ..present.export import markdown
-from ..present.export.alarms import alarms_text
+from ..present.export.alarm_guide import alarms_text, as_html
 from ..present.series.series import Series
 from ..studies.analysis.diagnosis import Diagnosis
 from ..studies.analysis.forecast import Forecasts, question_from_json
 from ..views.rerun.feed import RerunFeed
-from .answer import answered
-from .api import Json, command_from_json, episodes_json, faults_json, one_line, status_json
-from .bounds import BODY
+from .commands_json import command_from_json
 from .door import Door
-from .export_api import ExportApi
 from .fit_api import FitApi
-from .model_json import model_json
-from .one_at_a_time import OneAtATime
-from .page_file import PAGE, page_file
-from .page_stream import PageStream
-from .refit_api import RefitApi
+from .http import PAGE, OneAtATime, get, page_file, post
 from .runs_api import RunsApi
-from .tunings_api import TuningsApi
+from .streams import PageStream, feed_rerun
+from .twin_json import episodes_json, faults_json, model_json, status_json
 from .viewer_assets import FILES, viewer_assets, viewer_version
 from .viser_proxy import ViserProxy
 
 if TYPE_CHECKING:
     from ..views.viser.stage import Choices
 
-PERIOD = 0.2
-"""Seconds between two frames that one Rerun viewer is fed, at least."""
-
-STATUS_PERIOD = 0.5
-"""Seconds between two status messages."""
+AWAITED_PERIOD_S = 0.5
+"""Between two looks at whether the first filter is compiled."""
 
 FOR_EVER = "public, max-age=31536000, immutable"
-KINDS = {".js": "text/javascript", ".wasm": "application/wasm"}
+MEDIA_TYPES = {".js": "text/javascript", ".wasm": "application/wasm"}
 
 
 class PageServer:
@@ -80,43 +67,42 @@ class PageServer:
 
         Args:
             engine: What to show.
-            port: On 127.0.0.1; 0 takes a free one. Or the door that is there: it shows this once it is started.
+            port: On 127.0.0.1; 0 takes a free one. Or an open door, which shows this once it is started.
             viser_port: Where the private Viser server listens; None if there is none.
             secret: What Viser asks for.
             review: The recording that is reviewed, offered beside those that this process writes.
-            choices: What may be chosen about Viser's scene; None if there is none.
-            refits: What is fitted beside it now and then; None for nothing, ever.
+            choices: Options of Viser's scene; None if there is no scene.
+            refits: Fits of the last window; None for none.
 
         Raises:
-            ConfigError: If the port cannot be had.
+            ConfigError: If the port cannot be taken.
         """
         self._engine = engine
         self._review = review
         self._choices = choices
         self._series = Series(engine)
-        self._runs = RunsApi(engine)
-        self._fit, self._refit = FitApi(engine), RefitApi(refits or Refits(engine))
-        self._exports = ExportApi(engine, self._series, self._runs.scores)
+        self._runs = RunsApi(engine, self._series)
+        self.refits = refits or Refits(engine)
+        self._fit = FitApi(engine, self.refits)
         self._forecasts, self._diagnosis = Forecasts(engine), Diagnosis(engine)
-        self._forecasting, self._diagnosing = OneAtATime("forecast"), OneAtATime("diagnosis")
         self._boot = uuid.uuid4().hex
         self.unread: str | None = None
-        """What is wrong with the twin's files as they were saved last, if they are not what runs."""
+        """Why the twin's files, as saved last, could not be read; None if they run."""
         self._own_door = not isinstance(port, Door)
         self.door = port if isinstance(port, Door) else Door(port)
         self.port, self.entered = self.door.port, self.door.entered
         self._assets: Future[Path] = Future()
         self._explored, self._stopping = threading.Event(), threading.Event()
         self._viser = ViserProxy(viser_port, secret) if viser_port is not None else None
-        self.application = self._application()
+        self.application = Starlette(routes=self._routes())
 
     @property
     def url(self) -> str:
-        """Address of the page, with the token that it asks for."""
+        """Address of the page, with its token."""
         return self.door.url
 
     def start(self) -> threading.Event:
-        """Serve; the Rerun viewer's files are prepared later, if this machine has not got them yet."""
+        """Serve; the Rerun viewer's files are prepared later, if this machine does not have them yet."""
         threading.Thread(target=self._prepare, name="viewer assets", daemon=True).start()
         self._runs.start()
         over = self.door.show(self.application, self._boot)
@@ -125,7 +111,7 @@ class PageServer:
         return over
 
     def stop(self) -> None:
-        """Compute nothing any more; close all connections and the port, if it is this twin's own."""
+        """Stop all work, close all connections, and the port if it is this twin's own."""
         self._stopping.set()
         self._runs.stop()
         self._fit.stop()
@@ -133,38 +119,39 @@ class PageServer:
             self.door.stop()
 
     def _prepare(self) -> None:
-        # What every page waits for comes first, unless somebody looks at Explore already: both take all processors.
+        # The first filter comes first, unless somebody looks at Explore already: both take all processors.
         while self._engine.status().awaited is not None and not self._explored.is_set():
-            if self._stopping.wait(STATUS_PERIOD):
+            if self._stopping.wait(AWAITED_PERIOD_S):
                 return
         try:
             self._assets.set_result(viewer_assets(lambda line: print(line, file=sys.stderr, flush=True)))
         except NisusError as error:
             self._assets.set_exception(error)
 
-    def _application(self) -> Starlette:
+    def _routes(self) -> list[Any]:
+        engine = self._engine
+        forecasting, diagnosing = OneAtATime("forecast"), OneAtATime("diagnosis")
         routes: list[Any] = [
-            Route("/", self._page),
-            Route("/explore", self._page),
-            Route("/alarms", self._alarms),
-            Route("/api/status", self._status),
-            Route("/api/model", self._model),
-            Route("/api/episodes", self._episodes),
+            Route("/", get(lambda: self._page("index.html"))),
+            Route("/explore", get(lambda: self._page("explore.html"))),
+            Route("/alarms", get(self._alarms)),
+            Route("/api/status", get(self._state)),
+            Route("/api/model", get(lambda: model_json(engine))),
+            Route("/api/episodes", get(lambda: episodes_json(engine))),
+            Route("/api/faults", get(lambda: faults_json(engine))),
             *self._runs.routes(),
             *self._fit.routes(),
-            *self._refit.routes(),
-            *TuningsApi(self._engine, self._runs.scores).routes(),
-            *self._exports.routes(),
-            Route("/api/recordings", self._list_recordings),
-            Route("/api/faults", self._faults),
-            Route("/api/command", self._command, methods=["POST"]),
-            Route("/api/forecast", self._forecast, methods=["GET", "POST"]),
-            Route("/api/diagnose", self._diagnose),
-            Route("/api/scene", self._scene, methods=["GET", "POST"]),
+            Route("/api/command", post(self._command, status=202), methods=["POST"]),
+            Route("/api/forecast", get(self._forecasts.may, refused=409)),
+            Route("/api/forecast", post(self._forecast, run=forecasting), methods=["POST"]),
+            Route("/api/diagnose", get(self._diagnosis.look, refused=503, run=diagnosing)),
+            Route("/api/scene", get(self._scene)),
+            Route("/api/scene", post(self._choose), methods=["POST"]),
+            Route("/api/recordings", get(self._list_recordings)),
+            Route("/rec/{name}", get(self._recording)),
             Route(f"/viewer/{viewer_version()}/{{name}}", self._viewer_file),
-            Route("/rec/{name}", self._recording),
             WebSocketRoute("/api/stream", self._page_stream),
-            WebSocketRoute("/rerun/stream", self._stream),
+            WebSocketRoute("/rerun/stream", self._rerun_stream),
             Mount("/page", StaticFiles(directory=PAGE)),
         ]
         if self._viser is not None:
@@ -173,87 +160,44 @@ class PageServer:
                 WebSocketRoute("/viser", self._viser.websocket),
                 Route("/viser/{path:path}", self._viser.http),
             ]
-        return Starlette(routes=routes)
+        return routes
 
-    async def _page(self, request: Request) -> Response:
-        name = "explore.html" if request.url.path == "/explore" else "index.html"
+    def _page(self, name: str) -> Response:
         settings = {"viewer": f"/viewer/{viewer_version()}", "boot": self._boot, "viser": self._viser is not None}
-        settings |= {"gallery": self.door.furnished, "stage_pass": self.door.stage_pass}
-        return page_file(name, settings)
+        return page_file(name, settings | {"gallery": self.door.furnished, "stage_pass": self.door.stage_pass})
 
-    async def _alarms(self, request: Request) -> Response:
-        """docs/alarms.md, to which episodes refer."""
+    def _alarms(self) -> Response:
+        """Answer with docs/alarms.md, to which episodes refer."""
         try:
-            text = markdown.as_html(alarms_text())
+            text = as_html(alarms_text())
         except ConfigError as error:
             return PlainTextResponse(f"Nisus: {error}\n", 404)
         return Response((PAGE / "alarms.html").read_text().replace("{{text}}", text), media_type="text/html")
-
-    async def _status(self, request: Request) -> Response:
-        return Json(await asyncio.to_thread(self._state))
 
     def _state(self) -> dict[str, Any]:
         scene = [] if self._choices is None else self._choices.json()
         status = {**status_json(self._engine), "recordings": sorted(self._recordings()), "scene": scene}
         reloads = getattr(self._engine, "reloads", 0)
-        return {**status, "unread": self.unread, "reloads": reloads, "refit": self._refit.brief()}
+        return {**status, "unread": self.unread, "reloads": reloads, "refit": self._fit.brief()}
 
-    async def _model(self, request: Request) -> Response:
-        return Json(await asyncio.to_thread(model_json, self._engine))
+    def _command(self, body: Any) -> Any:
+        command = command_from_json(body, self._engine)
+        self._engine.submit(command)
+        return {"submitted": type(command).__name__}
 
-    async def _page_stream(self, browser: WebSocket) -> None:
-        await PageStream(browser, self._engine, self._series, self._state, self._boot).run()
+    def _forecast(self, body: Any) -> Any:
+        return self._forecasts.ask(question_from_json(body, self._engine.model))
 
-    async def _episodes(self, request: Request) -> Response:
-        return Json(episodes_json(self._engine))
-
-    async def _list_recordings(self, request: Request) -> Response:
-        found = {name: path for name, path in self._recordings().items() if path.is_file()}
-        return Json([{"name": name, "bytes": path.stat().st_size} for name, path in sorted(found.items())])
-
-    async def _faults(self, request: Request) -> Response:
-        return Json(faults_json(self._engine))
-
-    async def _command(self, request: Request) -> Response:
-        async def submit(body: Any) -> Response:
-            command = command_from_json(body, self._engine)
-            self._engine.submit(command)
-            return Json({"submitted": type(command).__name__}, 202)
-
-        return await answered(request, submit)
-
-    async def _forecast(self, request: Request) -> Response:
-        if request.method == "GET":
-            try:
-                return Json(await asyncio.to_thread(self._forecasts.may))
-            except NisusError as error:
-                return Json({"error": one_line(str(error))}, 409)
-
-        async def ask(body: Any) -> Response:
-            question = question_from_json(body, self._engine.model)
-            return Json(await self._forecasting.do(lambda: self._forecasts.ask(question)))
-
-        return await answered(request, ask)
-
-    async def _diagnose(self, request: Request) -> Response:
-        try:
-            return Json(await self._diagnosing.do(self._diagnosis.look))
-        except NisusError as error:
-            return Json({"error": one_line(str(error))}, 503)
-
-    async def _scene(self, request: Request) -> Response:
-        """What may be chosen about the scene; or choose, with `{"key": …, "value": …}`."""
-        choices = self._choices
-        if choices is None:
+    def _scene(self) -> Any:
+        """Return the options of the scene."""
+        if self._choices is None:
             return PlainTextResponse("Nisus: there is no scene.\n", 404)
+        return self._choices.json()
 
-        async def choose(body: Any) -> Response:
-            if not isinstance(body, dict):
-                raise ConfigError(f"scene: {body!r} is no object")
-            choices.choose(str(body.get("key")), str(body.get("value")))
-            return Json(choices.json())
-
-        return Json(choices.json()) if request.method != "POST" else await answered(request, choose)
+    def _choose(self, key: str, value: str) -> Any:
+        if self._choices is not None:
+            self._choices.choose(key, value)
+        return self._scene()
 
     async def _viewer_file(self, request: Request) -> Response:
         name = request.path_params["name"]
@@ -266,83 +210,39 @@ class PageServer:
             return PlainTextResponse(f"{error}\n", 503)
         path = folder / f"{name}.gz"
         headers = {"Cache-Control": FOR_EVER, "Vary": "Accept-Encoding"}
-        kind = KINDS[Path(name).suffix]
+        media_type = MEDIA_TYPES[Path(name).suffix]
         if "gzip" in request.headers.get("accept-encoding", ""):
-            return FileResponse(path, media_type=kind, headers={**headers, "Content-Encoding": "gzip"})
-        content = await asyncio.to_thread(lambda: gzip.decompress(path.read_bytes()))
-        return Response(content, media_type=kind, headers=headers)
+            return FileResponse(path, media_type=media_type, headers={**headers, "Content-Encoding": "gzip"})
+        content = await run_in_threadpool(lambda: gzip.decompress(path.read_bytes()))
+        return Response(content, media_type=media_type, headers=headers)
 
     def _recordings(self) -> dict[str, Path]:
-        """What may be fetched: recordings that this process wrote, and the one it reviews."""
+        """Return by name the recordings that this process has written, and the one that it reviews."""
         recorder = self._engine.recorder
-        paths = [
-            *(recorder.finished if recorder is not None else ()),
-            *([self._review] if self._review is not None else []),
-        ]
+        paths = [*(recorder.finished if recorder is not None else ()), *([self._review] if self._review else [])]
         return {path.name: path for path in paths}
 
-    async def _recording(self, request: Request) -> Response:
-        path = self._recordings().get(request.path_params["name"])
+    def _list_recordings(self) -> Any:
+        found = {name: path for name, path in self._recordings().items() if path.is_file()}
+        return [{"name": name, "bytes": path.stat().st_size} for name, path in sorted(found.items())]
+
+    def _recording(self, name: str) -> Response:
+        path = self._recordings().get(name)
         if path is None or not path.is_file():
             return PlainTextResponse("Nisus: this process has no such recording.\n", 404)
         return FileResponse(path, media_type="application/octet-stream", filename=path.name)
 
-    async def _stream(self, browser: WebSocket) -> None:
-        """Feed one Rerun viewer: each frame when it has drawn the one before."""
+    async def _page_stream(self, browser: WebSocket) -> None:
+        await PageStream(browser, self._engine, self._series, self._state, self._boot).run()
+
+    async def _rerun_stream(self, browser: WebSocket) -> None:
         await browser.accept()
         layout = browser.query_params.get("layout", "1") == "1"
         palette = THEMES.get(browser.query_params.get("theme", ""), EITHER)
         feed = await asyncio.to_thread(RerunFeed, self._engine, layout=layout, palette=palette)
-        drawn = asyncio.Event()
-        drawn.set()
-        listener = asyncio.create_task(_listen_to(browser, drawn))
-        feeder = asyncio.create_task(self._feed(browser, feed, drawn))
-        try:
-            await asyncio.wait([listener, feeder], return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            # Cancelled first, then awaited: the feed is closed only when no thread is inside it.
-            for task in (listener, feeder):
-                task.cancel()
-            await asyncio.gather(listener, feeder, return_exceptions=True)
-            await asyncio.to_thread(feed.close)
-            with contextlib.suppress(RuntimeError):
-                await browser.close()
+        await feed_rerun(browser, feed, self._rerun_status)
 
-    async def _feed(self, browser: WebSocket, feed: RerunFeed, drawn: asyncio.Event) -> None:
-        told = -STATUS_PERIOD
-        while True:
-            begun = time.monotonic()
-            if begun - told >= STATUS_PERIOD:
-                told = begun
-                status, origin = await asyncio.to_thread(lambda: (status_json(self._engine), self._series.origin()))
-                news = {"status": status, "boot": self._boot, "origin": None if origin is None else str(origin)}
-                await browser.send_text(json.dumps({**news, "recordings": sorted(self._recordings())}))
-            if drawn.is_set():
-                async for message in _given(feed):
-                    if isinstance(message, str):
-                        await browser.send_text(message)
-                    else:
-                        drawn.clear()
-                        await browser.send_bytes(message)
-            with contextlib.suppress(TimeoutError):
-                # Until the frame is drawn, or the status is due.
-                await asyncio.wait_for(drawn.wait(), STATUS_PERIOD)
-            await asyncio.sleep(max(0.0, PERIOD - (time.monotonic() - begun)))
-
-
-async def _given(feed: RerunFeed) -> AsyncIterator[str | bytes]:
-    """What the feed gives next, made in a thread: a long history takes a while."""
-    task = asyncio.ensure_future(asyncio.to_thread(feed.next))
-    try:
-        messages = await asyncio.shield(task)
-    except asyncio.CancelledError:
-        await task
-        raise
-    for message in messages:
-        yield message
-
-
-async def _listen_to(browser: WebSocket, drawn: asyncio.Event) -> None:
-    """A word from the browser says that it has drawn what it got; whoever says anything longer is not the page."""
-    while (word := (await browser.receive()).get("text")) is not None and len(word) <= BODY:
-        drawn.set()
+    def _rerun_status(self) -> dict[str, Any]:
+        origin = self._series.origin()
+        status = {"status": status_json(self._engine), "boot": self._boot, "recordings": sorted(self._recordings())}
+        return status | {"origin": None if origin is None else str(origin)}

@@ -5,11 +5,17 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import gc
+import html
+import os
+import shutil
 import sys
+import tempfile
 import threading
 import time
 import weakref
+import webbrowser
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -21,7 +27,6 @@ from ..live.commands import Record
 from ..terminal import complain, restore, when_asked_to_end
 from ..views.recording.rrd_file import NEVER, Split
 from .door import Door
-from .open_browser import Opening as BrowserOpening
 from .running import Opening, RunningTwin
 
 if TYPE_CHECKING:
@@ -31,7 +36,7 @@ if TYPE_CHECKING:
     from ..twin.twin import Twin
     from ..views.recording.writer import Recorder
 
-PATIENCE = 3.0
+DISCONNECT_TIMEOUT_S = 3.0
 """Seconds for the browsers to let go of a twin that was stopped."""
 
 SWITCH = 0.0005
@@ -52,9 +57,9 @@ def _settle(gone: threading.Event | None = None, before: Callable[[], Engine | N
     Not so what ran before, which is garbage once nobody is connected to it any more (`gone`) and the last request to it
     was answered: `before` gives its engine until then.
     """
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + DISCONNECT_TIMEOUT_S
     if gone is not None:
-        gone.wait(PATIENCE)
+        gone.wait(DISCONNECT_TIMEOUT_S)
     gc.unfreeze()
     gc.collect()
     while before is not None and before() is not None and time.monotonic() < end:
@@ -220,10 +225,10 @@ class Session:
             ends = [item.stop for item in (self.running, self.door) if item is not None]
             run_all(*ends)
 
-    def _open(self, url: str) -> BrowserOpening | None:
+    def _open(self, url: str) -> BrowserPage | None:
         """Open the page in a browser; where that cannot be, the printed address is there."""
         try:
-            opening = BrowserOpening(url)
+            opening = BrowserPage(url)
         except OSError as error:
             complain(f"the browser is not opened ({error.strerror}: {error.filename}); open the address above")
             return None
@@ -237,7 +242,7 @@ class Session:
             NisusError: If the page cannot be served, or, in the end, that `record` could not be written.
         """
         done = threading.Event()
-        opening: BrowserOpening | None = None
+        opening: BrowserPage | None = None
         previous = when_asked_to_end(done.set)
         try:
             self.start()
@@ -266,3 +271,43 @@ class Session:
             restore(previous)
         if record is not None and self.recorder.failure:
             raise SourceError(self.recorder.failure)
+
+
+REDIRECT = """<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<meta name="referrer" content="no-referrer">
+<meta http-equiv="refresh" content="0;url={url}">
+<title>Nisus</title>
+<a href="{url}">Open Nisus</a>
+</html>
+"""
+
+
+class BrowserPage:
+    """A file that leads to the page, in a folder of its own, until it has been used."""
+
+    def __init__(self, url: str) -> None:
+        """Write the file.
+
+        Raises:
+            OSError: If no folder for it can be made.
+        """
+        # The runtime folder is the user's own, and is emptied when they log out, should this process be killed.
+        root = os.environ.get("XDG_RUNTIME_DIR")
+        usable = root is not None and os.access(root, os.W_OK | os.X_OK)
+        # Made for this user only, as mkdtemp does; the file is too, whatever the umask says.
+        self._folder = Path(tempfile.mkdtemp(prefix="nisus-", dir=root if usable else None))
+        self.path = self._folder / "open.html"
+        handle = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(REDIRECT.format(url=html.escape(url)))
+
+    def show(self) -> None:
+        """Start the browser, in a thread: one in the terminal does not return before it is left."""
+        threading.Thread(target=webbrowser.open, args=(self.path.as_uri(),), daemon=True).start()
+
+    def close(self) -> None:
+        """Remove the file."""
+        with suppress(OSError):
+            shutil.rmtree(self._folder)

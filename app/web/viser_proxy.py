@@ -14,7 +14,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from websockets.asyncio.client import ClientConnection, connect
 
 from ..views.viser.guarded_server import HEADER
-from .page_file import PAGE
+from .http import PAGE
 
 PASSED_ON = ("content-type", "content-encoding", "etag", "last-modified", "cache-control")
 ASKED = ("accept", "accept-encoding", "if-none-match")

@@ -24,7 +24,7 @@ from ...format_time import format_time
 from ...live.changes import difference, in_words
 from ...twin.twin import Twin
 from ..result import Bar, Topic
-from .alarms import advice
+from .alarm_guide import advice
 from .calibration_lines import calibration_lines
 from .run_charts import run_charts
 from .svg import clock

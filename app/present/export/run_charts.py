@@ -14,9 +14,9 @@ from estimators.track import Track
 
 from ..drawing.colors import LIGHT, RGB
 from ..drawing.direct_readings import observed
+from ..series.chart_stream import drawn
 from ..series.columns import columns_of, rows_of
-from ..series.lane import drawn
-from ..series.pyramid import Groups, grouped
+from ..series.levels_of_detail import Groups, grouped
 from .extent import extent
 from .svg import Frame, Layer, chart
 

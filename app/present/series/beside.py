@@ -21,10 +21,9 @@ from ...live.integrity import LOWEST
 from ...live.interface import Running
 from ...live.outputs import Cursor, Pull
 from ...live.revisions import Run
+from .charted_run import ROWS, Levels, less
 from .columns import Column
-from .difference import less
-from .pyramid import FIRST, Groups, grouped
-from .run import ROWS, Levels
+from .levels_of_detail import FIRST, Groups, grouped
 
 PERIOD = 0.1
 """Seconds between two looks at whether something came."""

@@ -8,10 +8,9 @@ from collections.abc import Iterable
 from ...live.interface import Running
 from ...live.outputs import Pull
 from .beside import Beside, BesideRun
+from .chart_stream import ChartStream
+from .charted_run import DifferenceRun, KeptRun, LiveRun, Run
 from .columns import columns_of
-from .difference import DifferenceRun
-from .lane import Lane
-from .run import KeptRun, LiveRun, Run
 from .smoothed import Smoothing
 
 LIVE, PREVIOUS, SMOOTHED = "live", "previous", "smoothed"
@@ -34,7 +33,7 @@ class Series:
         self._kept: dict[str, KeptRun | DifferenceRun | BesideRun] = {}
         self._besides: dict[str, Beside] = {}
         self._smoothing: Smoothing | None = None
-        self._lanes: set[Lane] = set()
+        self._lanes: set[ChartStream] = set()
         self._origin: int | None = None
 
     def origin(self) -> int | None:
@@ -48,12 +47,12 @@ class Series:
             self._origin = first
         return self._origin
 
-    def open(self, lane: Lane) -> None:
+    def open(self, lane: ChartStream) -> None:
         """A browser looks at this lane from now on."""
         with self._lock:
             self._lanes.add(lane)
 
-    def close(self, lane: Lane) -> None:
+    def close(self, lane: ChartStream) -> None:
         """Nobody looks at it any more."""
         with self._lock:
             self._lanes.discard(lane)
@@ -64,7 +63,7 @@ class Series:
                     self._live.close()
                     self._live = None
 
-    def frames(self, lanes: Iterable[Lane]) -> list[bytes]:
+    def frames(self, lanes: Iterable[ChartStream]) -> list[bytes]:
         """What has changed in these lanes since they were asked last."""
         with self._lock:
             origin, newest = self.origin(), self._engine.span()[1]
@@ -84,7 +83,7 @@ class Series:
                     self._sync(run, [lane for lane in self._lanes if lane.wanted.run == name])
             return [frame for lane, run in shown if (frame := lane.frame(run, origin)) is not None]
 
-    def _sync(self, run: Run, lanes: list[Lane]) -> None:
+    def _sync(self, run: Run, lanes: list[ChartStream]) -> None:
         """Bring a run up to date for the lanes that show it."""
         run.sync({column for lane in lanes for column in lane.levelled})
         for lane in lanes:

@@ -19,9 +19,9 @@ from ...live.commands import SetEstimator, SetTuning
 from ...live.interface import Running
 from ...live.outputs import Status
 from ...present.drawing.colors import LIGHT, RGB, Palette, round_step
+from ...present.series.chart_stream import drawn
 from ...present.series.columns import LINE, LOWER, UPPER
-from ...present.series.lane import drawn
-from ...present.series.pyramid import FACTOR, grouped
+from ...present.series.levels_of_detail import FACTOR, grouped
 from .coalescer import Coalescer
 from .rows import ChoiceRow, NumberRow
 from .scene import History

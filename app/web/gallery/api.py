@@ -1,74 +1,75 @@
-"""The gallery's part of the page's API: what there is, what runs, start and stop."""
+"""The gallery over HTTP: twins to start, what runs, and recordings to open, download, delete or receive."""
 
 from __future__ import annotations
 
-import asyncio
 import time
 from pathlib import Path
 from typing import Any
 
 from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from config.loader import find
-from estimators.errors import ConfigError, quoted
+from estimators.errors import ConfigError, NisusError, quoted
 
-from ..answer import answered
-from ..api import Json, one_line
-from ..page_file import PAGE, page_file
-from .gallery import Gallery, Wanted
-from .pictures import picture_file
-from .recordings import Recordings
-from .recordings_api import RecordingsApi
-from .shelf import shelf
+from ..http import PAGE, Json, TooLarge, bounded_body, get, one_line, page_file, post, refusal
+from .cards import picture_file, shelf
+from .gallery import Gallery, StartRequest
+from .recordings import RECORDING, Recordings
 
-PATIENCE = 1.0
-"""Seconds after which it is said that a model is compiled; loading it from the cache takes less."""
+COMPILING_SHOWN_AFTER_S = 1.0
+"""Loading a model from the cache takes less."""
+
+PIECE_BYTES = 4 * 2**20
+"""Of a dropped file, sent at once: each piece has its own time to arrive."""
 
 
 class GalleryApi:
-    """Serves the gallery at the session's door, whatever else is shown there."""
+    """Serves the gallery and one folder of recordings at the session's door, whatever runs."""
 
     def __init__(self, gallery: Gallery, recordings: Recordings) -> None:
-        """Furnish the door; before the session starts."""
-        self._gallery = gallery
+        """Add the routes to the door; before the session starts."""
+        self._gallery, self._recordings = gallery, recordings
         door = gallery.session.door
         assert door is not None, "a gallery needs a page"
         self._door = door
+        page = get(self._page)
         routes = [
-            Route("/gallery", self._page),
+            Route("/gallery", page),
             Mount("/page", StaticFiles(directory=PAGE)),
-            Route("/api/session", self._state),
-            Route("/api/gallery", self._cards),
-            Route("/api/gallery/start", self._start, methods=["POST"]),
-            Route("/api/gallery/stop", self._stop, methods=["POST"]),
-            Route("/api/gallery/picture", self._picture),
-            *RecordingsApi(gallery, recordings).routes(),
+            Route("/api/session", get(self.state)),
+            Route("/api/gallery", get(self._cards)),
+            Route("/api/gallery/start", post(self._start, status=202), methods=["POST"]),
+            Route("/api/gallery/stop", post(self._stop), methods=["POST"]),
+            Route("/api/gallery/picture", get(self._picture)),
+            Route("/api/gallery/recordings", get(self._list)),
+            Route("/api/gallery/recordings/open", post(self._open, status=202), methods=["POST"]),
+            Route("/api/gallery/recordings/delete", post(self._delete), methods=["POST"]),
+            Route("/api/gallery/recordings/drop", self._drop, methods=["POST"]),
+            Route("/recordings/{name}", get(self._download)),
         ]
-        door.furnish(routes, Starlette(routes=[Route("/", self._page)]))
+        door.furnish(routes, Starlette(routes=[Route("/", page)]))
 
-    async def _page(self, request: Request) -> Response:
+    def _page(self) -> Response:
         return page_file("gallery.html", {"boot": self._door.boot})
 
-    async def _state(self, request: Request) -> Response:
-        return Json(self.state())
-
     def state(self) -> dict[str, Any]:
-        """What runs, what is being started, and what could not be."""
+        """Return what runs, what is being started, and the last start that failed."""
         gallery, running = self._gallery, self._gallery.session.running
-        starting, failed, wanted = gallery.starting, gallery.failed, gallery.running
+        starting, failed, request = gallery.starting, gallery.failed, gallery.running
         begun = gallery.compiling
-        compiling = begun is not None and time.monotonic() - begun > PATIENCE
+        compiling = begun is not None and time.monotonic() - begun > COMPILING_SHOWN_AFTER_S
         return {
             "boot": self._door.boot,
             "running": None
             if running is None
             else {
-                "name": None if wanted is None else wanted.twin,
-                "title": running.engine.twin.name if wanted is None else wanted.name,
+                "name": None if request is None else request.twin,
+                "title": running.engine.twin.name if request is None else request.name,
                 "review": running.opening.review is not None,
             },
             "starting": None
@@ -82,32 +83,83 @@ class GalleryApi:
             "failed": None if failed is None else {"title": failed.name, "text": one_line(failed.text)},
         }
 
-    async def _cards(self, request: Request) -> Response:
-        cards = await asyncio.to_thread(shelf, self._gallery.own)
-        return Json([card.json() for card in cards])
+    def _cards(self) -> Any:
+        return [card.json() for card in shelf(self._gallery.own)]
 
-    async def _start(self, request: Request) -> Response:
-        async def start(body: Any) -> Response:
-            name = body.get("twin") if isinstance(body, dict) else None
-            if not isinstance(name, str):
-                raise ConfigError('the body must be like {"twin": "motor_can"}')
-            self._gallery.start(Wanted(name))
-            return Json(self.state(), 202)
+    def _start(self, twin: str) -> Any:
+        self._gallery.start(StartRequest(twin))
+        return self.state()
 
-        return await answered(request, start)
+    def _stop(self) -> Any:
+        self._gallery.stop()
+        return self.state()
 
-    async def _stop(self, request: Request) -> Response:
-        async def stop(body: Any) -> Response:
-            await asyncio.to_thread(self._gallery.stop)
-            return Json(self.state())
-
-        return await answered(request, stop)
-
-    async def _picture(self, request: Request) -> Response:
-        name = request.query_params.get("twin", "")
-        if name not in self._gallery.names():
-            return PlainTextResponse(f"Nisus: {quoted(name)} is no twin of this gallery.\n", 404)
-        path: Path = picture_file(find(name))
+    def _picture(self, twin: str = "") -> Response:
+        if twin not in self._gallery.names():
+            return PlainTextResponse(f"Nisus: {quoted(twin)} is no twin of this gallery.\n", 404)
+        path = picture_file(find(twin))
         if not path.is_file():
             return PlainTextResponse("Nisus: there is no picture of it.\n", 404)
         return FileResponse(path, media_type="image/svg+xml")
+
+    # Recordings
+
+    def _list(self) -> Any:
+        found = self._recordings.entries(self._is_writing)
+        return {
+            "folder": str(self._recordings.folder),
+            "piece": PIECE_BYTES,
+            "files": [entry.json() for entry in found],
+        }
+
+    def _open(self, name: str, twin: str | None = None) -> Any:
+        """Review a recording, or run a twin on a log."""
+        path = self._idle(name)
+        if path.suffix.lower() == RECORDING:
+            self._gallery.start(StartRequest(recording=path))
+        elif twin is not None:
+            self._gallery.start(StartRequest(twin, (path,)))
+        else:
+            raise ConfigError(f"{path.name} is a log; name the twin that is to read it")
+        return {"opening": path.name}
+
+    def _delete(self, name: str) -> Any:
+        path = self._idle(name)
+        self._recordings.delete(name)
+        return {"deleted": path.name}
+
+    def _idle(self, name: str) -> Path:
+        path = self._recordings.find(name)
+        if self._is_writing(path):
+            raise ConfigError(f"{path.name} is being recorded; end the recording first")
+        return path
+
+    def _is_writing(self, path: Path) -> bool:
+        running = self._gallery.session.running
+        writing = None if running is None else running.recorder.writing
+        return writing is not None and path.absolute() == writing.absolute()
+
+    async def _drop(self, request: Request) -> Response:
+        """Receive a piece of a file: `?name=...&offset=...`, the last one with `&last=1`; the body is its bytes."""
+        query = request.query_params
+        try:
+            if request.headers.get("content-type") != "application/octet-stream":
+                raise ConfigError("Content-Type must be application/octet-stream")
+            offset = query.get("offset", "")
+            if not offset.isascii() or not offset.isdecimal() or len(offset) > 15:
+                raise ConfigError("offset must be the number of bytes that were sent before")
+            data = await bounded_body(request, PIECE_BYTES)
+            last = query.get("last") == "1"
+            name = await run_in_threadpool(self._recordings.receive, query.get("name"), int(offset), data, last=last)
+        except TooLarge as error:
+            return refusal(error, 413)
+        except NisusError as error:
+            return refusal(error)
+        return Json({"name": name})
+
+    def _download(self, name: str) -> Response:
+        try:
+            path = self._recordings.find(name)
+        except NisusError as error:
+            return PlainTextResponse(f"Nisus: {one_line(str(error))}.\n", 404)
+        return FileResponse(path, media_type="application/octet-stream", filename=path.name)

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import threading
 import time
+import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
-from config.loader import shipped
+from config.loader import shipped, shown_path
+from config.tunings import OWN
 from estimators.errors import ConfigError, NisusError, nearest, quoted
 
-from ...twin.twin import Twin
-from ..running import Opening
+from ...live.changes import obstacle
+from ...twin.twin import VERSION, Twin, with_version
+from ..running import Opening, RunningTwin, Stamp, stamp_of
 from ..session import Session
 
 
 @dataclass(frozen=True)
-class Wanted:
+class StartRequest:
     """What is to run: a twin, perhaps on other recordings than its own, or a recording to review."""
 
     twin: str | None = None
@@ -35,7 +38,7 @@ class Wanted:
 
 
 @dataclass(frozen=True)
-class Failed:
+class FailedStart:
     """What could not be started, and why, in one line."""
 
     name: str
@@ -45,7 +48,7 @@ class Failed:
 class Opener(Protocol):
     """How what is wanted is read from its files, and made ready."""
 
-    def open(self, wanted: Wanted) -> Opening:
+    def open(self, wanted: StartRequest) -> Opening:
         """Read it.
 
         Raises:
@@ -70,7 +73,7 @@ class Opener(Protocol):
 class Gallery:
     """Starts, switches and stops what runs in a session."""
 
-    def __init__(self, session: Session, opener: Opener, *, first: Wanted | None = None, own: Sequence[str] = ()):
+    def __init__(self, session: Session, opener: Opener, *, first: StartRequest | None = None, own: Sequence[str] = ()):
         """Take over a session.
 
         Args:
@@ -81,11 +84,11 @@ class Gallery:
         """
         self.session = session
         self.own = tuple(own)
-        self.running: Wanted | None = first
-        self.starting: tuple[Wanted, float] | None = None
+        self.running: StartRequest | None = first
+        self.starting: tuple[StartRequest, float] | None = None
         self.compiling: float | None = None
         """Since when what is being started is made ready; None while it is not."""
-        self.failed: Failed | None = None
+        self.failed: FailedStart | None = None
         self._opener = opener
         self._lock = threading.Lock()
 
@@ -93,7 +96,7 @@ class Gallery:
         """Of all twins that may be started."""
         return [*self.own, *shipped()]
 
-    def start(self, wanted: Wanted) -> None:
+    def start(self, wanted: StartRequest) -> None:
         """Begin to start something; `starting` and `failed` say how it goes.
 
         Raises:
@@ -124,27 +127,27 @@ class Gallery:
             self.running = None
         self.session.change(None)
 
-    def _begin(self, wanted: Wanted, work: Callable[[], None]) -> None:
+    def _begin(self, wanted: StartRequest, work: Callable[[], None]) -> None:
         with self._lock:
             if self.starting is not None:
                 raise ConfigError(f"{self.starting[0].name} is being started; wait until it runs")
             self.starting, self.failed = (wanted, time.monotonic()), None
         threading.Thread(target=self._carry_out, args=(wanted, work), name="gallery", daemon=True).start()
 
-    def _carry_out(self, wanted: Wanted, work: Callable[[], None]) -> None:
+    def _carry_out(self, wanted: StartRequest, work: Callable[[], None]) -> None:
         failed = None
         try:
             work()
         except NisusError as error:
-            failed = Failed(wanted.name, str(error).splitlines()[0])
+            failed = FailedStart(wanted.name, str(error).splitlines()[0])
         except Exception as error:  # noqa: BLE001  a driver or a user's model may raise anything
-            failed = Failed(wanted.name, f"{type(error).__name__}: {error}")
+            failed = FailedStart(wanted.name, f"{type(error).__name__}: {error}")
         with self._lock:
             self.starting, self.failed = None, failed
             if self.session.running is None:
                 self.running = None
 
-    def _start(self, wanted: Wanted, remark: str | None = None) -> None:
+    def _start(self, wanted: StartRequest, remark: str | None = None) -> None:
         opening = self._opener.open(wanted)
         if remark is not None:
             opening = replace(opening, remarks=[*opening.remarks, ("warn", remark)])
@@ -155,7 +158,7 @@ class Gallery:
             self.compiling = None
         self._put(wanted, opening)
 
-    def _put(self, wanted: Wanted, opening: Opening) -> None:
+    def _put(self, wanted: StartRequest, opening: Opening) -> None:
         """Run it in place of what runs."""
         # Two on one bus would hear each other's asset.
         both = _on_a_bus(opening) and self._runs_on_a_bus()
@@ -174,3 +177,93 @@ class Gallery:
 
 def _on_a_bus(opening: Opening) -> bool:
     return opening.review is None and opening.twin.config.source.type == "can" and opening.twin.plan.log_files is None
+
+
+EVERY = 0.4
+"""Seconds between two looks at the files. An editor may write one in pieces: it is read once it stays as it is."""
+
+
+class SavedFiles:
+    """Looks at the files of what runs in a gallery's session, in a thread of its own."""
+
+    def __init__(self, gallery: Gallery, *, every: float = EVERY) -> None:
+        self._gallery, self._every = gallery, every
+        # Not to be kept alive by being looked at.
+        self._of: weakref.ref[RunningTwin] | None = None
+        self._files: tuple[Path, ...] = ()
+        self._known: Stamp = ()
+        self._seen: Stamp = ()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="saved files", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End."""
+        self._stopping.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=2.0)
+
+    def look(self) -> None:
+        """Look once; act when a file has changed since it was read, and not since the last look."""
+        running = self._gallery.session.running
+        if running is None or running.opening.again is None:
+            self._of = None
+            return
+        if self._of is None or running is not self._of():
+            self._of, self._files = weakref.ref(running), running.opening.files
+            self._known = self._seen = running.opening.stamp
+        stamp = stamp_of(self._files)
+        settled, self._seen = stamp == self._seen, stamp
+        if settled and stamp != self._known and self._gallery.starting is None:
+            changed = [file for file, was, now in zip(self._files, self._known, stamp, strict=True) if was != now]
+            self._known = stamp
+            self._read(running, ", ".join(shown_path(file) for file in changed), running.opening.again)
+
+    def _watch(self, files: tuple[Path, ...]) -> None:
+        """The twin was read from these, some of which it may not have imported before."""
+        known = dict(zip(self._files, self._known, strict=True))
+        self._files = files
+        self._known = self._seen = tuple(known.get(file, *stamp_of((file,))) for file in files)
+
+    def _read(self, running: RunningTwin, what: str, again: Callable[[], Twin]) -> None:
+        engine = running.engine
+        try:
+            twin = again()
+            self._watch(twin.files)
+            chosen = engine.twin.overrides.get(VERSION, OWN)
+            if chosen != twin.overrides.get(VERSION, OWN):
+                # Loaded on the page.
+                twin = with_version(twin, chosen)
+            reason = obstacle(engine.twin, twin)
+            if reason is None:
+                self._gallery.prepare(twin)
+        except (NisusError, OSError) as error:
+            self._refuse(running, str(error).splitlines()[0])
+            return
+        except Exception as error:  # noqa: BLE001  a user's model may raise anything; the twin goes on
+            self._refuse(running, f"{what}: {type(error).__name__}: {error}")
+            return
+        running.server.unread = None
+        if twin.config == engine.twin.config and what == shown_path(twin.path):
+            return  # a comment
+        if reason is not None:
+            self._gallery.again(f"{what} was saved and {reason}: the twin was started anew")
+            return
+        engine.notices.say(f"{what} was saved: the history is folded again with it")
+        engine.reload(twin, f"{Path(what).name} saved")
+
+    def _refuse(self, running: RunningTwin, text: str) -> None:
+        running.server.unread = text
+        running.engine.notices.say(f"not read again: {text}", level="error")
+
+    def _run(self) -> None:
+        while not self._stopping.wait(self._every):
+            try:
+                self.look()
+            except NisusError as error:
+                running = self._gallery.session.running
+                if running is not None:
+                    running.engine.notices.say(str(error), level="warn")

@@ -11,7 +11,8 @@ from app.live.changes import turned
 from app.live.engine import Engine
 from app.twin.twin import load_twin
 from app.views.recording.writer import Recorder
-from app.web.api import command_from_json, status_json
+from app.web.commands_json import command_from_json
+from app.web.twin_json import status_json
 from estimators.errors import ConfigError
 from estimators.tuning import Tuning
 from tests.app.scripted import Scripted, pull_all, readings, wait_for

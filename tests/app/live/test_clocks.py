@@ -13,7 +13,8 @@ from app.live.notices import Notices
 from app.live.watchers import HostClock, clock_text
 from app.views.recording.reader import read_recording
 from app.views.recording.writer import Recorder
-from app.web.api import command_from_json, status_json
+from app.web.commands_json import command_from_json
+from app.web.twin_json import status_json
 from estimators.diagnostics.clock_fit import ClockFit
 from estimators.errors import ConfigError
 from estimators.events.maintenance import model_versions

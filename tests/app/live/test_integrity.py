@@ -8,7 +8,7 @@ import pytest
 from app.live.engine import Engine
 from app.live.integrity import IntegrityWatch, Window, reason_against, window
 from app.twin.twin import load_twin
-from app.web.api import status_json
+from app.web.twin_json import status_json
 from estimators.diagnostics.sensitivity import bounds_of, sensitivity
 from estimators.fold import Fold
 from estimators.log import Log

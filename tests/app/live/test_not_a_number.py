@@ -21,7 +21,7 @@ from app.views.rerun.pictures import FieldDrawing
 from app.views.rerun.sink import Sink, pair_name
 from app.views.viser.panel import status_html
 from app.views.viser.view import ViserView
-from app.web.api import status_json
+from app.web.twin_json import status_json
 from config.schema import SceneSection, ViewSection
 from estimators.log import READING, RESET
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel

@@ -11,7 +11,8 @@ from app.views.recording.format import tuning_from_json
 from app.views.recording.reader import read_recording
 from app.views.recording.writer import Recorder
 from app.views.viser.panel import status_html
-from app.web.api import command_from_json, status_json
+from app.web.commands_json import command_from_json
+from app.web.twin_json import status_json
 from estimators.errors import EstimatorError
 from estimators.fold import Fold
 from estimators.log import READING, RESET, Events, Log

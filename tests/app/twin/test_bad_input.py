@@ -13,7 +13,8 @@ from app.live.engine import Engine
 from app.live.execute import play
 from app.twin.twin import load_twin, restore_twin
 from app.views.viser.view import ViserView
-from app.web.api import command_from_json, status_json
+from app.web.commands_json import command_from_json
+from app.web.twin_json import status_json
 from estimators.compiled.model import compile_model
 from estimators.errors import ConfigError, ModelError, NisusError
 from estimators.fold import fold

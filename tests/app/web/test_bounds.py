@@ -12,8 +12,9 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from app.views.viser import guarded_server as private_viser
-from app.web import bounds
-from app.web.bounds import BODY, CONNECTIONS
+from app.web import door
+from app.web.door import CONNECTIONS
+from app.web.http import MAX_BODY_BYTES as BODY
 from tests.app.scripted import readings, wait_for
 from tests.app.served import PATIENCE
 from tests.app.web.test_door import STREAM, page  # noqa: F401  the fixture
@@ -64,13 +65,13 @@ def test_many_half_open_connections_leave_room_for_an_honest_one(page):  # noqa:
     ],
 )
 def test_a_header_that_does_not_end_is_not_waited_for(page, monkeypatch, sent):  # noqa: F811
-    monkeypatch.setattr(bounds, "SECONDS", 0.3)
+    monkeypatch.setattr(door, "REQUEST_TIMEOUT_S", 0.3)
     with half_open(page.client.port, sent) as sock:
         assert b"200 OK" not in sock.recv(65536)
 
 
 def test_a_header_that_trickles_is_not_waited_for_either(page, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(bounds, "SECONDS", 0.3)
+    monkeypatch.setattr(door, "REQUEST_TIMEOUT_S", 0.3)
     client = page.client
     first = f"GET /api/status HTTP/1.1\r\nHost: {client.host}\r\nCookie: {client.cookie}\r\n\r\n".encode()
     with half_open(client.port, first) as sock:
@@ -97,7 +98,7 @@ def test_a_body_that_does_not_end_is_not_waited_for(page, monkeypatch):  # noqa:
     client = page.client
     head = f"Host: {client.host}\r\nCookie: {client.cookie}\r\nOrigin: {client.origin}\r\n"
     kind = "Content-Type: application/json\r\nContent-Length: 40\r\n\r\n{"
-    monkeypatch.setattr(bounds, "SECONDS", 0.3)
+    monkeypatch.setattr(door, "REQUEST_TIMEOUT_S", 0.3)
     with half_open(client.port, f"POST /api/command HTTP/1.1\r\n{head}{kind}".encode()) as sock:
         assert b"HTTP/1.1 202" not in sock.recv(65536)
 

@@ -9,7 +9,7 @@ import pytest
 from app.live import commands
 from app.live.engine import Engine
 from app.twin.twin import load_twin
-from app.web.api import command_from_json
+from app.web.commands_json import command_from_json
 from estimators.errors import NisusError
 
 KINDS = typing.get_args(commands.Command)

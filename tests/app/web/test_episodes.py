@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from app.live.engine import Engine
-from app.web.api import episodes_json, status_json
+from app.web.twin_json import episodes_json, status_json
 from tests.app.scripted import Scripted, readings
 from tests.app.served import shown_twin
 

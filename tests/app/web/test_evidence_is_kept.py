@@ -8,7 +8,7 @@ import pytest
 from app.cli.run import live_source
 from app.live.commands import SetTuning
 from app.present.export.report import Reported, report
-from app.present.export.run_rows import rows_of_run
+from app.present.export.track_file import rows_of_run
 from app.twin.twin import load_twin
 from app.web.session import Page, Session
 from estimators.log import READING

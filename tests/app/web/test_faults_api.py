@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from app.web.api import command_from_json
+from app.web.commands_json import command_from_json
 from estimators.errors import NisusError
 from estimators.log import MARK, READING
 from sources.faults.kinds import KINDS

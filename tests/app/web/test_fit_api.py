@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.live.execute import retuned
-from app.web.api import command_from_json
+from app.web.commands_json import command_from_json
 from estimators.errors import NisusError
 from tests.app.scripted import readings, wait_for
 from tests.app.web.test_door import Page
@@ -58,12 +58,12 @@ def test_given_up_and_nothing_to_give_up(page):
 @pytest.mark.parametrize(
     ("body", "reason"),
     [
-        ([], "the body must be like"),
-        ({"wanted": "Q"}, "wanted must be a list of keys"),
-        ({"wanted": ["Q"], "more": 1}, "the body must be like"),
+        ([], "it must be an object of wanted, events"),
+        ({"wanted": "Q"}, "wanted is 'Q'; it must be a list of texts"),
+        ({"wanted": ["Q"], "more": 1}, "more is not known; choose from wanted, events"),
         ({"wanted": []}, "wanted is empty"),
-        ({"wanted": ["Q"], "events": 0}, "events must be a positive whole number"),
-        ({"wanted": ["Q"], "events": True}, "events must be a positive whole number"),
+        ({"wanted": ["Q"], "events": 0}, "events is 0; it must be a positive whole number"),
+        ({"wanted": ["Q"], "events": True}, "events is true; it must be a whole number"),
     ],
 )
 def test_what_is_refused(page, body, reason):

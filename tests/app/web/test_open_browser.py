@@ -11,8 +11,8 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
-from app.web import open_browser as opening_module
-from app.web.open_browser import Opening
+from app.web import session as opening_module
+from app.web.session import BrowserPage
 from tests.app.scripted import wait_for
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="permissions and command lines as on POSIX")
@@ -30,7 +30,7 @@ def runtime(tmp_path, monkeypatch):
 def test_only_this_user_can_read_the_file_and_it_leads_to_the_page(runtime, monkeypatch):
     before = os.umask(0)
     try:
-        opening = Opening(URL)
+        opening = BrowserPage(URL)
     finally:
         os.umask(before)
     assert stat.S_IMODE(opening.path.stat().st_mode) == 0o600
@@ -51,7 +51,7 @@ def test_only_this_user_can_read_the_file_and_it_leads_to_the_page(runtime, monk
 def test_without_a_runtime_folder_it_is_among_the_temporary_ones(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "absent"))
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    opening = Opening(URL)
+    opening = BrowserPage(URL)
     assert opening.path.parent.parent == tmp_path
     assert stat.S_IMODE(opening.path.parent.stat().st_mode) == 0o700
     opening.close()

@@ -3,8 +3,8 @@
 import pytest
 
 from app.live.engine import Engine
-from app.web.open_browser import Opening
 from app.web.server import PageServer
+from app.web.session import BrowserPage
 from tests.app.scripted import Scripted, wait_for
 from tests.app.served import SECRET, shown_twin
 from tests.app.web.page.browsed import PATIENCE
@@ -17,7 +17,7 @@ def test_the_file_opens_the_page_and_the_next_session_asks_for_its_own_address(b
     engine = Engine(shown_twin(), lambda report: Scripted())
     server = PageServer(engine, port=0, viser_port=None, secret=SECRET)
     server.start()
-    opening = Opening(server.url)
+    opening = BrowserPage(server.url)
     page = browser.new_context().new_page()
     try:
         page.goto(opening.path.as_uri())

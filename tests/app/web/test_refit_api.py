@@ -30,7 +30,7 @@ def page(tmp_path, monkeypatch):
     page.source.put(readings(np.arange(1.0, 651.0) * 0.1, 40.0 + 5.0 * rng.normal(size=650)))
     wait_for(lambda: page.rows() == 650)
     yield page
-    page.server._refit._refits.stop()
+    page.server.refits.stop()
     page.stop()
 
 
@@ -48,8 +48,8 @@ def brief(page):
 
 
 def proposed(page):
-    page.server._refit._refits._look = 0.01
-    page.server._refit._refits.start()
+    page.server.refits._look = 0.01
+    page.server.refits.start()
     wait_for(lambda: brief(page)["proposed"] is not None)
     return look(page)["fits"][0]
 
@@ -95,9 +95,9 @@ def test_at_once(page):
     [
         ("/api/refit/accept", {"number": 7}, "refit 7: it is not known"),
         ("/api/refit/dismiss", {"number": 7}, "refit 7: it is not known"),
-        ("/api/refit/accept", {"number": "1"}, "number: it must be a whole number"),
-        ("/api/refit/accept", {}, "the body must be an object of number"),
-        ("/api/refit", {"entries": []}, "the body must be an object"),
+        ("/api/refit/accept", {"number": "1"}, "number is '1'; it must be a whole number"),
+        ("/api/refit/accept", {}, "number is missing"),
+        ("/api/refit", {"entries": []}, "entries is not known; it takes no field"),
     ],
 )
 def test_what_is_refused(page, path, fields, reason):

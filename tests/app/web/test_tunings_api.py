@@ -95,12 +95,12 @@ def test_a_run_is_kept_and_loaded_again(page, tmp_path):
         ("/api/tunings", {"run": 0, "name": "own", "note": ""}, "the version's name is 'own'; use letters"),
         ("/api/tunings", {"run": 0, "name": "../a", "note": ""}, "the version's name is '../a'; use letters"),
         ("/api/tunings", {"run": 7, "name": "a", "note": ""}, "run 7 is not known"),
-        ("/api/tunings", {"run": True, "name": "a", "note": ""}, "run: it must be a whole number"),
-        ("/api/tunings", {"run": 0, "name": "a"}, "the body must be an object of run, name, note"),
+        ("/api/tunings", {"run": True, "name": "a", "note": ""}, "run is true; it must be a whole number"),
+        ("/api/tunings", {"run": 0, "name": "a"}, "note is missing; it takes run, name, note"),
         ("/api/tunings", {"run": 0, "name": "a", "note": "x" * 2001}, "note: it has 2001 characters; it may have 2000"),
         ("/api/tunings/load", {"name": "nobody"}, "--tuning nobody: winding has no such version"),
         ("/api/tunings/load", {"name": "/etc/passwd"}, "/etc/passwd: no version is read from there"),
-        ("/api/tunings/load", {"name": 3}, "name: it must be a text"),
+        ("/api/tunings/load", {"name": 3}, "name is 3; it must be a text"),
     ],
 )
 def test_what_is_refused(page, path, fields, said):

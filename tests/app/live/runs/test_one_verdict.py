@@ -11,7 +11,7 @@ from app.live.runs.runs_json import runs_json
 from app.live.runs.scores import RunScores
 from app.present.export.report import Reported, _scores
 from app.studies.analysis.diagnosis import Diagnosis
-from app.web.api import status_json
+from app.web.twin_json import status_json
 from estimators.diagnostics.evidence import no_baseline
 from estimators.diagnostics.score import score
 from tests.app.scripted import MODEL, Scripted, pull_all, readings

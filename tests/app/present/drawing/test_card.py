@@ -13,7 +13,7 @@ from app.cli.main import main
 from app.present.drawing import card
 from app.present.drawing.colors import ESTIMATE, gradient
 from app.twin.twin import load_twin
-from app.web.gallery.pictures import picture_file
+from app.web.gallery.cards import picture_file
 from config.loader import find, shipped
 from estimators.fold import Fold
 from estimators.log import truth_of

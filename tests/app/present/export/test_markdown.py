@@ -3,8 +3,7 @@
 import re
 from html.parser import HTMLParser
 
-from app.present.export.alarms import alarms_text
-from app.present.export.markdown import as_html
+from app.present.export.alarm_guide import alarms_text, as_html
 from estimators.diagnostics.episodes import CAUSES, anchor
 
 

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from app.cli.main import main
-from app.present.export.alarms import advice
+from app.present.export.alarm_guide import advice
 from app.present.export.run_charts import run_charts
 from estimators.diagnostics.episodes import CAUSES
 from estimators.fold import fold

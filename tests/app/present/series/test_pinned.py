@@ -7,13 +7,13 @@ from app.live import commands
 from app.live.engine import Engine
 from app.live.feeder import Restarted
 from app.present.series.beside import Beside
-from app.present.series.lane import Lane, Wanted
+from app.present.series.chart_stream import ChartQuery, ChartStream
 from app.present.series.series import Series
 from estimators.fold import fold
 from estimators.log import Log
 from estimators.tuning import Tuning
 from tests.app.live.runs.test_scores import carry_out
-from tests.app.present.series.test_lane import Browser
+from tests.app.present.series.test_chart_stream import Browser
 from tests.app.scripted import MODEL, Scripted, readings, row_count, twin, wait_for
 
 MEAN = f"mean:{MODEL.states[0].name}"
@@ -59,7 +59,7 @@ def taken(series, lane):
 
 
 def points(series, run):
-    lane = Lane("pinned", Wanted((MEAN,), run=run, points=2000), series.columns)
+    lane = ChartStream("pinned", ChartQuery((MEAN,), run=run, points=2000), series.columns)
     series.open(lane)
     found = taken(series, lane)
     series.close(lane)
@@ -74,7 +74,7 @@ def test_a_pinned_run_gives_its_own_points(engine):
 
 def test_a_difference_is_that_of_the_same_rows_and_follows_what_runs(engine):
     series = Series(engine)
-    lane = Lane("less", Wanted((MEAN,), run="difference:0", points=2000), series.columns)
+    lane = ChartStream("less", ChartQuery((MEAN,), run="difference:0", points=2000), series.columns)
     series.open(lane)
     expected = mean(FIRST) - mean(FIRST.set("Q.rate", 0.1))
     assert np.abs(expected).max() > 0.1
@@ -94,7 +94,7 @@ def test_what_is_not_pinned_gives_nothing(engine):
 
 def test_nothing_is_held_of_a_run_that_nobody_looks_at(engine):
     series = Series(engine)
-    live = Lane("live", Wanted((MEAN,)), series.columns)
+    live = ChartStream("live", ChartQuery((MEAN,)), series.columns)
     series.open(live)
     assert points(series, "0") is not None and "0" in series._kept
     series.frames([live])
@@ -127,7 +127,7 @@ class Watched:
 
     def __init__(self, engine, run, points=2000):
         self.series = Series(engine)
-        self.lane = Lane("pinned", Wanted((MEAN,), run=run, points=points), self.series.columns)
+        self.lane = ChartStream("pinned", ChartQuery((MEAN,), run=run, points=points), self.series.columns)
         self.browser = Browser()
         self.series.open(self.lane)
 

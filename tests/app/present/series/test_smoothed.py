@@ -9,7 +9,7 @@ from app.live import commands
 from app.live.engine import Engine
 from app.live.integrity import window
 from app.live.notices import Notices
-from app.present.series.lane import Lane, Wanted
+from app.present.series.chart_stream import ChartQuery, ChartStream
 from app.present.series.series import SMOOTHED, Series
 from app.present.series.smoothed import Smoothing
 from estimators import fold
@@ -75,7 +75,7 @@ def test_smoothed_rows_carry_the_version_of_the_model():
 def test_it_is_the_smoothed_fold_and_follows_what_runs(source_and_engine):
     source, engine = source_and_engine
     series = Series(engine)
-    lane = Lane("smoothed", Wanted((MEAN, UPPER), run=SMOOTHED, points=4000), series.columns)
+    lane = ChartStream("smoothed", ChartQuery((MEAN, UPPER), run=SMOOTHED, points=4000), series.columns)
     series.open(lane)
     first = shown(series, lane, lambda browser: len(browser.x) == N)
     expected = smoothed("kf", Tuning.of(MODEL), N)
@@ -98,7 +98,7 @@ def test_why_there_is_nothing_is_said(source_and_engine):
     _, engine = source_and_engine
     carry_out(engine, commands.SetEstimator("filterpy-kf"))
     series = Series(engine)
-    lane = Lane("smoothed", Wanted((MEAN,), run=SMOOTHED), series.columns)
+    lane = ChartStream("smoothed", ChartQuery((MEAN,), run=SMOOTHED), series.columns)
     series.open(lane)
 
     def told():

@@ -9,7 +9,7 @@ import pytest
 
 from app.live.engine import Engine
 from app.studies.analysis.forecast import Forecasts, forecast_json, question_from_json, recorded
-from app.web.one_at_a_time import OneAtATime
+from app.web.http import OneAtATime
 from app.web.server import PageServer
 from estimators.errors import ConfigError
 from estimators.forecast import Forecast, forecast
@@ -182,7 +182,7 @@ def test_the_page_asks_by_post(tmp_path, monkeypatch):
 
 
 def test_a_question_waits_for_the_one_before_it_and_not_for_ever(monkeypatch):
-    monkeypatch.setattr("app.web.one_at_a_time.PATIENCE", 0.01)
+    monkeypatch.setattr("app.web.http.QUEUE_TIMEOUT_S", 0.01)
     go_on, under_way = threading.Event(), []
 
     def slow():
@@ -192,13 +192,13 @@ def test_a_question_waits_for_the_one_before_it_and_not_for_ever(monkeypatch):
 
     async def ask():
         line = OneAtATime("forecast")
-        first = asyncio.create_task(line.do(slow))
+        first = asyncio.create_task(line(slow))
         while not under_way:
             await asyncio.sleep(0)
         with pytest.raises(ConfigError, match="forecast: another one is under way; ask again"):
-            await line.do(slow)
+            await line(slow)
         go_on.set()
-        return await first, await line.do(slow)
+        return await first, await line(slow)
 
     assert asyncio.run(ask()) == (1, 2)
 
@@ -209,4 +209,4 @@ def test_what_goes_wrong_in_the_thread_is_told_to_who_asked():
         raise ZeroDivisionError("in the model")
 
     with pytest.raises(ZeroDivisionError, match="in the model"):
-        asyncio.run(OneAtATime("forecast").do(wrong))
+        asyncio.run(OneAtATime("forecast")(wrong))

@@ -20,7 +20,7 @@ from app.views.recording.format import tuning_from_json
 from app.views.recording.reader import finished, read_recording
 from app.views.recording.rrd_file import NEVER, Split, parse_split
 from app.views.recording.writer import Recorder
-from app.web.api import command_from_json
+from app.web.commands_json import command_from_json
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import Log

@@ -4,7 +4,7 @@ import json
 from contextlib import contextmanager
 
 from app.cli.opener import FileOpener, open_session, opened_twin
-from app.web.gallery.gallery import Wanted
+from app.web.gallery.gallery import StartRequest
 from app.web.session import Page
 from tests.app.scripted import wait_for
 from tests.app.served import Client
@@ -52,7 +52,7 @@ def opened(folder, twin=None, *, speed=1.0):
         def read():
             return opened_twin(str(twin), speed=speed)
 
-        opening, wanted, opener = read(), Wanted(str(twin)), FileOpener({str(twin): read})
+        opening, wanted, opener = read(), StartRequest(str(twin)), FileOpener({str(twin): read})
     session = open_session(opening, wanted, opener, page=Page(0, open_browser=False), recordings=folder)
     session.start()
     try:

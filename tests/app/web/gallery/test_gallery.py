@@ -105,12 +105,14 @@ def test_a_twin_that_is_started_says_that_its_model_is_compiled(tmp_path, monkey
 
     monkeypatch.setattr(FileOpener, "made_ready", made_ready)
     with opened(tmp_path) as session:
-        monkeypatch.setattr(app.web.gallery.api, "PATIENCE", 0.0)
+        monkeypatch.setattr(app.web.gallery.api, "COMPILING_SHOWN_AFTER_S", 0.0)
         assert session.post("/api/gallery/start", {"twin": "motor_winding"})[0] == 202
         begun.wait(PATIENCE)
         starting = session.state()["starting"]
         assert starting["name"] == "motor_winding" and starting["doing"] == "compiling"
-        monkeypatch.setattr(app.web.gallery.api, "PATIENCE", PATIENCE)  # what takes no longer is loaded from the cache
+        monkeypatch.setattr(
+            app.web.gallery.api, "COMPILING_SHOWN_AFTER_S", PATIENCE
+        )  # what takes no longer is loaded from the cache
         assert session.state()["starting"]["doing"] == ""
         go.set()
         assert session.settled()["failed"] == {"title": "motor_winding", "text": "enough"}

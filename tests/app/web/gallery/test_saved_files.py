@@ -9,7 +9,7 @@ from app.live.changes import merged, obstacle
 from app.live.commands import SetEstimator, SetTuning
 from app.twin.twin import load_twin
 from app.views.recording.reader import read_recording
-from app.web.gallery.saved_files import SavedFiles
+from app.web.gallery.gallery import SavedFiles
 from app.web.running import stamp_of
 from estimators.fold import Fold
 from estimators.log import Log

@@ -4,7 +4,7 @@ import pytest
 
 from app.cli.run import live_source
 from app.twin.twin import load_twin
-from app.web.page_file import PAGE
+from app.web.http import PAGE
 from app.web.session import Page, Session
 from tests.app.scripted import wait_for
 from tests.app.web.page.browsed import PATIENCE, until

@@ -9,11 +9,9 @@ import pytest
 
 from app.live.commands import SetTuning
 from app.live.outputs import Pull
-from app.present.series.columns import columns_of
-from app.present.series.lane import Lane, Wanted, drawn, wanted_from_json
-from app.present.series.pyramid import grouped
+from app.present.series.chart_stream import ChartQuery, ChartStream, drawn
+from app.present.series.levels_of_detail import grouped
 from app.present.series.series import Series
-from estimators.errors import ConfigError
 from estimators.log import READING, TRUTH, Events
 from estimators.models import MODELS
 from tests.app.fake_engine import FakeEngine
@@ -60,8 +58,8 @@ def readings(engine: FakeEngine, start: int, n: int, every: int = 100_000_000) -
     return Events(t, t, kind, np.zeros(n, np.int32), value)
 
 
-def look(series: Series, **wanted: Any) -> tuple[Lane, Browser]:
-    lane = Lane("charts", Wanted(**wanted), series.columns)
+def look(series: Series, **wanted: Any) -> tuple[ChartStream, Browser]:
+    lane = ChartStream("charts", ChartQuery(**wanted), series.columns)
     series.open(lane)
     return lane, Browser()
 
@@ -216,20 +214,6 @@ def test_two_points_a_group() -> None:
     times, points = drawn(grouped(4, 0, t, values), np.array(["line", "upper", "lower", "dots"]))
     np.testing.assert_array_equal(times, [0, 3 * SECOND])
     np.testing.assert_array_equal(points, [[0.0, 5.0, 0.0, 3.0], [5.0, 5.0, 0.0, np.nan]])
-
-
-@pytest.mark.parametrize(
-    ("body", "word"),
-    [
-        ([], "no object"), ({}, "columns"), ({"columns": ["nothing"]}, "'nothing'"), ({"columns": [1]}, "columns"),
-        ({"columns": ["nis"], "span": "x"}, "span"), ({"columns": ["nis"], "points": 1}, "points"),
-        ({"columns": ["nis"], "points": 10**9}, "points"), ({"columns": ["nis"], "run": 3}, "run"),
-        ({"columns": ["nis"], "since": float("inf")}, "since"), ({"columns": ["nis"] * 500}, "at most"),
-    ],
-)  # fmt: skip
-def test_what_cannot_be_asked(engine: FakeEngine, body: Any, word: str) -> None:
-    with pytest.raises(ConfigError, match=word):
-        wanted_from_json(body, columns_of(engine.model))
 
 
 def test_a_kept_revision_is_shown_beside(engine: FakeEngine) -> None:

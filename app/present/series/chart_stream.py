@@ -1,6 +1,6 @@
-"""What one group of charts shows: some columns of one run between two times, as no more points than can be seen.
+"""Columns of one run between two times, as no more points than a chart can show.
 
-A lane remembers what it has sent and gives only groups that are new or have changed since.
+A stream remembers what it has sent and gives only groups of rows that are new or have changed since.
 """
 
 from __future__ import annotations
@@ -9,30 +9,32 @@ import json
 import math
 import struct
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from estimators.errors import ConfigError
 
+from .charted_run import Run
 from .columns import DOTS, LOWER, UPPER, Column
-from .pyramid import FACTOR, FIRST, Groups
-from .run import Run
+from .levels_of_detail import FACTOR, FIRST, Groups
 
 SLACK = 1.3
 """By how much the number of groups may leave its bounds before their size changes: else charts would flicker."""
 
-MOST_POINTS, MOST_COLUMNS = 4000, 400
-FOREVER = 2**62
+MAX_POINTS, MAX_COLUMNS, MAX_SECONDS = 4000, 400, 1e9
+"""Of one query."""
+
+LAST_ROW = 2**62
+"""After every row."""
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What a browser asks of a lane.
+class ChartQuery:
+    """Columns that a browser asks for.
 
     `run` is "live", "previous", "smoothed", the number of a pinned revision, or "difference:" and such a number (see
-    difference.py). Times are seconds since the first event; `since` None is the first, `until` None the newest, and
-    with `span` the last seconds are followed. `points` is how many groups there are at most.
+    `DifferenceRun`). Times are seconds since the first event; `since` None is the first, `until` None the newest, and
+    with `span` the last seconds are followed. `points` is the largest number of groups.
     """
 
     columns: tuple[str, ...]
@@ -43,41 +45,30 @@ class Wanted:
     points: int = 600
 
 
-def wanted_from_json(body: Any, columns: dict[str, Column]) -> Wanted:
-    """What a browser asks, checked.
+def check_query(query: ChartQuery, columns: dict[str, Column]) -> ChartQuery:
+    """Return a query from a browser, checked.
 
     Raises:
-        ConfigError: If it is not that.
+        ConfigError: If a column does not exist, or a number is out of bounds.
     """
-    if not isinstance(body, dict):
-        raise ConfigError(f"lane: {body!r} is no object")
-    names = body.get("columns")
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or len(names) > MOST_COLUMNS:
-        raise ConfigError(f"lane: columns must be a list of at most {MOST_COLUMNS} names")
-    unknown = next((name for name in names if name not in columns), None)
+    if len(query.columns) > MAX_COLUMNS:
+        raise ConfigError(f"lane: columns has {len(query.columns)} names; it may have {MAX_COLUMNS}")
+    unknown = next((name for name in query.columns if name not in columns), None)
     if unknown is not None:
         raise ConfigError(f"lane: there is no column {unknown!r}; /api/model lists them")
-    numbers = {}
     for key in ("since", "until", "span"):
-        value = body.get(key)
-        if value is not None and (
-            isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9
-        ):
+        value = getattr(query, key)
+        if value is not None and not abs(value) < MAX_SECONDS:
             raise ConfigError(f"lane: {key} is {value!r}; it must be a number of seconds, or null")
-        numbers[key] = value
-    points = body.get("points", 600)
-    if not isinstance(points, int) or isinstance(points, bool) or not 2 <= points <= MOST_POINTS:
-        raise ConfigError(f"lane: points is {points!r}; it must be a whole number from 2 to {MOST_POINTS}")
-    run = body.get("run", "live")
-    if not isinstance(run, str):
-        raise ConfigError(f"lane: run is {run!r}; it must be live, previous, smoothed, a number, or difference:NUMBER")
-    return Wanted(tuple(names), run, points=points, **numbers)
+    if not 2 <= query.points <= MAX_POINTS:
+        raise ConfigError(f"lane: points is {query.points!r}; it must be a whole number from 2 to {MAX_POINTS}")
+    return query
 
 
-class Lane:
-    """Gives frames of one view; see `Wanted`."""
+class ChartStream:
+    """Gives frames of one view; see `ChartQuery`."""
 
-    def __init__(self, name: str, wanted: Wanted, columns: dict[str, Column]) -> None:
+    def __init__(self, name: str, wanted: ChartQuery, columns: dict[str, Column]) -> None:
         self.name, self.wanted = name, wanted
         self._kinds = np.array([columns[column].kind for column in wanted.columns])
         self._size = 0
@@ -87,7 +78,7 @@ class Lane:
         """Numbers of the groups that the browser has, from the first to before the second; the row after their last."""
         self._told: object = None
         """Which run, and which generation of it, they are of."""
-        self._dirty = FOREVER
+        self._dirty = LAST_ROW
         """First row that has changed since the last frame."""
         self._offsets = np.full(len(wanted.columns), np.nan)
 
@@ -134,7 +125,7 @@ class Lane:
         if not fresh and (at >= last or self._dirty >= run.end):
             return None
         groups = run.groups(size, at, last, list(self.wanted.columns))
-        self._told, self._dirty, self._end = told, FOREVER, end
+        self._told, self._dirty, self._end = told, LAST_ROW, end
         # The last group may grow.
         self._sent = (first, groups.start + groups.n)
         return self._packed(groups, origin, fresh, first, run.revision)

@@ -1,4 +1,4 @@
-"""The cards of the gallery: what each twin is and teaches, and whether it can run here."""
+"""Where a twin's picture for the gallery is kept: those of twins that ship in a folder of their own."""
 
 from __future__ import annotations
 
@@ -8,13 +8,22 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from config.loader import Loaded, find, load, shipped
+from config.loader import TWINS, Loaded, find, load, shipped
 from estimators.errors import NisusError
 
 from ...twin.missing import missing
 from ...twin.twin import load_twin
 from ..running import Stamp, stamp_of
-from .pictures import picture_file
+
+CARDS = TWINS.parent / "cards"
+"""Folder of the pictures of the twins that ship."""
+
+
+def picture_file(twin: Path) -> Path:
+    """Where the picture of a twin's YAML is; it may be absent."""
+    ships = twin.resolve().parent == TWINS.resolve()
+    return CARDS / f"{twin.stem}.svg" if ships else twin.with_suffix(".svg")
+
 
 KINDS = {"simulator": "simulated", "can": "CAN bus", "can_log": "recorded", "table": "recorded", "merged": "recorded"}
 """What a type of source is called on a card."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from app.present.series.pyramid import FIRST, Groups, Pyramid, coarser, grouped
+from app.present.series.levels_of_detail import FIRST, Groups, Pyramid, coarser, grouped
 
 
 def by_hand(size: int, first: int, t: np.ndarray, values: np.ndarray) -> dict[int, tuple]:

@@ -1,0 +1,83 @@
+"""Commands to a running twin, as JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import typing
+from pathlib import Path
+from typing import Any
+
+from estimators.errors import ConfigError, nearest
+
+from ..live import commands, faults
+from ..live.execute import PLAYBACK, Refolding, check_maintenance, check_playback, retuned
+from ..live.interface import Running
+from .http import parse, shown
+
+MAX_NAME_BYTES = 255
+"""Of a file's name, on nearly all file systems."""
+
+COMMANDS = {kind.__name__: kind for kind in typing.get_args(commands.Command)}
+
+
+def command_from_json(body: Any, engine: Running) -> commands.Command:
+    """Return the command of `{"command": NAME, field: value, ...}`.
+
+    Raises:
+        NisusError: If there is no such command, a field is missing, unknown or of another type, or the engine would
+            refuse the command: whoever asks gets the reason at once, not as a later notice.
+    """
+    if not isinstance(body, dict):
+        raise ConfigError(f'the body is {shown(body)}; it must be like {{"command": "Reset"}}')
+    if "command" not in body:
+        raise ConfigError(f"command is missing; {nearest('', COMMANDS)}")
+    name = body["command"]
+    if not isinstance(name, str) or name not in COMMANDS:
+        raise ConfigError(f"command is {shown(name)}; {nearest(name if isinstance(name, str) else '', COMMANDS)}")
+    command = parse(COMMANDS[name], {key: value for key, value in body.items() if key != "command"}, name)
+    if isinstance(command, commands.Record) and command.path is not None:
+        path = _recording(str(body["path"]))
+        command = dataclasses.replace(command, path=path if engine.recorder is None else engine.recorder.folder / path)
+    _check(command, engine)
+    return command
+
+
+def _check(command: commands.Command, engine: Running) -> None:
+    if isinstance(command, Refolding):
+        retuned(command, engine)
+    elif isinstance(command, commands.Pin):
+        engine.revisions.free_place(command.number)
+    elif isinstance(command, commands.Unpin):
+        engine.revisions.find(command.number)
+    elif isinstance(command, commands.Note):
+        engine.revisions.check_words(command.number, command.name, command.note)
+    elif isinstance(command, commands.Reset) and not engine.span()[1]:
+        raise ConfigError("Reset: nothing to reset; no measurement has arrived yet")
+    elif isinstance(command, commands.Maintenance):
+        check_maintenance(command.what, command.states, engine.model)
+        if not engine.span()[1]:
+            raise ConfigError("Maintenance: no measurement has arrived yet; the estimate is still the prior")
+    elif isinstance(command, commands.Record):
+        if engine.recorder is None:
+            raise ConfigError("Record: this session cannot record")
+        if command.path is not None and os.path.lexists(command.path):
+            raise ConfigError(f"Record: path is {shown(command.path.name)}, which exists already; choose another name")
+    elif isinstance(command, commands.InjectFault | commands.ClearFault):
+        faults.check_fault(command, engine.source, engine.model)
+    if isinstance(command, PLAYBACK):
+        check_playback(command)
+        if not engine.status().seekable:
+            raise ConfigError("a live source cannot be paused, stepped or sought; only a replay or a simulation can")
+
+
+def _recording(name: str) -> Path:
+    """Check the name of a new recording: a browser names the file, but neither its folder nor one to replace."""
+    path, where = Path(name), f"Record: path is {shown(name)}"
+    if path.suffix != ".rrd" or name != path.name or "\\" in name or name.startswith("."):
+        raise ConfigError(f"{where}; it must be a file name that ends in .rrd, without folders")
+    if not name.isprintable():
+        raise ConfigError(f"{where}; it must have letters that can be shown, no control characters")
+    if len(os.fsencode(name)) > MAX_NAME_BYTES:
+        raise ConfigError(f"{where}, which is too long; it may have {MAX_NAME_BYTES} bytes")
+    return path

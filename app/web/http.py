@@ -1,0 +1,301 @@
+"""Endpoints of the page's API: bodies checked by pydantic, work in threads, errors in one line, bounded requests."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import inspect
+import json
+import math
+import threading
+import typing
+from collections.abc import Awaitable, Callable, Mapping
+from concurrent.futures import Future
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+
+from estimators.errors import ConfigError, NisusError, nearest, printable, quoted, shown_name
+
+T = TypeVar("T")
+Endpoint = Callable[[Request], Awaitable[Response]]
+Runner = Callable[[Callable[[], Any]], Awaitable[Any]]
+
+PAGE = Path(__file__).parent / "page"
+"""Folder of the page's HTML, CSS and JavaScript."""
+
+MAX_BODY_BYTES = 64 * 1024
+"""Of a request's body, or of a browser's message on a stream; a command takes a hundred bytes."""
+
+MAX_REASON_CHARACTERS = 500
+"""Of an error line, which may quote the request."""
+
+QUEUE_TIMEOUT_S = 15.0
+"""How long a question waits for the one before it."""
+
+RULES = {
+    "float_type": "a number", "float_parsing": "a number", "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "bool_type": "true or false", "string_type": "a text", "list_type": "a list of texts",
+    "tuple_type": "a list of texts", "dict_type": "an object of numbers", 
+}  # fmt: skip
+"""Types of pydantic's errors in words."""
+
+
+class Json(JSONResponse):
+    """An answer in JSON. A file's name may hold what UTF-8 cannot, so everything that is not ASCII is escaped."""
+
+    def render(self, content: Any) -> bytes:
+        """Return the bytes of the answer."""
+        return json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
+
+
+class TooLarge(ConfigError):
+    """A request's body has more bytes than any command needs."""
+
+
+def one_line(text: str) -> str:
+    """Return an error text as one printable line."""
+    line = printable(text).replace("\n", " ")
+    return line if len(line) <= MAX_REASON_CHARACTERS else line[: MAX_REASON_CHARACTERS - 1] + "…"
+
+
+def page_file(name: str, settings: Mapping[str, Any]) -> Response:
+    """Answer with an HTML file of the page, its settings in an attribute of the body.
+
+    In an attribute, not in a script: the security policy allows no inline scripts.
+    """
+    text = json.dumps(dict(settings)).replace("&", "&amp;").replace('"', "&quot;")
+    return Response((PAGE / name).read_text().replace("{{settings}}", text), media_type="text/html")
+
+
+def get(work: Callable[..., Any], *, refused: int = 400, run: Runner = run_in_threadpool) -> Endpoint:
+    """Return an endpoint that calls `work` in a thread and answers with its result as JSON.
+
+    Parameters of `work` come from the path and the query, converted to their annotated types; one that is called
+    `request` is the request itself. A `Response` is passed on; a `NisusError` is answered in one line.
+
+    Args:
+        work: A plain function.
+        refused: Status code of an error.
+        run: Runs a call; by default in the server's threads.
+    """
+    kind, takes_request = _parameters(work), "request" in inspect.signature(work).parameters
+
+    async def endpoint(request: Request) -> Response:
+        texts = {**request.query_params, **request.path_params}
+        given = {name: texts[name] for name in _names(kind) if name in texts}
+        subject = request.url.path.rpartition("/")[2].partition(".")[0]
+
+        def call() -> Any:
+            fields = vars(parse(kind, given, subject, text=True))
+            return work(request, **fields) if takes_request else work(**fields)
+
+        return await _answered(call, run, 200, refused)
+
+    return endpoint
+
+
+def post(work: Callable[..., Any], *, status: int = 200, run: Runner = run_in_threadpool) -> Endpoint:
+    """Return an endpoint that calls `work` in a thread with the fields of the request's JSON body; see `get`.
+
+    The body must be an object of exactly the parameters of `work`; one that is called `body` is the whole body.
+    """
+    kind, takes_body = _parameters(work), "body" in inspect.signature(work).parameters
+
+    async def endpoint(request: Request) -> Response:
+        if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+            return PlainTextResponse("Nisus: Content-Type must be application/json.\n", 415)
+        try:
+            body = json.loads(await bounded_body(request))
+        except TooLarge as error:
+            return PlainTextResponse(f"Nisus: {error}.\n", 413)
+        except ConfigError as error:
+            return refusal(error)
+        except (ValueError, RecursionError):
+            return Json({"error": "the body is no JSON, or holds a number or a nesting that is too large"}, 400)
+        subject = request.url.path.removeprefix("/api/")
+
+        def call() -> Any:
+            return work(body) if takes_body else work(**vars(parse(kind, body, subject)))
+
+        return await _answered(call, run, status, 400)
+
+    return endpoint
+
+
+async def _answered(call: Callable[[], Any], run: Runner, status: int, refused: int) -> Response:
+    try:
+        found = await run(call)
+    except NisusError as error:
+        return refusal(error, refused)
+    except (ValueError, RecursionError) as error:  # of a body that is nested too deeply, or of a number too long
+        return refusal(error)
+    return found if isinstance(found, Response) else Json(found, status)
+
+
+def refusal(error: Exception, status: int = 400) -> Json:
+    """Answer with an error in one line."""
+    return Json({"error": one_line(str(error))}, status)
+
+
+async def bounded_body(request: Request, limit: int = MAX_BODY_BYTES) -> bytes:
+    """Read the body of a request.
+
+    Raises:
+        TooLarge: If it has more than `limit` bytes; the rest is not read.
+        ConfigError: If the client disconnects before its end.
+    """
+    body = bytearray()
+    try:
+        async for piece in request.stream():
+            body += piece
+            if len(body) > limit:
+                raise TooLarge(f"a request's body may have {limit // 1024} kB; send one command at a time")
+    except ClientDisconnect:
+        raise ConfigError("the request ended before its body did; send it again") from None
+    return bytes(body)
+
+
+class OneAtATime:
+    """Runs calls one after the other, each in a daemon thread.
+
+    A model function that never returns blocks this queue, but neither other requests nor the end of the process.
+    """
+
+    def __init__(self, subject: str) -> None:
+        self._subject = subject
+        self._lock = asyncio.Lock()
+
+    async def __call__(self, work: Callable[[], T]) -> T:
+        """Return the result of `work`.
+
+        Raises:
+            ConfigError: If the call before it takes too long.
+        """
+        try:
+            await asyncio.wait_for(self._lock.acquire(), QUEUE_TIMEOUT_S)
+        except TimeoutError:
+            raise ConfigError(f"{self._subject}: another one is under way; ask again") from None
+        outcome: Future[T] = Future()
+        outcome.set_running_or_notify_cancel()
+
+        def run() -> None:
+            try:
+                outcome.set_result(work())
+            except Exception as error:  # noqa: BLE001  passed on to the request
+                outcome.set_exception(error)
+
+        threading.Thread(target=run, name=self._subject, daemon=True).start()
+        try:
+            return await asyncio.wrap_future(outcome)
+        finally:
+            self._lock.release()
+
+
+# Fields of a request as a dataclass
+
+
+def parse(kind: type[T], given: Any, subject: str, *, text: bool = False) -> T:
+    """Return a dataclass made of the fields of a JSON object, strictly: no text where a number is wanted.
+
+    Infinity is written "inf" where a number is wanted.
+
+    Args:
+        kind: The dataclass.
+        given: The object.
+        subject: Named at the start of an error line.
+        text: Whether all values are texts of an address, to be converted.
+
+    Raises:
+        ConfigError: If it is no object, or a field is unknown, missing or of another type.
+    """
+    fields = {item.name: item for item in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    names = ", ".join(fields)
+    if not isinstance(given, dict):
+        raise ConfigError(
+            f"{subject}: the body is {shown(given)}; it must be an object" + (f" of {names}" if names else "")
+        )
+    for name in given:
+        if name not in fields:
+            remedy = nearest(name, fields) if fields else "it takes no field"
+            raise ConfigError(f"{subject}: {shown_name(name)} is not known; {remedy}")
+    for name, item in fields.items():
+        if name not in given and item.default is dataclasses.MISSING:
+            raise ConfigError(f"{subject}: {name} is missing; it takes {names}")
+    adapter: TypeAdapter[T] = _adapter(typing.cast(Any, kind))
+    try:
+        if text:
+            return adapter.validate_python(given)
+        hints = typing.get_type_hints(kind)
+        checked = {name: _number(f"{subject}: {name}", value, hints[name]) for name, value in given.items()}
+        return adapter.validate_json(json.dumps(checked), strict=True)
+    except ValidationError as error:
+        raise ConfigError(_line(error, given, subject)) from None
+
+
+def _number(where: str, value: Any, hint: Any) -> Any:
+    """Return a value as pydantic takes it: infinity as a number, NaN as none; refuse what JSON's readers differ in."""
+    if isinstance(value, dict):
+        return {key: _number(f"{where}.{shown_name(key)}", item, hint) for key, item in value.items()}
+    if isinstance(value, int) and abs(value) >= 2**53:
+        raise ConfigError(f"{where} is too large; it must be below 2^53")
+    if isinstance(value, str) and not _encodable(value):
+        raise ConfigError(f"{where} is {shown(value)}; it must have letters that can be shown, no half ones")
+    if value == "inf" and "float" in str(hint):
+        return math.inf
+    return "NaN" if isinstance(value, float) and math.isnan(value) else value
+
+
+def _encodable(text: str) -> bool:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _line(error: ValidationError, given: Any, subject: str) -> str:
+    problems = error.errors(include_url=False)
+    path, value = [], given
+    for part in problems[0]["loc"]:  # the rest of a location names members of a union
+        if isinstance(value, dict) and part in value or isinstance(value, list) and isinstance(part, int):
+            value = value[part]  # type: ignore[index]
+            path.append(shown_name(str(part)))
+    rules = [
+        RULES.get(problem["type"], problem["msg"].removeprefix("Input should be "))
+        for problem in problems
+        if problem["loc"][:1] == problems[0]["loc"][:1]
+    ]
+    return f"{subject}: {'.'.join(path)} is {shown(value)}; it must be {' or '.join(dict.fromkeys(rules))}"
+
+
+def shown(value: Any) -> str:
+    """Return a value of a request as an error shows it: as JSON, shortened."""
+    return quoted(value) if isinstance(value, str) else shown_name(json.dumps(value))
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)
+
+
+def _names(kind: type) -> list[str]:
+    return [item.name for item in dataclasses.fields(kind)]
+
+
+def _parameters(work: Callable[..., Any]) -> type:
+    """Return a dataclass of the parameters of a function, without `request` and `body`."""
+    hints = typing.get_type_hints(work)
+    fields: list[Any] = []
+    for name, parameter in inspect.signature(work).parameters.items():
+        if name in ("request", "body"):
+            continue
+        default = [] if parameter.default is parameter.empty else [dataclasses.field(default=parameter.default)]
+        fields.append((name, hints[name], *default))
+    return dataclasses.make_dataclass(work.__name__, fields)

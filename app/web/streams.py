@@ -1,0 +1,279 @@
+"""WebSockets of the page: state and chart points for each page, frames for each Rerun viewer.
+
+A browser gets the next frame only once it has drawn the last one: a slow one loses frames and delays nobody.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import time
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import numpy as np
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from estimators.errors import ConfigError, nearest
+
+from ..live.interface import Running
+from ..present.series.chart_stream import ChartQuery, ChartStream, check_query
+from ..present.series.series import Series
+from ..views.rerun.feed import RerunFeed
+from .http import MAX_BODY_BYTES, one_line, parse
+from .twin_json import episodes_json
+
+FRAME_PERIOD_S = 0.1
+STATUS_PERIOD_S = 0.25
+RERUN_PERIOD_S = 0.2
+RERUN_STATUS_PERIOD_S = 0.5
+"""Least times between two messages of a kind."""
+
+MAX_STREAMS = 24
+"""Chart streams of one page."""
+
+MAX_PARTICLES = 400
+"""Drawn in the chart of one state over another; of more, every so many-th."""
+
+
+async def serve(browser: WebSocket, *works: Awaitable[None]) -> list[Exception]:
+    """Run works beside each other until the first ends, then end the others and close the connection.
+
+    Returns:
+        What went wrong, apart from the browser's leaving.
+    """
+    tasks = [asyncio.ensure_future(work) for work in works]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        # Cancelled first, then awaited: no thread works for this browser any more afterwards.
+        for task in tasks:
+            task.cancel()
+        outcomes = await asyncio.gather(*tasks, return_exceptions=True)
+        with contextlib.suppress(RuntimeError):
+            await browser.close()
+    return [item for item in outcomes if isinstance(item, Exception) and not isinstance(item, WebSocketDisconnect)]
+
+
+async def in_thread(work: Callable[..., Any], *arguments: Any) -> Any:
+    """Return the result of work in a thread, which is awaited also when the task is cancelled meanwhile."""
+    task = asyncio.ensure_future(asyncio.to_thread(work, *arguments))
+    try:
+        return await asyncio.shield(task)
+    except asyncio.CancelledError:
+        with contextlib.suppress(Exception):
+            await task
+        raise
+
+
+class PageStream:
+    """Serves one page: JSON in text messages, frames of its chart streams in binary ones."""
+
+    def __init__(
+        self, browser: WebSocket, engine: Running, series: Series, status: Callable[[], dict[str, Any]], boot: str
+    ) -> None:
+        self._browser, self._engine, self._series, self._status = browser, engine, series, status
+        self._streams: dict[str, ChartStream] = {}
+        self._drawn, self._asked = asyncio.Event(), asyncio.Event()
+        self._drawn.set()
+        self._sent: dict[str, Any] = {}
+        self._boot = boot
+        self._episodes: list[dict[str, Any]] | None = None
+        self._notice = 0
+        self._pair: tuple[int, int] | None = None
+        self._estimated: tuple[int, int] | None = None
+
+    async def run(self) -> None:
+        """Serve until either side ends it."""
+        await self._browser.accept()
+        await self._browser.send_text(json.dumps({"boot": self._boot}))
+        loop, watchers = asyncio.get_running_loop(), self._engine.revisions.watchers
+
+        def refolded() -> None:
+            with contextlib.suppress(RuntimeError):  # the server has ended
+                loop.call_soon_threadsafe(self._asked.set)
+
+        watchers.add(refolded)
+        try:
+            # The status does not wait for chart points, nor these for the fold.
+            for error in await serve(self._browser, self._listen(), self._tell(), self._draw()):
+                text = f"page error: {type(error).__name__}: {error}"
+                self._engine.notices.report("page error", text, "error")
+        finally:
+            watchers.discard(refolded)
+            await asyncio.to_thread(self._exchange, list(self._streams.values()), [])
+
+    async def _listen(self) -> None:
+        while True:
+            try:
+                text = await self._browser.receive_text()
+            except (WebSocketDisconnect, KeyError):
+                return
+            if len(text) > MAX_BODY_BYTES:
+                return
+            try:
+                await self._take(json.loads(text))
+            except (ConfigError, ValueError, RecursionError) as error:
+                await self._browser.send_text(json.dumps({"error": one_line(str(error))}))
+
+    async def _take(self, message: Any) -> None:
+        if not isinstance(message, dict):
+            raise ConfigError(f"page: {message!r} is no object")
+        if message.get("drawn"):
+            self._drawn.set()
+        if "pair" in message:
+            self._pair, self._estimated = pair_from_json(message["pair"], self._engine), None
+        bodies = message.get("lanes", {})
+        if not isinstance(bodies, dict):
+            raise ConfigError(f"page: lanes is {bodies!r}; it must be an object")
+        # All are checked before any is changed.
+        queries = {name: None if body is None else self._query(body) for name, body in bodies.items()}
+        if len({*self._streams, *queries}) > MAX_STREAMS:
+            raise ConfigError(f"page: there are more than {MAX_STREAMS} chart streams; close some")
+        if not queries:
+            return
+        closed = [self._streams[name] for name in queries if name in self._streams]
+        opened = {
+            name: ChartStream(name, query, self._series.columns) for name, query in queries.items() if query is not None
+        }
+        kept = {name: stream for name, stream in self._streams.items() if name not in queries}
+        self._streams = {**kept, **opened}
+        # In a thread, as the levels of detail of a long history may have to be made.
+        await in_thread(self._exchange, closed, list(opened.values()))
+        self._asked.set()
+
+    def _query(self, body: Any) -> ChartQuery:
+        return check_query(parse(ChartQuery, body, "lane"), self._series.columns)
+
+    def _exchange(self, closed: list[ChartStream], opened: list[ChartStream]) -> None:
+        """Open streams, then close others: levels that both need are kept."""
+        for stream in opened:
+            self._series.open(stream)
+        for stream in closed:
+            self._series.close(stream)
+
+    async def _tell(self) -> None:
+        """Send what has changed of status, episodes and notices, again and again."""
+        while True:
+            begun = time.monotonic()
+            status, episodes, origin = await in_thread(self._look)
+            status["origin"] = None if origin is None else str(origin)
+            news = {key: value for key, value in status.items() if key not in self._sent or self._sent[key] != value}
+            self._sent = status
+            message: dict[str, Any] = {"status": news} if news else {}
+            if episodes != self._episodes:
+                message["episodes"] = self._episodes = episodes
+            notices = self._engine.notices.since(self._notice)
+            if notices:
+                self._notice = notices[-1].number + 1
+                message["notices"] = [
+                    {"number": item.number, "t": item.t, "level": item.level, "text": item.text, "run": item.revision}
+                    for item in notices
+                ]
+            if message:
+                await self._send(message)
+            await asyncio.sleep(max(0.001, STATUS_PERIOD_S - (time.monotonic() - begun)))
+
+    def _look(self) -> tuple[dict[str, Any], list[dict[str, Any]], int | None]:
+        return self._status(), episodes_json(self._engine), self._series.origin()
+
+    async def _draw(self) -> None:
+        """Send chart points, once the page has drawn the last ones."""
+        while True:
+            begun = time.monotonic()
+            if self._drawn.is_set():
+                self._asked.clear()
+                streams = list(self._streams.values())
+                frames = await in_thread(self._series.frames, streams) if streams else []
+                if frames:
+                    self._drawn.clear()
+                    for frame in frames:
+                        await self._browser.send_bytes(frame)
+                    # The page answers `drawn` once it has drawn all of them.
+                    await self._browser.send_text('{"frames":true}')
+            await self._send_estimate()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(max(0.001, FRAME_PERIOD_S - (time.monotonic() - begun))):
+                    # A new query and a new revision are answered at once, if the page has drawn the last frames.
+                    await self._drawn.wait()
+                    await self._asked.wait()
+
+    async def _send_estimate(self) -> None:
+        """Send the joint estimate of the two states that the page shows, if it has changed."""
+        if self._pair is None or self._sent.get("t") is None:
+            return
+        now = (self._sent["revision"], self._sent["t"])
+        if now != self._estimated:
+            self._estimated = now
+            await self._send({"belief": await in_thread(belief_json, self._engine, *self._pair)})
+
+    async def _send(self, message: dict[str, Any]) -> None:
+        await self._browser.send_text(json.dumps(message, allow_nan=False, separators=(",", ":")))
+
+
+def pair_from_json(names: Any, engine: Running) -> tuple[int, int] | None:
+    """Return the indices of two states by their names; None for null.
+
+    Raises:
+        ConfigError: If they are not two names of states.
+    """
+    if names is None:
+        return None
+    known = list(engine.model.state_names)
+    if not isinstance(names, list) or len(names) != 2 or not all(isinstance(name, str) for name in names):
+        raise ConfigError(f"pair is {names!r}; it must be the names of two states, or null")
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"pair: state {name!r} does not exist; {nearest(name, known)}")
+    return known.index(names[0]), known.index(names[1])
+
+
+def belief_json(engine: Running, i: int, j: int) -> dict[str, Any] | None:
+    """Return mean (2), covariance [a, b, c] of [[a, b], [b, c]] and particles (k, 2); None while not finite."""
+    belief = engine.belief()
+    pair = [i, j]
+    mean, cov = belief.mean[pair], belief.cov[np.ix_(pair, pair)]
+    if not (np.isfinite(mean).all() and np.isfinite(cov).all()):
+        return None
+    points = np.asarray(belief.points)[:, pair] if len(belief.points) else np.zeros((0, 2))
+    points = points[:: max(1, -(-len(points) // MAX_PARTICLES))]
+    return {
+        "mean": mean.tolist(),
+        "cov": [float(cov[0, 0]), float(cov[0, 1]), float(cov[1, 1])],
+        "points": points[np.isfinite(points).all(axis=1)].tolist(),
+    }
+
+
+async def feed_rerun(browser: WebSocket, feed: RerunFeed, status: Callable[[], dict[str, Any]]) -> None:
+    """Feed one Rerun viewer, and tell its window the status."""
+    drawn = asyncio.Event()
+    drawn.set()
+
+    async def listen() -> None:
+        # Any short text says that the last frame is drawn; the page sends nothing longer.
+        while (word := (await browser.receive()).get("text")) is not None and len(word) <= MAX_BODY_BYTES:
+            drawn.set()
+
+    async def draw() -> None:
+        sent = -RERUN_STATUS_PERIOD_S
+        while True:
+            begun = time.monotonic()
+            if begun - sent >= RERUN_STATUS_PERIOD_S:
+                sent = begun
+                await browser.send_text(json.dumps(await asyncio.to_thread(status)))
+            if drawn.is_set():
+                for message in await in_thread(feed.next):  # a long history takes a while
+                    if isinstance(message, str):
+                        await browser.send_text(message)
+                    else:
+                        drawn.clear()
+                        await browser.send_bytes(message)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(drawn.wait(), RERUN_STATUS_PERIOD_S)
+            await asyncio.sleep(max(0.0, RERUN_PERIOD_S - (time.monotonic() - begun)))
+
+    try:
+        await serve(browser, listen(), draw())
+    finally:
+        await asyncio.to_thread(feed.close)

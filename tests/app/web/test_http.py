@@ -1,0 +1,75 @@
+"""Bodies and queries of requests: what is no JSON, or breaks a rule, is refused in one line."""
+
+import asyncio
+import json
+import math
+
+import pytest
+from starlette.requests import Request
+
+from app.present.series.chart_stream import ChartQuery, check_query
+from app.present.series.columns import columns_of
+from app.web.http import get, parse, post
+from estimators.errors import ConfigError
+from estimators.models import MODELS
+
+
+def answer(endpoint, body=b"", query=""):
+    """Status and body of the answer to a request."""
+
+    async def receive():
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    headers = [(b"content-type", b"application/json")]
+    scope = {"type": "http", "method": "POST", "path": "/api/x", "query_string": query.encode(), "headers": headers}
+    response = asyncio.run(endpoint(Request(scope, receive)))
+    return response.status_code, bytes(response.body).decode()
+
+
+@pytest.mark.parametrize("body", [b"", b"{", b"\xff\xfe", b"[" * 30_000, b"1" * 5000])
+def test_a_body_that_is_no_json_is_refused(body):
+    status, text = answer(post(lambda body: body), body)
+    assert status == 400 and "the body is no JSON" in text
+
+
+def test_a_body_becomes_arguments():
+    assert answer(post(lambda body: body), b"[1]") == (200, "[1]")
+
+    def keep(run: int, name: str, note: str = "") -> list:
+        return [run, name, note]
+
+    assert answer(post(keep, status=202), b'{"run": 3, "name": "a"}') == (202, '[3,"a",""]')
+    for body, words in (
+        ({"run": "3", "name": "a"}, "x: run is '3'; it must be a whole number"),
+        ({"run": 3}, "x: name is missing; it takes run, name, note"),
+        ({"run": 3, "nam": "a"}, "nam is not known; did you mean name?"),
+        ([], "it must be an object of run, name, note"),
+    ):
+        status, text = answer(post(keep), json.dumps(body).encode())
+        assert status == 400 and words in json.loads(text)["error"]
+
+
+def test_a_query_becomes_arguments():
+    def look(run: int | None = None, since: float = 0.0) -> list:
+        return [run, since]
+
+    assert answer(get(look), query="run=3&since=2.5&other=1") == (200, "[3,2.5]")
+    assert answer(get(look)) == (200, "[null,0.0]")
+    status, text = answer(get(look, refused=409), query="run=three")
+    assert status == 409 and "x: run is 'three'; it must be a whole number" in text
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        None, [], {"columns": "mean:rate"}, {"columns": ["mean:nothing"]}, {"columns": ["mean:rate"] * 401},
+        {"columns": [], "points": 1}, {"columns": [], "points": 2.5}, {"columns": [], "points": True},
+        {"columns": [], "since": "now"}, {"columns": [], "span": math.inf}, {"columns": [], "until": math.nan},
+        {"columns": [], "since": 1e12}, {"columns": [], "run": 3},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_chart_query_that_breaks_a_rule_is_refused(body):
+    with pytest.raises(ConfigError, match="^lane: .*") as refused:
+        check_query(parse(ChartQuery, body, "lane"), columns_of(MODELS["motor_winding"]))
+    assert "\n" not in str(refused.value)
