@@ -78,7 +78,7 @@ def circle(sides: int = 64) -> np.ndarray:
 
 
 _EVENTS = ("t", "kind", "channel", "value")
-_COLUMNS = (*_EVENTS, "mean", "std", "nis", "nis_mean", "nis_low", "nis_high", "verdict")
+_COLUMNS = (*_EVENTS, "mean", "std", "verdict")
 
 
 class History:

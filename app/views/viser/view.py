@@ -11,7 +11,6 @@ from urllib.parse import parse_qs
 from ...live.interface import Running
 from ...present.drawing.colors import THEMES
 from ...present.series.series import Series
-from .coalescer import Coalescer
 from .guarded_server import addresses, guarded_server, unprinted
 from .panel import Panel
 from .scene import History
@@ -49,9 +48,8 @@ class ViserView:
         self.engine = engine
         self.server = guarded_server(secret, engine.twin.title)
         self.port: int = self.server.get_port()
-        self.coalescer = Coalescer(engine.submit)
         self.stage = Stage(self.server, engine)
-        self.panel = Panel(self.server, engine, self.coalescer, self.stage)
+        self.panel = Panel(self.server, engine, self.stage)
         model, large = engine.model, engine.model.grid is not None
         limit = 4096 if large else 32_768
         self.history = History(len(model.shown), model.width, limit)
@@ -85,7 +83,7 @@ class ViserView:
             if changed:
                 self.stage.draw(self.history)
             if panel:
-                self.panel.sync(self.history, self._series.origin())
+                self.panel.sync(self._series.origin())
 
     def _begin(self) -> None:
         """Pull what the window shows, from its start."""
@@ -97,6 +95,7 @@ class ViserView:
             self.engine.release(self._cursor)
             self._cursor = None
             self.history.clear()
+            self.panel.nis.close()
 
     def _pull(self) -> bool:
         """Take what is new; whether there was anything."""
@@ -127,7 +126,6 @@ class ViserView:
     def _run(self) -> None:
         due = time.monotonic()
         while not self._stop.wait(FRAME / 2):
-            self.coalescer.flush()
             there = addresses(self.server)
             if not there:
                 self._rest()

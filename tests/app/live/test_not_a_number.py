@@ -138,7 +138,7 @@ def test_the_chart_begins_anew_after_the_estimate_was_not_a_number(view):
     view.engine.submit(SetEstimator("ekf"))
     view.engine.put(reset())
     view.engine.put(fixes(RESET_AT + 1, END))
-    view.panel._drawn = -np.inf
+    view.panel._chart_drawn = -np.inf
     view.frame()
     engine = view.engine
     lost = lost_rows(engine.fold.track)

@@ -153,7 +153,7 @@ class Running:
         revision = self.engine.status().revision
         self.give(1)
         panel = self.view.panel
-        choose(panel.estimator.handle, panel._titles[name])
+        choose(panel.controls.handles["estimator"], ESTIMATORS[name].title)
         self.give(1)
         wait_for(lambda: self.settled(revision + 1))
         self.give(PACE - 2)
@@ -183,7 +183,7 @@ class Running:
         assert (status.estimator, status.options, self.engine.folded_with()[1]) == (name, options, name)
         self.view.frame()
         panel, history = self.view.panel, self.view.history
-        assert panel.estimator.handle.value == ESTIMATORS[name].title
+        assert panel.controls.handles["estimator"].value == ESTIMATORS[name].title
         assert f"revision {status.revision}" in panel.status.content
         # What the scene and the chart are drawn from is the end of the track.
         assert history.n and history.base + history.n == self.given

@@ -4,8 +4,10 @@ import asyncio
 import base64
 import http.client
 import os
+import re
 import socket
 import threading
+from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -17,9 +19,9 @@ from viser import _messages
 
 from app.live.commands import SetEstimator, SetTuning
 from app.present.drawing.colors import DARK, LIGHT
-from app.views.viser.coalescer import DRAG_INTERVAL, TYPING_PAUSE
+from app.views.viser import panel
 from app.views.viser.guarded_server import HEADER, addresses, guarded_server
-from app.views.viser.rows import PATIENCE
+from app.views.viser.panel import SIGNS, error_html, status_html
 from app.views.viser.scene import History
 from app.views.viser.vehicle_scene import VehicleScene
 from app.views.viser.view import RESTED, ViserView
@@ -27,19 +29,13 @@ from config.schema import SceneSection, ViewSection
 from estimators.log import READING, TRUTH, Events
 from estimators.models import MODELS
 from estimators.numerics.peaks import Peak
+from estimators.track import DIVERGED, HEALTH_NAMES, SUSPECT
 from tests.app.fake_engine import FakeEngine, events
 from tests.app.scripted import wait_for
+from tests.support import SECOND
 
 WINDING = MODELS["motor_winding"]
 BROWSER = SimpleNamespace(client_id=0)
-
-
-class Clock:
-    def __init__(self):
-        self.now = 100.0
-
-    def __call__(self):
-        return self.now
 
 
 def history(n=60, seed=0):
@@ -59,19 +55,21 @@ def engine():
 
 
 @pytest.fixture
-def clock():
-    return Clock()
+def view(engine, monkeypatch):
+    monkeypatch.setattr(panel, "CHART_PERIOD_S", 0.0)
+    with shown(engine) as view:
+        yield view
 
 
-@pytest.fixture
-def view(engine, clock, monkeypatch):
+@contextmanager
+def shown(engine):
+    """A view that has drawn one frame."""
     view = ViserView(engine, secret="s3cret")
-    monkeypatch.setattr(view.coalescer, "_clock", clock)
-    for row in view.panel.rows.values():
-        monkeypatch.setattr(row._held, "_clock", clock)
-    view.frame()
-    yield view
-    view.stop()
+    try:
+        view.frame()
+        yield view
+    finally:
+        view.stop()
 
 
 def edit(handle, value):
@@ -141,81 +139,77 @@ def test_serve_is_restored_and_the_tunnel_gone(server):
         assert raw.getpeername()[0] == "127.0.0.1"
 
 
-# What an edit submits
+# The panel
 
 
-def test_slider_submits_the_variance_and_moves_the_field(view, engine):
-    row = view.panel.rows["Q.rate"]
-    edit(row.slider, 1.0)
-    assert engine.commands == [SetTuning("Q.rate", 0.01)]
-    assert row.field.value == "0.01"
+def test_an_edit_submits_its_command(view, engine):
+    handles = view.panel.controls.handles
+    edit(handles["Q.rate"], 1.0)
+    edit(handles["estimator"], "Unscented Kalman filter")
+    edit(handles["gate"], "99 %")
+    edit(handles["gate"], "off")
+    assert engine.commands == [
+        SetTuning("Q.rate", 0.01), SetEstimator("ukf"), SetTuning("gate", 0.99), SetTuning("gate", None),
+    ]  # fmt: skip
 
 
-def test_field_submits_after_a_pause_and_moves_the_slider(view, engine, clock):
-    row = view.panel.rows["R.winding"]
-    for text in ("0", "0.", "0.0", "0.04"):
-        edit(row.field, text)
-        clock.now += TYPING_PAUSE / 2
-        view.coalescer.flush()
-    assert engine.commands == []
-    clock.now += TYPING_PAUSE
-    view.coalescer.flush()
-    assert engine.commands == [SetTuning("R.winding", 0.04)]
-    assert row.slider.value == pytest.approx(-2.0)
-
-
-def test_text_that_is_no_number_is_refused_with_a_line(view, engine, clock):
-    row = view.panel.rows["R.winding"]
-    edit(row.field, "4 x")
-    clock.now += 10 * TYPING_PAUSE
-    view.coalescer.flush()
-    assert engine.commands == []
-    assert "R.winding is &#x27;4 x&#x27;; it must be a number" in view.panel._note.content
-
-
-def test_dragging_submits_the_latest_value_at_a_bounded_rate(view, engine, clock):
-    row = view.panel.rows["Q.temperature"]
-    for place in np.linspace(0.0, 2.0, 201):
-        edit(row.slider, float(place))
-        clock.now += 0.005
-        view.coalescer.flush()
-    clock.now += DRAG_INTERVAL
-    view.coalescer.flush()
-    assert len(engine.commands) <= 201 * 0.005 / DRAG_INTERVAL + 2
-    assert engine.commands[-1] == SetTuning("Q.temperature", 1.0)
-
-
-def test_the_estimator_submits_its_command(view, engine):
-    edit(view.panel.estimator.handle, view.panel._titles["ukf"])
-    assert engine.commands == [SetEstimator("ukf")]
-
-
-# What a status shows
-
-
-def test_status_moves_the_controls_without_an_echo(view, engine):
+def test_the_controls_follow_the_engine_without_an_echo(view, engine):
     """As after a change by another browser or the API."""
     engine.submit(SetTuning("Q.rate", 0.1))
     engine.submit(SetEstimator("ukf"))
     count = len(engine.commands)
     view.frame()
-    row = view.panel.rows["Q.rate"]
-    assert (row.slider.value, row.field.value) == (pytest.approx(2.0), "0.1")
-    assert view.panel.estimator.handle.value == view.panel._titles["ukf"]
+    handles = view.panel.controls.handles
+    assert handles["Q.rate"].value == pytest.approx(2.0)
+    assert handles["estimator"].value == "Unscented Kalman filter"
     assert "revision 2" in view.panel.status.content
-    view.coalescer.flush()
     assert len(engine.commands) == count
 
 
-def test_slow_engine_does_not_snap_the_slider_back(view, engine, clock):
+def test_slow_engine_does_not_snap_the_slider_back(view, engine, monkeypatch):
     engine.carry_out = False
-    row = view.panel.rows["Q.rate"]
-    edit(row.slider, 1.0)
+    slider = view.panel.controls.handles["Q.rate"]
+    edit(slider, 1.0)
     view.frame()
-    assert row.slider.value == 1.0
-    clock.now += PATIENCE + 0.1
+    assert slider.value == 1.0
+    monkeypatch.setattr(panel, "EDIT_HOLD_S", 0.0)
     view.frame()
-    assert row.slider.value == 0.0, "what the engine did not take must not stay on the panel"
+    assert slider.value == 0.0, "an edit that the engine did not take must not stay on the panel"
+
+
+def test_a_variance_of_zero_has_no_slider():
+    """Powers of ten from zero lead nowhere; the page has a field for it."""
+    row = replace(WINDING.sensors[0].rows[0], variance=0.0)
+    exact = replace(
+        WINDING,
+        states=(replace(WINDING.states[0], std=0.0), WINDING.states[1]),
+        sensors=(replace(WINDING.sensors[0], rows=(row,)),),
+    )
+    engine = FakeEngine(exact, "kf")
+    engine.put(history())
+    with shown(engine) as view:
+        assert list(view.panel.controls.handles) == ["estimator", "gate", "Q.temperature", "Q.rate"]
+
+
+@pytest.mark.parametrize(
+    ("span", "name"),
+    [(0.0, "s"), (179.0, "s"), (180.0, "min"), (3600.0, "min"), (10_800.0, "h"), (86400.0, "h"), (3 * 86400.0, "d")],
+)
+def test_the_time_unit_suits_the_span(span, name):
+    assert panel.time_unit(span).name == name
+
+
+def test_the_status_has_a_sign_a_cause_and_no_markup_of_others():
+    assert set(SIGNS) == set(HEALTH_NAMES) and len(set(SIGNS.values())) == len(SIGNS)
+    status = FakeEngine(WINDING, "kf").state
+    status.health, status.since, status.t = SUSPECT, 3 * SECOND, 9 * SECOND
+    status.cause, status.episodes_open = "winding reads 3 °C < the prediction", 3
+    text = re.sub(r"<[^>]+>", " ", status_html(status, SECOND))
+    for part in ("◐ suspect since 2.0 s", "revision 0", "8.0 s", "&lt; the prediction (2 more)"):
+        assert part in text
+    status.health, status.cause = DIVERGED, ""
+    assert "contradict the estimate" in status_html(status, SECOND)
+    assert "&lt;script&gt;" in error_html("<script>")
 
 
 # What is drawn
@@ -235,17 +229,18 @@ def test_the_chart_has_at_most_200_points_and_keeps_extremes(view, engine):
     rng = np.random.default_rng(4)
     t = 70.0 + 0.01 * np.arange(5000)
     engine.put(events(WINDING, READING, 0, t, 45.0 + rng.normal(0, 2, t.size)))
-    view.panel._drawn = -np.inf
     view.frame()
     x, high, low, mean, ends = view.panel.nis.handle.data
-    shown = view.history.column("nis_mean")
+    recent = engine.log.events.t >= engine.log.events.t[-1] - int(ViewSection().window * 1e9)
+    nis = engine.fold.track.nis_mean[recent]
     assert 50 < x.size <= 200 and np.all(np.diff(x) >= 0)
-    assert (mean.min(), mean.max()) == (shown.min(), shown.max())
+    assert (mean.min(), mean.max()) == (nis.min(), nis.max())
 
 
-def test_the_chart_is_drawn_at_most_twice_a_second(view, engine, monkeypatch):
+def test_the_chart_is_drawn_at_a_bounded_rate(view, engine, monkeypatch):
     drawn = []
-    monkeypatch.setattr(view.panel.nis, "draw", lambda history, origin: drawn.append(history.n))
+    monkeypatch.setattr(panel, "CHART_PERIOD_S", 1e9)
+    monkeypatch.setattr(view.panel.nis, "draw", drawn.append)
     for k in range(20):
         engine.put(events(WINDING, READING, 0, [80.0 + k], [45.0]))
         view.frame()
@@ -317,8 +312,6 @@ def test_nobody_there_nothing_pulled(engine, monkeypatch):
         wait_for(lambda: view._cursor is None)
         count = len(pulled)
         engine.put(events(WINDING, READING, 0, [100.0], [45.0]))
-        for _ in range(3):
-            view.coalescer.flush()
         assert len(pulled) == count and released and view.history.n == 0
     finally:
         leave.set()
@@ -464,32 +457,5 @@ def test_vehicle_scene_keeps_the_vehicle_in_the_middle():
         assert view.stage.scene._course == pytest.approx(0.0, abs=0.05)
         cov = engine.belief().cov[:2, :2]
         np.testing.assert_allclose(view.stage.scene._ellipse.scale[:2], 2 * np.sqrt(np.linalg.eigvalsh(cov)), rtol=1e-6)
-    finally:
-        view.stop()
-
-
-def test_a_variance_of_zero_is_typed_not_dragged(clock, monkeypatch):
-    """Powers of ten from zero lead nowhere: its row has no slider, and takes what is typed; zero again too."""
-    row = replace(WINDING.sensors[0].rows[0], variance=0.0)
-    exact = replace(
-        WINDING,
-        states=(replace(WINDING.states[0], std=0.0), WINDING.states[1]),
-        sensors=(replace(WINDING.sensors[0], rows=(row,)),),
-    )
-    engine = FakeEngine(exact, "kf")
-    engine.put(history())
-    view = ViserView(engine, secret="s3cret")
-    try:
-        monkeypatch.setattr(view.coalescer, "_clock", clock)
-        view.frame()
-        shown = view.panel.rows["R.winding"]
-        assert shown.slider is None and shown.field.value == "0"
-        for text, value in (("0.25", 0.25), ("0", 0.0)):
-            edit(shown.field, text)
-            clock.now += 2 * TYPING_PAUSE
-            view.coalescer.flush()
-            assert engine.commands[-1] == SetTuning("R.winding", value)
-        view.frame()
-        assert shown.field.value == "0" and engine.state.tuning.get("R.winding") == 0.0
     finally:
         view.stop()
