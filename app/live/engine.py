@@ -29,6 +29,7 @@ from .counts import RowCounts
 from .execute import Remembered, execute
 from .feeder import Feeder, Finished, Restarted
 from .interface import Records
+from .jobs import Jobs
 from .outputs import Status
 from .refolder import Refolded, Refolder
 from .running_fold import RunningFold
@@ -103,6 +104,7 @@ class Engine(RunningFold):
         self._stopping = threading.Event()
         self._finished = False
         self._idle_ticks = IdleTicks(section.tick)
+        self.jobs = Jobs(self.notices)
         self._watchers = Watchers(self)
         self.revisions.said = self._watchers.episodes_of
         self.recorder: Records | None = None
@@ -123,15 +125,22 @@ class Engine(RunningFold):
         self._thread.start()
         self._feeder.start()
         self._watchers.start()
+        self.jobs.start()
         if self._awaited is not None:
             self._inbox.put(Ready(self._awaited))
 
     def stop(self) -> None:
         """Stop reading and folding."""
         self._stopping.set()
-        run_all(self._fold_last, self._feeder.stop, self._workshop.stop, self._refolder.stop, *self._watchers.resting)
+        run_all(self._fold_last, self._feeder.stop, self._workshop.stop, self._refolder.stop, self.jobs.stop)
         self._watchers.stop()
         self._watchdog.stop()
+
+    def settle(self) -> None:
+        """Carry out all that waits (events, commands, refolds, jobs) in this thread, for an engine without `start`."""
+        while self._feeder.read(0.0) or not self._inbox.empty() or self._refolder.step() or self.jobs.step():
+            if not self._inbox.empty():
+                self._round(0.0)
 
     def _fold_last(self) -> None:
         """Wait for the piece that is being folded."""
@@ -204,16 +213,16 @@ class Engine(RunningFold):
     def _run(self) -> None:
         while not self._stopping.is_set():
             try:
-                self._round()
+                self._round(min(0.05, self._tick))
             except NisusError as error:
                 self.notices.report("engine error", str(error), level="error")
-            except Exception as error:  # noqa: BLE001  nothing a user or a sensor does may stop the twin
+            except (Exception, SystemExit) as error:  # noqa: BLE001  nothing a user or a sensor does may stop the twin
                 self.notices.report("engine error", f"{type(error).__name__}: {error}", level="error")
 
-    def _round(self) -> None:
+    def _round(self, timeout: float) -> None:
         """Wait for something, then deal with all that is there."""
         try:
-            item = self._inbox.get(timeout=min(0.05, self._tick))
+            item = self._inbox.get(timeout=timeout)
         except queue.Empty:
             self._when_silent()
             return

@@ -70,7 +70,7 @@ class Feeder:
         ended = False
         while not self._stop.is_set():
             try:
-                if self._read():
+                if self.read(READ_TIMEOUT) is not None:
                     ended = False
                 elif self._paced is None:
                     self._inbox.put(Finished())
@@ -107,16 +107,16 @@ class Feeder:
     def _restarts(self) -> int:
         return self._paced.restarts if self._paced is not None else 0
 
-    def _read(self) -> bool:
-        """Pass one batch on; False at the end of the source."""
+    def read(self, timeout: float) -> int | None:
+        """Pass one batch on and return its number of events; None at the end of the source."""
         before = self._restarts()
-        batch = self.source.read(READ_TIMEOUT)
+        batch = self.source.read(timeout)
         if self._restarts() != before:
             self._inbox.put(Restarted())
         if batch is None:
-            return False
+            return None
         if len(batch):
             if not self.source.live:
                 self._room.acquire()
             self._inbox.put(batch)
-        return True
+        return len(batch)

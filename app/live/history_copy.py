@@ -4,27 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from estimators.diagnostics.field_pictures import Picture
 from estimators.errors import ConfigError
-from estimators.fold import Fold
 from estimators.log import READING, Events, Log
-from estimators.snapshots import SPARSE_EVERY, Base
+from estimators.snapshots import Base
 from estimators.track import Track
 from estimators.tuning import Tuning
 
 from .interface import Running
 from .outputs import Pull
 
+END_OF_TIME = 2**62
+"""Later than every event, ns."""
+
 COPY_EVENTS = 4096
 """Events that are copied at once, so that the engine never waits for long."""
 
 
 def copy_log(
-    engine: Running, tuning: Tuning, most: int | None = None, go: Callable[[], bool] = lambda: True
+    engine: Running, tuning: Tuning, most: int | None = None, check: Callable[[], None] = lambda: None
 ) -> tuple[Log, Base | None]:
     """Copy the events, and where a fold of them starts; None for the prior.
 
@@ -32,7 +33,7 @@ def copy_log(
         engine: Whose.
         tuning: With which they were folded.
         most: How many, the last; a few more, since a fold starts at a snapshot. None for all.
-        go: Whether to go on with the next piece.
+        check: Called before each chunk; may raise to end the copy.
 
     Raises:
         ConfigError: If another tuning took over meanwhile, or no reading has come.
@@ -41,53 +42,16 @@ def copy_log(
     at, base = engine.origin(0 if most is None else max(0, end - most))
     pieces = []
     for start in range(at, end, COPY_EVENTS):
+        check()
         pull = engine.rows(start, min(start + COPY_EVENTS, end))
         if engine.folded_with()[0] is not tuning or pull.first != start:
             raise ConfigError("the history became another while it was copied; ask again")
         pieces.append(pull.events)
-        if not go():
-            break
     events = Events.concat(pieces, engine.model.width)
     log = Log.resume(engine.model, base, events)
     if not (log.kind[: log.n] == READING).any():
         raise ConfigError("no reading has come yet; there is nothing to fold")
     return log, base
-
-
-END_OF_TIME = 2**62
-"""Later than every event."""
-
-
-class RecentRows(NamedTuple):
-    """Copies of the last rows, and what it takes to fold them again: a base before them, None for the prior."""
-
-    estimator: str
-    tuning: Tuning
-    pull: Pull
-    base: Base | None
-
-    @property
-    def track(self) -> Track:
-        """What the running fold concluded."""
-        return self.pull.track
-
-    def fold(self, engine: Running, estimator: str, tuning: Tuning) -> Fold:
-        """A fold over these events, of any estimator and tuning; nothing is folded yet."""
-        log = Log.resume(engine.model, self.base, self.pull.events)
-        return Fold(estimator, engine.model, tuning, log, policy=engine.policy, base=self.base)
-
-
-def recent_rows(engine: Running, most: int) -> RecentRows | None:
-    """The last `most` events, from a snapshot on; None if there are none, or another fold took over meanwhile."""
-    tuning, estimator = engine.folded_with()
-    end = engine.index_at(END_OF_TIME)
-    index = max(0, end - most)
-    # `origin` goes back to where all revisions have a snapshot.
-    at, base = engine.origin(-(-index // SPARSE_EVERY) * SPARSE_EVERY)
-    pull = engine.rows(at, end)
-    if engine.folded_with()[0] is not tuning or not len(pull.events):
-        return None
-    return RecentRows(estimator, tuning, pull, base)
 
 
 COPY_ROWS = 16_384

@@ -17,13 +17,17 @@ from estimators.tuning import Tuning
 from sources.source import Source
 
 from .commands import Command
-from .integrity import MOST, Window
+from .jobs import Jobs
 from .notices import Notices
-from .outputs import Belief, Cursor, Here, Pull, Status
+from .outputs import Belief, Cursor, EventWindow, Here, Pull, Status
 from .revisions import Revisions
 
 if TYPE_CHECKING:
     from ..twin.twin import Twin
+
+
+WINDOW_EVENTS = 4000
+"""Events of a window that is folded many times over."""
 
 
 class Records(Protocol):
@@ -51,6 +55,7 @@ class Running(Protocol):
     estimator: str
     tuning: Tuning
     notices: Notices
+    jobs: Jobs
     recorder: Records | None
     revisions: Revisions
 
@@ -98,8 +103,12 @@ class Running(Protocol):
     def here(self) -> Here | None:
         """The filter as it stands, to fold on from; None while nothing has come."""
 
-    def last_events(self, most: int = MOST) -> Window | None:
-        """The last events, to fold them again; None while there are none, or a refold is waited for."""
+    def last_events(self, limit: int = WINDOW_EVENTS, *, rows: bool = False) -> EventWindow | None:
+        """Copy the last events, to fold them again; None while there are none.
+
+        With `rows` the window has its track and begins where all revisions have a snapshot; without, it is None while
+        a refold is under way.
+        """
 
     def span(self) -> tuple[int, int]:
         """Times of the first and the last event, ns; zeros while there is none."""

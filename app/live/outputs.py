@@ -1,23 +1,26 @@
-"""What the engine shows to views, recorder and API: copies, so that nobody ever waits for anybody."""
+"""Copies of the engine's state for views, recorder and API, so that no reader ever waits for another."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from estimators.diagnostics.clock_fit import ClockFit
 from estimators.diagnostics.field_pictures import Picture
-from estimators.log import Events
+from estimators.diagnostics.health import HealthPolicy
+from estimators.diagnostics.sensitivity import Bound, Smallest
+from estimators.fold import Fold
+from estimators.log import Events, Log
 from estimators.numerics.peaks import Peak
-from estimators.snapshots import Base
+from estimators.snapshots import SPARSE_EVERY, Base
 from estimators.track import Track
 from estimators.tuning import Tuning
 from sources.faults.layer import FaultStatus
 
-from .integrity import Integrity
 from .notices import Notice
 
 
@@ -88,6 +91,82 @@ class Here:
     step: float
 
 
+class EventWindow(NamedTuple):
+    """The last events of a fold with their rows, and where a fold of them starts; `base` None is the prior.
+
+    `track` has the rows if they were asked for, else none.
+    """
+
+    estimator: str
+    tuning: Tuning
+    events: Events
+    track: Track
+    base: Base | None
+    revision: int
+
+    @property
+    def end(self) -> int:
+        """Time of the last event, ns."""
+        return int(self.events.t[-1])
+
+    @property
+    def first(self) -> int:
+        """Absolute index of the first event."""
+        return 0 if self.base is None else self.base.first
+
+    def log(self) -> Log:
+        """The events as a log of their own."""
+        return Log.resume(self.tuning.model, self.base, self.events)
+
+    def fold(self, estimator: str = "", tuning: Tuning | None = None, policy: HealthPolicy | None = None) -> Fold:
+        """A fold over these events, by default with their own settings; nothing is folded yet."""
+        tuning = tuning or self.tuning
+        model = tuning.model
+        return Fold(estimator or self.estimator, model, tuning, self.log(), policy=policy, base=self.base)
+
+
+def event_window(
+    fold: Fold, revision: int, limit: int, *, origin: Base | None = None, rows: bool = False
+) -> EventWindow | None:
+    """Copy the last events of a fold from a snapshot on; None while there are none. Takes about a millisecond.
+
+    Args:
+        fold: The running fold.
+        revision: Its number.
+        limit: Events; a few more, since the window begins at a snapshot.
+        origin: Where the fold itself started; None for the prior.
+        rows: Whether to copy the track too, and to begin where all revisions have a snapshot.
+    """
+    if not fold.n:
+        return None
+    index = max(0, fold.n - limit)
+    if rows:
+        first = fold.log.first
+        index = -(-(first + index) // SPARSE_EVERY) * SPARSE_EVERY - first
+    at, base = fold.base_at(index)
+    events = Events(*(column[at : fold.n].copy() for column in fold.log.events))
+    track = fold.track.select(slice(at, fold.n) if rows else slice(0, 0)).copy()
+    return EventWindow(fold.estimator.name, fold.tuning, events, track, base if at else origin, revision)
+
+
+@dataclass(frozen=True)
+class ProtectionLevels:
+    """Protection levels (integrity bounds) by state at the log's time `t` (ns) for one revision, or why there are none.
+
+    `smallest` are the minimal detectable faults.
+    """
+
+    revision: int
+    t: int
+    reason: str = ""
+    bounds: dict[str, Bound] = field(default_factory=dict)
+    smallest: tuple[Smallest, ...] = ()
+
+    def age(self, now: int | None) -> float | None:
+        """Seconds of the log since then; `now` is the time of its last event, ns."""
+        return None if now is None else (now - self.t) * 1e-9
+
+
 @dataclass(frozen=True)
 class Status:
     """The state of the running twin, for panels and the API.
@@ -133,7 +212,7 @@ class Status:
     latency_ms: float | None
     latency_p50_ms: float | None
     faults: tuple[FaultStatus, ...] = ()
-    integrity: Integrity | None = None
+    integrity: ProtectionLevels | None = None
     awaited: str | None = None
     compiling: Mapping[str, float | None] = field(default_factory=dict)
     nis_judged: float = np.nan

@@ -133,6 +133,14 @@ class Refolder:
                     return
             self._done(answer)
 
+    def step(self) -> bool:
+        """Carry out the waiting request in this thread; return whether there was one."""
+        with self._wake:
+            pending, self._pending = self._pending, None
+        if pending is not None:
+            self._done(self._fold(*pending))
+        return pending is not None
+
     def _fold(self, ticket: int, make: Callable[[], Any]) -> Refolded:
         try:
             fold, batches = make(), BatchSizer()
@@ -141,7 +149,7 @@ class Refolder:
                     pass
         except NisusError as error:
             return Refolded(ticket, None, str(error))
-        except Exception as error:  # noqa: BLE001  a user's model may raise anything; the running fold goes on
+        except (Exception, SystemExit) as error:  # noqa: BLE001  a user's model may raise anything; the running fold goes on
             return Refolded(ticket, None, f"{type(error).__name__}: {error}")
         return Refolded(ticket, fold, "")
 

@@ -7,19 +7,18 @@ whenever twice as much has been seen of it.
 
 from __future__ import annotations
 
-import os
-import sys
-import threading
 from collections.abc import Callable, Sequence
+from math import inf
 
 from estimators.diagnostics.episodes import Episode
 from estimators.diagnostics.sensitivity.responses import DRIFT, SENSOR
 from estimators.diagnostics.sensitivity.suspects import RIDDLES, in_words, likeliest, suspects
 from estimators.errors import NisusError
-from estimators.log import Log
 
-from .integrity import LOWEST, Stopped, Unhurried, Window, reason_against
+from .integrity import reason_against
+from .jobs import Job, PacedExecutor
 from .notices import Notices
+from .outputs import EventWindow
 
 EVERY = 1.0
 """Seconds between two looks at the open episodes."""
@@ -34,10 +33,8 @@ class Blame:
     def __init__(
         self,
         episodes: Callable[[], Sequence[Episode]],
-        take: Callable[[], Window | None],
+        take: Callable[[], EventWindow | None],
         notices: Notices,
-        *,
-        every: float = EVERY,
     ) -> None:
         """Prepare.
 
@@ -45,24 +42,11 @@ class Blame:
             episodes: Gives those known now.
             take: Gives a copy of the last events, or None if now is not the time.
             notices: Where a finding is said, once.
-            every: Seconds between two looks.
         """
-        self._episodes, self._take, self._notices, self._every = episodes, take, notices, every
+        self._episodes, self._take, self._notices = episodes, take, notices
         self._words: dict[str, str] = {}
         self._rows: dict[str, str] = {}
         self._seen: dict[str, float] = {}
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="blame", daemon=True)
-
-    def start(self) -> None:
-        """Begin."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End after the fold that is under way."""
-        self._stopping.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=1.0)
 
     def of(self, episode: Episode) -> str:
         """Who is most likely off, in words; nothing if it is not known."""
@@ -81,7 +65,7 @@ class Blame:
         row = self._rows.get(episode.subject) if _riddle(episode) else None
         return next((other for other in self._episodes() if _riddle(other) and other.subject == row), episode)
 
-    def look(self) -> None:
+    def look(self, job: Job) -> None:
         """Ask for the open episode of which most is new."""
         riddles = [episode for episode in self._episodes() if _riddle(episode)]
         subjects = {episode.subject for episode in riddles}
@@ -91,23 +75,22 @@ class Blame:
         taken = self._take() if riddles else None
         if taken is None or reason_against(taken.tuning.model, taken.estimator):
             return
-        now, begun = taken.events.t[-1] * 1e-9, taken.base.clock * 1e-9
+        now, begun = taken.end * 1e-9, -inf if taken.base is None else taken.base.clock * 1e-9
         for episode in riddles:
             lasted = now - episode.start
             if lasted < max(SOON, 2.0 * self._seen.get(episode.subject, 0.0)) or episode.start < begun:
                 continue
             self._seen[episode.subject] = lasted
-            self._ask(episode, taken)
+            self._ask(episode, taken, job)
 
-    def _ask(self, episode: Episode, taken: Window) -> None:
+    def _ask(self, episode: Episode, taken: EventWindow, job: Job) -> None:
         model = taken.tuning.model
-        log = Log.resume(model, taken.base, taken.events)
-        executor = Unhurried(self._stopping)
+        log, executor = taken.log(), PacedExecutor(job)
         try:
             found = suspects(
                 taken.estimator, model, taken.tuning, log, episode.start, base=taken.base, executor=executor
             )
-        except (NisusError, Stopped):
+        except NisusError:
             return
         words, before = in_words(found), self.of(episode)
         if words:
@@ -118,15 +101,6 @@ class Blame:
                 self._notices.say(
                     f"{episode.subject}: most likely off: {words}", level="warn", t=int(taken.events.t[-1])
                 )
-
-    def _run(self) -> None:
-        if sys.platform == "linux":
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOWEST)
-        while not self._stopping.wait(self._every):
-            try:
-                self.look()
-            except Exception as error:  # noqa: BLE001  a user's model may raise anything; the twin goes on
-                self._notices.report("blame", f"{type(error).__name__}: {error}", level="error", counted=False)
 
 
 def _riddle(episode: Episode) -> bool:

@@ -19,9 +19,9 @@ from estimators.numerics.peaks import peaks_of
 from estimators.snapshots import SPARSE_EVERY, Base
 
 from .counts import RowCounts
-from .integrity import MOST, Window, window
+from .interface import WINDOW_EVENTS
 from .notices import Notices
-from .outputs import Belief, Cursor, Here, Pull
+from .outputs import Belief, Cursor, EventWindow, Here, Pull, event_window
 from .refolder import BatchSizer, Requests
 from .revisions import Revisions
 from .watchdog import Watchdog
@@ -215,10 +215,12 @@ class RunningFold:
             t = int(log.t[fold.n - 1])
             return Here(self._revision, fold.estimator.name, fold.tuning, fold.base_here(), t, step)
 
-    def last_events(self, most: int = MOST) -> Window | None:
-        """The last events, to fold them again; None while there are none, or a refold is waited for."""
+    def last_events(self, limit: int = WINDOW_EVENTS, *, rows: bool = False) -> EventWindow | None:
+        """Copy the last events, to fold them again; see `Running`."""
         with self._reading():
-            return None if self._requests.waiting else window(self._fold, self._revision, most)
+            if self._requests.waiting and not rows:
+                return None
+            return event_window(self._fold, self._revision, limit, origin=self._base, rows=rows)
 
     # For the thread that moves it
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,10 +16,10 @@ from sources.source import Paced, Source
 from .alerts import Alerts, Silence
 from .counts import Latency
 from .episode_log import Chronicle
-from .integrity import IntegrityWatch
+from .integrity import PERIOD_S, ProtectionMonitor
 from .interface import Running
 from .notices import Notices
-from .root_cause import Blame
+from .root_cause import EVERY, Blame
 
 if TYPE_CHECKING:
     from estimators.diagnostics.episodes import Episode
@@ -31,24 +30,20 @@ class Watchers:
 
     def __init__(self, engine: Running) -> None:
         section, notices = engine.twin.config.time, engine.notices
+        self._jobs = engine.jobs
         self.latency = Latency()
         self.clock = HostClock(notices, section.horizon)
         self.chronicle = Chronicle(engine)
         self.alerts = Alerts(notices, lambda: self.chronicle.account.in_alarm)
         self.silence = Silence(notices, section.stale_after)
-        self.integrity = IntegrityWatch(engine.last_events, engine.policy.false_alarm_every)
+        self.integrity = ProtectionMonitor(engine.last_events, engine.policy.false_alarm_every)
         self.blame = Blame(lambda: self.chronicle.account.episodes, engine.last_events, notices)
 
     def start(self) -> None:
         """Begin to watch."""
         self.chronicle.start()
-        self.integrity.start()
-        self.blame.start()
-
-    @property
-    def resting(self) -> tuple[Callable[[], None], ...]:
-        """What ends those that fold."""
-        return self.integrity.stop, self.blame.stop
+        self._jobs.run("protection levels", self.integrity.look, every=PERIOD_S)
+        self._jobs.run("root cause", self.blame.look, every=EVERY)
 
     def stop(self) -> None:
         """Look at the last rows, and end."""

@@ -16,7 +16,7 @@ from estimators.pieces import LOOP, Piece
 from sources.pieces import KERNELS, is_made, make, needs, pieces_of
 
 from .compilers import MOST, Worker
-from .integrity import LOWEST
+from .jobs import LOWEST_PRIORITY
 
 LOOK = 0.2
 """Seconds between two looks at whether something else was asked for."""
@@ -132,7 +132,7 @@ class Workshop:
                         while hurried and all(worker not in self._under_way for worker in hurried):
                             hurried.pop().stop()
                         if quiet not in self._under_way and (piece := self._next_quiet()) is not None:
-                            quiet = quiet or Worker(self._work, LOWEST)
+                            quiet = quiet or Worker(self._work, LOWEST_PRIORITY)
                             self._give(quiet, piece)
                     if not self._under_way:
                         self._wake.wait()

@@ -11,11 +11,12 @@ from estimators.errors import ConfigError
 
 from ..live.history_copy import END_OF_TIME
 from ..live.interface import Running
-from ..live.runs.fitting import Attempt, Fitting
-from ..live.runs.refits import FITTING, Refit, Refits
+from ..live.jobs import DONE
+from ..live.runs.fitting import FitAttempt, Fitting
+from ..live.runs.refits import FITTING, Refits, WindowFit
 from ..live.tunings.fitted import settings_of
 from ..live.tunings.versions import keep, version_text
-from ..studies.advice.advising import DONE, Advising
+from ..studies.advice.advising import Advising
 from .http import get, one_line, post
 from .runs_api import checked_note
 
@@ -27,10 +28,6 @@ class FitApi:
         self._engine, self._refits = engine, refits
         self.fitting = Fitting(engine)
         self._advising = Advising(engine)
-
-    def stop(self) -> None:
-        """Stop the fit that is under way."""
-        self.fitting.stop()
 
     def routes(self) -> list[Route]:
         """Return the routes."""
@@ -81,7 +78,7 @@ class FitApi:
         found = self._advising
         current = found.revision == self._engine.revisions.runs[-1].number
         state = {"state": found.state, "revision": found.revision, "current": current, "reason": one_line(found.reason)}
-        return state | ({"advice": found.told} if found.state == DONE else {})
+        return state | ({"advice": found.advice} if found.state == DONE else {})
 
     def _advise(self) -> Any:
         """Begin to find the estimator that suits the log."""
@@ -125,7 +122,7 @@ class FitApi:
         return self._refit()
 
 
-def _attempt_json(attempt: Attempt) -> dict[str, Any]:
+def _attempt_json(attempt: FitAttempt) -> dict[str, Any]:
     """Return a fit as JSON; `values` are the proposed values of its entries, by key."""
     found: dict[str, Any] = {
         "number": attempt.number,
@@ -147,7 +144,7 @@ def _attempt_json(attempt: Attempt) -> dict[str, Any]:
     return found | {"result": fit_json(attempt.fitted), "values": values}
 
 
-def _refit_json(refit: Refit) -> dict[str, Any]:
+def _refit_json(refit: WindowFit) -> dict[str, Any]:
     """Return a fit of a window as JSON; times as text, since JavaScript's numbers cannot hold them."""
     attempt = refit.attempt
     found: dict[str, Any] = {

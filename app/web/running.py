@@ -142,7 +142,6 @@ class RunningTwin:
 
     def stop(self) -> None:
         """Stop everything; a recording is finished, with the last row that there will be."""
-        self.refits.stop()
         shown = () if self.server is None else (self.server.stop, self.view.stop)
         run_all(self._close_log, *shown)
 

@@ -47,14 +47,6 @@ class RunsApi:
         self.scores = RunScores(engine)
         self._sweeps = Sweeps(engine)
 
-    def start(self) -> None:
-        """Start the thread that sweeps."""
-        self._sweeps.start()
-
-    def stop(self) -> None:
-        """Stop it."""
-        self._sweeps.stop()
-
     def routes(self) -> list[Route]:
         """Return the routes."""
         copying = OneAtATime("export")

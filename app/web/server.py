@@ -104,7 +104,6 @@ class PageServer:
     def start(self) -> threading.Event:
         """Serve; the Rerun viewer's files are prepared later, if this machine does not have them yet."""
         threading.Thread(target=self._prepare, name="viewer assets", daemon=True).start()
-        self._runs.start()
         over = self.door.show(self.application, self._boot)
         if self._own_door:
             self.door.start()
@@ -113,8 +112,6 @@ class PageServer:
     def stop(self) -> None:
         """Stop all work, close all connections, and the port if it is this twin's own."""
         self._stopping.set()
-        self._runs.stop()
-        self._fit.stop()
         if self._own_door:
             self.door.stop()
 

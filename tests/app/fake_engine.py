@@ -7,6 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 
 from app.live.commands import Pause, Record, Restore, SetEstimator, SetOption, SetTuning, Speed, UseSensor
+from app.live.jobs import Jobs
+from app.live.notices import Notices
 from app.live.revisions import Revisions
 from config.schema import ViewSection
 from estimators.diagnostics.episodes import episodes
@@ -46,6 +48,7 @@ class FakeEngine:
         self.revisions = Revisions(estimator, tuning)
         self.tuning = tuning
         self.notices = []
+        self.jobs = Jobs(Notices(lambda: 0))
 
     def put(self, readings):
         index, _ = self.log.extend(readings)

@@ -1,10 +1,15 @@
-"""A twin and a source for engine tests: the source gives what a test hands it, when it hands it."""
+"""Twins, sources and engines for tests of the running twin.
+
+A `Stepped` twin has no threads: what a test puts in is folded, and what it submits is carried out, before the call
+returns. A test that needs threads starts an `Engine` and polls with `wait_for`.
+"""
 
 import queue
 from types import SimpleNamespace
 
 import numpy as np
 
+from app.live.engine import Engine
 from app.twin.dropout import DegradedAfter
 from app.twin.late import Late
 from estimators.diagnostics.health import HealthPolicy
@@ -23,6 +28,12 @@ def readings(times_s, values):
     return Events(
         t, t.copy(), np.full(n, READING, np.int8), np.zeros(n, np.int32), np.asarray(values, float).reshape(n, 1)
     )
+
+
+def random_walk(n, seed=1, step=0.1):
+    """Times (s) and values of n measurements of a random walk at 10 Hz with noise of variance 1."""
+    rng = np.random.default_rng(seed)
+    return np.arange(1, n + 1) * 0.1, 40 + np.cumsum(rng.normal(size=n)) * step + rng.normal(size=n)
 
 
 def twin(history=200_000, horizon=2.0, tick=1000.0, model=MODEL, estimator="kf"):
@@ -78,9 +89,17 @@ class Scripted:
 
 
 class Replayed(Scripted):
-    """As a replay, whose time can be held and sought; a test says when it began again, by `restarts`."""
+    """As a replay, whose time can be held and sought; a test says when it begins again, by `restart`."""
 
     speed, paused, restarts, span = 1.0, False, 0, None
+    beginning = False
+
+    def restart(self):
+        self.beginning = True
+
+    def read(self, timeout):
+        self.restarts, self.beginning = self.restarts + self.beginning, False
+        return super().read(timeout)
 
     def pause(self):
         pass
@@ -96,6 +115,37 @@ class Replayed(Scripted):
 
     def seek(self, t):
         pass
+
+
+class Stepped:
+    """An engine without threads, on a scripted source."""
+
+    def __init__(self, n=0, *, source=None, of=None, seed=1, step=0.1, **options):
+        """`n` measurements of a random walk are folded at once; `options` are those of `twin`."""
+        self.source = source or Scripted()
+        self.engine = Engine(of or twin(**options), lambda report: self.source)
+        if n:
+            self.put(readings(*random_walk(n, seed, step)))
+
+    def put(self, *batches):
+        """Fold measurements."""
+        for batch in batches:
+            self.source.put(batch)
+        self.engine.settle()
+
+    def submit(self, *commands):
+        """Carry out commands, and the refolds and jobs that follow from them."""
+        for command in commands:
+            self.engine.submit(command)
+        self.engine.settle()
+
+    def status(self):
+        """A status that is not the cached one."""
+        return fresh_status(self.engine)
+
+    def notices(self):
+        """Texts of all notices."""
+        return [line.text for line in self.engine.notices.since(0)]
 
 
 def wait_for(condition, seconds=60.0):

@@ -10,7 +10,6 @@ import numpy as np
 from estimators.diagnostics.innovations import SensorNoise, sensor_noise
 from estimators.tuning import Tuning
 
-from ..history_copy import recent_rows
 from ..interface import Running
 from .sweep import MOST, Sweeps, Swept
 
@@ -34,18 +33,18 @@ class Noise:
 
 def noise(engine: Running, sweeps: Sweeps) -> Noise:
     """What the last events of the running twin say."""
-    taken, q = recent_rows(engine, MOST), sweeps.around("Q")
+    taken, q = engine.last_events(MOST, rows=True), sweeps.around("Q")
     if taken is None:
         return Noise(q.revision, {}, "no readings yet", q, {})
     reason = _reason_against(engine, taken.tuning.options.get("adapt", 0.0))
-    rows = {} if reason else sensor_noise(taken.track, taken.pull.events, taken.tuning)
+    rows = {} if reason else sensor_noise(taken.track, taken.events, taken.tuning)
     found = _by_key(engine, taken.tuning, rows)
     if any(_doubtful(noise) for noise in found.values()):
         # An R that is wrong by itself leaves correlated innovations, too. Then they are white once it is mended.
         matched = sweeps.matched()
         if matched is not None:
             found = _by_key(engine, taken.tuning, matched.rows)
-    return Noise(taken.pull.revision, found, reason, q, doubts(found, q.level))
+    return Noise(taken.revision, found, reason, q, doubts(found, q.level))
 
 
 def _by_key(engine: Running, tuning: Tuning, rows: Mapping[str, SensorNoise]) -> dict[str, SensorNoise]:

@@ -1,10 +1,9 @@
-"""Dual estimation of a running twin: parameters fitted again now and then on its last readings, and what came of it.
+"""Dual estimation of a running twin: fit the parameters again at intervals to its last measurements.
 
-A thread of its own looks at the log's clock, and has the fit done by `Fitting`, beside the engine, at the lowest
-priority. What wins on the blocks held out is a proposal, which waits for whoever looks, or is adopted where the YAML
-says so. Nothing of it is silent: every fit is a line among the notices, and what is adopted a tuning version with its
-evidence. A proposal holds for the tuning that it was fitted from; one that was dismissed does not come again while the
-data say the same.
+A job watches the log's clock and starts the fits. A result that wins on the held-out blocks is a proposal, which a
+user accepts or dismisses, or which is adopted at once if the YAML says so. Every fit adds a notice; an adopted one
+becomes a tuning version with its evidence. A proposal is valid for the tuning that it was fitted from; a dismissed one
+is proposed again only when the data differ.
 """
 
 from __future__ import annotations
@@ -19,13 +18,14 @@ from estimators.errors import ConfigError, NisusError
 
 from ...format_time import format_time
 from ..interface import Running
+from ..jobs import DONE, FAILED
 from ..tunings.versions import keep, load_into, version_text
-from .fitting import DONE, FAILED, Attempt, Fitting
+from .fitting import FitAttempt, Fitting
 
 if TYPE_CHECKING:
     from estimators.fit.fit import Fitted
 
-LOOK = 0.5
+CLOCK_PERIOD_S = 0.5
 """Seconds between two looks at the log's clock."""
 
 EDGE = ", at the edge of its range"
@@ -39,7 +39,7 @@ FITTING, OFFERED, ADOPTED, DISMISSED, OUTDATED, NOTHING, BROKEN = (
 
 
 @dataclass(frozen=True)
-class Refit:
+class WindowFit:
     """One fit of a window: which, of what, and what came of it, in a line (`text`).
 
     start and end are the window's first and last time, ns. `name` is the tuning version that was made of it.
@@ -48,7 +48,7 @@ class Refit:
     number: int
     start: int
     end: int
-    attempt: Attempt
+    attempt: FitAttempt
     state: str = FITTING
     text: str = ""
     name: str = ""
@@ -62,17 +62,15 @@ class Refit:
 class Refits:
     """All of a running twin, the oldest first."""
 
-    def __init__(self, engine: Running, *, look: float = LOOK) -> None:
-        """Nothing is fitted before `start`; `look` is the time between two looks, s."""
-        self._engine, self._look = engine, look
+    def __init__(self, engine: Running) -> None:
+        """Nothing is fitted before `start`."""
+        self._engine = engine
         self._fitting = Fitting(engine)
         self._lock = threading.RLock()
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="refit", daemon=True)
         self._passage = 0
         self._due: int | None = None
         self._dismissed: Fitted | None = None
-        self.known: tuple[Refit, ...] = ()
+        self.known: tuple[WindowFit, ...] = ()
 
     # For everybody, from any thread
 
@@ -82,7 +80,7 @@ class Refits:
         return self._engine.twin.config.refit
 
     @property
-    def open(self) -> Refit | None:
+    def open(self) -> WindowFit | None:
         """What is proposed now."""
         return next((item for item in self.known if item.state == OFFERED), None)
 
@@ -93,14 +91,7 @@ class Refits:
 
     def start(self) -> None:
         """Begin to look at the log's clock."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """The twin ends."""
-        self._stopping.set()
-        self._fitting.stop()
-        if self._thread.is_alive():
-            self._thread.join(timeout=1.0)
+        self._engine.jobs.run("refit", lambda job: self.look(), every=CLOCK_PERIOD_S)
 
     def now(self) -> None:
         """Fit at once.
@@ -157,21 +148,14 @@ class Refits:
             self._become(number, DISMISSED, refit.text)
             self._engine.notices.say(f"refit {number}: dismissed: {refit.text}")
 
-    # On its own thread
-
-    def _run(self) -> None:
-        while not self._stopping.wait(self._look):
-            try:
-                self.look()
-            except Exception as error:  # noqa: BLE001  the twin goes on, whatever becomes of a fit
-                self._engine.notices.report("refit", f"refit: {type(error).__name__}: {error}")
+    # In its job
 
     def look(self) -> None:
         """Take what is done, and begin what is due."""
         with self._lock:
             last = self.known[-1] if self.known else None
             if last is not None and last.state == FITTING:
-                if last.attempt.ended is not None:
+                if last.attempt.job.over:
                     self._take(last)
                 return
             self._outdate()
@@ -200,9 +184,9 @@ class Refits:
         self._due = newest + round(section.every * 1e9)
         attempt = self._fitting.begin(section.entries, since=first)
         number = self.known[-1].number + 1 if self.known else 1
-        self.known = (*self.known, Refit(number, first, newest, attempt))[-KEPT:]
+        self.known = (*self.known, WindowFit(number, first, newest, attempt))[-KEPT:]
 
-    def _take(self, refit: Refit) -> None:
+    def _take(self, refit: WindowFit) -> None:
         """Say what came of a fit, and propose what won."""
         attempt, number = refit.attempt, refit.number
         fitted = attempt.fitted
@@ -218,7 +202,7 @@ class Refits:
         else:
             self._offer(refit, fitted)
 
-    def _offer(self, refit: Refit, fitted: Fitted) -> None:
+    def _offer(self, refit: WindowFit, fitted: Fitted) -> None:
         section, before = self.section, self.open
         if before is not None:
             self._become(before.number, OUTDATED, f"{before.text}; fit {refit.number} took its place")
@@ -239,10 +223,10 @@ class Refits:
         if refit is not None and not self._current(refit.attempt):
             self._tell(refit.number, OUTDATED, f"{refit.text}; but another tuning runs by now")
 
-    def _current(self, attempt: Attempt) -> bool:
+    def _current(self, attempt: FitAttempt) -> bool:
         return self._engine.tuning is attempt.tuning and self._engine.estimator == attempt.estimator
 
-    def _proposed(self, number: int) -> Refit:
+    def _proposed(self, number: int) -> WindowFit:
         refit = self.open
         if refit is None or refit.number != number:
             state = next((item.state for item in self.known if item.number == number), "not known")

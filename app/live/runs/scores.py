@@ -11,7 +11,7 @@ import numpy as np
 from estimators.diagnostics.score import Score, score
 from estimators.errors import NisusError
 
-from ..history_copy import copy_rows, recent_rows
+from ..history_copy import copy_rows
 from ..interface import Running
 from ..outputs import Pull
 from ..revisions import Run
@@ -96,11 +96,11 @@ class RunScores:
 
 def _step_us(engine: Running, run: Run) -> float:
     """Elapsed time of an event under a revision's settings, µs, over the last events of the log."""
-    part = recent_rows(engine, TIMED)
+    part = engine.last_events(TIMED, rows=True)
     if part is None:
         return np.nan
     try:
-        fold = part.fold(engine, run.estimator, run.tuning)
+        fold = part.fold(run.estimator, run.tuning, engine.policy)
         fold.advance(min(BEGUN, fold.log.n // 2))
         events, begun = 0, time.perf_counter()
         while (done := fold.advance(BEGUN)) and time.perf_counter() - begun < LONGEST:

@@ -1,13 +1,10 @@
 """Around a knob: likelihood and NIS of the last events over several values of one entry of the tuning.
 
-A thread of the lowest priority folds them, one value after another, the nearest first, and gives up as soon as the
-tuning that runs is another.
+A job folds them, one value after another, the nearest first, and ends as soon as another tuning runs.
 """
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -21,9 +18,10 @@ from estimators.errors import ConfigError, NisusError
 from estimators.track import FAILED, Track
 from estimators.tuning import Tuning
 
-from ..history_copy import END_OF_TIME, RecentRows, recent_rows
-from ..integrity import LOWEST
+from ..history_copy import END_OF_TIME
 from ..interface import Running
+from ..jobs import Cancelled, Job
+from ..outputs import EventWindow
 
 FACTORS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 
@@ -128,28 +126,15 @@ class Matched:
 
 
 class Sweeps:
-    """Folds what was asked for last, in a thread of its own."""
+    """Folds what was asked for last, in one job."""
 
     def __init__(self, engine: Running) -> None:
         self._engine = engine
-        self._wake = threading.Condition()
+        self._lock = threading.Lock()
         self._wanted: list[str] = []
+        self._job: Job | None = None
         self._known: dict[str, Swept] = {}
         self._matched: Matched | None = None
-        self._stopping = False
-        self._thread = threading.Thread(target=self._run, name="sweep", daemon=True)
-
-    def start(self) -> None:
-        """Wait to be asked."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Give up what is under way."""
-        with self._wake:
-            self._stopping = True
-            self._wake.notify()
-        if self._thread.is_alive():
-            self._thread.join(timeout=1.0)
 
     def around(self, key: str) -> Swept:
         """What is known of a key by now; the rest is folded from now on. Of several keys the last asked comes first.
@@ -177,119 +162,110 @@ class Sweeps:
         return known if current else None
 
     def _want(self, key: str) -> None:
-        with self._wake:
+        with self._lock:
             self._wanted = [key, *(other for other in self._wanted if other != key)][:KEPT]
-            self._wake.notify()
+            if self._job is None or self._job.over:
+                self._job = self._engine.jobs.run("sweep", self._work)
 
     def _outdated(self, known: Swept) -> bool:
         return known.done and known.events < min(MOST - FEWEST, self._engine.index_at(END_OF_TIME) / GROWN)
 
-    def _run(self) -> None:
-        if sys.platform == "linux":
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOWEST)
-        while True:
-            with self._wake:
-                while not self._wanted and not self._stopping:
-                    self._wake.wait()
-                turned = self._engine.tuning
-                # While a knob is dragged, the processors belong to what follows it.
-                self._wake.wait_for(lambda: self._stopping, SETTLED)
-                if self._stopping:
-                    return
-                if self._engine.tuning is not turned or not self._wanted:
-                    continue
-                key = self._wanted.pop(0)
-            try:
-                self.sweep(key)
-            except Exception as error:  # noqa: BLE001  a user's model may raise anything; the twin goes on
-                self._engine.notices.report("sweep", f"around {key}: {type(error).__name__}: {error}", level="error")
+    def _work(self, job: Job) -> None:
+        while (key := self._next(job)) is not None:
+            self.sweep(key, job)
 
-    def sweep(self, key: str) -> None:
-        """Fold every value of a key, and leave what is found to `around`."""
-        taken = recent_rows(self._engine, FEWEST)
-        if taken is None or not self._goes_on(taken):
+    def _next(self, job: Job) -> str | None:
+        """The key that was asked for last, once no slider has moved for `SETTLED` seconds; None if there is none."""
+        while True:
+            tuning = self._engine.tuning
+            job.rest(SETTLED)
+            with self._lock:
+                if not self._wanted:
+                    self._job = None
+                    return None
+                if self._engine.tuning is tuning:
+                    return self._wanted.pop(0)
+
+    def sweep(self, key: str, job: Job) -> None:
+        """Fold every value of a key; `around` returns the points as they come.
+
+        Raises:
+            Cancelled: If the job is, or another tuning runs by now.
+        """
+        taken = self._engine.last_events(FEWEST, rows=True)
+        if taken is None:
             return
+        self._check(taken, job)
         most, reason = self._affordable(taken)
         if most > FEWEST:
-            taken = recent_rows(self._engine, most)
-            if taken is None:
-                return
+            taken = self._engine.last_events(most, rows=True) or taken
         if key == MATCHED:
             if not reason:
-                self._match(taken)
+                self._match(taken, job)
             return
-        value, revision = value_of(taken.tuning, key), taken.pull.revision
-        swept = Swept(key, revision, value, len(taken.pull.events))
+        value, events = value_of(taken.tuning, key), len(taken.events)
         values = values_around(taken.tuning, key)
         if reason or not values:
-            swept = replace(swept, done=True, reason=reason or f"{key} is 0: nothing to scale")
-            self._known[key] = swept
+            reason = reason or f"{key} is 0: nothing to scale"
+            self._known[key] = Swept(key, taken.revision, value, events, done=True, reason=reason)
             return
         points: list[Point] = []
-        for k, (factor, tuning) in enumerate(values):
-            point = self._point(taken, key, factor, tuning)
-            if point is None:
-                return
-            points = sorted([*points, point], key=lambda point: point.value)
-            done = k + 1 == len(values)
-            self._known[key] = Swept(key, revision, value, swept.events, tuple(points), done)
+        for factor, tuning in values:
+            points = sorted([*points, self._point(taken, key, factor, tuning, job)], key=lambda point: point.value)
+            done = len(points) == len(values)
+            self._known[key] = Swept(key, taken.revision, value, events, tuple(points), done)
         self._known = dict(list(self._known.items())[-KEPT:])
 
-    def _match(self, taken: RecentRows) -> None:
-        """Fold with the R that the innovations of the fold before say, until it rests."""
+    def _match(self, taken: EventWindow, job: Job) -> None:
+        """Fold with the R that the innovations of the fold before imply, until it rests."""
         tuning, track = taken.tuning, taken.track
         for _ in range(TURNS):
-            said = sensor_noise(track, taken.pull.events, tuning)
-            following = _with(tuning, said)
+            following = _with(tuning, sensor_noise(track, taken.events, tuning))
             moved = np.abs(np.log(following.r[following.r > 0.0] / tuning.r[following.r > 0.0]))
             if not moved.size or moved.max() < AT_REST:
                 break
             tuning = following
             try:
-                fold = taken.fold(self._engine, taken.estimator, tuning)
-                while self._goes_on(taken) and fold.advance(CHUNK):
-                    pass
+                track = self._fold(taken, tuning, job)
             except NisusError:
                 return
-            if not self._goes_on(taken):
-                return
-            track = fold.track
-        self._matched = Matched(
-            taken.pull.revision, len(taken.pull.events), sensor_noise(track, taken.pull.events, tuning)
-        )
+        self._matched = Matched(taken.revision, len(taken.events), sensor_noise(track, taken.events, tuning))
 
-    def _point(self, taken: RecentRows, key: str, factor: float, tuning: Tuning) -> Point | None:
-        """One value, folded; None if nobody wants it any more."""
+    def _point(self, taken: EventWindow, key: str, factor: float, tuning: Tuning, job: Job) -> Point:
+        """One value, folded."""
         value = value_of(tuning, key) if key not in GROUPS else factor
         try:
-            fold = taken.fold(self._engine, taken.estimator, tuning)
-            while self._goes_on(taken) and fold.advance(CHUNK):
-                pass
+            track = self._fold(taken, tuning, job)
         except NisusError:
             return Point(factor, value, None, None)
-        if not self._goes_on(taken):
-            return None
-        track = fold.track
-        found = score(track, taken.pull.events, self._engine.model, gate=tuning.gate)
+        found = score(track, taken.events, self._engine.model, gate=tuning.gate)
         likelihood, nis = found.log_likelihood, mean_nis(track, tuning.gate)
         failed = _failures(track) > _failures(taken.track)
         return Point(factor, value, _number(likelihood, failed), _number(nis, failed))
 
-    def _affordable(self, taken: RecentRows) -> tuple[int, str]:
+    def _fold(self, taken: EventWindow, tuning: Tuning, job: Job) -> Track:
+        fold = taken.fold(tuning=tuning, policy=self._engine.policy)
+        while fold.advance(CHUNK):
+            self._check(taken, job)
+        return fold.track
+
+    def _check(self, taken: EventWindow, job: Job) -> None:
+        job.check()
+        if self._engine.tuning is not taken.tuning:
+            raise Cancelled
+
+    def _affordable(self, taken: EventWindow) -> tuple[int, str]:
         """How many events can be folded in reasonable time, or why none."""
         if self._engine.model.black_box:
             return 0, f"{self._engine.model.name} is a black box, too slow to be folded again beside what runs"
-        fold = taken.fold(self._engine, taken.estimator, taken.tuning)
+        fold = taken.fold(policy=self._engine.policy)
         fold.advance(min(TRIED, fold.log.n // 2))
         start = time.perf_counter()
         events = fold.advance(TRIED)
         each = (time.perf_counter() - start) / max(1, events)
-        if each * len(taken.pull.events) > TOO_LONG:
+        if each * len(taken.events) > TOO_LONG:
             return 0, f"{taken.estimator} takes {each * FEWEST:.0f} s for {FEWEST} events, too slow to be folded again"
         return int(min(MOST, max(FEWEST, LONGEST / max(each, 1e-9)))), ""
-
-    def _goes_on(self, taken: RecentRows) -> bool:
-        return not self._stopping and self._engine.tuning is taken.tuning
 
 
 def value_of(tuning: Tuning, key: str) -> float:

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 
 from ...live.interface import Running
 from ...live.outputs import Pull
-from .beside import Beside, BesideRun
 from .chart_stream import ChartStream
 from .charted_run import DifferenceRun, KeptRun, LiveRun, Run
 from .columns import columns_of
-from .smoothed import Smoothing
+from .pinned_runs import PinnedFold, PinnedRun
+from .smoothed import Smoother
 
 LIVE, PREVIOUS, SMOOTHED = "live", "previous", "smoothed"
 
@@ -30,9 +30,9 @@ class Series:
         self.columns = columns_of(engine.model)
         self._lock = threading.Lock()
         self._live: LiveRun | None = None
-        self._kept: dict[str, KeptRun | DifferenceRun | BesideRun] = {}
-        self._besides: dict[str, Beside] = {}
-        self._smoothing: Smoothing | None = None
+        self._kept: dict[str, KeptRun | DifferenceRun | PinnedRun] = {}
+        self._besides: dict[str, PinnedFold] = {}
+        self._smoothing: Smoother | None = None
         self._lanes: set[ChartStream] = set()
         self._origin: int | None = None
 
@@ -102,11 +102,11 @@ class Series:
             return None
         beside = self._beside(name.removeprefix(LESS), pull)
         if beside is not None and beside.caught_up:
-            if not isinstance(kept, BesideRun) or kept.beside is not beside:
-                kept = BesideRun(beside, self.columns, self._engine if name.startswith(LESS) else None)
+            if not isinstance(kept, PinnedRun) or kept.fold is not beside:
+                kept = PinnedRun(beside, self.columns, self._engine if name.startswith(LESS) else None)
                 self._kept[name] = kept
             return kept
-        if isinstance(kept, BesideRun):
+        if isinstance(kept, PinnedRun):
             kept = None
         if kept is None or kept.of is not pull:
             if name.startswith(LESS):
@@ -116,7 +116,7 @@ class Series:
             self._kept[name] = kept
         return kept
 
-    def _beside(self, name: str, pull: Pull) -> Beside | None:
+    def _beside(self, name: str, pull: Pull) -> PinnedFold | None:
         """The fold of a pinned run that goes on; None while there is nothing that its kept rows lack."""
         found = self._besides.get(name)
         if (
@@ -124,7 +124,7 @@ class Series:
             and name not in (PREVIOUS, SMOOTHED)
             and self._engine.index_at(ALL) > pull.first + len(pull.events)
         ):
-            found = self._besides[name] = Beside(self._engine, self._engine.revisions.find(int(name)))
+            found = self._besides[name] = PinnedFold(self._engine, self._engine.revisions.find(int(name)))
         return found
 
     def _leave(self, looked_at: set[str]) -> None:
@@ -138,7 +138,7 @@ class Series:
     def _pulled(self, name: str) -> Pull | None:
         if name == SMOOTHED:
             if self._smoothing is None:
-                self._smoothing = Smoothing(self._engine)
+                self._smoothing = Smoother(self._engine)
             return self._smoothing.latest
         if name == PREVIOUS:
             return self._engine.previous()

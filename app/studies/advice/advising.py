@@ -1,67 +1,64 @@
-"""Advice on the running twin's estimator, by what its own log shows: measured when asked, in a thread of its own."""
+"""Advice on the running twin's estimator, measured on its own log as a background job."""
 
 from __future__ import annotations
 
-import os
-import sys
-import threading
-import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
-from estimators.errors import ConfigError, NisusError
+from estimators.errors import ConfigError
 
 from ...live.history_copy import copy_log
-from ...live.integrity import LOWEST
 from ...live.interface import Running
+from ...live.jobs import RUNNING, Job
 
-RUNNING, FAILED, DONE = "running", "failed", "done"
 
-
-@dataclass
 class Advising:
-    """One at a time; the last is kept, with the `revision` of which it is. `told` is the advice as JSON, once known."""
+    """Measures one log at a time and keeps the last result with its `revision`."""
 
-    engine: Running
-    state: str = "none"
-    revision: int | None = None
-    reason: str = ""
-    told: dict[str, Any] | None = None
-    begun: float = 0.0
+    def __init__(self, engine: Running) -> None:
+        self._engine = engine
+        self._job: Job | None = None
+        self.revision: int | None = None
+
+    @property
+    def state(self) -> str:
+        """That of the job, or "none"."""
+        return "none" if self._job is None else self._job.state
+
+    @property
+    def reason(self) -> str:
+        """Why it failed."""
+        return "" if self._job is None else self._job.reason
+
+    @property
+    def advice(self) -> dict[str, Any]:
+        """The advice as JSON, once the state is done."""
+        return {} if self._job is None else self._job.result
 
     def begin(self) -> None:
-        """Measure the log that is there.
+        """Measure the log.
 
         Raises:
-            ConfigError: If that is being done, or would hold up what runs.
+            ConfigError: If it is being measured, or measuring would hold up the running twin.
         """
-        engine = self.engine
+        engine = self._engine
         if self.state == RUNNING:
             raise ConfigError("advice: the log is being measured; wait for it")
         if engine.model.black_box:
             raise ConfigError(f"advice: {engine.model.name} is a black box, too slow to be measured; use nisus advise")
         if engine.status().compiling:
-            # What compiles holds the interpreter.
+            # Compiling holds the interpreter.
             raise ConfigError("advice: the filters that it compares are still being compiled; ask again then")
-        self.state, self.told, self.reason, self.begun = RUNNING, None, "", time.monotonic()
         self.revision = engine.revisions.runs[-1].number
-        threading.Thread(target=self._run, name="advice", daemon=True).start()
+        self._job = engine.jobs.run("advice", self.measure, failed=lambda reason: None)
 
-    def _run(self) -> None:
-        if sys.platform == "linux":
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOWEST)
+    def measure(self, job: Job) -> dict[str, Any]:
+        """Return the advice on a copy of the log, as JSON."""
         from .advice_json import advice_json
         from .measured import Measured
         from .verdict import advise
 
-        state = DONE
-        try:
-            tuning, estimator = self.engine.folded_with()
-            log, _ = copy_log(self.engine, tuning)
-            twin = replace(self.engine.twin, tuning=tuning, estimator=estimator)
-            self.told = advice_json(twin, log, advise(Measured(twin, log)))
-        except NisusError as error:
-            state, self.reason = FAILED, str(error)
-        except Exception as error:  # noqa: BLE001  a user's model may raise anything; the twin goes on
-            state, self.reason = FAILED, f"{type(error).__name__}: {error}"
-        self.state = state
+        tuning, estimator = self._engine.folded_with()
+        log, _ = copy_log(self._engine, tuning, check=job.check)
+        twin = replace(self._engine.twin, tuning=tuning, estimator=estimator)
+        return advice_json(twin, log, advise(Measured(twin, log)))

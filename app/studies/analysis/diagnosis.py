@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from estimators.diagnostics.innovations import flat_range
 from estimators.diagnostics.score import nis_verdict
+from estimators.diagnostics.sensitivity import View, gramian
 from estimators.log import Events
 from estimators.model.state_space import LARGE
 from estimators.registry import find_entry
 from estimators.track import Track
 
+from ...live.integrity import reason_against
 from ...live.interface import Running
-from ...live.outputs import Status
+from ...live.jobs import Job, PacedExecutor
+from ...live.outputs import EventWindow, Status
 from .numbers import listed, number
 from .row_figures import rows_json
-from .slow import Found, Slow
 
 ROWS = 20_000
 """Rows that are looked at, the last."""
@@ -36,11 +39,79 @@ MOST_NAMES = 48
 """States of a correlation map."""
 
 
+FIGURES_PERIOD_S = 20.0
+"""Seconds between two computations of the fold figures."""
+
+COST_TIME_S = 0.25
+"""Seconds of work after which the cost of a step is known well enough."""
+
+COST_CHUNK = 64
+
+
+@dataclass(frozen=True)
+class FoldFigures:
+    """Of one revision: microseconds of an event, by a fold of the last ones again; observability, or why there is none.
+
+    `note` is what to know of it.
+    """
+
+    revision: int
+    cost: float
+    observability: View | None
+    reason: str
+    note: str = ""
+
+
+class FoldFigureCache:
+    """Computes the figures that take many folds when asked, at most once every `FIGURES_PERIOD_S`."""
+
+    def __init__(self, engine: Running) -> None:
+        self._engine = engine
+        self._latest: FoldFigures | None = None
+        self._job: Job | None = None
+        self._wanted: int | None = None
+
+    def of(self, revision: int) -> FoldFigures | None:
+        """Return the latest figures if they are of this revision; begin to compute new ones where it is time."""
+        job = self._job
+        if job is None or (job.over and (time.monotonic() - job.begun > FIGURES_PERIOD_S or revision != self._wanted)):
+            self._wanted = revision
+            self._job = self._engine.jobs.run("diagnosis", self._work, failed=self._fail)
+        latest = self._latest
+        return latest if latest is not None and latest.revision == revision else None
+
+    def _work(self, job: Job) -> None:
+        taken = self._engine.last_events()
+        if taken is None:
+            self._wanted = None
+        else:
+            self._latest = fold_figures(taken, job)
+
+    def _fail(self, reason: str) -> None:
+        assert self._wanted is not None
+        self._latest = FoldFigures(self._wanted, float("nan"), None, reason)
+
+
+def fold_figures(taken: EventWindow, job: Job) -> FoldFigures:
+    """Fold a window again, for its cost and with every state nudged."""
+    fold = taken.fold()
+    begun = time.thread_time()
+    while fold.advance(COST_CHUNK) and time.thread_time() - begun < COST_TIME_S:
+        job.check()
+    cost = 1e6 * (time.thread_time() - begun) / max(1, fold.n)
+    reason = reason_against(fold.model, taken.estimator)
+    if reason:
+        return FoldFigures(taken.revision, cost, None, reason)
+    log, executor = taken.log(), PacedExecutor(job)
+    found = gramian(taken.estimator, fold.model, taken.tuning, log, base=taken.base, windows=0, executor=executor)
+    return FoldFigures(taken.revision, cost, found.whole, found.reason, found.note)
+
+
 class Diagnosis:
     """Answers `GET /api/diagnose`; from any thread but the engine's, one question at a time."""
 
     def __init__(self, engine: Running) -> None:
-        self._engine, self._slow = engine, Slow(engine)
+        self._engine, self._figures = engine, FoldFigureCache(engine)
         self._known: tuple[float, dict[str, Any]] | None = None
 
     def look(self) -> dict[str, Any]:
@@ -64,7 +135,7 @@ class Diagnosis:
         revision, events, track = last_rows(engine, ROWS)
         status = engine.status()
         marginal = find_entry(estimator).family in ("particle", "ensemble")
-        slow = self._slow.of(revision) if len(events) else None
+        slow = self._figures.of(revision) if len(events) else None
         nis = nis_verdict(track, events, engine.model, tuning.baseline)
         return {
             "revision": revision,
@@ -151,7 +222,7 @@ def _correlation(engine: Running) -> dict[str, Any]:
     return {"names": names, "matrix": listed(matrix, 3), "reason": left}
 
 
-def _observability(engine: Running, found: Found | None) -> dict[str, Any]:
+def _observability(engine: Running, found: FoldFigures | None) -> dict[str, Any]:
     if found is None:
         return {"reason": "being computed", "states": {}}
     view = found.observability

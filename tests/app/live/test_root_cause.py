@@ -1,12 +1,11 @@
 """Who is most likely off, found beside a running twin."""
 
-import time
-
 import numpy as np
 import pytest
 
-from app.live.integrity import Window, window
+from app.live.jobs import Job
 from app.live.notices import Notices
+from app.live.outputs import event_window
 from app.live.root_cause import Blame
 from estimators.diagnostics.episodes import Episode, episodes
 from estimators.fold import Fold
@@ -35,14 +34,14 @@ def folded():
 
 def blame_of(fold, known, notices=None):
     said = notices or Notices(lambda: 0)
-    return Blame(lambda: known, lambda: window(fold, 0), said, every=0.01), said
+    return Blame(lambda: known, lambda: event_window(fold, 0, 4000), said), said
 
 
 def test_the_sensor_that_is_off_is_named_once_and_in_the_text(folded):
     (yoke,) = [episode for episode in episodes(folded) if (episode.subject, episode.cause) == ("yoke", "shifted")]
     blame, notices = blame_of(folded, [yoke])
-    blame.look()
-    blame.look()
+    blame.look(Job("test"))
+    blame.look(Job("test"))
     words = blame.of(yoke)
     assert words.startswith("sensor yoke +")
     assert blame.told(yoke).text == f"{yoke.text}; most likely off: {words}"
@@ -57,7 +56,7 @@ def test_a_consequence_leads_to_the_sensor_that_is_behind_it(folded):
     known = [yoke, tooth]
     blame, _ = blame_of(folded, known)
     assert blame.behind(tooth) is tooth  # not yet asked
-    blame.look()
+    blame.look(Job("test"))
     assert blame.behind(tooth) is yoke and blame.behind(yoke) is yoke
     known[0] = yoke._replace(end=80.0)
     assert blame.behind(tooth) is tooth
@@ -67,26 +66,13 @@ def test_what_is_over_or_no_riddle_is_left_alone(folded):
     over = Episode(60.0, 70.0, "yoke", "shifted", 1.0, 0.5, 1.5, "σ", "yoke reads high")
     stuck = Episode(60.0, None, "tooth", "stuck", 41.0, np.nan, np.nan, "°C", "tooth is stuck")
     blame, notices = blame_of(folded, [over, stuck])
-    blame.look()
+    blame.look(Job("test"))
     assert not notices.since(0) and blame.told(over) is over and blame.told(stuck) is stuck
 
 
 def test_an_episode_older_than_the_window_is_not_guessed(folded):
     old = Episode(60.0, None, "yoke", "shifted", 1.0, 0.5, 1.5, "σ", "yoke reads high")
-    taken = window(folded, 0)
-    late = Window(taken.estimator, taken.tuning, taken.events, taken.base._replace(clock=70 * 10**9), 0)
+    late = event_window(folded, 0, 4000)._replace(base=folded.base_at(0)[1]._replace(clock=70 * 10**9))
     blame = Blame(lambda: [old], lambda: late, Notices(lambda: 0))
-    blame.look()
+    blame.look(Job("test"))
     assert blame.of(old) == ""
-
-
-def test_the_thread_asks_and_ends(folded):
-    known = [episode for episode in episodes(folded) if episode.end is None]
-    blame, _ = blame_of(folded, known)
-    blame.start()
-    until = time.monotonic() + 60.0
-    while not any(blame.of(episode) for episode in known):
-        assert time.monotonic() < until
-        time.sleep(0.02)
-    blame.stop()
-    assert not blame._thread.is_alive()

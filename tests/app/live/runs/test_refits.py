@@ -1,7 +1,7 @@
 """Dual estimation of a running twin: proposed, adopted, dismissed, said; the engine goes on whatever comes of it."""
 
 import shutil
-import threading
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,9 +10,6 @@ from app.cli.main import main
 from app.cli.opener import recorded_twin
 from app.cli.run import live_source
 from app.live.commands import Record, SetTuning
-from app.live.engine import Engine
-from app.live.feeder import Restarted
-from app.live.runs.fitting import Fitting
 from app.live.runs.refits import ADOPTED, BROKEN, DISMISSED, FITTING, NOTHING, OFFERED, OUTDATED, Refits
 from app.twin.twin import load_twin
 from app.views.recording.reader import read_recording
@@ -20,99 +17,78 @@ from app.web.session import Session
 from config.loader import TWINS
 from config.tunings import load_version, version_files
 from estimators.errors import ConfigError
-from tests.app.scripted import Scripted, readings, row_count, wait_for
+from tests.app.scripted import Replayed, Stepped, readings, row_count, wait_for
 
 WINDOW, EVERY, RATE = 60, 30, 10
 SECTION = f"{{entries: [R.winding], every: {EVERY} s, window: {WINDOW} s, adopt: %s}}"
 
 
-class Asset:
-    """A winding that stays at 40 °C; its thermometer is as sharp as is asked for."""
-
-    def __init__(self):
-        self.source, self.rng, self.t = Scripted(), np.random.default_rng(11), 0
-
-    def speak(self, seconds, std):
-        n = seconds * RATE
-        times = (self.t + np.arange(1, n + 1)) / RATE
-        self.t += n
-        self.source.put(readings(times, 40.0 + std * self.rng.normal(size=n)))
-
-
-class Beside:
-    """A twin of it that runs, and its fits, which are looked at when a test says so."""
+class Refitted(Stepped):
+    """A winding that stays at 40 °C, measured with the noise that a test asks for, and the fits of its twin."""
 
     def __init__(self, folder, adopt="by hand"):
         path = folder / "winding.yaml"
         shutil.copy(TWINS / "motor_winding.yaml", path)
         self.twin = load_twin(path, overrides={"refit": SECTION % adopt, "Q.rate": "1e-6", "Q.temperature": "1e-6"})
-        self.asset = Asset()
-        self.engine = Engine(self.twin, lambda report: self.asset.source)
+        super().__init__(of=self.twin, source=Replayed())
         self.refits = Refits(self.engine)
-        self.engine.start()
+        self.rng, self.t = np.random.default_rng(11), 0
 
-    def hears(self, seconds, std):
-        self.asset.speak(seconds, std)
-        wait_for(lambda: row_count(self.engine) == self.asset.t)
+    def measure(self, seconds, std):
+        n = seconds * RATE
+        times = (self.t + np.arange(1, n + 1)) / RATE
+        self.t += n
+        self.put(readings(times, 40.0 + std * self.rng.normal(size=n)))
 
-    def looks(self):
-        """To the end of a fit, if one is due; how the last one stands."""
+    def look(self):
+        """To the end of a fit, if one is due; the state of the last one."""
         self.refits.look()
+        self.engine.settle()
         if self.refits.known and self.refits.known[-1].state == FITTING:
-            wait_for(lambda: self.refits.known[-1].attempt.ended is not None)
-            self.refits._fitting._thread.join(60.0)
             self.refits.look()
+            self.engine.settle()
         return self.refits.known[-1].state if self.refits.known else None
 
-    def settles(self, name):
-        wait_for(lambda: self.engine.folded_with()[0].name == name and not self.engine.status().refolding)
+    def accept(self, number):
+        name = self.refits.accept(number)
+        self.engine.settle()
+        assert self.engine.folded_with()[0].name == name
+        return name
 
-    def said(self):
-        return [line.text for line in self.engine.notices.since(0) if line.text.startswith("refit")]
-
-    def stop(self):
-        self.refits.stop()
-        self.engine.stop()
+    def refit_notices(self):
+        return [text for text in self.notices() if text.startswith("refit")]
 
 
 @pytest.fixture
 def begin(tmp_path):
-    begun = []
-
-    def make(**options):
-        begun.append(Beside(tmp_path, **options))
-        return begun[-1]
-
-    yield make
-    for twin in begun:
-        twin.stop()
+    return partial(Refitted, tmp_path)
 
 
 def test_nothing_is_fitted_before_a_whole_window_and_then_at_set_times(begin):
     twin = begin()
-    assert twin.looks() is None
-    twin.hears(WINDOW - 1, 2.0)
-    assert twin.looks() is None
-    twin.hears(2, 2.0)
-    assert twin.looks() is not None
+    assert twin.look() is None
+    twin.measure(WINDOW - 1, 2.0)
+    assert twin.look() is None
+    twin.measure(2, 2.0)
+    assert twin.look() is not None
     (first,) = twin.refits.known
     # To the event: the last 60 s of the log, though a fold's snapshots lie elsewhere.
     assert first.attempt.events == WINDOW * RATE + 1 and first.end - first.start == WINDOW * 10**9
     assert twin.refits.due == first.end + EVERY * 10**9
-    twin.hears(EVERY - 1, 2.0)
-    twin.looks()
+    twin.measure(EVERY - 1, 2.0)
+    twin.look()
     assert len(twin.refits.known) == 1
-    twin.hears(1, 2.0)
-    twin.looks()
+    twin.measure(1, 2.0)
+    twin.look()
     assert [item.number for item in twin.refits.known] == [1, 2]
 
 
 def test_what_does_not_win_is_not_proposed_and_is_said(begin):
     twin = begin()
     # 2 °C, as the YAML says.
-    twin.hears(WINDOW + 1, 2.0)
-    assert twin.looks() == NOTHING and twin.refits.open is None
-    (line,) = twin.said()
+    twin.measure(WINDOW + 1, 2.0)
+    assert twin.look() == NOTHING and twin.refits.open is None
+    (line,) = twin.refit_notices()
     assert line.startswith("refit 1: nothing better: it does not predict the blocks held out better")
     assert not version_files(twin.twin.path) and twin.engine.tuning is twin.engine.twin.tuning
     with pytest.raises(ConfigError, match="refit 1: it is nothing better; only what is proposed"):
@@ -121,12 +97,11 @@ def test_what_does_not_win_is_not_proposed_and_is_said(begin):
 
 def test_adopted_by_hand_a_version_with_its_evidence_goes_on(begin):
     twin = begin()
-    twin.hears(WINDOW + 1, 5.0)
-    assert twin.looks() == OFFERED and twin.refits.open.number == 1
+    twin.measure(WINDOW + 1, 5.0)
+    assert twin.look() == OFFERED and twin.refits.open.number == 1
     # Nothing was put in, and nothing written.
     assert twin.engine.revisions.runs[-1].number == 0 and not version_files(twin.twin.path)
-    assert twin.refits.accept(1) == "refit-1"
-    twin.settles("refit-1")
+    assert twin.accept(1) == "refit-1"
     version = load_version(version_files(twin.twin.path)["refit-1"])
     (line,) = twin.refits.known[0].fitted.lines
     assert twin.engine.tuning.get("R.winding") == line.after and line.low < 25.0 < line.high
@@ -136,73 +111,69 @@ def test_adopted_by_hand_a_version_with_its_evidence_goes_on(begin):
     assert evidence.gain > 2.0 * evidence.error > 0.0
     assert version.head.scores["log_likelihood"] > evidence.before["log_likelihood"]
     assert "by hand" in version.head.note and version.head.fitted_on[0].startswith("601 events over 60 s, to 61 s")
-    assert [text.split(": ")[:2] for text in twin.said()] == [
+    assert [text.split(": ")[:2] for text in twin.refit_notices()] == [
         ["refit 1", "proposed"],
         ["refit 1", "adopted by hand as tuning version refit-1"],
     ]
     assert twin.engine.revisions.runs[-1].why == "refit 1, version refit-1"
     # The next one starts from there, and finds nothing to mend.
-    twin.hears(EVERY, 5.0)
-    assert twin.looks() == NOTHING and [item.state for item in twin.refits.known] == [ADOPTED, NOTHING]
+    twin.measure(EVERY, 5.0)
+    assert twin.look() == NOTHING and [item.state for item in twin.refits.known] == [ADOPTED, NOTHING]
 
 
 def test_dismissed_it_does_not_come_again_until_the_data_say_something_else(begin):
     twin = begin()
-    twin.hears(WINDOW + 1, 5.0)
-    assert twin.looks() == OFFERED
+    twin.measure(WINDOW + 1, 5.0)
+    assert twin.look() == OFFERED
     twin.refits.dismiss(1)
     assert twin.refits.open is None and twin.engine.revisions.runs[-1].number == 0
     with pytest.raises(ConfigError, match="refit 1: it is dismissed; only what is proposed"):
         twin.refits.accept(1)
     for _ in range(2):
-        twin.hears(EVERY, 5.0)
-        assert twin.looks() == DISMISSED and twin.refits.open is None
-    assert "the data say what they said when it was dismissed" in twin.said()[-1]
-    twin.hears(WINDOW, 10.0)
-    assert twin.looks() == OFFERED and twin.refits.open.number == 4
+        twin.measure(EVERY, 5.0)
+        assert twin.look() == DISMISSED and twin.refits.open is None
+    assert "the data say what they said when it was dismissed" in twin.refit_notices()[-1]
+    twin.measure(WINDOW, 10.0)
+    assert twin.look() == OFFERED and twin.refits.open.number == 4
 
 
 def test_adopted_by_rule_is_said_too(begin, tmp_path):
     twin = begin(adopt="if better")
-    twin.hears(WINDOW + 1, 5.0)
-    assert twin.looks() == ADOPTED and twin.refits.known[0].name == "refit-1"
-    twin.settles("refit-1")
-    assert twin.said()[-1].startswith("refit 1: adopted by rule as tuning version refit-1: R.winding 4 → ")
-    twin.hears(WINDOW, 12.0)
-    assert twin.looks() == ADOPTED and twin.refits.known[-1].name == "refit-2"
-    twin.settles("refit-2")
+    twin.measure(WINDOW + 1, 5.0)
+    assert twin.look() == ADOPTED and twin.refits.known[0].name == "refit-1"
+    assert twin.refit_notices()[-1].startswith("refit 1: adopted by rule as tuning version refit-1: R.winding 4 → ")
+    twin.measure(WINDOW, 12.0)
+    assert twin.look() == ADOPTED and twin.refits.known[-1].name == "refit-2"
     assert set(version_files(twin.twin.path)) == {"refit-1", "refit-2"}
 
 
 def test_what_cannot_be_kept_waits_and_is_said(begin, tmp_path):
     (tmp_path / "winding.tunings").write_text("no folder")
     twin = begin(adopt="if better")
-    twin.hears(WINDOW + 1, 5.0)
-    assert twin.looks() == OFFERED and twin.engine.revisions.runs[-1].number == 0
-    assert "refit 1: not adopted: " in twin.said()[-1]
+    twin.measure(WINDOW + 1, 5.0)
+    assert twin.look() == OFFERED and twin.engine.revisions.runs[-1].number == 0
+    assert "refit 1: not adopted: " in twin.refit_notices()[-1]
     (tmp_path / "winding.tunings").unlink()
-    assert twin.refits.accept(1) == "refit-1"
-    twin.settles("refit-1")
+    assert twin.accept(1) == "refit-1"
 
 
 def test_a_proposal_holds_for_the_tuning_that_it_was_fitted_from(begin):
     twin = begin()
-    twin.hears(WINDOW + 1, 5.0)
-    assert twin.looks() == OFFERED
-    twin.engine.submit(SetTuning("R.winding", 20.0))
-    wait_for(lambda: twin.engine.revisions.runs[-1].number == 1)
+    twin.measure(WINDOW + 1, 5.0)
+    assert twin.look() == OFFERED
+    twin.submit(SetTuning("R.winding", 20.0))
     with pytest.raises(ConfigError, match="refit 1: it is outdated"):
         twin.refits.accept(1)
-    assert "but another tuning runs by now" in twin.said()[-1]
+    assert "but another tuning runs by now" in twin.refit_notices()[-1]
     assert not version_files(twin.twin.path) and twin.engine.tuning.get("R.winding") == 20.0
 
 
 def test_a_newer_proposal_takes_the_place_of_the_older(begin):
     twin = begin()
-    twin.hears(WINDOW + 1, 5.0)
-    twin.looks()
-    twin.hears(WINDOW, 9.0)
-    assert twin.looks() == OFFERED
+    twin.measure(WINDOW + 1, 5.0)
+    twin.look()
+    twin.measure(WINDOW, 9.0)
+    assert twin.look() == OFFERED
     assert [item.state for item in twin.refits.known] == [OUTDATED, OFFERED] and twin.refits.open.number == 2
 
 
@@ -211,74 +182,45 @@ def test_the_engine_goes_on_if_a_fit_fails(begin, monkeypatch):
         raise ArithmeticError("no such luck")
 
     twin = begin()
-    twin.hears(WINDOW + 1, 5.0)
+    twin.measure(WINDOW + 1, 5.0)
     with monkeypatch.context() as patch:
         patch.setattr("estimators.fit.fit.fit", broken)
-        assert twin.looks() == BROKEN
-    assert twin.said() == ["refit 1: failed: ArithmeticError: no such luck"]
+        assert twin.look() == BROKEN
+    assert twin.refit_notices() == ["refit 1: failed: ArithmeticError: no such luck"]
     assert twin.engine.notices.since(0)[-1].level == "warn"
-    twin.hears(EVERY, 5.0)
-    assert twin.looks() == OFFERED
+    twin.measure(EVERY, 5.0)
+    assert twin.look() == OFFERED
 
 
-def test_the_engine_goes_on_while_it_is_fitted(begin, monkeypatch):
-    under_way, go_on = threading.Event(), threading.Event()
-    real = Fitting._count
-
-    def count(self, attempt, folds):
-        if folds:
-            under_way.set()
-            go_on.wait(60.0)
-        return real(self, attempt, folds)
-
-    monkeypatch.setattr(Fitting, "_count", count)
+def test_events_are_folded_while_a_fit_is_under_way(begin):
     twin = begin()
-    twin.hears(WINDOW + 1, 5.0)
+    twin.measure(WINDOW + 1, 5.0)
     twin.refits.look()
-    assert under_way.wait(60.0)
-    try:
-        # Rows come, and what is due meanwhile waits.
-        twin.hears(2 * EVERY, 5.0)
-        twin.refits.look()
-        assert [item.state for item in twin.refits.known] == [FITTING]
-        with pytest.raises(ConfigError, match="another one is under way"):
-            twin.refits.now()
-    finally:
-        go_on.set()
-    assert twin.looks() == OFFERED
-
-
-def test_a_thread_looks_and_survives_what_it_meets(begin, monkeypatch):
-    twin = begin()
-    failed = threading.Event()
-    real = Refits.look
-
-    def look(self):
-        if not failed.is_set():
-            failed.set()
-            raise ArithmeticError("once")
-        real(self)
-
-    monkeypatch.setattr(Refits, "look", look)
-    twin.refits._look = 0.01
-    twin.refits.start()
-    twin.hears(WINDOW + 1, 5.0)
-    wait_for(lambda: twin.refits.open is not None)
-    assert "refit: ArithmeticError: once" in twin.said()
+    engine = twin.engine
+    # Rows come, and the fit that is due meanwhile waits.
+    engine._inbox.put(readings([WINDOW + 2.0], [40.0]))
+    engine._round(0.0)
+    assert row_count(engine) == (WINDOW + 1) * RATE + 1
+    twin.refits.look()
+    assert [item.state for item in twin.refits.known] == [FITTING]
+    with pytest.raises(ConfigError, match="another one is under way"):
+        twin.refits.now()
+    engine.settle()
+    twin.refits.look()
+    assert twin.refits.known[-1].state == OFFERED
 
 
 def test_a_source_that_begins_again_is_waited_for_anew(begin):
     twin = begin()
-    twin.hears(WINDOW + 1, 2.0)
-    twin.looks()
-    twin.engine._inbox.put(Restarted())
-    wait_for(lambda: row_count(twin.engine) == 0)
-    twin.asset.t = 0
-    twin.hears(WINDOW - 1, 2.0)
-    twin.looks()
+    twin.measure(WINDOW + 1, 2.0)
+    twin.look()
+    twin.source.restart()
+    twin.t = 0
+    twin.measure(WINDOW - 1, 2.0)
+    twin.look()
     assert len(twin.refits.known) == 1
-    twin.hears(2, 2.0)
-    twin.looks()
+    twin.measure(2, 2.0)
+    twin.look()
     assert len(twin.refits.known) == 2
 
 
@@ -286,9 +228,9 @@ def test_at_once_if_asked_and_not_without_a_section(begin):
     twin = begin()
     with pytest.raises(ConfigError, match="no reading has come yet"):
         twin.refits.now()
-    twin.hears(20, 5.0)
+    twin.measure(20, 5.0)
     twin.refits.now()
-    assert twin.looks() == OFFERED and twin.refits.known[0].attempt.events == 20 * RATE
+    assert twin.look() == OFFERED and twin.refits.known[0].attempt.events == 20 * RATE
     object.__setattr__(twin.twin.config, "refit", None)
     assert twin.refits.section is None
     with pytest.raises(ConfigError, match="no `refit` section"):

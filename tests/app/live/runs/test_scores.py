@@ -4,58 +4,28 @@ import numpy as np
 import pytest
 
 from app.live import commands
-from app.live.engine import Engine
 from app.live.history_copy import COPY_ROWS
 from app.live.runs.scores import RunScores
 from estimators.fold import fold
 from estimators.log import Log
 from estimators.track import HELD_OUT, USED
 from estimators.tuning import Tuning
-from tests.app.scripted import MODEL, Scripted, readings, row_count, twin, wait_for
+from tests.app.scripted import MODEL, Stepped, random_walk, readings
 
 FIRST = Tuning.of(MODEL)
 
 
-def series(n, seed=1):
-    rng = np.random.default_rng(seed)
-    return np.arange(1, n + 1) * 0.1, 40 + np.cumsum(rng.normal(size=n)) * 0.1 + rng.normal(size=n)
-
-
-@pytest.fixture
-def started():
-    engines = []
-
-    def start(n):
-        source = Scripted()
-        engine = Engine(twin(), lambda report: source)
-        engines.append(engine)
-        engine.start()
-        source.put(readings(*series(n)))
-        wait_for(lambda: row_count(engine) == n if n < COPY_ROWS else engine.index_at(2**62) == n)
-        return engine
-
-    yield start
-    for engine in engines:
-        engine.stop()
-
-
-def carry_out(engine, command):
-    before = engine.revisions.version
-    engine.submit(command)
-    wait_for(lambda: engine.revisions.version > before and not engine.status().refolding)
-
-
 def by_hand(estimator, tuning, n):
     log = Log(MODEL.width)
-    log.extend(readings(*series(n)))
+    log.extend(readings(*random_walk(n)))
     return fold(estimator, MODEL, tuning, log), log.events
 
 
-def test_scores_are_those_of_a_refold(started):
-    engine = started(800)
-    carry_out(engine, commands.SetTuning("Q.rate", 0.05))
-    carry_out(engine, commands.SetEstimator("ukf"))
-    scores = RunScores(engine)
+def test_scores_are_those_of_a_refold():
+    twin = Stepped(800)
+    twin.submit(commands.SetTuning("Q.rate", 0.05))
+    twin.submit(commands.SetEstimator("ukf"))
+    scores = RunScores(twin.engine)
     (gone, nothing), (left, of_left), (running, of_running) = scores.all()
     assert gone.track is None and nothing is None
     assert (left.estimator, running.estimator) == ("kf", "ukf")
@@ -69,10 +39,10 @@ def test_scores_are_those_of_a_refold(started):
         assert known.step_us > 0.0
 
 
-def test_a_sensor_held_out_is_scored_by_its_predictions(started):
-    engine = started(300)
-    carry_out(engine, commands.UseSensor("winding", False))
-    (_, (_, known)) = RunScores(engine).all()
+def test_a_sensor_held_out_is_scored_by_its_predictions():
+    twin = Stepped(300)
+    twin.submit(commands.UseSensor("winding", False))
+    (_, (_, known)) = RunScores(twin.engine).all()
     track, events = by_hand("kf", FIRST.set("use.winding", False), 300)
     held = track.verdict == HELD_OUT
     error, std = track.innovation[held, 0], track.innovation_std[held, 0]
@@ -81,29 +51,24 @@ def test_a_sensor_held_out_is_scored_by_its_predictions(started):
     assert fit.coverage == pytest.approx(np.mean(np.abs(error) <= 1.959964 * std))
 
 
-def test_what_was_scored_stays_known_when_its_track_goes(started):
-    engine = started(300)
-    carry_out(engine, commands.SetTuning("Q.rate", 0.05))
-    scores = RunScores(engine)
+def test_what_was_scored_stays_known_when_its_track_goes():
+    twin = Stepped(300)
+    twin.submit(commands.SetTuning("Q.rate", 0.05))
+    scores = RunScores(twin.engine)
     first = scores.all()[0][1]
     assert first is not None and scores.all()[0][1] is first
-    carry_out(engine, commands.SetTuning("R.winding", 2.0))
+    twin.submit(commands.SetTuning("R.winding", 2.0))
     (run, known), *_ = scores.all()
     assert run.track is None and known is first
 
 
-def test_a_history_of_several_pieces_is_scored_whole(started):
+def test_a_history_of_several_pieces_is_scored_whole():
     n = 2 * COPY_ROWS + 100
-    engine = started(n)
-    ((_, known),) = RunScores(engine).all()
+    twin = Stepped(n)
+    ((_, known),) = RunScores(twin.engine).all()
     assert known.rows == n and known.score.readings == n
 
 
 def test_before_anything_has_come_there_is_nothing_to_score():
-    engine = Engine(twin(), lambda report: Scripted())
-    engine.start()
-    try:
-        ((run, known),) = RunScores(engine).all()
-        assert run.number == 0 and known is None
-    finally:
-        engine.stop()
+    ((run, known),) = RunScores(Stepped().engine).all()
+    assert run.number == 0 and known is None

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from app.live.engine import Engine
-from app.live.history_copy import recent_rows
+from app.live.jobs import Cancelled, Job
 from app.live.runs.noise import noise
 from app.live.runs.sweep import AT_REST, FACTORS, MATCHED, Point, Sweeps, Swept, scaled, value_of, values_around
 from estimators.errors import ConfigError
@@ -13,38 +12,23 @@ from estimators.log import Log
 from estimators.models import MODELS
 from estimators.track import USED
 from estimators.tuning import Tuning
-from tests.app.scripted import MODEL, Scripted, readings, row_count, twin, wait_for
+from tests.app.scripted import MODEL, Stepped, random_walk, readings, twin
 
 FIRST = Tuning.of(MODEL)
 
 
-def series(n, seed=3):
-    rng = np.random.default_rng(seed)
-    return np.arange(1, n + 1) * 0.1, 40 + np.cumsum(rng.normal(size=n)) * 0.05 + rng.normal(size=n)
+def walk(n):
+    return readings(*random_walk(n, seed=3, step=0.05))
 
 
-@pytest.fixture
-def started():
-    engines = []
-
-    def start(n):
-        source = Scripted()
-        engine = Engine(twin(), lambda report: source)
-        engines.append(engine)
-        engine.start()
-        source.put(readings(*series(n)))
-        wait_for(lambda: row_count(engine) == n)
-        return engine
-
-    yield start
-    for engine in engines:
-        engine.stop()
+def started(n):
+    return Stepped(n, seed=3, step=0.05).engine
 
 
 def brute_force(key, n):
     """Log-likelihood and mean NIS of a whole fold for each factor, from the prior."""
     log = Log(MODEL.width)
-    log.extend(readings(*series(n)))
+    log.extend(walk(n))
     found = {}
     for factor in FACTORS:
         track = fold("kf", MODEL, FIRST.set(key, FIRST.get(key) * factor), log)
@@ -54,11 +38,11 @@ def brute_force(key, n):
 
 
 @pytest.mark.parametrize("key", ["Q.rate", "R.winding"])
-def test_every_point_is_a_fold_and_the_best_is_the_best(started, key):
+def test_every_point_is_a_fold_and_the_best_is_the_best(key):
     engine = started(1500)
     sweeps = Sweeps(engine)
     assert sweeps.around(key).points == ()
-    sweeps.sweep(key)
+    sweeps.sweep(key, Job("test"))
     swept, expected = sweeps.around(key), brute_force(key, 1500)
     assert swept.done and swept.events == 1500 and [point.factor for point in swept.points] == list(FACTORS)
     for point in swept.points:
@@ -69,48 +53,46 @@ def test_every_point_is_a_fold_and_the_best_is_the_best(started, key):
     assert swept.best.factor == max(FACTORS, key=lambda factor: expected[factor][0])
 
 
-def test_a_window_goes_on_from_a_snapshot_as_the_whole_fold_did(started):
+def test_a_window_goes_on_from_a_snapshot_as_the_whole_fold_did():
     engine = started(6000)
-    taken = recent_rows(engine, 3000)
-    assert len(taken.pull.events) <= 3000 and taken.pull.first % 1024 == 0
-    again = taken.fold(engine, taken.estimator, taken.tuning)
+    taken = engine.last_events(3000, rows=True)
+    assert len(taken.events) <= 3000 and taken.first % 1024 == 0
+    again = taken.fold()
     again.advance()
     np.testing.assert_array_equal(again.track.mean, taken.track.mean)
     log = Log(MODEL.width)
-    log.extend(readings(*series(6000)))
+    log.extend(walk(6000))
     whole = Fold("kf", MODEL, FIRST, log)
     whole.advance()
-    np.testing.assert_array_equal(again.track.mean, whole.track.mean[taken.pull.first :])
+    np.testing.assert_array_equal(again.track.mean, whole.track.mean[taken.first :])
 
 
-def test_another_tuning_ends_a_sweep(started):
+def test_another_tuning_ends_a_sweep():
     engine = started(1500)
     sweeps = Sweeps(engine)
-    taken = recent_rows(engine, 2048)
     engine.tuning = FIRST.set("Q.rate", 0.5)
-    assert sweeps._point(taken, "Q.rate", 1.0, taken.tuning) is None
-    sweeps.sweep("Q.rate")
+    with pytest.raises(Cancelled):
+        sweeps.sweep("Q.rate", Job("test"))
     assert sweeps.around("Q.rate").points == ()
 
 
-def test_what_is_too_slow_says_so(started, monkeypatch):
+def test_what_is_too_slow_says_so(monkeypatch):
     engine = started(600)
     sweeps = Sweeps(engine)
     monkeypatch.setattr("app.live.runs.sweep.TOO_LONG", 0.0)
-    sweeps.sweep("Q.rate")
+    sweeps.sweep("Q.rate", Job("test"))
     found = sweeps.around("Q.rate")
     assert found.done and not found.points and "too slow to be folded again" in found.reason
 
 
-def test_the_thread_folds_what_was_asked_for_and_ends(started):
+def test_one_job_folds_all_that_was_asked_for(monkeypatch):
+    monkeypatch.setattr("app.live.runs.sweep.SETTLED", 0.0)
     engine = started(600)
     sweeps = Sweeps(engine)
-    sweeps.start()
     sweeps.around("R.winding")
     sweeps.around("Q.rate")
-    wait_for(lambda: sweeps.around("Q.rate").done and sweeps.around("R.winding").done)
-    sweeps.stop()
-    assert not sweeps._thread.is_alive()
+    assert engine.jobs.step() and not engine.jobs.step()
+    assert sweeps.around("Q.rate").done and sweeps.around("R.winding").done and not engine.jobs.step()
 
 
 def test_a_group_is_scaled_as_a_whole():
@@ -151,12 +133,12 @@ def test_a_value_at_which_readings_fail_is_never_the_best():
     assert swept.best.factor == 1.0
 
 
-def test_what_the_innovations_say_of_r_is_given_by_key(started):
+def test_what_the_innovations_say_of_r_is_given_by_key():
     engine = started(1500)
     found = noise(engine, Sweeps(engine))
     # The readings are of a random walk with noise of variance 1.
     estimate = found.sensors["R.winding"]
-    track = recent_rows(engine, 2048).track
+    track = engine.last_events(2048, rows=True).track
     weight = track.innovation_std[:, 0] ** -4
     excess = np.sum(weight * (track.innovation[:, 0] ** 2 - track.innovation_std[:, 0] ** 2)) / np.sum(weight)
     assert found.reason == "" and estimate.n == 1500
@@ -166,19 +148,20 @@ def test_what_the_innovations_say_of_r_is_given_by_key(started):
 @pytest.mark.parametrize(("r", "q", "doubted"), [(1.0, 1.0, False), (25.0, 1.0, False), (1.0, 1e-4, True)])
 def test_an_r_that_is_wrong_alone_is_mended_and_a_wrong_q_is_not_laid_to_r(r, q, doubted):
     """Readings as the model says, of noise of variance 1, folded with `r` and a factor `q` of all of Q."""
-    engine = Engine(twin(), lambda report: Scripted())
-    engine.twin.tuning = scaled(FIRST.set("R.winding", r), "Q", q)
-    engine = Engine(engine.twin, lambda report: Scripted())
+    own = twin()
+    own.tuning = scaled(FIRST.set("R.winding", r), "Q", q)
+    stepped = Stepped(of=own)
     rng = np.random.default_rng(3)
     n, dt, x, values = 4000, 0.1, np.array([40.0, 0.0]), []
     for _ in range(n):
         x = np.array([[1.0, dt], [0.0, 1.0]]) @ x + rng.normal(size=2) * np.sqrt(FIRST.q * dt)
         values.append(x[0] + rng.normal())
-    engine._accept([readings(dt * np.arange(1, n + 1), np.array(values))])
+    stepped.put(readings(dt * np.arange(1, n + 1), np.array(values)))
+    engine = stepped.engine
     sweeps = Sweeps(engine)
     as_it_is = noise(engine, sweeps)
     assert bool(as_it_is.doubts) == (r > 1.0 or doubted)  # a gain that is wrong leaves a correlation
-    sweeps.sweep(MATCHED)
+    sweeps.sweep(MATCHED, Job("test"))
     found = noise(engine, sweeps)
     assert bool(found.doubts) == doubted
     if not doubted:

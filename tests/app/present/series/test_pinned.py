@@ -4,17 +4,15 @@ import numpy as np
 import pytest
 
 from app.live import commands
-from app.live.engine import Engine
-from app.live.feeder import Restarted
-from app.present.series.beside import Beside
+from app.live.jobs import Job
 from app.present.series.chart_stream import ChartQuery, ChartStream
+from app.present.series.pinned_runs import PinnedFold
 from app.present.series.series import Series
 from estimators.fold import fold
 from estimators.log import Log
 from estimators.tuning import Tuning
-from tests.app.live.runs.test_scores import carry_out
 from tests.app.present.series.test_chart_stream import Browser
-from tests.app.scripted import MODEL, Scripted, readings, row_count, twin, wait_for
+from tests.app.scripted import MODEL, Replayed, Stepped, readings, wait_for
 
 MEAN = f"mean:{MODEL.states[0].name}"
 FIRST = Tuning.of(MODEL)
@@ -27,21 +25,12 @@ def values(n, seed=8):
 
 
 @pytest.fixture
-def source_and_engine():
-    source = Scripted()
-    running = Engine(twin(), lambda report: source)
-    running.start()
-    source.put(readings(*values(N)))
-    wait_for(lambda: row_count(running) == N)
-    carry_out(running, commands.Pin(0))
-    carry_out(running, commands.SetTuning("Q.rate", 0.1))
-    yield source, running
-    running.stop()
-
-
-@pytest.fixture
-def engine(source_and_engine):
-    return source_and_engine[1]
+def stepped():
+    """Run 0 is pinned, run 1 with another Q runs."""
+    made = Stepped()
+    made.put(readings(*values(N)))
+    made.submit(commands.Pin(0), commands.SetTuning("Q.rate", 0.1))
+    return made
 
 
 def mean(tuning):
@@ -66,34 +55,34 @@ def points(series, run):
     return found
 
 
-def test_a_pinned_run_gives_its_own_points(engine):
-    shown = points(Series(engine), "0")
+def test_a_pinned_run_gives_its_own_points(stepped):
+    shown = points(Series(stepped.engine), "0")
     np.testing.assert_allclose(shown.x, np.arange(N) * 0.1, atol=1e-9)
     np.testing.assert_allclose(shown.values[MEAN], mean(FIRST), rtol=1e-6)
 
 
-def test_a_difference_is_that_of_the_same_rows_and_follows_what_runs(engine):
-    series = Series(engine)
+def test_a_difference_is_that_of_the_same_rows_and_follows_what_runs(stepped):
+    series = Series(stepped.engine)
     lane = ChartStream("less", ChartQuery((MEAN,), run="difference:0", points=2000), series.columns)
     series.open(lane)
     expected = mean(FIRST) - mean(FIRST.set("Q.rate", 0.1))
     assert np.abs(expected).max() > 0.1
     np.testing.assert_allclose(taken(series, lane).values[MEAN], expected, atol=1e-5)
     assert taken(series, lane) is None
-    carry_out(engine, commands.SetTuning("R.winding", 3.0))
+    stepped.submit(commands.SetTuning("R.winding", 3.0))
     expected = mean(FIRST) - mean(FIRST.set("Q.rate", 0.1).set("R.winding", 3.0))
     np.testing.assert_allclose(taken(series, lane).values[MEAN], expected, atol=1e-5)
 
 
-def test_what_is_not_pinned_gives_nothing(engine):
-    series = Series(engine)
+def test_what_is_not_pinned_gives_nothing(stepped):
+    series = Series(stepped.engine)
     assert points(series, "1") is None and points(series, "difference:7") is None
-    carry_out(engine, commands.Unpin(0))
+    stepped.submit(commands.Unpin(0))
     assert points(series, "0") is None
 
 
-def test_nothing_is_held_of_a_run_that_nobody_looks_at(engine):
-    series = Series(engine)
+def test_nothing_is_held_of_a_run_that_nobody_looks_at(stepped):
+    series = Series(stepped.engine)
     live = ChartStream("live", ChartQuery((MEAN,)), series.columns)
     series.open(live)
     assert points(series, "0") is not None and "0" in series._kept
@@ -115,18 +104,17 @@ def all_of(tuning, n, late=()):
     return fold("kf", MODEL, tuning, log).mean[:, 0]
 
 
-def said(source, engine, n):
-    """The asset goes on, up to n readings."""
+def go_on(stepped, n):
+    """The asset goes on, up to n measurements."""
     t, y = longer(n)
-    source.put(readings(t[N:], y[N:]))
-    wait_for(lambda: row_count(engine) == n)
+    stepped.put(readings(t[N:], y[N:]))
 
 
 class Watched:
     """A lane, and what its browser has."""
 
-    def __init__(self, engine, run, points=2000):
-        self.series = Series(engine)
+    def __init__(self, stepped, run, points=2000):
+        self.engine, self.series = stepped.engine, Series(stepped.engine)
         self.lane = ChartStream("pinned", ChartQuery((MEAN,), run=run, points=points), self.series.columns)
         self.browser = Browser()
         self.series.open(self.lane)
@@ -135,6 +123,7 @@ class Watched:
         """Take frames until the browser has what is asked; the values then."""
 
         def look():
+            self.engine.settle()
             for frame in self.series.frames([self.lane]):
                 self.browser.take(frame)
             return there(self.browser)
@@ -148,56 +137,47 @@ class Watched:
 
 
 @pytest.mark.parametrize("run", ["0", "difference:0"])
-def test_a_pinned_run_goes_on_with_the_asset(source_and_engine, run):
+def test_a_pinned_run_goes_on_with_the_asset(stepped, run):
     """Readings that come after it gave way, and a late one, are folded as its own settings say."""
-    source, engine = source_and_engine
     n = N + 300
 
     def expected(late=()):
         own = all_of(FIRST, n, late)
         return own if run == "0" else own - all_of(FIRST.set("Q.rate", 0.1), n, late)
 
-    watched = Watched(engine, run)
+    watched = Watched(stepped, run)
     assert watched.until(lambda browser: len(browser.x)).size == N
-    said(source, engine, n)
+    go_on(stepped, n)
     shown = watched.until(lambda browser: len(browser.x) == n)
     np.testing.assert_allclose(shown, expected(), atol=2e-5)
     late = (float(longer(n)[0][-6]) + 0.05, 55.0)
-    source.put(readings([late[0]], [late[1]]))
+    stepped.put(readings([late[0]], [late[1]]))
     shown = watched.until(lambda browser: len(browser.x) == n + 1)
     np.testing.assert_allclose(shown, expected([late]), atol=2e-5)
     watched.close()
 
 
-def test_few_points_of_one_that_goes_on_have_its_extremes(source_and_engine):
-    source, engine = source_and_engine
-    watched = Watched(engine, "0", points=50)
-    said(source, engine, N + 300)
+def test_few_points_of_one_that_goes_on_have_its_extremes(stepped):
+    watched = Watched(stepped, "0", points=50)
+    go_on(stepped, N + 300)
     shown = watched.until(lambda browser: len(browser.x) and browser.x[-1] == pytest.approx((N + 299) * 0.1))
     expected = all_of(FIRST, N + 300)
     assert len(shown) < 300 and np.nanmax(shown) == pytest.approx(expected.max(), abs=2e-5)
     watched.close()
 
 
-def test_while_nothing_comes_nothing_is_folded(engine):
-    watched = Watched(engine, "0")
+def test_while_nothing_comes_nothing_is_folded(stepped):
+    watched = Watched(stepped, "0")
     assert watched.until(lambda browser: len(browser.x)).size == N
     assert not watched.series._besides
     watched.close()
 
 
-@pytest.fixture
-def beside(monkeypatch):
-    """beside(engine): the fold of run 0, which is moved by hand."""
-    monkeypatch.setattr(Beside, "_run", lambda self: None)
-    return lambda engine: Beside(engine, engine.revisions.find(0))
-
-
-def caught_up(engine, beside):
-    """Let it take all that there is, and compare its events with the engine's; it."""
+def caught_up(engine, fold):
+    """Let the fold of a pinned run take all that there is, and compare its events with the engine's."""
     for _ in range(20):
-        beside._follow()
-    shown = beside.rows(0, 10**9)
+        fold._follow(Job("test"))
+    shown = fold.rows(0, 10**9)
     there = engine.rows(0, 10**9)
     assert shown.first == there.first and len(shown.events) == len(there.events)
     np.testing.assert_array_equal(shown.events.t, there.events.t)
@@ -205,35 +185,40 @@ def caught_up(engine, beside):
     return shown
 
 
-def test_a_pinned_run_outlives_events_that_were_forgotten_before_it_took_them(beside):
-    source = Scripted()
-    engine = Engine(twin(history=2048), lambda report: source)
-    engine.start()
-    try:
-        t, y = np.arange(1, 16_001) * 0.1, 40 + np.random.default_rng(4).normal(size=16_000)
-        source.put(readings(t[:1000], y[:1000]))
-        wait_for(lambda: row_count(engine) == 1000)
-        own = beside(engine)
-        assert len(caught_up(engine, own).events) == 1000
-        source.put(readings(t[1000:], y[1000:]))
-        wait_for(lambda: engine.span()[1] == round(t[-1] * 1e9))
-        shown = caught_up(engine, own)
-        assert shown.first > 2000 and np.abs(shown.track.mean[-1, 0] - 40.0) < 2.0
-        own.stop()
-    finally:
-        engine.stop()
+def test_a_pinned_run_outlives_events_that_were_forgotten_before_it_took_them():
+    stepped = Stepped(history=2048)
+    t, y = np.arange(1, 16_001) * 0.1, 40 + np.random.default_rng(4).normal(size=16_000)
+    stepped.put(readings(t[:1000], y[:1000]))
+    engine = stepped.engine
+    own = PinnedFold(engine, engine.revisions.find(0))
+    assert len(caught_up(engine, own).events) == 1000
+    own._job.cancel()
+    stepped.put(readings(t[1000:], y[1000:]))
+    shown = caught_up(engine, own)
+    assert shown.first > 2000 and np.abs(shown.track.mean[-1, 0] - 40.0) < 2.0
 
 
-def test_a_pinned_run_goes_on_where_the_log_begins_again(source_and_engine, beside):
-    source, engine = source_and_engine
-    own = beside(engine)
+def test_a_pinned_run_goes_on_where_the_log_begins_again():
+    stepped = Stepped(source=Replayed())
+    stepped.put(readings(*values(N)))
+    stepped.submit(commands.Pin(0), commands.SetTuning("Q.rate", 0.1))
+    engine = stepped.engine
+    own = PinnedFold(engine, engine.revisions.find(0))
     assert len(caught_up(engine, own).events) == N and own.caught_up
-    engine._inbox.put(Restarted())
-    wait_for(lambda: engine.span() == (0, 0))
-    source.put(readings(*values(2 * N, seed=10)))
-    wait_for(lambda: row_count(engine) == 2 * N)
+    stepped.source.restart()
+    stepped.put(readings(*values(2 * N, seed=10)))
     shown = caught_up(engine, own)
     log = Log(MODEL.width)
     log.extend(readings(*values(2 * N, seed=10)))
     np.testing.assert_array_equal(shown.track.mean, fold("kf", MODEL, FIRST, log).mean)
-    own.stop()
+
+
+def test_a_pinned_run_that_fails_ends_and_its_kept_rows_stay(stepped):
+    watched = Watched(stepped, "0")
+    assert watched.until(lambda browser: len(browser.x)).size == N
+    go_on(stepped, N + 10)
+    kept = watched.series._pulled("0")
+    own = watched.series._beside("0", kept)
+    own._fail("no such luck")
+    assert not own.caught_up and any("run 0 is not continued: no such luck" in text for text in stepped.notices())
+    watched.close()

@@ -1,13 +1,11 @@
-"""A pinned run goes on beside what runs, over the same log, while somebody looks at it: else it would leave the charts.
+"""Pinned runs continue beside the running fold while a client shows them, so that their charts do not end.
 
-A thread of the lowest priority folds what the engine has folded with the settings of the run: from where the engine's
-own fold starts, so that its rows are those that were kept, and on from there.
+A job folds the log that the engine has folded, with the settings of the run: from where the engine's own fold starts,
+so that its rows are those that were kept, and on from there.
 """
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 from collections.abc import Iterable
 from dataclasses import replace
@@ -17,25 +15,25 @@ import numpy as np
 from estimators.fold import Fold
 from estimators.log import Events, Log
 
-from ...live.integrity import LOWEST
 from ...live.interface import Running
+from ...live.jobs import Job
 from ...live.outputs import Cursor, Pull
 from ...live.revisions import Run
 from .charted_run import ROWS, Levels, less
 from .columns import Column
 from .levels_of_detail import FIRST, Groups, grouped
 
-PERIOD = 0.1
-"""Seconds between two looks at whether something came."""
+POLL_PERIOD_S = 0.1
+"""Seconds between two looks for new events."""
 
-MOST = 4096
+PULL_EVENTS = 4096
 """Events that are taken at once."""
 
-CHUNK = 64
-"""Events that are folded at once: whoever looks waits no longer."""
+CHUNK_EVENTS = 64
+"""Events that are folded at once: a reader waits no longer."""
 
 
-class Beside:
+class PinnedFold:
     """The fold of one run that is not the running one. Any thread may read its rows."""
 
     def __init__(self, engine: Running, run: Run) -> None:
@@ -44,15 +42,13 @@ class Beside:
         self._cursor = engine.cursor(follows_log=True)
         self._marks: list[Cursor] = []
         self._fold: Fold | None = None
-        self._stopping = threading.Event()
         self.caught_up = False
-        """Whether it has come to where the kept rows end."""
-        self._thread = threading.Thread(target=self._run, name=f"run {run.number}", daemon=True)
-        self._thread.start()
+        """Whether it has reached the end of the kept rows."""
+        self._job = engine.jobs.run(f"run {run.number}", self._follow, every=POLL_PERIOD_S, failed=self._fail)
 
     def stop(self) -> None:
-        """Nobody looks any more."""
-        self._stopping.set()
+        """End the fold; no client shows the run."""
+        self._job.cancel()
         self._engine.release(self._cursor)
 
     def mark(self) -> Cursor:
@@ -92,23 +88,18 @@ class Beside:
         events = Events(*(column.copy() for column in log.events.select(rows)))
         return Pull(self.run.number, False, start, events, self._fold.track.select(rows).copy(), oldest=log.first)
 
-    def _run(self) -> None:
-        if sys.platform == "linux":
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOWEST)
-        try:
-            while not self._stopping.is_set():
-                if not self._follow():
-                    self._stopping.wait(PERIOD)
-        except Exception as error:  # noqa: BLE001  a user's model may raise anything; the kept rows stay
-            self.caught_up = False
-            text = f"page error: run {self.run.number} goes on no further: {error}"
-            self._engine.notices.report("page error", text, "error")
+    def _fail(self, reason: str) -> None:
+        # The kept rows stay.
+        self.caught_up = False
+        self._job.cancel()
+        text = f"page error: run {self.run.number} is not continued: {reason}"
+        self._engine.notices.report("page error", text, "error")
 
-    def _follow(self) -> bool:
-        """Fold what came; whether there was so much that there may be more."""
-        pull = self._engine.pull(self._cursor, MOST)
+    def _follow(self, job: Job) -> float:
+        """Fold what came; return the seconds until the next look."""
+        pull = self._engine.pull(self._cursor, PULL_EVENTS)
         if pull.fresh and not self._begin(pull):
-            return False
+            return POLL_PERIOD_S
         assert self._fold is not None
         fold, log = self._fold, self._fold.log
         with self._lock:
@@ -118,16 +109,16 @@ class Beside:
                 if at > log.n:
                     # The engine has forgotten events that were not taken yet: all of them again, from where it starts.
                     self._cursor.log = -1
-                    return True
+                    return 0.0
                 fold.rewind(at)
                 log.n = at
                 log.extend(pull.events)
-                fold.advance(at - fold.n + CHUNK)
+                fold.advance(at - fold.n + CHUNK_EVENTS)
                 for mark in self._marks:
                     mark.next = min(mark.next, pull.first)
-        while not self._stopping.is_set():
+        while job.wanted:
             with self._lock:
-                if not fold.advance(CHUNK):
+                if not fold.advance(CHUNK_EVENTS):
                     break
         with self._lock:
             if pull.oldest - log.first > log.n // 2:
@@ -136,7 +127,7 @@ class Beside:
                 log.drop_front(count)
         kept = self.run.track
         self.caught_up |= kept is None or log.first + fold.n >= kept.first + len(kept.events)
-        return len(pull.events) == MOST
+        return 0.0 if len(pull.events) == PULL_EVENTS else POLL_PERIOD_S
 
     def _begin(self, pull: Pull) -> bool:
         """Begin where the engine's fold does, also when the log has begun again; False if that has just moved."""
@@ -156,13 +147,13 @@ class Beside:
         return True
 
 
-class BesideRun:
+class PinnedRun:
     """See `series.run.Run`: the rows of a pinned run, or, with `than`, its means less those of what runs there."""
 
-    def __init__(self, beside: Beside, columns: dict[str, Column], than: Running | None = None) -> None:
-        self.beside, self._levels, self._than = beside, Levels(columns), than
-        self._mark = beside.mark()
-        self.revision = beside.run.number
+    def __init__(self, fold: PinnedFold, columns: dict[str, Column], than: Running | None = None) -> None:
+        self.fold, self._levels, self._than = fold, Levels(columns), than
+        self._mark = fold.mark()
+        self.revision = fold.run.number
         self.generation = self.changed = self.end = 0
 
     def sync(self, columns: Iterable[str]) -> None:
@@ -175,7 +166,7 @@ class BesideRun:
             self.generation += 1
         self.changed = self.end
         while True:
-            pull = self.beside.pull(self._mark, ROWS)
+            pull = self.fold.pull(self._mark, ROWS)
             if len(pull.events):
                 self._levels.take(pull if self._than is None else less(pull, self._than))
                 self.changed = min(self.changed, pull.changed)
@@ -185,12 +176,12 @@ class BesideRun:
 
     def span(self, since: int, until: int) -> tuple[int, int]:
         """See `Run`."""
-        return self.beside.index_at(since), self.beside.index_at(until)
+        return self.fold.index_at(since), self.fold.index_at(until)
 
     def groups(self, size: int, start: int, stop: int, columns: list[str]) -> Groups:
         """See `Run`."""
         if size >= FIRST:
             return self._levels.part(size, start, stop, columns)
-        pull = self.beside.rows(start * size, min(stop * size, self.end))
+        pull = self.fold.rows(start * size, min(stop * size, self.end))
         pull = pull if self._than is None else less(pull, self._than)
         return grouped(size, pull.first, pull.events.t, self._levels.values(pull, columns))

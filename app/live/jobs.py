@@ -1,0 +1,241 @@
+"""Background jobs of a running twin: one pool of threads at the lowest priority.
+
+Work that needs many folds (protection levels, sweeps, fits, smoothing) runs here and never delays the engine.
+A job is a function that takes its `Job`; it calls `check` or `rest` often, which end it once nobody wants the result.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import math
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from typing import Any
+
+from estimators.errors import NisusError
+
+from .notices import Notices
+
+MAX_JOBS = 6
+"""Jobs that run at once; the others wait. A fit, an advice and a smoother may each take minutes."""
+
+LOWEST_PRIORITY = 19
+"""Niceness of the threads."""
+
+STOP_TIMEOUT_S = 1.0
+
+RUNNING, CANCELLING, CANCELLED, FAILED, DONE = "running", "cancelling", "cancelled", "failed", "done"
+
+
+class Cancelled(Exception):  # noqa: N818  no error: the result is not wanted
+    """The job was cancelled, or its result is out of date."""
+
+
+class Job:
+    """Handle of one job: state, result, and cancellation.
+
+    `state` is RUNNING from the moment of the request, then DONE with `result`, FAILED with `reason`, or CANCELLED.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        work: Callable[[Job], Any] = lambda job: None,
+        *,
+        stale: Callable[[], bool] = lambda: False,
+        every: float | None = None,
+        failed: Callable[[str], Any] = lambda reason: None,
+    ) -> None:
+        """See `Jobs.run`."""
+        self.name, self.work, self.every, self.failed = name, work, every, failed
+        self._stale = stale
+        self._cancelled = threading.Event()
+        self.state, self.reason = RUNNING, ""
+        self.result: Any = None
+        self.begun = time.monotonic()
+        self.ended: float | None = None
+
+    @property
+    def over(self) -> bool:
+        """Whether it has ended."""
+        return self.ended is not None
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds from the request to the end, or until now."""
+        return (time.monotonic() if self.ended is None else self.ended) - self.begun
+
+    @property
+    def wanted(self) -> bool:
+        """Whether the result is still wanted."""
+        return not (self._cancelled.is_set() or self._stale())
+
+    def cancel(self) -> None:
+        """Ask the job to end; it does so at its next `check`."""
+        if not self.over:
+            self.state = CANCELLING
+        self._cancelled.set()
+
+    def check(self) -> None:
+        """Raise `Cancelled` if the result is no longer wanted."""
+        if not self.wanted:
+            raise Cancelled
+
+    def rest(self, seconds: float) -> None:
+        """Wait so many seconds; raise `Cancelled` as soon as the job is cancelled."""
+        self._cancelled.wait(seconds)
+        self.check()
+
+    def run(self) -> float | None:
+        """Call the work once in this thread; return the seconds until the next call of a repeated job, else None."""
+        answer, reason, state = None, "", DONE
+        try:
+            self.check()
+            answer = self.work(self)
+        except Cancelled:
+            state = CANCELLED
+        except NisusError as error:
+            state, reason = FAILED, str(error)
+        except (Exception, SystemExit) as error:  # noqa: BLE001  a user's model may raise anything; the twin goes on
+            state, reason = FAILED, f"{type(error).__name__}: {error}"
+        if state == FAILED:
+            self.failed(reason)
+        if self.every is not None and state != CANCELLED and not self._cancelled.is_set():
+            return self.every if state == FAILED or answer is None else float(answer)
+        self.result, self.reason, self.ended = answer, reason, time.monotonic()
+        self.state = state
+        return None
+
+
+class PacedExecutor(Executor):
+    """Runs one item after another and rests after each as long as it took, so that it takes half a processor."""
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+
+    def map(self, fn: Callable[..., Any], *iterables: Any, timeout: Any = None, chunksize: int = 1) -> Iterator[Any]:
+        """Apply a function as the built-in `map` does; raise `Cancelled` once the job is not wanted."""
+        took = 0.0
+        for items in zip(*iterables, strict=False):
+            self._job.rest(took)
+            begun = time.thread_time()
+            yield fn(*items)
+            took = time.thread_time() - begun
+
+
+class Jobs:
+    """Pool of at most `MAX_JOBS` threads, started as they are needed."""
+
+    def __init__(self, notices: Notices, *, clock: Callable[[], float] = time.monotonic) -> None:
+        """Prepare; jobs wait until `start`. Failures are reported to `notices`."""
+        self._notices, self._clock = notices, clock
+        self._wake = threading.Condition()
+        self._queue: list[tuple[float, int, Job]] = []
+        self._order = itertools.count()
+        self._under_way: set[Job] = set()
+        self._threads: list[threading.Thread] = []
+        self._idle = 0
+        self._open = self._stopping = False
+
+    def run(
+        self,
+        name: str,
+        work: Callable[[Job], Any],
+        *,
+        stale: Callable[[], bool] = lambda: False,
+        every: float | None = None,
+        failed: Callable[[str], Any] | None = None,
+    ) -> Job:
+        """Queue a job.
+
+        Args:
+            name: What it computes, for notices.
+            work: Called with the job, in a thread of the pool. What it returns is the job's `result`.
+            stale: Whether the result is out of date; the job ends at its next `check` then.
+            every: Seconds between two calls of a repeated job, which ends when it is cancelled; the work may return
+                another number of seconds. None: one call.
+            failed: Called with the reason if the work raises; by default that is a notice. A repeated job goes on.
+        """
+        job = Job(name, work, stale=stale, every=every, failed=failed or self._reporter(name))
+        self._put(job, 0.0)
+        return job
+
+    def start(self) -> None:
+        """Begin to run what is queued."""
+        with self._wake:
+            self._open = True
+            self._hire()
+
+    def stop(self) -> None:
+        """Cancel everything, and wait for what is under way, up to `STOP_TIMEOUT_S`."""
+        with self._wake:
+            self._stopping = True
+            for job in (*self._under_way, *(job for _, _, job in self._queue)):
+                job.cancel()
+            self._wake.notify_all()
+        end = time.monotonic() + STOP_TIMEOUT_S
+        for thread in self._threads:
+            thread.join(max(0.0, end - time.monotonic()))
+
+    def step(self) -> bool:
+        """Run the next job that is due in this thread; return whether there was one."""
+        with self._wake:
+            if not self._is_due():
+                return False
+            job = self._take()
+        self._carry_out(job)
+        return True
+
+    def _reporter(self, name: str) -> Callable[[str], None]:
+        return lambda reason: self._notices.report(f"job {name}", f"{name}: {reason}", level="error", counted=False)
+
+    def _put(self, job: Job, delay: float) -> None:
+        with self._wake:
+            heapq.heappush(self._queue, (self._clock() + delay, next(self._order), job))
+            self._hire()
+            self._wake.notify()
+
+    def _hire(self) -> None:
+        """Start a thread if jobs wait and none is idle."""
+        if self._open and not self._stopping and self._queue and not self._idle and len(self._threads) < MAX_JOBS:
+            thread = threading.Thread(target=self._serve, name=f"job {len(self._threads)}", daemon=True)
+            self._threads.append(thread)
+            self._idle += 1
+            thread.start()
+
+    def _is_due(self) -> bool:
+        return bool(self._queue) and self._queue[0][0] <= self._clock()
+
+    def _take(self) -> Job:
+        job = heapq.heappop(self._queue)[2]
+        self._under_way.add(job)
+        return job
+
+    def _serve(self) -> None:
+        if sys.platform == "linux":
+            # Threads that a job starts inherit it.
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOWEST_PRIORITY)
+        while True:
+            with self._wake:
+                while not self._stopping and not self._is_due():
+                    self._wake.wait(max(0.0, self._queue[0][0] - self._clock()) if self._queue else None)
+                if self._stopping:
+                    return
+                job = self._take()
+                self._idle -= 1
+                self._hire()
+            self._carry_out(job)
+            with self._wake:
+                self._idle += 1
+
+    def _carry_out(self, job: Job) -> None:
+        again = job.run()
+        with self._wake:
+            self._under_way.discard(job)
+        if again is not None and math.isfinite(again):
+            self._put(job, again)
