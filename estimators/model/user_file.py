@@ -10,6 +10,7 @@ import ast
 import hashlib
 import importlib
 import importlib.util
+import os
 import sys
 from collections.abc import Callable, Iterator
 from functools import lru_cache, partial, reduce
@@ -21,6 +22,32 @@ from typing import Any
 
 MARK = "~"
 """In the name of a function, before what tells the versions of the files that its own file imports."""
+
+
+_guarded: set[str] = set()
+"""Model files, and those that they import beside them."""
+
+
+def _refuse_exit(files: tuple[Path, ...]) -> None:
+    """Have `os._exit` and `os.abort` raise where a model's file calls them: they would end the program without a word.
+
+    Child processes that a model forks still end with them.
+    """
+    if not _guarded:
+        os._exit, os.abort = _guard(os._exit), _guard(os.abort)  # type: ignore[assignment]
+    _guarded.update(map(str, files))
+
+
+def _guard(function: Callable[..., Any]) -> Callable[..., Any]:
+    process = os.getpid()
+
+    def guarded(*given: Any) -> Any:
+        if sys._getframe(1).f_code.co_filename in _guarded and os.getpid() == process:
+            call = f"os.{function.__name__}({', '.join(map(repr, given))})"
+            raise RuntimeError(f"{call} would end the program; a model reports an error by raising an exception")
+        return function(*given)
+
+    return guarded
 
 
 def imported_beside(path: Path) -> tuple[Path, ...]:
@@ -89,6 +116,7 @@ def run_file(name: str, path: Path) -> ModuleType:
     sys.modules[name] = module  # Before it runs: dataclasses and Numba look their module up by name.
     beside = imported_beside(path)
     _forget(beside)
+    _refuse_exit((path, *beside))
     sys.path.insert(0, str(path.parent))
     # Nothing is left beside the user's files, by those that this one imports either.
     before, sys.dont_write_bytecode = sys.dont_write_bytecode, True

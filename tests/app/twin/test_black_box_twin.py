@@ -101,6 +101,15 @@ def test_processes_run_the_models_file_and_give_the_bits_of_threads(tmp_path: Pa
         run(tmp_path / "processes", BOX.replace("EXECUTOR", "'processes'"), last=9.0)
 
 
+@pytest.mark.parametrize("call", ["os._exit(3)", "os.abort()", "sys.exit(3)"])
+@pytest.mark.parametrize("executor", ["threads", "processes"])
+def test_a_model_that_would_end_the_program_is_one_line(tmp_path: Path, call: str, executor: str) -> None:
+    text = BOX.replace('raise ValueError("the step is too long")', f"import sys; {call}")
+    line = BOX.splitlines().index('        raise ValueError("the step is too long")') + 1
+    with pytest.raises(ModelError, match=rf"box.py:{line}: model box: f fails on .*(would end the program|SystemExit)"):
+        run(tmp_path, text.replace("EXECUTOR", repr(executor)), last=9.0)
+
+
 @pytest.mark.parametrize("f", ["lambda X, u, p, dt: X", "Called().f"])
 def test_what_has_no_name_in_the_file_is_refused(tmp_path: Path, f: str) -> None:
     called = "class Called:\n    def f(self, X, u, p, dt):\n        return X\n\n\nFACTOR"

@@ -290,6 +290,13 @@ def test_a_model_from_a_file_beside_the_yaml(monkeypatch: pytest.MonkeyPatch) ->
             ModelError,
             "pump.py:2: SystemExit: 3; correct the model's file",
         ),
+        (
+            "from os import _exit\n_exit(3)\n",
+            "./pump.py:Pump",
+            ModelError,
+            "pump.py:2: RuntimeError: os._exit(3) would end the program; a model reports an error by raising an "
+            "exception; correct the model's file",
+        ),
         ("x = 1\x00", "./pump.py:Pump", ModelError, "pump.py: "),
         (
             PUMP.replace("0.01", "-1.0"),
