@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from estimators.errors import ConfigError
@@ -43,3 +45,23 @@ def read_text(path: Path, listing: str) -> str:
             raise ConfigError(f"{shown_name}: it is a recording; `nisus review {shown_name}` opens it") from None
         line = raw.count(b"\n", 0, error.start) + 1
         raise ConfigError(f"{shown_name}:{line}: it is not UTF-8 text; is this the YAML file?") from None
+
+
+@contextmanager
+def writing(path: Path, option: str = "") -> Iterator[None]:
+    """Report an error while a file is written in one line that names it.
+
+    Args:
+        path: The file.
+        option: Option of the command line that gave it.
+
+    Raises:
+        ConfigError: In place of any OSError; most of those name no file (a full disk).
+    """
+    try:
+        yield
+    except OSError as error:
+        name = f"{option} {shown_path(path)}".strip()
+        raise ConfigError(
+            f"{name}: cannot be written: {error.strerror or error}; check free space and permissions"
+        ) from None

@@ -12,7 +12,7 @@ from estimators.errors import ConfigError
 
 from ..terminal import complain, restore, when_asked_to_end
 from ..twin.twin import Twin, load_twin
-from .given import settings
+from .options import settings
 
 if TYPE_CHECKING:
     from .arguments import Bus

@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
+from config.files import writing
+
 from ..present.result import to_html, to_text
+from ..twin.log_reader import read_log
 from ..twin.twin import load_twin
 from .check_figures import figures
 from .check_tables import sections
 from .checked import Checked, check
-from .fold import read_log
-from .given import settings
+from .options import settings
 from .prepare import attend, prepare
 
 if TYPE_CHECKING:
@@ -30,7 +32,8 @@ def check_twin(arguments: Arguments) -> int:
     checked: Checked = attend(twin.model, lambda: check(twin, log, counts), "checking")
     parts = sections(checked)
     if arguments.html is not None:
-        arguments.html.write_text(to_html(f"nisus check {twin.name}", parts), encoding="utf-8")
+        with writing(arguments.html, "--html"):
+            arguments.html.write_text(to_html(f"nisus check {twin.name}", parts), encoding="utf-8")
     if arguments.json:
         print(json.dumps(figures(checked), allow_nan=False))
     else:

@@ -12,10 +12,9 @@ from estimators.diagnostics.sensitivity import Sensitivity, View, bounds_of
 from estimators.track import HEALTH_NAMES
 
 from ..present.result import plain
+from ..studies.fold_result import calibration_dict, number
 from .check_list import blamed, checklist, stamps
 from .checked import Checked
-from .fold_report import calibration_dict
-from .fold_smoothed import number
 
 
 def figures(checked: Checked) -> dict[str, Any]:

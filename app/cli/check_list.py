@@ -15,8 +15,8 @@ from estimators.diagnostics.sensitivity.responses import digits, subject_text
 from estimators.log import MAINTENANCE
 from estimators.track import HEALTH_NAMES, Track
 
+from ..studies.scores import scores_file
 from .checked import Checked
-from .scores import scores_file
 
 YES, PARTLY, NO, NONE = "yes", "partly", "no", "not told"
 

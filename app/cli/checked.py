@@ -17,9 +17,9 @@ from estimators.fold import Fold
 from estimators.log import READING, Log
 from estimators.registry import find_entry
 
+from ..studies.compare import timed
+from ..studies.fold_result import calibration_of
 from ..twin.twin import Twin
-from .compare_fold import timed
-from .fold_report import calibration_of
 
 BUDGET = 20.0
 """Seconds of one processor for the folds with a sensor held out; of a log that takes longer the first part is taken."""

@@ -15,9 +15,9 @@ from estimators.track import DIVERGED, FAILED, GATED, SCREENED, STALE
 
 from ..live.tunings.versions import write_section
 from ..live.watchdog import interruptible
+from ..twin.log_reader import read_log
 from ..twin.twin import load_twin
-from .fold import read_log
-from .given import settings
+from .options import settings
 from .prepare import prepare
 
 if TYPE_CHECKING:

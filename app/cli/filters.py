@@ -11,8 +11,8 @@ from estimators.estimator import Option
 from estimators.log import READING
 from estimators.registry import ESTIMATORS, unfit
 
+from ..twin.log_reader import read_log
 from ..twin.twin import Twin, load_twin
-from .fold import read_log
 from .prepare import attend
 
 if TYPE_CHECKING:

@@ -8,17 +8,14 @@ from typing import TYPE_CHECKING
 
 import numba
 
-from config.files import shown_path
+from config.files import writing
 from estimators.errors import ConfigError, printable
 
 from ..present.result import Topic, to_text
-from ..studies.guard.junit import Guarded, junit
-from ..studies.guard.last import keep_last
-from .beside import beside, jobs_of
-from .given import settings
-from .guard_archive import Archived, chosen
-from .guard_fold import Wanted, guarded
-from .places import check_place
+from ..studies.guard.archive import Archived, Wanted, chosen, guarded
+from ..studies.guard.baseline import Guarded, junit, keep_last
+from ..studies.processes import beside, jobs_of
+from .options import check_place, settings
 from .progress import progress
 
 if TYPE_CHECKING:
@@ -39,12 +36,8 @@ def guard(arguments: Arguments) -> int:
         for twin in dict.fromkeys(each.twin for each in archive):
             keep_last(twin, [one for each, one in zip(archive, found, strict=True) if each.twin == twin])
     if arguments.junit is not None:
-        try:
+        with writing(arguments.junit, "--junit"):
             arguments.junit.write_bytes(junit(found, absent_fails=must))
-        except OSError as error:
-            raise ConfigError(
-                f"--junit {shown_path(arguments.junit)}: {error.strerror}; choose another place"
-            ) from None
     print("\n".join(to_text(_parts(found, must))))
     if any(each.failure or (each.absent and must) for each in found):
         return 2

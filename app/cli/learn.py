@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from config.files import shown_path
+from config.files import shown_path, writing
 from estimators.errors import ConfigError
 from estimators.fit.entries import Setting
 from estimators.fit.judge import Part, worths
@@ -24,15 +24,13 @@ from estimators.smoothing.smooth import check_smooth
 from estimators.tuning import Tuning
 
 from ..present.result import to_text
+from ..studies.learn import Lesson, as_dict, correction_text, noises_of, scores_of, sections
 from ..terminal import complain
 from ..twin.learned import run_net
+from ..twin.log_reader import read_log
 from ..twin.model import physics_of
 from ..twin.twin import Twin, load_twin
-from .fold import read_log
-from .given import settings
-from .learn_file import correction_text, noises_of
-from .learn_text import Lesson, as_dict, scores_of, sections
-from .places import check_place
+from .options import check_place, settings
 from .prepare import attend, prepare
 
 if TYPE_CHECKING:
@@ -122,7 +120,8 @@ def learn_correction(arguments: Arguments) -> int:
     else:
         print("\n".join(to_text(sections(twin.name, arguments.window, lesson, arguments.keep))))
     if lesson.better and arguments.keep is not None:
-        arguments.keep.write_text(text(_beside(arguments.net, arguments.keep), scores_of(lesson)), encoding="utf-8")
+        with writing(arguments.keep, "--keep"):
+            arguments.keep.write_text(text(_beside(arguments.net, arguments.keep), scores_of(lesson)), encoding="utf-8")
         complain(f"{shown_path(arguments.keep)}: kept")
     return 0 if lesson.better else 1
 

@@ -6,11 +6,13 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from config.files import writing
 from config.loader import shipped
 from estimators.errors import ConfigError
 
 if TYPE_CHECKING:
     from .arguments import New as Arguments
+    from .arguments import Schema
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
@@ -124,8 +126,28 @@ def outflow(x, u, p, out):
 '''
 
 
-def new_twin(arguments: Arguments) -> tuple[Path, Path]:
-    """Carry the command out: a pump, or the signals of a recording.
+def write_schema(arguments: Schema) -> int:
+    """Write the JSON Schema of a twin's YAML."""
+    from config.json_schema import json_schema_text
+
+    text = json_schema_text()
+    if arguments.out is None:
+        print(text)
+    else:
+        with writing(arguments.out, "--out"):
+            arguments.out.write_text(text + "\n", encoding="utf-8")
+    return 0
+
+
+def new_twin(arguments: Arguments) -> int:
+    """Write the two files of a new twin and print their paths."""
+    for path in new_files(arguments):
+        print(path)
+    return 0
+
+
+def new_files(arguments: Arguments) -> tuple[Path, Path]:
+    """Write the two files: a pump, or the signals of a recording.
 
     Raises:
         ConfigError: If the twin cannot be written so.
@@ -137,8 +159,8 @@ def new_twin(arguments: Arguments) -> tuple[Path, Path]:
         if wanted or arguments.dbc:
             raise ConfigError("--signals and --dbc say what to take from a recording; name it with --log FILE")
         return write_twin(name, folder)
-    from ..studies.advice.log.draft import python_text, yaml_text
-    from ..studies.advice.log.plan import plan
+    from ..studies.advice.draft import python_text, yaml_text
+    from ..studies.advice.plan import plan
     from .log import database_of, look
 
     check_new(name, folder)
@@ -204,9 +226,6 @@ def write_pair(name: str, folder: Path, yaml_text: str, python_text: str) -> tup
     """
     paths = folder / f"{name}.yaml", folder / f"{name}.py"
     for path, text in zip(paths, (yaml_text, python_text), strict=True):
-        try:
-            with path.open("x", encoding="utf-8") as file:
-                file.write(text)
-        except OSError as error:
-            raise ConfigError(f"{path}: it cannot be written: {error.strerror}; check the folder") from None
+        with writing(path), path.open("x", encoding="utf-8") as file:
+            file.write(text)
     return paths

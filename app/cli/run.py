@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from estimators.errors import ConfigError
@@ -15,9 +16,9 @@ from ..views.recording.format import TAKEN
 from ..views.recording.rrd_file import NEVER, parse_split
 from ..web.gallery.gallery import StartRequest
 from ..web.port import check_port
-from ..web.session import Page
-from .given import settings
-from .opener import FileOpener, live_source, open_session, opened_twin
+from ..web.session import Page, Session
+from .open_twin import FileOpener, live_source, open_session, opened_review, opened_twin
+from .options import settings
 from .prepare import prepare
 
 if TYPE_CHECKING:
@@ -81,4 +82,33 @@ def run_twin(arguments: Run, workers: Sequence[Worker] = ()) -> int:
             if "adopted" in text or k >= len(refits) - SAID:
                 complain(text)
         return 2 if failed else 0
+    return 0
+
+
+if TYPE_CHECKING:
+    from ..web.running import Opening
+    from .arguments import Review
+
+
+def open_review(path: Path, page: Page | None, recordings: Path = Path()) -> tuple[Session, Opening]:
+    """A session over the recorded readings, and what it runs.
+
+    Raises:
+        NisusError: As `opened_review`, or if the page's port is in use.
+    """
+    if page is not None:
+        check_port(page.port)
+    opening = opened_review(path)
+    prepare(opening.twin)
+    for level, text in opening.remarks:
+        if level == "warn":
+            complain(text)
+    return open_session(opening, StartRequest(recording=path), FileOpener(), page=page, recordings=recordings), opening
+
+
+def review_recording(arguments: Review) -> int:
+    """Carry the command out."""
+    page = Page(arguments.port, not arguments.no_browser)
+    session, _ = open_review(arguments.file, page, arguments.recordings)
+    session.run(record=None, duration=arguments.duration, until_finished=False)
     return 0

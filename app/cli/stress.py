@@ -19,7 +19,7 @@ from ..studies.stress.matrix import matrix
 from ..studies.stress.scenario import Bench, Mistake, asset_of
 from ..terminal import complain
 from ..twin.twin import load_twin
-from .given import settings
+from .options import settings
 from .prepare import prepare
 from .progress import progress
 

@@ -3,32 +3,33 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from config.files import shown_path
+from pydantic_core import PydanticCustomError
+
+from config.fields import as_seconds
+from config.files import shown_path, writing
 from config.loader import find
-from config.source_schema import SimulatorSection
 from estimators.errors import ConfigError, printable
-from estimators.fit.aims import CRPS, ERROR
+from estimators.fit.aims import CRPS, ERROR, LIKELIHOOD
+from estimators.fit.dual import Refit, walk
 from estimators.fit.fit import Fitted, fit
 from estimators.fit.recording import Recording
-from estimators.log import Log
 
 from ..live.runs.runs_json import fit_json
 from ..live.tunings.fitted import settings_of
 from ..live.tunings.tuning_yaml import tuning_yaml
 from ..live.tunings.versions import check_free, keep, version_text
 from ..present.result import to_text
+from ..studies.tune import heading, sections, window_json, window_topics, windows_verdict
 from ..terminal import complain
 from ..twin.bounds import bounds_of, natural_aim
+from ..twin.log_reader import read_log, read_logs
 from ..twin.twin import Twin, load_twin
-from .fold import read_log
-from .given import settings
-from .places import check_place
+from .options import check_place, settings
 from .prepare import attend, prepare
-from .tune_text import heading, sections
-from .tune_windows import tune_windows
 
 if TYPE_CHECKING:
     from .arguments import Tune as Arguments
@@ -78,7 +79,8 @@ def tune_twin(arguments: Arguments) -> int:
         print("\n".join(to_text(sections(twin, found))))
     if arguments.save is not None and found.proposed:
         text = heading(twin, found) + tuning_yaml(twin.config, twin.estimator, *found.setting)
-        arguments.save.write_text(text, encoding="utf-8")
+        with writing(arguments.save, "--save"):
+            arguments.save.write_text(text, encoding="utf-8")
     if arguments.keep is not None and found.proposed:
         fitted_on = arguments.log or (f"{twin.name}, its own log",)
         given = settings_of(found, [str(name) for name in fitted_on], printable(arguments.note))
@@ -92,7 +94,9 @@ def _recordings(arguments: Arguments) -> tuple[Twin, list[Recording]]:
     if not arguments.log:
         twin = load_twin(arguments.twin, overrides=overrides)
         prepare(twin)
-        return twin, [Recording(log) for log in _own(twin, arguments, overrides)]
+        return twin, [
+            Recording(log) for log in read_logs(twin, arguments.twin, overrides, arguments.logs, arguments.duration)
+        ]
     if arguments.logs != 1:
         raise ConfigError("--logs: is for a simulated twin; a recording is named by --log, once each")
     named = [_named(text) for text in arguments.log]
@@ -121,14 +125,76 @@ def _named(text: str) -> tuple[list[Path], float]:
     return [Path(part) for part in files.split(",")], number
 
 
-def _own(twin: Twin, arguments: Arguments, overrides: dict[str, str]) -> list[Log]:
-    if arguments.logs == 1:
-        return [read_log(twin, arguments.duration)[0]]
-    source = twin.config.source
-    if arguments.logs < 1:
-        raise ConfigError(f"--logs {arguments.logs}: must be 1 or more")
-    if not isinstance(source, SimulatorSection):
-        raise ConfigError(f"--logs {arguments.logs}: {twin.name} is not simulated; name recordings by --log")
-    seeds = range(source.seed, source.seed + arguments.logs)
-    twins = (load_twin(arguments.twin, overrides={**overrides, "source.seed": str(seed)}) for seed in seeds)
-    return [read_log(other, arguments.duration)[0] for other in twins]
+Recordings = Callable[["Arguments"], tuple[Twin, list[Recording]]]
+
+
+def tune_windows(arguments: Arguments, wanted: Sequence[str], recordings: Recordings) -> int:
+    """Carry the command out; `recordings` reads what is named.
+
+    Returns:
+        0 if something was adopted, else 1.
+    """
+    assert arguments.windows is not None
+    window = _seconds("--windows", arguments.windows)
+    every = window if arguments.every is None else _seconds("--every", arguments.every)
+    if arguments.aim not in (None, LIKELIHOOD):
+        raise ConfigError(f"--aim {arguments.aim}: windows are fitted by their likelihood; leave it out")
+    twin, given = recordings(arguments)
+    if any(item.weight != 1.0 for item in given):
+        raise ConfigError("--log: with --windows each recording follows the one before; leave the weights out")
+
+    def work() -> list[tuple[int, Refit]]:
+        found, tuning = [], twin.tuning
+        for k, item in enumerate(given):
+            for refit in walk(
+                twin.estimator,
+                tuning,
+                item.log,
+                wanted=wanted,
+                window=window,
+                every=every,
+                bounds=bounds_of(twin.config, twin.model),
+                blocks=arguments.blocks,
+            ):
+                # Its rows are many, and nobody asks for them here.
+                found.append((k, refit._replace(lived=refit.lived.select(slice(0, 0)).copy())))
+                if refit.fitted is not None and refit.proposed:
+                    tuning = refit.fitted.setting.tuning
+        return found
+
+    found = attend(twin.model, work, "fitting window after window")
+    origins = [int(item.log.t[0]) for item in given]
+    ends = [int(item.log.t[item.log.n - 1]) for item in given]
+    if arguments.json:
+        told = [window_json(k, refit, origins[k]) for k, refit in found]
+        print(json.dumps({"twin": twin.name, "window": window, "every": every, "windows": told}, allow_nan=False))
+    else:
+        print("\n".join(to_text([*window_topics(found, origins), windows_verdict(twin, found, origins, ends)])))
+    adopted = [refit.fitted for _, refit in found if refit.fitted is not None and refit.proposed]
+    if not adopted:
+        return 1
+    last = adopted[-1]
+    if arguments.save is not None:
+        with writing(arguments.save, "--save"):
+            arguments.save.write_text(
+                heading(twin, last) + tuning_yaml(twin.config, twin.estimator, *last.setting), encoding="utf-8"
+            )
+    if arguments.keep is not None:
+        names = [str(name) for name in arguments.log or (f"{twin.name}, its own log",)]
+        settings = settings_of(last, [f"{', '.join(names)}: windows of {window:g} s"], printable(arguments.note))
+        path = keep(twin, arguments.keep, version_text(twin, settings))
+        complain(f"{shown_path(path)}: kept")
+    return 0
+
+
+def _seconds(option: str, text: str) -> float:
+    try:
+        value = as_seconds(text)
+    except PydanticCustomError:
+        try:
+            value = float(text)
+        except ValueError:
+            raise ConfigError(f"{option} {text}: give seconds, or a number with its unit, as in 10min") from None
+    if not 0.0 < value < float("inf"):
+        raise ConfigError(f"{option} {text}: must be positive")
+    return float(value)

@@ -15,9 +15,9 @@ from ..live.changes import difference
 from ..live.tunings.versions import COVERAGE, Settings, accept, figures, keep, listing, version_text
 from ..live.watchdog import interruptible
 from ..present.result import Topic, to_text
+from ..twin.log_reader import read_log
 from ..twin.twin import load_twin
-from .fold import read_log
-from .given import settings
+from .options import settings
 from .prepare import prepare
 
 if TYPE_CHECKING:

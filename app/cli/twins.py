@@ -5,11 +5,10 @@ from __future__ import annotations
 from itertools import takewhile
 from typing import TYPE_CHECKING
 
+from config.files import writing
 from config.loader import Loaded, find, load, shipped, shown_path
-from estimators.errors import ConfigError
 
-from .compare_table import printed
-from .scores import read_scores
+from ..studies.scores import printed, read_scores
 
 if TYPE_CHECKING:
     from .arguments import Twins as Arguments
@@ -33,9 +32,9 @@ def show_twins(arguments: Arguments) -> int:
 def _drawn(name: str) -> str:
     """Fold a twin's log, draw its picture for the gallery and keep it; the file."""
     from ..present.drawing.card import picture_of
+    from ..twin.log_reader import read_log
     from ..twin.twin import load_twin
     from ..web.gallery.cards import picture_file
-    from .fold import read_log
     from .prepare import prepare
 
     twin = load_twin(name)
@@ -44,11 +43,10 @@ def _drawn(name: str) -> str:
     duration = 10.0 * twin.config.view.window if twin.config.source.type == "simulator" else None
     log, _ = read_log(twin, duration)
     path = picture_file(find(name))
-    try:
+    picture = picture_of(twin, log)
+    with writing(path):
         path.parent.mkdir(exist_ok=True)
-        path.write_text(picture_of(twin, log), encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{shown_path(path)}: {error.strerror}; the picture cannot be written there") from None
+        path.write_text(picture, encoding="utf-8")
     return shown_path(path)
 
 

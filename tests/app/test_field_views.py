@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from app.cli.review import open_review
+from app.cli.run import open_review
 from app.live import commands
 from app.live.engine import Engine
 from app.present.drawing.colors import ERROR, FAR, NOTHING, ODD, QUIET, SILENT, Frame, Scale, sensor_colors

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from app.cli.fold import read_log
+from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin
 from config.loader import shipped
 from estimators.errors import NisusError

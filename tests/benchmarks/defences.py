@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from app.cli.fold import read_log
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators import fold_kernel
 from estimators.diagnostics.health import assess

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from app.cli.fold import read_log
+from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin
 from estimators.log import Log
 from estimators.track import USED, Track

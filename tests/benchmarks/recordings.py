@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from app.cli.fold import read_log
 from app.twin.bounds import bounds_of
+from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin
 from estimators.errors import NisusError
 from estimators.fit.aims import AIMS, WITNESSES, correlation_time, track_of, witnesses

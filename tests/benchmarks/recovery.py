@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from app.cli.fold import read_log
+from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin
 from estimators.diagnostics.score import score
 from estimators.fit.entries import Entry, entries_of, with_values

@@ -8,7 +8,7 @@ from time import process_time
 
 import numpy as np
 
-from app.cli.fold import read_log
+from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin
 from estimators.fit.fit import Line
 from estimators.fold import Fold

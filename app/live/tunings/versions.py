@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from config.files import shown_path
+from config.files import shown_path, writing
 from config.tuning_schema import AcceptedSection, EvidenceSection, VersionSection
 from config.tunings import OWN, Version, check_name, folders, load_version, version_files, version_of
 from config.yaml_text import as_section
@@ -37,15 +37,13 @@ def write_section(path: Path, key: str, section: str) -> None:
     pattern = re.compile(
         rf"^{re.escape(key)}:.*(?:\n|\Z)(?:(?:[ \t]*(?:#.*)?\r?\n)*[ \t]+[^\s#].*(?:\n|\Z))*", re.MULTILINE
     )
-    try:
+    with writing(path):
         with path.open(encoding="utf-8", newline="") as file:
             text = file.read()
         end = "\r\n" if "\r\n" in text else "\n"
         section = section.replace("\n", end)
         kept, found = pattern.subn(lambda _: section, text, count=1)
         path.write_text(kept if found else text.rstrip("\r\n") + 2 * end + section, encoding="utf-8", newline="")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written ({error.strerror})") from None
 
 
 def listing(twin: Twin) -> list[dict[str, Any]]:
@@ -169,14 +167,13 @@ def keep(twin: Twin, name: str, text: str) -> Path:
     """
     path = check_free(twin.path, name)
     version_of(name, text, path)
-    try:
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError:
-        raise _taken(path) from None
-    except OSError as error:
-        raise ConfigError(f"{shown_path(path)}: {error.strerror}; the version cannot be written there") from None
+        try:
+            with path.open("x", encoding="utf-8") as file:
+                file.write(text)
+        except FileExistsError:
+            raise _taken(path) from None
     return path
 
 

@@ -54,9 +54,8 @@ class Advising:
 
     def measure(self, job: Job) -> dict[str, Any]:
         """Return the advice on a copy of the log, as JSON."""
-        from .advice_json import advice_json
         from .measured import Measured
-        from .verdict import advise
+        from .verdict import advice_json, advise
 
         tuning, estimator = self._engine.folded_with()
         log, _ = copy_log(self._engine, tuning, check=job.check)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -11,9 +12,9 @@ import numpy as np
 
 from estimators.diagnostics.score import score
 from estimators.diagnostics.sensitivity import Gramian, gramian
-from estimators.diagnostics.sensitivity.checklist import Linearity, linearity
+from estimators.diagnostics.sensitivity.checklist import LEAST, Linearity, linearity
 from estimators.diagnostics.sensitivity.posterior import Peaks, peaks
-from estimators.diagnostics.sensitivity.responses import stand_in
+from estimators.diagnostics.sensitivity.responses import digits, stand_in
 from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.log import READING, Log
@@ -115,3 +116,57 @@ def likelihood_of(fold: Fold, n: int) -> float:
     part = slice(0, n)
     found = score(fold.track.select(part), fold.log.events.select(part), fold.model, (), gate=fold.tuning.gate)
     return found.log_likelihood / max(1, found.readings + found.gated)
+
+
+YES, NO, UNTOLD = "yes", "no", "not told"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A question and its answer.
+
+    `figure` is the number that decides, `threshold` what it is compared with, and `of` says what both are, with the
+    unit; the figure is None where nothing could be measured, and `answer` is then by the model's own word or "not
+    told". `reason` has the arithmetic; `remedy` is what to do beside the choice of a filter, if anything.
+    """
+
+    key: str
+    question: str
+    answer: str
+    figure: float | None
+    threshold: float | None
+    of: str
+    reason: str
+    remedy: str = ""
+
+
+__all__ = ["apart_text", "bytes_text", "digits", "percent", "seconds_text"]
+
+_BYTES = ((1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB"), (1.0, "B"))
+_SECONDS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
+
+
+def apart_text(sigma: float) -> str:
+    """A distance in σ; what is very small is said to be."""
+    return f"less than {LEAST:g} σ" if sigma < LEAST else f"{digits(sigma)} σ"
+
+
+def bytes_text(count: float) -> str:
+    """A number of bytes with a prefix."""
+    size, unit = next((step for step in _BYTES if count >= step[0]), _BYTES[-1])
+    return f"{count / size:.3g} {unit}"
+
+
+def seconds_text(seconds: float) -> str:
+    """A time below minutes with a prefix."""
+    size, unit = next((step for step in _SECONDS if seconds >= step[0]), _SECONDS[-1])
+    return f"{seconds / size:.3g} {unit}"
+
+
+def percent(share: float) -> str:
+    """A share in percent: whole from ten on, two digits below; what is nearly all is not said to be all."""
+    if not math.isfinite(share):
+        return "unknown"
+    if 0.995 <= share < 1.0:
+        return f"{math.floor(10_000.0 * share) / 100.0:.2f} %"
+    return f"{100.0 * share:.0f} %" if share >= 0.1 else f"{100.0 * share:.2g} %"

@@ -16,14 +16,19 @@ observations, as Künsch (1989), doi:10.1214/aos/1176347265, does for dependent 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import t as student
 
+from config.guard_schema import FigureSection, ReferenceSection
 from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.health import PROBABILITY
 from estimators.diagnostics.score import score
+from estimators.errors import ConfigError
 from estimators.events.batch import truth_of
 from estimators.fold import Fold
+from estimators.log import Log
 from estimators.track import DIVERGED, HELD_OUT, USED
 
 from ...live.tunings.versions import COVERAGE, LIKELIHOOD, NIS, REFUSED, RMSE, figures
@@ -113,3 +118,124 @@ def _figures(fold: Fold, rows: np.ndarray) -> dict[str, float]:
     found.pop(REFUSED, None)
     found[LOST] = float(np.mean(track.health == DIVERGED)) if len(track) else 0.0
     return found
+
+
+CHANCE = 1e-4
+"""Probability with which a figure of a filter that draws is called worse though only its draws are others."""
+
+
+class Judged(NamedTuple):
+    """A figure before and now, its change for the worse, and what of that is allowed.
+
+    Means over all folds; where logs are judged one by one, of the worst `log`, counted from 0. `now` is NaN if there is
+    no such figure any more.
+    """
+
+    figure: str
+    before: float
+    now: float
+    change: float
+    allowed: float
+    log: int | None = None
+
+    @property
+    def worse(self) -> bool:
+        """Whether it got worse by more than is allowed."""
+        return not self.change <= self.allowed
+
+    @property
+    def better(self) -> bool:
+        """Whether it got better by more than that."""
+        return self.change < -self.allowed
+
+
+def judge(known: ReferenceSection, found: ReferenceSection, *, simulated: bool) -> list[Judged]:
+    """Every recorded figure beside what it is now.
+
+    Args:
+        known: What was recorded.
+        found: What was measured.
+        simulated: Whether the logs are simulated anew, so that others may stand in their place.
+
+    Raises:
+        ConfigError: If a recording is another one.
+    """
+    logs, others = ([*zip(each.events, each.sums, strict=True)] for each in (known, found))
+    same = len(logs) == len(others) and all(map(same_log, logs, others))
+    if not same and not simulated:
+        raise ConfigError(
+            f"its log is another one: {known.events[0]} events were folded, {found.events[0]} are now; if that is "
+            "meant, record its scores with --accept"
+        )
+    judged = []
+    for name, section in known.figures.items():
+        before, after = _folds(name, section, known.seeds), None
+        if name in found.figures:
+            after = _folds(name, found.figures[name], found.seeds)
+        if after is None:
+            judged.append(Judged(name, float(np.mean(section.values)), np.nan, np.inf, float(np.mean(section.allowed))))
+        elif same and known.seeds == found.seeds == 1:
+            judged.append(_of_logs(name, section, found.figures[name], (after - before)[:, 0]))
+        else:
+            judged.append(_of_means(name, section, found.figures[name], before, after, same=same))
+    return judged
+
+
+def _folds(name: str, section: FigureSection, seeds: int) -> np.ndarray:
+    """Badness of every fold, (logs, seeds)."""
+    return np.array([badness(name, value) for value in section.values]).reshape(-1, seeds)
+
+
+def _of_logs(name: str, known: FigureSection, found: FigureSection, change: np.ndarray) -> Judged:
+    """The log that got worst, as what it is allowed has it; if none got worse than that, the one that got best."""
+    ratio = change / np.array(known.allowed)
+    k = int(np.argmax(ratio))
+    k = k if ratio[k] > 1.0 else int(np.argmin(ratio))
+    return Judged(name, known.values[k], found.values[k], float(change[k]), known.allowed[k], k)
+
+
+def _of_means(
+    name: str, known: FigureSection, found: FigureSection, before: np.ndarray, after: np.ndarray, *, same: bool
+) -> Judged:
+    if not same:
+        before, after = (each.mean(axis=1)[None, :] for each in (before, after))
+    change = float(after.mean() - before.mean())
+    chance = _apart(before, after)
+    if same and before.shape == after.shape:
+        chance = min(chance, _deviation(after - before) / np.sqrt(before.size) * _quantile(_freedom(before)))
+    allowed = max(float(np.mean(known.allowed)), chance)
+    return Judged(name, float(np.mean(known.values)), float(np.mean(found.values)), change, allowed)
+
+
+def _apart(before: np.ndarray, after: np.ndarray) -> float:
+    variance = sum(_deviation(each) ** 2 / each.size for each in (before, after))
+    return float(np.sqrt(variance) * _quantile(_freedom(before) + _freedom(after)))
+
+
+def _freedom(folds: np.ndarray) -> int:
+    return folds.shape[0] * (folds.shape[1] - 1)
+
+
+def _deviation(folds: np.ndarray) -> float:
+    """Of a fold about the mean of its log."""
+    within = folds - folds.mean(axis=1, keepdims=True)
+    return float(np.sqrt(np.sum(within**2) / max(_freedom(folds), 1)))
+
+
+def _quantile(freedom: int) -> float:
+    # Without a second fold nobody knows what chance makes.
+    return float(student.ppf(1.0 - CHANCE, freedom)) if freedom else np.inf
+
+
+ALIKE = 1e-9
+"""Relative difference of two sums of one log's values, as another processor's rounding leaves of a simulated one."""
+
+
+def fingerprint(log: Log) -> tuple[int, float]:
+    """Number of events, and the sum of the sizes of their values: alike of the same log on any processor."""
+    return log.n, float(np.nansum(np.abs(log.value[: log.n])))
+
+
+def same_log(one: tuple[int, float], other: tuple[int, float]) -> bool:
+    """Whether two fingerprints are of one log."""
+    return one[0] == other[0] and abs(one[1] - other[1]) <= ALIKE * max(one[1], other[1])

@@ -8,8 +8,8 @@ import pytest
 
 from app.cli.arguments import Commission
 from app.cli.commission import commission_twin, lines
-from app.cli.fold import read_log
 from app.live.tunings.versions import write_section
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.commission import Normal, baseline_of, lost_from
 from estimators.diagnostics.evidence import CAUSES
@@ -106,7 +106,7 @@ def test_too_little_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_file_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"absent\.yaml: cannot be written \(No such file or directory\)$"):
+    with pytest.raises(ConfigError, match=r"absent\.yaml: cannot be written: No such file or directory; "):
         write_section(tmp_path / "absent.yaml", "commissioned", "commissioned: {}\n")
 
 

@@ -11,12 +11,23 @@ import pytest
 from pyarrow import csv as pa_csv
 
 import app.cli.compare
-import app.cli.compare_fold
-from app.cli.compare_fold import Figure, Row, fold_row, refold, tidy, within
-from app.cli.compare_table import Cell, cells, printed, read_cell, read_span
-from app.cli.fold import read_log
+import app.studies.compare
 from app.cli.main import main
-from app.cli.scores import SCORES, read_scores, scores_file, write_scores
+from app.studies.compare import fold_row, refold, tidy, within
+from app.studies.scores import (
+    SCORES,
+    Row,
+    ScoreCell,
+    Spread,
+    cells,
+    printed,
+    read_cell,
+    read_scores,
+    read_span,
+    scores_file,
+    write_scores,
+)
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from config.loader import load, shipped
 from estimators.errors import ConfigError
@@ -25,15 +36,15 @@ from estimators.registry import ESTIMATORS
 from estimators.track import GATED, USED
 from tests.support import as_log
 
-NOTHING = Figure(np.nan)
+NOTHING = Spread(np.nan)
 ROWS = [
-    Row("kf", {"°C": Figure(1.04321), "V": Figure(0.01)}, Figure(0.823), (0.7, 1.3), Figure(0.892), 1.26e-6, {}),
+    Row("kf", {"°C": Spread(1.04321), "V": Spread(0.01)}, Spread(0.823), (0.7, 1.3), Spread(0.892), 1.26e-6, {}),
     Row(
         "pf",
-        {"°C": Figure(1.04321, 0.0123), "V": Figure(123.4, 56.7)},
-        Figure(0.8231, 1e-9),
+        {"°C": Spread(1.04321, 0.0123), "V": Spread(123.4, 56.7)},
+        Spread(0.8231, 1e-9),
         (0.7, 1.3),
-        Figure(0.8919, 0.0213),
+        Spread(0.8919, 0.0213),
         1.26e-4,
         {"particles": 4000},
         seeds=8,
@@ -65,7 +76,7 @@ def test_scores_of_a_twin_that_ships_have_a_folder_of_their_own(monkeypatch):
 
 def test_scores_that_cannot_be_written_say_where(tmp_path):
     (tmp_path / "pump.scores.csv").mkdir()
-    with pytest.raises(ConfigError, match=r"pump\.scores\.csv: Is a directory; the scores cannot be written"):
+    with pytest.raises(ConfigError, match=r"pump\.scores\.csv: cannot be written: Is a directory"):
         write_scores(tmp_path / "pump.yaml", LINES)
 
 
@@ -102,7 +113,7 @@ def test_figures_are_printed_to_the_digits_that_mean_something():
     }  # fmt: skip
     assert ukf["mean NIS"] == ukf["RMSE [V]"] == ukf["NIS low"] == "" and ukf["failure"] == "no factor"
     assert read_span(pf) == 20.0 and read_span(kf) is None
-    assert read_cell(pf, "RMSE [V]") == Cell(123.0, 57.0, 0.5)
+    assert read_cell(pf, "RMSE [V]") == ScoreCell(123.0, 57.0, 0.5)
     assert read_cell(kf, "mean NIS")[::2] == (0.823, 0.00005)
     assert np.isnan(read_cell(ukf, "mean NIS").value)
 
@@ -214,7 +225,7 @@ def test_a_slow_filter_folds_a_stated_span(monkeypatch):
         return count
 
     monkeypatch.setattr(Fold, "advance", counted)
-    monkeypatch.setattr(app.cli.compare_fold.time, "process_time", lambda: 1e-4 * stepped)
+    monkeypatch.setattr(app.studies.compare.time, "process_time", lambda: 1e-4 * stepped)
     row = fold_row(twin, "filterpy-ekf", [events], budget=0.06)
     assert row.span == tidy((events.t[599] - events.t[0]) * 1e-9)
     assert row.seconds_per_step == pytest.approx(1e-4)
@@ -256,7 +267,7 @@ def test_all_twins_in_turn_and_those_without_a_recording_are_named(monkeypatch, 
     source = "source: {type: table, files: no.csv, time: {column: t}, sensors: {winding: {columns: w}}}\n"
     bad.write_text(f"model: motor_winding\nestimator: kf\n{source}", encoding="utf-8")
     monkeypatch.setattr(app.cli.compare, "shipped", lambda: [str(bad), str(good)])
-    monkeypatch.setattr(app.cli.compare, "ESTIMATORS", {"kf": ESTIMATORS["kf"]})
+    monkeypatch.setattr(app.studies.compare, "ESTIMATORS", {"kf": ESTIMATORS["kf"]})
     assert main(["compare", "all", "--write"]) == 2
     assert "no.csv" in capsys.readouterr().err
     (line,) = read_scores(good)
@@ -269,7 +280,7 @@ def test_all_twins_in_turn_and_those_without_a_recording_are_named(monkeypatch, 
     ("arguments", "why"),
     [
         (["motor_can", "--estimators", "kf"], "does not apply"),
-        (["motor_winding", "--write", "--estimators", "kf"], "leave the other options out"),
+        (["motor_winding", "--write", "--estimators", "kf"], "leave other options out"),
         (["motor_winding", "--logs", "0"], "--logs 0"),
     ],
 )

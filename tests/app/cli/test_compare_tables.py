@@ -7,10 +7,9 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from app.cli.compare import events_of
-from app.cli.compare_fold import Outcome, draws, refold, within
-from app.cli.compare_table import COST, read_cell, read_span
-from app.cli.scores import read_scores
+from app.studies.compare import Outcome, draws, refold, within, without_marks
+from app.studies.scores import COST, read_cell, read_scores, read_span
+from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin
 from config.loader import shipped
 from estimators.errors import SourceError
@@ -35,7 +34,7 @@ SIGMA = 5.0 * math.sqrt(1 + 1 / 8)
 def recorded(name: str) -> tuple[Twin, Events]:
     twin = load_twin(name)
     try:
-        return twin, events_of(twin)
+        return twin, without_marks(read_log(twin, None)[0].events)
     except SourceError as error:
         if "is not there" in str(error):
             absent(str(error))
@@ -112,7 +111,7 @@ def test_other_logs_are_as_the_head_says(name: str) -> None:
     for seed in (int(said[2]) + 1, int(said[2]) + 2):
         twin = load_twin(name, overrides={"source.seed": str(seed)})
         assert twin.estimator == said[3]
-        outcome = refold(twin, twin.estimator, events_of(twin))
+        outcome = refold(twin, twin.estimator, without_marks(read_log(twin, None)[0].events))
         assert abs(outcome.nis - nis[0]) < SIGMA * nis[1]
         assert abs(100.0 * outcome.coverage - band[0]) < SIGMA * max(band[1], LEAST)
 

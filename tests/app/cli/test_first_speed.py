@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from app.cli.opener import opened_twin
+from app.cli.open_twin import opened_twin
 from config.loader import load
 from estimators.errors import ConfigError
 

@@ -11,9 +11,10 @@ import pytest
 from rerun.chunk import RrdReader
 
 from app.cli.arguments import Fold
-from app.cli.compare_fold import fold_row
-from app.cli.fold import fold_twin, read_log
-from app.cli.fold_episodes import Told, dropped, episode_lines
+from app.cli.fold import fold_twin
+from app.studies.compare import fold_row
+from app.studies.fold_result import Told, dropped, episode_lines
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import Episode
 from estimators.errors import ConfigError, EstimatorError

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import yaml
 
-from app.cli.fold import read_log
 from app.cli.main import main
 from app.twin.learned import run_net
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from app.cli.main import main
-from app.studies.advice.log.noise import noise_of
+from app.studies.advice.signals import noise_of
 from app.twin.twin import load_twin
 from sources.inspect import Series
 

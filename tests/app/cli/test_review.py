@@ -2,8 +2,8 @@
 
 import pytest
 
-from app.cli.fold import read_log
-from app.cli.opener import recorded_twin
+from app.cli.open_twin import recorded_twin
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from app.views.recording.reader import read_recording
 from app.views.recording.writer import write_recording

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-import app.cli.opener
+import app.cli.open_twin
 import app.cli.prepare
 from app.cli.main import main
 from app.live.workshop import Workshop
@@ -96,8 +96,8 @@ def test_files_of_a_source_are_looked_at_before_anything_is_compiled(
     def too_late(*_: object) -> None:
         raise AssertionError("it went on")
 
-    monkeypatch.setattr(app.cli.opener, "begin_to_compile", lambda *_: Workshop())
-    monkeypatch.setattr(app.cli.opener, "prepare_model", too_late)
+    monkeypatch.setattr(app.cli.open_twin, "begin_to_compile", lambda *_: Workshop())
+    monkeypatch.setattr(app.cli.open_twin, "prepare_model", too_late)
     monkeypatch.setattr(app.cli.prepare, "attend", too_late)
     (drive / "drive.csv").write_text("t,y\n0,1\n")
     (line,) = said(capsys, "run", str(drive / "drive.yaml"), "--no-browser", "--port", "0", *options)

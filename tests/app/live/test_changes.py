@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from app.cli.review import open_review
+from app.cli.run import open_review
 from app.live import commands
 from app.live.changes import turned
 from app.live.engine import Engine

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.cli.fold import read_log
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import episodes
 from estimators.fold import Fold

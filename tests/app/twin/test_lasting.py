@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.cli.fold import read_log
+from app.twin.log_reader import read_log
 from app.twin.twin import Twin, restore_twin
 from config.json_schema import json_schema
 from estimators.diagnostics.score import score

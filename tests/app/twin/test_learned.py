@@ -2,7 +2,7 @@
 
 import pytest
 
-from app.cli.opener import opened_twin
+from app.cli.open_twin import opened_twin
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from estimators.models import MODELS

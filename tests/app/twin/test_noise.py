@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from app.cli.arguments import Fold as Arguments
-from app.cli.fold import fold_twin, read_log
+from app.cli.fold import fold_twin
 from app.live.commands import SetEstimator, SetOption
 from app.live.execute import retuned
+from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin, restore_twin
 from app.views.recording.format import tuning_from_json
 from app.views.recording.reader import read_recording

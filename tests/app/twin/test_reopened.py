@@ -5,7 +5,7 @@ whatever pieces the readings come.
 import numpy as np
 import pytest
 
-from app.cli.fold import read_log
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.fold import Fold
 from estimators.log import READING, Log

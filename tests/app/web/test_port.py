@@ -4,7 +4,7 @@ import socket
 
 import pytest
 
-import app.cli.opener
+import app.cli.open_twin
 import app.cli.run
 from app.cli.main import main
 from app.web.port import check_port
@@ -24,8 +24,8 @@ def test_a_port_in_use_is_told_first(command, taken, monkeypatch, capsys):
     def too_late(*_):
         raise AssertionError("it went on")
 
-    monkeypatch.setattr(app.cli.opener, "begin_to_compile", too_late)
-    monkeypatch.setattr(app.cli.opener, "read_recording", too_late)
+    monkeypatch.setattr(app.cli.open_twin, "begin_to_compile", too_late)
+    monkeypatch.setattr(app.cli.open_twin, "read_recording", too_late)
     assert main([command, "motor_winding", "--port", str(taken), "--no-browser"]) == 2
     assert capsys.readouterr().err == f"nisus: port {taken}: Address already in use; choose another with --port\n"
 

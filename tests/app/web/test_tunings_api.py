@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from app.live.commands import SetTuning
-from app.studies.guard.junit import Guarded
-from app.studies.guard.last import keep_last
-from app.studies.guard.verdict import Judged
+from app.studies.guard.baseline import Guarded, keep_last
+from app.studies.guard.figures import Judged
 from app.twin.twin import load_twin
 from config.loader import TWINS
 from estimators.fold import Fold

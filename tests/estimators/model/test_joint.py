@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.cli.fold import read_log
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.compiled.model import compile_model
 from estimators.diagnostics.score import score

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import PchipInterpolator
 
-from app.cli.fold import read_log
+from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin
 from estimators.compiled.model import compile_model
 from estimators.diagnostics.score import Score, score

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.cli.fold import read_log
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.compiled.model import compile_model
 from estimators.fold import Fold

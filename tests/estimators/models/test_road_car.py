@@ -1,6 +1,6 @@
 """The real drive: what a filter that is lost, and refuses the fixes that say so, is worth beside one that is not."""
 
-from app.cli.fold import read_log
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.score import score
 from estimators.errors import SourceError

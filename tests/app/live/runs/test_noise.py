@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from app.cli.fold import read_log
 from app.cli.prepare import prepare
 from app.live.runs.noise import doubts
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.innovations import SensorNoise, sensor_noise
 from estimators.diagnostics.score import score

@@ -9,11 +9,12 @@ import pyarrow.parquet
 import pytest
 
 from app.cli.arguments import Fold, Tunings
-from app.cli.fold import fold_twin, read_log
+from app.cli.fold import fold_twin
 from app.cli.main import main
-from app.cli.opener import recorded_twin
+from app.cli.open_twin import recorded_twin
 from app.cli.tunings import tunings_of
 from app.live.tunings.versions import Settings, accept, keep, version_text
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from app.views.recording.reader import read_recording
 from config.loader import TWINS, shipped

@@ -8,10 +8,10 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from app.cli.fold import read_log
 from app.cli.main import main
 from app.present.drawing import card
 from app.present.drawing.colors import ESTIMATE, gradient
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from app.web.gallery.cards import picture_file
 from config.loader import find, shipped

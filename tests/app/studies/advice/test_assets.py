@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from app.cli.fold import read_log
-from app.studies.advice.claim import UNTOLD
-from app.studies.advice.lines import apply, lines
-from app.studies.advice.measured import Measured
-from app.studies.advice.verdict import Advice, advise
+from app.studies.advice.measured import UNTOLD, Measured
+from app.studies.advice.verdict import Advice, advise, apply, lines
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.log import READING
 from estimators.registry import find_entry

@@ -5,8 +5,7 @@ import json
 import pytest
 
 from app.cli.main import main
-from app.studies.advice.lines import apply, changed, lines, with_entry
-from app.studies.advice.verdict import Advice
+from app.studies.advice.verdict import Advice, apply, changed, lines, with_entry
 from config.yaml_lines import parse
 from estimators.errors import ConfigError
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from app.cli.main import main
-from app.studies.advice.log.drivers import driven
-from app.studies.advice.log.pairs import pairs
-from app.studies.advice.log.signals import rough, signal
+from app.studies.advice.relations import driven, pairs
+from app.studies.advice.signals import rough, signal
 from sources.inspect import Series
 
 

@@ -10,18 +10,17 @@ import pytest
 import yaml
 from scipy.stats import chi2
 
-from app.cli import guard_fold
 from app.cli.arguments import Fold as FoldArguments
 from app.cli.arguments import Guard
-from app.cli.fold import fold_twin, read_log
+from app.cli.fold import fold_twin
 from app.cli.guard import guard
-from app.cli.guard_archive import of_twin
 from app.cli.main import main
 from app.live.tunings.versions import Settings, accept, keep, version_text
-from app.studies.guard.figures import MOST, SHARE, allowances, measured
-from app.studies.guard.last import last
-from app.studies.guard.reference import read_reference
-from app.studies.guard.verdict import judge
+from app.studies.guard import archive as guard_fold
+from app.studies.guard.archive import of_twin
+from app.studies.guard.baseline import last, read_reference
+from app.studies.guard.figures import MOST, SHARE, allowances, judge, measured
+from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from config.loader import TWINS, shipped
 from config.tunings import load_version

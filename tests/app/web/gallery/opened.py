@@ -3,7 +3,7 @@
 import json
 from contextlib import contextmanager
 
-from app.cli.opener import FileOpener, open_session, opened_twin
+from app.cli.open_twin import FileOpener, open_session, opened_twin
 from app.web.gallery.gallery import StartRequest
 from app.web.session import Page
 from tests.app.scripted import wait_for

@@ -10,7 +10,7 @@ import pytest
 from websockets.sync.client import connect
 
 import app.web.gallery.api
-from app.cli.opener import FileOpener
+from app.cli.open_twin import FileOpener
 from config.loader import shipped
 from estimators.errors import ConfigError
 from tests.app.scripted import wait_for

@@ -6,9 +6,8 @@ import pytest
 
 from app.cli.run import live_source
 from app.live.tunings.versions import listing
-from app.studies.guard.junit import Guarded
-from app.studies.guard.last import keep_last
-from app.studies.guard.verdict import Judged
+from app.studies.guard.baseline import Guarded, keep_last
+from app.studies.guard.figures import Judged
 from app.twin.twin import load_twin, with_version
 from app.web.session import Page, Session
 from tests.app.scripted import wait_for

@@ -5,8 +5,7 @@ import io
 import numpy as np
 import pytest
 
-from app.cli.review import open_review
-from app.cli.run import live_source
+from app.cli.run import live_source, open_review
 from app.twin.twin import load_twin
 from app.views.recording.reader import read_recording
 from app.web.session import Page, Session

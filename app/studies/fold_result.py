@@ -1,29 +1,160 @@
-"""What `nisus fold` says of a fold: as lines of text, and as JSON for a script."""
+"""What `nisus fold --smooth` says of the smoother: how far it was off, and whether it agrees with the filter."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from estimators.diagnostics.calibration import BANDS, Calibration, calibrations, truth_calibration
+from estimators.diagnostics.episodes import Episode, episode_json
 from estimators.diagnostics.failure_cause import failures
 from estimators.diagnostics.intervals import Interval
-from estimators.diagnostics.score import Score
+from estimators.diagnostics.score import Fit, Score, score
+from estimators.diagnostics.sensitivity.suspects import RIDDLES, Suspect, in_words, likeliest, suspects
+from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.fold_failures import cause_of
 from estimators.gate.isolation import Decision, softened
+from estimators.log import READING
 from estimators.screen import reasons_by_sensor
+from estimators.smoothing.smooth import consistency
+from estimators.smoothing.smoothed import Smoothed
 from estimators.track import FAILED, HEALTH_NAMES, REASONS, USED
 from estimators.tuning import TOGETHER
 from sources.source import WRONG_TIME
 
 from ..present.export.calibration_lines import calibration_lines
 from ..twin.twin import Twin
-from .fold_episodes import Told, as_json, dropped
-from .fold_smoothed import Better, errors_dict, number
+
+
+class Better(NamedTuple):
+    """By name of the state: errors where the truth is known, and consistency with the filter."""
+
+    states: Mapping[str, Fit]
+    consistency: Mapping[str, float]
+
+    @staticmethod
+    def of(fold: Fold, smoothed: Smoothed) -> Better:
+        """What came of smoothing a fold."""
+        fits = score(smoothed.instead_of(fold.track), fold.log.events, fold.model, gate=fold.tuning.gate).states
+        return Better(fits, consistency(fold.track, smoothed, fold.model))
+
+    def as_dict(self) -> dict[str, Any]:
+        """For a script."""
+        told = {name: number(value) for name, value in self.consistency.items()}
+        return {**errors_dict(self.states), "consistency": told}
+
+    def as_rows(self, units: Mapping[str, str]) -> list[tuple[str, str]]:
+        """Names and values, as the report has them."""
+        rows = [
+            (f"RMSE {name}, smoothed", f"{fit.rmse:.5g} {units[name]}   in the 95 % band: {100 * fit.coverage:.1f} %")
+            for name, fit in self.states.items()
+        ]
+        told = [f"{name} {value:.2f}" for name, value in self.consistency.items() if np.isfinite(value)]
+        return [*rows, ("smoother against filter", ", ".join(told) + "   1 where the model holds")] if told else rows
+
+
+def errors_dict(states: Mapping[str, Fit]) -> dict[str, dict[str, float | None]]:
+    """Root mean square errors of states, and how many of them lie in the 95 % band."""
+    return {
+        "rmse": {name: number(fit.rmse) for name, fit in states.items()},
+        "coverage": {name: number(fit.coverage) for name, fit in states.items()},
+    }
+
+
+def number(value: float) -> float | None:
+    """As JSON has it: null where there is none."""
+    return float(value) if np.isfinite(value) else None
+
+
+SHOWN = 10
+
+ASKED = 3
+"""Episodes whose cause is looked for, the first ones: each takes a refold for every sensor, input and parameter."""
+
+
+class Told(NamedTuple):
+    """An episode, and the faults that explain it best."""
+
+    episode: Episode
+    suspects: tuple[Suspect, ...]
+
+
+MANY = 0.05
+"""Share of readings that never came into the log from which nothing that it says is to be trusted."""
+
+
+def dropped(counts: Mapping[str, int], fold: Fold) -> list[Episode]:
+    """An episode of what was dropped before the log, if that was much."""
+    lost = counts.get("stale", 0) + counts.get(WRONG_TIME, 0)
+    kept = int(np.sum(fold.log.kind[: fold.n] == READING))
+    share = lost / max(1, lost + kept)
+    if share < MANY:
+        return []
+    t = fold.log.t[: fold.n] * 1e-9
+    text = (
+        f"{100 * share:.3g} % of the readings were dropped, {lost} of {lost + kept}: too late, or with a time that "
+        "cannot be true; check the times of the source, or lengthen time.horizon"
+    )
+    return [Episode(float(t[0]), None, "twin", "dropped", share, math.nan, math.nan, "", text)]
+
+
+def blamed(fold: Fold, episodes: Sequence[Episode]) -> list[Told]:
+    """The episodes, the first of those in which readings are shifted with whoever may be to blame."""
+    told: list[Told] = []
+    asked = 0
+    for episode in episodes:
+        found: tuple[Suspect, ...] = ()
+        if episode.cause in RIDDLES and asked < ASKED:
+            asked += 1
+            found = _suspects(fold, episode)
+        told.append(Told(episode, found))
+    return told
+
+
+def _suspects(fold: Fold, episode: Episode) -> tuple[Suspect, ...]:
+    try:
+        return likeliest(suspects(fold.estimator.name, fold.model, fold.tuning, fold.log, episode.start))
+    except NisusError:
+        return ()
+
+
+def as_json(told: Told) -> dict[str, Any]:
+    """An episode for JSON, with its suspects."""
+    return {
+        **episode_json(told.episode),
+        "suspects": [
+            {
+                "kind": suspect.nudge.kind,
+                "name": suspect.nudge.name,
+                "size": suspect.size,
+                "deviation": suspect.deviation,
+                "unit": suspect.nudge.unit,
+                "log_likelihood": suspect.gain,
+            }
+            for suspect in told.suspects
+        ],
+    }
+
+
+def episode_lines(told: Sequence[Told]) -> Iterator[str]:
+    """A heading and a line each; a word where there are none."""
+    if not told:
+        yield "no episodes: nothing that the tests could see was wrong"
+        return
+    yield f"{len(told)} episode(s); docs/alarms.md says what each cause means"
+    for episode, found in told[:SHOWN]:
+        lasted = "at the end" if episode.end is None else f"for {episode.end - episode.start:.3g} s"
+        yield f"  {episode.cause}, {lasted}: {episode.text}"
+        if found:
+            yield f"    most likely off: {in_words(found)}"
+    if len(told) > SHOWN:
+        yield f"  and {len(told) - SHOWN} more; --json has them all"
+
 
 DECISIONS = 10
 """On sensors that stayed refused, that are printed at most: the last ones; --json has all."""

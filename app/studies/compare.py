@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import as_completed
+from dataclasses import replace
+from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 
 from estimators.diagnostics.score import Fit, score
 from estimators.errors import NisusError
 from estimators.estimator import Estimator
 from estimators.fold import Fold
-from estimators.log import Events, Log
-from estimators.registry import find_estimator
+from estimators.log import MARK, Events, Log
+from estimators.registry import ESTIMATORS, find_estimator, unfit
 from estimators.track import DIVERGED
 
-from ..twin.twin import Twin
+from ..twin.twin import Twin, load_twin
+from .processes import beside, jobs_of
+from .scores import Row, Spread
 
 SEEDS = 8
 """Folds of a filter that draws its members; one makes do for the others."""
@@ -27,40 +31,6 @@ BUDGET = 20.0
 
 ENOUGH = 0.2
 """Seconds that a fold is timed for."""
-
-
-class Figure(NamedTuple):
-    """A mean over seeds (or logs), and the standard deviation of one of them; NaN where there is only one."""
-
-    value: float
-    spread: float = np.nan
-
-
-@dataclass(frozen=True)
-class Row:
-    """What one filter made of the log.
-
-    `rmse` by unit: the root mean square over the states of that unit whose truth is known, or, where no truth is,
-    over the sensors held out. `coverage` is the share of those errors inside their 95 % band. `span` is the part of
-    the log that was folded, s, or None for all of it. `diverged` is how many of the `seeds` folds did, `since` when
-    the first of them did (s from the log's start), `lost` the share of all events. `refused` is the share of the
-    readings that the gate refused, which are in no other figure. `failure` says why there are no numbers.
-    """
-
-    estimator: str
-    rmse: Mapping[str, Figure]
-    nis: Figure
-    nis_bounds: tuple[float, float]
-    coverage: Figure
-    seconds_per_step: float
-    options: Mapping[str, float]
-    seeds: int = 1
-    span: float | None = None
-    diverged: int = 0
-    since: float = np.nan
-    lost: float = 0.0
-    refused: float = 0.0
-    failure: str = ""
 
 
 class Outcome(NamedTuple):
@@ -102,7 +72,7 @@ def fold_row(twin: Twin, estimator: str, logs: Sequence[Events], budget: float =
                 events = within(events, span)
             outcomes.append(outcome_of(fold, events, seconds))
     except NisusError as error:
-        nothing = Figure(np.nan)
+        nothing = Spread(np.nan)
         return Row(estimator, {}, nothing, (np.nan, np.nan), nothing, np.nan, options, failure=str(error))
     return row_of(estimator, outcomes, options, span)
 
@@ -194,10 +164,10 @@ def row_of(estimator: str, outcomes: Sequence[Outcome], options: Mapping[str, fl
     since = [outcome.since for outcome in outcomes if np.isfinite(outcome.since)]
     return Row(
         estimator=estimator,
-        rmse={unit: _figure([outcome.rmse[unit] for outcome in outcomes]) for unit in outcomes[0].rmse},
-        nis=_figure([outcome.nis for outcome in outcomes]),
+        rmse={unit: _spread([outcome.rmse[unit] for outcome in outcomes]) for unit in outcomes[0].rmse},
+        nis=_spread([outcome.nis for outcome in outcomes]),
         nis_bounds=outcomes[0].nis_bounds,
-        coverage=_figure([outcome.coverage for outcome in outcomes]),
+        coverage=_spread([outcome.coverage for outcome in outcomes]),
         seconds_per_step=min(outcome.seconds_per_step for outcome in outcomes),
         options=options,
         seeds=len(outcomes),
@@ -209,5 +179,70 @@ def row_of(estimator: str, outcomes: Sequence[Outcome], options: Mapping[str, fl
     )
 
 
-def _figure(values: Sequence[float]) -> Figure:
-    return Figure(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else np.nan)
+def _spread(values: Sequence[float]) -> Spread:
+    return Spread(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else np.nan)
+
+
+_shared: dict[str, Any] = {}
+"""Twin and logs of a worker process."""
+
+
+def without_marks(events: Events) -> Events:
+    """Return the events without fault marks, which are no steps of the asset."""
+    return events.select(events.kind != MARK)
+
+
+def applicable(twin: Twin, names: Sequence[str] = ()) -> list[str]:
+    """Return the filters that apply to a twin, or check those that are named.
+
+    Raises:
+        EstimatorError: If a named filter does not apply.
+    """
+    for name in names:
+        find_estimator(name, twin.model)
+    return list(dict.fromkeys(names)) or [name for name, entry in ESTIMATORS.items() if not unfit(entry, twin.model)]
+
+
+def compare(
+    twin: str,
+    overrides: Mapping[str, str],
+    names: Sequence[str],
+    logs: Sequence[Events],
+    jobs: int | None = None,
+    budget: float = BUDGET,
+) -> Iterator[Row]:
+    """Fold each filter over the logs, in processes of their own; rows come as they are done.
+
+    Args:
+        twin: Name or path.
+        overrides: See `load_twin`.
+        names: Of the filters.
+        logs: The events; see `fold_row`.
+        jobs: Processes; None for one a processor.
+        budget: Seconds for a filter; see `fold_row`.
+    """
+    jobs = jobs_of(jobs, len(names))
+    if jobs == 1:
+        ready = load_twin(twin, overrides=overrides)
+        threads = numba.get_num_threads()
+        numba.set_num_threads(1)
+        try:
+            yield from (fold_row(ready, name, logs, budget) for name in names)
+        finally:
+            numba.set_num_threads(threads)
+        return
+    given = (twin, dict(overrides), [tuple(log) for log in logs])
+    # The last filters of the catalogue are the slow ones.
+    with beside(_fold, [(name, budget) for name in reversed(names)], jobs, _share, given) as futures:
+        for future in as_completed(futures):
+            yield future.result()
+
+
+def _share(name: str, overrides: dict[str, str], logs: list[tuple[np.ndarray, ...]]) -> None:
+    _shared["twin"] = load_twin(name, overrides=overrides)
+    _shared["logs"] = [Events(*columns) for columns in logs]
+    numba.set_num_threads(1)  # the processors have a filter each, and a step costs what it costs one
+
+
+def _fold(estimator: str, budget: float) -> Row:
+    return fold_row(_shared["twin"], estimator, _shared["logs"], budget)

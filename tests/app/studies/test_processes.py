@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from app.cli.beside import beside, jobs_of
+from app.studies.processes import beside, jobs_of
 from estimators.errors import ConfigError
 
 

@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from estimators.errors import ConfigError, nearest
 from sources.inspect import RecordingContents
 
-from .drivers import Driven, driven, simulated
-from .noise import noise_of, walk_of
-from .pairs import Pair, pairs
-from .signals import FEWEST, Signal, signals
+from .relations import Driven, Pair, driven, pairs, simulated
+from .signals import FEWEST, Signal, noise_of, signals, walk_of
 
-MOST = 6
+MAX_SIGNALS = 6
 """Signals that are taken where none are named."""
 
 
@@ -143,7 +141,7 @@ def _finest(found: RecordingContents, every: Sequence[Signal]) -> list[Signal]:
     fine = [one for one in every if one.kind == "signal"] or [
         one for one in every if one.kind == "switch" and one.levels > 2
     ]
-    kept = sorted(range(len(fine)), key=lambda k: (-fine[k].levels, k))[:MOST]
+    kept = sorted(range(len(fine)), key=lambda k: (-fine[k].levels, k))[:MAX_SIGNALS]
     if not kept:
         raise ConfigError(f"{found.files[0]}: no signal of it varies; name those to take with --signals")
     return [fine[k] for k in sorted(kept)]

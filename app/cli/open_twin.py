@@ -12,6 +12,7 @@ import numpy as np
 
 from config.loader import shipped
 
+from ..twin.log_reader import remarking
 from ..twin.twin import Twin, load_twin, restore_twin
 from ..views.recording.format import tuning_from_json
 from ..views.recording.reader import read_recording
@@ -22,7 +23,6 @@ from ..web.gallery.recordings import Recordings
 from ..web.running import Opening, stamp_of
 from ..web.session import Page, Session
 from .prepare import begin_to_compile, compile_for, prepare_model
-from .remarks import remarking
 
 if TYPE_CHECKING:
     from sources.source import Source

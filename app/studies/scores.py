@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from .compare_fold import Figure, Row
+from config.files import writing
+from config.loader import TWINS
 
 GAP = "  "
 """Between printed columns; no cell holds two spaces."""
@@ -18,7 +23,41 @@ LOST = "diverged [% of events]"
 REFUSED = "refused [%]"
 
 
-class Cell(NamedTuple):
+class Spread(NamedTuple):
+    """A mean over seeds (or logs), and the standard deviation of one of them; NaN where there is only one."""
+
+    value: float
+    spread: float = np.nan
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one filter made of the log.
+
+    `rmse` by unit: the root mean square over the states of that unit whose truth is known, or, where no truth is,
+    over the sensors held out. `coverage` is the share of those errors inside their 95 % band. `span` is the part of
+    the log that was folded, s, or None for all of it. `diverged` is how many of the `seeds` folds did, `since` when
+    the first of them did (s from the log's start), `lost` the share of all events. `refused` is the share of the
+    readings that the gate refused, which are in no other figure. `failure` says why there are no numbers.
+    """
+
+    estimator: str
+    rmse: Mapping[str, Spread]
+    nis: Spread
+    nis_bounds: tuple[float, float]
+    coverage: Spread
+    seconds_per_step: float
+    options: Mapping[str, float]
+    seeds: int = 1
+    span: float | None = None
+    diverged: int = 0
+    since: float = np.nan
+    lost: float = 0.0
+    refused: float = 0.0
+    failure: str = ""
+
+
+class ScoreCell(NamedTuple):
     """A figure as it is printed: value, spread (NaN if there is none), and half a unit of the last digit."""
 
     value: float
@@ -48,13 +87,13 @@ def cells(rows: Sequence[Row], events: int, seconds: float) -> list[dict[str, st
     for row in rows:
         line = {"filter": row.estimator}
         for unit in units:
-            line |= _figure(f"RMSE [{unit}]", row.rmse.get(unit, Figure(np.nan)))
+            line |= _figure(f"RMSE [{unit}]", row.rmse.get(unit, Spread(np.nan)))
         line |= _figure(NIS, row.nis)
         low, high = row.nis_bounds
         line |= {"NIS low": _number(low, ".3f"), "NIS high": _number(high, ".3f")}
-        line |= _figure(BAND, Figure(100.0 * row.coverage.value, 100.0 * row.coverage.spread), decimals=1)
+        line |= _figure(BAND, Spread(100.0 * row.coverage.value, 100.0 * row.coverage.spread), decimals=1)
         line |= {
-            COST: _text(Figure(1e6 * row.seconds_per_step), digits=3),
+            COST: _text(Spread(1e6 * row.seconds_per_step), digits=3),
             "seeds": str(row.seeds),
             "diverged": str(row.diverged),
             "diverged at [s]": _number(row.since, ".4g"),
@@ -70,7 +109,7 @@ def cells(rows: Sequence[Row], events: int, seconds: float) -> list[dict[str, st
     return found
 
 
-def _figure(title: str, figure: Figure, decimals: int | None = None) -> dict[str, str]:
+def _figure(title: str, figure: Spread, decimals: int | None = None) -> dict[str, str]:
     value, _, deviation = _text(figure, decimals=decimals).partition("±")
     return {title: value, spread(title): deviation}
 
@@ -79,7 +118,7 @@ def _number(value: float, form: str) -> str:
     return format(value, form) if np.isfinite(value) else ""
 
 
-def _text(figure: Figure, digits: int = 4, decimals: int | None = None) -> str:
+def _text(figure: Spread, digits: int = 4, decimals: int | None = None) -> str:
     """A figure to as many digits, or so many decimals; with a spread, to the spread's second digit.
 
     A spread that does not show in them counts as a unit of the last.
@@ -136,14 +175,62 @@ def _notes(line: Mapping[str, str]) -> str:
     return ", ".join(said)
 
 
-def read_cell(line: Mapping[str, str], title: str) -> Cell:
+def read_cell(line: Mapping[str, str], title: str) -> ScoreCell:
     """A figure of a row; NaN where there is none."""
     if not line[title]:
-        return Cell(np.nan, np.nan, np.nan)
+        return ScoreCell(np.nan, np.nan, np.nan)
     decimals = len(line[title].partition(".")[2])
-    return Cell(float(line[title]), float(line[spread(title)] or "nan"), 0.5 * 10.0**-decimals)
+    return ScoreCell(float(line[title]), float(line[spread(title)] or "nan"), 0.5 * 10.0**-decimals)
 
 
 def read_span(line: Mapping[str, str]) -> float | None:
     """Seconds of the log that a row speaks of; None for all."""
     return float(line[SPAN]) if line[SPAN] else None
+
+
+SCORES = TWINS.parent / "scores"
+"""Folder of the scores of the twins that ship."""
+
+
+def scores_file(twin: Path) -> Path:
+    """Where the scores of a twin's YAML are: those of one that ships in a folder of their own, others beside it."""
+    ships = twin.resolve().parent == TWINS.resolve()
+    return SCORES / f"{twin.stem}.csv" if ships else twin.with_name(f"{twin.stem}.scores.csv")
+
+
+def write_scores(twin: Path, lines: Sequence[Mapping[str, str]]) -> Path:
+    """Write the cells of a comparison (see `compare_table.cells`) for a twin's YAML.
+
+    Returns:
+        The file.
+
+    Raises:
+        ConfigError: If it cannot be written.
+    """
+    path = scores_file(twin)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(lines[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
+    with writing(path):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text.getvalue(), encoding="utf-8")
+    return path
+
+
+def read_scores(twin: Path) -> list[dict[str, str]]:
+    """The cells of a twin's scores, as they were written; none if there is no such file."""
+    try:
+        with scores_file(twin).open(encoding="utf-8", newline="") as file:
+            return list(csv.DictReader(file))
+    except FileNotFoundError:
+        return []
+
+
+def row_json(row: Row) -> dict[str, Any]:
+    """Return a row for scripts: every figure is its mean, with the standard deviations under `spread`."""
+    figures: dict[str, Any] = {"rmse": {unit: figure.value for unit, figure in row.rmse.items()}}
+    spreads: dict[str, Any] = {"rmse": {unit: figure.spread for unit, figure in row.rmse.items()}}
+    for name in ("nis", "coverage"):
+        figures[name], spreads[name] = getattr(row, name)
+    return {**asdict(row), **figures, "spread": spreads}

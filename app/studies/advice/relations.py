@@ -12,22 +12,21 @@ from scipy.signal import lfilter
 
 from sources.inspect import Series
 
-from .grid import common
-from .signals import Signal
+from .signals import Signal, common
 
-TIMES = 24
+TRIED_TIME_CONSTANTS = 24
 """Time constants that are tried, from one interval to the length of the log, evenly by their logarithm."""
 
-MOST = 4
+MAX_DRIVERS = 4
 """Drivers of a signal."""
 
-WINS = 0.8
+ERROR_FACTOR = 0.8
 """Factor by which more drivers must lower the error on the second half to be worth it."""
 
-EXPLAINED = 0.5
+MIN_EXPLAINED = 0.5
 """Share of the variance of the second half that drivers must explain to be taken."""
 
-LEAST = 60
+MIN_DRIVER_TIMES = 60
 """Common times that it takes."""
 
 
@@ -56,7 +55,7 @@ def driven(found: Sequence[Signal], target: int, candidates: Sequence[int]) -> D
         return None
     t, values = common([found[target].series, *(found[k].series for k in candidates)])
     there = np.isfinite(values).all(axis=1)
-    if there.sum() < LEAST:
+    if there.sum() < MIN_DRIVER_TIMES:
         return None
     # A hole is bridged by what was last there, and not scored.
     y, u = values[:, 0], _held(values[:, 1:])
@@ -65,7 +64,7 @@ def driven(found: Sequence[Signal], target: int, candidates: Sequence[int]) -> D
         return None
     taken: list[int] = []
     sets: list[tuple[float, Driven]] = []
-    while len(taken) < min(MOST, len(candidates)):
+    while len(taken) < min(MAX_DRIVERS, len(candidates)):
         tried = [(_fitted(t, y, u[:, [*taken, k]], half), k) for k in range(len(candidates)) if k not in taken]
         (error, tau, weights), k = min(tried, key=lambda entry: entry[0][0])
         taken.append(k)
@@ -73,8 +72,8 @@ def driven(found: Sequence[Signal], target: int, candidates: Sequence[int]) -> D
         names, gains = tuple(candidates[k] for k in taken), tuple(float(w) for w in weights[2:])
         sets.append((error, Driven(target, names, gains, float(weights[0]), tau, explained)))
     least = min(error for error, _ in sets)
-    best = next(one for error, one in sets if WINS * error <= least)
-    if best.explained < EXPLAINED:
+    best = next(one for error, one in sets if ERROR_FACTOR * error <= least)
+    if best.explained < MIN_EXPLAINED:
         return None
     own = u[:, [list(candidates).index(k) for k in best.drivers]]
     fine = minimize_scalar(
@@ -115,7 +114,7 @@ def _held(values: np.ndarray) -> np.ndarray:
 def _fitted(t: np.ndarray, y: np.ndarray, u: np.ndarray, half: int) -> tuple[float, float, np.ndarray]:
     """Mean square error on the second half, time constant, and weights: offset, start, gains."""
     step = float(t[1] - t[0])
-    times = np.geomspace(step, max(2.0 * step, t[-1] - t[0]), TIMES).tolist()
+    times = np.geomspace(step, max(2.0 * step, t[-1] - t[0]), TRIED_TIME_CONSTANTS).tolist()
     tried = [(*_lag(t, y, u, half, tau), tau) for tau in times]
     # The first half alone chooses the time constant.
     _, error, weights, tau = min(tried, key=lambda entry: entry[0])
@@ -138,3 +137,111 @@ def _columns(t: np.ndarray, u: np.ndarray, tau: float) -> np.ndarray:
     a = np.exp(-float(t[1] - t[0]) / tau)
     lagged = lfilter([0.0, 1.0 - a], [1.0, -a], u, axis=0, zi=u[:1])[0]
     return np.column_stack([np.ones(t.size), np.exp(-t / tau), lagged])
+
+
+ALIKE = 0.98
+"""Share of the variance of one signal that a line through the other explains, from which on they are much alike."""
+
+NOISY = 0.8
+"""The same where what is left is white, so that it may be the noise of both."""
+
+RATE = 0.9
+"""The same of the changes of one signal by the integral of the other."""
+
+WHITE = 0.5
+"""Correlation of what is left with the next, beyond which it is no noise."""
+
+LAGS = 20
+"""Intervals by which one may follow the other."""
+
+MIN_PAIR_TIMES = 30
+"""Common times that it takes."""
+
+
+class Pair(NamedTuple):
+    """`second` = offset + gain · first, `lag` s later, explains the share `explained` of its variance.
+
+    `left` is the standard deviation of what is left of the second, `related` its correlation with the next: where that
+    is high they are two quantities that are much alike, and not two sensors of one.
+    With `rate`, offset + gain · second is the speed of `first`, and the variance is that of the first's changes.
+    """
+
+    first: int
+    second: int
+    gain: float
+    offset: float
+    lag: float
+    explained: float
+    left: float
+    related: float
+    rate: bool = False
+
+    @property
+    def one(self) -> bool:
+        """Whether they may be two sensors of one quantity: what differs is noise."""
+        return self.rate or self.related < WHITE
+
+
+def pairs(found: Sequence[Signal]) -> list[Pair]:
+    """All pairs among some signals, by their indices; of equal ones the first is the one with less noise."""
+    told = []
+    for i in range(len(found)):
+        for j in range(i + 1, len(found)):
+            t, values = common((found[i].series, found[j].series))
+            if t.size < MIN_PAIR_TIMES:
+                continue
+            pair = _alike(i, j, t, values) or _rate(i, j, t, values) or _rate(j, i, t, values[:, ::-1])
+            if pair is not None:
+                told.append(pair)
+    return told
+
+
+def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
+    """Gain and offset of y over x, and the share explained; none where one of them stands still."""
+    there = np.isfinite(x) & np.isfinite(y)
+    x, y = x[there], y[there]
+    if x.size < MIN_PAIR_TIMES or not (np.ptp(x) > 0.0 and np.ptp(y) > 0.0):
+        return 0.0, 0.0, 0.0
+    gain = float(np.cov(x, y)[0, 1] / np.var(x, ddof=1))
+    return gain, float(np.mean(y) - gain * np.mean(x)), float(np.corrcoef(x, y)[0, 1] ** 2)
+
+
+def _related(left: np.ndarray) -> float:
+    """Correlation of each value with the next."""
+    both = np.isfinite(left[1:]) & np.isfinite(left[:-1])
+    one, other = left[:-1][both], left[1:][both]
+    return float(np.corrcoef(one, other)[0, 1]) if one.size > 2 and np.ptp(one) > 0.0 and np.ptp(other) > 0.0 else 0.0
+
+
+def _alike(i: int, j: int, t: np.ndarray, values: np.ndarray) -> Pair | None:
+    step = float(t[1] - t[0])
+    best: Pair | None = None
+    for lag in range(-min(LAGS, t.size // 10), min(LAGS, t.size // 10) + 1):
+        x, y = (
+            (values[: t.size - lag, 0], values[lag:, 1]) if lag >= 0 else (values[-lag:, 0], values[: t.size + lag, 1])
+        )
+        gain, offset, explained = _line(x, y)
+        # Of two lags that explain alike, the shorter one.
+        if best is None or explained > best.explained + 1e-4 * abs(lag):
+            left = y - offset - gain * x
+            best = Pair(i, j, gain, offset, lag * step, explained, float(np.nanstd(left)), _related(left))
+    if best is None or best.explained < NOISY:
+        return None
+    return best if best.explained >= ALIKE or best.related < WHITE else None
+
+
+def _rate(i: int, j: int, t: np.ndarray, values: np.ndarray) -> Pair | None:
+    """Whether the changes of the first are the integral of the second, over intervals long enough for noise."""
+    step = float(t[1] - t[0])
+    for over in (1, 5, 20):
+        if t.size < 2 * over * MIN_PAIR_TIMES // 10:
+            break
+        change = values[over:, 0] - values[:-over, 0]
+        middle = 0.5 * (values[1:, 1] + values[:-1, 1]) * step
+        total = np.cumsum(np.concatenate(([0.0], np.nan_to_num(middle))))
+        gain, offset, explained = _line(total[over:] - total[:-over], change)
+        if explained >= RATE:
+            left = change - offset - gain * (total[over:] - total[:-over])
+            a_second = offset / (over * step)
+            return Pair(i, j, gain, a_second, 0.0, explained, float(np.nanstd(left)), _related(left), True)
+    return None

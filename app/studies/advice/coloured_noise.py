@@ -25,9 +25,7 @@ from estimators.model.coloured import Lasting, coloured, disturbance_time, error
 from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import Tuning
 
-from .claim import NO, UNTOLD, YES, Claim
-from .measured import Measured
-from .words import digits
+from .measured import NO, UNTOLD, YES, Claim, Measured, digits
 
 QUESTION = "Would noise that lasts explain innovations that follow one another?"
 OF = "correlation of one innovation with the next"

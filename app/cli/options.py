@@ -1,11 +1,28 @@
-"""What was given on the command line: `--set KEY=VALUE` as pairs, and numbers that are none."""
+"""Where a command writes: refused before its work, not after."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import get_args, get_type_hints
 
 from estimators.errors import ConfigError, quoted
+
+
+def check_place(option: str, path: Path) -> None:
+    """Refuse a file that could not be written, before the work of minutes that it is to keep.
+
+    Raises:
+        ConfigError: If it is a folder, or its folder is not there or lets nobody write.
+    """
+    folder = path.absolute().parent
+    if path.is_dir():
+        raise ConfigError(f"{option} {path}: is a folder; name a file in it")
+    if not folder.is_dir():
+        raise ConfigError(f"{option} {path}: there is no folder {path.parent}; make it first")
+    if not os.access(path if path.exists() else folder, os.W_OK):
+        raise ConfigError(f"{option} {path}: cannot be written; check the permissions")
 
 
 def settings(given: Sequence[str], estimator: str | None = None, tuning: str | None = None) -> dict[str, str]:

@@ -1,16 +1,104 @@
-"""What a fit found, as sections of tables."""
+"""`nisus tune --windows`: dual estimation over recordings, window after window, as a running twin does it."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from estimators.diagnostics.sensitivity.responses import digits
+from estimators.fit.dual import Refit, against, shift
 from estimators.fit.fit import Fitted, Line
 from estimators.fit.judge import Part, Prediction, Worth
 
-from ..live.runs.runs_json import correlated
+from ..live.runs.runs_json import correlated, fit_json
 from ..present.result import Topic
 from ..twin.twin import Twin
+
+UNSEEN = 0.05
+"""Share of a window up to which nobody need be told that the end of a log is in none."""
+
+
+def window_json(recording: int, refit: Refit, origin: int) -> dict[str, Any]:
+    """A window as JSON: `from` and `to` in seconds after the recording's first event, and the fit as `nisus tune`."""
+    told: dict[str, Any] = {
+        "recording": recording,
+        "from": (refit.start - origin) * 1e-9,
+        "to": (refit.end - origin) * 1e-9,
+        "events": refit.events,
+        "adopted": refit.proposed,
+        "reason": refit.reason,
+    }
+    return told | ({} if refit.fitted is None else {"result": fit_json(refit.fitted)})
+
+
+def window_topics(found: Sequence[tuple[int, Refit]], origins: Sequence[int]) -> list[Topic]:
+    """For every entry a table: its value and interval of each window, and what the twin went on with."""
+    keys = dict.fromkeys(line.key for _, refit in found if refit.fitted is not None for line in refit.fitted.lines)
+    head = (
+        *_place(None, None, origins), "fitted", "95 % interval", "σ moved", "gain, nats a reading", "went on with",
+    )  # fmt: skip
+    sections = []
+    for key in keys:
+        rows = []
+        unit = ""
+        for k, refit in found:
+            line = _line_of(refit, key)
+            unit = unit or ("" if line is None else line.unit)
+            rows.append((*_place(k, refit, origins), *_window_row(refit, line)))
+        title = f"{key}{f', {unit}' if unit else ''}"
+        sections.append(Topic(title, (), head, tuple(rows)))
+    return sections
+
+
+def _place(k: int | None, refit: Refit | None, origins: Sequence[int]) -> tuple[str, ...]:
+    """Recording, where there are several, start and end of a window, s; the head of these columns for None."""
+    if k is None or refit is None:
+        return (*(("recording",) if len(origins) > 1 else ()), "from s", "to s")
+    at = (f"{(t - origins[k]) * 1e-9:,.0f}" for t in (refit.start, refit.end))
+    return (*((str(k + 1),) if len(origins) > 1 else ()), *at)
+
+
+def _line_of(refit: Refit, key: str) -> Line | None:
+    lines = () if refit.fitted is None else refit.fitted.lines
+    return next((line for line in lines if line.key == key), None)
+
+
+def _window_row(refit: Refit, line: Line | None) -> tuple[str, ...]:
+    if refit.fitted is None or line is None:
+        return ("-", "", "", "", "-")
+    verdict = refit.fitted.verdict
+    gain = f"{verdict.gain:+.3g} ± {verdict.error:.2g}" if np.isfinite(verdict.gain) else "-"
+    kept = f"{line.after if refit.proposed else line.before:.4g}"
+    kept += " (adopted)" if refit.proposed and not line.alone else ""
+    if line.alone:
+        return ("not told", "", "", gain, kept)
+    bound = "" if line.told else " (bound)"
+    return (f"{line.after:.4g}", f"{line.low:.4g} to {line.high:.4g}{bound}", f"{shift(line):+.1f}", gain, kept)
+
+
+def windows_verdict(
+    twin: Twin, found: Sequence[tuple[int, Refit]], origins: Sequence[int], ends: Sequence[int]
+) -> Topic:
+    """How many were adopted, of each other one why not, and what no window looked at."""
+    adopted = sum(refit.proposed for _, refit in found)
+    folds = sum(refit.fitted.folds for _, refit in found if refit.fitted is not None)
+    said = [f"{adopted} of {len(found)} windows were adopted ({twin.estimator}, {folds} folds)."]
+    for k, refit in found:
+        if not refit.proposed:
+            reasons = (refit.reason,) if refit.fitted is None else against(refit.fitted)
+            *recording, begin, end = _place(k, refit, origins)
+            which = f"recording {recording[0]}, " if recording else ""
+            said.append(f"{which}{begin} to {end} s: {'; '.join(reasons)}.")
+    for k, last in enumerate(ends):
+        own = [refit for other, refit in found if other == k]
+        left = (last - max((refit.end for refit in own), default=origins[k])) * 1e-9
+        if left > UNSEEN * max((refit.end - refit.start for refit in own), default=0) * 1e-9:
+            which = f"Of recording {k + 1} the" if len(ends) > 1 else "The"
+            said.append(f"{which} last {left:,.0f} s are less than half a window, or half a step, and were not fitted.")
+    return Topic("Verdict", tuple(said))
+
 
 ALONE = "left alone: the data cannot tell"
 BOUND = "only a bound: the data cannot tell it from none"

@@ -1,0 +1,460 @@
+"""Arguments of every command, a dataclass for each. Nothing slow is imported here, so that help appears at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+Twin = Annotated[str, tyro.conf.Positional]
+Repeated = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+
+
+@dataclass(frozen=True)
+class TwinOptions:
+    """Options of a command that works on one twin."""
+
+    twin: Twin
+    """Name of a bundled twin, or path to a YAML file."""
+
+
+@dataclass(frozen=True)
+class FoldOptions(TwinOptions):
+    """Options of a command that folds the log of a twin."""
+
+    estimator: str | None = None
+    """Estimator to use instead of the twin's own; `nisus filters` lists them."""
+    set: Repeated = ()
+    """KEY=VALUE, repeatable; see `nisus run --help`."""
+    tuning: str | None = None
+    """Name of the tuning version to start from; `nisus tunings TWIN` lists them. Default: the twin's file."""
+    log: tuple[Path, ...] = ()
+    """Recordings to read instead of the twin's own."""
+    duration: float | None = None
+    """Read only this many seconds of the source."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableOptions:
+    """Options for reading recordings."""
+
+    dbc: Repeated = ()
+    """DBC file that names messages and signals, repeatable; FILE@BUS limits it to one bus."""
+    time: str | None = None
+    """Time column of a table. Default: the column with such a name."""
+    time_unit: str = "s"
+    """Unit of the time column: s, ms, us, ns, min or h."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """Run a twin and show it in the browser. Without a twin: the gallery of bundled twins."""
+
+    twin: Annotated[str | None, tyro.conf.Positional] = None
+    """Name of a bundled twin (see `nisus twins`), or path to a YAML file. Default: choose one in the gallery."""
+    estimator: str | None = None
+    """Estimator to use instead of the twin's own; `nisus filters` lists them."""
+    set: Repeated = ()
+    """KEY=VALUE, repeatable: Q.temperature=0.02, R.winding=9, p.NAME, use.SENSOR=false, gate, or a dotted YAML key."""
+    tuning: str | None = None
+    """Name of the tuning version to start from; `nisus tunings TWIN` lists them. Default: the twin's file."""
+    log: tuple[Path, ...] = ()
+    """Recordings to read instead of the twin's own."""
+    record: Path | None = None
+    """Record to this .rrd file from the start."""
+    record_split: str | None = None
+    """Continue in a new file (run-2.rrd after run.rrd) at this size or duration: 1GB, 10min."""
+    speed: float | None = None
+    """Speed of replays and simulations, as a multiple of real time; inf is as fast as possible. Default: the twin's."""
+    duration: float | None = None
+    """Stop after this many seconds."""
+    port: int = 9900
+    """Port of the page on 127.0.0.1; 0 picks a free one."""
+    recordings: Path = Path("recordings")
+    """Folder of recordings and of logs dropped on the page; created when needed."""
+    no_browser: Flag = False
+    """Print the URL without opening a browser."""
+    headless: Flag = False
+    """Run without a page."""
+
+
+@dataclass(frozen=True)
+class Fold(FoldOptions):
+    """Fold the log of a twin as fast as possible and print scores, calibration and fault episodes."""
+
+    out: Path | None = None
+    """Write the track to this .csv or .parquet file, or a recording to this .rrd file."""
+    html: Path | None = None
+    """Write a self-contained HTML report: scores, charts, checks, episodes, tuning."""
+    smooth: Flag = False
+    """Also smooth: estimate each state from all measurements, before and after. Adds columns to --out."""
+    json: Flag = False
+    """Print one JSON object."""
+
+
+@dataclass(frozen=True)
+class Check(FoldOptions):
+    """Print a checklist of what could be wrong with a twin without being detected.
+
+    Linearity, size, shape of the posterior, observability, the smallest visible fault of every sensor, input and
+    parameter, protection levels, timing, health, and the prediction of every sensor held out in turn.
+    """
+
+    json: Flag = False
+    """Print one JSON object."""
+    html: Path | None = None
+    """Also write a self-contained HTML page."""
+
+
+@dataclass(frozen=True)
+class Advise(TableOptions):
+    """Recommend an estimator for a twin from its log, or draft a twin from recordings.
+
+    For a twin: the simplest estimator whose assumptions hold on the log, with the figure behind each claim and the
+    lines for its YAML. For recordings: sample rates, gaps, noise, redundant signals, and drivers of each signal.
+    """
+
+    what: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """Name of a bundled twin, path to a YAML file, or recordings."""
+    estimator: str | None = None
+    """Estimator to start from instead of the twin's own."""
+    set: Repeated = ()
+    """KEY=VALUE, repeatable; see `nisus run --help`."""
+    log: tuple[Path, ...] = ()
+    """Recordings to read instead of the twin's own."""
+    duration: float | None = None
+    """Read only this many seconds of the source."""
+    signals: str = ""
+    """Signals of the recordings to use, separated by commas; see `nisus new --help`."""
+    json: Flag = False
+    """Print one JSON object."""
+    apply: Flag = False
+    """Write the lines into the twin's YAML; the previous file is kept beside it."""
+    out: Path | None = None
+    """Write the changed YAML to this file (same folder if it names other files). Recordings: write the draft,
+    NAME.yaml and NAME.py."""
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Fold every applicable filter over the same log, in parallel, and print a table of scores.
+
+    Filters that draw random members are folded with eight seeds; their figures are mean ± standard deviation of one
+    fold. A step is one event of the log; its cost is the time on one processor.
+    """
+
+    twin: Twin
+    """Name of a bundled twin, path to a YAML file, or `all` for every bundled twin."""
+    estimators: tuple[str, ...] = ()
+    """Compare only these filters."""
+    set: Repeated = ()
+    """KEY=VALUE, repeatable; see `nisus run --help`."""
+    tuning: str | None = None
+    """Name of the tuning version to start from; `nisus tunings TWIN` lists them. Default: the twin's file."""
+    log: tuple[Path, ...] = ()
+    """Recordings to read instead of the twin's own."""
+    duration: float | None = None
+    """Read only this many seconds of the source."""
+    logs: int = 1
+    """Number of simulated logs, with consecutive seeds; figures are mean ± standard deviation over them."""
+    budget: float = 20.0
+    """CPU seconds for each filter; a slower filter folds a shorter span, shown in its row."""
+    jobs: int | None = None
+    """Number of processes. Default: one per processor."""
+    json: Flag = False
+    """Print one JSON list."""
+    write: Flag = False
+    """Save the table as CSV: config/scores/NAME.csv for a bundled twin, else NAME.scores.csv beside the YAML."""
+
+
+@dataclass(frozen=True)
+class Tune(TwinOptions):
+    """Fit noises, parameters and options to recordings, and propose the result if it predicts held-out data better.
+
+    Each recording is divided into blocks of time, and every third is held out to judge the fit. So are each sensor in
+    turn and the true states where they are known. Exit status: 0 if a tuning is proposed, 1 if not.
+    """
+
+    fit: str = "Q,R"
+    """What to fit, separated by commas: groups (Q, R, p, options, prior; over: correlation times) and single entries
+    (Q.winding, R.yoke, p.NAME, options.alpha, prior.STATE.std). scale: one factor for all of Q and R."""
+    aim: Literal["witnesses", "likelihood", "crps", "error"] | None = None
+    """Objective. likelihood: of every measurement given those before it. witnesses: likelihood plus true states and
+    held-out sensors. crps, error: predictions of sensors held out in turn, by continuous ranked probability score or
+    squared error. Default: witnesses for recordings, likelihood for simulations."""
+    predict: tuple[str, ...] = ()
+    """Sensors that crps and error hold out. Default: each in turn."""
+    estimator: str | None = None
+    """Estimator to use instead of the twin's own; `nisus filters` lists them."""
+    set: Repeated = ()
+    """KEY=VALUE, repeatable; see `nisus run --help`. Sets the start of the fit, which is also its weak prior."""
+    log: Repeated = ()
+    """Recording to fit instead of the twin's own, repeatable. FILE,FILE are parts of one recording; FILE@0.5 has half
+    the weight."""
+    logs: int = 1
+    """Number of simulated logs, with consecutive seeds."""
+    duration: float | None = None
+    """Read only this many seconds of each recording."""
+    blocks: int = 9
+    """Number of blocks with equally many measurements; every third is held out."""
+    windows: str | None = None
+    """Dual estimation: fit one window of this length after another (600, 10min, 1h), as a running twin with `refit`
+    does, and print every parameter over time. A shorter log is one window."""
+    every: str | None = None
+    """Time between the ends of two windows. Default: the length of the windows."""
+    save: Path | None = None
+    """Write the proposed tuning to this .yaml file, as sections that replace the twin's own."""
+    keep: str | None = None
+    """Save the proposed tuning as a tuning version of this name; see `nisus tunings`."""
+    note: str = ""
+    """Note to save with --keep."""
+    json: Flag = False
+    """Print one JSON object."""
+
+
+@dataclass(frozen=True)
+class Learn(TwinOptions):
+    """Learn the model error of a twin from recordings, as a correction with its own uncertainty.
+
+    Each recording is divided into blocks of time; on every third the twin is judged with and without the correction.
+    Exit status: 0 if the correction is better there, 1 if not; then nothing is written.
+    """
+
+    corrects: str
+    """States whose rates are corrected, separated by commas: magnet."""
+    features: str
+    """States and inputs that the correction depends on, separated by commas: speed,i_d,i_q."""
+    kind: Literal["gp", "ridge", "net"] = "gp"
+    """gp: Gaussian process, needs scikit-learn. ridge: ridge regression. net: the network of --net, which is judged but
+    not trained, needs onnxruntime."""
+    net: Path | None = None
+    """ONNX file for --kind net: features (N, d) to rates (N, k), units of the states per second."""
+    degree: Literal[1, 2] = 1
+    """Degree of ridge: 2 adds squares and products of the features."""
+    window: float = 30.0
+    """Seconds over which the model is compared with the true states, or with smoothed states where there are none."""
+    estimator: str | None = None
+    """Estimator to use instead of the twin's own; `nisus filters` lists them."""
+    set: Repeated = ()
+    """KEY=VALUE, repeatable; see `nisus run --help`."""
+    log: Repeated = ()
+    """Recording to learn from instead of the twin's own, repeatable; FILE,FILE are parts of one recording."""
+    duration: float | None = None
+    """Read only this many seconds of each recording."""
+    blocks: int = 9
+    """Number of blocks with equally many measurements; every third is held out (of 3 the last)."""
+    keep: Path | None = None
+    """Write the correction to this .yaml file; a twin uses it with `learned: FILE`."""
+    json: Flag = False
+    """Print one JSON object."""
+
+
+@dataclass(frozen=True)
+class Guard:
+    """Fold archived recordings with the accepted tunings of their twins and list figures that got worse.
+
+    Without a name: the bundled twins with their bundled logs and those under NISUS_DATA. A figure is worse if it
+    changed by more than chance and by more than is negligible. Exit status: 0 if nothing got worse, 1 if something
+    did, 2 if a recording could not be folded. Missing recordings are reported; with CI=true they are errors.
+    """
+
+    twins: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Names of bundled twins, or paths to YAML files."""
+    archive: Path | None = None
+    """Folder of recordings (.rrd) and twins (.yaml) to guard."""
+    junit: Path | None = None
+    """Also write the verdict to this file as JUnit XML."""
+    accept: Flag = False
+    """Record the present figures as the baseline."""
+    note: str = ""
+    """Reason for --accept, saved with the baseline."""
+    set: Repeated = ()
+    """KEY=VALUE, repeatable; see `nisus run --help`. Shows the figures under another setting."""
+    jobs: int | None = None
+    """Number of processes. Default: one per processor."""
+
+
+@dataclass(frozen=True)
+class Stress:
+    """Inject faults into a twin and print how soon and how correctly they are detected.
+
+    Tuning errors hold from the start. Sensor faults hold from one third to two thirds of the log, to show false alarms
+    before them and recovery after them. Figures are medians over the seeds.
+    """
+
+    twin: Twin
+    """Name of a bundled twin, or path to a YAML file."""
+    estimators: tuple[str, ...] = ()
+    """Filters to test. Default: the twin's own."""
+    only: tuple[str, ...] = ()
+    """Only faults whose name contains one of these texts."""
+    list: Flag = False
+    """List the faults without folding."""
+    seeds: int = 3
+    """Number of seeds for simulator, faults and filter."""
+    duration: float = 600.0
+    """Seconds of the log."""
+    set: Repeated = ()
+    """KEY=VALUE, repeatable; see `nisus run --help`."""
+    tuning: str | None = None
+    """Name of the tuning version to start from; `nisus tunings TWIN` lists them. Default: the twin's file."""
+    log: tuple[Path, ...] = ()
+    """Recordings to read instead of the twin's own."""
+    json: Flag = False
+    """Print one JSON list, an object per fault, filter and seed."""
+
+
+@dataclass(frozen=True)
+class Commission(FoldOptions):
+    """Record the normal innovations of a twin from fault-free data; later alarms then report changes from it.
+
+    Prints the section `commissioned` for the twin's YAML, or writes it there.
+    """
+
+    force: Flag = False
+    """Accept the data even if sensors are rejected or stuck, or the twin diverges."""
+    write: Flag = False
+    """Write the section into the twin's YAML, replacing the one there."""
+
+
+@dataclass(frozen=True)
+class Filters:
+    """List the estimators: assumptions, options, cost, and when they fail."""
+
+    twin: str | None = None
+    """Name of a bundled twin, or path to a YAML file: list which filters apply, their cost, and why others do not."""
+
+
+@dataclass(frozen=True)
+class Review:
+    """Open a recording on the page, where its measurements can be folded again with other settings."""
+
+    file: Annotated[Path, tyro.conf.Positional]
+    """The .rrd file."""
+    port: int = 9900
+    """Port of the page on 127.0.0.1; 0 picks a free one."""
+    recordings: Path = Path("recordings")
+    """Folder of recordings and of logs dropped on the page; created when needed."""
+    no_browser: Flag = False
+    """Print the URL without opening a browser."""
+    duration: float | None = None
+    """Stop after this many seconds."""
+
+
+@dataclass(frozen=True)
+class Bus:
+    """Simulate the asset of a twin on a CAN bus."""
+
+    twin: Twin
+    """Name of a bundled twin with a CAN source and an `asset`, or path to a YAML file."""
+    interface: str = "udp_multicast"
+    """Interface of python-can: udp_multicast reaches other processes on this machine, socketcan a real bus."""
+    channel: str | None = None
+    """Channel of the interface. Default: the twin's if it fits, else the interface's own."""
+    set: Repeated = ()
+    """KEY=VALUE of the YAML, repeatable."""
+    duration: float | None = None
+    """Stop after this many seconds."""
+    record: Path | None = None
+    """Also write the frames to this log (.blf, .asc, .log, .csv, .mf4, .trc)."""
+
+
+@dataclass(frozen=True)
+class Twins:
+    """List the bundled twins, or describe one with the scores of every filter."""
+
+    name: Annotated[str | None, tyro.conf.Positional] = None
+    """Name of a bundled twin, or path to a YAML file."""
+    picture: Flag = False
+    """Draw the gallery picture of the twin, or of all: config/cards/NAME.svg, or NAME.svg beside the YAML."""
+
+
+@dataclass(frozen=True)
+class Tunings(TwinOptions):
+    """List the tuning versions of a twin, compare two of them, save one or accept one.
+
+    Versions are files FILE.tunings/NAME.yaml beside FILE.yaml; those of a bundled twin are in the user's data folder.
+    `own` is the twin's file itself.
+    """
+
+    names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Two versions to compare: the entries that differ, and their scores."""
+    save: str | None = None
+    """Save the twin with --tuning, --estimator and --set as a version of this name, with its scores."""
+    accept: str | None = None
+    """Accept the version of this name: `nisus guard` then folds with it."""
+    note: str = ""
+    """Note for --save and --accept."""
+    estimator: str | None = None
+    """For --save: estimator to use instead of the twin's own."""
+    set: Repeated = ()
+    """For --save: KEY=VALUE, repeatable; see `nisus run --help`."""
+    tuning: str | None = None
+    """For --save: version to start from. Default: the twin's file."""
+    log: tuple[Path, ...] = ()
+    """For --save: recordings to score on instead of the twin's own."""
+    duration: float | None = None
+    """For --save: read only this many seconds of the source."""
+    json: Flag = False
+    """Print JSON."""
+
+
+@dataclass(frozen=True)
+class Schema:
+    """Write the JSON Schema of a twin's YAML, for editors that complete and check."""
+
+    out: Path | None = None
+    """File to write. Default: standard output."""
+
+
+@dataclass(frozen=True)
+class Log(TableOptions):
+    """List the content of recordings: buses, messages, signals or columns, with rates, time spans and gaps."""
+
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """CAN logs (MF4, BLF, ASC, TRC, candump, CSV, SQLite) or tables (CSV, Parquet, MATLAB, NumPy), in order."""
+    json: Flag = False
+    """Print one JSON object."""
+
+
+@dataclass(frozen=True)
+class New(TableOptions):
+    """Write NAME.yaml and NAME.py, a runnable example (a pump) or a draft from the signals of a recording."""
+
+    name: Annotated[str, tyro.conf.Positional]
+    """Name of the twin."""
+    folder: Path = field(default_factory=Path.cwd)
+    """Folder to write to."""
+    log: tuple[Path, ...] = ()
+    """Recordings whose signals become sensors."""
+    signals: str = ""
+    """Signals (SIGNAL or MESSAGE.SIGNAL) or columns to use, separated by commas. Default: the six with most levels."""
+
+
+COMMANDS: dict[type, str] = {
+    Run: "run:run_twin",
+    Fold: "fold:fold_twin",
+    Check: "check:check_twin",
+    Advise: "advise:advise",
+    Compare: "compare:compare_twin",
+    Tune: "tune:tune_twin",
+    Learn: "learn:learn_correction",
+    Guard: "guard:guard",
+    Stress: "stress:stress_twin",
+    Commission: "commission:commission_twin",
+    Filters: "filters:show_filters",
+    Review: "run:review_recording",
+    Bus: "bus:play_bus",
+    Twins: "twins:show_twins",
+    Tunings: "tunings:tunings_of",
+    Schema: "new:write_schema",
+    Log: "log:show_log",
+    New: "new:new_twin",
+}
+"""Module and function of every command, imported when the command runs."""
+
+NAMES = {command.__name__.lower(): command for command in COMMANDS}
+"""Command by its name on the command line."""

@@ -1,0 +1,124 @@
+"""Remarks about a recording as a whole go to standard error too, besides being counted and shown."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from config.source_schema import SimulatorSection
+from estimators.errors import ConfigError, SourceError
+from estimators.fold import Fold
+from estimators.late import inflated
+from estimators.log import Log
+from sources.source import NEVER, TRUNCATED, WRONG_TIME, Endless
+from sources.tables.order import REMARKS as ORDER
+
+from ..intake import CLOCK_MOVED, Intake
+from ..terminal import complain
+from .twin import Twin, load_twin
+
+if TYPE_CHECKING:
+    from estimators.events.clocks import Passed
+
+REMARKS = (*ORDER, NEVER, TRUNCATED, CLOCK_MOVED)
+
+FIRST = (WRONG_TIME,)
+"""Of these only the first is said: there may be as many as there are rows."""
+
+
+def remarking(report: Callable[[str, str], None]) -> Callable[[str, str], None]:
+    """A report that also says each remark, once."""
+    said: set[str] = set()
+
+    def both(key: str, text: str) -> None:
+        if key in REMARKS and text not in said:
+            said.add(text)
+            complain(text)
+        elif key in FIRST and key not in said:
+            said.add(key)
+            complain(text)
+        report(key, text)
+
+    return both
+
+
+def read_log(twin: Twin, duration: float | None) -> tuple[Log, Counter[str]]:
+    """Everything that the twin's source says, in the order of time, and what was counted on the way.
+
+    Raises:
+        ConfigError: If `duration` is not positive.
+        SourceError: If the source cannot be opened, has no end, or says nothing.
+    """
+    if duration is not None and not duration > 0.0:
+        raise ConfigError(f"--duration {duration:g}: must be positive")
+    counts: Counter[str] = Counter()
+
+    def count(key: str, text: str) -> None:
+        counts[key] += 1
+
+    def put(passed: Passed) -> None:
+        events = passed.events
+        if beside is not None:
+            events, late = inflated(events, beside, log.newest, horizon)
+            counts["inflated"] += late
+        first, stale = log.extend(events, horizon, passed.settled)
+        counts["stale"] += stale
+        if beside is not None:
+            beside.rewind(first)
+            beside.advance()
+
+    remark = remarking(count)
+    source = twin.open_source(remark, live=False)
+    if duration is None and isinstance(source, Endless) and source.endless:
+        source.close()
+        raise SourceError(f"{twin.name}: its source has no end; give --duration SECONDS")
+    log = Log.of(twin.model)
+    horizon = round(twin.config.time.horizon * 1e9)
+    # What a late reading is inflated by is asked of the estimate when it comes.
+    beside = Fold(twin.estimator, twin.model, twin.tuning, log) if twin.late.inflate else None
+    intake = Intake(twin.model, horizon, remark, twin.maintenance)
+    try:
+        while (batch := source.read(1.0)) is not None:
+            put(intake.take(batch))
+            if duration is not None and log.n and log.t[log.n - 1] - log.t[0] > duration * 1e9:
+                log.n = int(np.searchsorted(log.t[: log.n], log.t[0] + round(duration * 1e9), side="right"))
+                break
+        else:
+            put(intake.finish())
+    finally:
+        source.close()
+    if not log.n:
+        files = ", ".join(map(str, twin.plan.log_files or ()))
+        place = f"--log {files}" if files else twin.loaded.places.at(("source",))
+        raise SourceError(f"{place}: the source said nothing that a sensor needs; check the channel maps")
+    return log, +counts
+
+
+def read_logs(
+    twin: Twin, name: str, overrides: Mapping[str, str], count: int = 1, duration: float | None = None
+) -> list[Log]:
+    """Read the log of a twin, or several logs of its simulator with consecutive seeds.
+
+    Args:
+        twin: The twin.
+        name: Name or path that it was loaded from.
+        overrides: Overrides that it was loaded with.
+        count: Number of logs.
+        duration: Seconds of each; None for all.
+
+    Raises:
+        NisusError: As `read_log`, or if the twin is not simulated.
+    """
+    if count == 1:
+        return [read_log(twin, duration)[0]]
+    source = twin.config.source
+    if count < 1:
+        raise ConfigError(f"--logs {count}: must be 1 or more")
+    if not isinstance(source, SimulatorSection):
+        raise ConfigError(f"--logs {count}: {twin.name} is not simulated and has one log; name recordings with --log")
+    seeds = range(source.seed, source.seed + count)
+    twins = (load_twin(name, overrides={**overrides, "source.seed": str(seed)}) for seed in seeds)
+    return [read_log(other, duration)[0] for other in twins]
