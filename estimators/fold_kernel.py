@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numba import types
 
-from .compiled.context import context_type, prior, sensor_rows
+from .compiled.context import context_type, prior, sensor_rows, steps_of
 from .compiled.verdict import limit_of
 from .diagnostics.evidence import watch_rows
 from .diagnostics.health import assess, bounds_type, policy_type
@@ -19,7 +19,6 @@ from .gate.soften import soften
 from .interpreted.fold_loop import LONGEST, UNSET
 from .log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, inlined, jit, part
-from .numerics.steps import steps_of
 from .screen import pass_on, screen_reading, screen_signature
 from .track import ANCESTORS, EFFECTIVE, GATED, MISSING, NONE, SCREENED, USED, WHITENED, borrowed_columns, track_type
 

@@ -21,9 +21,8 @@ from .fold_kernel import compiled
 from .gate import doubt
 from .gate.isolation import widening
 from .interpreted import fold_loop
-from .interpreted.black_box_filters import driven
 from .interpreted.fold_loop import UNSET
-from .interpreted.view import View
+from .interpreted.view import View, driven
 from .log import Log
 from .model.mode_as_number import indicator
 from .model.state_space import LARGE, StateSpaceModel

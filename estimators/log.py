@@ -23,7 +23,6 @@ from .events.batch import (
 )
 from .events.checks import Layout, admitted
 from .events.maintenance import versions_dropped
-from .events.order import in_order, sorted_order
 
 if TYPE_CHECKING:
     from .model.state_space import StateSpaceModel
@@ -36,7 +35,7 @@ __all__ = [
 
 
 class Log:
-    """A bounded, columnar log in the order of order.py: by measured time, and at one time by kind and channel.
+    """A bounded, columnar log in the order of `sorted_order`: by measured time, and at one time by kind and channel.
 
     Timestamps are int64 nanoseconds. `first` counts the events that were dropped from the front, so `first + i` names
     an event for ever. Columns are full-length arrays of which the first `n` rows are valid. `changes` counts what was
@@ -290,3 +289,37 @@ class Log:
         for new, old in zip(twin._columns(), self._columns(), strict=True):
             new[: self.n] = old[: self.n]
         return twin
+
+
+_ORDER = (INPUT, READING, TRUTH, TICK, MARK, MAINTENANCE, RESET)
+_RANK = np.array([_ORDER.index(kind) for kind in range(len(_ORDER))], np.int64) << 32
+
+
+def in_order(events: Events) -> bool:
+    """Whether each event comes after the one before it, with no two that only their values could order."""
+    t = events.t
+    if t.size < 2:
+        return True
+    later = t[1:] > t[:-1]
+    if later.all():
+        return True
+    place = _RANK.take(events.kind) + events.channel
+    return bool(np.all(later | ((t[1:] == t[:-1]) & (place[1:] > place[:-1]))))
+
+
+def sorted_order(events: Events) -> np.ndarray:
+    """Return the permutation (N,) that puts events in the order of a log, whatever the order of arrival.
+
+    Events are ordered by time. At one time come the inputs first, as a measurement is predicted with the inputs that
+    hold when it is taken; then the measurements; then queries, which do not change the estimate (true states, ticks,
+    marks) and so see all measurements of their time; then maintenance, and a reset last. Events of one kind follow
+    their channel: sensors in the order of the model. Several events of one kind, channel and time are ordered by their
+    values, the smallest first and a missing one last; of two inputs at one time the larger holds. The order of arrival
+    cannot decide that, as a late event would then count for more than the same event in time.
+    """
+    place = _RANK.take(events.kind) + events.channel
+    order: np.ndarray = np.lexsort((place, events.t))
+    t, at = events.t[order], place[order]
+    if np.any((t[1:] == t[:-1]) & (at[1:] == at[:-1])):
+        order = np.lexsort((*events.value.T[::-1], place, events.t))
+    return order

@@ -16,7 +16,7 @@ from .fold_kernel import (
     screen_reading,
     screen_signature,
 )
-from .numerics.threads import threaded
+from .numerics.jit import threaded
 from .registry import ESTIMATORS
 from .smoothing.pieces import PIECES
 

@@ -17,7 +17,6 @@ IMPURE_HERE = {
     "numerics/cache.py": {"os"},  # where the compile cache is
     "numerics/cache_entries.py": {"os"},  # reads and writes the compile cache
     "numerics/jit.py": {"os"},  # whether the user says where, and how threads wait
-    "numerics/threads.py": {"os"},  # how many processors there are
     "model/user_file.py": {"os"},  # a model that would end the program
     "compiled/orphan.py": {"os", "threading"},  # a worker that ends with its parent
 }

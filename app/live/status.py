@@ -12,12 +12,12 @@ import numpy as np
 from estimators.diagnostics.health import FAR
 from estimators.diagnostics.score import nis_verdict
 from estimators.diagnostics.sensor_states import sensor_states
+from estimators.events.maintenance import model_version_at
 from estimators.fold import Fold
 from estimators.log import RESET
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import find_estimator
 from estimators.track import FAILED, GATED, USED
-from estimators.versions import model_version_at
 from sources.source import Source
 
 from .counts import RowCounts, last_run

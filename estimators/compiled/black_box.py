@@ -1,7 +1,7 @@
 """A model whose functions run on blocks of states in Python, split over threads, processes or any executor.
 
 A compiled filter that runs f and h at its own members alone is driven on it: the block is run first, and what the
-filter calls as f or h looks the answer up by the address of the member (see interpreted/black_box_filters.py).
+filter calls as f or h looks the answer up by the address of the member (see interpreted/view.py).
 """
 
 from __future__ import annotations

@@ -1,16 +1,25 @@
-"""What a compiled filter sees of a model and a tuning: addresses of code, layout, numbers."""
+"""The context of a compiled filter: addresses of the model's code, layout, numbers of the tuning.
+
+A model's f and h are called through loops over the rows of a block, `looped_f` and `looped_h`. Numba passes an array
+as seven numbers, so a call f(x, u, p, dt, out) takes 29 of them, most through memory: 15 ns, more than most models need
+to answer. The loop takes addresses instead, has its sizes as constants, and contains the model's own code.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import math
+from collections.abc import Callable
+from types import FunctionType
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
 from numba import from_dtype, types
+from numba.core.serialize import dumps
 from numba.extending import intrinsic
 
-from ..numerics.jit import C1, F1, F2, caller, f64, flags, floats, i64, inlined, ints, jit, matrix, part
-from .row_loops import call_f_rows, call_h_rows
+from ..numerics.jit import C1, F1, F2, by_address, caller, f64, flags, floats, i64, inlined, ints, jit, matrix, part
 
 f_signature = types.void(F1, F1, F1, f64, F1)
 f_complex_signature = types.void(C1, F1, F1, f64, C1)
@@ -241,3 +250,79 @@ def own_likelihood(context, sensor, y, x, u):
     """log p(y | x) of a sensor that gives it."""
     target = ints(context.log_likelihood, context.n_sensors)[sensor]
     return call_log_likelihood(target, y, x, u, parameters(context), sensor_variances(context, sensor))
+
+
+f_rows_signature = types.void(i64, i64, i64, i64, i64, f64, i64, i64)
+h_rows_signature = types.void(i64, i64, i64, i64, i64, i64, i64)
+
+# What the templates below name, and `_looped` gives them for each model.
+function: Any = None
+NX = NU = PARAMETERS = NY = 0
+
+call_f_rows = caller(f_rows_signature)
+call_h_rows = caller(h_rows_signature)
+
+
+def _f_rows(x, stride, n, u, p, dt, out, out_stride):
+    for i in range(n):
+        function(
+            floats(x + 8 * i * stride, NX),
+            floats(u, NU),
+            floats(p, PARAMETERS),
+            dt,
+            floats(out + 8 * i * out_stride, NX),
+        )
+
+
+def _h_rows(x, stride, n, u, p, out, out_stride):
+    for i in range(n):
+        function(
+            floats(x + 8 * i * stride, NX),
+            floats(u, NU),
+            floats(p, PARAMETERS),
+            floats(out + 8 * i * out_stride, NY),
+        )
+
+
+def looped_f(f: Any, nx: int, nu: int, parameters: int) -> Any:
+    """A dispatcher of f_rows(x, stride, n, u, p, dt, out, out_stride): f of n rows, `stride` numbers apart."""
+    return _looped(_f_rows, f, {"NX": nx, "NU": nu, "PARAMETERS": parameters})
+
+
+def looped_h(h: Any, nx: int, nu: int, parameters: int, ny: int) -> Any:
+    """A dispatcher of h_rows(x, stride, n, u, p, out, out_stride): h of n rows, `stride` numbers apart."""
+    return _looped(_h_rows, h, {"NX": nx, "NU": nu, "PARAMETERS": parameters, "NY": ny})
+
+
+def _looped(template: Callable, dispatcher: Any, sizes: dict[str, int]) -> Any:
+    """The template around a model's function, cached under the function's own file, line and name.
+
+    Numba keys its cache by these, the bytecode and the closure, but not by globals; so the sizes, and what the
+    function has in its closure, go into the name.
+    """
+    model = dispatcher.py_func
+    closure = dumps(tuple(cell.cell_contents for cell in model.__closure__ or ()))
+    digest = hashlib.sha256(repr(sizes).encode() + closure).hexdigest()[:12]
+    name = f"{model.__name__}_rows_{digest}"
+    code = template.__code__.replace(
+        co_name=name, co_filename=model.__code__.co_filename, co_firstlineno=model.__code__.co_firstlineno
+    )
+    loop = FunctionType(code, {"function": dispatcher, "floats": floats, **sizes}, name)
+    loop.__qualname__ = f"{model.__qualname__}_rows_{digest}"
+    loop.__module__ = model.__module__
+    return by_address(loop)
+
+
+SLACK = 1e-3
+"""Share of a step by which a step may be longer than `max_step`.
+
+0.3 s in steps of 0.1 s are three, though 0.3 / 0.1 is a little more than 3 in floating point; and so are three periods
+of 1/30 s, though timestamps are whole nanoseconds. `max_step` bounds how far a crude integration goes, which a
+thousandth does not change.
+"""
+
+
+@jit
+def steps_of(dt: float, max_step: float) -> int:
+    """The fewest equal steps that cross `dt` seconds with none longer than `max_step`, within `SLACK` of a step."""
+    return max(1, int(math.ceil(dt / max_step - SLACK)))

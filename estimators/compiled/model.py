@@ -27,14 +27,17 @@ from .context import (
     H_signature,
     Q_signature,
     f_complex_signature,
+    f_rows_signature,
     f_signature,
     h_complex_signature,
+    h_rows_signature,
     h_signature,
     log_likelihood_signature,
+    looped_f,
+    looped_h,
     shape_signature,
 )
 from .jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step_f, complex_step_h, scratch_size
-from .row_loops import f_rows_signature, h_rows_signature, looped_f, looped_h
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..compiled.context import steps_of
 from ..compiled.model import CompiledModel
 from ..errors import ModelError
 from ..model.check import indefinite, numbers, place
 from ..model.state_space import SHOWN
-from ..numerics.steps import steps_of
 from ..track import FAILED, GATED, Track, estimated_rows
 
 AWAY = (1.0, -1.0, 3.0, -3.0)

@@ -13,7 +13,7 @@ from ..compiled.context import (
     expect,
     sensor_variances,
 )
-from ..compiled.sensor_noise import has_correlated_rows, independent_rows
+from ..compiled.noise import has_correlated_rows, independent_rows
 from ..compiled.verdict import verdict_of
 from ..numerics.jit import jit
 from ..numerics.linalg import solve_transposed, solve_upper, wrap

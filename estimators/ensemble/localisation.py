@@ -16,10 +16,9 @@ from ..errors import EstimatorError
 from ..estimator import Options
 from ..model.field import Field
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import floats, ints, jit, matrix
+from ..numerics.jit import floats, ints, jit, matrix, threaded
 from ..numerics.simd import WIDE
 from ..numerics.simd_ir import LANES
-from ..numerics.threads import threaded
 
 _FIELDS = 6
 """Numbers a sensor in the table: how many blocks, and where they, their rows' starts, rows, tapers and the tapers

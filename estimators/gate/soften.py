@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..compiled.context import sensor_rows
-from ..compiled.sensor_noise import independent_rows
+from ..compiled.noise import independent_rows
 from ..compiled.verdict import limit_of
 from ..estimator import call_update
 from ..numerics.jit import floats, jit, part

@@ -16,8 +16,7 @@ from ..model.state_space import StateSpaceModel
 from ..tuning import Tuning
 from .robust import OPTIONS, memory, shared_options
 from .shared import describe, moments, start, state_size
-from .sigma_points import sigma_points, weights
-from .ukf import predict, update, work_size
+from .ukf import predict, sigma_points, update, weights, work_size
 
 
 def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:

@@ -20,12 +20,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..compiled.context import options, row_count, transition
+from ..compiled.context import options, row_count, steps_of, transition
 from ..errors import EstimatorError
 from ..estimator import Estimator, Option, Options
 from ..model.correlation import covariance_of
 from ..model.state_space import StateSpaceModel
-from ..numerics import steps
 from ..numerics.jit import inlined, jit
 from ..numerics.linalg import congruence, unit_factor
 from ..numerics.workspace import layout, start_of, take_matrix
@@ -189,7 +188,7 @@ def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
 
     period, rate = values["period"], float(np.log(values["inflation"]))
     u = np.array([item.default for item in model.inputs], float)
-    steps = steps_of(model, period)
+    steps = steps_of(period, float(model.max_step))
     F, Q, H = matrices(model, u, tuning.p, tuning.q, period, rate)
     R = covariance_of(model.sensors[0].correlation, np.asarray(tuning.r, float))
     if model.correlated:
@@ -230,7 +229,7 @@ def matrices(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """F and Q over a period, in steps that the model allows, and H of the only sensor; F includes the inflation."""
     n, m = model.nx, len(model.sensors[0].rows)
-    steps = steps_of(model, period)
+    steps = steps_of(period, float(model.max_step))
     dt = period / steps
     f, h = _plain(model.f), _plain(model.sensors[0].h)
     F = columns(lambda x, out: f(x, u, p, dt, out), n, n)
@@ -259,11 +258,6 @@ def columns(function: Callable, n: int, m: int) -> np.ndarray:
         function(x, out)
         J[:, j] = out - origin
     return J
-
-
-def steps_of(model: StateSpaceModel, period: float) -> int:
-    """Steps in which the fold crosses a period."""
-    return steps.steps_of(period, float(model.max_step))
 
 
 def undetectable(model: StateSpaceModel, F: np.ndarray, H: np.ndarray) -> str | None:

@@ -150,8 +150,8 @@ def reading_variances(context, sensor, state, r):
 def weight(kind, at, m, nu, r, S, V, z):
     """The weight w by which a reading counts: as if its noise were N(0, R / w). NaN if S + R (1/w - 1) has no factor.
 
-    nu, r (m,): raw innovation and variances of independent rows (a full R is factored before, see sensor_noise.py, and
-    scaled as a whole); S (m, m) includes R; V (m, m) and z (2 m,) are scratch.
+    nu, r (m,): raw innovation and variances of independent rows (a full R is factored before and scaled as a whole, see
+    compiled/noise.py); S (m, m) includes R; V (m, m) and z (2 m,) are scratch.
     """
     return huber(at, m, nu, r, S, V, z) if kind == HUBER else student_t(at, m, nu, r, S, V, z)
 

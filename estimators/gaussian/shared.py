@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..compiled.context import circular_rows, circular_states, shown_states
-from ..compiled.sensor_noise import has_correlated_rows, independent_rows
+from ..compiled.noise import has_correlated_rows, independent_rows
 from ..compiled.verdict import verdict_of
 from ..estimator import Options
 from ..numerics.jit import inlined, ints, jit, part
@@ -204,7 +204,7 @@ def gather(context, sensor, y, reading, H, P, innovation, innovation_std):
 
 @part
 def make_independent(m, L, nu, S, C, H):
-    """ν ← L⁻¹ ν, S ← L⁻¹ S L⁻ᵀ, C ← C L⁻ᵀ, H ← L⁻¹ H, in their leading m rows of a reading: see sensor_noise.py."""
+    """ν ← L⁻¹ ν, S ← L⁻¹ S L⁻ᵀ, C ← C L⁻ᵀ, H ← L⁻¹ H, in their leading m rows of a reading: see compiled/noise.py."""
     solve_unit(L, m, nu)
     for i in range(m):
         solve_unit(L, m, S[i])

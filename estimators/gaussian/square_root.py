@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..compiled.context import add_process_noise, circular_rows, options, shown_states
-from ..compiled.sensor_noise import has_correlated_rows, independent_rows
+from ..compiled.noise import has_correlated_rows, independent_rows
 from ..estimator import Options
 from ..numerics.jit import inlined, ints, jit
 from ..numerics.linalg import EPSILON, remove, root, solve_transposed, solve_unit, triangularise, wrap
@@ -198,7 +198,7 @@ def gather(context, sensor, y, own, expected, Y, lost, innovation):
 
 @jit
 def make_independent(m, L, nu, Y, lost):
-    """ν ← L⁻¹ ν, Y ← Y L⁻ᵀ, lost ← L⁻¹ lost: see sensor_noise.py."""
+    """ν ← L⁻¹ ν, Y ← Y L⁻ᵀ, lost ← L⁻¹ lost: see compiled/noise.py."""
     solve_unit(L, m, nu)
     for i in range(Y.shape[0]):
         solve_unit(L, m, Y[i])

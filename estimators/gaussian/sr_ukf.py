@@ -1,6 +1,6 @@
 """The square-root unscented Kalman filter: sigma points from a factor of P that is never multiplied out.
 
-Sigma points and weights as in sigma_points.py. A negative central weight takes a square off the others: that is a
+Sigma points and weights as in ukf.py. A negative central weight takes a square off the others: that is a
 rank-one downdate, which fails visibly where nothing positive definite is left.
 
 Source: van der Merwe & Wan (2001), doi:10.1109/ICASSP.2001.940586. Their m downdates by the columns of K S^½, which
@@ -22,9 +22,8 @@ from ..numerics.simd_ir import padded
 from ..numerics.workspace import layout, size_of, start_of, take_matrix, take_vector
 from .robust import growth, memory
 from .shared import moments_of, state_size
-from .sigma_points import deviations, weights, weights_of
 from .square_root import Conditioning, condition, conditioning, describe, moments, noise_root, settle, start
-from .ukf import UKF, tune
+from .ukf import UKF, deviations, tune, weights, weights_of
 
 
 def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:

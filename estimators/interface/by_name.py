@@ -15,7 +15,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from multiprocessing import get_context
 from pickle import PicklingError
 from typing import Any
@@ -24,17 +25,20 @@ import numba
 import numpy as np
 
 from ..compiled.orphan import leave_with_parent
+from ..diagnostics.consistency import Nees, nees
+from ..diagnostics.episodes import Course, Episode, found_in
 from ..diagnostics.health import HealthPolicy
+from ..diagnostics.score import Score, score
 from ..errors import ConfigError, EstimatorError
 from ..fold import Fold
 from ..fold import fold as fold_track
-from ..log import Events, Log
+from ..log import READING, Events, Log
 from ..model.state_space import StateSpaceModel
 from ..registry import checked, find_estimator
 from ..smoothing.smooth import check_smooth, smooth
 from ..track import Track
 from ..tuning import Tuning
-from .estimates import Estimates
+from .table import table_of
 
 __all__ = ["fold", "fold_many"]
 
@@ -304,3 +308,99 @@ def _entries(group: str, name: str, value: Any, model: StateSpaceModel) -> list[
         raise ConfigError(f"{group}[{name!r}] has shape {given.shape}; it must be {wanted}")
     start = model.row_start[model.sensor_names.index(name)]
     return [(f"R.{model.row_names[start + k]}", float(number)) for k, number in enumerate(given)]
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """One row an event of the log, in its order; `track` has all columns, `events` what was folded."""
+
+    estimator: str
+    model: StateSpaceModel
+    tuning: Tuning = field(repr=False)
+    events: Events = field(repr=False)
+    track: Track = field(repr=False)
+    covariance: bool = False
+
+    def __len__(self) -> int:
+        """Number of events."""
+        return len(self.track)
+
+    @cached_property
+    def seconds(self) -> np.ndarray:
+        """Times of the events, s, (N,)."""
+        seconds: np.ndarray = self.events.t * 1e-9
+        return seconds
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Estimates of the states after each event, (N, nx), in their units."""
+        mean: np.ndarray = self.track.mean
+        return mean
+
+    @property
+    def std(self) -> np.ndarray:
+        """Their standard deviations, (N, nx)."""
+        std: np.ndarray = self.track.std
+        return std
+
+    @property
+    def nis(self) -> np.ndarray:
+        """Normalised innovation squared of each reading, (N,); NaN for other events."""
+        nis: np.ndarray = self.track.nis
+        return nis
+
+    @property
+    def cov(self) -> np.ndarray:
+        """Covariances after each event, (N, nx, nx).
+
+        Raises:
+            EstimatorError: If the fold did not keep them.
+        """
+        if not self.covariance:
+            raise EstimatorError("the covariances were not kept; fold with covariance=True")
+        n = self.model.nx
+        cov = np.empty((len(self), n, n))
+        cov[:, range(n), range(n)] = self.track.std**2
+        i, j = np.triu_indices(n, 1)
+        cov[:, i, j] = cov[:, j, i] = self.track.cross
+        return cov
+
+    @property
+    def log_likelihood(self) -> float:
+        """Sum over the readings that were used or refused; see diagnostics/refusals.py."""
+        return self.score().log_likelihood
+
+    def readings(self, sensor: str) -> np.ndarray:
+        """Indices of the rows that are readings of a sensor.
+
+        Raises:
+            EstimatorError: If there is no such sensor.
+        """
+        if sensor not in self.model.sensor_names:
+            raise EstimatorError(
+                f"{self.model.name} has no sensor {sensor!r}; it has {', '.join(self.model.sensor_names)}"
+            )
+        channel = self.model.sensor_names.index(sensor)
+        return np.flatnonzero((self.events.kind == READING) & (self.events.channel == channel))
+
+    def table(self) -> Any:
+        """A pyarrow.Table, one row an event; `.to_pandas()` makes a frame of it. See tabular.py for its columns."""
+        return table_of(self.model, self.events, self.track, self.episodes())
+
+    def episodes(self) -> list[Episode]:
+        """What was wrong from when to when, with whom, by how much, and what to do: see docs/alarms.md."""
+        marginal = find_estimator(self.estimator, self.model).family in ("particle", "ensemble")
+        course = Course(self.model, self.tuning, marginal, self.events, self.track)
+        return [found.episode for found in found_in(course)]
+
+    def score(self) -> Score:
+        """NIS and its bounds, errors against the truth, predictions of sensors held out."""
+        return score(self.track, self.events, self.model, gate=self.tuning.gate, baseline=self.tuning.baseline)
+
+    def nees(self) -> Nees:
+        """Normalised estimation error squared wherever the truth is known.
+
+        Raises:
+            EstimatorError: If the fold did not keep the covariances, or no truth is known.
+        """
+        return nees(self.model, self.events, self.mean, self.cov)

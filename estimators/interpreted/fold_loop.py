@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from ..compiled.context import steps_of
 from ..compiled.verdict import limit_of
 from ..errors import ModelError
 from ..gate.doubt import Rule, forget, note
 from ..gate.soften import inflation
 from ..log import INPUT, MARK, READING, RESET, TICK, TRUTH
-from ..numerics.steps import steps_of
 from ..screen import pass_on, screen_reading
 from ..track import (
     ANCESTORS,

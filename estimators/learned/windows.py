@@ -14,12 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..compiled.context import steps_of
 from ..compiled.model import compile_model
 from ..fold import Fold
 from ..log import INPUT, READING, RESET, Log, truth_of
 from ..model.hybrid import gathered, places
 from ..model.state_space import StateSpaceModel
-from ..numerics.steps import steps_of
 from ..smoothing.smooth import smooth
 
 SHORTEST = 0.5

@@ -357,3 +357,27 @@ def weighted(typing_context: Any, n: Any, w: Any, x: Any, out: Any) -> Any:
         return _summing(builder, given[0], whole, single)
 
     return _f64(_i64, _i64, _i64, _i64), codegen
+
+
+@intrinsic
+def exp_minus(typing_context: Any, n: Any, x: Any, shift: Any, out: Any) -> Any:
+    """out[:n] = e^(x[:n] - shift), within a unit in the last place; 0 where it is below the normal numbers."""
+
+    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        n, shift = given[0], given[2]
+        x, out = simd_ir.pointer(builder, given[1]), simd_ir.pointer(builder, given[3])
+        wide = simd_ir.broadcast(builder, shift)
+
+        def whole(i: Any) -> None:
+            simd_ir.store(
+                builder, simd_ir.exponential(builder, builder.fsub(simd_ir.load(builder, x, i), wide)), out, i
+            )
+
+        def single(i: Any) -> None:
+            value = simd_ir.exponential(builder, builder.fsub(builder.load(builder.gep(x, [i])), shift))
+            builder.store(value, builder.gep(out, [i]))
+
+        simd_ir.in_vectors(builder, n, whole, single)
+        return context.get_dummy_value()
+
+    return types.void(_i64, _i64, _f64, _i64), codegen

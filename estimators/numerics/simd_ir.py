@@ -5,6 +5,7 @@ The compiler splits them where the processor's vectors are shorter.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -112,3 +113,47 @@ def sum_of(builder: Any, vector: Any) -> Any:
     while len(numbers) > 1:
         numbers = [builder.fadd(a, b) for a, b in zip(numbers[::2], numbers[1::2], strict=True)]
     return numbers[0]
+
+
+_LOWEST = -708.0
+"""e to this is the smallest normal number, nearly; below it `exp_minus` gives 0."""
+
+_HIGHEST = 709.0
+
+_LN2_HIGH, _LN2_LOW = float.fromhex("0x1.62e42fefa3800p-1"), float.fromhex("0x1.ef35793c76730p-45")
+"""ln 2 in two parts; the first has 42 bits, so that its product with an exponent is exact (as in FDLIBM's e_exp.c)."""
+
+_ROUND = 1.5 * 2.0**52
+"""Adding and taking it away rounds to a whole number, which then stands in the low bits."""
+
+
+def exponential(builder: Any, x: Any) -> Any:
+    """e^x for a number or a vector of them, within a unit in the last place; 0 below `_LOWEST`.
+
+    x = k ln 2 + r with |r| ≤ ln 2 / 2, and the Taylor polynomial of degree 13, whose remainder is under 5e-18.
+    """
+    kind = x.type
+    wide = isinstance(kind, ir.VectorType)
+    whole_kind = ir.VectorType(I64, LANES) if wide else I64
+
+    def number(value: float) -> Any:
+        return ir.Constant(kind, [value] * LANES if wide else value)
+
+    def whole_number(value: int) -> Any:
+        return ir.Constant(whole_kind, [value] * LANES if wide else value)
+
+    low = builder.fcmp_ordered("<", x, number(_LOWEST))
+    high = builder.fcmp_ordered(">", x, number(_HIGHEST))
+    bounded = builder.select(low, number(_LOWEST), builder.select(high, number(_HIGHEST), x))
+    shifted = multiply_add(builder, bounded, number(1.4426950408889634), number(_ROUND))
+    k = builder.fsub(shifted, number(_ROUND))
+    r = multiply_add(builder, k, number(-_LN2_HIGH), bounded)
+    r = multiply_add(builder, k, number(-_LN2_LOW), r)
+    value = number(1.0 / math.factorial(13))
+    for power in range(12, -1, -1):
+        value = multiply_add(builder, value, r, number(1.0 / math.factorial(power)))
+    exponent = builder.add(builder.bitcast(shifted, whole_kind), whole_number(1023))
+    power_of_two = builder.bitcast(builder.shl(exponent, whole_number(52)), kind)
+    value = builder.fmul(value, power_of_two)
+    value = builder.select(low, number(0.0), value)
+    return builder.select(high, number(math.inf), value)

@@ -1,4 +1,4 @@
-"""The vector instructions of simd.py and simd_exp.py on arrays, so that no address stands in a filter.
+"""The vector instructions of simd.py on arrays, so that no address stands in a filter.
 
 Rows must be contiguous; n counts what of them is worked on.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from . import simd, simd_exp
+from . import simd
 from .jit import inlined
 from .simd import WIDE
 from .simd_ir import LANES
@@ -46,7 +46,7 @@ def weighted(n, w, x, out):
 @inlined
 def exp_minus(n, x, shift, out):
     """out[:n] = e^(x[:n] - shift); 0 where it is below the normal numbers."""
-    simd_exp.exp_minus(n, x.ctypes.data, shift, out.ctypes.data)
+    simd.exp_minus(n, x.ctypes.data, shift, out.ctypes.data)
 
 
 @inlined

@@ -18,8 +18,7 @@ import numpy as np
 
 from ..compiled.context import options as numbers
 from ..compiled.context import sensor_variances
-from ..compiled.noise import semidefinite_root
-from ..compiled.sensor_noise import independent_rows
+from ..compiled.noise import independent_rows, semidefinite_root
 from ..estimator import Estimator
 from ..numerics.jit import jit, matrix
 from ..numerics.random import ONE, key_of, normal

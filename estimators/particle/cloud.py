@@ -13,9 +13,8 @@ import numpy as np
 
 from ..estimator import Option, Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import jit, matrix
+from ..numerics.jit import jit, matrix, threaded
 from ..numerics.linalg import wrap
-from ..numerics.threads import threaded
 from ..numerics.workspace import WORD, layout, size_of, start_of, take_matrix, take_vector, view
 from ..tuning import Tuning
 from .resampling import SCHEME_NAMES

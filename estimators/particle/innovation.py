@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..compiled.context import circular_rows, expect, has_own_likelihood, sensor_variances
-from ..compiled.sensor_noise import add_covariances
+from ..compiled.noise import add_covariances
 from ..numerics.jit import jit
 from ..numerics.linalg import wrap
 from ..numerics.normal_score import normal_score

@@ -13,8 +13,7 @@ import numpy as np
 
 from ..compiled.context import options as numbers
 from ..compiled.context import sensor_variances
-from ..compiled.noise import add_noise, semidefinite_root
-from ..compiled.sensor_noise import independent_rows
+from ..compiled.noise import add_noise, independent_rows, semidefinite_root
 from ..estimator import Estimator
 from ..numerics.jit import inlined, jit
 from ..numerics.random import ONE, key_of, normal

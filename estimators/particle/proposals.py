@@ -24,8 +24,7 @@ from ..compiled.context import (
 )
 from ..compiled.context import options as numbers
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
-from ..compiled.noise import add_noise, semidefinite_root
-from ..compiled.sensor_noise import add_covariances, has_correlated_rows
+from ..compiled.noise import add_covariances, add_noise, has_correlated_rows, semidefinite_root
 from ..compiled.verdict import LOG_2PI
 from ..estimator import Options
 from ..gaussian.shared import admit

@@ -7,7 +7,7 @@ import numpy as np
 from ..compiled.context import circular_rows, circular_states, expect, linear_states, sensor_variances
 from ..compiled.context import options as numbers
 from ..compiled.jacobians import sensor_jacobian
-from ..compiled.sensor_noise import add_covariances
+from ..compiled.noise import add_covariances
 from ..compiled.verdict import LOG_2PI
 from ..gaussian.shared import factor
 from ..numerics.jit import jit

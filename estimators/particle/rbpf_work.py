@@ -15,8 +15,7 @@ from ..compiled.context import options as numbers
 from ..compiled.jacobians import scratch_size
 from ..estimator import Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import jit
-from ..numerics.threads import threaded
+from ..numerics.jit import jit, threaded
 from ..numerics.workspace import layout, size_of, take_matrix, take_vector
 from ..tuning import Tuning
 from .cloud import MEMBERS, THREADS, members

@@ -13,7 +13,7 @@ from ..compiled.context import (
     sensor_variances,
 )
 from ..compiled.context import options as numbers
-from ..compiled.sensor_noise import has_correlated_rows, independent_rows
+from ..compiled.noise import has_correlated_rows, independent_rows
 from ..compiled.verdict import LOG_2PI
 from ..numerics.jit import jit
 from ..numerics.linalg import solve_unit, wrap

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from ..compiled.context import circular_states, transition_points
 from ..compiled.jacobians import scratch_size, state_jacobian
-from ..gaussian.sigma_points import deviations, weights_of
+from ..gaussian.ukf import deviations, weights_of
 from ..numerics.jit import floats, inlined, jit
 from ..numerics.padded_rows import cross_covariance, factor, spread_points
 from ..numerics.simd_ir import padded

@@ -29,6 +29,7 @@ from ..compiled.context import (
     expect,
     process_variances,
     row_count,
+    steps_of,
     transition,
 )
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
@@ -38,7 +39,6 @@ from ..log import INPUT, READING, RESET, Log
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import jit
 from ..numerics.linalg import root, wrap
-from ..numerics.steps import steps_of
 from ..track import USED
 from ..tuning import Tuning
 from .moments_back import MomentsBack

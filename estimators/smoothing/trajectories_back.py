@@ -15,14 +15,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from ..compiled.context import add_process_noise, transition_points
+from ..compiled.context import add_process_noise, steps_of, transition_points
 from ..errors import EstimatorError
 from ..estimator import call_predict
 from ..fold import Fold
 from ..interpreted.fold_loop import LONGEST, UNSET
 from ..log import INPUT, RESET
 from ..numerics.jit import jit
-from ..numerics.steps import steps_of
 from ..particle.cloud import weights_of
 from ..snapshots import Snapshot
 from .smoothed import Smoothed

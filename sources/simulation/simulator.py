@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from estimators.compiled.context import steps_of
 from estimators.compiled.model import compile_model
 from estimators.errors import NisusError, SourceError, nearest
 from estimators.log import INPUT, READING, TICK, TRUTH, Events
 from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.jit import plain
-from estimators.numerics.steps import steps_of
 
 from ..faults.change import NEVER, Change
 from .profile import Constant, Profile

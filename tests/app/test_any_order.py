@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from app.intake import Intake
 from estimators.diagnostics.health import HealthPolicy
-from estimators.events.order import sorted_order
 from estimators.fold import Fold
-from estimators.log import MAINTENANCE, MARK, READING, RESET, TICK, TRUTH, Events, Log
+from estimators.log import MAINTENANCE, MARK, READING, RESET, TICK, TRUTH, Events, Log, sorted_order
 from estimators.model.limits import Limits
 from estimators.tuning import Tuning
 from sources.source import WRONG_TIME

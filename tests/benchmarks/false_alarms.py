@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import poisson
 
+from estimators.compiled.context import steps_of
 from estimators.compiled.model import compile_model
 from estimators.diagnostics.evidence import CAUSES, IMPOVERISHED
 from estimators.diagnostics.health import HealthPolicy
@@ -26,7 +27,6 @@ from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import StateSpaceModel
 from estimators.models import MODELS
 from estimators.numerics.jit import jit_brief
-from estimators.numerics.steps import steps_of
 from estimators.tuning import Tuning
 
 from ..support import SECOND

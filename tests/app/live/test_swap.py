@@ -21,9 +21,8 @@ from app.twin.twin import load_twin
 from app.views.rerun.feed import RerunFeed
 from app.views.viser.view import ViserView
 from config.loader import shipped
-from estimators.events.order import sorted_order
 from estimators.fold import Fold
-from estimators.log import INPUT, READING, TICK, TRUTH, Events, Log
+from estimators.log import INPUT, READING, TICK, TRUTH, Events, Log, sorted_order
 from estimators.registry import ESTIMATORS, unfit
 from tests.app.scripted import Scripted, wait_for
 

@@ -25,7 +25,7 @@ from app.views.recording.writer import Recorder
 from estimators.fold import Fold, fold
 from estimators.log import Log
 from estimators.numerics.cache import cache_folder
-from estimators.numerics.threads import threaded
+from estimators.numerics.jit import threaded
 from estimators.pieces import LOOP, Piece, is_made, pieces_of
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning

@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from estimators.compiled.noise import add_noise, belief_root, semidefinite_root
+from estimators.compiled.noise import add_noise, belief_root, has_correlated_rows, independent_rows, semidefinite_root
+from estimators.errors import ModelError
+from estimators.fold import Fold
+from estimators.log import READING, Log
+from estimators.model.correlation import correlation_of, covariance_of
+from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.tuning import Tuning
+from sources.simulation.simulator import Simulator
+from tests.support import read_all
 
 
 def root(A):
@@ -71,3 +79,107 @@ def test_noise_is_added_through_the_whole_lower_triangle():
     x = np.array([10.0, 20.0, 30.0])
     add_noise(L, np.array([1.0, 10.0, 100.0]), x)
     np.testing.assert_array_equal(x, [12.0, 73.0, 769.0])
+
+
+C = ((1.0, 0.6, -0.3), (0.6, 1.0, 0.2), (-0.3, 0.2, 1.0))
+
+
+def f(x, u, p, dt, out):
+    out[0] = x[0]
+
+
+def alone(x, u, p, out):
+    out[0] = x[0]
+
+
+def thrice(x, u, p, out):
+    out[0] = x[0]
+    out[1] = 2.0 * x[0]
+    out[2] = -x[0]
+
+
+def model(correlation):
+    rows = tuple(Row(name, "m", variance) for name, variance in (("a", 0.5), ("b", 2.0), ("c", 1e-3)))
+    return StateSpaceModel(
+        name="three",
+        title="three rows of one state",
+        states=(State("x", "m", mean=0.0, std=1.0),),
+        noises=(Noise("x", "m²/s", 1e-3),),
+        sensors=(
+            Sensor("one", (Row("one", "m", 1.0),), h=alone),
+            Sensor("three", rows, h=thrice, correlation=correlation),
+        ),
+        f=f,
+        linear=True,
+    )
+
+
+@pytest.fixture(scope="module")
+def context():
+    declared = model(C)
+    fold = Fold("kf", declared, Tuning.of(declared), Log(declared.width))
+    yield fold._machine.context
+    del fold
+
+
+@pytest.mark.parametrize("there", [[0], [1], [2], [0, 1], [0, 2], [1, 2], [0, 1, 2]])
+@pytest.mark.parametrize("r", [[0.5, 2.0, 1e-3], [3e-200, 1e-190, 2.0], [0.5, 0.0, 2.0], [0.0, 1.0, 2.0]])
+def test_r_of_the_rows_that_are_there(context, there, r):
+    y, r = np.full(3, np.nan), np.array(r)
+    y[there] = 1.0
+    L, d = np.full((3, 3), np.nan), np.full(3, np.nan)
+    m = independent_rows(context, 1, y, r, L, d)
+    assert m == len(there) and has_correlated_rows(context, 1) and not has_correlated_rows(context, 0)
+    L = np.tril(L[:m, :m], -1) + np.eye(m)
+    # The oracle: R by its definition, in the units of each row's deviation.
+    scale = np.where(r[there] > 0.0, np.sqrt(r[there]), 1.0)
+    R = np.array(C)[np.ix_(there, there)] * np.outer(*[np.sqrt(r[there]) / scale] * 2)
+    root = (L / scale[:, None]) * np.sqrt(d[:m])
+    np.testing.assert_allclose(root @ root.T, R, rtol=0, atol=1e-14)
+
+
+def test_independent_rows_keep_their_variances(context):
+    L, d = np.full((1, 1), np.nan), np.empty(1)
+    assert independent_rows(context, 0, np.array([1.0]), np.array([7.0]), L, d) == 1
+    assert d[0] == 7.0 and np.isnan(L[0, 0])
+
+
+def test_a_covariance_and_its_correlation():
+    R = np.array([[4.0, 1.0], [1.0, 0.25]]) + np.diag([0.0, 1.0])
+    c = correlation_of(R)
+    np.testing.assert_allclose(covariance_of(c, np.diag(R)), R, rtol=1e-15)
+    np.testing.assert_array_equal(covariance_of(None, np.diag(R)), np.diag(np.diag(R)))
+
+
+def test_a_sensor_holds_any_matrix_so_that_models_compare():
+    assert model(np.array(C)) == model(C) and hash(model(np.array(C))) == hash(model(C))
+    assert model(C) != model(None)
+
+
+@pytest.mark.parametrize(
+    ("correlation", "message"),
+    [
+        (np.eye(2), "has 2 rows of 2, 2; it must be 3 × 3"),
+        ([[1.0]], "has 1 rows of 1; it must be 3 × 3"),
+        (2.0 * np.eye(3), "must be finite, with ones on its diagonal; of a covariance R give R_ij"),
+        (np.full((3, 3), np.nan), "must be finite"),
+        (np.eye(3) + 0.1 * np.eye(3, k=1), "is not symmetric; fill both triangles alike"),
+        (np.ones((3, 3)), "is not positive definite"),
+        (1.1 * np.eye(3) - 0.1 + 0.9 * (np.eye(3) - 1.0), "is not positive definite"),
+    ],
+)
+def test_what_is_no_correlation_is_refused(correlation, message):
+    with pytest.raises(ModelError, match=rf"model three: the correlation of sensor three .*{message}"):
+        model(correlation)
+
+
+def test_the_simulator_draws_correlated_noise():
+    declared = model(C)
+    events = read_all(
+        Simulator(declared, seed=1, step=1.0, duration=4000.0, initial={"x": 0.0}, truth_noise={"x": 0.0})
+    )
+    y = events.value[(events.kind == READING) & (events.channel == 1), :3]
+    R = covariance_of(C, np.array([0.5, 2.0, 1e-3]))
+    # A sample covariance of N draws has the standard deviation √((R_ii R_jj + R_ij²) / N).
+    spread = np.sqrt((np.outer(np.diag(R), np.diag(R)) + R**2) / len(y))
+    assert np.all(np.abs(np.cov(y.T) - R) < 4.0 * spread)

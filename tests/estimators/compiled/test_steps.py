@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from estimators import registry
+from estimators.compiled.context import SLACK, steps_of
 from estimators.fold import fold
 from estimators.log import TICK, Events
-from estimators.numerics.steps import SLACK, steps_of
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear
 from tests.estimators.test_fold import in_python

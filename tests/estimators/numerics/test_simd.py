@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from estimators.numerics.simd_exp import exp_minus
+from estimators.numerics.simd import exp_minus
 
 
 @njit
