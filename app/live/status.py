@@ -12,9 +12,8 @@ import numpy as np
 from estimators.diagnostics.health import FAR
 from estimators.diagnostics.score import nis_verdict
 from estimators.diagnostics.sensor_states import sensor_states
-from estimators.events.maintenance import model_version_at
 from estimators.fold import Fold
-from estimators.log import RESET
+from estimators.log import RESET, model_version_at
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import find_estimator
 from estimators.track import FAILED, GATED, USED

@@ -7,14 +7,10 @@ from the prior's variance, uncorrelated with the others, as what was known of th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .batch import MAINTENANCE, Events
-
-if TYPE_CHECKING:
-    from ..log import Log
 
 
 def maintained(t: int, arrival: int, states: Sequence[int], width: int) -> Events:
@@ -59,20 +55,3 @@ def without(cov: np.ndarray, prior: np.ndarray, state: int) -> np.ndarray:
     apart[:, state] = 0.0
     apart[state, state] = prior[0, state] if prior.shape[0] == 1 else prior[state, state]
     return apart
-
-
-def maintenance_times(log: Log) -> np.ndarray:
-    """Times (ns) of the maintenances that the log has kept, ascending."""
-    return np.unique(log.t[: log.n][log.kind[: log.n] == MAINTENANCE])
-
-
-def model_version_at(log: Log, t: int) -> int:
-    """The version of the model at time t, ns."""
-    return log.version + int(np.searchsorted(maintenance_times(log), t, side="right"))
-
-
-def last_maintenance(log: Log, t: int) -> int | None:
-    """Time (ns) of the last maintenance at or before t that the log has kept; None if there is none."""
-    times = maintenance_times(log)
-    k = int(np.searchsorted(times, t, side="right"))
-    return int(times[k - 1]) if k else None

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from estimators.compiled.model import compile_model
-from estimators.events.maintenance import last_maintenance, maintained, model_version_at, model_versions
+from estimators.events.maintenance import maintained, model_versions
 from estimators.fold import Fold, fold
-from estimators.log import INPUT, MAINTENANCE, READING, TICK, Events, Log
+from estimators.log import INPUT, MAINTENANCE, READING, TICK, Events, Log, last_maintenance, model_version_at
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
