@@ -117,7 +117,7 @@ class Fold:
 
     @property
     def evidence(self) -> np.ndarray:
-        """The state of the bank of tests now; see diagnostics/evidence/."""
+        """Present state of the detectors; see diagnostics/detector_state.py."""
         return self._now.evidence.copy()
 
     @property

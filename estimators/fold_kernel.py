@@ -10,16 +10,15 @@ from numba import types
 
 from .compiled.context import context_type, prior, sensor_rows, steps_of
 from .compiled.verdict import limit_of
-from .diagnostics.evidence import watch_rows
-from .diagnostics.health import assess, bounds_type, policy_type
-from .diagnostics.normal_nis import NORMALS
+from .diagnostics.detector_watch import watch_rows
+from .diagnostics.health import NORMALS, assess, bounds_type, policy_type
 from .estimator import call_describe, call_predict, call_start, call_update, code_type
-from .gate.doubt import forget, note, rule_type
+from .gate.rejection_runs import forget, note, rule_type
 from .gate.soften import soften
 from .interpreted.fold_loop import LONGEST, UNSET
 from .log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from .numerics.jit import B1, F1, F2, I1, borrowed, borrowed_rows, floats, i64, inlined, jit, part
-from .screen import pass_on, screen_reading, screen_signature
+from .plausibility import pass_on, screen_reading, screen_signature
 from .track import ANCESTORS, EFFECTIVE, GATED, MISSING, NONE, SCREENED, USED, WHITENED, borrowed_columns, track_type
 
 

@@ -12,13 +12,13 @@ import numpy as np
 from .compiled.context import context_of
 from .compiled.jacobians import scratch_size, sensor_jacobian
 from .compiled.model import compile_model
-from .diagnostics.evidence import fresh, no_baseline, watched
+from .diagnostics.detector_state import detector_context, fresh, no_baseline
 from .diagnostics.health import Bounds, HealthPolicy, chi_square_bounds
 from .errors import ModelError
 from .estimator import Code, Estimator, Options
 from .events.maintenance import without
 from .fold_kernel import compiled
-from .gate import doubt
+from .gate import rejection_runs as doubt
 from .gate.isolation import widening
 from .interpreted import fold_loop
 from .interpreted.fold_loop import UNSET
@@ -27,7 +27,7 @@ from .log import Log
 from .model.mode_as_number import indicator
 from .model.state_space import LARGE, StateSpaceModel
 from .numerics.quantiles import chi_square_quantile
-from .screen import fresh_screen, limits_of
+from .plausibility import fresh_screen, limits_of
 from .snapshots import Base, Snapshot, Story
 from .track import WHITENED, Track
 from .tuning import Tuning
@@ -100,7 +100,7 @@ class Machine:
             "pairs": self._pairs,
             "prepared": self.estimator.prepare(model, self.options),
             **limits_of(model),
-            **watched(model, tuning.gate, self.marginal, baseline, expected),
+            **detector_context(model, tuning.gate, self.marginal, baseline, expected),
         }
         self.held: dict[str, Any] = {**self.compiled.static, **own}
         if prior is not None:

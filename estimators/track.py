@@ -45,7 +45,7 @@ class Track(NamedTuple):
     was used, gated or failed, or since a reset. consistency: DIVERGED where the window alone says so, else TRACKING.
     whitened (N, ny): the innovation as it would be drawn from N(0, I), by row of the reading; of a prediction that is
     not Gaussian each row by itself, Φ⁻¹(F(y)). alarms (N, width): bits of the causes that are in alarm after this
-    event, by row of the reading or state of the truth; flags: bits of what else is wrong (diagnostics/evidence/).
+    event, by row of the reading or state of the truth; flags: bits of what else is wrong (diagnostics/detectors.py).
     screened (N, ny): bits of `REASONS` for which a row of the reading was refused at the edge.
     effective: of particles, their effective sample size after a reading that was used, before resampling; ancestors:
     how many of some readings ago these descend from (particle/lineage.py); NaN elsewhere.

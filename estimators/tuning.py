@@ -55,9 +55,9 @@ class Tuning:
     (np,) the model's parameters; `used` (sensors,) is False where a sensor is held out: predicted and scored, never
     used. `gate` is the probability that a good reading passes, or None; a reading beyond it is refused, or, where
     `gate_kind` is "soft", counts with its noise inflated (gate/soften.py). A sensor that stays refused is judged
-    (gate/reopening.py); if nothing tells whether it or the twin is wrong, the asset is believed after `reopen` seconds,
+    (gate/isolation.py); if nothing tells whether it or the twin is wrong, the asset is believed after `reopen` seconds,
     None for never. `options` are the estimator's own. `baseline` (rows, ...) is what was normal of the innovations when
-    it was accepted (diagnostics/evidence/), or None for white ones. `name` is that of the version that was loaded, with
+    it was accepted (commission.py), or None for white ones. `name` is that of the version that was loaded, with
     a `*` behind it once an entry was turned; empty if nobody gave one. `version` counts in this process.
     """
 

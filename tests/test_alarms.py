@@ -8,8 +8,8 @@ import pytest
 
 from app.live.outputs import Status
 from config.schema import TwinSection
+from estimators.diagnostics.detector_state import SENSOR_STATES
 from estimators.diagnostics.episodes import CAUSES, anchor
-from estimators.diagnostics.sensor_states import STATES
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES
 
 ROOT = Path(__file__).parents[1]
@@ -59,7 +59,7 @@ def test_each_cause_says_what_it_is_and_what_to_do(cause):
     assert body.strip().startswith("*")
 
 
-@pytest.mark.parametrize("state", sorted({*HEALTH_NAMES, *STATES}))
+@pytest.mark.parametrize("state", sorted({*HEALTH_NAMES, *SENSOR_STATES}))
 def test_each_state_has_its_heading(state):
     body = sections()[anchor(state)]
     assert "Response:" in body or "Clears:" in body
@@ -127,11 +127,11 @@ def test_the_settings_are_there():
 def test_each_word_of_a_notice_says_what_to_do(word):
     body = sections()[anchor(word)]
     assert body.strip() and "*Clears:*" in body
-    assert "*Response:*" in body or word in STATES or anchor(word) in CAUSES
+    assert "*Response:*" in body or word in SENSOR_STATES or anchor(word) in CAUSES
 
 
 def test_nothing_is_explained_that_is_never_said():
-    said = {*CAUSES, *HEALTH_NAMES, *STATES, *outcomes(), *notices(), *SETTINGS}
+    said = {*CAUSES, *HEALTH_NAMES, *SENSOR_STATES, *outcomes(), *notices(), *SETTINGS}
     assert set(sections()) == {anchor(name) for name in said}
 
 

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimators.diagnostics.detectors import LOST
 from estimators.diagnostics.episodes import ANY, JOINED, LOSSES, Course, Episode, Found, Going, found_in
-from estimators.diagnostics.evidence import LOST
 from estimators.diagnostics.held_out import Offset, offsets
 from estimators.registry import find_estimator
 from estimators.track import DIVERGED, HEALTH_NAMES, TRACKING, WAITING, estimated_rows

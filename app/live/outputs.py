@@ -173,7 +173,7 @@ class Status:
 
     `t` is the time of the last event (ns), `since` the time when the present health began, `lost` the time from which
     the estimate has not been a number (None if it is one). `cause` is the text of the leading episode while health is
-    not tracking; `sensors` gives each sensor's state (diagnostics/sensor_states.py) and the text of its own episode.
+    not tracking; `sensors` gives each sensor's state (`detector_state.SENSOR_STATES`) and the text of its own episode.
     `model_version` counts up with each maintenance. `clock` is
     that of a live source against this machine's, None while it is not known. `counts` are those of the rows of this
     revision, and of other things that happened to the twin. `account` is what the filter says of itself (see

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from estimators.diagnostics.health import FAR
+from estimators.diagnostics.detector_state import sensor_states
+from estimators.diagnostics.health import MAX_ROWS_PER_READING
 from estimators.diagnostics.score import nis_verdict
-from estimators.diagnostics.sensor_states import sensor_states
 from estimators.fold import Fold
 from estimators.log import RESET, model_version_at
 from estimators.model.state_space import StateSpaceModel
@@ -133,7 +133,7 @@ def _judged(fold: Fold) -> float:
     baseline, n, window = fold.tuning.baseline, fold.n, fold.policy.window
     if baseline is None:
         return np.nan
-    rows = slice(max(0, n - FAR * window), n)
+    rows = slice(max(0, n - MAX_ROWS_PER_READING * window), n)
     resets = np.flatnonzero(fold.log.kind[rows] == RESET)
     begun = rows.start + (int(resets[-1]) + 1 if resets.size else 0)
     judged = begun + np.flatnonzero(np.isin(fold.track.verdict[begun:n], (USED, GATED, FAILED)))[-window:]

@@ -20,7 +20,7 @@ from estimators.fold import Fold
 from estimators.fold_failures import cause_of
 from estimators.gate.isolation import Decision, softened
 from estimators.log import READING
-from estimators.screen import reasons_by_sensor
+from estimators.plausibility import reasons_by_sensor
 from estimators.smoothing.smooth import consistency
 from estimators.smoothing.smoothed import Smoothed
 from estimators.track import FAILED, HEALTH_NAMES, REASONS, USED

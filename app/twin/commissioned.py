@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from config.loader import Loaded
 from estimators.diagnostics.commission import Normal
-from estimators.diagnostics.evidence import CAUSES
+from estimators.diagnostics.detectors import ALARM_NAMES
 from estimators.model.state_space import StateSpaceModel
 
 
@@ -20,9 +20,9 @@ def commissioned(loaded: Loaded, model: StateSpaceModel) -> dict[str, Normal]:
             rows = ", ".join(model.row_names[:8])
             raise loaded.error(("commissioned", name), f"is no sensor row of {model.name}; it has {rows}")
         for cause in section.reached:
-            if cause not in CAUSES:
+            if cause not in ALARM_NAMES:
                 raise loaded.error(
-                    ("commissioned", name, "reached", cause), f"is no cause; choose from {', '.join(CAUSES)}"
+                    ("commissioned", name, "reached", cause), f"is no cause; choose from {', '.join(ALARM_NAMES)}"
                 )
     return {
         name: Normal(section.bias, section.scale, section.correlation, section.reached, section.nis)

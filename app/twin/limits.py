@@ -11,7 +11,7 @@ from config.schema import SensorSection, TwinSection
 from config.source_schema import AssetSection
 from estimators.model.limits import Limits, Stuck
 from estimators.model.state_space import Sensor
-from estimators.screen import DAY, surprise
+from estimators.plausibility import DAY, surprise
 
 MOST_READINGS = 1e6
 """Equal readings after which a sensor that is stuck must be found at the latest."""

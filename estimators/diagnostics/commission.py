@@ -15,10 +15,11 @@ import numpy as np
 from ..log import READING, RESET
 from ..model.state_space import StateSpaceModel
 from ..track import FAILED, GATED, USED
+from .detector_state import gate_log_ratios, no_baseline, threshold_of
+from .detector_tests import highest
+from .detectors import ALARM_NAMES, BITS
 from .episodes import Folded, course_of, standardised
-from .evidence import BITS, CAUSES, chances_of, highest, no_baseline, threshold_of
-from .health import FAR, FEW, HealthPolicy
-from .normal_nis import LEAST, normal_nis
+from .health import JUDGED_MEAN, MAX_ROWS_PER_READING, MIN_WINDOW_EVENTS, HealthPolicy, normal_nis
 
 MARGIN = 1.5
 """By which a test may rise above the highest that it reached, besides its own threshold, and the NIS over a window
@@ -82,14 +83,14 @@ def commission(fold: Judged, evidence: np.ndarray) -> dict[str, Normal]:
             judged = np.isin(verdict, (USED, GATED, FAILED))
             refused = np.where(judged, (verdict != USED).astype(np.int8), np.int8(-1))
             values = np.ascontiguousarray(log.value[rows, k])
-            W = highest(e, refused, values, float(fold.tuning.r[index]), h, base, chances_of(fold.tuning.gate))
+            W = highest(e, refused, values, float(fold.tuning.r[index]), h, base, gate_log_ratios(fold.tuning.gate))
             reached = {}
-            for bit, name in enumerate(CAUSES):
+            for bit, name in enumerate(ALARM_NAMES):
                 own = W[BITS == 1 << bit]
                 if own.size and own.max() > 1.0:
                     reached[name] = round(float(own.max()), 1)
             found[model.row_names[index]] = Normal(round(bias, 3), round(scale, 3), round(phi, 3), reached)
-    most = _most_nis(fold, normal_nis(model, baseline_of(model, found))[:, LEAST])
+    most = _most_nis(fold, normal_nis(model, baseline_of(model, found))[:, JUDGED_MEAN])
     most[MARGIN * most <= HealthPolicy().diverged_nis] = 0.0
     of_row = np.repeat(most, [len(sensor.rows) for sensor in model.sensors]).tolist()
     nis = {name: round(value, 3) for name, value in zip(model.row_names, of_row, strict=True)}
@@ -109,12 +110,12 @@ def _most_nis(fold: Judged, normal: np.ndarray) -> np.ndarray:
     due = np.where(used, track.dof[rows] * normal[sensor], 0.0)
     resets = np.flatnonzero(log.kind[: fold.n] == RESET)
     last_reset = np.append(-1, resets)[np.searchsorted(resets, rows)]
-    begin = np.searchsorted(rows, np.maximum(rows - FAR * window, last_reset), side="right")
+    begin = np.searchsorted(rows, np.maximum(rows - MAX_ROWS_PER_READING * window, last_reset), side="right")
     begin = np.maximum(begin, np.arange(1, rows.size + 1) - window)
     most = np.zeros(normal.size)
     for i, first in enumerate(begin):
         expected = due[first : i + 1].sum()
-        if i + 1 - first >= FEW and expected > 0.0:
+        if i + 1 - first >= MIN_WINDOW_EVENTS and expected > 0.0:
             most[sensor[i]] = max(most[sensor[i]], nis[first : i + 1].sum() / expected)
     return most
 
@@ -126,7 +127,7 @@ def baseline_of(model: StateSpaceModel, normals: Mapping[str, Normal]) -> np.nda
         own = baseline[model.row_names.index(name)]
         own[:3] = normal.bias, normal.scale, normal.correlation
         for cause, peak in normal.reached.items():
-            own[3:][BITS == 1 << CAUSES.index(cause)] = MARGIN * peak
+            own[3:][BITS == 1 << ALARM_NAMES.index(cause)] = MARGIN * peak
     return baseline
 
 

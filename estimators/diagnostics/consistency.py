@@ -12,7 +12,7 @@ from ..errors import EstimatorError
 from ..events.batch import TRUTH, Events
 from ..model.state_space import StateSpaceModel
 from ..numerics.quantiles import chi_square_quantile
-from .normal_nis import PROBABILITY
+from .health import PROBABILITY
 
 
 class NisVerdict(NamedTuple):

@@ -1,4 +1,17 @@
-"""When an estimate may be trusted, and its NIS over a window against the chi-square bounds."""
+"""Health limits of a twin, the expected mean NIS, and the NIS of a window against its chi-square bounds.
+
+For a consistent filter, innovations are white and normal, and the sum of NIS is chi-square. A commissioned twin
+(`commission.py`) has a baseline instead: the innovations of each row have a bias b, a scale s and a lag-1 correlation
+φ. Then E e² = b² + s², and a long sum of n of them has the variance
+
+    n (2 s⁴ (1 + φ²) / (1 - φ²) + 4 b² s² (1 + φ) / (1 - φ)),
+
+which for b = 0, s = 1, φ = 0 is the 2 n of chi-square. The bounds are those of a scaled chi-square of that mean and
+variance, with at most the actual degrees of freedom.
+
+Sources: Bar-Shalom, Li & Kirubarajan (2001), 5.4.2, for the bounds; Bayley & Hammersley (1946), doi:10.2307/2983560,
+for correlated sums; Satterthwaite (1946), doi:10.2307/3002019, for the scaled chi-square.
+"""
 
 from __future__ import annotations
 
@@ -8,30 +21,31 @@ import numpy as np
 from numba import types
 
 from ..log import RESET
-from ..numerics.jit import F1, f64, i64, inlined, jit
+from ..model.state_space import StateSpaceModel
+from ..numerics.jit import F1, f64, i64, inlined, jit, plain
 from ..numerics.quantiles import chi_square_quantile
 from ..numerics.simd import total as sum_of
 from ..track import DIVERGED, FAILED, GATED, TRACKING, USED, borrowed_columns
-from .normal_nis import LEAST, MEAN, NORMALS, PROBABILITY, VARIANCE, free_degrees
 
-FEW = 10
-"""Events in a window below which it says nothing of health."""
+MIN_WINDOW_EVENTS = 10
+"""Events in a window below which it is not judged."""
 
-
-FAR = 20
-"""Rows for each reading of the window, beyond which a reading is too old to count."""
+MAX_ROWS_PER_READING = 20
+"""Rows for each measurement of the window, beyond which a measurement is too old to count."""
 
 
 class HealthPolicy(NamedTuple):
-    """When a twin may be trusted.
+    """Limits of a twin's health.
 
-    `window` readings are averaged. Without a reading for `degraded_after` seconds the twin is degraded, after
-    `stale_after` stale. It is diverged when the windowed NIS is `diverged_nis` times what was normal of its readings
-    when the tuning was accepted (without a baseline, and at least, what it should be), when the gate
-    refuses more than `diverged_gated` of the window (or they fail), or when a number is not finite. A reset begins a
-    new window. It is suspect, or degraded where a sensor is lost, when a test of evidence/ is in alarm: by chance
-    once in `false_alarm_every` seconds. A sensor is silent after `silent_periods` of its mean periods, and twice its
-    longest silence so far; of so many more, as long as its period is known from few readings.
+    Attributes:
+        window: Measurements that are averaged; a reset begins a new window.
+        degraded_after: Seconds without a measurement after which the twin is degraded.
+        stale_after: Seconds without a measurement after which it is stale.
+        diverged_nis: Multiple of the expected NIS (of the baseline, where that is larger) from which it has diverged.
+        diverged_gated: Share of the window from which rejected or failed measurements mean the same.
+        false_alarm_every: Mean seconds between false alarms of all detectors, which make it suspect or degraded.
+        silent_periods: Mean periods after which a sensor has dropped out, and at least twice its longest gap; more
+            while its period is known from few measurements.
     """
 
     window: int = 50
@@ -44,7 +58,7 @@ class HealthPolicy(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """Chi-square quantiles by degrees of freedom: the 95 % bounds."""
+    """Chi-square quantiles by degrees of freedom, the 95 % bounds."""
 
     low: Any
     high: Any
@@ -54,23 +68,23 @@ bounds_type = types.NamedUniTuple(F1, len(Bounds._fields), Bounds)
 policy_type = types.NamedTuple((i64, f64, f64, f64, f64, f64, f64), HealthPolicy)
 
 
-def chi_square_bounds(most: int) -> Bounds:
-    """Quantiles for 0 to `most` degrees of freedom."""
-    dof = np.arange(most + 1)
-    dof[0] = 1  # of no use, but chi-square has no quantile for 0
+def chi_square_bounds(max_dof: int) -> Bounds:
+    """Return the quantiles for 0 to `max_dof` degrees of freedom."""
+    dof = np.arange(max_dof + 1)
+    dof[0] = 1  # Unused, but chi-square has no quantile for 0.
     tail = (1.0 - PROBABILITY) / 2.0
     return Bounds(chi_square_quantile(tail, dof), chi_square_quantile(1.0 - tail, dof))
 
 
 @inlined
 def judges(verdict):
-    """Whether a reading of this verdict says something of the estimate."""
+    """Return whether a measurement of this verdict counts in the window."""
     return verdict == USED or verdict == GATED or verdict == FAILED
 
 
 @inlined
 def _keep(k, row, track, channel, normal, rows, dofs, terms):
-    """Write a reading into place k of the window."""
+    """Write a measurement into place k of the window."""
     used = track.verdict[row] == USED
     rows[k] = row
     dofs[k] = track.dof[row] if used else -1
@@ -81,7 +95,7 @@ def _keep(k, row, track, channel, normal, rows, dofs, terms):
 
 @inlined
 def _quantile(table, dof):
-    """A quantile of chi-square with `dof` degrees of freedom, 1 at least, from those of whole numbers."""
+    """Interpolate a quantile of chi-square for `dof` degrees of freedom, at least 1, between those of integers."""
     whole = int(dof)
     share = dof - whole
     return table[whole] if share == 0.0 else (1.0 - share) * table[whole] + share * table[whole + 1]
@@ -89,7 +103,7 @@ def _quantile(table, dof):
 
 @inlined
 def _judge(i, total, due, mean, variance, dof, used, refused, track, policy, bounds):
-    """Mean NIS of the window that ends at row i, its bounds, and what it alone says of the estimate."""
+    """Fill mean NIS, bounds and consistency of row i from the window that ends there."""
     if used > 0:
         free = free_degrees(mean, variance, dof)
         track.nis_mean[i] = total / used
@@ -101,7 +115,7 @@ def _judge(i, total, due, mean, variance, dof, used, refused, track, policy, bou
         track.nis_high[i] = np.nan
     judged = used + refused
     track.consistency[i] = TRACKING
-    if judged >= FEW and (refused > policy.diverged_gated * judged or total > policy.diverged_nis * due):
+    if judged >= MIN_WINDOW_EVENTS and (refused > policy.diverged_gated * judged or total > policy.diverged_nis * due):
         track.consistency[i] = DIVERGED
 
 
@@ -109,23 +123,21 @@ def _judge(i, total, due, mean, variance, dof, used, refused, track, policy, bou
 def assess(first, last, t, kind, channel, track, normal, policy, bounds):
     """Fill age, windowed NIS, its bounds and consistency of rows `first` to `last` of a track.
 
-    A row looks only at rows before it, so the outcome does not depend on how a fold was cut into pieces. The window
-    changes with a reading that is used, gated or failed; the other rows have that of the row before. A reset empties
-    it: what the readings said of the estimate before, they do not say of the new one. `normal` (sensors · NORMALS,) is
-    what was normal of the NIS of each sensor, see normal_nis.py.
+    A row depends only on rows before it, so the result does not depend on the pieces of a fold. The window changes
+    with a measurement that is used, gated or failed; other rows keep that of the row before. A reset empties it.
+    `normal` (sensors · NORMALS,): expected NIS of each sensor, see `normal_nis`.
     """
     window = policy.window
     track = borrowed_columns(track)
-    # The window's readings, the oldest first, lie at `begin` to `end`: row, degrees of freedom (-1 if it was refused),
-    # and `terms`, 0 if it was refused: NIS, then `NORMALS`. It moves up, and back to the start when it has reached the
-    # end.
+    # The window lies at `begin` to `end`, the oldest first: row, degrees of freedom (-1 if rejected), and `terms` (0 if
+    # rejected): NIS, then `NORMALS`. It moves up, and back to the start when it reaches the end.
     rows = np.empty(2 * window, np.int64)
     dofs = np.empty(2 * window, np.int64)
     terms = np.empty((1 + NORMALS, 2 * window))
     begin = window
     end = window
     row = first - 1
-    while row >= 0 and kind[row] != RESET and end - begin < window and first - row < FAR * window:
+    while row >= 0 and kind[row] != RESET and end - begin < window and first - row < MAX_ROWS_PER_READING * window:
         if judges(track.verdict[row]):
             begin -= 1
             _keep(begin, row, track, channel, normal, rows, dofs, terms)
@@ -155,15 +167,15 @@ def assess(first, last, t, kind, channel, track, normal, policy, bounds):
                     dof += dofs[end]
                     used += 1
                 end += 1
-            # Out goes what is too many, too far back, or from before a reset.
-            while begin < end and (reset or end - begin > window or i - rows[begin] >= FAR * window):
+            # Drop measurements beyond the window, too old, or from before a reset.
+            while begin < end and (reset or end - begin > window or i - rows[begin] >= MAX_ROWS_PER_READING * window):
                 if dofs[begin] >= 0:
                     dof -= dofs[begin]
                     used -= 1
                 begin += 1
-            # Summed anew each time: a running sum would keep the rounding of an outlier.
+            # Summed again each time: a running sum would keep the rounding of an outlier.
             total = sum_of(end - begin, terms[0, begin:].ctypes.data)
-            due = sum_of(end - begin, terms[1 + LEAST, begin:].ctypes.data)
+            due = sum_of(end - begin, terms[1 + JUDGED_MEAN, begin:].ctypes.data)
             mean = sum_of(end - begin, terms[1 + MEAN, begin:].ctypes.data)
             variance = sum_of(end - begin, terms[1 + VARIANCE, begin:].ctypes.data)
             _judge(i, total, due, mean, variance, dof, used, end - begin - used, track, policy, bounds)
@@ -173,3 +185,50 @@ def assess(first, last, t, kind, channel, track, normal, policy, bounds):
             track.nis_low[i] = track.nis_low[i - 1]
             track.nis_high[i] = track.nis_high[i - 1]
             track.consistency[i] = track.consistency[i - 1]
+
+
+PROBABILITY = 0.95
+"""Probability of the bounds in charts and reports."""
+
+JUDGED_MEAN, MEAN, VARIANCE = range(3)
+NORMALS = 3
+"""Expected NIS of a sensor: mean, at least 1, for divergence; mean and variance of one degree of freedom."""
+
+
+def normal_nis(model: StateSpaceModel, baseline: np.ndarray) -> np.ndarray:
+    """Return the expected NIS of each sensor, (sensors, NORMALS), averaged over its rows.
+
+    Args:
+        model: The model.
+        baseline: Bias, scale and correlation of each row in its first columns, (rows, 3 or more).
+    """
+    b, s, phi = baseline[:, 0], baseline[:, 1], baseline[:, 2]
+    mean = b**2 + s**2
+    variance = 2.0 * s**4 * (1.0 + phi**2) / (1.0 - phi**2) + 4.0 * b**2 * s**2 * (1.0 + phi) / (1.0 - phi)
+    rows = zip(model.row_start, (len(sensor.rows) for sensor in model.sensors), strict=True)
+    means = [(mean[start : start + n].mean(), variance[start : start + n].mean()) for start, n in rows]
+    return np.array([(max(m, 1.0), m, v) for m, v in means], float).reshape(-1, NORMALS)
+
+
+@inlined
+def free_degrees(mean: Any, variance: Any, dof: Any) -> Any:
+    """Return the degrees of freedom of the scaled chi-square of that mean and variance, from 1 to `dof`."""
+    return max(1.0, min(2.0 * mean * mean / variance, float(dof)))
+
+
+def nis_bounds(dof: np.ndarray, readings: int, normal: np.ndarray | None = None) -> tuple[float, float]:
+    """Return the 95 % bounds of the mean NIS of `readings` measurements.
+
+    Args:
+        dof: Their total degrees of freedom by sensor, (sensors,).
+        readings: Their number.
+        normal: Expected NIS of each sensor (`normal_nis`); None for white, normal innovations.
+    """
+    total = float(np.sum(dof))
+    if not total:
+        return np.nan, np.nan
+    mean, variance = (total, 2.0 * total) if normal is None else (dof @ normal[:, MEAN], dof @ normal[:, VARIANCE])
+    free = plain(free_degrees)(float(mean), float(variance), total)
+    tail = (1.0 - PROBABILITY) / 2.0
+    low, high = (float(mean / free * chi_square_quantile(q, free) / readings) for q in (tail, 1.0 - tail))
+    return low, high

@@ -19,7 +19,7 @@ from ..log import READING
 from ..numerics.quantiles import normal_quantile
 from ..track import HELD_OUT, Track
 from ..tuning import Tuning
-from .normal_nis import PROBABILITY
+from .health import PROBABILITY
 
 LAST = 200
 """Readings of a row that are looked at, the last."""

@@ -18,8 +18,7 @@ from ..numerics.quantiles import chi_square_quantile, normal_quantile
 from ..track import GATED, HELD_OUT, MISSING, USED, VERDICT_NAMES, Track
 from .consistency import NisVerdict
 from .field_pictures import Picture
-from .health import FAR
-from .normal_nis import PROBABILITY, nis_bounds, normal_nis
+from .health import MAX_ROWS_PER_READING, PROBABILITY, nis_bounds, normal_nis
 
 FARTHEST = 6.0
 """σ from which on a row counts no more for what is normal (commission.py)."""
@@ -199,7 +198,7 @@ def spread_ratio(track: Track, window: int) -> float:
 
     1 / mean(ν² / S) over their rows: below 1 the spread is too small, above 1 too large. NaN where there is none.
     """
-    verdict = track.verdict[-FAR * window :]
+    verdict = track.verdict[-MAX_ROWS_PER_READING * window :]
     rows = np.flatnonzero((verdict == USED) | (verdict == GATED))[-window:] + len(track) - verdict.size
     e = track.innovation[rows] / track.innovation_std[rows]
     e = e[np.isfinite(e)]

@@ -81,7 +81,7 @@ def without_stuck(tuning: Tuning, log: Log) -> tuple[Log, dict[str, int]]:
     A stuck sensor predicts itself, so its fitted R would tend to zero. Two readings of standard deviation σ, rounded to
     a quantum q, are equal with a probability of at most erf(q / 2σ), and an asset at rest repeats more often: the share
     of repetitions in all other runs counts if it is larger. A run is stuck if its probability is below
-    `RUN_PROBABILITY`. The running twin uses the same test (diagnostics/evidence/row_tests.py); here it sees the whole
+    `RUN_PROBABILITY`. The running twin uses the same test (diagnostics/detector_tests.py); here it sees the whole
     log. A sensor that never changes is left as it is: its R is not fitted in any case.
     """
     model, kind = tuning.model, log.kind[: log.n]

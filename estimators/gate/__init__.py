@@ -1,1 +1,1 @@
-"""The gate: readings far from their prediction are refused or softened; a sensor that stays refused is judged."""
+"""The gate: reject or soften measurements far from their prediction, and decide about sensors that stay rejected."""

@@ -11,7 +11,7 @@ from ..log import READING, Log
 from ..model.state_space import StateSpaceModel
 from ..snapshots import Story
 from ..track import GATED, HELD_OUT, USED, Track
-from .doubt import ASKED, DUE, EVER, FROM, PASSED, RUN, SINCE, WAIT
+from .rejection_runs import ASKED, DUE, EVER, FROM, PASSED, RUN, SINCE, WAIT
 
 STRETCH = 1024
 """Events, at most, over which two stories are compared: the work of a decision is bounded."""

@@ -1,10 +1,10 @@
-"""The soft gate: a reading beyond it is not refused, its noise is inflated until it lies on it.
+"""The soft gate: inflate the noise of a measurement beyond the gate until it lies on it.
 
     R ← w R,   w = 1 + (1/g - 1/NIS) νᵀ R⁻¹ ν,   NIS = νᵀ S⁻¹ ν > g
 
 With one row, or where ν is an eigenvector of S R⁻¹, NIS(w) is g exactly: 1/NIS is linear in w. With more rows 1/NIS is
-concave in w, and its slope nowhere less than 1 / νᵀ R⁻¹ ν, so NIS(w) is at most g. The further off a reading is, the
-less it moves the estimate: by about g/√NIS of what it asks for.
+concave in w, and its slope nowhere less than 1 / νᵀ R⁻¹ ν, so NIS(w) is at most g. A measurement moves the estimate
+by about g/√NIS of the unsoftened update, the less the further off it is.
 
 Sources: Huber (1964), doi:10.1214/aoms/1177703732, for weights that fall with the distance; Chang (2014),
 doi:10.1007/s00190-013-0690-8, for a factor of R from the NIS.
@@ -22,18 +22,18 @@ from ..numerics.jit import floats, jit, part
 from ..numerics.linalg import solve_unit
 from ..track import GATED, LOG_LIKELIHOOD, USED
 
-MARGIN = 1e-9
-"""By which a softened NIS stays below the gate, relative: rounding must not leave it above."""
+GATE_MARGIN = 1e-9
+"""Relative margin of a softened NIS below the gate, against rounding."""
 
 
 @jit
 def inflation(context, sensor, y, innovation, nis, m):
-    """The factor w of R with which a reading's NIS is at most the gate's.
+    """Return the factor w of R with which the NIS of a measurement is at most that of the gate.
 
     Args:
-        context: The context; its R is what the reading was judged by.
+        context: The context, with the R by which the measurement was judged.
         sensor: Index of the sensor.
-        y: The reading (ny,), of which m rows are finite.
+        y: The measurement (ny,), of which m rows are finite.
         innovation: ν (ny,).
         nis: Its NIS, beyond the gate.
         m: Finite rows.
@@ -51,17 +51,17 @@ def inflation(context, sensor, y, innovation, nis, m):
     square = 0.0
     for i in range(m):
         square += e[i] * e[i] / d[i]
-    limit = limit_of(context, sensor, m) * (1.0 - MARGIN)
+    limit = limit_of(context, sensor, m) * (1.0 - GATE_MARGIN)
     return 1.0 + (1.0 / limit - 1.0 / nis) * square
 
 
 @part
 def soften(code, context, u, sensor, y, index, state, work, innovation, innovation_std, score):
-    """Update on a reading beyond the gate with its noise inflated: the verdict.
+    """Update on a measurement beyond the gate with inflated noise, and return the verdict.
 
-    What the track shows of the reading, innovation, deviation, NIS and whitened rows, stays that of the noise which was
-    tuned; the log-likelihood is that of the inflated noise. Refused as before where R cannot be inflated, as a row
-    without noise, or a density of the sensor's own that does not go by it.
+    Innovation, standard deviation, NIS and whitened rows in the track stay those of the tuned noise; the log-likelihood
+    is that of the inflated noise. The measurement is rejected where R cannot be inflated, as for a row without noise or
+    a sensor with a density of its own.
     """
     first, rows = sensor_rows(context, sensor)
     r = floats(context.r, context.n_rows)[first : first + rows]

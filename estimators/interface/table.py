@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from ..diagnostics.detectors import ALARM_NAMES, IMPOVERISHED, OUTSIDE, SENSOR_FLAGS, TRUTH_MISSED
 from ..diagnostics.episodes import Episode, episode_json
-from ..diagnostics.evidence import CAUSES, IMPOVERISHED, OUTSIDE, SENSORS, TRUTH_MISSED
 from ..events.batch import KIND_NAMES, READING, Events, truth_of
 from ..events.maintenance import model_versions
 from ..model.state_space import StateSpaceModel
@@ -77,14 +77,14 @@ def table_of(
     columns["alarms"] = pa.array(
         _words(np.bitwise_or.reduce(track.alarms, axis=1, dtype=np.int64), _CAUSES), pa.string()
     )
-    bits = {1 << k: f"{name} silent" for k, name in enumerate(model.sensor_names[:SENSORS])} | _FLAGS
+    bits = {1 << k: f"{name} silent" for k, name in enumerate(model.sensor_names[:SENSOR_FLAGS])} | _FLAGS
     columns["flags"] = pa.array(_words(track.flags, bits), pa.string())
     plain = {k: np.ascontiguousarray(c) if isinstance(c, np.ndarray) else c for k, c in columns.items()}
     metadata = {"episodes": json.dumps([episode_json(episode) for episode in episodes])}
     return pa.table(plain).replace_schema_metadata(metadata)
 
 
-_CAUSES = {1 << k: cause for k, cause in enumerate(CAUSES)}
+_CAUSES = {1 << k: cause for k, cause in enumerate(ALARM_NAMES)}
 _FLAGS = {IMPOVERISHED: "impoverished", OUTSIDE: "outside the fitted range", TRUTH_MISSED: "truth missed"}
 
 

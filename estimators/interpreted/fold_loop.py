@@ -14,10 +14,10 @@ import numpy as np
 from ..compiled.context import steps_of
 from ..compiled.verdict import limit_of
 from ..errors import ModelError
-from ..gate.doubt import Rule, forget, note
+from ..gate.rejection_runs import Rule, forget, note
 from ..gate.soften import inflation
 from ..log import INPUT, MARK, READING, RESET, TICK, TRUTH
-from ..screen import pass_on, screen_reading
+from ..plausibility import pass_on, screen_reading
 from ..track import (
     ANCESTORS,
     EFFECTIVE,

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import os
 from importlib.metadata import version
 from pathlib import Path
 
-CONSTANTS = ("errors.py", "batch.py", "state_space.py", "alarms.py", "hypotheses.py")
+CONSTANTS = ("errors.py", "batch.py", "state_space.py", "detectors.py")
 """Files from which compiled code takes constants, and nothing else."""
+
+PROSE_CHARACTERS = 24
+"""Strings of these files from which on are prose, an edit of which compiles nothing anew."""
 
 
 def cache_folder() -> Path:
@@ -23,7 +27,17 @@ def cache_folder() -> Path:
     package = Path(__file__).parent.parent
     for path in sorted(package.rglob("*.py")):
         source = path.read_bytes()
-        compiling = b"jit" in source or b"intrinsic" in source or path.name in CONSTANTS
-        if compiling and package / "models" not in path.parents:
+        if path.name in CONSTANTS:
+            digest.update(_without_prose(source))
+        elif (b"jit" in source or b"intrinsic" in source) and package / "models" not in path.parents:
             digest.update(source)
     return base / "nisus" / "numba" / digest.hexdigest()[:16]
+
+
+def _without_prose(source: bytes) -> bytes:
+    """Return the code of a file without its comments, docstrings and other prose."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and len(node.value) >= PROSE_CHARACTERS:
+            node.value = ""
+    return ast.dump(tree).encode()

@@ -18,7 +18,7 @@ from estimators.log import MAINTENANCE, MARK, READING, RESET, TICK, TRUTH, Event
 from estimators.model.limits import Limits
 from estimators.tuning import Tuning
 from sources.source import WRONG_TIME
-from tests.estimators.test_screen import model
+from tests.estimators.test_plausibility import model
 from tests.support import SECOND, assert_same
 
 BEAT = SECOND // 4

@@ -11,8 +11,7 @@ import numpy as np
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators import fold_kernel
-from estimators.diagnostics.health import assess
-from estimators.diagnostics.normal_nis import NORMALS
+from estimators.diagnostics.health import NORMALS, assess
 from estimators.fold import Fold
 from estimators.log import Log
 from estimators.models import MODELS

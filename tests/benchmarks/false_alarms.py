@@ -20,7 +20,7 @@ from scipy.stats import poisson
 
 from estimators.compiled.context import steps_of
 from estimators.compiled.model import compile_model
-from estimators.diagnostics.evidence import CAUSES, IMPOVERISHED
+from estimators.diagnostics.detectors import ALARM_NAMES, IMPOVERISHED
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold
 from estimators.log import READING, TICK, Events, Log
@@ -142,7 +142,7 @@ def onsets(fold: Fold) -> Counter[str]:
     for s, sensor in enumerate(fold.model.sensors):
         masks = track.alarms[(kind == READING) & (channel == s), : len(sensor.rows)]
         began = masks[1:] & ~masks[:-1]
-        for bit, name in enumerate(CAUSES):
+        for bit, name in enumerate(ALARM_NAMES):
             if count := int(np.sum(began >> bit & 1)):
                 found[name] += count
     poor = track.flags & IMPOVERISHED != 0
@@ -175,7 +175,7 @@ def table(readings: int, every: float, say: Callable[[str], None] = print) -> No
         n = max(1, round(readings * case.share))
         begun = perf_counter()
         seconds, found = count_alarms(case, n, every, seed=k)
-        alarms = sum(count for name, count in found.items() if name in CAUSES)
+        alarms = sum(count for name, count in found.items() if name in ALARM_NAMES)
         whole, expected, seen = whole + n, expected + seconds / every, seen + alarms
         name = f"{case.estimator} {case.model.name}"
         took = f"{(perf_counter() - begun) / n * 1e6:.1f} µs"

@@ -16,11 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimators.diagnostics.detectors import OUTSIDE
 from estimators.diagnostics.episodes import episodes
-from estimators.diagnostics.evidence import OUTSIDE
 from estimators.diagnostics.score import Score, score
 from estimators.diagnostics.sensitivity.responses import SMOOTH, astray, stand_in
-from estimators.diagnostics.sensitivity.visibility import tests_of
+from estimators.diagnostics.sensitivity.visibility import fault_tests
 from estimators.fold import Fold
 from estimators.log import READING
 
@@ -143,7 +143,7 @@ def _seen(bench: Bench, clean: Fold, wrong: Fold, mistake: Mistake) -> tuple[boo
     standardised = np.full_like(clean.track.innovation, np.nan)
     # The bank knows S of the fold that is wrong.
     standardised[own] = moved / wrong.track.innovation_std[other]
-    tests = tests_of(
+    tests = fault_tests(
         model,
         clean.tuning,
         clean.log,
@@ -155,7 +155,7 @@ def _seen(bench: Bench, clean: Fold, wrong: Fold, mistake: Mistake) -> tuple[boo
     flagged, before = wrong.track.flags[other] & OUTSIDE != 0, clean.track.flags[own] & OUTSIDE != 0
     # A range is not left by chance: states and inputs are what they are.
     outside = bool(np.any(flagged & ~before & during))
-    likely, possible = tests.sees(standardised)
+    likely, possible = tests.detects(standardised)
     multiple = np.nan if outside else tests.multiple(standardised, standardised)
     return likely or outside, possible or outside, multiple
 

@@ -24,7 +24,7 @@ from config.tunings import Version, version_of
 from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.score import Score, score
 from estimators.errors import NisusError, SourceError
-from estimators.gate.doubt import REMEMBERED
+from estimators.gate.rejection_runs import REMEMBERED
 from estimators.log import Events
 from estimators.model.state_space import StateSpaceModel
 from estimators.snapshots import Base

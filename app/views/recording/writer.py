@@ -17,7 +17,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-from estimators.diagnostics.health import FAR
+from estimators.diagnostics.health import MAX_ROWS_PER_READING
 from estimators.errors import NisusError, SourceError
 
 from ...live.notices import Notice
@@ -198,7 +198,7 @@ class _Part:
             # The same cursors, so that no late reading is missed in between.
             self._events, self._charts, self.disk = before._events, before._charts, before.disk
             # Health looks back at the rows before: they are there from where this part takes over.
-            self._start, self._base = engine.origin(self._events.next - FAR * engine.policy.window)
+            self._start, self._base = engine.origin(self._events.next - MAX_ROWS_PER_READING * engine.policy.window)
             self._events.next = self._start
         self._drawn_from = self._charts.next
         self._revision = -1

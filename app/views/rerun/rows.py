@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
+from estimators.diagnostics.detector_state import SENSOR_STATES, sensor_states_over_time
 from estimators.diagnostics.field_pictures import Picture
-from estimators.diagnostics.sensor_states import STATES, states_along
 from estimators.log import READING, Events, truth_of
 from estimators.track import FAILED, GATED, HEALTH_NAMES, Track, estimated_rows
 
@@ -86,7 +86,9 @@ class RerunRows:
             self.sink.static(
                 f"/sensor/{name}",
                 rr.StateConfiguration(
-                    values=list(STATES), labels=list(STATES), colors=state_colors(STATES, self._palette)
+                    values=list(SENSOR_STATES),
+                    labels=list(SENSOR_STATES),
+                    colors=state_colors(SENSOR_STATES, self._palette),
                 ),
             )
         if self._layout:
@@ -234,14 +236,14 @@ class RerunRows:
 
     def _sensor_changes(self, events: Events, track: Track, past: bool) -> None:
         for s, name in enumerate(self._sensors):
-            rows, states = states_along(events, track, s)
+            rows, states = sensor_states_over_time(events, track, s)
             if not rows.size:
                 continue
             changes = np.flatnonzero(np.append(-1 if past else self._states_of[name], states[:-1]) != states)
             if not past:
                 self._states_of[name] = int(states[-1])
             if changes.size:
-                words = [STATES[states[k]] for k in changes]
+                words = [SENSOR_STATES[states[k]] for k in changes]
                 self.sink.columns(f"/sensor/{name}", events.t[rows[changes]], rr.StateChange.columns(state=words))
 
     def _readings(self, events: Events, track: Track, width: int) -> None:

@@ -10,8 +10,7 @@ import numpy as np
 from ...log import READING, RESET
 from ...track import GATED, REASONS, SCREENED, USED
 from .. import words
-from ..effects import KINDS, Effect, against, common_scale, effects, onset
-from ..evidence import (
+from ..detectors import (
     AGREEING,
     ALTERNATING,
     BITS,
@@ -25,6 +24,7 @@ from ..evidence import (
     STUCK,
     WIDE,
 )
+from ..effects import KINDS, Effect, against, common_scale, effects, onset
 from .course import JOINED, Course, Run, runs, standardised, unusual
 from .episode import Episode, Found
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...log import READING
 from .. import words
-from ..evidence import SENSORS
+from ..detectors import SENSOR_FLAGS
 from .course import Course, runs
 from .episode import Episode, Found
 
@@ -19,7 +19,7 @@ def of_silence(course: Course) -> Iterator[Found]:
     t = events.t
     if not flags.any():
         return
-    for s, sensor in enumerate(model.sensors[:SENSORS]):
+    for s, sensor in enumerate(model.sensors[:SENSOR_FLAGS]):
         heard = np.flatnonzero((events.kind == READING) & (events.channel == s))
         known = 0 if course.heard is None else int(course.heard[s])
         for run in runs(flags >> s & 1 != 0):

@@ -9,7 +9,7 @@ import numpy as np
 from ...log import INPUT, TRUTH, truth_of
 from ...model.state_space import Input, State
 from .. import words
-from ..evidence import MISSED, OUTSIDE
+from ..detectors import MISSED, OUTSIDE
 from .course import JOINED, Course, runs
 from .episode import Episode, Found
 

@@ -9,7 +9,7 @@ import numpy as np
 from ...log import READING
 from ...track import DIVERGED, GATED, HEALTH_NAMES, SCREENED, STALE
 from .. import words
-from ..evidence import IMPOVERISHED, REFUSED, SHIFTED_DOWN, SHIFTED_UP, STUCK
+from ..detectors import IMPOVERISHED, REFUSED, SHIFTED_DOWN, SHIFTED_UP, STUCK
 from .course import Course, runs
 from .episode import Episode, Found
 

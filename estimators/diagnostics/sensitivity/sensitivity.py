@@ -21,7 +21,6 @@ from ...snapshots import Base
 from ...track import USED
 from ...tuning import Tuning
 from ..health import HealthPolicy
-from .faults import fault
 from .gramian import Uncertainty, information, uncertainty
 from .responses import (
     KINDS,
@@ -39,7 +38,7 @@ from .responses import (
     start,
     subject_text,
 )
-from .visibility import tests_of
+from .visibility import fault_tests, undetectable_fault
 
 CURVED = 0.5
 """Nonlinearity from which on a derivative says little; where half the nudges are beyond it, the result says so."""
@@ -167,7 +166,7 @@ def sensitivity(
     fisher = information([response.whitened[used] for response in responses])
     told = uncertainty(fisher, nudges)
     t = still.t[: still.n].copy()
-    tests = tests_of(
+    tests = fault_tests(
         model,
         tuning,
         still,
@@ -176,7 +175,7 @@ def sensitivity(
         detection=detection,
         bank=seen_by == BANK,
     )
-    faults = each(lambda response: fault(begun, response, tests), responses, executor)
+    faults = each(lambda response: undetectable_fault(begun, response, tests), responses, executor)
     bounds = integrity([item.error for item in faults], track.std)
     notes = [begun.note]
     if np.median([item.nonlinearity for item in faults]) > CURVED:

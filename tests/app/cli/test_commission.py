@@ -12,7 +12,7 @@ from app.live.tunings.versions import write_section
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.commission import Normal, baseline_of, lost_from
-from estimators.diagnostics.evidence import CAUSES
+from estimators.diagnostics.detectors import ALARM_NAMES
 from estimators.errors import ConfigError
 from estimators.fold import fold
 from estimators.track import DIVERGED
@@ -119,7 +119,7 @@ def test_a_file_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
         ),
         (
             "  winding:\n    reached:\n      broken: 2\n",
-            "drive.yaml:12: commissioned.winding.reached.broken is no cause; choose from " + ", ".join(CAUSES),
+            "drive.yaml:12: commissioned.winding.reached.broken is no cause; choose from " + ", ".join(ALARM_NAMES),
         ),
         ("  winding: {scale: 0}\n", "drive.yaml:10: commissioned.winding.scale"),
         ("  winding: {correlation: 1}\n", "drive.yaml:10: commissioned.winding.correlation"),

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from estimators.diagnostics.commission import FEWEST, MARGIN, Normal, baseline_of, commission, lost_from
-from estimators.diagnostics.evidence import BITS, CAUSES, NARROW, no_baseline
-from estimators.diagnostics.health import FAR, FEW, HealthPolicy
-from estimators.diagnostics.normal_nis import LEAST, normal_nis
+from estimators.diagnostics.detector_state import no_baseline
+from estimators.diagnostics.detectors import ALARM_NAMES, BITS, NARROW
+from estimators.diagnostics.health import JUDGED_MEAN, MAX_ROWS_PER_READING, MIN_WINDOW_EVENTS, HealthPolicy, normal_nis
 from estimators.fold import Fold
 from estimators.log import READING, RESET, Events
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
@@ -86,7 +86,7 @@ def test_the_normal_is_that_of_the_innovations(normals):
         assert (normal.bias, normal.scale) == pytest.approx((e.mean(), e.std()), abs=5.1e-4)
         # That of corrcoef takes the means and deviations of either end apart: 1/n more or less.
         assert normal.correlation == pytest.approx(lag, abs=2e-3)
-        assert set(normal.reached) <= set(CAUSES) and all(peak > 1.0 for peak in normal.reached.values())
+        assert set(normal.reached) <= set(ALARM_NAMES) and all(peak > 1.0 for peak in normal.reached.values())
 
 
 @pytest.mark.parametrize("seed", range(1, 7))
@@ -112,7 +112,7 @@ def test_a_change_is_heard(normals, change, cause, within):
     track = folded(asset(1, change=added), baseline_of(MODEL, normals)).track
     gauge = track.alarms[::2, 0]
     assert not gauge[:1500].any()
-    assert np.bitwise_or.reduce(gauge[1500 : 1500 + within]) >> CAUSES.index(cause) & 1
+    assert np.bitwise_or.reduce(gauge[1500 : 1500 + within]) >> ALARM_NAMES.index(cause) & 1
 
 
 def test_the_baseline_is_what_was_normal(normals):
@@ -137,15 +137,15 @@ def test_the_highest_nis_over_a_window_is_by_definition():
     """Over every reading and those before it, with a reset that begins anew: a loop over rows, as its words say."""
     fold = folded(lurching())
     normals = commission(fold, fold.evidence)
-    normal = normal_nis(MODEL, baseline_of(MODEL, normals))[:, LEAST]
+    normal = normal_nis(MODEL, baseline_of(MODEL, normals))[:, JUDGED_MEAN]
     log, track, most = fold.log, fold.track, [0.0, 0.0]
     for i in np.flatnonzero(log.kind[: log.n] == READING):
         rows = []
-        for k in range(i, max(-1, i - FAR * fold.policy.window), -1):
+        for k in range(i, max(-1, i - MAX_ROWS_PER_READING * fold.policy.window), -1):
             if log.kind[k] == RESET or len(rows) == fold.policy.window:
                 break
             rows.append(k)
-        if len(rows) >= FEW:
+        if len(rows) >= MIN_WINDOW_EVENTS:
             ratio = track.nis[rows].sum() / (track.dof[rows] * normal[log.channel[rows]]).sum()
             most[log.channel[i]] = max(most[log.channel[i]], ratio)
     assert min(most) > HealthPolicy().diverged_nis

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from estimators.diagnostics.consistency import NisVerdict
-from estimators.diagnostics.normal_nis import LEAST, MEAN, VARIANCE, nis_bounds, normal_nis
+from estimators.diagnostics.health import JUDGED_MEAN, MEAN, VARIANCE, nis_bounds, normal_nis
 from estimators.diagnostics.score import nis_verdict
 from estimators.log import READING, Events
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
@@ -80,7 +80,7 @@ def test_white_innovations_leave_the_chi_square():
 
 
 def test_a_smaller_normal_does_not_make_divergence_earlier():
-    assert normal_nis(MODEL, BASELINE)[0, LEAST] == 1.0
+    assert normal_nis(MODEL, BASELINE)[0, JUDGED_MEAN] == 1.0
     assert normal_nis(MODEL, BASELINE)[0, MEAN] == pytest.approx(0.34, rel=1e-12)
 
 

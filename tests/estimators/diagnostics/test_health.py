@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from estimators.diagnostics.health import FAR, FEW, HealthPolicy, assess, chi_square_bounds
-from estimators.diagnostics.normal_nis import nis_bounds
+from estimators.diagnostics.health import (
+    MAX_ROWS_PER_READING,
+    MIN_WINDOW_EVENTS,
+    HealthPolicy,
+    assess,
+    chi_square_bounds,
+    nis_bounds,
+)
 from estimators.diagnostics.score import score
 from estimators.fold import Fold, fold
 from estimators.log import READING, RESET, TICK, TRUTH, Events, Log
@@ -333,7 +339,9 @@ def by_definition(t, kind, channel, track, normal, policy):
         # The row that last changed the window.
         e = max([k for k in range(i, -1, -1) if judged[k] or kind[k] == RESET][:1] or [0])
         after = max(resets[resets <= e], default=-1)
-        rows = [k for k in range(max(after + 1, e - FAR * policy.window + 1, 0), e + 1) if judged[k]][-policy.window :]
+        rows = [k for k in range(max(after + 1, e - MAX_ROWS_PER_READING * policy.window + 1, 0), e + 1) if judged[k]][
+            -policy.window :
+        ]
         used = [k for k in rows if track.verdict[k] == USED]
         total, dof = float(np.sum(track.nis[used])), int(np.sum(track.dof[used], dtype=int))
         due, mean, variance = track.dof[used] @ normal[channel[used]]
@@ -345,7 +353,7 @@ def by_definition(t, kind, channel, track, normal, policy):
             values = [total / len(used), *bounds]
         refused = len(rows) - len(used)
         lost = refused > policy.diverged_gated * len(rows) or total > policy.diverged_nis * due
-        yield (t[i] - t[e]) / SECOND, *values, DIVERGED if len(rows) >= FEW and lost else TRACKING
+        yield (t[i] - t[e]) / SECOND, *values, DIVERGED if len(rows) >= MIN_WINDOW_EVENTS and lost else TRACKING
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from estimators.diagnostics.detector_state import SENSOR_STATES, sensor_states, sensor_states_over_time
 from estimators.diagnostics.episodes import episodes
 from estimators.diagnostics.health import HealthPolicy
-from estimators.diagnostics.sensor_states import STATES, sensor_states, states_along
 from estimators.fold import Fold
 from estimators.interface.table import table_of
 from estimators.log import READING, TICK, Events, Log
@@ -77,15 +77,15 @@ def test_along_the_track_it_changes_where_the_episodes_begin():
     track, events = fold.track, fold.log.events
     of = {episode.subject: episode for episode in episodes(fold)}
     for s, name, after in ((1, "two", 100), (2, "three", 130)):
-        rows, codes = states_along(events, track, s)
-        words = [STATES[code] for code in codes]
+        rows, codes = sensor_states_over_time(events, track, s)
+        words = [SENSOR_STATES[code] for code in codes]
         change = words.index("degraded")
         assert set(words[:change]) == {"tracking"} and set(words[change:]) == {"degraded"}
         # Told after the cause: some repetitions, or six periods.
         assert after < events.t[rows[change]] / SECOND < after + 30
         assert of[name].cause in ("stuck", "silent") and of[name].start < events.t[rows[change]] / SECOND
-    rows, codes = states_along(events, track, 0)
-    assert {STATES[code] for code in codes} == {"tracking"} and rows.size == 180
+    rows, codes = sensor_states_over_time(events, track, 0)
+    assert {SENSOR_STATES[code] for code in codes} == {"tracking"} and rows.size == 180
 
 
 def test_the_table_has_alarms_and_flags_in_words():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from estimators.fold import Fold
-from estimators.gate.doubt import CHANCE, FEWEST, rule_of
 from estimators.gate.isolation import SHARE, Evidence, cost, decided, widening
+from estimators.gate.rejection_runs import MIN_RUN, RUN_PROBABILITY, rule_of
 from estimators.log import READING, RESET, Events, Log
 from estimators.track import GATED, USED
 from tests.support import SECOND, as_log, assert_same
@@ -149,8 +149,8 @@ def test_a_fold_from_a_base_decides_as_the_whole_one():
 def test_most_refusals_in_a_row_that_chance_explains():
     for gate in (0.5, 0.95, 0.999):
         most = rule_of(gate, "hard", True).most
-        assert (1.0 - gate) ** most <= CHANCE < (1.0 - gate) ** (most - 1)
-    assert rule_of(0.999999, "hard", True).most == FEWEST
+        assert (1.0 - gate) ** most <= RUN_PROBABILITY < (1.0 - gate) ** (most - 1)
+    assert rule_of(0.999999, "hard", True).most == MIN_RUN
     assert rule_of(0.95, "hard", False).most == 0 and rule_of(None, "soft", True) == (0, 0)
 
 

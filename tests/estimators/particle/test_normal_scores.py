@@ -217,8 +217,9 @@ def test_effective_sample_size_before_resampling():
 
 def test_a_poor_cloud_is_told():
     """A sensor a thousand times sharper than the cloud leaves a particle or two each time; a blunt one does not."""
+    from estimators.diagnostics.detector_watch import POOR_MEASUREMENTS
+    from estimators.diagnostics.detectors import IMPOVERISHED
     from estimators.diagnostics.episodes import episodes
-    from estimators.diagnostics.evidence import IMPOVERISHED, PATIENCE
     from estimators.track import SUSPECT
 
     rng = np.random.default_rng(5)
@@ -234,5 +235,5 @@ def test_a_poor_cloud_is_told():
         causes = [episode.cause for episode in episodes(growing)]
         assert ("impoverished" in causes) == poor
         if poor:
-            assert told[0] >= PATIENCE - 1
+            assert told[0] >= POOR_MEASUREMENTS - 1
             assert growing.track.health[told[0]] >= SUSPECT

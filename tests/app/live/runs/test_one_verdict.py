@@ -12,7 +12,7 @@ from app.live.runs.scores import RunScores
 from app.present.export.report import Reported, _scores
 from app.studies.analysis.diagnosis import Diagnosis
 from app.web.twin_json import status_json
-from estimators.diagnostics.evidence import no_baseline
+from estimators.diagnostics.detector_state import no_baseline
 from estimators.diagnostics.score import score
 from tests.app.scripted import MODEL, Scripted, pull_all, readings
 from tests.app.served import shown_twin

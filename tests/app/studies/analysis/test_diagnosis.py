@@ -14,7 +14,7 @@ from app.live.engine import Engine
 from app.live.execute import execute
 from app.studies.analysis.diagnosis import Diagnosis, _agreed, last_rows
 from app.studies.analysis.row_figures import LAGS, rows_json, verdict
-from estimators.diagnostics.evidence import no_baseline
+from estimators.diagnostics.detector_state import no_baseline
 from estimators.diagnostics.innovations import autocorrelation
 from estimators.log import READING, Events
 from estimators.track import USED, Track

@@ -7,17 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from estimators.diagnostics.detector_state import no_baseline
+from estimators.diagnostics.detectors import BITS, IMPOVERISHED, NARROW, SHIFTED_DOWN, SHIFTED_UP, SPIKY, STUCK
 from estimators.diagnostics.episodes import CAUSES, JOINED, Episode, course_of, episode_json, episodes, found_in
-from estimators.diagnostics.evidence import (
-    BITS,
-    IMPOVERISHED,
-    NARROW,
-    SHIFTED_DOWN,
-    SHIFTED_UP,
-    SPIKY,
-    STUCK,
-    no_baseline,
-)
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold
 from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events

@@ -5,9 +5,10 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import binom, norm
 
-from estimators.diagnostics.evidence import SHIFTS, TESTS, no_baseline
+from estimators.diagnostics.detector_state import no_baseline
+from estimators.diagnostics.detectors import RATIOS, TESTS
 from estimators.diagnostics.sensitivity import sensitivity
-from estimators.diagnostics.sensitivity.visibility import Witness, noncentrality, threshold
+from estimators.diagnostics.sensitivity.visibility import FaultTests, noncentrality, threshold
 from estimators.fold import Fold, fold
 from estimators.log import READING, Log
 from estimators.models import MODELS
@@ -140,13 +141,13 @@ def test_the_bank_sees_a_shift_of_a_white_row_with_the_probability_asked_for():
     """Its sums over simulated e, run here by themselves: log densities of the shifted and the white one."""
     n, runs, h, z = 4000, 1000, 16.0, norm.ppf(0.95)
     row = np.full((n, 1), 1.0)
-    tests = Witness(np.array([h]), z, np.ones(n, bool), (np.arange(n),), (0,), no_baseline(WALK), True)
+    tests = FaultTests(np.array([h]), z, np.ones(n, bool), (np.arange(n),), (0,), no_baseline(WALK), True)
     size = tests.multiple(row, row)
     # The best test has no lower bound for how small a lasting shift may be; the bank's smallest is 0.2, half of it too.
-    assert max(0.1, tests.best(row)) < size < 2.0 * tests.best(row)
+    assert max(0.1, tests.optimal_multiple(row)) < size < 2.0 * tests.optimal_multiple(row)
     e = np.random.default_rng(29).normal(size=(runs, n)) + size
     seen = np.zeros(runs, bool)
-    for shift in SHIFTS:
+    for shift in RATIOS[RATIOS[:, 3] != 0.0, 3]:
         ratios = norm.logpdf(e, loc=shift) - norm.logpdf(e)
         sums = np.concatenate([np.zeros((runs, 1)), np.cumsum(ratios, axis=1)], axis=1)
         seen |= (sums - np.minimum.accumulate(sums, axis=1)).max(axis=1) >= h

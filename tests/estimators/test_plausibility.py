@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from estimators.diagnostics.detectors import OUTSIDE, REFUSED, STUCK
 from estimators.diagnostics.episodes import episodes
-from estimators.diagnostics.evidence import OUTSIDE, REFUSED, STUCK
 from estimators.errors import ModelError
 from estimators.fold import Fold, fold
 from estimators.log import READING, Events, Log

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from estimators.diagnostics.evidence import CAUSES, OUTSIDE, TRUTH_MISSED, no_baseline
+from estimators.diagnostics.detector_state import no_baseline
+from estimators.diagnostics.detectors import ALARM_NAMES, OUTSIDE, TRUTH_MISSED
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold, fold
 from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events, Log
@@ -278,7 +279,7 @@ def by_definition(events, track, gate, baseline, expected):
                     if k == 0:
                         said = said - {"disagreeing", "agreeing"} | (together if judged else sensor.said)
                     row.said = said
-                    alarms[k] = sum(1 << CAUSES.index(cause) for cause in said)
+                    alarms[k] = sum(1 << ALARM_NAMES.index(cause) for cause in said)
         elif kind == TRUTH:
             for k, truth in enumerate(events.value[i, : 2 - s]):
                 if np.isfinite(truth):
@@ -291,7 +292,7 @@ def by_definition(events, track, gate, baseline, expected):
                     for m, square in enumerate(squares[j][1:], 2):
                         mean += (square - mean) / min(m, 10)
                     missed[j] = (n >= 10 and mean > 4.5**2) or (missed[j] and mean > 3.0**2)
-                    alarms[k] = missed[j] << CAUSES.index("missed")
+                    alarms[k] = missed[j] << ALARM_NAMES.index("missed")
         elif kind == INPUT and np.isfinite(events.value[i, 0]):
             feed = events.value[i, 0]
         elif kind == RESET:
@@ -420,7 +421,7 @@ def test_all_that_can_be_said_is_said_in_those_streams():
         flags |= int(np.bitwise_or.reduce(growing.track.flags))
         healths |= set(growing.track.health)
         verdicts |= set(growing.track.verdict)
-    assert bits == (1 << len(CAUSES)) - 1
+    assert bits == (1 << len(ALARM_NAMES)) - 1
     assert flags == OUTSIDE | TRUTH_MISSED | 0b111
     assert healths == {WAITING, TRACKING, SUSPECT, DEGRADED, DIVERGED, STALE}
     assert verdicts >= {USED, GATED, HELD_OUT, MISSING, SCREENED}

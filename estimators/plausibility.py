@@ -1,12 +1,12 @@
-"""The screen: which rows of a reading are refused at the edge, before the filter sees them.
+"""Range, rate, saturation, repetition and duplicate checks of measurements before the filter.
 
-A pure function of the readings in the order of measured time, so the log keeps every reading as it came and a fold that
-goes back screens them alike. Nothing of it depends on the estimate or the tuning: a reading is judged by what its
-sensor can say at all (model/limits.py) and by what it said before.
+A pure function of the measurements in the order of their time: the log keeps every measurement, and a fold that goes
+back gets the same verdicts. It depends neither on the estimate nor on the tuning, only on the limits of the sensor
+(`model/limits.py`) and its earlier measurements.
 
-A row is stuck without being told how long, by its quantum q: noise of standard deviation σ about a value that stands
-still gives the same code again with a probability of at most p = erf(q / (2√2 σ)), that of the best placed code, so m
-more in a row with pᵐ at most. At n readings a day, a run of m ≥ ln n / -ln p repetitions comes less than once a day.
+Without a limit for the length of a run, a row is stuck by its quantum q: noise of standard deviation σ about a constant
+value repeats a code with a probability of at most p = erf(q / (2√2 σ)), so m times in succession with at most pᵐ. At n
+measurements a day, a run of m ≥ ln n / -ln p repetitions occurs less than once a day.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from .track import DUPLICATE, RANGE, RATE, REASONS, REPEATED, SATURATED
 
 DAY = 86400.0
 
-# A sensor's part of the state: how many readings, the time of the first, and of the one that later ones may repeat.
+# Sensor: number of measurements, time of the first, and time of the one that later ones may duplicate.
 _COUNT, _FIRST, _ORIGINAL = range(3)
 SENSOR = 3
 """Numbers in the state for each sensor."""
 
-# A row's part: the value that may be repeated; the last that kept all limits, and its time; the value, begin and length
-# of the run of equal ones.
+# Row: the value that may be duplicated; the last one within all limits, and its time; value, begin and length of the
+# run of equal values.
 _VALUE, _KEPT, _KEPT_AT, _RUN, _RUN_BEGAN, _RUN_LENGTH = range(6)
 ROW = 6
 """Numbers in the state for each row."""
@@ -39,17 +39,17 @@ ROW = 6
 
 _LOW, _HIGH, _CLIP_LOW, _CLIP_HIGH, _RATE, _SLACK, _HALF, _REPETITIONS, _LASTING, _SURPRISE = range(10)
 COLUMNS = 10
-"""Columns of the limits: lowest and highest value; where the converter clips; rate, units a second, and slack, units;
-half the quantum; repetitions and seconds of a run that is stuck, infinite where only surprise counts: -ln p, 0 where
-there is no such rule."""
+"""Columns of the limits: lowest and highest value; values at which the converter clips; rate, units per second, and
+slack, units; half the quantum; repetitions and seconds of a stuck run, infinite where the surprise -ln p decides, 0
+where it does not."""
 
 
 def limits_of(model: StateSpaceModel) -> dict[str, np.ndarray]:
-    """What the screen finds in a context.
+    """Return the entries of these checks in a filter's context.
 
     Returns:
         `limits` (rows, COLUMNS); `limited` (sensors,), whether a sensor has limits of its values; `duplicates`
-        (sensors,), ns within which equal readings are one.
+        (sensors,), ns within which equal measurements are duplicates.
     """
     count, rows = len(model.sensors), len(model.row_names)
     limits = np.tile([-np.inf, np.inf, -np.inf, np.inf, np.inf, 0.0, 0.0, np.inf, np.inf, 0.0], (rows, 1))
@@ -86,15 +86,15 @@ def _be_stuck(own: np.ndarray, stuck: Stuck, std: np.ndarray) -> None:
 
 
 def surprise(quantum: float, std: float) -> float:
-    """-ln p of one repetition, p = erf(q / (2√2 σ)): 0 where noise never moves the code, so nothing can be told."""
+    """Return -ln p of one repetition, p = erf(q / (2√2 σ)); 0 where noise never changes the code."""
     if not std > 0.0:
         return 0.0
-    # By its complement, which keeps its digits where p is nearly 1.
+    # The complement keeps its digits where p is nearly 1.
     return -math.log1p(-math.erfc(quantum / (math.sqrt(8.0) * std)))
 
 
 def fresh_screen(model: StateSpaceModel) -> np.ndarray:
-    """The screen's state before the first event. Times in it are int64, the other numbers float64."""
+    """Return the state before the first event; its times are int64, its other numbers float64."""
     sensors = len(model.sensors)
     state = np.zeros(sensors * SENSOR + len(model.row_names) * ROW)
     each = state[sensors * SENSOR :].reshape(-1, ROW)
@@ -104,13 +104,13 @@ def fresh_screen(model: StateSpaceModel) -> np.ndarray:
 
 @inlined
 def _same(a, b):
-    """Whether two values are equal, or both missing."""
+    """Return whether two values are equal, or both missing."""
     return a == b or np.isnan(a) and np.isnan(b)
 
 
 @inlined
 def _is_duplicate(now, y, s, first, count, within, begin, state, times):
-    """Whether a reading says what the one before said, at the same time or too soon after it to be another."""
+    """Return whether a measurement repeats the one before within the time in which it counts as a duplicate."""
     own = s * SENSOR
     if state[own + _COUNT] == 0.0 or now - times[own + _ORIGINAL] > within:
         return False
@@ -122,7 +122,7 @@ def _is_duplicate(now, y, s, first, count, within, begin, state, times):
 
 @part
 def _repeats(now, y, at, a_day, limit, state, times):
-    """Whether a row has said the same for too long."""
+    """Return whether a row has repeated its value for too long."""
     if not np.isfinite(state[at + _RUN]) or abs(y - state[at + _RUN]) > limit[_HALF]:
         state[at + _RUN], state[at + _RUN_LENGTH] = y, 0.0
         times[at + _RUN_BEGAN] = now
@@ -136,7 +136,7 @@ def _repeats(now, y, at, a_day, limit, state, times):
 
 @part
 def _reasons(now, y, circular, at, a_day, limit, state, times):
-    """Bits of the limits that a row of a reading breaks."""
+    """Return the bits of the limits that a row of a measurement violates."""
     bits = 0
     if y < limit[_LOW] or y > limit[_HIGH]:
         bits |= RANGE
@@ -158,12 +158,12 @@ def _reasons(now, y, circular, at, a_day, limit, state, times):
 
 @jit
 def screen_reading(i, now, s, y, context, state, screened):
-    """Fill row i of `screened` (N, ny): bits of the limits that each row of reading y of sensor s breaks.
+    """Fill row i of `screened` (N, ny) with the bits of the limits that each row of measurement y violates.
 
-    `state` moves on with it, so the outcome does not depend on how a fold was cut into pieces.
+    `state` evolves with the measurements, so the result does not depend on the pieces of a fold.
 
     Returns:
-        Whether any row is refused.
+        Whether any row is rejected.
     """
     times = ints(state.ctypes.data, state.size)
     begin = context.n_sensors * SENSOR
@@ -171,12 +171,12 @@ def screen_reading(i, now, s, y, context, state, screened):
     own = s * SENSOR
     within = ints(context.duplicates, context.n_sensors)[s]
     if _is_duplicate(now, y, s, first, count, within, begin, state, times):
-        told = False
+        copied = False
         for k in range(count):
             if not np.isnan(y[k]):
                 screened[i, k] = DUPLICATE
-                told = True
-        return told
+                copied = True
+        return copied
     if state[own + _COUNT] == 0.0:
         times[own + _FIRST] = now
     times[own + _ORIGINAL] = now
@@ -201,7 +201,7 @@ screen_signature = types.boolean(i64, i64, i64, F1, context_type, F1, B2)
 
 
 def reasons_by_sensor(sensors: int, channel: np.ndarray, screened: np.ndarray) -> np.ndarray:
-    """How many readings were refused, wholly or in part, for each reason: (sensors, reasons); of rows of a track."""
+    """Count the measurements of a track that were rejected, in whole or in part, by reason, (sensors, reasons)."""
     rows = np.flatnonzero(screened.any(axis=1))
     bits = np.bitwise_or.reduce(screened[rows], axis=1)
     counts = [np.bincount(channel[rows[bits & (1 << k) != 0]], minlength=sensors) for k in range(len(REASONS))]
@@ -210,7 +210,7 @@ def reasons_by_sensor(sensors: int, channel: np.ndarray, screened: np.ndarray) -
 
 @jit
 def pass_on(value, screened, i, out):
-    """out ← reading i with NaN in the rows that are refused; whether any row is left."""
+    """Copy measurement i to `out` with NaN in the rejected rows; return whether any row is left."""
     left = False
     for k in range(out.size):
         out[k] = value[i, k]

@@ -1,14 +1,14 @@
-"""Watching: each new row of a track is put to the tests, and gets its alarms, its flags and the health of the twin."""
+"""Apply the detectors to new rows of a track, and fill their alarms, flags and the health of the twin."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ...compiled.context import circular_states, sensor_rows, sensor_variances
-from ...log import INPUT, READING, RESET, TRUTH
-from ...numerics.jit import borrowed, borrowed_rows, floats, inlined, ints, part
-from ...numerics.linalg import wrap
-from ...track import (
+from ..compiled.context import circular_states, sensor_rows, sensor_variances
+from ..log import INPUT, READING, RESET, TRUTH
+from ..numerics.jit import borrowed, borrowed_rows, floats, inlined, ints, part
+from ..numerics.linalg import wrap
+from ..track import (
     DEGRADED,
     DIVERGED,
     DUPLICATE,
@@ -22,11 +22,11 @@ from ...track import (
     WAITING,
     borrowed_columns,
 )
-from .alarms import AGREEING, DISAGREEING, IMPOVERISHED, LOST, MISSED, OUTSIDE, REFUSED, SENSORS, STUCK, TRUTH_MISSED
-from .bank import (
+from .detector_state import (
     BEGUN,
     DUE,
     HEARD,
+    JOINT_MASK,
     LOST_ROWS,
     MASK,
     MISSED_STATES,
@@ -40,42 +40,54 @@ from .bank import (
     STATE,
     SUSPECT_ROWS,
     THRESHOLD,
-    TOGETHER,
     TWIN,
     forget,
     row_part,
     sensor_part,
 )
-from .hypotheses import AT_REFUSALS, TESTS
-from .row_tests import add, alarm, repeat, weigh, weigh_together
-from .silence import listen, note_time
+from .detector_tests import add, alarm, find_dropouts, note_time, repeat, weigh, weigh_joint
+from .detectors import (
+    AGREEING,
+    AT_REFUSALS,
+    DISAGREEING,
+    IMPOVERISHED,
+    LOST,
+    MISSED,
+    OUTSIDE,
+    REFUSED,
+    SENSOR_FLAGS,
+    STUCK,
+    TESTS,
+    TRUTH_MISSED,
+)
 
-MISSES, MISSES_NO_MORE = 4.5, 3.0
-"""Root mean square of (estimate - truth) / σ, over about `TOLD` tellings, from which a truth is missed, and no more."""
+MISSED_RMS, MISSED_RMS_CLEARED = 4.5, 3.0
+"""Root mean square of (estimate - truth) / σ over about `TRUTH_VALUES` values from which a truth is missed, and below
+which it no longer is."""
 
-TOLD = 10
+TRUTH_VALUES = 10
 
-FEW_PARTICLES = 4.0
-"""Effective sample size below which a cloud is poor; it is too if all of it descends from one particle."""
+MIN_PARTICLES = 4.0
+"""Effective sample size below which particles are poor; they also are if all descend from one particle."""
 
-PATIENCE = 60
-"""Readings more, poor than not, from which a cloud is impoverished; it is no more at half as many. Three times as many
-as lie between two counts of ancestors: of a sound cloud a count may be 1 by chance, hardly three in a row."""
+POOR_MEASUREMENTS = 60
+"""Measurements more, poor than not, from which particles are impoverished; cleared at half as many. Three times the
+number between two counts of ancestors: by chance one count may be 1, hardly three in succession."""
 
 
 @part
 def _miss(own, z, before):
-    """Whether the truth of a state is missed, after another error of z standard deviations."""
-    own[1] = min(own[1] + 1.0, TOLD)
+    """Return `MISSED` if the truth of a state is missed after another error of z standard deviations, else 0."""
+    own[1] = min(own[1] + 1.0, TRUTH_VALUES)
     own[0] += (min(z * z, 1e4) - own[0]) / own[1]
-    if own[1] == TOLD and own[0] > MISSES * MISSES:
+    if own[1] == TRUTH_VALUES and own[0] > MISSED_RMS * MISSED_RMS:
         return MISSED
-    return MISSED if before and own[0] > MISSES_NO_MORE * MISSES_NO_MORE else 0
+    return MISSED if before and own[0] > MISSED_RMS_CLEARED * MISSED_RMS_CLEARED else 0
 
 
 @inlined
 def _is_copy(i, track):
-    """Whether a reading came before: the copies that a gateway makes say nothing for or against anyone."""
+    """Return whether a measurement is a copy, as gateways make them: it is no evidence."""
     for k in range(track.screened.shape[1]):
         if track.screened[i, k] & DUPLICATE != 0:
             return True
@@ -83,8 +95,8 @@ def _is_copy(i, track):
 
 
 @part
-def _says(y, count):
-    """Whether a reading has a value in any of its rows."""
+def _has_value(y, count):
+    """Return whether a measurement has a value in any row."""
     for k in range(count):
         if np.isfinite(y[k]):
             return True
@@ -92,8 +104,8 @@ def _says(y, count):
 
 
 @part
-def _hear(i, now, y, s, context, policy, state, track):
-    """Put a reading y of sensor s, and the variances that it may have brought, to all tests."""
+def _test(i, now, y, s, context, policy, state, track):
+    """Apply all tests to a measurement y of sensor s and the variances that may follow it."""
     width = track.alarms.shape[1]
     sensors = context.n_sensors
     chances = floats(context.chances, 2)
@@ -106,12 +118,12 @@ def _hear(i, now, y, s, context, policy, state, track):
     h = own[THRESHOLD]
     verdict = track.verdict[i]
     judged = verdict == USED or verdict == GATED
-    together = 0
+    joint = 0
     base = floats(context.baseline + 8 * first * (3 + TESTS), 3)
     white = base[0] == 0.0 and base[1] == 1.0 and base[2] == 0.0
     if judged and context.marginal == 0 and count > 1 and white:
-        together = weigh_together(own, track.nis[i], track.dof[i], h, int(own[TOGETHER]))
-        own[TOGETHER] = together
+        joint = weigh_joint(own, track.nis[i], track.dof[i], h, int(own[JOINT_MASK]))
+        own[JOINT_MASK] = joint
     for k in range(count):
         if not np.isfinite(y[k]):
             continue
@@ -126,17 +138,17 @@ def _hear(i, now, y, s, context, policy, state, track):
         screened = track.screened[i, k] != 0
         if judged or verdict == FAILED or screened:
             ratio = chances[1] if verdict == USED and not screened else chances[0]
-            said = add(each, AT_REFUSALS, ratio, h, base[3 + AT_REFUSALS])
-            mask = mask & ~REFUSED | alarm(said, REFUSED, before)
+            level = add(each, AT_REFUSALS, ratio, h, base[3 + AT_REFUSALS])
+            mask = mask & ~REFUSED | alarm(level, REFUSED, before)
         if judged and not screened:
-            # A prediction that is not Gaussian says nothing where its distribution function is not known.
+            # NaN where the distribution function of a prediction that is not Gaussian is not known.
             e = track.whitened[i, k]
             if context.marginal == 0:
                 e = track.innovation[i, k] / track.innovation_std[i, k]
             if np.isfinite(e):
                 mask = mask & LOST | weigh(each, e, h, base, before)
         if k == 0:
-            mask = mask & ~(DISAGREEING | AGREEING) | int(own[TOGETHER])
+            mask = mask & ~(DISAGREEING | AGREEING) | int(own[JOINT_MASK])
         each[MASK] = mask
         track.alarms[i, k] = mask
         state[SUSPECT_ROWS] += (mask != 0) - (before != 0)
@@ -145,20 +157,20 @@ def _hear(i, now, y, s, context, policy, state, track):
 
 @part
 def _count_particles(effective, ancestors, state):
-    """Whether a cloud is impoverished, after another reading that it used."""
-    if effective < FEW_PARTICLES or ancestors < 2.0:
-        state[POOR] = min(state[POOR] + 1.0, float(PATIENCE))
+    """Update whether particles are impoverished after another measurement that was used."""
+    if effective < MIN_PARTICLES or ancestors < 2.0:
+        state[POOR] = min(state[POOR] + 1.0, float(POOR_MEASUREMENTS))
     else:
         state[POOR] = max(state[POOR] - 1.0, 0.0)
-    if state[POOR] == PATIENCE:
+    if state[POOR] == POOR_MEASUREMENTS:
         state[POOR_CLOUD] = 1.0
-    elif state[POOR] <= PATIENCE // 2:
+    elif state[POOR] <= POOR_MEASUREMENTS // 2:
         state[POOR_CLOUD] = 0.0
 
 
 @part
-def _tell(i, first, truth, context, state, track):
-    """Compare the estimate with the truth of some states, from `first` on."""
+def _compare(i, first, truth, context, state, track):
+    """Compare the estimate with true values of states from index `first` on."""
     begin = TWIN + context.n_sensors * SENSOR + context.n_rows * ROW
     columns, circular = ints(context.column, context.nx), circular_states(context)
     for k in range(truth.size):
@@ -180,7 +192,7 @@ def _tell(i, first, truth, context, state, track):
 
 @part
 def _range(i, u, context, track):
-    """Whether a state, or an input that holds, is outside the range in which the model was fitted."""
+    """Return whether a state or an input is outside the range in which the model was fitted."""
     states = track.mean.shape[1]
     ranges = floats(context.ranges, 2 * (states + u.size))
     for k in range(states + u.size):
@@ -192,7 +204,7 @@ def _range(i, u, context, track):
 
 @part
 def _health(i, now, silent, flags, state, policy, track):
-    """The state of the twin after an event."""
+    """Return the health of the twin after an event."""
     finite = True
     for j in range(track.mean.shape[1]):
         finite &= np.isfinite(track.mean[i, j]) & np.isfinite(track.std[i, j])
@@ -213,10 +225,9 @@ def _health(i, now, silent, flags, state, policy, track):
 
 @part
 def watch_rows(first, last, t, kind, channel, value, context, policy, state, track):
-    """Fill alarms, flags and health of rows `first` to `last` of a track, whose other columns are there.
+    """Fill alarms, flags and health of rows `first` to `last` of a track whose other columns are known.
 
-    `state` moves on with them, as a filter's state does with the events, so the outcome does not depend on how a fold
-    was cut into pieces.
+    `state` evolves with the rows, so the result does not depend on the pieces of a fold.
     """
     sensors, rows, nu = context.n_sensors, context.n_rows, context.nu
     track = borrowed_columns(track)
@@ -237,17 +248,17 @@ def watch_rows(first, last, t, kind, channel, value, context, policy, state, tra
             track.alarms[i, k] = 0
         if kind[i] == READING:
             y = floats(value[i:].ctypes.data, value.shape[1])
-            # A sensor that says no value is as silent as one that does not speak.
-            if _says(y, sensor_rows(context, channel[i])[1]):
+            # A sensor that reports no value has dropped out all the same.
+            if _has_value(y, sensor_rows(context, channel[i])[1]):
                 if track.verdict[i] != SCREENED:
                     state[HEARD] = 1.0
                 if not _is_copy(i, track):
-                    _hear(i, now, y, channel[i], context, policy, state, track)
+                    _test(i, now, y, channel[i], context, policy, state, track)
             if np.isfinite(track.effective[i]):
                 _count_particles(track.effective[i], track.ancestors[i], state)
         elif kind[i] == TRUTH:
             truth = floats(value[i:].ctypes.data, min(width, context.nx - channel[i]))
-            _tell(i, channel[i], truth, context, state, track)
+            _compare(i, channel[i], truth, context, state, track)
         elif kind[i] == INPUT:
             for k in range(nu):
                 if np.isfinite(value[i, k]):
@@ -255,11 +266,11 @@ def watch_rows(first, last, t, kind, channel, value, context, policy, state, tra
         elif kind[i] == RESET:
             forget(state, sensors, rows, track.mean.shape[1])
         if now > state[NEXT_DUE]:
-            listen(state, sensors, now)
+            find_dropouts(state, sensors, now)
         flags = 0
         for s in range(sensors if state[SILENT_SENSORS] > 0.0 else 0):
             if sensor_part(state, s)[SILENT] != 0.0:
-                flags |= 1 << min(s, SENSORS - 1)
+                flags |= 1 << min(s, SENSOR_FLAGS - 1)
         silent = flags
         if context.fitted != 0 and _range(i, u, context, track):
             flags |= OUTSIDE

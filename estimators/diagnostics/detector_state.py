@@ -1,0 +1,201 @@
+"""State of the detectors, one flat array that evolves with the events, and their constants in a filter's context."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..events.batch import READING, Events
+from ..model.state_space import StateSpaceModel
+from ..numerics.jit import floats, inlined, part
+from ..track import HELD_OUT, MISSING, Track
+from .detectors import GAINS, JOINT, LOST, REJECTED_SHARE, SENSOR_FLAGS, TESTS
+from .health import HealthPolicy, normal_nis
+
+# Twin: rows in alarm and rows lost; time at which the next sensor drops out; time of the first event, whether a
+# measurement has arrived; states whose truth is missed; sensors that dropped out; measurements more, poor than not, of
+# a particle filter, and whether it is impoverished.
+SUSPECT_ROWS, LOST_ROWS, NEXT_DUE, BEGUN, HEARD, MISSED_STATES, SILENT_SENSORS, POOR, POOR_CLOUD = range(9)
+TWIN = 9
+
+# Sensor: W of the joint tests, then the number of measurements, time of the first and the last, longest gap, threshold
+# of the tests, time at which it drops out, whether it has, alarms of the joint tests.
+COUNT, FIRST, LAST, LONGEST_GAP, THRESHOLD, DUE, SILENT, JOINT_MASK = range(JOINT, JOINT + 8)
+SENSOR = JOINT + 8
+"""Numbers in the state for each sensor."""
+
+# Row: W of its tests, then its alarms; the last e, and the same whitened by the baseline; the last value; its smallest
+# step; length of the present run of equal values; repeated values, of how many; measurements since the last outlier;
+# the next e that each filter of `GAINS` predicts.
+MASK, RAW, WHITE, VALUE, QUANTUM, RUN, EQUAL, COUNTED, CALM_FOR, EXPECTED = range(TESTS, TESTS + 10)
+ROW = EXPECTED + len(GAINS)
+"""Numbers in the state for each row."""
+
+# Shown state: mean square of its standardised errors, how many true values were given, whether it is missed. The
+# inputs that hold follow.
+STATE = 3
+
+SENSOR_STATES = ("waiting", "tracking", "suspect", "degraded", "stale", "held out")
+"""State of a sensor: no measurement yet; consistent; in alarm; dropped out, stuck or rejected; dropped out for so long
+that a twin without other sensors would be stale; predicted and scored, never used."""
+
+
+def no_baseline(model: StateSpaceModel) -> np.ndarray:
+    """Return the baseline of white innovations, (rows, 3 + TESTS)."""
+    baseline = np.zeros((len(model.row_names), 3 + TESTS))
+    baseline[:, 1] = 1.0
+    return baseline
+
+
+def detector_context(
+    model: StateSpaceModel,
+    gate: float | None,
+    marginal: bool,
+    baseline: np.ndarray,
+    expected: np.ndarray | None = None,
+) -> dict[str, Any]:
+    """Return the detectors' entries of a filter's context.
+
+    Args:
+        model: The model.
+        gate: Probability that a good measurement passes, or None.
+        marginal: Whether predictions are not Gaussian, so that `Track.whitened` holds each row by itself.
+        baseline: Bias, scale and correlation of the baseline, and the highest W of each test, (rows, 3 + TESTS).
+        expected: Sensors that must report, (sensors,); None for those that have reported.
+
+    Returns:
+        `baseline` (rows, 3 + TESTS); `normal` (sensors, 3), see `normal_nis`; `ranges` (shown + inputs, 2) in which
+        the model was fitted, and `fitted`, 1 if there is any; `column` (nx,) of a state in the track, or -1; `expected`
+        (sensors,); `chances` (2,), log Λ of a rejected and of an accepted measurement; `marginal`; `n_tests` in all.
+    """
+    shown = model.shown
+    column = np.full(model.nx, -1, np.int64)
+    column[shown] = np.arange(len(shown))
+    if model.mode >= 0:
+        column[model.mode] = -1
+    ranges = np.full((len(shown) + model.nu, 2), [-np.inf, np.inf])
+    fitted = [item.fitted for item in model.shown_states] + [item.fitted for item in model.inputs]
+    for k, limits in enumerate(fitted):
+        if limits is not None:
+            ranges[k] = limits
+    counts = np.array([len(sensor.rows) for sensor in model.sensors], np.int64)
+    return {
+        "baseline": np.ascontiguousarray(baseline, float),
+        "normal": normal_nis(model, baseline),
+        "ranges": ranges,
+        "fitted": int(np.any(np.isfinite(ranges))),
+        "column": column,
+        "expected": np.zeros(len(counts), np.int64) if expected is None else np.ascontiguousarray(expected, np.int64),
+        "chances": gate_log_ratios(gate),
+        "marginal": int(marginal),
+        "n_tests": int(counts.sum()) * TESTS + int(np.sum(counts > 1)) * JOINT,
+    }
+
+
+def gate_log_ratios(gate: float | None) -> np.ndarray:
+    """Return log Λ of a rejected and of an accepted measurement, (2,); `gate`: probability that a good one passes."""
+    chance = min(max(1e-6, 1.0 - gate), 0.5 * REJECTED_SHARE) if gate is not None else 0.5 * REJECTED_SHARE
+    return np.log([REJECTED_SHARE / chance, (1.0 - REJECTED_SHARE) / (1.0 - chance)])
+
+
+def threshold_of(model: StateSpaceModel, state: np.ndarray, s: int) -> float:
+    """Return the present threshold h of the tests of sensor s."""
+    return float(state[TWIN + s * SENSOR + THRESHOLD])
+
+
+def fresh(model: StateSpaceModel) -> np.ndarray:
+    """Return the state before the first event."""
+    rows, sensors = len(model.row_names), len(model.sensors)
+    state = np.zeros(TWIN + sensors * SENSOR + rows * ROW + len(model.shown) * STATE + model.nu)
+    state[NEXT_DUE], state[BEGUN] = np.inf, np.nan
+    _sensors(model, state)[:, DUE] = np.inf
+    _rows(model, state)[:, [RAW, WHITE, VALUE]] = np.nan
+    state[state.size - model.nu :] = [item.default for item in model.inputs]
+    return state
+
+
+def _sensors(model: StateSpaceModel, state: np.ndarray) -> np.ndarray:
+    return state[TWIN : TWIN + len(model.sensors) * SENSOR].reshape(-1, SENSOR)
+
+
+def _rows(model: StateSpaceModel, state: np.ndarray) -> np.ndarray:
+    begin = TWIN + len(model.sensors) * SENSOR
+    return state[begin : begin + len(model.row_names) * ROW].reshape(-1, ROW)
+
+
+def sensor_states(
+    model: StateSpaceModel, used: np.ndarray, state: np.ndarray, now: float, policy: HealthPolicy
+) -> list[str]:
+    """Return the present state of each sensor, one of `SENSOR_STATES`.
+
+    Args:
+        model: The model.
+        used: Which sensors are used, (sensors,) of bool.
+        state: State of the detectors.
+        now: Time of the last event, s.
+        policy: Limits of the twin's health.
+    """
+    sensors, masks = _sensors(model, state), _rows(model, state)[:, MASK].astype(int)
+    found = []
+    for s, sensor in enumerate(model.sensors):
+        own, start = sensors[s], model.row_start[s]
+        alarms = int(np.bitwise_or.reduce(masks[start : start + len(sensor.rows)], initial=int(own[JOINT_MASK])))
+        if not used[s]:
+            word = "held out"
+        elif own[SILENT] > 0.0:
+            never_stale = own[COUNT] == 0.0 or now - own[LAST] <= policy.stale_after
+            word = "degraded" if never_stale else "stale"
+        elif own[COUNT] == 0.0:
+            word = "waiting"
+        elif alarms & LOST:
+            word = "degraded"
+        else:
+            word = "suspect" if alarms else "tracking"
+        found.append(word)
+    return found
+
+
+def sensor_states_over_time(events: Events, track: Track, s: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the state of sensor s over time, as far as single rows show it: a stale sensor is degraded here.
+
+    Returns:
+        Indices of the rows that concern the sensor, ascending (k,), and indices into `SENSOR_STATES` (k,).
+    """
+    silent = track.flags >> s & 1 != 0 if s < SENSOR_FLAGS else np.zeros(len(events), bool)
+    reported = (events.kind == READING) & (events.channel == s) & (track.verdict != MISSING)
+    rows = np.flatnonzero(silent | reported)
+    alarms = np.bitwise_or.reduce(track.alarms[rows], axis=1) * reported[rows]
+    cases = (track.verdict[rows] == HELD_OUT, silent[rows] | (alarms & LOST != 0), alarms != 0)
+    words = [SENSOR_STATES.index(word) for word in ("held out", "degraded", "suspect")]
+    return rows, np.select(cases, words, SENSOR_STATES.index("tracking"))
+
+
+@inlined
+def sensor_part(state, s):
+    """Return the slice of sensor s."""
+    return floats(state.ctypes.data + 8 * (TWIN + s * SENSOR), SENSOR)
+
+
+@inlined
+def row_part(state, sensors, row):
+    """Return the slice of a sensor row."""
+    return floats(state.ctypes.data + 8 * (TWIN + sensors * SENSOR + row * ROW), ROW)
+
+
+@part
+def forget(state, sensors, rows, states):
+    """Clear the evidence at a reset: measurements before it concern another estimate."""
+    for s in range(sensors):
+        own = sensor_part(state, s)
+        own[JOINT_MASK] = 0.0
+        own[:JOINT] = 0.0
+    for k in range(rows):
+        own = row_part(state, sensors, k)
+        own[:TESTS] = 0.0
+        own[MASK] = own[CALM_FOR] = 0.0
+        own[EXPECTED:ROW] = 0.0
+        own[RAW] = own[WHITE] = np.nan
+    begin = TWIN + sensors * SENSOR + rows * ROW
+    state[begin : begin + states * STATE] = 0.0
+    state[SUSPECT_ROWS] = state[LOST_ROWS] = state[MISSED_STATES] = state[POOR] = state[POOR_CLOUD] = 0.0

@@ -1,0 +1,265 @@
+"""Sequential tests of one sensor row, of all rows of a sensor together, and of its sample times.
+
+Each way in which innovations can be wrong is another density of the standardised innovation e (`detectors.py`), tested
+by the accumulated log-likelihood ratio (CUSUM):
+
+    W ← min(max(W, 0) + log Λ, cap);  alarm when W ≥ h,  cleared when W < 0.85 h
+
+With h = log(measurements between false alarms × tests) the mean time between false alarms of all tests together is at
+least the requested one, whatever is wrong and however long it lasts. The test in alarm names the cause.
+
+Where a tuning was accepted although its innovations are not white, a `baseline` holds their bias, scale and
+correlation. e is standardised by it first, and the threshold of each test is raised by the highest W that the accepted
+data reached.
+
+Sources: Page (1954), doi:10.1093/biomet/41.1-2.100; Lorden (1971), doi:10.1214/aoms/1177693055, for the bound on false
+alarms; Basseville & Nikiforov (1993), Detection of Abrupt Changes, chapter 2; Shin, Ramdas & Rinaldo (2024),
+doi:10.51387/23-NEJSDS51.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..numerics.jit import inlined, jit, part
+from .detector_state import (
+    CALM_FOR,
+    COUNT,
+    COUNTED,
+    DUE,
+    EQUAL,
+    EXPECTED,
+    FIRST,
+    LAST,
+    LONGEST_GAP,
+    NEXT_DUE,
+    QUANTUM,
+    RAW,
+    ROW,
+    RUN,
+    SILENT,
+    SILENT_SENSORS,
+    THRESHOLD,
+    VALUE,
+    WHITE,
+    sensor_part,
+)
+from .detectors import (
+    ALTERNATING,
+    AT_DENSITIES,
+    AT_GAINS,
+    AT_REFUSALS,
+    AT_REPETITION,
+    BITS,
+    DENSITIES,
+    DENSITY_RATIOS,
+    DENSITY_STEPS,
+    FADING,
+    FOLLOWED,
+    GAINS,
+    JOINT,
+    JOINT_BITS,
+    JOINT_RATIOS,
+    LAGGED,
+    MAX_SIGMA,
+    NEW_VALUE,
+    OUTLIER_TESTS,
+    QUADRATIC,
+    RARE_TESTS,
+    RATIOS,
+    REPEAT_PROBABILITY,
+    STUCK,
+    TESTS,
+    UNKNOWN_QUANTUM,
+)
+
+HEADROOM_NATS = 1.0
+"""Amount by which W may exceed its threshold, so that it falls again when the cause has gone."""
+
+CLEARING_SHARE = 0.85
+"""Share of the threshold above which an alarm lasts."""
+
+CALM_MEASUREMENTS, OUTLIER_FROM = 500, 3.5
+"""Measurements without |e| beyond this after which earlier outliers are forgotten."""
+
+KNOWN_PERIOD = 16.0
+"""Measurements from which the period of a sensor is known; with fewer it may pause for longer."""
+
+
+@inlined
+def add(W, k, ratio, h, peak):
+    """Add log Λ of a measurement to test k; return 2 if it is in alarm, 1 if an alarm may last, else 0.
+
+    A single measurement never raises an alarm: it counts half a threshold at most.
+    """
+    threshold = h + peak
+    W[k] = min(max(W[k], 0.0) + min(ratio, 0.5 * h), threshold + HEADROOM_NATS)
+    if W[k] >= threshold:
+        return 2
+    return 1 if W[k] >= CLEARING_SHARE * threshold else 0
+
+
+@inlined
+def alarm(level, bit, before):
+    """Return the bit of a test that is in alarm, from now on or still; 0 otherwise."""
+    return bit if level == 2 or level == 1 and before & bit != 0 else 0
+
+
+@inlined
+def _density_ratio(k, e):
+    """Return log Λ of density k at e, by linear interpolation."""
+    at = (e + MAX_SIGMA) * DENSITY_STEPS
+    j = int(at)
+    low, high = DENSITY_RATIOS[k, j], DENSITY_RATIOS[k, j + 1]
+    return low + (at - j) * (high - low)
+
+
+@part
+def weigh(own, e, h, base, before):
+    """Apply the tests of a row to one standardised innovation; return the alarms."""
+    raw = min(max((e - base[0]) / base[1], -MAX_SIGMA), MAX_SIGMA)
+    phi = base[2]
+    white = raw
+    if phi != 0.0 and np.isfinite(own[RAW]):
+        white = (raw - phi * own[RAW]) / math.sqrt(1.0 - phi * phi)
+        white = min(max(white, -MAX_SIGMA), MAX_SIGMA)
+    own[RAW] = raw
+    last = own[WHITE]
+    # The first has no predecessor.
+    tests = QUADRATIC
+    if not np.isfinite(last):
+        last = 0.0
+        tests -= LAGGED
+    own[WHITE] = white
+    square, product, old = white * white, white * last, last * last
+    highest = -1.0
+    for k in range(tests):
+        ratio = (
+            RATIOS[k, 0] * square + RATIOS[k, 1] * product + RATIOS[k, 2] * old + RATIOS[k, 3] * white + RATIOS[k, 4]
+        )
+        W = min(max(own[k], 0.0) + min(ratio, 0.5 * h), h + base[3 + k] + HEADROOM_NATS)
+        own[k] = W
+        highest = max(highest, W - CLEARING_SHARE * base[3 + k])
+    mask = 0
+    if highest >= CLEARING_SHARE * h:
+        for k in range(tests):
+            threshold = h + base[3 + k]
+            if own[k] >= threshold or own[k] >= CLEARING_SHARE * threshold and before & BITS[k] != 0:
+                mask |= BITS[k]
+    for k in range(len(GAINS)):
+        off = white - own[EXPECTED + k]
+        own[EXPECTED + k] = FADING * own[EXPECTED + k] + FOLLOWED[k, 0] * white
+        ratio = 0.5 * square - FOLLOWED[k, 1] * off * off + FOLLOWED[k, 2]
+        mask |= alarm(add(own, AT_GAINS + k, ratio, h, base[3 + AT_GAINS + k]), ALTERNATING, before)
+    own[CALM_FOR] = 0.0 if abs(white) > OUTLIER_FROM else own[CALM_FOR] + 1.0
+    for k in range(DENSITIES):
+        at = AT_DENSITIES + k
+        if OUTLIER_TESTS[k] and own[CALM_FOR] >= CALM_MEASUREMENTS:
+            own[at] = 0.0
+        # An outlier while something else is wrong is not a rare one.
+        if RARE_TESTS[k] and mask & ~BITS[at] != 0:
+            own[at] = 0.0
+            continue
+        mask |= alarm(add(own, at, _density_ratio(k, white), h, base[3 + at]), BITS[at], before)
+    return mask
+
+
+@part
+def repeat(own, y, r, h, base, before):
+    """Apply the test of repetition to a value.
+
+    Two measurements of standard deviation σ, rounded to a quantum q, are equal with a probability of erf(q / 2σ) at
+    most; q is the smallest step that the sensor has made so far. An asset at rest repeats itself more often: the share
+    of repetitions before the present run counts if it is larger.
+    """
+    last = own[VALUE]
+    own[VALUE] = y
+    if not np.isfinite(last):
+        return 0
+    if y == last:
+        own[RUN] += 1.0
+        chance = UNKNOWN_QUANTUM
+        if own[QUANTUM] > 0.0 and r > 0.0:
+            chance = max(math.erf(0.5 * own[QUANTUM] / math.sqrt(r)), 0.01, own[EQUAL] / own[COUNTED])
+        ratio = math.log(REPEAT_PROBABILITY / min(chance, REPEAT_PROBABILITY))
+    else:
+        step = abs(y - last)
+        if own[QUANTUM] == 0.0 or step < own[QUANTUM]:
+            own[QUANTUM] = step
+        own[EQUAL] += own[RUN]
+        own[COUNTED] += own[RUN] + 1.0
+        own[RUN] = 0.0
+        ratio = NEW_VALUE - h
+    return alarm(add(own, AT_REPETITION, ratio, h, base[3 + AT_REPETITION]), STUCK, before)
+
+
+@jit
+def highest(e, refused, y, r, h, base, chances):
+    """Return the highest W of each test of a row over its measurements, (TESTS,), with thresholds that never cap it.
+
+    `refused` (n,): 1 where the gate rejected the measurement, 0 where it accepted it, -1 where it did not apply.
+    """
+    own = np.zeros(ROW)
+    own[RAW] = own[WHITE] = own[VALUE] = np.nan
+    found = np.zeros(TESTS)
+    for i in range(e.size):
+        if np.isfinite(y[i]):
+            repeat(own, y[i], r, h, base, 0)
+        if refused[i] >= 0:
+            add(own, AT_REFUSALS, chances[1 - refused[i]], h, base[3 + AT_REFUSALS])
+        if np.isfinite(e[i]):
+            weigh(own, e[i], h, base, 0)
+        for k in range(TESTS):
+            found[k] = max(found[k], own[k])
+    return found
+
+
+@part
+def weigh_joint(own, nis, dof, h, before):
+    """Apply the tests of a sensor's common scale to its NIS, chi-square with `dof` under the model.
+
+    They do not apply where the baseline is not that of white innovations.
+    """
+    mask = 0
+    for k in range(JOINT):
+        ratio = JOINT_RATIOS[k, 0] * min(nis, dof * MAX_SIGMA * MAX_SIGMA) + dof * JOINT_RATIOS[k, 4]
+        mask |= alarm(add(own, k, ratio, h, 0.0), JOINT_BITS[k], before)
+    return mask
+
+
+@part
+def note_time(own, now, every, tests, policy):
+    """Note the time of a measurement: update the sensor's period, its threshold, and when it will have dropped out."""
+    count = own[COUNT]
+    if count == 0.0:
+        own[FIRST] = now
+    else:
+        own[LONGEST_GAP] = max(own[LONGEST_GAP], now - own[LAST])
+    own[LAST] = now
+    own[COUNT] = count + 1.0
+    n = int(own[COUNT])
+    period = (now - own[FIRST]) / count if count > 0.0 else 0.0
+    if n <= 16 or n & (n - 1) == 0:
+        # The estimate of the rate improves; the threshold follows it in ever wider steps.
+        own[THRESHOLD] = max(math.log(every / max(period, 1e-3) * tests), math.log(8.0 * tests))
+    # The mean of few gaps is no period yet: after three measurements in quick succession the next gap is no dropout.
+    usual = policy.silent_periods * period
+    pause = max(usual, min(usual * KNOWN_PERIOD / n, policy.stale_after))
+    own[DUE] = now + max(pause, 2.0 * own[LONGEST_GAP]) if n > 2 else np.inf
+    own[SILENT] = 0.0
+
+
+@part
+def find_dropouts(state, sensors, now):
+    """Mark the sensors that dropped out, and note when the next will."""
+    due = np.inf
+    for s in range(sensors):
+        own = sensor_part(state, s)
+        if now > own[DUE]:
+            state[SILENT_SENSORS] += 1.0 - own[SILENT]
+            own[SILENT] = 1.0
+        elif own[DUE] < due:
+            due = own[DUE]
+    state[NEXT_DUE] = due

@@ -1,0 +1,405 @@
+"""The table of detectors: each cause of an episode with its tests, wording, remedy, severity and guide heading.
+
+Under the model the standardised innovation e of a sensor row is N(0, 1) and white. A test is another density of e given
+the value before; its log-likelihood ratio accumulates in a CUSUM (`detector_tests.py`). A test is either the five
+coefficients (a, b, c, d, f) of
+
+    log Λ = a e² + b e e₋ + c e₋² + d e + f
+
+or a `Density`, whose log Λ is any function of e. Compiled code, episodes, status, report and guide take everything they
+know of a detector from its row. To add a detector, add a row with its tests and a section to the guide: a row without
+`effect` gets episodes of its own, whose size is the mean log Λ of its most significant test.
+
+Source: Basseville & Nikiforov (1993), Detection of Abrupt Changes, chapters 2 and 4.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Ratio = tuple[float, float, float, float, float]
+
+
+class Density(NamedTuple):
+    """Test of a density of e: `log_ratio` (n,) -> (n,) is its log Λ, tabulated by compiled code.
+
+    `outliers`: the sum returns to zero after `CALM_MEASUREMENTS` without an outlier. `rare`: it also does while another
+    test of the row is in alarm.
+    """
+
+    log_ratio: Callable[[np.ndarray], np.ndarray]
+    outliers: bool = False
+    rare: bool = False
+
+
+def scale_ratio(variance: float) -> Ratio:
+    """Return the coefficients for e ~ N(0, variance)."""
+    return 0.5 - 0.5 / variance, 0.0, 0.0, 0.0, -0.5 * math.log(variance)
+
+
+def mean_ratio(mean: float) -> Ratio:
+    """Return the coefficients for e ~ N(mean, 1)."""
+    return 0.0, 0.0, 0.0, mean, -0.5 * mean * mean
+
+
+def correlation_ratio(phi: float) -> Ratio:
+    """Return the coefficients for e of unit variance and lag-1 correlation phi."""
+    rest = 1.0 - phi * phi
+    return 0.5 - 0.5 / rest, phi / rest, -0.5 * phi * phi / rest, 0.0, -0.5 * math.log(rest)
+
+
+OUTLIER_SIGMA = 5.0
+"""Standard deviation of e of an outlier."""
+
+
+def outlier_density(share: float, *, rare: bool = False) -> Density:
+    """Return the test of a mixture in which this share of e has `OUTLIER_SIGMA` standard deviations."""
+
+    def log_ratio(e: np.ndarray) -> np.ndarray:
+        wide = np.exp(0.5 * e**2 * (1.0 - 1.0 / OUTLIER_SIGMA**2)) / OUTLIER_SIGMA
+        return np.log1p(share * (wide - 1.0))
+
+    return Density(log_ratio, outliers=True, rare=rare)
+
+
+class Detector(NamedTuple):
+    """One cause of episodes.
+
+    Attributes:
+        name: The cause, as episodes, JSON and the guide name it.
+        wording: Text of an episode, formatted with the facts of one (`episodes/wording.py`) as field 0.
+        remedy: What to do, formatted alike; follows the wording.
+        statistic: What is tested, for the guide.
+        effect: What the size of an episode is; empty where nothing but the tests themselves is known.
+        unit: Unit of the size.
+        alarms: Tests by the name of their alarm, a bit of `Track.alarms`. Alarms without tests have a kernel of their
+            own.
+        severity: The smallest is the most urgent.
+        sensor_lost: Whether the sensor says nothing of the asset meanwhile.
+        isolate: Whether sensor, input and parameter are compared to find the most likely fault.
+    """
+
+    name: str
+    wording: str = "{0.name}: {0.cause} innovations {0.since} (log-likelihood ratio {0.size:.2g} nats a measurement)"
+    remedy: str = "see the guide"
+    statistic: str = ""
+    effect: str = ""
+    unit: str = ""
+    alarms: Mapping[str, tuple[Ratio | Density, ...]] = MappingProxyType({})
+    severity: int = 5
+    sensor_lost: bool = False
+    isolate: bool = False
+
+    @property
+    def anchor(self) -> str:
+        """Anchor of its heading in the guide."""
+        return anchor(self.name)
+
+    @property
+    def bits(self) -> int:
+        """Bits of its alarms in `Track.alarms`."""
+        return sum(bit_of(name) for name in self.alarms)
+
+    def text(self, facts: Any) -> str:
+        """Return the sentence of an episode with these facts."""
+        return "; ".join(part.format(facts) for part in (self.wording, self.remedy) if part)
+
+
+def anchor(heading: str) -> str:
+    """Return the anchor that Markdown makes of a heading."""
+    return heading.lower().replace(" ", "-")
+
+
+DETECTORS = (
+    Detector(
+        "narrow",
+        "bands of {0.name} are too narrow {0.since}: off {0.size:.2f} times as far as predicted",
+        "{0.variance} too small, or it got noisier",
+        statistic="variance of e, tested at 1.5, 2.5 and 6",
+        effect="ratio of the standard deviation to the predicted one",
+        unit="×",
+        alarms={"narrow": (scale_ratio(1.5), scale_ratio(2.5), scale_ratio(6.0))},
+    ),
+    Detector(
+        "wide",
+        "bands of {0.name} are too wide {0.since}: off {0.size:.2f} times as far as predicted",
+        "{0.variance} too large",
+        statistic="variance of e, tested at 0.6, 0.3 and 0.05",
+        effect="ratio of the standard deviation to the predicted one",
+        unit="×",
+        alarms={"wide": (scale_ratio(0.6), scale_ratio(0.3), scale_ratio(0.05))},
+    ),
+    Detector(
+        "shifted",
+        "{0.name} reads {0.offset} ({0.sigmas:.1f} σ) {0.side} the prediction {0.since}",
+        "the sensor, an input or a parameter; hold {0.sensor} out to see",
+        statistic="mean of e, tested at ± 0.2, ± 0.5 and ± 1.5",
+        effect="mean of e",
+        unit="σ",
+        alarms={
+            "shifted up": (mean_ratio(0.2), mean_ratio(0.5), mean_ratio(1.5)),
+            "shifted down": (mean_ratio(-0.2), mean_ratio(-0.5), mean_ratio(-1.5)),
+        },
+        severity=3,
+        isolate=True,
+    ),
+    Detector(
+        "correlated",
+        "innovations of {0.name} are correlated ({0.size:+.2f}) {0.since}",
+        "{0.process_noise} too small, or a missing state",
+        statistic="lag-1 correlation of e, tested at 0.25 and 0.6",
+        effect="lag-1 correlation",
+        alarms={"correlated": (correlation_ratio(0.25), correlation_ratio(0.6))},
+    ),
+    Detector(
+        "alternating",
+        "innovations of {0.name} change sign ({0.size:+.2f}) {0.since}",
+        "{0.process_noise} too large, so that the estimate follows the noise",
+        statistic="lag-1 correlation of e, tested at -0.25 and -0.6, and innovations of a gain that follows the noise",
+        effect="lag-1 correlation",
+        alarms={"alternating": (correlation_ratio(-0.25), correlation_ratio(-0.6))},
+    ),
+    Detector(
+        "spiky",
+        "{0.name} spikes {0.since}: {0.percent:.2g} % of its readings are outliers",
+        "set a gate, look at its wiring",
+        statistic="mixtures in which 3 % or 0.3 % of e have 5 σ",
+        effect="share of |e| beyond 4 σ",
+        alarms={"spiky": (outlier_density(0.03), outlier_density(0.003, rare=True))},
+    ),
+    Detector(
+        "refused",
+        "{0.name} is refused by the gate {0.since} ({0.percent:.0f} % of its readings)",
+        "the sensor is wrong, or the twin is; {0.cross_check}",
+        statistic="share of rejected readings, tested at 30 %",
+        effect="share of rejected readings",
+        alarms={"refused": ()},
+        severity=2,
+        sensor_lost=True,
+        isolate=True,
+    ),
+    Detector(
+        "stuck",
+        "{0.name} is stuck at {0.size:.6g}{0.spaced_unit} {0.since}: {0.observed_by}",
+        "hold it out until it is mended",
+        statistic="repeated values",
+        effect="the value",
+        alarms={"stuck": ()},
+        severity=2,
+        sensor_lost=True,
+    ),
+    Detector(
+        "disagreeing",
+        "rows of {0.sensor} contradict each other {0.since}",
+        "R.{0.sensor} too small, or one of them is wrong",
+        statistic="NIS of all rows together, as variances 1.5, 2.5 and 6",
+        effect="√(NIS / degrees of freedom)",
+        unit="×",
+        alarms={"disagreeing": ()},
+    ),
+    Detector(
+        "agreeing",
+        "rows of {0.sensor} are closer to the prediction than their noise {0.since}",
+        "R.{0.sensor} too large",
+        statistic="NIS of all rows together, as variances 0.6, 0.3 and 0.05",
+        effect="√(NIS / degrees of freedom)",
+        unit="×",
+        alarms={"agreeing": ()},
+    ),
+    Detector(
+        "missed",
+        "{0.name} is {0.offset} ({0.size:.1f} σ) from the truth {0.since}",
+        "the estimate is wrong and its band does not show it; look at what else is in alarm",
+        statistic="root mean square of (estimate - truth) / σ",
+        effect="root mean square of (estimate - truth) / σ",
+        unit="σ",
+        alarms={"missed": ()},
+        severity=4,
+    ),
+    Detector(
+        "screened",
+        "{0.name} breaks its limits ({0.reasons}) {0.since}: {0.percent:.0f} % of its readings are not used",
+        "{0.observed_by}; look at the sensor, or at sensors.{0.sensor} in the YAML",
+        statistic="share of readings beyond their limits",
+        effect="share of readings beyond their limits",
+        severity=2,
+        sensor_lost=True,
+    ),
+    Detector(
+        "silent",
+        "{0.name} {0.dropout}: {0.observed_by}",
+        "check its wiring and its bus",
+        statistic="time since the last reading, in mean periods",
+        effect="duration",
+        unit="s",
+        severity=2,
+    ),
+    Detector(
+        "never heard",
+        "{0.name} {0.dropout}: {0.observed_by}",
+        "check its channel map and its bus",
+        statistic="time since the start",
+        effect="duration",
+        unit="s",
+        severity=2,
+    ),
+    Detector(
+        "outside",
+        "{0.name} is {0.size:.4g}{0.spaced_unit}, outside {0.limits} where the model was fitted, {0.since}",
+        "bands hold only inside; use a model fitted there",
+        statistic="value of a state or an input",
+        effect="the value",
+    ),
+    Detector(
+        "impoverished",
+        "the cloud is impoverished {0.since}: {0.size:.3g} particles count, and all descend from {0.ancestors}",
+        "more particles, pf-ekf or pf-reg, or a larger Q of the states that hardly move",
+        statistic="effective sample size and number of ancestors",
+        effect="effective sample size",
+    ),
+    Detector(
+        "stale",
+        "no reading was used {0.since}: the estimate is the model's alone",
+        "check the source",
+        statistic="time since the last reading that was used",
+        effect="duration",
+        unit="s",
+        severity=1,
+    ),
+    Detector(
+        "diverged",
+        "the estimate is lost {0.since}{0.contradiction}",
+        "{0.reset_advice}",
+        statistic="mean NIS of the window, share of rejected readings",
+        effect="duration",
+        unit="s",
+        severity=0,
+    ),
+    Detector(
+        "dropped",
+        "{0.percent:.3g} % of the readings were dropped, {0.counts}: too late, or with a time that cannot be true",
+        "check the times of the source, or lengthen time.horizon",
+        statistic="share of readings that never came into the log",
+        effect="share of readings",
+    ),
+)
+"""Order: the alarms, in the order of their bits in `Track.alarms`, then what is found otherwise."""
+
+CAUSES = tuple(detector.name for detector in DETECTORS)
+
+ALARM_NAMES = tuple(name for detector in DETECTORS for name in detector.alarms)
+"""Names of the bits of `Track.alarms`, from the lowest."""
+
+
+def bit_of(alarm: str) -> int:
+    """Return the bit of `Track.alarms` of an alarm."""
+    return 1 << ALARM_NAMES.index(alarm)
+
+
+def detector_of(cause: str) -> Detector:
+    """Return the row of a cause; a row of defaults for one that the table lacks."""
+    return next((row for row in DETECTORS if row.name == cause), Detector(cause))
+
+
+NARROW, WIDE, SHIFTED_UP, SHIFTED_DOWN = map(bit_of, ("narrow", "wide", "shifted up", "shifted down"))
+CORRELATED, ALTERNATING, SPIKY = map(bit_of, ("correlated", "alternating", "spiky"))
+REFUSED, STUCK, DISAGREEING, AGREEING, MISSED = map(bit_of, ("refused", "stuck", "disagreeing", "agreeing", "missed"))
+
+LOST = sum(detector.bits for detector in DETECTORS if detector.sensor_lost)
+"""Alarms during which a sensor says nothing of the asset."""
+
+IMPOVERISHED, OUTSIDE, TRUTH_MISSED = 1 << 59, 1 << 60, 1 << 61
+"""Bits of `Track.flags` above those of the sensors that dropped out: few particles carry the estimate; outside the
+range in which the model was fitted; a known true state is outside its band."""
+
+SENSOR_FLAGS = 58
+"""Sensors with a bit of their own in `Track.flags`; the others share the last."""
+
+# What follows is compiled into the kernels as constants.
+
+_TESTS = [(bit_of(name), test) for detector in DETECTORS for name, tests in detector.alarms.items() for test in tests]
+# Stable: tests that need the value before come last, as they skip the first e.
+_QUADRATIC = sorted(
+    ((bit, test) for bit, test in _TESTS if not isinstance(test, Density)), key=lambda item: item[1][1] != 0.0
+)
+_DENSITIES = [(bit, test) for bit, test in _TESTS if isinstance(test, Density)]
+
+RATIOS = np.array([test for _, test in _QUADRATIC])
+"""Coefficients (a, b, c, d, f) of the quadratic tests, (QUADRATIC, 5)."""
+
+QUADRATIC = len(RATIOS)
+LAGGED = int(np.sum(RATIOS[:, 1] != 0.0))
+"""Quadratic tests, and how many of them, the last, need the e before."""
+
+MAX_SIGMA = 6.0
+"""|e| is clipped here: a more distant value carries no more evidence."""
+
+GAINS, FADING = (0.2, 0.5), 0.95
+"""Gains of a filter that follows noise: its innovations are (1 - L) / (1 - (1 - gain) L) of white noise, L the lag;
+`FADING` in place of 1 leaves an offset to the other tests. Their lag-1 correlation is small, but they fall below white
+noise at all long lags together. At unit variance, too."""
+
+
+def _followed_ratio(gain: float) -> tuple[float, float, float]:
+    step = 1.0 - gain - FADING
+    rest = 1.0 / (1.0 + step * step / (1.0 - (1.0 - gain) ** 2))
+    return step, 0.5 / rest, -0.5 * math.log(rest)
+
+
+FOLLOWED = np.array([_followed_ratio(gain) for gain in GAINS])
+"""Coefficients (a, b, c) of m ← fading m + a e, log Λ = ½ e² - b (e - m)² + c, (gains, 3); m predicts e."""
+
+DENSITIES = len(_DENSITIES)
+DENSITY_STEPS = 256.0
+"""Steps per σ of the tabulated log Λ, between which it is interpolated (error below 1e-5)."""
+
+_GRID = np.arange(2.0 * MAX_SIGMA * DENSITY_STEPS + 2.0) / DENSITY_STEPS - MAX_SIGMA
+DENSITY_RATIOS = np.array([test.log_ratio(_GRID) for _, test in _DENSITIES])
+"""log Λ of each density from -MAX_SIGMA on, (DENSITIES, steps)."""
+
+OUTLIER_TESTS = np.array([test.outliers for _, test in _DENSITIES])
+RARE_TESTS = np.array([test.rare for _, test in _DENSITIES])
+"""`Density.outliers` and `Density.rare` of each density, (DENSITIES,)."""
+
+AT_GAINS = QUADRATIC
+AT_DENSITIES = AT_GAINS + len(GAINS)
+AT_REFUSALS = AT_DENSITIES + DENSITIES
+AT_REPETITION = AT_REFUSALS + 1
+TESTS = AT_REPETITION + 1
+"""Tests of a row, in this order: quadratic ones, followed noise, densities, rejections, repetition."""
+
+BITS = np.array(
+    [*(bit for bit, _ in _QUADRATIC), *[ALTERNATING] * len(GAINS), *(bit for bit, _ in _DENSITIES), REFUSED, STUCK]
+)
+"""Alarm of each test of a row, (TESTS,)."""
+
+JOINT_RATIOS = np.array([scale_ratio(variance) for variance in (1.5, 2.5, 6.0, 0.6, 0.3, 0.05)])
+JOINT = len(JOINT_RATIOS)
+JOINT_BITS = np.array([DISAGREEING] * 3 + [AGREEING] * 3)
+"""Tests of all rows of a sensor together, by its NIS: coefficients (JOINT, 5) and alarms (JOINT,)."""
+
+REJECTED_SHARE = 0.3
+"""Share of rejected readings that is tested against what the gate rejects by chance."""
+
+REPEAT_PROBABILITY = 0.999
+"""Probability that a stuck sensor repeats its last value."""
+
+UNKNOWN_QUANTUM = 0.5
+"""Probability of a repeated value of a sensor that has never changed: its quantum is not known yet."""
+
+NEW_VALUE = math.log((1.0 - REPEAT_PROBABILITY) / (1.0 - UNKNOWN_QUANTUM))
+"""log Λ of a value that differs from the last one."""
+
+
+def log_ratios(bits: int, e: np.ndarray) -> np.ndarray:
+    """Return log Λ of the tests of these alarms at each of e (n,), finite, shape (tests, n)."""
+    e = np.clip(e, -MAX_SIGMA, MAX_SIGMA)
+    before = np.concatenate((np.zeros(min(1, e.size)), e[:-1]))
+    terms = np.stack((e * e, e * before, before * before, e, np.ones(e.size)))
+    found = [np.array(ratio) @ terms for bit, ratio in _QUADRATIC if bit & bits]
+    return np.array(found + [test.log_ratio(e) for bit, test in _DENSITIES if bit & bits]).reshape(-1, e.size)
