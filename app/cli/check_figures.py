@@ -12,7 +12,7 @@ from estimators.diagnostics.sensitivity import Sensitivity, View, bounds_of
 from estimators.track import HEALTH_NAMES
 
 from ..present.result import plain
-from ..studies.fold_result import calibration_dict, number
+from ..studies.fold_result import calibration_json
 from .check_list import blamed, checklist, stamps
 from .checked import Checked
 
@@ -38,7 +38,7 @@ def figures(checked: Checked) -> dict[str, Any]:
         "held_out": _held_out(checked),
         "open_loop": _open_loop(checked),
         "timing": _timing(checked),
-        "calibration": [calibration_dict(entry) for entry in checked.calibration],
+        "calibration": [calibration_json(entry) for entry in checked.calibration],
         "posterior": _posterior(checked),
         "linearity": _linearity(checked),
         "dimension": plain(checked.dimension._asdict()),
@@ -56,8 +56,7 @@ def _observability(checked: Checked) -> dict[str, Any]:
         "windows": [_view(checked, view) for view in found.windows],
         "blame": [{"one": one, "other": other, "correlation": value} for one, other, value in blamed(told)],
         "deviation": {
-            f"{nudge.kind} {nudge.name}": number(value)
-            for nudge, value in zip(told.nudges, told.deviation, strict=True)
+            f"{nudge.kind} {nudge.name}": plain(value) for nudge, value in zip(told.nudges, told.deviation, strict=True)
         },
     }
 
@@ -68,9 +67,9 @@ def _view(checked: Checked, view: View) -> dict[str, Any]:
         "begin": view.begin * 1e-9,
         "end": view.end * 1e-9,
         "rank": view.rank,
-        "conditioning": number(view.conditioning),
+        "conditioning": plain(view.conditioning),
         "eigenvalues": plain(view.eigenvalues),
-        "left": {name: number(value) for name, value in zip(names, view.deviation, strict=True)},
+        "left": {name: plain(value) for name, value in zip(names, view.deviation, strict=True)},
         "weakest": view.text,
     }
 
@@ -82,10 +81,10 @@ def smallest_visible(found: Sensitivity) -> list[dict[str, Any]]:
             "kind": nudge.kind,
             "name": nudge.name,
             "unit": nudge.unit,
-            "value": number(nudge.value),
-            "size": number(size),
-            "low": number(low),
-            "high": number(high),
+            "value": plain(nudge.value),
+            "size": plain(size),
+            "low": plain(low),
+            "high": plain(high),
             "seen": bool(np.isfinite(size)),
         }
         for nudge, size, (low, high) in zip(found.nudges, found.smallest_visible, found.unseen, strict=True)
@@ -109,13 +108,13 @@ def _held_out(checked: Checked) -> dict[str, Any]:
             "sensor": row.sensor,
             "unit": row.unit,
             "n": row.n,
-            "rms": number(row.rms),
-            "bias": number(row.bias),
+            "rms": plain(row.rms),
+            "bias": plain(row.bias),
             "coverage": {
-                f"{100 * band:.0f}": {"value": number(value), "low": number(low), "high": number(high)}
+                f"{100 * band:.0f}": {"value": plain(value), "low": plain(low), "high": plain(high)}
                 for band, value, (low, high) in zip(BANDS, row.coverage, row.intervals, strict=True)
             },
-            "open_loop": number(row.open_loop),
+            "open_loop": plain(row.open_loop),
             "worse": row.worse,
         }
         for row in checked.held_out.rows
@@ -125,12 +124,12 @@ def _held_out(checked: Checked) -> dict[str, Any]:
 def _open_loop(checked: Checked) -> dict[str, Any]:
     rows, states = checked.held_out.rows, checked.held_out.states
     return {
-        "sensors": {row.row: {"unit": row.unit, "rms": number(row.open_loop)} for row in rows},
+        "sensors": {row.row: {"unit": row.unit, "rms": plain(row.open_loop)} for row in rows},
         "states": {
             item.state: {
                 "unit": item.unit,
-                "rms": number(item.open_loop),
-                "filter": number(item.filter),
+                "rms": plain(item.open_loop),
+                "filter": plain(item.filter),
                 "worse": item.worse,
             }
             for item in states
@@ -143,8 +142,8 @@ def _timing(checked: Checked) -> dict[str, Any]:
     return {
         "stamps": stamps(checked),
         "horizon": section.horizon,
-        "degraded_after": number(policy.degraded_after),
-        "stale_after": number(policy.stale_after),
+        "degraded_after": plain(policy.degraded_after),
+        "stale_after": plain(policy.stale_after),
         "stale": checked.counts["stale"],
         "sensors": {item.sensor: plain(item) for item in checked.arrivals},
     }
@@ -169,6 +168,6 @@ def _health(checked: Checked) -> dict[str, Any]:
     share = np.bincount(track.health, minlength=len(HEALTH_NAMES)) / max(1, len(track))
     return {
         "share": {name: float(value) for name, value in zip(HEALTH_NAMES, share, strict=True)},
-        "false_alarm_every": number(checked.twin.policy.false_alarm_every),
+        "false_alarm_every": plain(checked.twin.policy.false_alarm_every),
         "episodes": [episode_json(episode) for episode in checked.episodes],
     }

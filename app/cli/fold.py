@@ -1,34 +1,37 @@
-"""`nisus fold`: a twin's readings folded as fast as possible, and what the estimate was worth."""
+"""`nisus fold`: fold the log of a twin as fast as possible and score the estimate."""
 
 from __future__ import annotations
 
-import json
 import os
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from config.files import writing
-from estimators.diagnostics.episodes import Episode, episodes
-from estimators.diagnostics.field_pictures import Picture
+from estimators.diagnostics.episodes import episodes
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.interface.table import table_of
-from estimators.log import Log
 from estimators.registry import find_estimator
 from estimators.smoothing.smooth import check_smooth, smooth
 from estimators.smoothing.smoothed import Smoothed
-from estimators.track import Track
 
 from ..live.watchdog import interruptible
 from ..present.export.report import Reported, report
 from ..present.export.track_file import encoded
-from ..present.result import to_html
-from ..studies.fold_result import Better, as_dict, as_text, blamed, calibration_of, dropped, episode_lines
+from ..present.result import to_html, to_json, to_text
+from ..studies.fold_result import (
+    FoldResult,
+    calibration_of,
+    dropped,
+    explained,
+    fold_json,
+    fold_topics,
+    smoothing_score,
+)
 from ..twin.log_reader import read_log
-from ..twin.twin import Twin, load_twin
+from ..twin.twin import load_twin
 from ..views.recording.format import TAKEN
 from .options import settings
 from .prepare import attend, prepare
@@ -38,21 +41,19 @@ if TYPE_CHECKING:
 
 
 def fold_twin(arguments: Arguments) -> int:
-    """Carry the command out."""
-    twin = load_twin(
-        arguments.twin,
-        log_files=arguments.log or None,
-        overrides=settings(arguments.set, arguments.estimator, arguments.tuning),
-    )
-    if arguments.out is not None and arguments.out.suffix not in (".csv", ".parquet", ".rrd"):
-        raise ConfigError(f"--out {arguments.out}: must end in .csv, .parquet or .rrd")
-    if arguments.out is not None and arguments.out.suffix == ".rrd" and os.path.lexists(arguments.out):
-        raise ConfigError(f"--out {arguments.out}: {TAKEN}")
+    """Run the command."""
+    overrides = settings(arguments.set, arguments.estimator, arguments.tuning)
+    twin = load_twin(arguments.twin, log_files=arguments.log or None, overrides=overrides)
+    out = arguments.out
+    if out is not None and out.suffix not in (".csv", ".parquet", ".rrd"):
+        raise ConfigError(f"--out {out}: must end in .csv, .parquet or .rrd")
+    recorded = out is not None and out.suffix == ".rrd"
+    if out is not None and recorded and os.path.lexists(out):
+        raise ConfigError(f"--out {out}: {TAKEN}")
     if arguments.smooth:
         check_smooth(find_estimator(twin.estimator, twin.model), twin.model, twin.tuning.options)
     prepare(twin)
     log, counts = read_log(twin, arguments.duration)
-    period = twin.picture if arguments.out is not None and arguments.out.suffix == ".rrd" else None
     fold = Fold(
         twin.estimator,
         twin.model,
@@ -60,7 +61,7 @@ def fold_twin(arguments: Arguments) -> int:
         log,
         pairs=twin.pairs,
         policy=twin.policy,
-        picture=period,
+        picture=twin.picture if recorded else None,
         expected=twin.expected,
     )
     begun = time.perf_counter()
@@ -72,44 +73,43 @@ def fold_twin(arguments: Arguments) -> int:
     interruptible(fold, work)
     seconds = (time.perf_counter() - begun) / log.n
     pictures = fold.pictures.taken if fold.pictures is not None else []
-    result = score(fold.track, log.events, twin.model, pictures, gate=twin.tuning.gate, baseline=twin.tuning.baseline)
-    smoothed = attend(twin.model, lambda: smooth(fold), "smoothing") if arguments.smooth else None
-    better = Better.of(fold, smoothed) if smoothed is not None else None
-    found = calibration_of(twin, fold)
-    told = blamed(fold, [*dropped(counts, fold), *episodes(fold)])
-    if arguments.out is not None:
-        _write(arguments.out, twin, log, fold.track, pictures, [item.episode for item in told], smoothed)
+    smoothed: Smoothed | None = attend(twin.model, lambda: smooth(fold), "smoothing") if arguments.smooth else None
+    result = FoldResult(
+        twin,
+        fold,
+        counts,
+        seconds,
+        score(fold.track, log.events, twin.model, pictures, gate=twin.tuning.gate, baseline=twin.tuning.baseline),
+        calibration_of(twin, fold),
+        explained(fold, [*dropped(counts, fold), *episodes(fold)]),
+        smoothing_score(fold, smoothed) if smoothed is not None else None,
+    )
+    if out is not None:
+        _write(out, result, smoothed)
     if arguments.html is not None:
         run = Reported(
-            twin, twin.estimator, twin.tuning, log.events, fold.track, pictures, [item.episode for item in told],
-            fold.marginal, smoothed=smoothed,
+            twin, twin.estimator, twin.tuning, log.events, fold.track, pictures,
+            [item.episode for item in result.episodes], fold.marginal, smoothed=smoothed,
         )  # fmt: skip
         with writing(arguments.html, "--html"):
             arguments.html.write_text(to_html(f"{twin.name}, {twin.estimator}", report(run)), encoding="utf-8")
-    if arguments.json:
-        print(json.dumps(as_dict(twin, result, found, seconds, counts, fold, told, better)))
-    else:
-        print("\n".join([*as_text(twin, result, found, seconds, counts, fold, better), *episode_lines(told)]))
+    print(to_json(fold_json(result)) if arguments.json else "\n".join(to_text(fold_topics(result))))
     return 0
 
 
-def _write(
-    path: Path,
-    twin: Twin,
-    log: Log,
-    track: Track,
-    pictures: Sequence[Picture],
-    found: Sequence[Episode],
-    smoothed: Smoothed | None,
-) -> None:
+def _write(path: Path, result: FoldResult, smoothed: Smoothed | None) -> None:
+    """Write the track as a recording or a table."""
+    twin, fold = result.twin, result.fold
+    found = [item.episode for item in result.episodes]
     if path.suffix == ".rrd":
         from ..views.recording.writer import write_recording
 
-        write_recording(path, twin, log, track, pictures, found, smoothed)
+        pictures = fold.pictures.taken if fold.pictures is not None else []
+        write_recording(path, twin, fold.log, fold.track, pictures, found, smoothed)
         return
     table = table_of(
-        twin.model, log.events, track, found, smoothed=smoothed,
-        tuning_version=twin.tuning.version, tuning=twin.tuning.name, model_version=log.version,
+        twin.model, fold.log.events, fold.track, found, smoothed=smoothed,
+        tuning_version=twin.tuning.version, tuning=twin.tuning.name, model_version=fold.log.version,
     )  # fmt: skip
     with writing(path, "--out"), path.open("wb") as file:
         file.writelines(encoded(path.suffix[1:], [table]))

@@ -12,8 +12,9 @@ from rerun.chunk import RrdReader
 
 from app.cli.arguments import Fold
 from app.cli.fold import fold_twin
+from app.present.result import to_text
 from app.studies.compare import fold_row
-from app.studies.fold_result import Told, dropped, episode_lines
+from app.studies.fold_result import ExplainedEpisode, dropped, episodes_topic
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import Episode
@@ -92,8 +93,8 @@ def test_episodes_are_printed_told_to_scripts_and_kept(tmp_path: Path, capsys: p
     twin, out = str(stuck_drive(tmp_path)), tmp_path / "track.parquet"
     assert fold_twin(Fold(twin, out=out)) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert "1 episode(s); docs/alarms.md says what each cause means" in lines
-    assert lines[-1].startswith("  stuck, at the end: winding is stuck at 41.5 °C since 100.0 s")
+    assert any(line.startswith("1 episode(s); docs/alarms.md") for line in lines)
+    assert "stuck, at the end: winding is stuck at 41.5 °C since 100.0 s" in " ".join(" ".join(lines[-3:]).split())
     assert fold_twin(Fold(twin, json=True)) == 0
     (episode,) = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)["episodes"]
     assert {key: episode[key] for key in ("start", "end", "subject", "cause", "size", "low", "high", "unit")} == {
@@ -113,10 +114,10 @@ def test_episodes_are_printed_told_to_scripts_and_kept(tmp_path: Path, capsys: p
 
 def test_of_many_episodes_the_first_are_printed() -> None:
     one = Episode(1.0, 2.5, "winding", "narrow", 2.0, 1.9, 2.1, "×", "bands of winding are too narrow")
-    lines = list(episode_lines([Told(one, ())] * 25))
-    assert lines[1] == "  narrow, for 1.5 s: bands of winding are too narrow"
-    assert len(lines) == 12 and lines[-1] == "  and 15 more; --json has them all"
-    assert len(list(episode_lines([]))) == 1
+    lines = to_text([episodes_topic([ExplainedEpisode(one, ())] * 25)])
+    assert lines[1] == "  narrow, for 1.5 s: bands of winding are too narrow."
+    assert len(lines) == 12 and "15 more" in lines[-1] and "--json" in lines[-1]
+    assert len(to_text([episodes_topic([])])) == 1
 
 
 BOX = """\
@@ -156,7 +157,7 @@ def test_what_a_black_box_failed_with_is_told(tmp_path: Path, capsys: pytest.Cap
     )
     assert fold_twin(Fold(path)) == 0
     printed = capsys.readouterr().out
-    assert "\nfailed " in printed and "  2: no estimate" in printed
+    assert re.search(r"\n  failed +2: no estimate", printed)
     assert f"the model failed 2 time(s)  {said}" in printed
     assert fold_twin(Fold(path, json=True)) == 0
     told = json.loads(capsys.readouterr().out)
@@ -173,7 +174,7 @@ def test_the_calibration_is_printed(tmp_path: Path, capsys: pytest.CaptureFixtur
     (tmp_path / "drive.csv").write_text("\n".join(["t,y,temperature,rate", *lines]))
     (tmp_path / "drive.yaml").write_text(DRIVE)
     assert fold_twin(Fold(str(tmp_path / "drive.yaml"))) == 0
-    head, *said = capsys.readouterr().out.partition("calibration, 95 % intervals:\n")[1:]
+    head, *said = capsys.readouterr().out.partition("Calibration, 95 % intervals\n")[1:]
     assert head and re.search(r"^  winding: bands too narrow by a factor of 2\.\d \(scale 2\.\d\d, ", said[0])
     assert re.search(r"^  temperature: truth in its 95 % band \d\.?\d* % \(\S+ to \S+\) of the time$", said[0], re.M)
 
@@ -201,7 +202,7 @@ def test_what_of_the_model_made_a_reading_fail_is_told(tmp_path: Path, capsys: p
     assert fold_twin(Fold(str(tmp_path / "box.yaml"))) == 0
     printed = capsys.readouterr().out
     said = r"h\(x, u\) of sensor gauge is \[nan\] at x = \[4\d.*\], where the estimate got; it must be finite"
-    assert re.search(rf"\nbecause +{re.escape(str(tmp_path))}/box.py:7: model box: {said}", printed)
+    assert re.search(rf"\n  because +{re.escape(str(tmp_path))}/box.py:7: model box: {said}", printed)
     assert fold_twin(Fold(str(tmp_path / "box.yaml"), json=True)) == 0
     assert re.search(said, json.loads(capsys.readouterr().out)["failure"])
 
@@ -280,7 +281,7 @@ def test_what_was_dropped_is_said_if_it_was_much() -> None:
     assert dropped({}, folded) == [] and dropped({"stale": 0, "wrong time": 0}, folded) == []
     (episode,) = dropped({"stale": 80, "wrong time": 10}, folded)
     assert (episode.cause, episode.subject, episode.size, episode.end) == ("dropped", "twin", 0.9, None)
-    assert episode.text.startswith("90 % of the readings were dropped, 90 of 100:")
+    assert episode.text.startswith("90 % of the measurements were dropped, 90 of 100:")
 
 
 def test_what_is_smoothed_stands_beside_the_filter(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
