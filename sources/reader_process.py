@@ -8,19 +8,16 @@ from __future__ import annotations
 
 import atexit
 import os
-import pickle
-import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 from estimators.errors import NisusError, SourceError
+
+from .worker_process import FAULT, ITEM, WorkerProcess, gist
 
 ITEM_TIMEOUT_S = 30.0
 """Seconds that a reader may take for its next item, and one more for each `BYTES_A_SECOND` of the file."""
@@ -40,93 +37,16 @@ DRAIN_S = 0.1
 MAX_IDLE_WORKERS = 2
 """Idle readers that are kept; each has loaded its libraries, which takes longer than most files."""
 
-_BOOT = f"""
-import pickle, sys
-lifeline, sys.path[:] = pickle.load(sys.stdin.buffer)
-from {__name__} import serve
-serve(lifeline)
-"""
-
 EXIT_TIMEOUT_S = 5.0
 """Seconds between the end of a process's pipe and its own."""
-
-_ITEM, _END, _FAULT = range(3)
 
 
 class ReaderError(SourceError):
     """The reader of a file crashed, hung, took too much memory, or raised an error of its library."""
 
 
-class _Worker:
-    """A process that runs one generator after another and hands their items over a pipe, which bounds its lead."""
-
-    def __init__(self) -> None:
-        # The pipe is never written to: its end tells the worker, wherever it is, that this process has gone.
-        theirs, self._lifeline = os.pipe()
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-c", _BOOT],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            pass_fds=[theirs],
-        )
-        os.close(theirs)
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._requests = self._process.stdin
-        self._answers = Connection(os.dup(self._process.stdout.fileno()), writable=False)
-        self._process.stdout.close()
-        self._write((theirs, list(sys.path)))
-
-    def _write(self, *items: Any) -> None:
-        with suppress(BrokenPipeError):  # A worker that died says so where its answer is awaited.
-            for item in items:
-                pickle.dump(item, self._requests)
-            self._requests.flush()
-
-    def ask(self, function: Callable[..., Iterator[Any]], args: tuple[Any, ...], memory: tuple[str, int]) -> None:
-        """Run `function(*args)`, which must be importable by name, with so many bytes of memory for the named file."""
-        # The folder comes first and by itself: a function may be from a folder that was added since.
-        self._write((list(sys.path), os.getcwd(), memory), (function, args))
-
-    def answer(self, timeout: float) -> tuple[int, Any] | None:
-        """The next answer; None if none comes in time.
-
-        Raises:
-            EOFError: If the process has ended.
-        """
-        try:
-            return pickle.loads(self._answers.recv_bytes()) if self._answers.poll(timeout) else None
-        except OSError as error:
-            raise EOFError from error
-
-    @property
-    def alive(self) -> bool:
-        """Whether the process is still there."""
-        return self._process.poll() is None
-
-    def end(self, grace: float = 0.0) -> str:
-        """End it, and say how it had ended if it had: its status comes up to `grace` seconds after its pipe closed."""
-        _busy.discard(self)
-        self._answers.close()
-        with suppress(BrokenPipeError):
-            self._requests.close()
-        os.close(self._lifeline)
-        try:
-            code = self._process.wait(grace)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-            return "was ended"
-        if code >= 0:
-            return f"ended with status {code}"
-        try:
-            return f"was ended by {signal.Signals(-code).name}"
-        except ValueError:
-            return f"was ended by signal {-code}"
-
-
-_idle: list[_Worker] = []
-_busy: set[_Worker] = set()
+_idle: list[WorkerProcess] = []
+_busy: set[WorkerProcess] = set()
 """Held here too: a source that is left open is collected with all it holds in any order, and then closes its reader."""
 
 _lock = threading.RLock()  # A collection may close a reader wherever it happens, here as well.
@@ -142,7 +62,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget)
 
 
-def _hire() -> _Worker:
+def _hire() -> WorkerProcess:
     with _lock:
         while _idle:
             worker = _idle.pop()
@@ -150,12 +70,12 @@ def _hire() -> _Worker:
                 break
             worker.end()
         else:
-            worker = _Worker()
+            worker = WorkerProcess()
         _busy.add(worker)
         return worker
 
 
-def _dismiss(worker: _Worker) -> None:
+def _dismiss(worker: WorkerProcess) -> None:
     """Keep it for the next file, unless enough wait."""
     with _lock:
         _busy.discard(worker)
@@ -163,6 +83,12 @@ def _dismiss(worker: _Worker) -> None:
             _idle.append(worker)
             return
     worker.end()
+
+
+def _end(worker: WorkerProcess, grace: float = 0.0) -> str:
+    with _lock:
+        _busy.discard(worker)
+    return worker.end(grace)
 
 
 @atexit.register
@@ -189,8 +115,8 @@ class IsolatedReader:
         size = path.stat().st_size if path.is_file() else 0
         self._timeout = ITEM_TIMEOUT_S + size / BYTES_A_SECOND if timeout is None else timeout
         self._waited = 0.0
-        self._worker: _Worker | None = _hire()
-        self._worker.ask(function, (path, *args), (str(path), memory_limit(path)))
+        self._worker: WorkerProcess | None = _hire()
+        self._worker.ask(_read, function, path, args)
 
     @property
     def ended(self) -> bool:
@@ -213,22 +139,22 @@ class IsolatedReader:
             answer = worker.answer(timeout)
         except EOFError:
             self._worker = None
-            raise ReaderError(f"its reader {worker.end(EXIT_TIMEOUT_S)}") from None
+            raise ReaderError(f"its reader {_end(worker, EXIT_TIMEOUT_S)}") from None
         if answer is None:
             # No more than was meant to be waited: a machine that was suspended meanwhile has not hung.
             self._waited += min(time.monotonic() - begun, timeout)
             if self._waited >= self._timeout:
                 self._worker = None
-                worker.end()
+                _end(worker)
                 raise ReaderError(f"its reader gave nothing for {self._timeout:.0f} s and was ended")
             return None
         self._waited = 0.0
         kind, item = answer
-        if kind == _ITEM:
+        if kind == ITEM:
             return item
         self._worker = None
         _dismiss(worker)
-        if kind == _FAULT:
+        if kind == FAULT:
             raise item
         return None
 
@@ -241,10 +167,10 @@ class IsolatedReader:
         with suppress(EOFError):
             while (left := limit - time.monotonic()) > 0:
                 answer = worker.answer(left)
-                if answer is not None and answer[0] != _ITEM:
+                if answer is not None and answer[0] != ITEM:
                     _dismiss(worker)
                     return
-        worker.end()
+        _end(worker)
 
 
 def memory_limit(path: Path) -> int:
@@ -279,51 +205,19 @@ def read_isolated(
     return items
 
 
-def serve(lifeline: int) -> None:
-    """Run requests in the worker until the process that sends them has gone."""
-    _end_with_parent(lifeline)
-    answers = Connection(os.dup(1), readable=False)
-    os.dup2(2, 1)  # What libraries print is no answer.
-    requests = sys.stdin.buffer
-    with suppress(EOFError, BrokenPipeError, KeyboardInterrupt):
-        while True:
-            sys.path[:], folder, (path, limit) = pickle.load(requests)
-            os.chdir(folder)
-            _limit_memory(limit)
-            function, args = pickle.load(requests)
-            try:
-                for item in function(*args):
-                    answers.send((_ITEM, item))
-                answers.send((_END, None))
-            except NisusError as error:
-                answers.send((_FAULT, error))
-            except (BrokenPipeError, KeyboardInterrupt):
-                raise
-            except MemoryError:
-                _limit_memory(None)
-                answers.send((_FAULT, memory_error(path, "its content takes more", limit)))
-            except BaseException as error:  # noqa: BLE001  libraries raise anything, some of it no Exception
-                gist = " ".join(str(error).split())[:160] or type(error).__name__
-                answers.send((_FAULT, ReaderError(gist)))
-
-
-def _end_with_parent(lifeline: int) -> None:
-    """Have the kernel end this process with its parent: a library that hangs would let no thread of Python see it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends this process in its time.
-    with suppress(ImportError, OSError):
-        import fcntl
-
-        signal.signal(signal.SIGIO, signal.SIG_DFL)
-        fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
-        fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
-        # The last end may have closed before the signal was asked for.
-        import select
-
-        if select.select([lifeline], [], [], 0)[0]:
-            os._exit(1)
-    with suppress(OSError):
-        # If memory runs out all the same, this process ends first, not the twin.
-        Path("/proc/self/oom_score_adj").write_text("1000")
+def _read(function: Callable[..., Iterator[Any]], path: Path, args: tuple[Any, ...]) -> Iterator[Any]:
+    """In the worker: read a file with limited memory."""
+    limit = memory_limit(path)
+    _limit_memory(limit)
+    try:
+        yield from function(path, *args)
+    except (NisusError, GeneratorExit):
+        raise
+    except MemoryError:
+        _limit_memory(None)
+        raise memory_error(path, "its content takes more", limit) from None
+    except BaseException as error:  # libraries raise anything, some of it no Exception
+        raise ReaderError(gist(error)) from None
 
 
 def _limit_memory(allowance: int | None) -> None:

@@ -29,9 +29,9 @@ def carry_out(command: Any) -> int:
     module, _, function = COMMANDS[type(command)].partition(":")
     workers: tuple[Any, ...] = ()
     if isinstance(command, Run) and command.twin is not None and not command.headless:
-        from ..live.compilers import first_workers
+        from ..live.compilers import first_compilers
 
-        workers = (first_workers(),)  # started before the imports of `run`, which take seconds
+        workers = (first_compilers(),)  # started before the imports of `run`, which take seconds
     result = getattr(importlib.import_module(f".{module}", __package__), function)(command, *workers)
     sys.stdout.flush()
     return int(result)

@@ -27,7 +27,7 @@ from .prepare import begin_to_compile, compile_for, prepare_model
 if TYPE_CHECKING:
     from sources.source import Source
 
-    from ..live.compilers import Worker
+    from ..live.compilers import Compiler
     from ..views.recording.reader import Recorded
 
 
@@ -103,7 +103,7 @@ class FileOpener:
     """
 
     def __init__(
-        self, given: Mapping[str, Callable[[], Opening]] | None = None, workers: Sequence[Worker] = ()
+        self, given: Mapping[str, Callable[[], Opening]] | None = None, workers: Sequence[Compiler] = ()
     ) -> None:
         self._given = dict(given or {})
         self._workers = workers

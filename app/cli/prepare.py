@@ -16,7 +16,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.registry import ESTIMATORS, unfit
 from sources.pieces import make, pieces_of
 
-from ..live.compilers import Worker
+from ..live.compilers import Compiler
 from ..live.watchdog import CallWatch
 from ..live.workshop import Workshop
 from ..twin.twin import Twin
@@ -51,7 +51,7 @@ def compile_for(twin: Twin) -> None:
     attend(twin.model, work, "compiling filters, once", "compiled filters, once")
 
 
-def begin_to_compile(twin: Twin, workers: Sequence[Worker] = ()) -> Workshop:
+def begin_to_compile(twin: Twin, workers: Sequence[Compiler] = ()) -> Workshop:
     """Let other processes compile what is not in the cache: what the twin's source needs, its filter, then all others.
 
     Those that do not apply to the twin are left out. `workers` are processes that were started before.

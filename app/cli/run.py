@@ -24,7 +24,7 @@ from .prepare import prepare
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ..live.compilers import Worker
+    from ..live.compilers import Compiler
     from .arguments import Run
 
 
@@ -34,7 +34,7 @@ SAID = 5
 """Failures that a run without a page prints at its end, since it has no list of events."""
 
 
-def run_twin(arguments: Run, workers: Sequence[Worker] = ()) -> int:
+def run_twin(arguments: Run, workers: Sequence[Compiler] = ()) -> int:
     """Carry the command out; `workers` are processes that wait for something to compile."""
     speed = arguments.speed
     if speed is not None and not (0.0 < speed <= MAX_SPEED or speed == math.inf):

@@ -1,45 +1,44 @@
-"""The processes in which filters are compiled; nothing that takes long is imported here, so that they begin first."""
+"""Worker processes that compile filters; nothing that takes long is imported here, so that they begin first."""
 
 from __future__ import annotations
 
-import contextlib
 import gc
-import multiprocessing
 import os
-import signal
 import sys
 import time
-from collections.abc import Callable
-from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import TYPE_CHECKING
 
-from estimators.compiled.orphan import leave_with_parent
 from estimators.numerics.cache import cache_folder
+from sources.worker_process import ITEM, WorkerProcess
 
 if TYPE_CHECKING:
     from estimators.pieces import Piece
 
-MOST = min(3, max(2, os.cpu_count() or 1))
-"""Processes at most that compile what is asked for; more have no more pieces to take."""
+MAX_COMPILERS = min(3, max(2, os.cpu_count() or 1))
+"""Processes at most that compile what is asked for; more find no more pieces to compile at once."""
+
+COMPILE_TIMEOUT_S = 600.0
+"""Seconds after which a compiler is taken to hang."""
 
 
-def first_workers() -> list[Worker]:
-    """Workers that get ready while the program imports its own parts, where nothing was ever compiled; else none."""
+def first_compilers() -> list[Compiler]:
+    """Return compilers that start while the program imports its own parts, if nothing was ever compiled; else none."""
     if "NUMBA_CACHE_DIR" in os.environ or cache_folder().exists():
         return []
-    return [Worker(None, 0) for _ in range(MOST)]
+    return [Compiler(None, 0) for _ in range(MAX_COMPILERS)]
 
 
-class Worker:
+class Compiler:
     """A process that compiles one piece after another."""
 
     def __init__(self, work: Callable[[Piece], None] | None, niceness: int) -> None:
-        """Start it; `work` None is that of `sources/pieces.py`, imported there alone."""
-        context = multiprocessing.get_context("spawn")
-        self.connection, its_end = context.Pipe()
-        self._process = context.Process(target=_serve, args=(its_end, work, niceness), name="compile", daemon=True)
-        self._process.start()
-        its_end.close()
+        """Start it; `work` None is `make` of `sources/pieces.py`, imported there alone."""
+        self._process = WorkerProcess()
+        self._process.ask(_set_up, niceness)
+        self._work, self._left = work, 1
+        self.connection, self.pid = self._process.answers, self._process.pid
         self.begun = 0.0
         self.ended = False
         """Whether the process was found to have ended."""
@@ -47,17 +46,25 @@ class Worker:
     def give(self, piece: Piece) -> None:
         """Begin a piece."""
         self.begun = time.monotonic()
-        with contextlib.suppress(OSError):  # a process that has ended answers so, below
-            self.connection.send(piece)
+        self._left += 1
+        self._process.ask(_compile, self._work, piece)
 
     def answered(self) -> bool:
-        """Whether the piece is done, or the process has ended."""
+        """Return whether the piece is done, or the process has ended, if necessary after a timeout."""
+        if time.monotonic() - self.begun > COMPILE_TIMEOUT_S:
+            self.end()
         try:
-            return self.connection.poll() and (self.connection.recv(), True)[1]
-        except (EOFError, OSError):
-            self.ended = True
+            while self._left and (answer := self._process.answer(0.0)) is not None:
+                self._left -= answer[0] != ITEM
+        except EOFError:
             self.stop()
-            return True
+            self.ended = True
+        return not self._left or self.ended
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self._process.alive
 
     def end(self) -> None:
         """Have the process end; what it writes into the cache is there whole or not at all."""
@@ -65,28 +72,24 @@ class Worker:
 
     def stop(self) -> None:
         """End the process, and wait until it has."""
-        self.end()
-        self._process.join(1.0)
-        self.connection.close()
+        if not self.ended:
+            self._process.end()
 
 
-def _serve(connection: Connection[Any, Piece], work: Callable[[Piece], None] | None, niceness: int) -> None:
-    """In a process of its own: do what is sent, and answer."""
-    leave_with_parent()
-    # Ctrl-C is for the process that shows the twin, which ends this one.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _set_up(niceness: int) -> Iterator[None]:
+    """In the process: take its priority, and import what compiles."""
     if niceness and sys.platform != "win32":
         os.setpriority(os.PRIO_PROCESS, 0, niceness)
-    from sources.pieces import make
 
-    work = work or make
     # Compiling leaves few cycles behind, and looking for them takes an eighth of the time.
     gc.disable()
-    while True:
-        try:
-            piece = connection.recv()
-        except EOFError:
-            return
-        with contextlib.suppress(Exception):
-            work(piece)
-        connection.send(None)
+    yield from ()
+
+
+def _compile(work: Callable[[Piece], None] | None, piece: Piece) -> Iterator[None]:
+    """In the process: compile a piece."""
+    from sources.pieces import make
+
+    with suppress(Exception):
+        (work or make)(piece)
+    yield from ()

@@ -15,7 +15,7 @@ from multiprocessing.connection import wait
 from estimators.pieces import LOOP, Piece
 from sources.pieces import KERNELS, is_made, make, needs, pieces_of
 
-from .compilers import MOST, Worker
+from .compilers import MAX_COMPILERS, Compiler
 from .jobs import LOWEST_PRIORITY
 
 LOOK = 0.2
@@ -32,7 +32,7 @@ class Workshop:
         pieces: Callable[[str], list[Piece]] = pieces_of,
         work: Callable[[Piece], None] = make,
         is_done: Callable[[Piece], bool] = is_made,
-        workers: Sequence[Worker] = (),
+        workers: Sequence[Compiler] = (),
     ) -> None:
         """Look at what is in the cache; nothing is compiled yet.
 
@@ -52,7 +52,7 @@ class Workshop:
                 self._left[name] = left
         self._asked: dict[str, float] = {}
         self._told: list[tuple[str, Callable[[str], None]]] = []
-        self._under_way: dict[Worker, Piece] = {}
+        self._under_way: dict[Compiler, Piece] = {}
         self._lost: list[Piece] = []
         self.report: Callable[[str], None] = lambda text: None
         """Told of what went wrong, in another thread."""
@@ -109,7 +109,7 @@ class Workshop:
 
     def _run(self) -> None:
         hurried = self._workers
-        quiet: Worker | None = None
+        quiet: Compiler | None = None
         try:
             while True:
                 with self._wake:
@@ -123,16 +123,16 @@ class Workshop:
                     while (piece := self._next(wanted)) is not None:
                         worker = next((each for each in hurried if each not in self._under_way), None)
                         if worker is None:
-                            if len(hurried) == MOST:
+                            if len(hurried) == MAX_COMPILERS:
                                 break
-                            worker = Worker(self._work, 0)
+                            worker = Compiler(self._work, 0)
                             hurried.append(worker)
                         self._give(worker, piece)
                     if not wanted:
                         while hurried and all(worker not in self._under_way for worker in hurried):
                             hurried.pop().stop()
                         if quiet not in self._under_way and (piece := self._next_quiet()) is not None:
-                            quiet = quiet or Worker(self._work, LOWEST_PRIORITY)
+                            quiet = quiet or Compiler(self._work, LOWEST_PRIORITY)
                             self._give(quiet, piece)
                     if not self._under_way:
                         self._wake.wait()
@@ -148,7 +148,7 @@ class Workshop:
                 self._left.clear()
                 self._tell()
 
-    def _give(self, worker: Worker, piece: Piece) -> None:
+    def _give(self, worker: Compiler, piece: Piece) -> None:
         worker.give(piece)
         self._under_way[worker] = piece
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from app.live.commands import Record, SetEstimator, SetTuning
-from app.live.compilers import MOST, Worker, first_workers
+from app.live.compilers import MAX_COMPILERS, Compiler, first_compilers
 from app.live.engine import Engine
 from app.live.workshop import Workshop
 from app.views.recording.format import tuning_from_json
@@ -304,29 +304,29 @@ def test_what_a_source_needs_comes_first_and_is_waited_for_alone(shop, tmp_path)
 
 
 def test_workers_that_began_before_the_workshop_compile_in_it(tmp_path):
-    worker, other = (Worker(partial(slow_work, tmp_path), 0) for _ in range(2))
+    worker, other = (Compiler(partial(slow_work, tmp_path), 0) for _ in range(2))
     piece = Piece("ukf", 0)
     pieces = {"ukf": [piece]}
     busy = Workshop(["ukf"], pieces=lambda name: pieces.get(name, []), is_done=lambda _: False, workers=[worker])
     busy.ask("ukf")
     busy.start()
     wait_for(lambda: begun(tmp_path, piece))
-    assert begun(tmp_path, piece)[0] == worker._process.pid
+    assert begun(tmp_path, piece)[0] == worker.pid
     busy.stop()
     idle = Workshop(["ukf"], pieces=lambda _: [], workers=[other])
     idle.start()
-    assert worker._process.exitcode is not None and other._process.exitcode is not None
+    assert not worker.alive and not other.alive
 
 
 def test_workers_begin_before_all_else_only_where_nothing_was_compiled(tmp_path, monkeypatch):
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    begun_first = first_workers()
-    assert len(begun_first) == MOST
+    begun_first = first_compilers()
+    assert len(begun_first) == MAX_COMPILERS
     for worker in begun_first:
         worker.stop()
     cache_folder().mkdir(parents=True)
-    assert first_workers() == []
+    assert first_compilers() == []
 
 
 def test_nothing_is_left_running(shop, tmp_path):

@@ -10,8 +10,6 @@ from scipy.signal import lfilter
 from scipy.stats import norm
 
 from app.live.commands import SetEstimator
-from app.live.engine import Engine
-from app.live.execute import execute
 from app.studies.analysis.diagnosis import Diagnosis, _agreed, last_rows
 from app.studies.analysis.row_figures import LAGS, rows_json, verdict
 from estimators.diagnostics.detector_state import no_baseline
@@ -19,7 +17,7 @@ from estimators.diagnostics.innovations import autocorrelation
 from estimators.log import READING, Events
 from estimators.track import USED, Track
 from estimators.tuning import Tuning
-from tests.app.scripted import MODEL, Scripted, pull_all, readings, twin, wait_for
+from tests.app.scripted import MODEL, Stepped, pull_all, readings
 from tests.app.served import shown_twin
 
 
@@ -39,8 +37,9 @@ def slow_error(n=4000):
 
 
 def looked(events, **options):
-    engine = Engine(shown_twin(**options), lambda report: Scripted())
-    engine._accept([events])
+    stepped = Stepped(of=shown_twin(**options))
+    engine = stepped.engine
+    stepped.put(events)
     return engine, json.loads(json.dumps(Diagnosis(engine)._look(), allow_nan=False))
 
 
@@ -129,9 +128,10 @@ def test_a_sensor_in_doubt_is_not_called_consistent():
 
 
 def test_only_the_last_rows_are_looked_at():
-    engine = Engine(shown_twin(), lambda report: Scripted())
+    stepped = Stepped(of=shown_twin())
+    engine = stepped.engine
     events = consistent(9000)
-    engine._accept([events])
+    stepped.put(events)
     revision, rows, track = last_rows(engine, 5000)
     assert revision == 0 and len(rows) == len(track) == 5000
     np.testing.assert_array_equal(rows.t, events.t[-5000:])
@@ -139,7 +139,8 @@ def test_only_the_last_rows_are_looked_at():
 
 
 def test_nothing_is_said_before_the_first_reading():
-    engine = Engine(shown_twin(), lambda report: Scripted())
+    stepped = Stepped(of=shown_twin())
+    engine = stepped.engine
     said = json.loads(json.dumps(Diagnosis(engine).look(), allow_nan=False))
     assert said["events"] == 0 and said["rows"][0]["verdict"] == "winding: no reading among the last rows"
 
@@ -153,18 +154,20 @@ def test_particles_over_time():
     assert len(said["particles"]["t"]) == 200 and said["particles"]["t"][0] < -290
 
 
-def test_observability_and_cost_come_from_the_background():
-    engine = Engine(twin(), lambda report: Scripted())
-    engine._accept([consistent(600)])
-    diagnosis = Diagnosis(engine)
+def test_observability_and_cost_come_from_a_background_job():
+    stepped = Stepped()
+    stepped.put(consistent(600))
+    diagnosis = Diagnosis(stepped.engine)
     assert diagnosis._look()["observability"]["reason"] == "being computed"
-    wait_for(lambda: diagnosis._slow._latest is not None)
+    stepped.engine.settle()
     said = diagnosis._look()
     assert said["cost"] > 0.0
     told = said["observability"]
-    # A thermometer read over minutes tells both temperature and its rate.
+    # A thermometer read over minutes determines both temperature and its rate.
     assert (told["rank"], told["of"]) == (2, 2) and set(told["states"]) == {"temperature", "rate"}
     assert all(0.0 < left < 1.0 for left in told["states"].values())
     # Of another revision nothing is known at first.
-    execute(SetEstimator("ekf"), engine)
-    assert diagnosis._slow.of(engine.status().revision + 1) is None
+    stepped.submit(SetEstimator("ekf"))
+    assert diagnosis._look()["observability"]["reason"] == "being computed"
+    stepped.engine.settle()
+    assert diagnosis._look()["observability"]["rank"] == 2
