@@ -18,7 +18,7 @@ from .fold_kernel import (
 )
 from .numerics.jit import threaded
 from .registry import ESTIMATORS
-from .smoothing.pieces import PIECES
+from .smoothing.moments_back import PIECES
 
 LOOP = "loop"
 """In place of a filter's name: the loop over the events, which serves all of them."""

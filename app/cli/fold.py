@@ -15,7 +15,7 @@ from estimators.fold import Fold
 from estimators.interface.table import table_of
 from estimators.registry import find_estimator
 from estimators.smoothing.smooth import check_smooth, smooth
-from estimators.smoothing.smoothed import Smoothed
+from estimators.smoothing.walk import Smoothed
 
 from ..live.watchdog import interruptible
 from ..present.export.report import Reported, report

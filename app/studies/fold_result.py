@@ -22,7 +22,7 @@ from estimators.gate.isolation import softened
 from estimators.log import READING
 from estimators.plausibility import reasons_by_sensor
 from estimators.smoothing.smooth import consistency
-from estimators.smoothing.smoothed import Smoothed
+from estimators.smoothing.walk import Smoothed
 from estimators.track import FAILED, HEALTH_NAMES, REASONS, USED
 from estimators.tuning import TOGETHER
 from sources.source import WRONG_TIME

@@ -6,28 +6,31 @@ once and writes it once, in place; its cost is that of the memory, and its scrat
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
+import numpy as np
 from numba import prange
 
 from ..compiled.context import context_at, place_of
+from ..compiled.context import options as numbers
+from ..estimator import Option
 from ..numerics.jit import jit, matrix
+from ..numerics.random import key_of, normal
 from ..numerics.simd import WIDE
 from ..numerics.simd_ir import LANES
 from ..numerics.vectors import add_scaled, combine_rows, spread_rows
-from ..numerics.workspace import layout, share, start_of, take_matrix, take_vector
+from ..numerics.workspace import declare_layout, share, start_of
 from .localisation import localised, reached
+from .shared import CREWS, OWN, ROTATE
 
 
 @jit
 def blocks_of(n):
-    """Blocks that n states make: of `WIDE` columns, and of `LANES` behind them."""
+    """Return the number of blocks of n states: of `WIDE` columns, and of `LANES` behind them."""
     return n // WIDE + (n % WIDE + LANES - 1) // LANES
 
 
 @jit
 def block_at(b, n):
-    """First state of a block, how many it has, and the columns that it takes (the rest of them is zero)."""
+    """Return the first state of a block, its number of states, and its columns (the rest of them is zero)."""
     wide = n // WIDE
     if b < wide:
         return b * WIDE, WIDE, WIDE
@@ -35,45 +38,19 @@ def block_at(b, n):
     return first, min(LANES, n - first), LANES
 
 
-class Transform(NamedTuple):
-    """What a crew transforms a block in: the block (N + 1, width), and a row of the result (width,)."""
-
-    block: Any
-    out: Any
-    end: int
+Transform, transform_at = declare_layout("Transform", "N, width", block="N + 1, width", out="width")
+"""Scratch of a crew that transforms a block: the block, and a row of the result."""
 
 
-@layout
-def transform_at(at, N, width):
-    """Lay it out."""
-    block, at = take_matrix(at, N + 1, width)
-    out, at = take_vector(at, width)
-    return Transform(block, out, at)
-
-
-class Regression(NamedTuple):
-    """What a crew regresses a block in: the block (N + 1, width), the forecast's anomalies, a row's c, its reach."""
-
-    block: Any
-    seen: Any
-    c: Any
-    reach: Any
-    end: int
-
-
-@layout
-def regression_at(at, N, width):
-    """Lay it out."""
-    block, at = take_matrix(at, N + 1, width)
-    seen, at = take_matrix(at, N, width)
-    c, at = take_vector(at, width)
-    reach, at = take_vector(at, width)
-    return Regression(block, seen, c, reach, at)
+Regression, regression_at = declare_layout(
+    "Regression", "N, width", block="N + 1, width", seen="N, width", c="width", reach="width"
+)
+"""Scratch of a crew that regresses a block: the block, the forecast's anomalies, a row's c, its reach."""
 
 
 @jit
 def load(X, first, count, width, block):
-    """Take a block out of the ensemble: anomalies in rows 0 to N - 1, the mean in row N."""
+    """Copy a block out of the ensemble: anomalies in rows 0 to N - 1, the mean in row N."""
     N = X.shape[0]
     mean = block[N]
     for j in range(width):
@@ -98,7 +75,7 @@ def load(X, first, count, width, block):
 
 @jit
 def store(X, first, count, block):
-    """Put a block back."""
+    """Copy a block back."""
     N = X.shape[0]
     for i in range(N):
         for j in range(count):
@@ -107,7 +84,7 @@ def store(X, first, count, block):
 
 @jit
 def transform(X, W, crew, crews, scratch):
-    """One crew's share of X ← x̄ + W A, with W (N, N + 1): its last column, of ones, takes the mean along."""
+    """Apply one crew's share of X ← x̄ + W A, with W (N, N + 1): its last column, of ones, takes the mean along."""
     N, n = X.shape
     blocks = blocks_of(n)
     for b in range(crew * blocks // crews, (crew + 1) * blocks // crews):
@@ -140,22 +117,22 @@ def transform_all(X, W, crews, scratch):
 
 @jit
 def regress(context, sensor, X, places, ZT, B, serial, inflation, crew, crews, scratch):
-    """One crew's share of a regression on the rows of a reading, tapered state by state.
+    """Regress one crew's share of the states on the rows of a measurement, tapered state by state.
 
     For each row k that reaches a state: c = ρ Σᵢ aᵢ ZT[k, i], then aᵢ += B[k, i] c and the mean += B[k, N] c. In a
-    serial one a row sees what the rows before it left of the anomalies, else all see the forecast.
+    serial regression a row sees the anomalies that the rows before it left, otherwise all see the forecast.
 
     Args:
         context: The context.
         sensor: Its index.
         X: Members (N, n).
-        places: For each row of the reading its index k, or -1 where it is missing.
+        places: For each row of the measurement its index k, or -1 where it is missing.
         ZT: Whitened anomalies (m, N).
-        B: What a regression coefficient does to members and mean, (m, N + 1).
+        B: Factors of a regression coefficient on members and mean, (m, N + 1).
         serial: Whether rows are assimilated one after the other.
         inflation: Factor on the anomalies, where the taper is 1; 1 where it is 0.
-        crew: Which share.
-        crews: Of how many.
+        crew: Index of the share.
+        crews: Number of shares.
         scratch: The crew's own.
     """
     N, n = X.shape
@@ -209,8 +186,80 @@ def _regress_on_threads(context, sensor, X, places, ZT, B, serial, inflation, cr
 
 @jit
 def regress_all(context, sensor, X, places, ZT, B, serial, inflation, crews, scratch):
-    """The regression of `regress` for all states."""
+    """Apply `regress` to all states."""
     if crews > 1:
         _regress_on_threads(context, sensor, X, places, ZT, B, serial, inflation, crews, scratch)
     else:
         regress(context, sensor, X, places, ZT, B, serial, inflation, 0, 1, scratch)
+
+
+ROTATION = Option("rotation", 0, 0, 1, "", "1 turns the members at random after each reading; mean and spread stay")
+
+
+@jit
+def rotate_members(seed, index, T, W):
+    """T ← Ω T with a random orthogonal Ω that keeps the mean: Ω 1 = Ωᵀ 1 = 1; W is scratch (N, N + 1).
+
+    Ω = H diag(1, Q) H, where the reflection H turns the first unit vector into 1/√N and Q is a random rotation of the
+    other N - 1 axes, from the orthogonalisation of normal numbers.
+
+    Source: Sakov & Oke (2008), doi:10.1175/2007MWR2021.1.
+    """
+    N = T.shape[0]
+    key = key_of(seed, index, ROTATE)
+    Q = np.zeros((N, N))
+    Q[0, 0] = 1.0
+    for i in range(1, N):
+        for j in range(1, N):
+            Q[i, j] = normal(key, np.uint64(i * N + j))
+        # Twice: the second time takes away what rounding left.
+        for _ in range(2):
+            for k in range(1, i):
+                dot = 0.0
+                for j in range(1, N):
+                    dot += Q[i, j] * Q[k, j]
+                add_scaled(N, -dot, Q[k], Q[i])
+        norm = 0.0
+        for j in range(1, N):
+            norm += Q[i, j] * Q[i, j]
+        for j in range(1, N):
+            Q[i, j] /= np.sqrt(norm)
+    h = np.full(N, 1.0 / np.sqrt(N))
+    h[0] -= 1.0
+    half = 1.0 - 1.0 / np.sqrt(N)
+    for _ in range(2):
+        for i in range(N):
+            dot = 0.0
+            for j in range(N):
+                dot += Q[i, j] * h[j]
+            add_scaled(N, -dot / half, h, Q[i])
+        for i in range(N):
+            for j in range(i):
+                Q[i, j], Q[j, i] = Q[j, i], Q[i, j]
+    for i in range(N):
+        for j in range(N):
+            W[i, j] = 0.0
+        for k in range(N):
+            add_scaled(N, Q[i, k], T[k], W[i])
+    for i in range(N):
+        for j in range(N):
+            T[i, j] = W[i, j]
+
+
+@jit
+def rotate(context, index, X, a, rest):
+    """Rotate the members X (N, n), where the option is set; T (N, N) and W (N, N + 1) of the analysis are scratch."""
+    given = numbers(context)
+    if given[OWN] == 0.0:
+        return
+    N = X.shape[0]
+    T, W = a.T, a.W
+    for i in range(N):
+        for j in range(N):
+            T[i, j] = 1.0 if i == j else 0.0
+    rotate_members(context.seed, index, T, W)
+    for i in range(N):
+        for j in range(N):
+            W[i, j] = T[i, j]
+        W[i, N] = 1.0
+    transform_all(X, W, int(given[CREWS]), rest)

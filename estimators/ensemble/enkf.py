@@ -1,9 +1,9 @@
-"""The stochastic ensemble Kalman filter: each member is corrected by a reading perturbed for it alone.
+"""The stochastic ensemble Kalman filter: each member is corrected by its own perturbed measurement.
 
     xᵢ ← xᵢ + K (y + vᵢ - h(xᵢ)),   K = C_xy (C_yy + R)⁻¹,   vᵢ ~ N(0, R)
 
 with the covariances of the members. The perturbations have mean zero over the members, so that the mean is updated
-with the reading itself; without them the spread would become too small.
+with the measurement itself; without them the spread would become too small.
 
 Sources: Evensen (1994), doi:10.1029/94JC00572; Burgers, van Leeuwen & Evensen (1998),
 doi:10.1175/1520-0493(1998)126<1719:ASITEK>2.0.CO;2; Evensen (2003), doi:10.1007/s10236-003-0036-9. Localisation of
@@ -15,7 +15,6 @@ from __future__ import annotations
 import numpy as np
 
 from ..compiled.context import options as numbers
-from ..estimator import Estimator
 from ..numerics.jit import jit
 from ..numerics.random import key_of, normal
 from ..numerics.symmetric import solve_rows
@@ -23,28 +22,18 @@ from ..numerics.vectors import add_scaled
 from ..track import USED
 from .analysis import begin_analysis, find_places, work_size
 from .blocks import regress_all, transform_all
-from .forecast import add_spread, predict
-from .innovation import judge_reading, observe
 from .localisation import localised, prepare
-from .ranks import account
 from .shared import (
-    ADD,
     CREWS,
-    INFLATE,
     INFLATION,
-    MEMBERS,
     PERTURB,
     RADIUS,
-    block,
     describe,
-    ensemble,
-    moments,
+    ensemble_filter,
+    finish,
     next_draw,
-    points,
-    settle,
+    predict,
     start,
-    state_size,
-    tune,
 )
 
 
@@ -97,7 +86,7 @@ def weights(m, a, inflation):
 
 @jit
 def gains(m, a):
-    """B[k, i] becomes what a covariance with row k does to anomaly i, B[k, N] what it does to the mean."""
+    """Turn B[k, i] into the factor of a covariance with row k on anomaly i, B[k, N] into that on the mean."""
     B, N = a.B, a.ZT.shape[1]
     solve_rows(a.U, m, B, N)
     scale = 1.0 / np.sqrt(N - 1.0)
@@ -113,15 +102,12 @@ def gains(m, a):
 
 @jit
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
-    """Condition the ensemble on a reading; see the module's equations.
+    """Condition the ensemble on a measurement; see the module's equations.
 
     Moments are right on average over the perturbations; those of one analysis scatter by 1/√N. The spread collapses
-    over many readings where members are few, unless it is inflated.
+    over many measurements where members are few, unless it is inflated.
     """
-    X = ensemble(context, state)
-    a, rest = begin_analysis(context, sensor, X.shape[0], work)
-    m = observe(context, sensor, u, y, state, a, innovation, innovation_std, score)
-    verdict = judge_reading(context, sensor, m, a, score)
+    X, a, rest, m, verdict = begin_analysis(context, u, sensor, y, state, work, innovation, innovation_std, score)
     if verdict != USED:
         return verdict
     index = next_draw(context, state)
@@ -135,28 +121,18 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     else:
         weights(m, a, given[INFLATION])
         transform_all(X, a.W, crews, rest)
-    add_spread(context, index, X, rest)
-    settle(context, X)
+    finish(context, index, X, rest)
     return USED
 
 
-ENKF = Estimator(
+ENKF = ensemble_filter(
+    RADIUS,
     name="enkf",
     title="Stochastic ensemble Kalman filter",
-    family="ensemble",
     assumes="posterior near Gaussian, its spread within the span of the members",
-    model_runs="members",
     fails_when="few members: chance covariances, and the chance of the perturbations; the spread collapses",
     source="Burgers, van Leeuwen & Evensen (1998), doi:10.1175/1520-0493(1998)126<1719:ASITEK>2.0.CO;2",
     functions=(start, predict, update, describe),
-    runs=lambda options, nx: options["members"],
-    state_size=state_size,
     work_size=work_size,
-    moments=moments,
-    points=points,
-    options=(MEMBERS, INFLATE, ADD, RADIUS),
-    tune=tune,
     prepare=prepare,
-    blocks=block,
-    account=account,
 )

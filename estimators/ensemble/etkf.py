@@ -1,10 +1,10 @@
-"""The ensemble transform Kalman filter: all members are turned at once so that their moments are the posterior's.
+"""The ensemble transform Kalman filter: all members are transformed at once so that their moments are the posterior's.
 
-In whitened anomalies Z (N, m) of the expected reading and d of the reading itself (see innovation.py),
+In whitened anomalies Z (N, m) of the expected measurement and d of the measurement itself (see analysis.py),
 
     x̄ ← x̄ + Aᵀ w,   w = (I + Z Zᵀ)⁻¹ Z d / √(N - 1);      A ← T A,   T = (I + Z Zᵀ)^(-1/2)
 
-with the symmetric root, which changes the members least and leaves their mean. All of it happens in the space of
+with the symmetric root, which changes the members least and keeps their mean. The transform is computed in the space of
 the members; the states follow in one product.
 
 Sources: Bishop, Etherton & Majumdar (2001), doi:10.1175/1520-0493(2001)129<0420:ASWTET>2.0.CO;2; Hunt, Kostelich &
@@ -17,45 +17,33 @@ from __future__ import annotations
 import numpy as np
 
 from ..compiled.context import options as numbers
-from ..estimator import Estimator
 from ..numerics.jit import jit
 from ..numerics.symmetric import gram, symmetric_eigen
 from ..numerics.vectors import add_scaled
 from ..track import FAILED, USED
 from .analysis import begin_analysis, work_size
-from .blocks import transform_all
-from .forecast import add_spread, predict
-from .innovation import judge_reading, observe
-from .ranks import account
-from .rotation import ROTATION, rotate_members
+from .blocks import ROTATION, rotate_members, transform_all
 from .shared import (
-    ADD,
     CREWS,
-    INFLATE,
     INFLATION,
-    MEMBERS,
     OWN,
-    block,
     describe,
-    ensemble,
-    moments,
+    ensemble_filter,
+    finish,
     next_draw,
-    points,
-    settle,
+    predict,
     start,
-    state_size,
-    tune,
 )
 
 
 @jit
 def symmetric_transform(m, a):
-    """T = (I + Z Zᵀ)^(-1/2) and v = √(N - 1) w, from the eigenvectors of Zᵀ Z or Z Zᵀ, whichever is smaller.
+    """Fill T = (I + Z Zᵀ)^(-1/2) and v = √(N - 1) w, from the eigenvectors of Zᵀ Z or Z Zᵀ, whichever is smaller.
 
-    With Zᵀ Z = V Λ Vᵀ,  T = I - Z V φ(Λ) Vᵀ Zᵀ,  φ(λ) = (1 - 1/√(1+λ))/λ = 1 / (1 + λ + √(1+λ)), which is good at 0.
+    With Zᵀ Z = V Λ Vᵀ,  T = I - Z V φ(Λ) Vᵀ Zᵀ,  φ(λ) = (1 - 1/√(1+λ))/λ = 1 / (1 + λ + √(1+λ)), which is regular at 0.
 
     Args:
-        m: Rows of the reading.
+        m: Rows of the measurement.
         a: The analysis, after `observe`; gets T and v.
 
     Returns:
@@ -110,7 +98,7 @@ def symmetric_transform(m, a):
 
 @jit
 def transform_members(context, index, m, a, X, rest):
-    """x̄ + A ← x̄ + (T + 1 wᵀ) A for all states; False, and nothing is changed, if a number is not finite."""
+    """x̄ + A ← x̄ + (T + 1 wᵀ) A for all states; return False, without any change, if a number is not finite."""
     N = X.shape[0]
     T, W, v = a.T, a.W, a.v
     # T = (I + Z Zᵀ)^(-1/2),  w = (I + Z Zᵀ)⁻¹ Z d / √(N - 1)
@@ -130,48 +118,30 @@ def transform_members(context, index, m, a, X, rest):
 
 @jit
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
-    """Condition the ensemble on a reading; see the module's equations.
+    """Condition the ensemble on a measurement; see the module's equations.
 
     Its moments become those of the Kalman update of the ensemble's own moments, exactly, where h is linear. The spread
-    collapses over many readings where members are few, unless it is inflated: the members' own sampling error is in
+    collapses over many measurements where members are few, unless it is inflated: the members' own sampling error is in
     no covariance.
     """
-    X = ensemble(context, state)
-    a, rest = begin_analysis(context, sensor, X.shape[0], work)
     # Z = (h(xᵢ) - ȳ) R^(-1/2) / √(N - 1),  d = R^(-1/2) (y - ȳ)
-    m = observe(context, sensor, u, y, state, a, innovation, innovation_std, score)
-    verdict = judge_reading(context, sensor, m, a, score)
+    X, a, rest, m, verdict = begin_analysis(context, u, sensor, y, state, work, innovation, innovation_std, score)
     if verdict != USED:
         return verdict
     index = next_draw(context, state)
     if not transform_members(context, index, m, a, X, rest):
         return FAILED
-    add_spread(context, index, X, rest)
-    settle(context, X)
+    finish(context, index, X, rest)
     return USED
 
 
-ETKF = Estimator(
+ETKF = ensemble_filter(
+    ROTATION,
     name="etkf",
     title="Ensemble transform Kalman filter",
-    family="ensemble",
     assumes="posterior near Gaussian, its spread within the span of the members; no localisation (letkf has it)",
-    model_runs="members",
-    fails_when="few members of many states: chance covariances move what the reading knows nothing of",
+    fails_when="few members of many states: chance covariances move states that the reading does not depend on",
     source="Hunt, Kostelich & Szunyogh (2007), doi:10.1016/j.physd.2006.11.008",
     functions=(start, predict, update, describe),
-    runs=lambda options, nx: options["members"],
-    state_size=state_size,
     work_size=work_size,
-    moments=moments,
-    blocks=block,
-    account=account,
-    points=points,
-    options=(
-        MEMBERS,
-        INFLATE,
-        ADD,
-        ROTATION,
-    ),
-    tune=tune,
 )

@@ -1,8 +1,8 @@
-"""Localisation: a reading acts only near its sensor, because far from it an ensemble's covariances are mostly chance.
+"""Localisation: a measurement acts only near its sensor, since far from it an ensemble's covariances are mostly chance.
 
-What is near is found once, when a fold is prepared, and laid out by blocks of states as the analysis goes through
-them (see blocks.py): for each sensor the blocks that it reaches, for each of these the sensor's rows that reach it, and
-for each such row the taper at each of the block's states.
+The neighbourhoods are computed once, when a fold is prepared, and laid out by blocks of states as the analysis goes
+through them (see blocks.py): for each sensor the blocks that it reaches, for each of these the sensor's rows that reach
+it, and for each such row the taper at each of the block's states.
 
 Source: Gaspari & Cohn (1999), doi:10.1002/qj.49712555417, equation 4.10, with c half the radius.
 """
@@ -21,20 +21,23 @@ from ..numerics.simd import WIDE
 from ..numerics.simd_ir import LANES
 
 _FIELDS = 6
-"""Numbers a sensor in the table: how many blocks, and where they, their rows' starts, rows, tapers and the tapers
+"""Numbers per sensor in the table: count of blocks, and where they, their rows' starts, rows, tapers and the tapers
 between the sensor's own rows begin, in units of 8 bytes from the table's start. The first number of all is 1."""
 
-_MOST_BYTES = 2e9
-"""A table may not be larger: localisation that reaches everywhere is none."""
+
+MAX_TABLE_BYTES = 2e9
+"""Largest table: localisation that reaches everywhere is none."""
 
 
 def crews(numbers: int, threaded_from: int) -> int:
-    """Threads that share the work on an ensemble of so many numbers."""
+    """Return the number of threads that share the work on an ensemble of so many numbers."""
     return int(numba.config.NUMBA_NUM_THREADS) if numbers >= threaded_from and threaded() else 1
 
 
 def gaspari_cohn(distance: np.ndarray, radius: float) -> np.ndarray:
-    """The taper: 1 at no distance, 5/24 at half the radius, 0 from the radius on; positive definite in up to 3 axes.
+    """Return the taper: 1 at distance 0, 5/24 at half the radius, 0 from the radius on.
+
+    It is positive definite in up to 3 dimensions.
 
     Source: Gaspari & Cohn (1999), doi:10.1002/qj.49712555417, equation 4.10.
     """
@@ -46,7 +49,7 @@ def gaspari_cohn(distance: np.ndarray, radius: float) -> np.ndarray:
 
 
 def apart(a: np.ndarray, b: np.ndarray, periods: np.ndarray) -> np.ndarray:
-    """Distances between places a (..., axes) and b (..., axes), the short way round where an axis is periodic."""
+    """Return distances between places a and b (..., axes), the short way round where an axis is periodic."""
     difference = np.abs(a - b)
     with np.errstate(invalid="ignore"):
         difference = np.where(np.isfinite(periods), np.minimum(difference, periods - difference), difference)
@@ -58,7 +61,7 @@ def check_placed(model: StateSpaceModel, radius: float) -> None:
 
     Raises:
         EstimatorError: If the radius is positive and a state or a sensor row has no position, or rows are correlated:
-            what makes them independent mixes rows that stand in different places.
+            making them independent mixes rows at different places.
     """
     if not radius > 0:
         return
@@ -78,11 +81,12 @@ def check_placed(model: StateSpaceModel, radius: float) -> None:
 
 
 def prepare(model: StateSpaceModel, options: Options) -> np.ndarray:
-    """Lay out which readings reach which states, as int64s (float64s among them by their bits).
+    """Return the layout of blocks, rows and tapers as int64s (float64s among them by their bits).
 
     Raises:
-        EstimatorError: If a radius is given and the model does not say where its states or sensors are, or the
-            layout would not fit into memory.
+        EstimatorError: If a radius is given and the model has no positions of its states or sensors, or the layout
+        would
+            not fit into memory.
     """
     radius = options.get("radius", 0.0)
     if not radius > 0:
@@ -113,10 +117,10 @@ def prepare(model: StateSpaceModel, options: Options) -> np.ndarray:
             heads[k, field] = at
             parts.append(np.ascontiguousarray(part).view(np.int64).ravel())
             at += parts[-1].size
-        if 8 * at > _MOST_BYTES:
+        if 8 * at > MAX_TABLE_BYTES:
             raise EstimatorError(
-                f"radius is {radius:g}: its tapers on {model.nx:,} states take more than {_MOST_BYTES * 1e-9:g} GB; "
-                "choose a smaller one, or 0 for no localisation"
+                f"radius is {radius:g}: its tapers on {model.nx:,} states take more than {MAX_TABLE_BYTES * 1e-9:g} "
+                "GB; choose a smaller one, or 0 for no localisation"
             )
     return np.concatenate([np.ones(1, np.int64), heads.ravel(), *parts])
 
@@ -124,7 +128,7 @@ def prepare(model: StateSpaceModel, options: Options) -> np.ndarray:
 def _by_blocks(
     near: list[np.ndarray], tapers: list[np.ndarray], nx: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Blocks reached, where each one's entries start (one more than blocks), each entry's row and tapers (WIDE,)."""
+    """Return blocks reached, where each one's entries start (blocks + 1,), each entry's row and tapers (WIDE,)."""
     wide = nx // WIDE
     blocks, rows, taper = [], [], []
     for row, (states, values) in enumerate(zip(near, tapers, strict=True)):
@@ -146,13 +150,13 @@ def _by_blocks(
 
 @jit
 def localised(context):
-    """Whether the filter localises."""
+    """Return whether the filter localises."""
     return ints(context.prepared, 1)[0] != 0
 
 
 @jit
 def reached(context, sensor):
-    """Blocks that a sensor reaches, starts of their entries, rows of the entries, and tapers (entries, WIDE)."""
+    """Return the blocks that a sensor reaches, starts of their entries, rows of the entries, tapers (entries, WIDE)."""
     table = ints(context.prepared, context.n_prepared)
     head = table[1 + _FIELDS * sensor : 1 + _FIELDS * (sensor + 1)]
     count = head[0]
@@ -164,7 +168,7 @@ def reached(context, sensor):
 
 @jit
 def between_rows(context, sensor):
-    """The taper between a sensor's rows, (ny, ny); (0, 0) where the filter does not localise."""
+    """Return the taper between a sensor's rows, (ny, ny); (0, 0) where the filter does not localise."""
     if not localised(context):
         return matrix(floats(context.prepared, 1), 0, 0, 0)
     table = ints(context.prepared, context.n_prepared)

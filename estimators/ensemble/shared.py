@@ -1,97 +1,102 @@
-"""What the ensemble filters share: members as a flat state, where they start, what the track shows of them.
+"""Parts that all ensemble filters share: state, start, forecast, additive inflation, rank histogram, row of the track.
 
-The state is the ensemble X (N, nx), member after member, the number of times that something was drawn, and in which
-tenth of the members' expectations the readings lay. The covariance P = Aᵀ A / (N - 1) of its anomalies A is never
-formed.
+The state is the ensemble X (N, nx), member after member, the number of draws, and the counts of the rank histogram. The
+covariance P = Aᵀ A / (N - 1) of its anomalies A is never formed.
 
 Members of a circular state keep within half a turn of their mean, which keeps within ±π; plain sums are then right.
 
-Randomness goes by (seed, event, member), and sums over members run in their order: the same bits on any number of
-threads.
+Random numbers are keyed by (seed, event, member), and sums over members run in their order: the same bits on any number
+of threads.
+
+Sources: Evensen (2003), doi:10.1007/s10236-003-0036-9, for the forecast; Hamill (2001),
+doi:10.1175/1520-0493(2001)129<0550:IORHFV>2.0.CO;2, for the ranks, with the sensor's noise on each member's expectation
+as in section 3 there.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from numba import prange
 
 from ..compiled.context import (
     circular_states,
+    context_at,
+    place_of,
+    prior,
+    process_variances,
     shaped,
     shown_states,
+    transition,
 )
 from ..compiled.context import options as numbers
-from ..compiled.noise import add_noise, belief_root
-from ..estimator import Option, Options
+from ..compiled.noise import add_noise, belief_root, noise_root
+from ..estimator import Estimator, Option, Options
 from ..model.state_space import LARGE, StateSpaceModel
 from ..numerics.jit import ints, jit
 from ..numerics.linalg import wrap
-from ..numerics.random import key_of, normal
+from ..numerics.random import key_of, normal, unit, word
 from ..numerics.vectors import add_scaled
-from ..numerics.workspace import layout, size_of, start_of, take_matrix, take_vector, view
+from ..numerics.workspace import declare_layout, share, size_of, start_of, view
 from ..tuning import Tuning
 from .localisation import crews
 
 SIZE, INFLATION, ADDITIVE, CREWS, OWN = range(5)
-"""Positions in the context's options; a filter's own number stands at the last."""
+"""Positions in the context's options; the last is the filter's own option."""
+
 
 PROCESS, START, PERTURB, SPREAD, ROTATE, RANK = range(6)
 """Streams of randomness; see numerics/random.py."""
 
+
 BINS = 10
-"""Bins of the rank histogram (ranks.py)."""
+"""Bins of the rank histogram."""
+
 
 THREADED_FROM = 65_536
 """Numbers in an ensemble from which threads gain more than they cost."""
 
+
 MEMBERS = Option("members", 50, 2, 10_000, "", "number of members")
+
+
 INFLATE = Option("inflation", 1.0, 1.0, 10.0, "", "factor on the anomalies after each reading that is used")
+
+
 ADD = Option("additive", 0.0, 0.0, 10.0, "", "noise added after each reading, in standard deviations of the prior")
+
+
 RADIUS = Option("radius", 0.0, 0.0, 1e9, "", "distance at which a reading's influence ends; 0: it has no end")
 
 
 def members(options: Options) -> int:
-    """Number of members."""
+    """Return the number of members."""
     return int(options["members"])
 
 
 def tune(options: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
-    """The numbers that the compiled functions read."""
+    """Return the numbers that the compiled functions read."""
     N, own = members(options), options.get("rotation", 0.0)
     return np.array([N, options["inflation"], options["additive"], crews(N * model.nx, THREADED_FROM), own])
 
 
-class Members(NamedTuple):
-    """The state: members X (N, nx), how many predictions and analyses have drawn, (1,), and counts of ranks (BINS,)."""
-
-    X: Any
-    draws: Any
-    ranks: Any
-    end: int
-
-
-@layout
-def members_at(at, N, nx):
-    """Lay the state out."""
-    X, at = take_matrix(at, N, nx)
-    draws, at = take_vector(at, 1)
-    ranks, at = take_vector(at, BINS)
-    return Members(X, draws, ranks, at)
+Members, members_at = declare_layout("Members", "N, nx", X="N, nx", draws="1", ranks=f"{BINS}")
+"""The state: members, number of predictions and analyses that have drawn, counts of the rank histogram."""
 
 
 def state_size(options: Options, nx: int) -> int:
-    """Numbers in the state."""
+    """Return the length of the state."""
     return size_of(members_at, members(options), nx)
 
 
 def block(options: Options, state: np.ndarray, nx: int) -> np.ndarray:
-    """A view of the members (N, nx) in a state."""
+    """Return a view of the members (N, nx) in a state."""
     return view(members_at(0, members(options), nx).X, state)
 
 
 def moments(options: Options, state: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (nx,) and covariance (nx, nx) of a state; beyond `LARGE` states the variances (1, nx)."""
+    """Return mean (nx,) and covariance (nx, nx) of a state; beyond `LARGE` states the variances (1, nx)."""
     X = block(options, state, nx)
     N = len(X)
     mean = X[0] + np.mean(X - X[0], axis=0) if nx <= LARGE else X.mean(axis=0)
@@ -105,20 +110,37 @@ def moments(options: Options, state: np.ndarray, nx: int) -> tuple[np.ndarray, n
 
 
 def points(options: Options, state: np.ndarray, nx: int) -> np.ndarray:
-    """The members (N, nx); none of a large state."""
+    """Return the members (N, nx); none of a large state."""
     return block(options, state, nx).copy() if nx <= LARGE else np.zeros((0, nx))
+
+
+def account(options: Options, state: np.ndarray, nx: int) -> dict[str, float | list[float]]:
+    """Return the number of members, and the rank histogram since the filter started, in `BINS` bins.
+
+    A U shape means that the spread is too small, a hump that it is too large, a slope that the model is biased.
+    """
+    ranks = view(members_at(0, members(options), nx).ranks, state)
+    return {"members": float(members(options)), "ranks": [float(count) for count in ranks]}
 
 
 @jit
 def parts(context, state):
-    """The parts of a state."""
+    """Return the parts of a state."""
     return members_at(start_of(state), int(numbers(context)[SIZE]), context.nx)
 
 
 @jit
 def ensemble(context, state):
-    """The members X (N, nx) of a state."""
+    """Return the members X (N, nx) of a state."""
     return parts(context, state).X
+
+
+@jit
+def next_draw(context, state):
+    """Count this prediction or analysis, and return the count, which keys its random numbers; see estimator.py."""
+    draws = parts(context, state).draws
+    draws[0] += 1.0
+    return int(draws[0])
 
 
 @jit
@@ -176,7 +198,7 @@ def start(context, mean, cov, state):
 
 @jit
 def describe(context, state, mean, std, cross):
-    """Mean and standard deviation of the states that the track keeps, and the configured covariances."""
+    """Fill mean and standard deviation of the states in the track, and the configured covariances."""
     X = ensemble(context, state)
     shown = shown_states(context)
     for k in range(mean.size):
@@ -191,7 +213,7 @@ def describe(context, state, mean, std, cross):
 
 @jit
 def column_mean(X, j):
-    """Mean of a state over the members."""
+    """Return the mean of a state over the members."""
     N = X.shape[0]
     total = 0.0
     for i in range(N):
@@ -201,7 +223,7 @@ def column_mean(X, j):
 
 @jit
 def covariance(X, j, mean_j, k, mean_k):
-    """Covariance of two states over the members."""
+    """Return the covariance of two states over the members."""
     N = X.shape[0]
     total = 0.0
     for i in range(N):
@@ -209,9 +231,144 @@ def covariance(X, j, mean_j, k, mean_k):
     return total / (N - 1)
 
 
+Forecast, forecast_at = declare_layout(
+    "Forecast", "n, side", forward="n", z="n", w="n", L="side, side", spare="side, side"
+)
+"""Scratch of a crew: next state, normal numbers, shaped noise; where the noise has a covariance (`side` is n, otherwise
+0) a root of Q and room for it."""
+
+
 @jit
-def next_draw(context, state):
-    """Number this prediction or analysis among all of the state's: the place of its draws; see estimator.py."""
-    draws = parts(context, state).draws
-    draws[0] += 1.0
-    return int(draws[0])
+def forecast(context, u, dt, key, X, crew, crews, scratch):
+    """Move one crew's share of the members through f, each with its own process noise."""
+    N, n = X.shape
+    q = process_variances(context)
+    first = ints(context.noise_state, context.n_noises)
+    count = ints(context.noise_states, context.n_noises)
+    side = n if context.each_state == 0 else 0
+    forward, z, w, L, spare, _ = forecast_at(start_of(scratch), n, side)
+    if side > 0 and context.Q_varies == 0:
+        noise_root(context, X[0], u, dt, L, spare)
+    for i in range(crew * N // crews, (crew + 1) * N // crews):
+        x = X[i]
+        transition(context, x, u, dt, forward)
+        base = i * n
+        if side > 0:
+            # Noise that depends on the state does so where the step began.
+            if context.Q_varies != 0:
+                noise_root(context, x, u, dt, L, spare)
+            for j in range(n):
+                z[j] = normal(key, np.uint64(base + j))
+            add_noise(L, z, forward)
+        elif context.shape != 0:
+            for j in range(n):
+                z[j] = normal(key, np.uint64(base + j))
+            shaped(context, z, w)
+            add_scaled(n, np.sqrt(q[0] * dt), w, forward)
+        else:
+            for k in range(q.size):
+                std = np.sqrt(q[k] * dt)
+                if std > 0.0:
+                    for j in range(first[k], first[k] + count[k]):
+                        forward[j] += std * normal(key, np.uint64(base + j))
+        for j in range(n):
+            x[j] = forward[j]
+
+
+@jit(parallel=True)
+def _forecast_on_threads(context, u, dt, key, X, crews, scratch):
+    place = place_of(context)
+    for crew in prange(crews):
+        forecast(context_at(place), u, dt, key, X, crew, crews, share(scratch, crew, crews))
+
+
+@jit
+def predict(context, u, dt, index, state, work):
+    """xᵢ ← f(xᵢ, u) + wᵢ, wᵢ ~ N(0, Q), for every member.
+
+    Source: Evensen (2003), doi:10.1007/s10236-003-0036-9.
+    """
+    X = ensemble(context, state)
+    key = key_of(context.seed, next_draw(context, state), PROCESS)
+    crews = int(numbers(context)[CREWS])
+    if crews > 1:
+        _forecast_on_threads(context, u, dt, key, X, crews, work)
+    else:
+        forecast(context, u, dt, key, X, 0, 1, work)
+    settle(context, X)
+
+
+@jit
+def add_spread(context, index, X, scratch):
+    """Additive inflation: to each pair of members ±s z with z ~ N(0, 1), so that the mean stays.
+
+    Source: Whitaker & Hamill (2012), doi:10.1175/MWR-D-11-00276.1, with noise in place of archived states.
+    """
+    share = numbers(context)[ADDITIVE]
+    if share == 0.0:
+        return
+    N, n = X.shape
+    _, cov = prior(context)
+    key = key_of(context.seed, index, SPREAD)
+    room = forecast_at(start_of(scratch), n, 0)
+    z, w = room.z, room.w
+    for i in range(N // 2):
+        for j in range(n):
+            z[j] = normal(key, np.uint64(i * n + j))
+        drawn = z
+        if context.shape != 0:
+            shaped(context, z, w)
+            drawn = w
+        for j in range(n):
+            a = share * drawn[j] * np.sqrt(cov[0, j] if cov.shape[0] < n else cov[j, j])
+            X[2 * i, j] += a
+            X[2 * i + 1, j] -= a
+
+
+@jit
+def finish(context, index, X, scratch):
+    """Add the additive inflation to an analysis, and wrap its angles."""
+    add_spread(context, index, X, scratch)
+    settle(context, X)
+
+
+@jit
+def count_ranks(context, m, ZT, d, rows, state):
+    """Count for every finite row in which tenth of the members' expectations, with noise added, the measurement lies.
+
+    Args:
+        context: The context.
+        m: Finite rows.
+        ZT: (m, N): (h(xᵢ) - ȳ) / √(r (N - 1)).
+        d: (m,): (y - ȳ) / √r.
+        rows: (m,): index of each in the measurement.
+        state: The filter's state; only its counts change.
+    """
+    N = ZT.shape[1]
+    own = parts(context, state)
+    key = key_of(context.seed, int(own.draws[0]), RANK)
+    scale = np.sqrt(N - 1.0)
+    for k in range(m):
+        place = rows[k] * (N + 1)
+        rank = unit(word(key, np.uint64(place + N)))
+        for i in range(N):
+            if scale * ZT[k, i] + normal(key, np.uint64(place + i)) < d[k]:
+                rank += 1.0
+        own.ranks[min(int(BINS * rank / (N + 1.0)), BINS - 1)] += 1.0
+
+
+def ensemble_filter(*own: Option, **fields: Any) -> Estimator:
+    """Return an `Estimator` with the parts that all ensemble filters share, and options of its own."""
+    return Estimator(
+        family="ensemble",
+        model_runs="members",
+        runs=lambda options, nx: options["members"],
+        state_size=state_size,
+        moments=moments,
+        points=points,
+        blocks=block,
+        account=account,
+        options=(MEMBERS, INFLATE, ADD, *own),
+        tune=tune,
+        **fields,
+    )

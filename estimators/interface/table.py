@@ -13,7 +13,7 @@ from ..diagnostics.episodes import Episode, episode_json
 from ..events.batch import KIND_NAMES, READING, Events, truth_of
 from ..events.maintenance import model_versions
 from ..model.state_space import StateSpaceModel
-from ..smoothing.smoothed import Smoothed
+from ..smoothing.walk import Smoothed
 from ..track import HEALTH_NAMES, REASONS, VERDICT_NAMES, Track
 
 

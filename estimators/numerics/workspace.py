@@ -1,24 +1,25 @@
 """A filter's scratch, laid out once: the views that a kernel works in, and how much room they take.
 
-A filter declares its workspace as one function that takes arrays one after the other from an address:
+A filter declares its workspace as the arrays that stand one after the other, with their shapes:
 
-    class Work(NamedTuple):
-        D: Any
-        mean: Any
-        end: int
+    Work, workspace = declare_layout("Work", "n, m", D="2 * n + 1, m", mean="m")
+
+and a kernel calls it with the address of its scratch, `workspace(start_of(work), n, m)`. The size follows from the same
+function, called in Python from address zero without touching memory: `size_of(workspace, n, m)`. Where arrays share
+memory, the layout is written out as the function that `declare_layout` would make:
 
     @layout
     def workspace(at, n, m):
         D, at = take_matrix(at, 2 * n + 1, m)
         mean, at = take_vector(at, m)
         return Work(D, mean, at)
-
-A kernel calls it with the address of its scratch, `start_of(work)`. The size follows from the same function, called
-in Python from address zero without touching memory: `size_of(workspace, n, m)`.
 """
 
 from __future__ import annotations
 
+import ast
+import sys
+from collections import namedtuple
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -55,6 +56,42 @@ def take_vector(at: int, n: int) -> tuple[Any, int]:
 def take_integers(at: int, n: int) -> tuple[Any, int]:
     """A vector (n,) of int64s that begins at the address `at`, and the address after it."""
     return Part(at, (n,)), at + WORD * n
+
+
+_TAKES = (take_matrix, take_vector, take_integers)
+
+
+def declare_layout(
+    kind: str, sizes: str, /, *functions: Callable[..., Any], **fields: str
+) -> tuple[Any, Callable[..., Any]]:
+    """Return a named tuple and the layout `(at, *sizes)` that fills it with arrays that stand one after the other.
+
+    Args:
+        kind: Name of the named tuple, to which the caller binds it; its last field, `end`, is the address after the
+            last array.
+        sizes: Parameters of the layout, such as "n, m".
+        functions: Functions that the shapes call.
+        fields: Shape of each array: "n, m" for a matrix, "n" for a vector, "int n" for a vector of int64s, or a call
+            "other(at, n)" for a nested layout.
+    """
+    lines = [f"def {kind}(at, {sizes}):"]
+    for name, shape in fields.items():
+        if "(at, " in shape:
+            lines += [f"    {name} = {shape}", f"    at = {name}.end"]
+        else:
+            shape = shape.removeprefix("int ")
+            # A comma within parentheses separates arguments, not dimensions.
+            matrix = isinstance(ast.parse(shape, mode="eval").body, ast.Tuple)
+            take = "take_integers" if shape != fields[name] else "take_matrix" if matrix else "take_vector"
+            lines.append(f"    {name}, at = {take}(at, {shape})")
+    lines.append(f"    return _kind({', '.join(fields)}, at)")
+    # As of namedtuple itself, the caller's module is where pickle finds the class again.
+    module = sys._getframe(1).f_globals["__name__"]
+    made: Any = namedtuple(kind, [*fields, "end"], module=module)  # type: ignore[misc]
+    names: dict[str, Any] = {function.__name__: function for function in (*functions, *_TAKES)}
+    names |= {"__name__": module, "_kind": made}
+    exec("\n".join(lines), names)
+    return made, layout(names[kind])
 
 
 # Not inlined: where Numba inlines an overload it looks for dead code, and takes a write through a field of a tuple,

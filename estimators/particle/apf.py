@@ -1,9 +1,9 @@
-"""The auxiliary particle filter: choose the particles by how well they foresee the reading, then let them move.
+"""The auxiliary particle filter: choose the particles by how well they predict the measurement, then move them.
 
-First stage: particle j is chosen in proportion to λ_j = w_j' p̂_j(y), the density of the reading under its predictive
-Gaussian N(h(f(x_j)), H P H' + R). Second: x_i ~ p(x | x_j'), w_i ∝ p(y | x_i) / p̂_j(y). The likelihood
+First stage: particle j is chosen in proportion to λ_j = w_j' p̂_j(y), the density of the measurement under its
+predictive Gaussian N(h(f(x_j)), H P H' + R). Second: x_i ~ p(x | x_j'), w_i ∝ p(y | x_i) / p̂_j(y). The likelihood
 Σ_j λ_j · (1/N) Σ_i p(y | x_i) / p̂_j(y) is unbiased for the transition that proposals.py draws from: the model's own
-where one step lies between readings, the EKF's Gaussian over several.
+where one step lies between measurements, the EKF's Gaussian over several.
 
 Pitt & Shephard score by p(y | f(x_j)) itself, whose tails are lighter than those of p(y | x), so that weights have no
 bound; with the predictive spread they have one (Johansen & Doucet).
@@ -16,20 +16,28 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled.context import options as numbers
 from ..compiled.context import sensor_variances
 from ..compiled.noise import independent_rows, semidefinite_root
 from ..estimator import Estimator
-from ..numerics.jit import jit, matrix
+from ..numerics.jit import jit
 from ..numerics.random import ONE, key_of, normal
 from ..track import FAILED, MISSING, USED
-from .cloud import DRAW, MEMBERS, OPTIONS, RESAMPLE, RESAMPLED, cloud_of, own_covariance, sized, tune, weigh_equally
-from .describe import describe, moments, peaks, points, recoveries
+from .cloud import (
+    DRAW,
+    OPTIONS,
+    RESAMPLE,
+    count_of,
+    describe,
+    own_cloud,
+    own_covariance,
+    score_cloud,
+)
+from .draws import recover, start
 from .innovation import finite_rows
-from .lineage import account, inherit, score_cloud
 from .proposals import (
     PROPOSE,
-    ahead_of,
+    WAITING,
+    densities_of,
     expect_block,
     expected_reading,
     move_block,
@@ -37,12 +45,20 @@ from .proposals import (
     predict,
     room_of,
     settle_draw,
-    work_size,
 )
-from .recovery import recover, start
-from .resampling import ancestors_of, take_ancestors
-from .steps import add_up, block_of, range_of, sweep, work_of
-from .weights import children_of, keep, normalise, phases
+from .resampling import take_ancestors
+from .weights import (
+    add_up,
+    block_of,
+    keep,
+    members_own,
+    normalise,
+    phases,
+    range_of,
+    resample,
+    sweep,
+    work_of,
+)
 
 
 @jit
@@ -51,11 +67,10 @@ def propose_block(context, u, dt, sensor, y, key, value, state, work, number):
 
     p̂ is the predictive density by which the particle was chosen.
     """
-    nx = context.nx
-    n = int(numbers(context)[MEMBERS])
-    shared, cloud = work_of(context, work), cloud_of(state, nx, n)
+    nx, n = context.nx, count_of(context)
+    shared, cloud = work_of(context, work), own_cloud(context, state)
     room, sums = room_of(context, shared, number), block_of(context, shared, number).sums
-    ahead, L, z = ahead_of(context, shared).densities, room.L, room.z
+    ahead, L, z = densities_of(context, shared), room.L, room.z
     G, d, seen = room.G, room.d, room.seen
     independent_rows(context, sensor, y, sensor_variances(context, sensor), G, d)
     records, log_w, joints = cloud.records, cloud.log_w, shared.joint
@@ -79,22 +94,16 @@ def propose_block(context, u, dt, sensor, y, key, value, state, work, number):
 
 @jit
 def choose(context, key, state, work):
-    """Let each particle of the first stage's weights have its children, with the density by which it was chosen."""
-    nx = context.nx
-    n = int(numbers(context)[MEMBERS])
+    """Resample by the weights of the first stage; each child takes along the density that chose its parent."""
+    resample(context, key, state, work)
     shared = work_of(context, work)
-    children = children_of(context, key, state, work)
-    ancestors_of(children, shared.ancestors)
-    take_ancestors(shared.ancestors, cloud_of(state, nx, n).records)
-    inherit(context, shared.ancestors, state)
-    take_ancestors(shared.ancestors, matrix(ahead_of(context, shared).densities, 0, n, 1))
-    weigh_equally(state, nx, n)
-    state[RESAMPLED] += 1.0
+    densities, _ = members_own(context, shared, 1)
+    take_ancestors(shared.ancestors, densities)
 
 
 @jit
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
-    """Choose by the predictive density, move, weigh by what it got wrong."""
+    """Choose by the predictive density, move, and weigh by the ratio of the density to its prediction."""
     if finite_rows(y, sensor_variances(context, sensor).size) == 0:
         return MISSING
     index, verdict = expected_reading(context, u, sensor, y, state, work, innovation, innovation_std, score)
@@ -120,21 +129,12 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
 APF = Estimator(
     name="apf",
     title="Auxiliary particle filter",
-    family="particle",
     assumes="as pf; h differentiable, the noise of a step Gaussian",
     model_runs="2 N, and the derivatives of h (of f too between readings of several steps)",
     fails_when="the predictive density, linearised, misjudges which particles will explain the reading",
     source="Pitt & Shephard (1999), doi:10.1080/01621459.1999.10474153",
     functions=(start, predict, update, describe),
     runs=lambda options, nx: 2 * options["particles"],
-    state_size=sized(lambda nx: nx + nx * nx),
-    work_size=work_size,
-    moments=moments,
-    points=points,
-    peaks=peaks,
-    recoveries=recoveries,
-    account=account,
-    options=tuple(option for option in OPTIONS if option.name != "fraction"),
-    tune=tune,
     prepare=phases(move_block, expect_block, propose_block),
+    **(WAITING | {"options": tuple(option for option in OPTIONS if option.name != "fraction")}),
 )

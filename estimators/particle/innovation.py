@@ -1,24 +1,25 @@
-"""What a cloud expects of a reading: the innovation of its weighted mean, and the covariance of that."""
+"""The innovation of a cloud's weighted mean with its covariance, normal scores, and the density of a measurement."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ..compiled.context import circular_rows, expect, has_own_likelihood, sensor_variances
-from ..compiled.noise import add_covariances
+from ..compiled.context import circular_rows, expect, has_own_likelihood, own_likelihood, sensor_variances
+from ..compiled.noise import add_covariances, has_correlated_rows
+from ..compiled.verdict import LOG_2PI
 from ..numerics.jit import jit
-from ..numerics.linalg import wrap
+from ..numerics.linalg import solve_unit, wrap
 from ..numerics.normal_score import normal_score
 from ..track import WHITENED
-from .moments import tails_of
+from .cloud import tails_of
 
 
 @jit
 def first_residual(context, u, sensor, y, x, out):
-    """What a reading leaves over the expectation of a particle x, by row, and 0 where it is no number.
+    """Fill the residuals of particle x (ny,), 0 where a residual is not finite.
 
-    The residuals' moments are taken about that of the first particle: the spread of the particles then keeps its digits
-    however far off the reading is.
+    The residuals' moments are taken about those of the first particle: the spread of the particles then keeps its
+    digits however large the residuals are.
     """
     expect(context, sensor, x, u, out)
     circular = circular_rows(context, sensor)
@@ -32,14 +33,14 @@ def first_residual(context, u, sensor, y, x, out):
 
 @jit
 def about(residual, reference, circular):
-    """A residual's deviation from a reference; of angles the shorter way."""
+    """Return a residual's deviation from a reference, wrapped for angles."""
     deviation = residual - reference
     return wrap(deviation) if circular != 0 else deviation
 
 
 @jit
 def finite_rows(y, rows):
-    """How many of the reading's rows are there."""
+    """Return the number of finite rows."""
     m = 0
     for row in range(rows):
         if np.isfinite(y[row]):
@@ -49,7 +50,7 @@ def finite_rows(y, rows):
 
 @jit
 def predicted(context, u, sensor, y, x, shared, innovation, innovation_std):
-    """Innovation ν and its covariance S, over the finite rows, from sums about the residual of x, the first particle.
+    """Fill the innovation ν and its covariance S over the finite rows, from sums about the residual of particle x.
 
     Returns:
         The number of finite rows.
@@ -87,10 +88,10 @@ def predicted(context, u, sensor, y, x, shared, innovation, innovation_std):
 def score_rows(context, sensor, y, shared, score):
     """Write the normal score of each finite row to score[WHITENED + row]: e = Φ⁻¹(F(y)), N(0, 1) under the model.
 
-    F = Σ wᵢ Φ((y - hᵢ) / √sᵢ) is the distribution function of the row by itself under the weights before the reading,
-    with sᵢ the variance of the reading given particle i: r, or H P Hᵀ + r where a Gaussian stands behind it. Angles
-    are counted from what the first particle expects, up to half a turn to either side. A sensor with a likelihood of
-    its own has no known distribution function, and its rows are NaN.
+    F = Σ wᵢ Φ((y - hᵢ) / √sᵢ) is the distribution function of the row by itself under the weights before the
+    measurement, with sᵢ the variance of the measurement given particle i: r, or H P Hᵀ + r where a Gaussian stands
+    behind it. Angles count from the first particle's expectation, up to half a turn to either side. A sensor with a
+    likelihood of its own has no known distribution function, and its rows are NaN.
     """
     tails = tails_of(context, shared.sums)
     own = has_own_likelihood(context, sensor)
@@ -101,3 +102,40 @@ def score_rows(context, sensor, y, shared, score):
             if not own:
                 score[WHITENED + row] = normal_score(tails[2 * k], tails[2 * k + 1])
             k += 1
+
+
+@jit
+def half_square(F, d, m, e):
+    """Return ½ eᵀ R⁻¹ e of a residual e (m,) with R = F diag(d) Fᵀ; e becomes F⁻¹ e."""
+    solve_unit(F, m, e)
+    half = 0.0
+    for k in range(m):
+        half += 0.5 * e[k] * e[k] / d[k]
+    return half
+
+
+@jit
+def log_density(context, sensor, u, y, x, F, d, e):
+    """Return log p(y | x): Gaussian over the finite rows, or the sensor's own; -inf if it is NaN.
+
+    F and d are those of `independent_rows`, e (ny,) is scratch.
+    """
+    if has_own_likelihood(context, sensor):
+        value = own_likelihood(context, sensor, y, x, u)
+    else:
+        circular = circular_rows(context, sensor)
+        expect(context, sensor, x, u, e)
+        m = 0
+        for row in range(circular.size):
+            if np.isfinite(y[row]):
+                # Row `row` moves up to m ≤ row.
+                e[m] = y[row] - e[row]
+                if circular[row] != 0:
+                    e[m] = wrap(e[m])
+                m += 1
+        if has_correlated_rows(context, sensor):
+            solve_unit(F, m, e)
+        value = 0.0
+        for k in range(m):
+            value -= 0.5 * (e[k] * e[k] / d[k] + LOG_2PI + np.log(d[k]))
+    return value if -np.inf < value < np.inf else -np.inf

@@ -1,7 +1,7 @@
-"""The particle filter with an EKF proposal: each particle moves by its own EKF step into the reading.
+"""The particle filter with an EKF proposal: each particle moves by its own EKF step into the measurement.
 
 x_i ~ q = N(x; EKF posterior of particle i),  w_i ∝ w_i' p(y | x_i) p(x_i | x_i') / q(x_i). With a linear sensor and one
-step between readings q is the optimal proposal p(x | x', y), and the weight does not depend on the draw.
+step between measurements q is the optimal proposal p(x | x', y), and the weight does not depend on the draw.
 
 Sources: van der Merwe, Doucet, de Freitas & Wan (2000), The unscented particle filter, for the EKF as proposal; Doucet,
 Godsill & Andrieu (2000), doi:10.1023/A:1008935410038, for the optimal proposal and its weight.
@@ -11,19 +11,26 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled.context import options as numbers
 from ..compiled.context import sensor_variances
 from ..compiled.noise import add_noise, independent_rows, semidefinite_root
 from ..estimator import Estimator
 from ..numerics.jit import inlined, jit
 from ..numerics.random import ONE, key_of, normal
 from ..track import FAILED, MISSING, USED
-from .cloud import DRAW, MEMBERS, OPTIONS, RESAMPLE, cloud_of, own_covariance, sized, tune
-from .describe import describe, moments, peaks, points, recoveries
+from .cloud import (
+    DRAW,
+    RESAMPLE,
+    count_of,
+    describe,
+    own_cloud,
+    own_covariance,
+    score_cloud,
+)
+from .draws import recover, start
 from .innovation import finite_rows
-from .lineage import account, score_cloud
 from .proposals import (
     PROPOSE,
+    WAITING,
     expect_block,
     expected_reading,
     look,
@@ -32,11 +39,8 @@ from .proposals import (
     predict,
     room_of,
     settle_draw,
-    work_size,
 )
-from .recovery import recover, start
-from .steps import add_up, block_of, range_of, sweep, work_of
-from .weights import keep_or_resample, normalise, phases
+from .weights import add_up, block_of, keep_or_resample, normalise, phases, range_of, sweep, work_of
 
 
 @jit
@@ -46,9 +50,8 @@ def propose_block(context, u, dt, sensor, y, key, value, state, work, number):
     In coordinates z of P = L Lᵀ: z ~ N(ẑ, Σ) with ẑ = (H L)ᵀ S⁻¹ e, Σ = I - (H L)ᵀ S⁻¹ H L, and the weight
     w' p(y | x) N(z; 0, I) / N(z; ẑ, Σ).
     """
-    nx = context.nx
-    n = int(numbers(context)[MEMBERS])
-    shared, cloud = work_of(context, work), cloud_of(state, nx, n)
+    nx, n = context.nx, count_of(context)
+    shared, cloud = work_of(context, work), own_cloud(context, state)
     room, sums = room_of(context, shared, number), block_of(context, shared, number).sums
     L, C, z, xi, HL, S, U = room.L, room.C, room.z, room.xi, room.HL, room.S, room.U
     G, d, e, seen, scratch = room.G, room.d, room.e, room.seen, room.scratch
@@ -85,7 +88,7 @@ def propose_block(context, u, dt, sensor, y, key, value, state, work, number):
 
 @inlined
 def posterior(m, HL, U, seen, z, P):
-    """z = ẑ and the lower triangle of P = Σ, from what `look` left of m rows; H L becomes U⁻ᵀ H L."""
+    """Fill z = ẑ and the lower triangle of P = Σ from the results of `look` for m rows; H L becomes U⁻ᵀ H L."""
     nx = z.size
     for k in range(m):
         for j in range(nx):
@@ -107,7 +110,7 @@ def posterior(m, HL, U, seen, z, P):
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """Draw each particle from its EKF posterior, weigh it, resample where few carry the weight.
 
-    The log-likelihood of a reading that is not used is that of the particles' Gaussians, Σ w' N(y; h(x), S).
+    The log-likelihood of a measurement that is not used is that of the particles' Gaussians, Σ w' N(y; h(x), S).
     """
     if finite_rows(y, sensor_variances(context, sensor).size) == 0:
         return MISSING
@@ -130,21 +133,12 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
 PF_EKF = Estimator(
     name="pf-ekf",
     title="Particle filter with EKF proposal",
-    family="particle",
     assumes="as pf; f and h differentiable, the noise of a step Gaussian",
     model_runs="3 N, and the derivatives of h (of f too between readings of several steps)",
     fails_when="the EKF's posterior of a particle misses where the reading puts it",
     source="van der Merwe, Doucet, de Freitas & Wan (2000), The unscented particle filter",
     functions=(start, predict, update, describe),
     runs=lambda options, nx: 3 * options["particles"],
-    state_size=sized(lambda nx: nx + nx * nx),
-    work_size=work_size,
-    moments=moments,
-    points=points,
-    peaks=peaks,
-    recoveries=recoveries,
-    account=account,
-    options=OPTIONS,
-    tune=tune,
     prepare=phases(move_block, expect_block, propose_block),
+    **WAITING,
 )

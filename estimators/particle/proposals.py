@@ -1,14 +1,12 @@
-"""Particles that wait for the reading before they move: what `pf-ekf` and `apf` share.
+"""Particles that wait for the measurement before they move: shared by `pf-ekf` and `apf`.
 
-Between readings a particle carries the Gaussian of where it may be, N(x, P): x ← f(x), and P ← F P Fᵀ + Q from P = 0
-at the last reading. One step from a certain particle is the model's own transition, exactly; over several steps it is
-the EKF's approximation of it. The reading then says where in that Gaussian the particle goes, and a weight corrects
-for the choice: in coordinates z of P = L Lᵀ, x + L z, so that a singular P is no obstacle.
+Between measurements a particle carries the Gaussian of its next state, N(x, P): x ← f(x), and P ← F P Fᵀ + Q from P = 0
+at the last measurement. One step from a certain particle is the model's own transition, exactly; over several steps it
+is the EKF's approximation of it. The measurement then decides where in that Gaussian the particle goes, and a weight
+corrects for the choice: in coordinates z of P = L Lᵀ, x + L z, so that a singular P is allowed.
 """
 
 from __future__ import annotations
-
-from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,119 +20,95 @@ from ..compiled.context import (
     sensor_variances,
     transition,
 )
-from ..compiled.context import options as numbers
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..compiled.noise import add_covariances, add_noise, has_correlated_rows, semidefinite_root
 from ..compiled.verdict import LOG_2PI
-from ..estimator import Options
 from ..gaussian.shared import admit
 from ..numerics.jit import inlined, jit
 from ..numerics.linalg import cholesky, congruence, solve_transposed, wrap
 from ..numerics.normal_score import add_tail
 from ..numerics.random import key_of
-from ..numerics.workspace import layout, size_of, take_matrix, take_vector
-from .cloud import EQUAL, MEMBERS, PROCESS, SETTLED, cloud_of, members, next_draw, own_covariance, wrap_record
-from .innovation import about, first_residual, predicted, score_rows
-from .mode_draws import jump, jump_key
-from .moments import tails_of
-from .recovery import recover
-from .steps import NO_KEY, add_up, block_of, blocks_of, range_of, sweep, work_at, work_of
-from .weigh import log_density
-from .weights import OWN
+from ..numerics.workspace import declare_layout, take_vector
+from .cloud import (
+    EQUAL,
+    PROCESS,
+    SETTLED,
+    SHARED,
+    clear_sums,
+    count_of,
+    next_draw,
+    own_cloud,
+    own_covariance,
+    sized,
+    tails_of,
+    wrap_record,
+)
+from .draws import jump, jump_key, recover
+from .innovation import about, first_residual, log_density, predicted, score_rows
+from .weights import (
+    NO_KEY,
+    OWN,
+    add_up,
+    block_of,
+    members_own,
+    range_of,
+    sweep,
+    work_of,
+    work_sized,
+)
 
 MOVE, EXPECT, PROPOSE = range(OWN, OWN + 3)
-"""Phases: N(x, P) one step on; what it says of the reading; the filter's own draw."""
+"""Phases: N(x, P) one step on; its prediction of the measurement; the filter's own draw."""
 
 
-class Room(NamedTuple):
-    """What a block's particles are worked on in, one after the other.
-
-    F (nx, nx) and T (2 nx, nx) for F P Fᵀ; roots L and C (nx, nx); H and H L (ny, nx), S and its factor U (ny, ny), e
-    and `seen` (ny,) of a look at the reading; the next state, z and ξ (nx,); R = G diag(d) Gᵀ of the rows that are
-    there; what a Jacobian takes.
-    """
-
-    F: Any
-    T: Any
-    L: Any
-    C: Any
-    H: Any
-    HL: Any
-    S: Any
-    U: Any
-    e: Any
-    seen: Any
-    forward: Any
-    z: Any
-    xi: Any
-    G: Any
-    d: Any
-    scratch: Any
-    end: int
+Room, room_at = declare_layout(
+    "Room",
+    "nx, ny",
+    scratch_size,
+    F="nx, nx",
+    T="2 * nx, nx",
+    L="nx, nx",
+    C="nx, nx",
+    H="ny, nx",
+    HL="ny, nx",
+    S="ny, ny",
+    U="ny, ny",
+    e="ny",
+    seen="ny",
+    forward="nx",
+    z="nx",
+    xi="nx",
+    G="ny, ny",
+    d="ny",
+    scratch="scratch_size(nx, ny)",
+)
+"""Scratch of a block for one particle: F and T for F P Fᵀ; roots L and C; H and H L, S and its factor U, residual e and
+U⁻ᵀ e of the predicted measurement; next state, z and ξ; R = G diag(d) Gᵀ of the finite rows; scratch of a Jacobian."""
 
 
-@layout
-def room_at(at, nx, ny):
-    """Lay it out."""
-    F, at = take_matrix(at, nx, nx)
-    T, at = take_matrix(at, 2 * nx, nx)
-    L, at = take_matrix(at, nx, nx)
-    C, at = take_matrix(at, nx, nx)
-    H, at = take_matrix(at, ny, nx)
-    HL, at = take_matrix(at, ny, nx)
-    S, at = take_matrix(at, ny, ny)
-    U, at = take_matrix(at, ny, ny)
-    e, at = take_vector(at, ny)
-    seen, at = take_vector(at, ny)
-    forward, at = take_vector(at, nx)
-    z, at = take_vector(at, nx)
-    xi, at = take_vector(at, nx)
-    G, at = take_matrix(at, ny, ny)
-    d, at = take_vector(at, ny)
-    scratch, at = take_vector(at, scratch_size(nx, ny))
-    return Room(F, T, L, C, H, HL, S, U, e, seen, forward, z, xi, G, d, scratch, at)
-
-
-class Ahead(NamedTuple):
-    """What follows the cloud's scratch: the particles' predictive log densities (N,), and where the rooms begin."""
-
-    densities: Any
-    rooms: int
-    end: int
-
-
-@layout
-def ahead_at(at, nx, ny, n):
-    """Lay it out."""
-    densities, at = take_vector(at, n)
-    return Ahead(densities, at, at + blocks_of(n) * room_at(0, nx, ny).end)
-
-
-def work_size(options: Options, nx: int, ny: int) -> int:
-    """Scratch: the cloud's, the predictive log densities, and a room for each block."""
-    n = members(options)
-    return size_of(work_at, nx, ny, n) + size_of(ahead_at, nx, ny, n)
+work_size = work_sized(room_at, lambda nx: 1)
 
 
 @jit
-def ahead_of(context, shared):
-    """What follows the cloud's scratch."""
-    return ahead_at(shared.end, context.nx, context.width, int(numbers(context)[MEMBERS]))
+def densities_of(context, shared):
+    """Return the particles' predictive log densities (N,)."""
+    densities, _ = take_vector(shared.end, count_of(context))
+    return densities
 
 
 @jit
 def room_of(context, shared, b):
-    """The room of block b."""
+    """Return the room of block b."""
     nx, ny = context.nx, context.width
-    return room_at(ahead_of(context, shared).rooms + b * room_at(0, nx, ny).end, nx, ny)
+    _, rooms = members_own(context, shared, 1)
+    return room_at(rooms + b * room_at(0, nx, ny).end, nx, ny)
 
 
 @jit
 def move_block(context, u, dt, sensor, y, key, value, state, work, number):
     """Predict N(x, P) of a block's members; its first sum is how many became infinite or NaN."""
-    nx = context.nx
-    n = int(numbers(context)[MEMBERS])
-    shared, cloud = work_of(context, work), cloud_of(state, nx, n)
+    nx, n = context.nx, count_of(context)
+    shared, cloud = work_of(context, work), own_cloud(context, state)
     room = room_of(context, shared, number)
     records, log_w, forward = cloud.records, cloud.log_w, room.forward
     F, T, scratch = room.F, room.T, room.scratch
@@ -218,15 +192,14 @@ def look(context, sensor, u, y, x, P, L, H, HL, S, U, e, expected, scratch):
 
 @jit
 def expect_block(context, u, dt, sensor, y, key, value, state, work, number):
-    """joint = log w + log N(y; h(x), H P Hᵀ + R), the second kept ahead, and the sums of residuals and S - R.
+    """joint = log w + log N(y; h(x), H P Hᵀ + R), the second also kept, and the sums of residuals and S - R.
 
-    The sums are about `first_residual`; with them those of the two tails of each row, see `score_rows`.
+    The sums are about `first_residual` and include the two tails of each row, see `score_rows`.
     """
-    nx = context.nx
-    n = int(numbers(context)[MEMBERS])
-    shared, cloud = work_of(context, work), cloud_of(state, nx, n)
+    nx, n = context.nx, count_of(context)
+    shared, cloud = work_of(context, work), own_cloud(context, state)
     room, sums = room_of(context, shared, number), block_of(context, shared, number).sums
-    joint, ahead = shared.joint, ahead_of(context, shared).densities
+    joint, ahead = shared.joint, densities_of(context, shared)
     records, log_w = cloud.records, cloud.log_w
     H = room.H[: sensor_variances(context, sensor).size]
     L, HL, S, U, e, seen, scratch = room.L, room.HL, room.S, room.U, room.e, room.seen, room.scratch
@@ -239,9 +212,7 @@ def expect_block(context, u, dt, sensor, y, key, value, state, work, number):
     reference = np.empty(r.size)
     first_residual(context, u, sensor, y, records[0, :nx], reference)
     tails = tails_of(context, sums)
-    for k in range(sums.size):
-        sums[k] = 0.0
-    sums[2] = -np.inf
+    clear_sums(sums)
     for i in range(first, last):
         x = records[i, :nx]
         P = own_covariance(records[i], nx)
@@ -278,7 +249,7 @@ def expect_block(context, u, dt, sensor, y, key, value, state, work, number):
 
 @inlined
 def place_draw(context, sensor, u, y, x, L, z, G, d, seen):
-    """x ← x + L z, certain of itself; returns log p(y | x)."""
+    """x ← x + L z, from now on certain; return log p(y | x)."""
     add_noise(L, z, x)
     wrap_record(circular_states(context), x)
     return log_density(context, sensor, u, y, x, G, d, seen)
@@ -286,7 +257,7 @@ def place_draw(context, sensor, u, y, x, L, z, G, d, seen):
 
 @inlined
 def settle_draw(P, value, i, joint, sums):
-    """Member i has drawn: its covariance is zero, its joint log weight `value`, or zero weight if that is NaN."""
+    """Set the covariance of a drawn member to zero, and its joint log weight to `value`, or -inf if that is NaN."""
     for a in range(P.shape[0]):
         for b in range(P.shape[0]):
             P[a, b] = 0.0
@@ -301,7 +272,7 @@ def settle_draw(P, value, i, joint, sums):
 @jit
 def predict(context, u, dt, index, state, work):
     """N(x, P) of every particle one step on: x ← f(x), P ← F P Fᵀ + Q."""
-    n = int(numbers(context)[MEMBERS])
+    n = count_of(context)
     index = next_draw(state)
     sweep(MOVE, context, u, dt, 0, u, key_of(context.seed, index, PROCESS), 0.0, state, work)
     lost = add_up(context, work)[0]
@@ -313,8 +284,8 @@ def predict(context, u, dt, index, state, work):
 
 @jit
 def expected_reading(context, u, sensor, y, state, work, innovation, innovation_std, score):
-    """What the particles' Gaussians say of the reading, and the verdict on it."""
-    shared, cloud = work_of(context, work), cloud_of(state, context.nx, int(numbers(context)[MEMBERS]))
+    """Fill the innovation and the scores from the particles' Gaussians; return index and verdict."""
+    shared, cloud = work_of(context, work), own_cloud(context, state)
     settled = state[SETTLED]
     index = next_draw(state)
     sweep(EXPECT, context, u, 0.0, sensor, y, NO_KEY, 0.0, state, work)
@@ -325,3 +296,7 @@ def expected_reading(context, u, sensor, y, state, work, innovation, innovation_
     verdict = admit(context, sensor, m, shared.nu, shared.S, shared.U, score)
     score_rows(context, sensor, y, shared, score)
     return index, verdict
+
+
+WAITING = {**SHARED, "state_size": sized(lambda nx: nx + nx * nx), "work_size": work_size}
+"""Fields of an `Estimator` that the filters whose particles wait share."""

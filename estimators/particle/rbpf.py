@@ -1,12 +1,12 @@
-"""The Rao-Blackwellised particle filter: sample what is nonlinear, leave the rest to a Kalman filter a particle.
+"""The Rao-Blackwellised particle filter: sample the nonlinear states, give each particle a Kalman filter for the rest.
 
-The model says which states it is linear in once the others are known (`conditionally_linear`), and may have a discrete
-mode (`jump`). A particle carries a value of the others and of the mode, and mean and covariance of the linear states
-given the whole past of these; a reading moves it as a Kalman filter and weighs it by N(y; h(x), H P Hᵀ + R). The
-estimate is the mixture of these Gaussians. What is integrated exactly needs no particles: the variance is never larger
-than that of `pf` with as many. With nothing to sample it is the Kalman filter.
+The model lists the states in which it is linear once the others are known (`conditionally_linear`), and may have a
+discrete mode (`jump`). A particle carries a value of the others and of the mode, and mean and covariance of the linear
+states given their whole past; a measurement updates it like a Kalman filter and weighs it by N(y; h(x), H P Hᵀ + R).
+The estimate is the mixture of these Gaussians. States that are integrated exactly need no particles: the variance is
+never larger than that of `pf` with as many. With nothing to sample it is the Kalman filter.
 
-The mode and the sampled states move as the model says, blind to the reading that comes.
+The mode and the sampled states move as the model predicts, without regard to the next measurement.
 
 Sources: Doucet, de Freitas, Murphy & Russell (2000), Rao-Blackwellised particle filtering for dynamic Bayesian
 networks, UAI 2000, section 3; Schön, Gustafsson & Nordlund (2005), Marginalized particle filters for mixed
@@ -18,27 +18,29 @@ from __future__ import annotations
 import numpy as np
 
 from ..compiled.context import circular_states, sensor_variances
-from ..compiled.context import options as numbers
 from ..estimator import Estimator, Option, Options
 from ..gaussian.shared import admit
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import floats, jit, matrix
-from ..numerics.peaks import Peak, peaks_of
+from ..numerics.peaks import peaks_of
 from ..numerics.random import key_of, normal
 from ..track import FAILED, MISSING, USED
 from .cloud import (
     EQUAL,
-    HEAD,
-    MEMBERS,
+    MAX_POINTS,
     PROCESS,
     RECOVER,
-    RECOVERIES,
     RESAMPLE,
     SETTLED,
+    SHARED,
     START,
-    cloud_of,
+    begin_lineage,
+    count_of,
+    describe,
     next_draw,
+    own_cloud,
     own_covariance,
+    score_cloud,
     sized,
     views,
     weigh_equally,
@@ -46,22 +48,29 @@ from .cloud import (
     wrap_record,
 )
 from .cloud import OPTIONS as CLOUD_OPTIONS
-from .describe import DRAWN, describe, moments, recoveries
+from .draws import any_mode, jump_key, lost_moments, nearest_mode, reset
 from .innovation import finite_rows, score_rows
-from .lineage import account, begin_lineage, score_cloud
-from .mode_draws import any_mode, jump_key, nearest_mode
-from .moments import cloud_moments
-from .rbpf_condition import adopt_block, condition_block, mixture, refer
-from .rbpf_predict import predict_block
-from .rbpf_sampling import fix_mode, sample
-from .rbpf_work import ADOPT, CONDITION, PREDICT, tune, work_size
-from .steps import NO_KEY, add_up, sweep, work_of
-from .weights import keep_or_resample, normalise, phases
+from .rbpf_blocks import (
+    ADOPT,
+    CONDITION,
+    PREDICT,
+    adopt_block,
+    condition_block,
+    drop,
+    fix_mode,
+    mixture,
+    predict_block,
+    refer,
+    sample,
+    tune,
+    work_size,
+)
+from .weights import NO_KEY, add_up, keep_or_resample, normalise, phases, sweep, work_of
 
 
 @jit
 def _spread(context, C, whole, key, member, mode, x, P, column, before):
-    """Add a draw of N(0, C) to a particle: its sampled states move, its linear ones get what is left of C."""
+    """Add a draw of N(0, C) to a particle: its sampled states move, its linear ones get the rest of C."""
     if context.mode >= 0:
         fix_mode(context, C, mode, x, column)
     sample(context, C, key, np.uint64(member * x.size), x, column, before)
@@ -73,10 +82,9 @@ def _spread(context, C, whole, key, member, mode, x, P, column, before):
 
 @jit
 def _begin(context, mean, cov, index, stream, state):
-    """The cloud that stands for N(mean, cov), of equal weights; the head's counters stay."""
-    nx = context.nx
-    n = int(numbers(context)[MEMBERS])
-    records = cloud_of(state, nx, n).records
+    """Draw a cloud of equal weights that stands for N(mean, cov); the head's counters stay."""
+    nx, n = context.nx, count_of(context)
+    records = own_cloud(context, state).records
     key = key_of(context.seed, index, stream)
     C, column, before = np.empty((nx, nx)), np.empty(nx), np.empty(nx)
     mode = 0.0
@@ -91,53 +99,40 @@ def _begin(context, mean, cov, index, stream, state):
             std = np.sqrt(cov[j, j])
             mode = nearest_mode(context, mean[j] + std * normal(jump_key(key), np.uint64(i)), mean[j], std)
         _spread(context, C, True, key, i, mode, x, own_covariance(records[i], nx), column, before)
-    weigh_equally(state, nx, n)
+    weigh_equally(context, state)
     begin_lineage(context, state)
     state[SETTLED] = 0.0
 
 
 @jit
 def start(context, mean, cov, state):
-    """Sampled states and modes drawn from N(mean, cov), and the linear ones given them: Schön et al., step 1."""
-    circular = circular_states(context)
-    for i in range(HEAD):
-        state[i] = 0.0
-    cloud = cloud_of(state, mean.size, int(numbers(context)[MEMBERS]))
-    for j in range(mean.size):
-        cloud.circular[j] = circular[j]
+    """Draw sampled states and modes from N(mean, cov), and condition the linear ones on them: Schön et al., step 1."""
+    reset(context, mean, state)
     _begin(context, mean, cov, 0, START, state)
 
 
 @jit
 def _recover(context, index, state):
-    """Widen a cloud in which no particle explains the reading, as `recover` does: any mode, twice the spread.
+    """Widen a cloud in which no particle explains the measurement, as `recover` does: any mode, twice the spread.
 
-    The sampled states move by a draw from the cloud's covariance, the linear ones get it added to theirs.
+    The sampled states move by a draw from the cloud's covariance, which adds to that of the linear ones.
     """
     nx = context.nx
-    n = int(numbers(context)[MEMBERS])
-    state[RECOVERIES] += 1.0
     mean, cov = np.empty(nx), np.empty((nx, nx))
-    cloud_moments(state, nx, n, mean, cov)
-    finite = True
-    for i in range(nx):
-        finite = finite and np.isfinite(mean[i]) and np.isfinite(cov[i, i])
-    if not finite:
+    if not lost_moments(context, state, mean, cov):
         prior = matrix(floats(context.prior_cov, nx * nx), 0, nx, nx)
         _begin(context, floats(context.prior_mean, nx), prior, index, RECOVER, state)
         return
-    records = cloud_of(state, nx, n).records
+    records = own_cloud(context, state).records
     key = key_of(context.seed, index, RECOVER)
     C, column, before = np.empty((nx, nx)), np.empty(nx), np.empty(nx)
     mode = 0.0
-    for i in range(n):
+    for i in range(records.shape[0]):
         for a in range(nx):
             for b in range(nx):
                 C[a, b] = cov[a, b]
         if context.mode >= 0:
-            for a in range(nx):
-                C[a, context.mode] = 0.0
-                C[context.mode, a] = 0.0
+            drop(C, context.mode)
             mode = any_mode(context, jump_key(key), i)
         _spread(context, C, False, key, i, mode, records[i, :nx], own_covariance(records[i], nx), column, before)
     begin_lineage(context, state)
@@ -150,7 +145,7 @@ def predict(context, u, dt, index, state, work):
 
     Source: Schön, Gustafsson & Nordlund (2005), theorem 1 and algorithm 1, step 4.
     """
-    n = int(numbers(context)[MEMBERS])
+    n = count_of(context)
     index = next_draw(state)
     sweep(PREDICT, context, u, dt, 0, u, key_of(context.seed, index, PROCESS), 0.0, state, work)
     lost = add_up(context, work)[0]
@@ -164,9 +159,9 @@ def predict(context, u, dt, index, state, work):
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """Each particle a Kalman update; w ← w N(y; h(x), H P Hᵀ + R); resampling where few carry the weight.
 
-    NIS is that of the mixture's mean and covariance, the log-likelihood the mixture's own, log Σ w N. When no particle
-    explains the reading the verdict is `FAILED`, the reading is not used, and the cloud is widened. A reading that
-    is infinite fails alone.
+    NIS is that of the mixture's mean and covariance, the log-likelihood the mixture's own, log Σ w N. If no particle
+    explains the measurement the verdict is `FAILED`, the measurement is not used, and the cloud is widened. An infinite
+    measurement fails without widening.
     """
     rows = sensor_variances(context, sensor).size
     if finite_rows(y, rows) == 0:
@@ -199,22 +194,17 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
 
 
 def points(options: Options, state: np.ndarray, nx: int) -> np.ndarray:
-    """Draws of the mixture (`DRAWN`, nx): particles picked by weight at even steps, and one of each's Gaussian."""
+    """Return draws of the mixture (`MAX_POINTS`, nx): particles picked by weight at even steps, one draw from each."""
     w, records = weights_of(options, state, nx)
-    picked = np.minimum(np.searchsorted(np.cumsum(w), (np.arange(DRAWN) + 0.5) / DRAWN), len(w) - 1)
-    P = records[picked, nx:].reshape(DRAWN, nx, nx)
+    picked = np.minimum(np.searchsorted(np.cumsum(w), (np.arange(MAX_POINTS) + 0.5) / MAX_POINTS), len(w) - 1)
+    P = records[picked, nx:].reshape(MAX_POINTS, nx, nx)
     values, vectors = np.linalg.eigh(np.where(np.isfinite(P), P, 0.0))
-    z = np.sqrt(np.maximum(values, 0.0)) * np.random.default_rng(0).standard_normal((DRAWN, nx))
+    z = np.sqrt(np.maximum(values, 0.0)) * np.random.default_rng(0).standard_normal((MAX_POINTS, nx))
     return np.asarray(records[picked, :nx] + np.einsum("kij,kj->ki", vectors, z))
 
 
-def peaks(options: Options, state: np.ndarray, nx: int) -> list[Peak]:
-    """The peaks of the mixture."""
-    return peaks_of(points(options, state, nx), views(options, state, nx).circular != 0.0)
-
-
 def applies(model: StateSpaceModel) -> str | None:
-    """Only a model that says what is linear, or has a mode, leaves something to a Kalman filter a particle."""
+    """Return why a model without linear states or with a sensor's own likelihood does not fit; None if it does."""
     if not len(model.linear_states):
         return (
             f"rbpf needs states that are linear once the others are known; {model.name} names none in "
@@ -228,10 +218,10 @@ def applies(model: StateSpaceModel) -> str | None:
 
 OPTIONS = (Option("particles", 500, 2, 1e6, "", "number of particles, each with a Kalman filter"), *CLOUD_OPTIONS[1:])
 
+
 RBPF = Estimator(
     name="rbpf",
     title="Rao-Blackwellised particle filter",
-    family="particle",
     assumes="f and h linear in the states of conditionally_linear given the others and the mode; Gaussian noise",
     model_runs="2 N, and the derivatives of f and h",
     fails_when="a jump or a sampled state that the readings demand is so unlikely that no particle tries it",
@@ -240,13 +230,17 @@ RBPF = Estimator(
     runs=lambda options, nx: options["particles"] * (nx + 1),
     state_size=sized(lambda nx: nx + nx * nx),
     work_size=work_size,
-    moments=moments,
-    points=points,
-    peaks=peaks,
-    recoveries=recoveries,
-    account=account,
-    options=OPTIONS,
-    tune=tune,
     prepare=phases(predict_block, condition_block, adopt_block),
     applies=applies,
+    **(
+        SHARED
+        | {
+            "points": points,
+            "peaks": lambda options, state, nx: peaks_of(
+                points(options, state, nx), views(options, state, nx).circular != 0.0
+            ),
+            "options": OPTIONS,
+            "tune": tune,
+        }
+    ),
 )

@@ -2,8 +2,8 @@
 
 All are unbiased, E[children of i] = N w_i. Systematic and stratified put one point into each of N equal strata of the
 cumulated weights (the same place in each, or a place of its own); residual gives ⌊N w_i⌋ and draws the rest;
-multinomial draws all. Stratified and residual never vary more than multinomial; systematic is the cheapest and mostly
-varies least, but in contrived orders can be the worst.
+multinomial draws all. Stratified and residual never vary more than multinomial; systematic is the cheapest and usually
+varies least, but can be the worst for contrived orders.
 
 Source: Douc & Cappé (2005), Comparison of resampling schemes for particle filtering, doi:10.1109/ISPA.2005.195385.
 """
@@ -17,12 +17,13 @@ from ..numerics.random import unit, word
 
 SYSTEMATIC, STRATIFIED, RESIDUAL, MULTINOMIAL = range(4)
 
+
 SCHEME_NAMES = ("systematic", "stratified", "residual", "multinomial")
 
 
 @jit
 def points_below(scheme, key, t):
-    """How many of the points k + u_k, k = 0 … N-1, lie below t; u_k is one number or a stratum's own."""
+    """Return how many of the points k + u_k, k = 0 … N-1, lie below t; u_k is one number or a stratum's own."""
     k = np.floor(t)
     place = np.uint64(0) if scheme == SYSTEMATIC else np.uint64(k)
     return k + 1.0 if unit(word(key, place)) < t - k else k
@@ -33,8 +34,8 @@ def strata_children(scheme, key, w, before, after, scale, children):
     """Fill `children` of the members whose weights are `w` by systematic or stratified resampling.
 
     The members are a run out of N. `before` and `after` are the cumulated weights at its ends in units of points (0 to
-    exactly N), which its neighbours see with the same bits, and `scale` turns a weight into points. So runs can be
-    done in any order, on any number of threads.
+    exactly N), the same bits as in the neighbouring runs, and `scale` turns a weight into points. So runs can be done
+    in any order, on any number of threads.
     """
     below = points_below(scheme, key, before)
     cumulated = before
@@ -92,9 +93,9 @@ def drawn_children(scheme, key, w, total, children):
 def ancestors_of(children, ancestors):
     """Fill `ancestors` (N,) int64 with each child's parent: siblings side by side, families in the members' order.
 
-    In this order members close to each other descend from close ones, so that the strata of the next systematic or
-    stratified resampling go on dividing the cloud evenly; with children wherever there is room these two schemes lose
-    most of what they gain over multinomial resampling.
+    In this order neighbouring members descend from neighbours, so that the strata of the next systematic or stratified
+    resampling keep dividing the cloud evenly; with children wherever there is room these two schemes lose most of their
+    advantage over multinomial resampling.
     """
     n = ancestors.size
     k = 0
@@ -119,8 +120,8 @@ def ancestors_of(children, ancestors):
 def take_ancestors(ancestors, rows):
     """Replace each row (N, k) by its ancestor's, in place; `ancestors` (N,) never falls.
 
-    Ancestors from further on are taken from the front, those from further back from the end: since they never fall,
-    none is overwritten before its last child has it, neither within a pass nor by the other.
+    Later ancestors are copied from the front, earlier ones from the end: since ancestors never fall, none is
+    overwritten before its last child is copied, neither within a pass nor by the other.
     """
     n, width = rows.shape
     flat = rows.reshape(n * width)

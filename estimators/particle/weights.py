@@ -1,42 +1,206 @@
-"""Weights: normalised, kept, and particles drawn by them.
+"""Steps over all particles, block by block, and their weights: normalised, kept, or resampled.
 
-The joint log weights of a reading, log w + log p(y | x), stand in the workspace with their sums; here they become the
-state's, or children of equal weight.
+A step is a phase: a function of one block, which `sweep` runs over all of them on one thread or several; the sums that
+it leaves in each block are added up in order afterwards. Phases are called through their addresses, which `prepare`
+lays down, so each is compiled once and not again into every function that sweeps. Randomness is keyed by the member, so
+the bits are the same on any number of threads.
+
+The joint log weights of a measurement, log w + log p(y | x), stand in the workspace with their sums; here they become
+the state's, or children of equal weight.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba import prange, types
 
+from ..compiled.context import context_at, context_type, place_of
 from ..compiled.context import options as numbers
 from ..estimator import Options
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import address, jit
+from ..numerics.jit import F1, address, caller, f64, i64, ints, jit
 from ..numerics.vectors import exp_minus
-from .cloud import EQUAL, ESS, FRACTION, MEMBERS, RESAMPLED, SCHEME, SETTLED, cloud_of, weigh_equally
-from .lineage import count_origins, inherit
-from .moments import add_members, finish_moments
+from ..numerics.workspace import (
+    declare_layout,
+    layout,
+    size_of,
+    start_of,
+    take_integers,
+    take_matrix,
+    take_vector,
+)
+from .cloud import (
+    BLOCK,
+    CHUNK,
+    EQUAL,
+    ESS,
+    FRACTION,
+    RESAMPLED,
+    SCHEME,
+    SETTLED,
+    THREADS,
+    add_members,
+    clear_sums,
+    count_of,
+    count_origins,
+    finish_moments,
+    inherit,
+    members,
+    own_cloud,
+    sums_size,
+    weigh_equally,
+)
 from .resampling import STRATIFIED, ancestors_of, drawn_children, strata_children, take_ancestors
-from .steps import NO_KEY, add_up, block_of, block_signature, range_of, sweep, work_of
 
 NORMALISE, CHILDREN, COMMIT, OWN = range(4)
-"""Places of the phases below among those that `prepare` lays down; a filter's own follow."""
+"""Places of the phases below among those that `prepare` lays down; a filter's own phases follow."""
+
+NO_KEY = np.uint64(0)
+"""For phases that draw nothing."""
+
+block_signature = types.void(context_type, F1, f64, i64, F1, types.uint64, f64, F1, F1, i64)
+"""phase(context, u, dt, sensor, y, key, value, state, work, number of the block): each gets all, needed or not."""
+
+call_block = caller(block_signature)
+
+
+class Work(NamedTuple):
+    """Scratch that all blocks share.
+
+    Weights w (N,), joint log weights (N,), the sums, a root L (nx, nx) and room for it, the covariance S of the
+    predicted measurement and its factor U (ny, ny), the innovation nu (ny,), the state from which deviations count
+    (nx,), and the points at which the blocks' strata begin. `ancestors` (N,), int64s, take the place of the weights
+    once particles are drawn by these. `blocks` is where the blocks' own parts start.
+    """
+
+    w: Any
+    ancestors: Any
+    joint: Any
+    sums: Any
+    L: Any
+    spare: Any
+    S: Any
+    U: Any
+    nu: Any
+    reference: Any
+    strata: Any
+    blocks: int
+    end: int
+
+
+Block, block_at = declare_layout("Block", "nx, ny", sums_size, sums="sums_size(nx, ny)", D=f"max(nx, ny) + 2, {CHUNK}")
+"""A block's own scratch: its sums, and the deviations of a chunk of members."""
+
+
+@layout
+def blocks_of(n):
+    """Return the number of blocks of n members."""
+    return (n + BLOCK - 1) // BLOCK
+
+
+@layout
+def work_at(at, nx, ny, n):
+    """Lay the scratch of a cloud out; a filter's own follows."""
+    ancestors, _ = take_integers(at, n)
+    w, at = take_vector(at, n)
+    joint, at = take_vector(at, n)
+    sums, at = take_vector(at, sums_size(nx, ny))
+    L, at = take_matrix(at, nx, nx)
+    spare, at = take_matrix(at, nx, nx)
+    S, at = take_matrix(at, ny, ny)
+    U, at = take_matrix(at, ny, ny)
+    nu, at = take_vector(at, ny)
+    reference, at = take_vector(at, nx)
+    strata, at = take_vector(at, blocks_of(n))
+    end = at + blocks_of(n) * block_at(0, nx, ny).end
+    return Work(w, ancestors, joint, sums, L, spare, S, U, nu, reference, strata, at, end)
+
+
+@jit
+def work_of(context, work):
+    """Return the shared part of a filter's scratch."""
+    return work_at(start_of(work), context.nx, context.width, count_of(context))
+
+
+@jit
+def block_of(context, shared, b):
+    """Return the scratch of block b."""
+    nx, ny = context.nx, context.width
+    return block_at(shared.blocks + b * block_at(0, nx, ny).end, nx, ny)
+
+
+def work_sized(
+    room_at: Callable[..., Any], own: Callable[[int], int] = lambda nx: 0
+) -> Callable[[Options, int, int], int]:
+    """Return the `work_size` of a filter: the cloud's scratch, `own(nx)` numbers a member, a room for each block."""
+
+    def size(options: Options, nx: int, ny: int) -> int:
+        n = members(options)
+        return size_of(work_at, nx, ny, n) + n * own(nx) + blocks_of(n) * size_of(room_at, nx, ny)
+
+    return size
+
+
+@jit
+def members_own(context, shared, width):
+    """Return the filter's own numbers of each member (N, width), and the address behind them: of the blocks' rooms."""
+    return take_matrix(shared.end, count_of(context), width)
+
+
+@jit
+def range_of(b, n):
+    """Return the first member of block b, and the one after its last."""
+    return b * BLOCK, min(n, (b + 1) * BLOCK)
+
+
+@jit(parallel=True)
+def _on_threads(code, context, u, dt, sensor, y, key, value, state, work, blocks):
+    place = place_of(context)
+    for b in prange(blocks):
+        call_block(code, context_at(place), u, dt, sensor, y, key, value, state, work, b)
+
+
+@jit
+def sweep(phase, context, u, dt, sensor, y, key, value, state, work):
+    """Run a phase, given by its place among those of `prepare`, over all blocks."""
+    blocks = blocks_of(count_of(context))
+    code = ints(context.prepared, context.n_prepared)[phase]
+    if numbers(context)[THREADS] != 0.0:
+        _on_threads(code, context, u, dt, sensor, y, key, value, state, work, blocks)
+    else:
+        for b in range(blocks):
+            call_block(code, context, u, dt, sensor, y, key, value, state, work, b)
+
+
+@jit
+def add_up(context, work):
+    """Add up the blocks' sums of the last phase, in their order; keep the highest maximum with its member."""
+    shared = work_of(context, work)
+    sums = shared.sums
+    clear_sums(sums)
+    for b in range(blocks_of(count_of(context))):
+        own = block_of(context, shared, b).sums
+        for k in range(sums.size):
+            if k != 2 and k != 3:
+                sums[k] += own[k]
+        if own[2] > sums[2]:
+            sums[2] = own[2]
+            sums[3] = own[3]
+    return sums
 
 
 @jit
 def normalise_block(context, u, dt, sensor, y, key, value, state, work, number):
     """w = exp(joint - value), and the sums of the cloud's moments, about the reference."""
-    n = int(numbers(context)[MEMBERS])
-    shared, cloud = work_of(context, work), cloud_of(state, context.nx, n)
+    shared, cloud = work_of(context, work), own_cloud(context, state)
     block = block_of(context, shared, number)
-    first, last = range_of(number, n)
+    first, last = range_of(number, cloud.log_w.size)
     w = shared.w[first:last]
-    for k in range(block.sums.size):
-        block.sums[k] = 0.0
+    clear_sums(block.sums)
     exp_minus(w.size, shared.joint[first:], value, w)
     add_members(cloud.circular, w, cloud.records[first:last], shared.reference, block.D, block.sums)
 
@@ -44,7 +208,7 @@ def normalise_block(context, u, dt, sensor, y, key, value, state, work, number):
 @jit
 def children_block(context, u, dt, sensor, y, key, value, state, work, number):
     """Children of the members by systematic or stratified resampling; `value` turns a weight into points."""
-    n = int(numbers(context)[MEMBERS])
+    n = count_of(context)
     shared = work_of(context, work)
     first, last = range_of(number, n)
     after = n if last == n else shared.strata[number + 1]
@@ -57,15 +221,14 @@ def children_block(context, u, dt, sensor, y, key, value, state, work, number):
 @jit
 def commit_block(context, u, dt, sensor, y, key, value, state, work, number):
     """log w = joint - value."""
-    n = int(numbers(context)[MEMBERS])
-    joint, log_w = work_of(context, work).joint, cloud_of(state, context.nx, n).log_w
-    first, last = range_of(number, n)
+    joint, log_w = work_of(context, work).joint, own_cloud(context, state).log_w
+    first, last = range_of(number, log_w.size)
     for i in range(first, last):
         log_w[i] = joint[i] - value
 
 
 def phases(*own: Any) -> Callable[[StateSpaceModel, Options], np.ndarray]:
-    """`prepare` of a filter with these phases of its own, numbered from `OWN` on: where their machine code starts."""
+    """Return `prepare` of a filter with these phases of its own, numbered from `OWN` on: their addresses."""
 
     @lru_cache(maxsize=1)
     def codes() -> np.ndarray:
@@ -77,18 +240,17 @@ def phases(*own: Any) -> Callable[[StateSpaceModel, Options], np.ndarray]:
 
 @jit
 def normalise(context, state, work):
-    """Weights, moments and effective sample size from the joint log weights, whose maximum stands in the sums.
+    """Fill weights, moments and effective sample size from the joint log weights, whose maximum is in the sums.
 
     Returns:
-        log Σ exp(joint), the reading's log-likelihood; -inf if no particle explains it.
+        log Σ exp(joint), the measurement's log-likelihood; -inf if no particle explains it.
     """
-    nx = context.nx
     shared = work_of(context, work)
     top = shared.sums[2]
     if not top > -np.inf:
         return -np.inf
-    heaviest = cloud_of(state, nx, int(numbers(context)[MEMBERS])).records[int(shared.sums[3])]
-    for j in range(nx):
+    heaviest = own_cloud(context, state).records[int(shared.sums[3])]
+    for j in range(context.nx):
         shared.reference[j] = heaviest[j]
     _over_weights(NORMALISE, context, NO_KEY, top, state, work)
     sums = add_up(context, work)
@@ -97,19 +259,19 @@ def normalise(context, state, work):
 
 @jit
 def _over_weights(phase, context, key, value, state, work):
-    """A phase that looks at neither inputs nor reading."""
+    """Run a phase that reads neither inputs nor measurement."""
     sweep(phase, context, state, 0.0, 0, state, key, value, state, work)
 
 
 @jit
 def _settle(context, state, work):
-    """Mean, covariance and effective sample size, 1 / Σ w², of the weights of `normalise`; a reading has been used.
+    """Fill mean, covariance and effective sample size, 1 / Σ w², of the weights of `normalise`.
 
     Source: Kong, Liu & Wong (1994), Sequential imputations, doi:10.1080/01621459.1994.10476469.
     """
     shared = work_of(context, work)
     sums = shared.sums
-    cloud = cloud_of(state, context.nx, int(numbers(context)[MEMBERS]))
+    cloud = own_cloud(context, state)
     finish_moments(cloud.circular, sums, shared.reference, cloud.mean, cloud.cov)
     state[SETTLED] = 1.0
     state[ESS] = sums[0] * sums[0] / sums[1]
@@ -126,17 +288,19 @@ def keep(context, log_sum, state, work):
 
 @jit
 def keep_or_resample(context, key, log_sum, state, work):
-    """Make mean and covariance of the weights of `normalise` the state's, and the weights, or particles drawn by them.
+    """Make the moments of the weights of `normalise` the state's, and the weights, or particles drawn by them.
 
-    They are drawn when the effective sample size has fallen under its part of N.
+    Particles are drawn when the effective sample size is below its fraction of N.
 
     Returns:
         Whether they were.
     """
     sums = work_of(context, work).sums
-    if sums[0] * sums[0] / sums[1] < numbers(context)[FRACTION] * numbers(context)[MEMBERS]:
+    if sums[0] * sums[0] / sums[1] < numbers(context)[FRACTION] * count_of(context):
         _settle(context, state, work)
+        effective = state[ESS]
         resample(context, key, state, work)
+        state[ESS] = effective
         return True
     keep(context, log_sum, state, work)
     return False
@@ -144,8 +308,8 @@ def keep_or_resample(context, key, log_sum, state, work):
 
 @jit
 def children_of(context, key, state, work):
-    """Number of children of each particle for the weights of `normalise`, (N,), in the place of the joint weights."""
-    n = int(numbers(context)[MEMBERS])
+    """Return the number of children of each particle (N,), in the place of the joint weights."""
+    n = count_of(context)
     shared = work_of(context, work)
     whole = shared.sums[0]
     scheme = int(numbers(context)[SCHEME])
@@ -163,15 +327,11 @@ def children_of(context, key, state, work):
 
 @jit
 def resample(context, key, state, work):
-    """Let each particle of the weights of `normalise` have its children, of equal weight, siblings side by side."""
-    nx = context.nx
-    n = int(numbers(context)[MEMBERS])
+    """Replace the particles by children drawn by the weights of `normalise`, siblings side by side, weights equal."""
     children = children_of(context, key, state, work)
     ancestors = work_of(context, work).ancestors
     ancestors_of(children, ancestors)
-    take_ancestors(ancestors, cloud_of(state, nx, n).records)
+    take_ancestors(ancestors, own_cloud(context, state).records)
     inherit(context, ancestors, state)
-    effective = state[ESS]
-    weigh_equally(state, nx, n)
-    state[ESS] = effective
+    weigh_equally(context, state)
     state[RESAMPLED] += 1.0

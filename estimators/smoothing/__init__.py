@@ -1,1 +1,1 @@
-"""What the readings of a whole log say of each moment of it: a backward pass over what a fold did."""
+"""Smoothing: a backward pass over a fold, which conditions every estimate on the whole log."""

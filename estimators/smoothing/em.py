@@ -1,4 +1,4 @@
-"""Q and R by expectation and maximisation: what noise the smoothed states and readings show, over and over.
+"""Q and R by expectation and maximisation: the noise that smoothed states and measurements show, iterated.
 
 With w = x' - f(x) of each step between events and all moments those of the smoothed states,
 
@@ -6,9 +6,9 @@ With w = x' - f(x) of each step between events and all moments those of the smoo
     qⱼ ← qⱼ Σ tr(Q⁻¹ Sⱼ Q⁻¹ E[w wᵀ]) / Σ tr(Q⁻¹ Sⱼ),    Q = Σ qⱼ Sⱼ
     r ← mean of (y - h(x))² + H P Hᵀ
 
-Of a linear model each round raises the likelihood of the readings, until it is at a maximum. Rounds are many where a
-noise hides behind another, so that each pair of them is followed further than it led. It is a second way to the values
-that maximise the likelihood.
+For a linear model each round raises the likelihood of the measurements until it reaches a maximum. Convergence is slow
+where one noise masks another, so each pair of rounds is extrapolated. EM reaches the same maximum likelihood estimate
+as a direct search.
 
 Sources: Shumway & Stoffer (1982), doi:10.1111/j.1467-9892.1982.tb00349.x; Särkkä, Bayesian Filtering and Smoothing
 (2013), 12.3.
@@ -42,21 +42,21 @@ from ..numerics.linalg import root, wrap
 from ..track import USED
 from ..tuning import Tuning
 from .moments_back import MomentsBack
-from .recorder import MEMBERS, solve_semidefinite
+from .notes import solve_semidefinite
+from .recorder import MEMBERS
 from .smooth import KINDS, check_smooth
-from .smoothed import Smoothed
-from .walk import Walk
+from .walk import Smoothed, Walk
 
-FURTHEST = 5.0
-"""By how much a logarithm of a variance may be guessed ahead."""
+MAX_EXTRAPOLATION = 5.0
+"""Largest extrapolation of the logarithm of a variance."""
 
 
-class Fitted(NamedTuple):
-    """The tuning that was found; the log-likelihood at first and after each pair of rounds; whether it had settled."""
+class EmFit(NamedTuple):
+    """The fitted tuning; the log-likelihood at the start and after each pair of rounds; whether it has converged."""
 
     tuning: Tuning
     log_likelihood: np.ndarray
-    settled: bool
+    converged: bool
 
 
 def em(
@@ -68,20 +68,21 @@ def em(
     noises: tuple[str, ...] | None = None,
     rounds: int = 200,
     tolerance: float = 1e-5,
-) -> Fitted:
+) -> EmFit:
     """Fit the process noises and the variances of the sensors' rows to a log.
 
     Args:
         estimator: A Gaussian filter that can be smoothed.
         model: The model; its Q must be linear in the noises.
-        tuning: Where to begin. A noise or a variance of zero stays zero; so does one of a sensor that is not used.
-        log: What the asset said.
-        noises: Process noises that are fitted; None for all. The variances of rows always are.
-        rounds: Pairs of rounds, at most.
-        tolerance: Largest relative change of a variance in a round after which it has settled.
+        tuning: Start of the iteration. A noise or a variance of zero stays zero; so does one of a sensor that is not
+        used.
+        log: The events.
+        noises: Process noises to fit; None for all. The variances of rows are always fitted.
+        rounds: Largest number of pairs of rounds.
+        tolerance: Largest relative change of a variance in a round that counts as converged.
 
     Raises:
-        EstimatorError: If the filter or the model is none for it.
+        EstimatorError: If filter or model do not meet the assumptions.
     """
     fold = _folded(estimator, model, tuning, log)
     _check(fold)
@@ -100,20 +101,20 @@ def em(
         return np.where(found > 0.0, np.log(np.where(found > 0.0, found, 1.0)), logs)
 
     logs = np.log(begin[moving])
-    told, settled = [_likelihood(fold)], False
-    while not settled and len(told) <= rounds:
+    likelihoods, converged = [_likelihood(fold)], False
+    while not converged and len(likelihoods) <= rounds:
         first = onward(fold, logs)
         second = onward(at(first), first)
-        settled = bool(np.all(np.abs(second - first) < tolerance))
+        converged = bool(np.all(np.abs(second - first) < tolerance))
         logs, fold = _better(logs, first, second, at)
-        told.append(_likelihood(fold))
-    return Fitted(fold.tuning, np.array(told), settled)
+        likelihoods.append(_likelihood(fold))
+    return EmFit(fold.tuning, np.array(likelihoods), converged)
 
 
 def _better(
     logs: np.ndarray, first: np.ndarray, second: np.ndarray, at: Callable[[np.ndarray], Fold]
 ) -> tuple[np.ndarray, Fold]:
-    """Where two rounds lead if they go on so, unless that is worse than where they have led.
+    """Return the extrapolation of two rounds, unless it lowers the likelihood; else their result.
 
     Source: Varadhan & Roland (2008), doi:10.1111/j.1467-9469.2007.00585.x, SqS3.
     """
@@ -125,7 +126,7 @@ def _better(
     if length <= 1.0:
         return second, fold
     guess = logs + 2.0 * length * by + length**2 * bend
-    if np.all(np.abs(guess - second) < FURTHEST):
+    if np.all(np.abs(guess - second) < MAX_EXTRAPOLATION):
         beyond = at(guess)
         if _likelihood(beyond) >= _likelihood(fold):
             return guess, beyond
@@ -144,7 +145,7 @@ def _likelihood(fold: Fold) -> float:
 
 
 def _check(fold: Fold) -> None:
-    """Refuse what the equations are not for."""
+    """Refuse a filter or a model for which the equations do not hold."""
     name, model = fold.estimator.name, fold.model
     check_smooth(fold.estimator, model, fold.options)
     if name not in KINDS or KINDS[name].holds == MEMBERS:
@@ -163,7 +164,7 @@ def _check(fold: Fold) -> None:
 
 
 def _round(fold: Fold) -> tuple[np.ndarray, np.ndarray]:
-    """q (nw,) and r (rows,) as the smoothed states and readings have them; NaN where nothing tells."""
+    """Return q (nw,) and r (rows,) from the smoothed states and measurements; NaN without information."""
     model, log, n = fold.model, fold.log, fold.model.nx
     lag = np.empty((fold.n, n, n))
     out = Smoothed.room_for(fold)
@@ -186,7 +187,7 @@ def _round(fold: Fold) -> tuple[np.ndarray, np.ndarray]:
 
 @jit
 def shapes(context, x, u, dt, S, scratch):
-    """Sⱼ (nx, nx) of each noise: what Q is when its variance is 1 and all others are 0."""
+    """Fill Sⱼ (nx, nx) for each noise: Q for a variance of 1, with all others 0."""
     q = process_variances(context)
     kept = q.copy()
     for j in range(q.size):
@@ -244,7 +245,7 @@ def gather(
 
 @jit
 def add_step(context, x, P, ahead, P_ahead, L, u, dt, jacobian, scratch, over_q):
-    """Add one step's tr(Q⁻¹ Sⱼ Q⁻¹ E[w wᵀ]) and tr(Q⁻¹ Sⱼ); of a step that the model takes in parts, over all."""
+    """Add one step's tr(Q⁻¹ Sⱼ Q⁻¹ E[w wᵀ]) and tr(Q⁻¹ Sⱼ), over all sub-steps of the model."""
     n = x.size
     nw = over_q.shape[1]
     S, T = np.zeros((nw, n, n)), np.empty((nw, n, n))

@@ -1,18 +1,165 @@
-"""Back over a fold by means and covariances: the Rauch-Tung-Striebel smoother, in the form of recorder.py."""
+"""Go back over a fold by means and covariances: the Rauch-Tung-Striebel smoother over the notes of a recorder.
+
+A query between two events has a note of its own, from its answer to the later of the two, and does not change the way
+back.
+
+Sources: Rauch, Tung & Striebel (1965), doi:10.2514/3.3166; Särkkä, Bayesian Filtering and Smoothing (2013), theorems
+8.2 and 9.1.
+"""
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any, NamedTuple
 
+import numpy as np
+from numba import types
+
+from ..compiled.context import context_type, shown_states
+from ..estimator import code_type, describe_signature, predict_signature, start_signature, update_signature
 from ..fold import Fold
-from ..log import RESET
+from ..fold_kernel import advance_to, asks
+from ..interpreted.fold_loop import UNSET
+from ..log import INPUT, RESET
+from ..numerics.jit import B1, F1, F2, I1, i64, inlined, ints, jit
 from ..numerics.workspace import size_of
 from ..snapshots import Snapshot
-from .backward import NOWHERE, Moments, backward, note_queries, step_back, tell
-from .jumps import changed, widened
-from .recorder import MEMBERS, Kind, Recorder, step
-from .smoothed import Smoothed
-from .walk import QUERIES, Jump, Stretch
+from .notes import STAYED, Step, changed, copy, cut, join_moments, step_at, step_back, step_layout, widened
+from .recorder import MEMBERS, ROW, Kind, Recorder, covariance_of, describe, head_of, predict, start, update
+from .walk import QUERIES, Jump, Smoothed, Stretch
+
+HERE = 3
+"""Kind of a query's note: asked at the time of the state before it. STAYED: at that of the next event."""
+
+
+NOWHERE = -(2**63)
+"""In place of the time of the event after a query: there is none, or its state is unrelated."""
+
+
+class Moments(NamedTuple):
+    """A mean (n,) and a covariance (n, n)."""
+
+    x: Any
+    P: Any
+
+
+@inlined
+def note_query(code, context, row, t, clock, following, u, holds, state, work, tape, own):
+    """Note the step from the answer to a query to the time of the event after it."""
+    n = context.nx
+    note = step_at(tape, row, n, own)
+    if t == clock:
+        note.kind[0] = HERE
+    elif following == NOWHERE:
+        x, P = np.empty(n), np.empty((n, n))
+        covariance_of(context, note.state, holds, x, P)
+        cut(note, x, P)
+    else:
+        note.kind[0] = STAYED
+        if t < following:
+            for j in range(own):
+                state[j] = note.state[j]
+            head = head_of(state)
+            head[ROW] = row
+            advance_to(code, context, u, t, following, row, state, work)
+
+
+@jit
+def note_queries(code, context, first, t, kind, value, clock, u, after, holds, state, work, tape, own):
+    """Note for each query among events the step from its answer to the next event that is no query.
+
+    Args:
+        code: The recorder's functions.
+        context: The context.
+        first: The row of the tape of the first event.
+        t: Times of the events (N,), ns.
+        kind: Their kinds (N,).
+        value: Their values.
+        clock: Time of the state before the first, ns.
+        u: Inputs before the first (nu,); changed.
+        after: Time of the first later event that is no query, or NOWHERE.
+        holds: Form of the covariance: COVARIANCE, FACTOR, MEMBERS.
+        state: A recorder's state; changed.
+        work: Scratch of the filter.
+        tape: Address of the tape.
+        own: Length of the filter's state.
+    """
+    n = t.size
+    if clock == UNSET and n > 0:
+        clock = t[0]
+    following = after
+    ahead = -1
+    for i in range(n):
+        if asks(kind[i]):
+            if ahead < i:
+                ahead = i
+                while ahead < n and asks(kind[ahead]):
+                    ahead += 1
+                following = after
+                if ahead < n:
+                    following = t[ahead] if kind[ahead] != RESET else NOWHERE
+            note_query(code, context, first + i, t[i], clock, following, u, holds, state, work, tape, own)
+            continue
+        clock = t[i]
+        if kind[i] == INPUT:
+            for j in range(u.size):
+                if np.isfinite(value[i, j]):
+                    u[j] = value[i, j]
+
+
+@jit
+def tell(context, x, P, mean, std, cross):
+    """Fill mean, standard deviation and the configured covariances of a row of the track."""
+    shown = shown_states(context)
+    for k in range(mean.size):
+        i = shown[k]
+        mean[k] = x[i]
+        std[k] = np.sqrt(P[i, i]) if P[i, i] >= 0.0 else np.nan
+    pairs = ints(context.pairs, 2 * context.n_pairs)
+    for k in range(cross.size):
+        cross[k] = P[pairs[2 * k], pairs[2 * k + 1]]
+
+
+@jit
+def backward(context, first, kind, tape, own, earlier, later, work, mean, std, cross, lag):
+    """Fill the rows of N events from the last to the first.
+
+    Args:
+        context: The context.
+        first: The row of the tape of the first event.
+        kind: The events' kinds (N,).
+        tape: Address of the tape.
+        own: Length of the filter's state.
+        earlier: The smoothed state after the last event that is no query; on return before the first.
+        later: That of the first later event that is no query; on return of the first of these.
+        work: Scratch, three times `earlier`.
+        mean: (N, shown).
+        std: (N, shown).
+        cross: (N, pairs).
+        lag: (N, nx, nx), or (0, nx, nx) for none: for each event that is no query the covariance of the smoothed states
+            before and after it; NaN where no step relates them.
+    """
+    n = context.nx
+    T, S, Q = work[0], work[1], work[2]
+    x = np.empty(n)
+    for i in range(kind.size - 1, -1, -1):
+        note = step_at(tape, first + i, n, own)
+        if asks(kind[i]):
+            if note.kind[0] == HERE:
+                tell(context, earlier.x, earlier.P, mean[i], std[i], cross[i])
+            else:
+                for j in range(n):
+                    x[j] = later.x[j]
+                copy(later.P, Q)
+                step_back(context, note, x, Q, T, S)
+                tell(context, x, Q, mean[i], std[i], cross[i])
+            continue
+        tell(context, earlier.x, earlier.P, mean[i], std[i], cross[i])
+        for j in range(n):
+            later.x[j] = earlier.x[j]
+        copy(earlier.P, later.P)
+        if lag.shape[0] > 0:
+            join_moments(note, earlier.P, lag[i])
+        step_back(context, note, earlier.x, earlier.P, T, S)
 
 
 class MomentsBack:
@@ -24,7 +171,7 @@ class MomentsBack:
         self._log, self._machine, self._kind, self._out = fold.log, fold.machine, kind, out
         self._members = int(fold.options["members"]) if kind.holds == MEMBERS else 0
         self._nx, self._own = n, fold.machine.fresh().state.size
-        self.each = 8 * size_of(step, n, self._own)
+        self.each = 8 * size_of(step_layout, n, self._own)
         self._scratch = np.empty((3, n, n))
         self._earlier = Moments(*fold.moments())
         self._later = Moments(np.empty(n), np.empty((n, n)))
@@ -71,3 +218,23 @@ class MomentsBack:
             note = widened(jump.mean, jump.cov, jump.added)
             step_back(context, note, *self._earlier, *self._scratch[:2])
             self._after = NOWHERE
+
+
+_F3 = types.Array(types.float64, 3, "C")
+_moments = types.NamedTuple((F1, F2), Moments)
+
+
+_step = types.NamedTuple((F1, F1, F1, F2, F2, F1, i64), Step)
+
+
+PIECES: tuple[tuple[Any, tuple[Any, ...]], ...] = (
+    (predict, predict_signature.args),
+    (start, start_signature.args),
+    (update, update_signature.args),
+    (describe, describe_signature.args),
+    (backward, (context_type, i64, B1, i64, i64, _moments, _moments, _F3, F2, F2, F2, _F3)),
+    (note_queries, (code_type, context_type, i64, I1, B1, F2, i64, F1, i64, i64, F1, F1, i64, i64)),
+    (step_back, (context_type, _step, F1, F2, F2, F2)),
+    (tell, (context_type, F1, F2, F1, F1, F1)),
+)
+"""Functions that smoothing compiles and the types of their arguments, slowest first; see estimators/pieces.py."""

@@ -1,16 +1,14 @@
-"""A filter that notes what it does: around the four functions of a Gaussian or ensemble filter, for the fold's loop.
+"""A filter that notes its steps: wraps the four functions of a Gaussian or ensemble filter, for the fold's loop.
 
-For each event it notes how the state that the event found hangs together with what came of it. If x is the state
-before and x⁻ its prediction, then given all readings up to x
+For each event it writes a `Step` (notes.py) to a tape. The covariance of a state and its prediction, C = Cov(x, x⁻),
+follows the rule with which the filter predicts: C = P Fᵀ with a tangent, the weighted sum over the points with sigma
+points, C = w·spread Σ U[k]ᵀ (D₊ₖ - D₋ₖ) with the deviations D± of opposite points' images, and the sample covariance of
+members.
 
-    x | x⁻ ~ N(m + G (x⁻ - m⁻), M),     G = C (P⁻)⁻¹,     M = P - C (P⁻)⁻¹ Cᵀ,     C = Cov(x, x⁻)
+The state of the recorder is that of the filter followed by the address of its head, so it can be copied for a query.
 
-whatever the readings after it say, which speak of x⁻ alone. So an update, its gate, its weights, its iterations need
-not be known. Steps within one event are joined: G ← G g, M ← M + G m Gᵀ.
-
-The state of the recorder is that of the filter and, behind it, where its notes are; so it can be copied, for a query.
-
-Source: Särkkä, Bayesian Filtering and Smoothing (2013), theorems 8.2 and 9.1.
+Sources: Rauch, Tung & Striebel (1965), doi:10.2514/3.3166; Särkkä (2008), doi:10.1109/TAC.2008.919531, for sigma
+points.
 """
 
 from __future__ import annotations
@@ -19,7 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..compiled.context import options
+from ..compiled.context import circular_states, options, transition_points
+from ..compiled.jacobians import scratch_size, state_jacobian
 from ..ensemble.shared import SIZE, column_mean, ensemble
 from ..estimator import (
     Code,
@@ -33,121 +32,100 @@ from ..estimator import (
     update_signature,
 )
 from ..gaussian.shared import moments_of
+from ..gaussian.ukf import deviations, weights_of
 from ..numerics.jit import address, floats, inlined, ints, jit
 from ..numerics.linalg import root
-from ..numerics.workspace import layout, size_of, take_matrix, take_vector
-from .cross_covariance import POINTS, Crossing, by_points, by_tangent, crossing, take_factor
+from ..numerics.padded_rows import cross_covariance, factor, spread_points
+from ..numerics.simd_ir import padded
+from ..numerics.workspace import declare_layout, layout, size_of, take_matrix, take_vector
+from .notes import CUT, STAYED, copy, cut, finite, join, solve_semidefinite, step_at, step_layout
 
-STAYED, MOVED, CUT = range(3)
-"""What an event did to the state before any update: nothing; it was predicted; it began anew, or came to nothing."""
+CONSTANT, TANGENT, POINTS = range(3)
+"""Prediction rule of a filter: the one F of a linear model, the tangent of f at the estimate, sigma points."""
+
 
 START, PREDICT, UPDATE, DESCRIBE, OWN, RULE, HELD, ROW, TAPE, SCRATCH, HEAD = range(11)
-"""Positions in the head: the addresses of the filter's functions, how many numbers its state has, how it predicts,
-what its state holds, the row of the tape that is written, and where tape and scratch are."""
+"""Positions in the head: addresses of the filter's functions, length of its state, prediction rule, form of its
+covariance, row of the tape that is written, addresses of tape and scratch."""
+
 
 COVARIANCE, FACTOR, MEMBERS = range(3)
-"""What the state of a filter holds beside or in place of the mean: P, a factor of it, or the members of an ensemble."""
+"""Form of the covariance in a filter's state: P, a factor of it, or the members of an ensemble."""
 
 
-class Step(NamedTuple):
-    """One row of the tape."""
+class Crossing(NamedTuple):
+    """Scratch of the cross-covariance.
 
-    kind: Any
-    """(1,): STAYED, MOVED or CUT."""
-    before: Any
-    """(n,): m, the mean of the state that the event found."""
-    after: Any
-    """(n,): m⁻, its prediction."""
-    G: Any
-    """(n, n)."""
-    M: Any
-    """(n, n); after a cut all of P."""
-    state: Any
-    """The filter's state behind the event, or of a query the answer to it."""
+    F (n, n) is df/dx with the scratch of a Jacobian; chol_P (n, padded n) is upper, chol_Pᵀ chol_P = P; sigma
+    (2n + 1, padded n) are the sigma points; D the same through f, then their deviations from the mean; `across`
+    (n, padded n) are the differences between opposite ones, in the place of the first of each pair.
+    """
+
+    F: Any
+    jacobian: Any
+    chol_P: Any
+    sigma: Any
+    D: Any
+    across: Any
+    mean: Any
     end: int
 
 
 @layout
-def step(at, n, own):
-    """The layout of a row, of a filter whose state has `own` numbers."""
-    kind, at = take_vector(at, 1)
-    before, at = take_vector(at, n)
-    after, at = take_vector(at, n)
-    G, at = take_matrix(at, n, n)
-    M, at = take_matrix(at, n, n)
-    state, at = take_vector(at, own)
-    return Step(kind, before, after, G, M, state, at)
+def crossing(at, n):
+    """Lay it out."""
+    F, at = take_matrix(at, n, n)
+    jacobian, at = take_vector(at, scratch_size(n, n))
+    chol_P, at = take_matrix(at, n, padded(n))
+    sigma, at = take_matrix(at, 2 * n + 1, padded(n))
+    _, second = take_vector(at, padded(n))
+    across, _ = take_matrix(second, n, padded(n))
+    D, at = take_matrix(at, 2 * n + 1, padded(n))
+    mean, at = take_vector(at, padded(n))
+    return Crossing(F, jacobian, chol_P, sigma, D, across, mean, at)
 
 
-class Noting(NamedTuple):
-    """What a note is computed in."""
-
-    x: Any
-    """(n,): m."""
-    P: Any
-    """(n, n)."""
-    P_found: Any
-    """(n, n): that with which the event began."""
-    ahead: Any
-    """(n, n): P⁻, then its factor."""
-    C: Any
-    """(n, n): Cov(x, x⁻), then G of the step."""
-    W: Any
-    """(n, n): U⁻ᵀ Cᵀ, for U of P⁻."""
-    T: Any
-    """(n, n): scratch of a product."""
-    after: Any
-    """(n,): m⁻."""
-    X: Any
-    """(N, n): the members before the step, of an ensemble."""
-    crossing: Crossing
-    end: int
-
-
-@layout
-def noting(at, n, N):
-    """The layout of it, for N members."""
-    x, at = take_vector(at, n)
-    P, at = take_matrix(at, n, n)
-    P_found, at = take_matrix(at, n, n)
-    ahead, at = take_matrix(at, n, n)
-    C, at = take_matrix(at, n, n)
-    W, at = take_matrix(at, n, n)
-    T, at = take_matrix(at, n, n)
-    after, at = take_vector(at, n)
-    X, at = take_matrix(at, N, n)
-    own = crossing(at, n)
-    return Noting(x, P, P_found, ahead, C, W, T, after, X, own, own.end)
+Noting, noting_layout = declare_layout(
+    "Noting",
+    "n, N",
+    crossing,
+    x="n",
+    P="n, n",
+    P_found="n, n",
+    ahead="n, n",
+    C="n, n",
+    W="n, n",
+    T="n, n",
+    after="n",
+    X="N, n",
+    cross="crossing(at, n)",
+)
+"""Scratch of a note: m; P; P at the start of the event; P⁻, then its factor; Cov(x, x⁻), then G of the step; U⁻ᵀ Cᵀ,
+for U of P⁻; a product; m⁻; the N members before the step, of an ensemble; the cross-covariance."""
 
 
 @inlined
 def head_of(state):
-    """The head of a recorder's state."""
+    """Return the head of a recorder's state."""
     return ints(int(state[state.size - 1]), HEAD)
 
 
 @inlined
 def own_of(head, state):
-    """The filter's own state in a recorder's."""
+    """Return the filter's own state in a recorder's."""
     return floats(state.ctypes.data, head[OWN])
 
 
 @inlined
-def step_at(tape, row, n, own):
-    """A row of a tape that begins at an address."""
-    first = step(0, n, own)
-    return step(tape + row * first.end, n, own)
-
-
-@inlined
-def count_of(context, holds):
-    """How many members the state has."""
-    return int(options(context)[SIZE]) if holds == MEMBERS else 0
+def noting_of(context, head):
+    """Return the scratch of a note."""
+    members = int(options(context)[SIZE]) if head[HELD] == MEMBERS else 0
+    return noting_layout(head[SCRATCH], context.nx, members)
 
 
 @jit
 def members_covariance(X, x, Y, y, C):
-    """x, y (n,) ← means of the members X, Y (N, n), which belong together;  C ← (X - x)ᵀ (Y - y) / (N - 1)."""
+    """x, y (n,) ← means of paired members X, Y (N, n);  C ← (X - x)ᵀ (Y - y) / (N - 1)."""
     N, n = X.shape
     for j in range(n):
         x[j] = column_mean(X, j)
@@ -184,117 +162,51 @@ def covariance_of(context, state, holds, x, P):
 
 
 @jit
-def cut(own, x, P):
-    """Note that nothing of what comes says anything of the state N(x, P) that the event found."""
-    own.kind[0] = CUT
-    for i in range(x.size):
-        own.before[i] = x[i]
-        own.after[i] = x[i]
-        for j in range(x.size):
-            own.G[i, j] = 0.0
-            own.M[i, j] = P[i, j]
-
-
-@inlined
-def solve_semidefinite(U, C, W):
-    """W ← U⁻ᵀ Cᵀ;  C ← C (Uᵀ U)⁻¹; a row of U that is zero has no share in either."""
-    n = U.shape[0]
-    for i in range(n):
-        for r in range(n):
-            W[i, r] = C[r, i]
-    for i in range(n):
-        inverse = 1.0 / U[i, i] if U[i, i] > 0.0 else 0.0
-        for r in range(n):
-            W[i, r] *= inverse
-        for j in range(i + 1, n):
-            a = U[i, j]
-            for r in range(n):
-                W[j, r] -= a * W[i, r]
-    for i in range(n - 1, -1, -1):
-        inverse = 1.0 / U[i, i] if U[i, i] > 0.0 else 0.0
-        for r in range(n):
-            s = W[i, r]
-            for j in range(i + 1, n):
-                s -= U[i, j] * C[r, j]
-            C[r, i] = s * inverse
-
-
-@jit
-def join(own, x, P, after, G, W, T):
-    """Note a step from N(x, P) to the mean `after`, of this G and M = P - Wᵀ W, behind what the event has so far."""
+def by_tangent(context, rule, x, u, dt, P, own, C):
+    """C (nx, nx) = P Fᵀ."""
     n = x.size
-    for i in range(n):
-        own.after[i] = after[i]
-    for i in range(n):
-        for j in range(i + 1):
-            s = P[i, j]
-            for k in range(n):
-                s -= W[k, i] * W[k, j]
-            P[i, j] = s
-            P[j, i] = s
-    if own.kind[0] == STAYED:
-        own.kind[0] = MOVED
-        for i in range(n):
-            own.before[i] = x[i]
-            for j in range(n):
-                own.G[i, j] = G[i, j]
-                own.M[i, j] = P[i, j]
-        return
-    turn(own.G, P, own.M, T)
+    # That of a linear model is found where its filter finds it: differences round differently at each x.
+    at = floats(context.prior_mean, n) if rule == CONSTANT else x
+    state_jacobian(context, at, u, dt, own.F, own.jacobian)
     for i in range(n):
         for j in range(n):
             s = 0.0
             for k in range(n):
-                s += own.G[i, k] * G[k, j]
-            T[i, j] = s
-    copy(T, own.G)
+                s += P[i, k] * own.F[j, k]
+            C[i, j] = s
+
+
+@jit
+def by_points(context, x, u, dt, own, C):
+    """C (nx, nx) from sigma points about x, spread by the factor in own.chol_P."""
+    n = x.size
+    w = weights_of(context)
+    spread_points(x, own.chol_P, w.spread, own.sigma)
+    transition_points(context, own.sigma, u, dt, own.D)
+    deviations(own.D, w.outer, circular_states(context), own.mean)
+    for k in range(n):
+        for j in range(n):
+            own.across[k, j] -= own.D[1 + n + k, j]
+    cross_covariance(own.chol_P, own.across, w.outer * w.spread, C)
 
 
 @inlined
-def copy(A, B):
-    """B ← A."""
-    for i in range(A.shape[0]):
-        for j in range(A.shape[1]):
-            B[i, j] = A[i, j]
-
-
-@jit
-def turn(G, P, M, T):
-    """M ← M + G P Gᵀ for symmetric P and M; T (nx, nx) is scratch."""
-    n = P.shape[0]
-    for i in range(n):
-        for j in range(n):
-            T[i, j] = 0.0
-        for k in range(n):
-            a = G[i, k]
-            for j in range(n):
-                T[i, j] += a * P[k, j]
-    for i in range(n):
-        for j in range(i + 1):
-            s = M[i, j]
-            for k in range(n):
-                s += T[i, k] * G[j, k]
-            M[i, j] = s
-            M[j, i] = s
-
-
-@jit
-def finite(own):
-    """Whether a note holds numbers."""
-    total = 0.0
-    for i in range(own.before.size):
-        total += own.after[i]
-        for j in range(own.before.size):
-            total += own.G[i, j] + own.M[i, j]
-    return np.isfinite(total)
+def take_factor(P, U, rooted, own):
+    """Fill own.chol_P: from U, if the state holds a factor, otherwise from P; False if P has none."""
+    if not rooted:
+        return factor(P, own.chol_P)
+    for i in range(U.shape[0]):
+        for j in range(U.shape[1]):
+            own.chol_P[i, j] = U[i, j]
+    return True
 
 
 @jit
 def start(context, mean, cov, state):
-    """As the filter's; the state that is given up is noted, and that it was."""
+    """Start the filter; note that the state before is lost."""
     head = head_of(state)
     own = own_of(head, state)
-    places = noting(head[SCRATCH], context.nx, count_of(context, head[HELD]))
+    places = noting_of(context, head)
     covariance_of(context, own, head[HELD], places.x, places.P)
     cut(step_at(head[TAPE], head[ROW], context.nx, own.size), places.x, places.P)
     call_start(head[START], context, mean, cov, own)
@@ -302,7 +214,7 @@ def start(context, mean, cov, state):
 
 @jit
 def predict(context, u, dt, index, state, work):
-    """As the filter's, and the note of it."""
+    """Predict as the filter does, and note the step."""
     n = context.nx
     head = head_of(state)
     own = own_of(head, state)
@@ -311,7 +223,7 @@ def predict(context, u, dt, index, state, work):
         call_predict(head[PREDICT], context, u, dt, index, own, work)
         return
     holds = head[HELD]
-    places = noting(head[SCRATCH], n, count_of(context, holds))
+    places = noting_of(context, head)
     x, P, C = places.x, places.P, places.C
     covariance_of(context, own, holds, x, P)
     if row.kind[0] == STAYED:
@@ -321,11 +233,11 @@ def predict(context, u, dt, index, state, work):
         copy(ensemble(context, own), places.X)
     elif head[RULE] == POINTS:
         _, held = moments_of(own, n)
-        good = take_factor(P, held, holds == FACTOR, places.crossing)
+        good = take_factor(P, held, holds == FACTOR, places.cross)
         if good:
-            by_points(context, x, u, dt, places.crossing, C)
+            by_points(context, x, u, dt, places.cross, C)
     else:
-        by_tangent(context, head[RULE], x, u, dt, P, places.crossing, C)
+        by_tangent(context, head[RULE], x, u, dt, P, places.cross, C)
     call_predict(head[PREDICT], context, u, dt, index, own, work)
     covariance_of(context, own, holds, places.after, places.ahead)
     if holds == MEMBERS:
@@ -341,7 +253,7 @@ def predict(context, u, dt, index, state, work):
 
 @jit
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
-    """As the filter's."""
+    """Update as the filter does."""
     head = head_of(state)
     own = own_of(head, state)
     return call_update(head[UPDATE], context, u, sensor, y, index, own, work, innovation, innovation_std, score)
@@ -349,7 +261,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
 
 @jit
 def describe(context, state, mean, std, cross):
-    """As the filter's; each event ends with it, so the next row of the tape begins."""
+    """Describe as the filter does; each event ends with this call, so the next row of the tape begins."""
     head = head_of(state)
     own = own_of(head, state)
     row = step_at(head[TAPE], head[ROW], context.nx, own.size)
@@ -362,20 +274,20 @@ def describe(context, state, mean, std, cross):
 
 
 class Kind(NamedTuple):
-    """How a filter predicts (CONSTANT, TANGENT, POINTS; of an ensemble all one), and what its state holds."""
+    """Prediction rule (CONSTANT, TANGENT, POINTS; unused for ensembles) and form of the covariance of a filter."""
 
     rule: int
     holds: int
 
 
 class Recorder:
-    """The functions that note, and room for the notes of so many events."""
+    """The noting functions, and room for the notes of a number of events."""
 
     def __init__(self, code: Code, kind: Kind, own: int, nx: int, members: int, rows: int) -> None:
         """`code` is the filter's, `own` how many numbers its state has; `members` is 0 unless it is an ensemble."""
-        self._each = size_of(step, nx, own)
+        self._each = size_of(step_layout, nx, own)
         self._tape = np.zeros((rows + 1) * self._each)
-        self._scratch = np.full(size_of(noting, nx, members), np.nan)
+        self._scratch = np.full(size_of(noting_layout, nx, members), np.nan)
         self._head = np.zeros(HEAD, np.int64)
         self._head[[START, PREDICT, UPDATE, DESCRIBE]] = code
         self._head[[OWN, RULE, HELD]] = own, *kind

@@ -1,6 +1,6 @@
-"""Smoothing: what the readings of a whole log say of each moment of it, those that came later too.
+"""Smoothing: the estimate at each event given all measurements of the log, later ones too.
 
-It works on what a fold did, reading by reading: refused, weighted, adapted, let in again.
+The smoother follows the fold measurement by measurement: rejected, weighted, adapted, accepted again.
 """
 
 from __future__ import annotations
@@ -14,12 +14,10 @@ from ..estimator import Estimator
 from ..fold import Fold
 from ..model.state_space import StateSpaceModel
 from ..track import Track
-from .cross_covariance import CONSTANT, POINTS, TANGENT
 from .moments_back import MomentsBack
-from .recorder import COVARIANCE, FACTOR, MEMBERS, Kind
-from .smoothed import Smoothed
+from .recorder import CONSTANT, COVARIANCE, FACTOR, MEMBERS, POINTS, TANGENT, Kind
 from .trajectories_back import TrajectoriesBack
-from .walk import Notes, Walk
+from .walk import Notes, Smoothed, Walk
 
 KINDS = {
     "kf": Kind(CONSTANT, COVARIANCE),
@@ -34,6 +32,7 @@ KINDS = {
     **dict.fromkeys(("enkf", "etkf", "ensrf", "letkf"), Kind(TANGENT, MEMBERS)),
 }
 """Filters that are smoothed by means and covariances."""
+
 
 PARTICLES = ("pf", "pf-reg")
 """Filters that are smoothed by trajectories."""
@@ -73,26 +72,31 @@ def smooth(fold: Fold) -> Smoothed:
     return out
 
 
-LEAST = 1e-3
-"""Share of a variance that later readings must take; of less, rounding makes the most."""
+MIN_REMOVED_SHARE = 1e-3
+"""Share of a variance that later measurements must remove; with less, rounding dominates."""
 
 
 def consistency(track: Track, smoothed: Smoothed, model: StateSpaceModel) -> dict[str, float]:
-    """Of each shown state the mean of (x - xˢ)² / (σ² - σˢ²); NaN where later readings say nothing of it.
+    """Return the mean of (x - xˢ)² / (σ² - σˢ²) by shown state; NaN where later measurements carry no information.
+
+    McReynolds' filter-smoother consistency, which needs no truth: where the model holds, the change of an estimate by
+    later measurements has the covariance that they remove, Cov(x - xˢ) = P - Pˢ, so the mean is 1. Far above 1 the
+    filter is
+    overconfident: f bends within the spread, or Q is too small, and the smoother may be worse than the filter.
 
     Args:
         track: The filter's.
-        smoothed: What came of it.
+        smoothed: Its smoothed estimates.
         model: The model.
     """
     moved = track.mean - smoothed.mean
-    turns = np.array([state.circular for state in model.shown_states], bool)
-    moved[:, turns] = (moved[:, turns] + np.pi) % (2.0 * np.pi) - np.pi
+    circular = np.array([state.circular for state in model.shown_states], bool)
+    moved[:, circular] = (moved[:, circular] + np.pi) % (2.0 * np.pi) - np.pi
     before = track.std**2
     taken = before - smoothed.std**2
-    told = taken > LEAST * before
-    ratios = np.where(told, moved**2 / np.where(told, taken, 1.0), np.nan)
+    informed = taken > MIN_REMOVED_SHARE * before
+    ratios = np.where(informed, moved**2 / np.where(informed, taken, 1.0), np.nan)
     return {
-        state.name: float(np.nanmean(ratios[:, k])) if told[:, k].any() else np.nan
+        state.name: float(np.nanmean(ratios[:, k])) if informed[:, k].any() else np.nan
         for k, state in enumerate(model.shown_states)
     }

@@ -1,11 +1,11 @@
-"""Back over a particle filter by trajectories: each is drawn from the last cloud, then from event to event backward.
+"""Go back over a particle filter by trajectories: each is drawn from the last cloud, then from event to event backward.
 
 A trajectory that stands at x' after an event goes back to the particle xᵢ before it with probability
 
     wᵢ p(x' | xᵢ) / Σⱼ wⱼ p(x' | xⱼ),     p(x' | x) = N(x'; f(x), Q)
 
-so the trajectories are draws from all of the smoothing distribution, whatever its shape. Where the model crosses the
-time in several steps, they pass the clouds between these. Moments of K trajectories scatter by 1/√K.
+so the trajectories are draws from the smoothing distribution, whatever its shape. Where the model takes several steps
+between two events, they pass the clouds between these. Moments of K trajectories scatter by 1/√K.
 
 Source: Godsill, Doucet & West (2004), doi:10.1198/016214504000000151.
 """
@@ -24,15 +24,14 @@ from ..log import INPUT, RESET
 from ..numerics.jit import jit
 from ..particle.cloud import weights_of
 from ..snapshots import Snapshot
-from .smoothed import Smoothed
-from .walk import QUERIES, Jump, Stretch
+from .walk import QUERIES, Jump, Smoothed, Stretch
 
 TRAJECTORIES = 200
 
 
 @jit
 def moved(context, X, u, dt, out, Qs, scratch):
-    """Fill out (N, nx) with f of the particles, and Qs (N or 1, nx, nx), which are zero, with the noise of a step."""
+    """Fill out (N, nx) with f of the particles, and Qs (N or 1, nx, nx), zero on entry, with the noise of a step."""
     transition_points(context, X, u, dt, out)
     for i in range(Qs.shape[0]):
         add_process_noise(context, X[i], u, dt, Qs[i], scratch)
@@ -45,7 +44,7 @@ def predict_once(code, context, u, dt, index, state, work):
 
 
 class TrajectoriesBack:
-    """Fills `out` on its way; see `Notes`. What is drawn is a function of the seed and the event."""
+    """Fills `out` on its way; see `Notes`. Draws are a function of the seed and the event."""
 
     def __init__(self, fold: Fold, out: Smoothed) -> None:
         self._fold, self._log, self._machine, self._out = fold, fold.log, fold.machine, out
@@ -61,7 +60,7 @@ class TrajectoriesBack:
         self._later: tuple[np.ndarray, int] | None = None
 
     def _check(self, dt: float) -> None:
-        """Refuse a model whose next state is no density: going back, no particle but its own parent leads to it.
+        """Refuse a model whose next state has no density: no particle but its own parent then leads to it.
 
         Raises:
             EstimatorError: With the states that have no noise.
@@ -120,20 +119,20 @@ class TrajectoriesBack:
             if outside and part.state >= 0:
                 self._at = self._drawn(i, own)
             self._later = None if log.kind[i] == RESET else (self._at, t)
-            # Behind a reset, and where the twin was found wrong, nothing tells of before.
+            # After a reset or a widened covariance there is no information on the states before.
             if log.kind[i] == RESET or (outside and i == part.start and part.sensor >= 0):
                 self._at = self._drawn(i, state)
             else:
                 self._at = self._gone_back(i, self._at, state, clock, t, u)
 
     def _asked(self, i: int, answer: np.ndarray, t: int, u: np.ndarray) -> np.ndarray:
-        """Where trajectories stand at a query between two events."""
+        """Return the trajectories at a query between two events."""
         if self._later is None:
             return self._drawn(i, answer)
         return self._gone_back(i, self._later[0], answer, t, self._later[1], u)
 
     def _gone_back(self, i: int, at: np.ndarray, state: np.ndarray, clock: int, t: int, u: np.ndarray) -> np.ndarray:
-        """Where trajectories that stand `at` (K, nx) at time t came from, in the clouds from `state` on."""
+        """Return the trajectories at `clock` that lead to `at` (K, nx) at time t, in the clouds from `state` on."""
         dt, longest = (t - clock) * 1e-9, self._fold.model.max_step
         if dt <= 0.0:
             return at
@@ -156,7 +155,7 @@ class TrajectoriesBack:
         return at
 
     def _distances(self, at: np.ndarray, X: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
-        """-2 log p(x' | x) but for a constant, of trajectories and particles, (K, N)."""
+        """Return -2 log p(x' | x) up to a constant, of trajectories and particles, (K, N)."""
         forward, Qs = self._moved(X, u, dt)
         if not self._varies and not self._circular.any():
             L = np.linalg.cholesky(Qs[0])
@@ -171,7 +170,7 @@ class TrajectoriesBack:
         return found + log_det
 
     def _moved(self, X: np.ndarray, u: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """f of particles (N, nx), and the covariances of a step's noise, (N, nx, nx), or (1, nx, nx) for all."""
+        """Return f of particles (N, nx), and the covariances of a step's noise, (N, nx, nx), or (1, nx, nx) for all."""
         n = X.shape[1]
         forward, Qs = np.empty((len(X), n)), np.zeros((len(X) if self._varies else 1, n, n))
         moved(self._context, np.ascontiguousarray(X), u, dt, forward, Qs, np.empty((n, n)))
@@ -181,7 +180,7 @@ class TrajectoriesBack:
         return np.random.default_rng([self._fold.tuning.seed, self._log.first + i])
 
     def _drawn(self, i: int, state: np.ndarray) -> np.ndarray:
-        """Trajectories (K, nx) that begin in the cloud of a state."""
+        """Return trajectories (K, nx) that begin in the cloud of a state."""
         w, X = weights_of(self._options, state, self._fold.model.nx)
         return np.asarray(X[self._rng(i).choice(len(w), TRAJECTORIES, p=w)])
 
@@ -198,7 +197,7 @@ class TrajectoriesBack:
 
 
 def _scaled(Q: np.ndarray) -> np.ndarray:
-    """A covariance as a correlation."""
+    """Return a covariance as a correlation."""
     scale = np.sqrt(np.diag(Q))
     correlation: np.ndarray = Q / np.outer(scale, scale)
     return correlation

@@ -14,6 +14,7 @@ from ..fold import Fold
 from ..gate.isolation import BELIEVED, REOPENED
 from ..log import MAINTENANCE, MARK, TICK, TRUTH
 from ..snapshots import Snapshot
+from ..track import Track
 
 ROOM = 32 * 2**20
 """Bytes that the notes of one batch may take, and the states between batches; one event is noted at a time at least."""
@@ -160,3 +161,21 @@ class Walk:
         if row is not None:
             return self._notes.take(part, now, row)
         return self._machine.run_apart(self._log, part.start, part.stop, now)[1]
+
+
+class Smoothed(NamedTuple):
+    """Columns of one length N, as `Track` has them: mean, std (N, shown); cross (N, pairs)."""
+
+    mean: np.ndarray
+    std: np.ndarray
+    cross: np.ndarray
+
+    @staticmethod
+    def room_for(fold: Fold) -> Smoothed:
+        """Columns to be filled."""
+        shape = fold.n, len(fold.model.shown)
+        return Smoothed(np.empty(shape), np.empty(shape), np.empty((fold.n, len(fold.pairs))))
+
+    def instead_of(self, track: Track) -> Track:
+        """The fold's track with these moments in the place of its own."""
+        return track._replace(mean=self.mean, std=self.std, cross=self.cross)

@@ -16,7 +16,7 @@ from estimators.diagnostics.sensitivity import Bound
 from estimators.diagnostics.sensitivity.responses import digits
 from estimators.log import READING, Events
 from estimators.registry import find_entry
-from estimators.smoothing.smoothed import Smoothed
+from estimators.smoothing.walk import Smoothed
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES, Track
 from estimators.tuning import GATE_KEYS, Tuning
 

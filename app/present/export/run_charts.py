@@ -9,7 +9,7 @@ import numpy as np
 from estimators.diagnostics.episodes import Episode
 from estimators.log import Events
 from estimators.model.state_space import StateSpaceModel
-from estimators.smoothing.smoothed import Smoothed
+from estimators.smoothing.walk import Smoothed
 from estimators.track import Track
 
 from ..drawing.colors import LIGHT, RGB

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from estimators.diagnostics.episodes import Episode
     from estimators.diagnostics.field_pictures import Picture
     from estimators.log import Log
-    from estimators.smoothing.smoothed import Smoothed
+    from estimators.smoothing.walk import Smoothed
     from estimators.track import Track
 
     from ...live.interface import Running

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest, norm, t
 
-from estimators.ensemble.innovation import score_of
+from estimators.ensemble.analysis import score_of
 from estimators.fold import Fold
 from estimators.log import READING
 from estimators.tuning import Tuning

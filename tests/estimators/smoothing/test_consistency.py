@@ -5,7 +5,7 @@ import pytest
 
 from estimators import fold
 from estimators.smoothing.smooth import consistency
-from estimators.smoothing.smoothed import Smoothed
+from estimators.smoothing.walk import Smoothed
 from tests.estimators.smoothing.test_textbook import CAR, car
 
 

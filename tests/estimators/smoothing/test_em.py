@@ -38,7 +38,7 @@ def test_it_agrees_with_the_maximum():
 
     best = minimize(negative, np.log([0.3, 0.25]), method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-10})
     found = em("kf", BODY, begin, log, tolerance=1e-7)
-    assert found.settled
+    assert found.converged
     # The last round changed less than 1e-7, and those that would follow, with a rate of 0.97, thirty times that.
     np.testing.assert_allclose([found.tuning.q[0], found.tuning.r[0]], np.exp(best.x), rtol=1e-5)
     assert np.all(np.diff(found.log_likelihood) > -1e-9)
