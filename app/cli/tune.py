@@ -14,7 +14,7 @@ from config.files import shown_path, writing
 from config.loader import find
 from estimators.errors import ConfigError, printable
 from estimators.fit.aims import CRPS, ERROR, LIKELIHOOD
-from estimators.fit.dual import Refit, walk
+from estimators.fit.dual import WindowFit, walk
 from estimators.fit.fit import Fitted, fit
 from estimators.fit.recording import Recording
 
@@ -143,7 +143,7 @@ def tune_windows(arguments: Arguments, wanted: Sequence[str], recordings: Record
     if any(item.weight != 1.0 for item in given):
         raise ConfigError("--log: with --windows each recording follows the one before; leave the weights out")
 
-    def work() -> list[tuple[int, Refit]]:
+    def work() -> list[tuple[int, WindowFit]]:
         found, tuning = [], twin.tuning
         for k, item in enumerate(given):
             for refit in walk(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from estimators.diagnostics.sensitivity.responses import digits
-from estimators.fit.dual import Refit, against, shift
+from estimators.fit.dual import WindowFit, against, shift
 from estimators.fit.fit import Fitted, Line
 from estimators.fit.judge import Part, Prediction, Worth
 
@@ -20,7 +20,7 @@ UNSEEN = 0.05
 """Share of a window up to which nobody need be told that the end of a log is in none."""
 
 
-def window_json(recording: int, refit: Refit, origin: int) -> dict[str, Any]:
+def window_json(recording: int, refit: WindowFit, origin: int) -> dict[str, Any]:
     """A window as JSON: `from` and `to` in seconds after the recording's first event, and the fit as `nisus tune`."""
     told: dict[str, Any] = {
         "recording": recording,
@@ -33,7 +33,7 @@ def window_json(recording: int, refit: Refit, origin: int) -> dict[str, Any]:
     return told | ({} if refit.fitted is None else {"result": fit_json(refit.fitted)})
 
 
-def window_topics(found: Sequence[tuple[int, Refit]], origins: Sequence[int]) -> list[Topic]:
+def window_topics(found: Sequence[tuple[int, WindowFit]], origins: Sequence[int]) -> list[Topic]:
     """For every entry a table: its value and interval of each window, and what the twin went on with."""
     keys = dict.fromkeys(line.key for _, refit in found if refit.fitted is not None for line in refit.fitted.lines)
     head = (
@@ -52,7 +52,7 @@ def window_topics(found: Sequence[tuple[int, Refit]], origins: Sequence[int]) ->
     return sections
 
 
-def _place(k: int | None, refit: Refit | None, origins: Sequence[int]) -> tuple[str, ...]:
+def _place(k: int | None, refit: WindowFit | None, origins: Sequence[int]) -> tuple[str, ...]:
     """Recording, where there are several, start and end of a window, s; the head of these columns for None."""
     if k is None or refit is None:
         return (*(("recording",) if len(origins) > 1 else ()), "from s", "to s")
@@ -60,12 +60,12 @@ def _place(k: int | None, refit: Refit | None, origins: Sequence[int]) -> tuple[
     return (*((str(k + 1),) if len(origins) > 1 else ()), *at)
 
 
-def _line_of(refit: Refit, key: str) -> Line | None:
+def _line_of(refit: WindowFit, key: str) -> Line | None:
     lines = () if refit.fitted is None else refit.fitted.lines
     return next((line for line in lines if line.key == key), None)
 
 
-def _window_row(refit: Refit, line: Line | None) -> tuple[str, ...]:
+def _window_row(refit: WindowFit, line: Line | None) -> tuple[str, ...]:
     if refit.fitted is None or line is None:
         return ("-", "", "", "", "-")
     verdict = refit.fitted.verdict
@@ -79,7 +79,7 @@ def _window_row(refit: Refit, line: Line | None) -> tuple[str, ...]:
 
 
 def windows_verdict(
-    twin: Twin, found: Sequence[tuple[int, Refit]], origins: Sequence[int], ends: Sequence[int]
+    twin: Twin, found: Sequence[tuple[int, WindowFit]], origins: Sequence[int], ends: Sequence[int]
 ) -> Topic:
     """How many were adopted, of each other one why not, and what no window looked at."""
     adopted = sum(refit.proposed for _, refit in found)

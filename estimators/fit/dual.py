@@ -1,14 +1,13 @@
-"""Dual estimation: a fast filter for the state, and beside it a slow fit of parameters on windows of what it has read.
+"""Dual estimation: a fast filter for the state, and beside it a slow fit of parameters on windows of its log.
 
-The filter goes on with parameters that are held. Now and then the last window of its log is fitted in one batch
-(fit.py): from the state that the filter had where the window begins, about the values of the day, which are weakly
-believed. If that wins on the window's blocks that were held out, and moved beyond chance, it is proposed; what is
-adopted takes the place of the values before, the log is folded again with it, and the filter goes on. In joint
-estimation the parameters are states instead, and one filter moves both (`model/joint.py`): that costs no fit, but it
-asks for a belief in how fast each parameter drifts, and nothing judges what it concludes.
+The filter runs with fixed parameters. From time to time the last window of its log is fitted in one batch (fit.py):
+from the filter's state where the window begins, with a weak prior about the current values. If the result is better on
+the window's held-out blocks, and beyond chance, it is proposed; once adopted, it replaces the current values and the
+log is folded again. In joint estimation the parameters are states instead, and one filter estimates both
+(`model/joint.py`): that needs no fit, but a drift rate for each parameter, and no held-out data judge the result.
 
 Sources: Nelson & Stear (1976), doi:10.1109/TAC.1976.1101148, for two estimators, each of which takes the other's
-estimate for true; Plett (2006), doi:10.1016/j.jpowsour.2006.06.004, for both ways on a battery.
+estimate as known; Plett (2006), doi:10.1016/j.jpowsour.2006.06.004, for both on a battery.
 """
 
 from __future__ import annotations
@@ -28,17 +27,15 @@ from .entries import check_key
 from .fit import Fitted, Line, fit
 from .objective import Go
 from .recording import BLOCKS, Recording
-
-Z = 1.959963984540054
-"""Deviations from a rejected value within which the data say what they said then."""
+from .uncertainty import Z
 
 
-class Refit(NamedTuple):
-    """One window, fitted.
+class WindowFit(NamedTuple):
+    """Fit of one window.
 
-    start and end are the times of its first and last event, ns; `tuning` is that with which the filter had come so
-    far. `fitted` is None where nothing could be fitted, for the `reason`. `lived` are the filter's own rows since the
-    window before, as it concluded them at the time, before anything of this window was adopted.
+    start and end are the times of its first and last event, ns; `tuning` is that of the filter until its end. `fitted`
+    is None if nothing could be fitted, for the `reason`. `lived` are the filter's own rows since the previous window,
+    before this one was adopted.
     """
 
     start: int
@@ -51,7 +48,7 @@ class Refit(NamedTuple):
 
     @property
     def proposed(self) -> bool:
-        """Whether nothing speaks against it."""
+        """Whether there is no reason against it."""
         return self.fitted is not None and not against(self.fitted)
 
 
@@ -66,28 +63,28 @@ def walk(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     blocks: int = BLOCKS,
     go: Go = lambda folds: True,
-) -> Iterator[Refit]:
-    """Go through a log as a running twin does that adopts what is better: window after window.
+) -> Iterator[WindowFit]:
+    """Go through a log window after window, as a running twin does that adopts every proposal.
 
-    A log that is shorter than a window is one window. What is left at its end is one too, if it is as long as half the
-    time between two.
+    A log shorter than a window is one window. The rest at its end is one too, if it is at least half the time between
+    two windows.
 
     Args:
         estimator: The filter.
-        tuning: Where it starts.
+        tuning: Start of the first window.
         log: It must not grow meanwhile.
         wanted: Keys and groups, see `entries_of`.
         window: Length of a window, s.
         every: Time between the ends of two windows, s; None for one after another.
-        bounds: Least and greatest value by key.
+        bounds: Range by key.
         blocks: As `fit`.
         go: As `fit`.
 
     Yields:
-        Each window; the next one is folded with what was proposed of it.
+        Each window; the next one is folded with its proposal.
 
     Raises:
-        Cancelled: If `go` says so.
+        Cancelled: If `go` returns False.
         ConfigError: If there is no such entry.
         EstimatorError: As `Fold`; if a window or the time between two is not positive.
     """
@@ -105,7 +102,7 @@ def walk(
     while done == 0 or last >= end - stride // 2:
         stop = int(np.searchsorted(t, end))
         if stop == done:
-            # A hole, longer than the time between two windows.
+            # A gap in the log, longer than the time between two windows.
             end += stride
             continue
         fold.advance(stop - fold.n)
@@ -118,7 +115,7 @@ def walk(
             )
         except NisusError as error:
             reason = str(error)
-        found = Refit(int(part.t[0]), int(part.t[part.n - 1]), part.n, tuning, fitted, reason, lived)
+        found = WindowFit(int(part.t[0]), int(part.t[part.n - 1]), part.n, tuning, fitted, reason, lived)
         yield found
         if fitted is not None and found.proposed:
             tuning = fitted.setting.tuning
@@ -127,12 +124,12 @@ def walk(
 
 
 def tail(fold: Fold, start: int, base: Base | None = None) -> tuple[Log, Base | None]:
-    """What a fold has folded from row `start` on, as a log of its own, and where a fold of that begins.
+    """Return the rows of a fold from `start` on as a log of their own, and the base of a fold of that.
 
     Args:
-        fold: It is where it was afterwards.
-        start: The first row that is wanted; one that leaves no event gives the last.
-        base: Where the fold itself began; None for the prior.
+        fold: It is unchanged afterwards.
+        start: First row; beyond the end, the last row.
+        base: Base of the fold itself; None for the prior.
     """
     stop = fold.n
     start = min(start, stop - 1)
@@ -149,32 +146,29 @@ def tail(fold: Fold, start: int, base: Base | None = None) -> tuple[Log, Base | 
 
 
 def against(fitted: Fitted) -> tuple[str, ...]:
-    """Why a window's fit is not proposed; nothing where it is.
+    """Return the reasons against a window's fit; empty if it is proposed.
 
-    Beside what blocks and sensors held out say: a value of the day that lies in every interval has nothing against it,
-    and to follow each window's chance would be a new version an hour, and none of them news.
+    A fit whose current values all lie in their intervals is not proposed either: following the chance of each window
+    would make a new version an hour without any information.
     """
     if not fitted.proposed:
         return fitted.verdict.reasons
     if all(line.alone or line.low <= line.before <= line.high for line in fitted.lines):
-        return ("every value of the day lies in its 95 % interval",)
+        return ("every current value lies in its 95 % interval",)
     return ()
 
 
-def shift(line: Line) -> float:
-    """By how many standard deviations of its estimate an entry moved; NaN of one that was left alone."""
-    return _apart(line, line.before)
+def shift(line: Line, value: float | None = None) -> float:
+    """Return the distance of an estimate from a value (None: the one before), in deviations; NaN if it was reset."""
+    if line.alone:
+        return np.nan
+    value = line.before if value is None else value
+    after, other = (np.log(line.after), np.log(value)) if line.log else (line.after, value)
+    return float((after - other) / line.deviation)
 
 
 def agrees(fitted: Fitted, other: Fitted) -> bool:
-    """Whether a fit finds no more than another did: the same entries, within the 95 % intervals of the first."""
+    """Return whether a fit confirms another: the same entries, within the 95 % intervals of the first."""
     values = {line.key: line.after for line in other.lines if not line.alone}
-    told = {line.key: line for line in fitted.lines if not line.alone}
-    return told.keys() == values.keys() and all(abs(_apart(told[key], value)) <= Z for key, value in values.items())
-
-
-def _apart(line: Line, value: float) -> float:
-    if line.alone:
-        return np.nan
-    after, other = (np.log(line.after), np.log(value)) if line.log else (line.after, value)
-    return float((after - other) / line.deviation)
+    found = {line.key: line for line in fitted.lines if not line.alone}
+    return found.keys() == values.keys() and all(abs(shift(found[key], value)) <= Z for key, value in values.items())

@@ -1,13 +1,19 @@
-"""What a fit maximises: what it aims at (aims.py), and a weak belief in what the twin says.
+"""The objective of a fit: its aim (aims.py) with a weak prior about the twin's values, and the way to its maximum.
 
-Usually that is
+For the likelihood that is
 
     log p(y_1..n) = Σ log p(y_t | y_1..t-1),    - ½ Σ ((θ - θ_0) / d)²
 
-The first is the predictive (prequential, or innovation) likelihood of a fold, with the price of what the gate refused
-(diagnostics/refusals.py); the second believes weakly in what the twin says. A reading that fails, and a fold that does
-not run, cost more than anything that can be gained, so an optimiser turns round there. A filter that draws does so with
-the seed of the tuning at every point: common random numbers, without which a difference of two points is mostly chance.
+the predictive (prequential, or innovation) likelihood of a fold, where rejected measurements count with their own
+density (diagnostics/score.py). A failed measurement and a failed fold cost more than any gain, so an optimiser turns
+back there. A filter that draws uses the tuning's seed at every point: common random numbers, without which a difference
+of two points is mostly chance.
+
+The gradient comes from concurrent refolds, which also give Σ s sᵀ of the scores s of single measurements, whose
+diagonal scales the entries (Berndt, Hall, Hall & Hausman 1974, Annals of Economic and Social Measurement 3, 653);
+without it a noise with little information needs hundreds of folds. The scale is renewed every few steps, since the
+information of a noise far from its optimum does not tell where that is. The objective of a filter that draws is not
+smooth where it resamples; there the search is by trust regions without derivatives (COBYQA, Ragonneau & Zhang 2023).
 
 Sources: Schweppe (1965), doi:10.1109/TIT.1965.1053737; Glasserman & Yao (1992), doi:10.1287/mnsc.38.6.884.
 """
@@ -26,30 +32,45 @@ from ..errors import NisusError
 from ..registry import find_estimator
 from ..tuning import Tuning
 from .aims import Aim
-from .entries import Entry, Setting, setting
+from .entries import Entry, Setting, with_values
 from .recording import Recording
 
-HOPELESS = -1e12
-"""Nats of a point at which nothing can be folded."""
+FAILED_FOLD = -1e12
+"""Nats of a point at which no fold is possible."""
 
 STEP = 1e-4
-"""Of a logarithm, or of the deviation of what has none: a difference over it is off by half of it times the curvature,
-far below the deviation of an estimate, and rounding by far less."""
+"""Step of the differences, in logarithms or deviations: the error of a difference, half the step times the curvature,
+is far below the deviation of an estimate, and rounding even more."""
 
 ALONE = ("particle", "ensemble")
-"""Families whose folds run one after the other: each of them runs on all processors."""
+"""Families whose folds run one after the other: each of them uses all processors."""
+
+MAX_ROUNDS = 8
+"""Most rounds of the optimiser, each with a new scale."""
+
+ROUND_STEPS = 15
+"""Steps of the optimiser per round."""
+
+GRADIENT = 0.02
+"""Gradient at the maximum, in deviations of an estimate: half its square is the remaining gain, in nats."""
+
+MIN_GAIN = 0.01
+"""Nats that a round must gain to be followed by another."""
+
+SEARCH_FOLDS = 60
+"""Most folds per entry of a search without derivatives."""
 
 Go = Callable[[int], bool]
-"""Told how many folds were done more; says whether to go on."""
+"""Callback with the number of folds done since the last call; returns whether to continue."""
 
 
 class Cancelled(Exception):
-    """Whoever asked for a fit wants it no more."""
+    """The fit was cancelled."""
 
 
 @dataclass(frozen=True)
 class Objective:
-    """What is maximised over the entries, from the tuning on, over the recordings; `fixed` are held at their `at`."""
+    """Objective over the entries, about the tuning, over the recordings; `fixed` are held at their values `at`."""
 
     estimator: str
     tuning: Tuning
@@ -63,30 +84,25 @@ class Objective:
 
     @property
     def start(self) -> np.ndarray:
-        """Where the tuning is, (k,)."""
+        """Point of the tuning, (k,)."""
         return np.array([item.inward(item.start) for item in self.entries])
 
     @property
     def limits(self) -> list[tuple[float, float]]:
         """Range of every entry, on its scale."""
-        return [(_inward(item, item.low), _inward(item, item.high)) for item in self.entries]
-
-    @property
-    def steps(self) -> np.ndarray:
-        """Of the differences, (k,)."""
-        return np.array([STEP * (1.0 if item.log else item.deviation) for item in self.entries])
+        return [(item.inward(item.low), item.inward(item.high)) for item in self.entries]
 
     @property
     def precision(self) -> np.ndarray:
-        """Of the weak belief, (k,)."""
+        """Precision of the weak prior, (k,)."""
         return np.array([item.deviation**-2 for item in self.entries])
 
     def penalty(self, x: np.ndarray) -> float:
-        """½ Σ ((θ - θ_0) / d)²."""
+        """Return ½ Σ ((θ - θ_0) / d)²."""
         return 0.5 * float(np.sum(self.precision * (x - self.start) ** 2))
 
     def pinned(self, fixed: Sequence[int], x: np.ndarray) -> Objective:
-        """The same over the other entries, with some fixed at their values in x (k,)."""
+        """Return the objective over the other entries, with some fixed at their values in x (k,)."""
         rest = [i for i in range(x.size) if i not in fixed]
         return replace(
             self,
@@ -96,35 +112,36 @@ class Objective:
         )
 
     def setting(self, x: np.ndarray) -> Setting:
-        """What a fold is given at a point."""
-        return setting(self.tuning, (*self.entries, *self.fixed), np.concatenate([x, self.at]))
+        """Return tuning and prior at a point."""
+        items, values = (*self.entries, *self.fixed), (*x.tolist(), *self.at)
+        return with_values(self.tuning, items, [i.outward(v) for i, v in zip(items, values, strict=True)])
 
     def terms(self, x: np.ndarray) -> np.ndarray:
-        """What each event of the fit adds, weighted, all recordings in one row."""
-        given = self.setting(x)
+        """Return the weighted score of each event, all recordings in one row."""
+        setting = self.setting(x)
         found = []
         for recording in self.recordings:
             try:
-                values = recording.weight * self.aim.terms(self.estimator, given, recording)
+                values = recording.weight * self.aim.terms(self.estimator, setting, recording)
             except NisusError:
-                values = np.full(recording.log.n, HOPELESS / recording.log.n)
+                values = np.full(recording.log.n, FAILED_FOLD / recording.log.n)
             found.append(np.where(recording.held_out, 0.0, values))
         if not self.go(self.aim.folds * len(found)):
             raise Cancelled
         return np.concatenate(found)
 
     def all_terms(self, points: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """The terms at several points, side by side."""
+        """Return the terms at several points, computed concurrently."""
         alone = find_estimator(self.estimator, self.tuning.model).family in ALONE
         return each(self.terms, points, None if alone else self.executor)
 
     def value(self, x: np.ndarray) -> float:
-        """What is maximised."""
+        """Return the objective."""
         return float(self.terms(x).sum()) - self.penalty(x)
 
     def slopes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The terms (n,) at a point, and their derivatives (k, n), by differences towards the inside of the ranges."""
-        steps = self.steps
+        """Return the terms (n,) at a point, and their derivatives (k, n), by differences into the ranges."""
+        steps = np.array([STEP * (1.0 if item.log else item.deviation) for item in self.entries])
         for k, (_, high) in enumerate(self.limits):
             if x[k] + steps[k] > high:
                 steps[k] = -steps[k]
@@ -133,70 +150,47 @@ class Objective:
         return here, np.array([(there - here) / step for there, step in zip(moved, steps, strict=True)])
 
     def gradient(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """What is maximised, and its gradient (k,)."""
+        """Return the objective and its gradient (k,)."""
         here, slopes = self.slopes(x)
         return float(here.sum()) - self.penalty(x), slopes.sum(axis=1) - self.precision * (x - self.start)
 
 
-def _inward(item: Entry, value: float) -> float:
-    return item.inward(value) if value > 0.0 or not item.log else -np.inf
-
-
-ROUNDS = 8
-"""Times that the scale is taken anew, at most."""
-
-STEPS = 15
-"""Steps of the optimiser between."""
-
-GRADIENT = 0.02
-"""Gradient in deviations of an estimate at which the maximum is reached: half its square is what is left, in nats."""
-
-GAIN = 0.01
-"""Nats that a round must bring for another one."""
-
-EVALUATIONS = 60
-"""Folds an entry without derivatives, at most."""
-
-REACH = 1.0
-"""First step without derivatives, in logarithms."""
-
-
-def maximise(objective: Objective, x: np.ndarray, *, rounds: int = ROUNDS) -> tuple[np.ndarray, float]:
-    """The point (k,) of the maximum nearest to x, and the value there."""
+def maximise(objective: Objective, x: np.ndarray, *, rounds: int = MAX_ROUNDS) -> tuple[np.ndarray, float]:
+    """Return the point (k,) of the maximum nearest to x, and the value there."""
     low, high = np.array(objective.limits).T
     value = -np.inf
     for _ in range(rounds):
         _, slopes = objective.slopes(x)
         unit = 1.0 / np.sqrt(np.sum(slopes**2, axis=1) + objective.precision)
 
-        def down(z: np.ndarray, x: np.ndarray = x, unit: np.ndarray = unit) -> tuple[float, np.ndarray]:
+        def loss(z: np.ndarray, x: np.ndarray = x, unit: np.ndarray = unit) -> tuple[float, np.ndarray]:
             found, gradient = objective.gradient(np.clip(x + unit * z, low, high))
             return -found, -gradient * unit
 
         found = minimize(
-            down,
+            loss,
             np.zeros_like(x),
             jac=True,
             method="L-BFGS-B",
             bounds=list(zip((low - x) / unit, (high - x) / unit, strict=True)),
-            options={"maxiter": STEPS, "maxfun": 2 * STEPS, "gtol": GRADIENT, "ftol": 1e-12},
+            options={"maxiter": ROUND_STEPS, "maxfun": 2 * ROUND_STEPS, "gtol": GRADIENT, "ftol": 1e-12},
         )
         gained, value = -found.fun - value, float(-found.fun)
         x = np.clip(x + unit * found.x, low, high)
-        if gained < GAIN or found.status == 0:
+        if gained < MIN_GAIN or found.status == 0:
             break
     return x, value
 
 
 def search(objective: Objective, x: np.ndarray) -> tuple[np.ndarray, float]:
-    """The same without derivatives, for a filter that draws by chance."""
+    """Return the same without derivatives, for a filter that draws; the first step is one logarithm or deviation."""
     low, high = np.array(objective.limits).T
-    unit = np.array([REACH if item.log else item.deviation for item in objective.entries])
+    unit = np.array([1.0 if item.log else item.deviation for item in objective.entries])
     found = minimize(
         lambda z: -objective.value(np.clip(x + unit * z, low, high)),
         np.zeros_like(x),
         method="COBYQA",
         bounds=list(zip((low - x) / unit, (high - x) / unit, strict=True)),
-        options={"maxfev": EVALUATIONS * x.size, "final_tr_radius": 0.02},
+        options={"maxfev": SEARCH_FOLDS * x.size, "final_tr_radius": 0.02},
     )
     return np.clip(x + unit * found.x, low, high), float(-found.fun)

@@ -1,23 +1,22 @@
-"""How much of a likelihood is believed: a power of it, chosen by what took no part in the fit.
+"""Tempering: the power of the likelihood, chosen by data that took no part in the fit.
 
     p(θ | y) ∝ p(y | θ)^η p(θ),    0 < η ≤ 1
 
-If the model is right, η = 1. The model of an asset errs slowly, so that a thousand readings say as much as ten would,
-and the likelihood is sure of what it cannot know: it explains the one stretch that it was fitted to, with noises under
-which what is not measured leaves its band. A smaller power counts readings for fewer, and entries go back to where they
-were, those first of which the data tell least.
+If the model is right, η = 1. The model of a real asset has slow errors, so that a thousand measurements carry the
+information of ten, and the likelihood is overconfident: it fits noises to one stretch of time under which the states
+that are not measured leave their bands. A smaller power discounts the measurements, and entries go back to their
+start, the least identified first.
 
-Where nothing but readings tells, the likelihood is believed unless there is evidence against it: of the powers that
-predict nothing that was held out worse, the largest is taken with which the blocks held out are predicted no worse than
-with the best by more than chance (two standard errors of the difference). Where witnesses tell, of which few errors are
-independent, it is the smallest of those with which the fit is proposed, if there is one with which all witnesses stay
-in their bands.
+With the aim `likelihood` the power is 1 unless there is evidence against it: among the powers that worsen no held-out
+prediction, the largest whose prediction of the held-out blocks is within chance (two standard errors of the difference)
+of the best. With references, whose independent errors are few, it is the smallest of those with which the fit is
+proposed, preferably with all references in their bands.
 
 The maximum at a power is taken from the parabola at the maximum x̂ of power 1, with H minus its second derivatives, D
-those of the belief in x_0: x(η) = x_0 + (η (H - D) + D)⁻¹ η H (x̂ - x_0). What each is worth is known by folding.
+those of the prior at x_0: x(η) = x_0 + (η (H - D) + D)⁻¹ η H (x̂ - x_0). Each is scored by folding.
 
 Sources: Grünwald & van Ommen (2017), doi:10.1214/17-BA1085, for a power learnt by prediction; Breiman, Friedman, Olshen
-& Stone, Classification and Regression Trees (1984), 3.4.3, for the simplest of what is no worse than by chance.
+& Stone, Classification and Regression Trees (1984), 3.4.3, for the simplest candidate that is no worse than by chance.
 """
 
 from __future__ import annotations
@@ -29,16 +28,16 @@ import numpy as np
 
 from .aims import LIKELIHOOD, Aim
 from .entries import Setting
-from .judge import COVERED, SURE, Verdict, Worth, gain, verdict
+from .judge import MIN_COVERAGE, MIN_SIGMAS, Verdict, Worth, gain, verdict
 from .objective import Objective
 from .uncertainty import Curvature
 
 POWERS = tuple(0.25**k for k in range(9))
-"""Powers that are tried: at the last, what 65,536 readings say counts as what one would."""
+"""Powers to try: at the last, 65,536 measurements count as one."""
 
 
 class Tempered(NamedTuple):
-    """What is believed: the power, the point x (k,), its covariance (k, k), and what it is worth."""
+    """The chosen power, its point x (k,) and covariance (k, k), and the scores before and after."""
 
     power: float
     x: np.ndarray
@@ -61,13 +60,13 @@ def tempered(
     """Choose the power.
 
     Args:
-        objective: What was maximised.
-        x: Where, (k,).
+        objective: The objective.
+        x: Its maximum, (k,).
         shape: Its curvature there.
-        setting: What is folded at a point.
-        judged: What settings are worth.
-        aim: Of the fit.
-        powers: From 1 on, falling.
+        setting: Setting to fold at a point.
+        judged: Scores of settings.
+        aim: Aim of the fit.
+        powers: Powers to try, from 1 on, falling.
     """
     found = [at_power(objective, x, shape, power) for power in powers]
     own, *others = judged([setting(objective.start), *(setting(point) for point, _ in found)])
@@ -77,7 +76,7 @@ def tempered(
 
 
 def at_power(objective: Objective, x: np.ndarray, shape: Curvature, power: float) -> tuple[np.ndarray, np.ndarray]:
-    """The maximum (k,) at a power, and its covariance (k, k)."""
+    """Return the maximum (k,) at a power, and its covariance (k, k)."""
     if power == 1.0 or not x.size:
         return x, shape.cov
     H = np.linalg.inv(shape.cov)
@@ -88,32 +87,29 @@ def at_power(objective: Objective, x: np.ndarray, shape: Curvature, power: float
 
 
 def _chosen(own: Worth, others: Sequence[Worth], verdicts: Sequence[Verdict], aim: Aim) -> int:
-    """Which power: of those with which the fit is proposed; else that of 1, whose reasons are told.
+    """Return the index of the power; 0 (power 1, whose reasons are reported) if none qualifies.
 
-    Where nothing but readings tells, of those that do no harm, as each that is tried may win by chance.
+    With the likelihood, harmless fits qualify: proposed ones may win by chance when several powers are tried.
     """
     if aim.kind == LIKELIHOOD:
-        harmless = [k for k, item in enumerate(verdicts) if item.harmless]
-        best = max(harmless, key=lambda k: verdicts[k].gain, default=0)
-        return next((k for k in harmless if _as_good(others[k], others[best])), 0)
-    proposed = [k for k, item in enumerate(verdicts) if item.proposed]
-    if not proposed:
-        return 0
-    proposed = [k for k in proposed if _in_band(own, others[k])] or proposed
-    best = max(proposed, key=lambda k: verdicts[k].gain)
-    if not aim.weights:
-        return best
-    return next(k for k in reversed(proposed) if _as_good(others[k], others[best]))
+        qualified = [k for k, item in enumerate(verdicts) if item.harmless]
+    else:
+        qualified = [k for k, item in enumerate(verdicts) if item.proposed]
+        qualified = [k for k in qualified if _in_band(own, others[k])] or qualified
+    best = max(qualified, key=lambda k: verdicts[k].gain, default=0)
+    if aim.kind == LIKELIHOOD:
+        return next((k for k in qualified if _as_good(others[k], others[best])), 0)
+    return next((k for k in reversed(qualified) if _as_good(others[k], others[best])), 0) if aim.weights else best
 
 
 def _as_good(one: Worth, best: Worth) -> bool:
-    """Whether what one of them predicts of the blocks held out is no worse than the best by more than chance."""
+    """Return whether a prediction of the held-out blocks is within chance of the best."""
     less, error = gain(one.held_out.aimed, best.held_out.aimed)
-    return less <= SURE * error
+    return less <= MIN_SIGMAS * error
 
 
 def _in_band(own: Worth, other: Worth) -> bool:
-    """Whether the bands of all witnesses, in the blocks fitted to and held out, are no worse or wide enough."""
+    """Return whether the bands of all references, fitted and held out, are wide enough or no narrower."""
     pairs = [
         (old, new[name])
         for one, two in ((own.fitted, other.fitted), (own.held_out, other.held_out))
@@ -121,4 +117,4 @@ def _in_band(own: Worth, other: Worth) -> bool:
         for name, old in olds.items()
         if name in new
     ]
-    return all(new.coverage >= min(COVERED, old.coverage) for old, new in pairs)
+    return all(new.coverage >= min(MIN_COVERAGE, old.coverage) for old, new in pairs)

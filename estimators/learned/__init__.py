@@ -1,1 +1,1 @@
-"""Learning a correction of a model from recordings; what one is stands in model/correction.py and model/hybrid.py."""
+"""Learned corrections of a model: training data from recordings, training, and judging; see model/correction.py."""

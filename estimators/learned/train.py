@@ -1,12 +1,12 @@
-"""A correction trained on windows, and chosen by blocks of time that it was not trained on.
+"""Train a correction on windows, choose it by cross-validation over blocks of time, and judge it on held-out blocks.
 
-A filter keeps the error that a wrong rate leaves in a hidden state, so candidates are judged by the drift that they
-would leave over a block, not by single windows: neighbours in time are alike, and a correction that knows the one by
-the other has learned nothing. With e = r - m of the windows of a block in order, T long each,
+A filter accumulates the error of a wrong rate in a hidden state, so candidates are judged by the drift that they would
+leave over a block, not by single windows: neighbours in time are alike, and predicting one from the other proves
+nothing. With e = r - m of the windows of a block in order, T long each,
 
     drift = mean over n of (Σᵢ≤ₙ eᵢ T)² / (n T)
 
-which of white noise is the variance that it adds in a second.
+which for white noise is the variance that it adds per second.
 
 Source: Roberts et al. (2017), doi:10.1111/ecog.02881, for blocks where neighbours are alike; Rasmussen & Williams
 (2006), 5.4.1, for length scales by marginal likelihood, which scikit-learn finds.
@@ -22,42 +22,48 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import EstimatorError
-from ..fit.judge import COVERED, NARROWER, SURE, WORSE, Part, Prediction, gain
+from ..fit.judge import MIN_SIGMAS, Part, gain, narrower, worse
 from ..model.correction import Correction, GaussianProcess, Net, Ridge
 from .windows import Windows
 
 GP, RIDGE, NET = KINDS = ("gp", "ridge", "net")
 
-FEWEST = 8
-"""Windows with which anything is trained."""
 
-MOST = 400
-"""Windows that a Gaussian process may keep: a step takes as many exponentials, Q half their square in products."""
+MIN_WINDOWS = 8
+"""Fewest windows to train on."""
+
+
+MAX_WINDOWS = 400
+"""Most windows of a Gaussian process: a step takes as many exponentials, Q half their square in products."""
+
 
 REACHES = (1.0, 2.0, 4.0)
-"""Length scales that are tried, in standard deviations of the features."""
+"""Length scales to try, in standard deviations of the features."""
+
 
 RATIOS = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
-"""What is tried of the variance that a window has beside the correction, over the correction's."""
+"""Ratios to try of the variance of a window to that of the correction."""
+
 
 PENALTIES = (0.1, 1.0, 10.0, 100.0, 1000.0)
-"""What is tried of a ridge's penalty."""
+"""Penalties of a ridge to try."""
+
 
 NEEDS = "it needs scikit-learn: pip install 'nisus[learned]'"
 
 
 class Candidate(NamedTuple):
-    """A way to train, in words, and what does it."""
+    """A description of a correction, and the function that trains it."""
 
     words: str
     on: Callable[[Windows], Correction]
 
 
 class Trained(NamedTuple):
-    """A correction, and what it leaves where it was not trained.
+    """A correction, and its errors in cross-validation.
 
-    `rest` (M, k) are the rates that were left in each window by a correction trained on the other blocks; `drift` and
-    `before` (k,) the variances a second that they add up to, with the correction and without; `words` say which it is.
+    `rest` (M, k) are the rates left in each window by a correction trained on the other blocks; `drift` and `before`
+    (k,) the variances per second that they add up to, with the correction and without; `words` describe the choice.
     """
 
     correction: Correction
@@ -75,12 +81,12 @@ def train(
     Args:
         kind: One of `KINDS`.
         given: The windows.
-        names: Of the features.
-        degree: Of a ridge.
-        net: Of kind `net` the function, which is trained already: it is only asked what it leaves.
+        names: Names of the features.
+        degree: Degree of a ridge.
+        net: For kind `net` the function, already trained: only its errors are computed.
 
     Raises:
-        EstimatorError: If there are too few windows or too many, a feature does not move, or scikit-learn is absent.
+        EstimatorError: If there are too few windows or too many, a feature is constant, or scikit-learn is absent.
     """
     _check(kind, given, names)
     scale = np.sqrt(np.mean(given.rates**2, axis=0))
@@ -96,7 +102,7 @@ def train(
 
 
 def left(candidate: Candidate, given: Windows) -> np.ndarray:
-    """Rates (M, k) that are left in each window by a correction that was trained on the other blocks."""
+    """Return the rates (M, k) left in each window by a correction trained on the other blocks."""
     rest = np.empty_like(given.rates)
     for block in np.unique(given.block):
         rows = given.block == block
@@ -105,7 +111,7 @@ def left(candidate: Candidate, given: Windows) -> np.ndarray:
 
 
 def drift(given: Windows, rates: np.ndarray) -> np.ndarray:
-    """The variance a second (k,) that rates (M, k) of windows add up to; see above."""
+    """Return the variance per second (k,) that rates (M, k) of windows add up to; see the module's equation."""
     found = []
     for block in np.unique(given.block):
         rows = given.block == block
@@ -116,18 +122,18 @@ def drift(given: Windows, rates: np.ndarray) -> np.ndarray:
 
 def _check(kind: str, given: Windows, names: Sequence[str]) -> None:
     count = len(given.start)
-    if count < FEWEST or np.unique(given.block).size < 2:
+    if count < MIN_WINDOWS or np.unique(given.block).size < 2:
         raise EstimatorError(
-            f"there are {count} windows to learn from; it takes {FEWEST} or more of two blocks: a longer recording, or "
-            "shorter windows"
+            f"there are {count} windows to learn from; it takes {MIN_WINDOWS} or more of two blocks: use a longer "
+            "recording, or shorter windows"
         )
-    if kind == GP and count > MOST:
+    if kind == GP and count > MAX_WINDOWS:
         raise EstimatorError(
-            f"there are {count} windows, and a Gaussian process takes {MOST} at most; make them longer"
+            f"there are {count} windows, and a Gaussian process takes {MAX_WINDOWS} at most; make them longer"
         )
     for name, values in zip(names, given.features.T, strict=True):
         if not np.ptp(values) > 1e-9 * np.max(np.abs(values)):
-            raise EstimatorError(f"{name} is {values[0]:g} in every window, and tells nothing apart; leave it out")
+            raise EstimatorError(f"{name} is {values[0]:g} in every window, and explains nothing; leave it out")
 
 
 def _candidates(kind: str, given: Windows, degree: int, net: Callable | None) -> Iterator[Candidate]:
@@ -155,7 +161,7 @@ def _process(reach: float, ratio: float, given: Windows) -> GaussianProcess:
 
 
 def _likeliest(given: Windows) -> GaussianProcess:
-    """A process with a length scale for each feature, and a ratio, of the greatest marginal likelihood."""
+    """Return the process with a length scale per feature and a ratio of the greatest marginal likelihood."""
     try:
         from sklearn.gaussian_process import GaussianProcessRegressor, kernels
     except ImportError:
@@ -172,10 +178,10 @@ def _likeliest(given: Windows) -> GaussianProcess:
 
 
 class OnWindows(NamedTuple):
-    """What the physics and the correction leave over in some windows, (k,) by corrected state.
+    """Errors of the physics and of the correction in some windows, (k,) by corrected state.
 
-    `rms` of the rates and the `drift` that they add up to, first of the physics; `known` is the mean share of its
-    variance that the correction knows away there.
+    `rms` of the rates and their `drift`, first of the physics; `known` is the mean share of the correction's prior
+    variance that its training data explain there.
     """
 
     n: int
@@ -185,29 +191,29 @@ class OnWindows(NamedTuple):
 
 
 def known(trained: Trained, given: Windows) -> float:
-    """The mean share of its variance that a correction knows away in some windows."""
+    """Return the mean share of a correction's prior variance that its training data explain in some windows."""
     return 1.0 - float(np.mean(trained.correction.share(given.features)))
 
 
 def on_windows(given: Windows, rest: np.ndarray, share: float) -> OnWindows:
-    """Of windows in which the correction left `rest` (M, k), and knows that share."""
+    """Return the errors in windows where the correction left `rest` (M, k), with that explained share."""
     both = given.rates, rest
     first, second = (np.sqrt(np.mean(rates**2, axis=0)) for rates in both)
     return OnWindows(len(rest), (first, second), (drift(given, both[0]), drift(given, both[1])), share)
 
 
 def on_held_out(trained: Trained, given: Windows) -> OnWindows:
-    """Of windows that took no part in its training."""
+    """Return the errors in windows that took no part in the training."""
     return on_windows(given, given.rates - trained.correction.mean(given.features), known(trained, given))
 
 
 def against(physics: Sequence[Part], corrected: Part, states: Sequence[str]) -> tuple[str, ...]:
-    """What speaks against a correction, on blocks that were held out; nothing if it is better.
+    """Return the reasons against a correction on held-out blocks; empty if it is better.
 
     Args:
-        physics: The physics alone, first as the twin has it: the correction must be better under any of the tunings.
-        corrected: With the correction.
-        states: Those that are corrected: judged by their truth where it is known, else by the next reading.
+        physics: Scores of the physics alone, first with the twin's tuning: the correction must beat all of them.
+        corrected: Scores with the correction.
+        states: Corrected states: judged by their truth where it is known, otherwise by the next measurement.
     """
     reasons: list[str] = []
     for one in physics:
@@ -215,30 +221,20 @@ def against(physics: Sequence[Part], corrected: Part, states: Sequence[str]) -> 
         for name in judged:
             old, new = one.states[name], corrected.states[name]
             mean, error = gain(-old.scores, -new.scores)
-            if not mean > SURE * error:
+            if not mean > MIN_SIGMAS * error:
                 reasons.append(
-                    f"the true {name}, held out, is not estimated better: CRPS {new.crps:.3g} {new.unit} after "
+                    f"no better estimate of the held-out true {name}: CRPS {new.crps:.3g} {new.unit} after "
                     f"{old.crps:.3g}, by {mean:+.2g} ± {error:.2g}"
                 )
             if one is physics[0]:
-                reasons += _narrower(f"the true {name}", old, new)
+                reasons += narrower(f"the true {name}", old, new)
         if not judged:
             mean, error = gain(one.terms, corrected.terms)
-            if not mean > SURE * error:
-                reasons.append(
-                    f"the blocks held out are not predicted better: {mean:+.3g} ± {error:.2g} nats a reading"
-                )
-        for kind, olds, news in (("sensor", one.sensors, corrected.sensors), ("true", one.states, corrected.states)):
-            for name, old in olds.items():
-                if kind == "true" and name in judged:
-                    continue
-                mean, error = gain(old.scores, news[name].scores)
-                if mean > WORSE * old.crps and mean > SURE * error:
-                    reasons.append(f"{kind} {name} is predicted worse: CRPS {news[name].crps:.3g} after {old.crps:.3g}")
+            if not mean > MIN_SIGMAS * error:
+                reasons.append(f"no better prediction of the held-out blocks: {mean:+.3g} ± {error:.2g} nats a reading")
+        for name, old in one.sensors.items():
+            reasons += worse(f"sensor {name}", old, corrected.sensors[name])
+        for name, old in one.states.items():
+            if name not in judged:
+                reasons += worse(f"true {name}", old, corrected.states[name])
     return tuple(dict.fromkeys(reasons))
-
-
-def _narrower(what: str, old: Prediction, new: Prediction) -> list[str]:
-    if new.coverage < COVERED and new.coverage < old.coverage - NARROWER:
-        return [f"{what} leaves its band: {100 * new.coverage:.0f} % inside after {100 * old.coverage:.0f} %"]
-    return []

@@ -1,10 +1,10 @@
-"""What there is to learn from a recording: windows of time, and the rates by which the physics was wrong in them.
+"""Training data from a recording: windows of time, and the rates by which the physics was wrong in them.
 
     r: x(t + T) = x̂(t + T | x(t), r),   dx̂ = (f + r) dt
 
-x is what is known of the states: the truth where the recording has it, else the smoothed estimate. x̂ begins there and
-goes through the window as f says, with the inputs that were, and a rate r beside it; states that are not corrected
-follow what is known of them, as sensors would keep them there. The features of a window are their means over its time.
+x are the known states: the truth where the recording has it, otherwise the smoothed estimate. x̂ starts there and
+follows f through the window, with the recorded inputs and a rate r added; states that are not corrected follow their
+known values, as if sensors kept them there. The features of a window are their means over its time.
 """
 
 from __future__ import annotations
@@ -22,18 +22,19 @@ from ..model.hybrid import gathered, places
 from ..model.state_space import StateSpaceModel
 from ..smoothing.smooth import smooth
 
-SHORTEST = 0.5
-"""Share of a window's length that there must be of it, and the longest that it may last in such units the other way."""
+MIN_LENGTH_SHARE = 0.5
+"""Shortest window, as a share of the length; the inverse is the longest."""
 
-LITTLE = 1e-3
-"""Prior standard deviations by which a state is moved to see what a rate does."""
+
+RATE_STEP = 1e-3
+"""Step of the derivative with respect to a rate, in prior standard deviations of its state."""
 
 
 class Windows(NamedTuple):
-    """M windows: features (M, d), rates (M, k) in units of the states a second, start and end (M,) in s, block (M,).
+    """M windows: features (M, d), rates (M, k) in units of the states per second, start and end (M,) in s, block (M,).
 
-    `block` is the recording's number of the stretch of time that each lies in, in order; `held_out` (M,) says whether
-    it is one to judge by.
+    `block` is the number of the stretch of time that each lies in, in order; `held_out` (M,) is whether it is one to
+    judge by.
     """
 
     features: np.ndarray
@@ -44,12 +45,12 @@ class Windows(NamedTuple):
     held_out: np.ndarray
 
     def of(self, rows: np.ndarray) -> Windows:
-        """Some of them."""
+        """Return some of them."""
         return Windows(*(column[rows] for column in self))
 
     @staticmethod
     def joined(parts: Sequence[Windows]) -> Windows:
-        """Those of several recordings, whose blocks stay apart."""
+        """Return those of several recordings, with distinct block numbers."""
         shifted, first = [], 0
         for part in parts:
             shifted.append(part._replace(block=part.block + first))
@@ -58,11 +59,11 @@ class Windows(NamedTuple):
 
 
 def known_states(fold: Fold, physics: StateSpaceModel) -> np.ndarray:
-    """What is known of the states of the physics (events, nx): the truth, between its events too; else smoothed.
+    """Return the known states of the physics (events, nx): the truth, interpolated in time; otherwise smoothed.
 
     Args:
         fold: Over the whole log, of a model whose first states are those of the physics.
-        physics: The model that is to be corrected.
+        physics: The model to correct.
 
     Raises:
         EstimatorError: If the fold's filter cannot be smoothed.
@@ -84,14 +85,14 @@ def windows(
     """Cut a log into windows.
 
     Args:
-        physics: The model that is to be corrected.
-        log: What the asset said.
-        known: Its states at each event, see `known_states`.
+        physics: The model to correct.
+        log: The events.
+        known: States at each event, see `known_states`.
         held_out: Mask (events,) of the blocks that judge. A window that lies in both parts is left out.
         corrects: States to correct.
-        features: States and inputs by which.
+        features: States and inputs to predict the correction from.
         seconds: Length of a window.
-        stretches: Of time, by which windows are told apart (`Windows.block`).
+        stretches: Number of stretches of time (`Windows.block`).
     """
     t = log.t[: log.n]
     u = _inputs(physics, log)
@@ -107,7 +108,7 @@ def windows(
         lasted = (t[min(edges[k + 1], log.n - 1)] - t[edges[k]]) * 1e-9
         kinds = log.kind[rows]
         judging = held_out[rows]
-        if not SHORTEST * seconds < lasted < seconds / SHORTEST or judging.any() != judging.all():
+        if not MIN_LENGTH_SHARE * seconds < lasted < seconds / MIN_LENGTH_SHARE or judging.any() != judging.all():
             continue
         if not np.any(kinds == READING) or np.any(kinds == RESET):
             continue
@@ -129,7 +130,7 @@ def windows(
 
 
 def _inputs(model: StateSpaceModel, log: Log) -> np.ndarray:
-    """The inputs that hold from each event on (events, nu)."""
+    """Return the inputs that hold from each event on (events, nu)."""
     u = np.full((log.n, model.nu), np.nan)
     told = log.kind[: log.n] == INPUT
     u[told] = log.value[: log.n, : model.nu][told]
@@ -145,12 +146,12 @@ def _rates(
     f: Callable, p: np.ndarray, model: StateSpaceModel, t: np.ndarray, known: np.ndarray, u: np.ndarray,
     target: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Constant rates (k,) beside the physics with which it leads from the first row to the last.
+    """Return the constant rates (k,) added to the physics that lead from the first row to the last.
 
-    One step of Newton's method; NaN where it leads nowhere.
+    One Newton step; NaN if it fails.
     """
     seconds = (t[-1] - t[0]) * 1e-9
-    little = LITTLE * model.prior_std[target] / seconds
+    little = RATE_STEP * model.prior_std[target] / seconds
     turned = np.array([bool(model.circular[j]) for j in target])
 
     def missed(rates: np.ndarray) -> np.ndarray:

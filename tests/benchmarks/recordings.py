@@ -20,7 +20,7 @@ from app.twin.bounds import bounds_of
 from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin
 from estimators.errors import NisusError
-from estimators.fit.aims import AIMS, WITNESSES, correlation_time, track_of, witnesses
+from estimators.fit.aims import AIMS, WITNESSES, correlation_time, references, track_of
 from estimators.fit.entries import Setting
 from estimators.fit.fit import fit
 from estimators.fit.judge import Part, Z, worths
@@ -69,7 +69,7 @@ def outside(twin: Twin, setting: Setting, log: Log, second: np.ndarray) -> list[
     """Of each witness whose band holds less or more than it should on the second half: how sure that is."""
     track = track_of(twin.estimator, setting, Recording(log, 1.0, second))
     found = []
-    for item in witnesses(twin.model, log, track):
+    for item in references(twin.model, log, track):
         squares = (item.error / item.std) ** 2
         late = second[item.rows]
         if not late.any() or not (~late).any():

@@ -10,7 +10,7 @@ import numpy as np
 
 from app.twin.bounds import bounds_of
 from app.twin.twin import Twin
-from estimators.fit.dual import Refit, walk
+from estimators.fit.dual import WindowFit, walk
 from estimators.fit.fit import Fitted, Line
 from estimators.fold import Fold
 from estimators.log import TICK, TRUTH, Events, Log, truth_of
@@ -70,7 +70,7 @@ def at_end(fold: Fold, parameters: Sequence[str]) -> dict[str, Value]:
     return found
 
 
-def dual(twin: Twin, log: Log, parameters: Sequence[str], window: float, every: float) -> tuple[Came, list[Refit]]:
+def dual(twin: Twin, log: Log, parameters: Sequence[str], window: float, every: float) -> tuple[Came, list[WindowFit]]:
     """By windows; the rows are those that the filter had at the time."""
     log, begun = untold(log), process_time()
     found = list(walked(twin, twin.tuning, log, parameters, window, every))
@@ -88,7 +88,7 @@ def dual(twin: Twin, log: Log, parameters: Sequence[str], window: float, every: 
 
 def walked(
     twin: Twin, tuning: Tuning, log: Log, parameters: Sequence[str], window: float, every: float
-) -> Iterator[Refit]:
+) -> Iterator[WindowFit]:
     """As `nisus tune --windows`."""
     wanted = [f"p.{name}" for name in parameters]
     bounds = bounds_of(twin.config, twin.model)
@@ -107,7 +107,7 @@ def untold(log: Log) -> Log:
     return again
 
 
-def told(found: Sequence[Refit], tuning: Tuning, parameters: Sequence[str]) -> dict[str, Value]:
+def told(found: Sequence[WindowFit], tuning: Tuning, parameters: Sequence[str]) -> dict[str, Value]:
     """What was adopted last of each parameter, with the interval of that window."""
     values = {}
     for name in parameters:

@@ -35,7 +35,7 @@ def test_each_window_is_a_row_and_the_next_begins_with_what_won(capsys):
     assert status == 0 and "R.winding, °C²" in out and "(adopted)" in out
     # Of each that was not adopted it is said why.
     assert out.count("(adopted)") + out.split("Verdict")[1].count(" s: ") == 5
-    assert "it does not predict the blocks held out better" in out.split("Verdict")[1]
+    assert "no better prediction of the held-out blocks" in out.split("Verdict")[1]
 
 
 def test_what_is_right_stays(capsys):

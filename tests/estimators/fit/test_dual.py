@@ -117,9 +117,9 @@ def test_a_tail_is_folded_to_the_same_bits():
 
 def test_a_window_that_cannot_be_fitted_stops_nothing():
     log = log_of(np.r_[np.zeros(WINDOW), wearing(5, [0.2]).value[:WINDOW, 0]])
-    # R of a sensor that says the same all the time cannot be told.
+    # R of a sensor that never changes cannot be identified.
     first, second = list(walk("kf", believed(), log, wanted=["R.float"], window=WINDOW))
-    assert first.fitted is None and "says the same all the time" in first.reason and not first.proposed
+    assert first.fitted is None and "readings never change" in first.reason and not first.proposed
     assert second.fitted is not None and second.reason == ""
 
 

@@ -126,7 +126,7 @@ def test_intervals_are_where_the_profile_of_the_joint_density_has_dropped(fitted
 
 def test_a_sensor_that_says_nothing_is_not_fitted(fitted):
     assert [item.key for item in fitted.skipped] == ["R.silent"]
-    assert "says nothing" in fitted.skipped[0].reason
+    assert "without readings" in fitted.skipped[0].reason
 
 
 def test_what_the_data_cannot_tell_is_left_alone(ys):
@@ -137,7 +137,7 @@ def test_what_the_data_cannot_tell_is_left_alone(ys):
 
 
 def test_without_blocks_held_out_nothing_is_proposed(fitted):
-    assert not fitted.proposed and "nothing was held out" in fitted.verdict.reasons[0]
+    assert not fitted.proposed and "no data were held out" in fitted.verdict.reasons[0]
 
 
 def test_a_tuning_that_is_wrong_is_replaced():
@@ -159,7 +159,7 @@ def test_a_tuning_that_is_right_stays():
 def test_a_sensor_that_is_stuck_tells_no_noise(ys):
     """It predicts itself so well that its R would run to nothing, and win on what was held out."""
     stuck, moves = log_of(np.full(300, 1.3)), log_of(ys)
-    with pytest.raises(ConfigError, match="R.float is of a sensor that says the same all the time here"):
+    with pytest.raises(ConfigError, match="R.float belongs to a sensor whose readings never change"):
         entries_of("kf", Tuning.of(MODEL), [stuck], ["R"])
     assert [item.key for item in entries_of("kf", Tuning.of(MODEL), [stuck, moves], ["R"])[0]] == ["R.float"]
 

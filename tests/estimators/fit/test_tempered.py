@@ -59,7 +59,7 @@ def test_what_is_not_proposed_is_told_of_the_whole_likelihood():
     assert not found.proposed and found.power == 1.0 and found.verdict.reasons
 
 
-@pytest.mark.parametrize("gained, said", [(1e-4, "what it gains is next to nothing: 0.02 nats in all"), (0.1, None)])
+@pytest.mark.parametrize("gained, said", [(1e-4, "negligible gain: 0.02 nats in total"), (0.1, None)])
 def test_a_little_of_a_gain_is_none(gained, said):
     """A small enough step towards what is better is surely better, and worth nothing: it is not proposed."""
 

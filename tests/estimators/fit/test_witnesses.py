@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import norm
 
 from estimators.errors import ConfigError
-from estimators.fit.aims import LIKELIHOOD, WITNESSES, aim_of, correlation_time, witnesses
+from estimators.fit.aims import LIKELIHOOD, WITNESSES, aim_of, correlation_time, references
 from estimators.fit.entries import Setting
 from estimators.fit.fit import fit
 from estimators.fit.judge import worths
@@ -58,7 +58,7 @@ def test_true_states_and_unused_sensors_are_witnesses():
     tuning = Tuning.of(MODEL).set("use.silent", False)
     fold = Fold("kf", MODEL, tuning, log)
     fold.advance()
-    truth, sensor = witnesses(MODEL, log, fold.track)
+    truth, sensor = references(MODEL, log, fold.track)
     assert (truth.name, truth.truth, sensor.name, sensor.truth) == ("level", True, "silent", False)
     np.testing.assert_array_equal(truth.error, xs - fold.track.mean[truth.rows, 0])
     np.testing.assert_allclose(sensor.error, ys - fold.track.mean[sensor.rows, 0], atol=1e-12)
@@ -104,7 +104,7 @@ def test_the_noise_of_a_sensor_that_is_held_out_is_told_by_its_own_prediction():
     log = log_of(ys)
     log.add("silent", np.arange(xs.size, dtype=float), xs + rng.normal(0.0, 2.0, xs.size))
     tuning = Tuning.of(MODEL).set("use.silent", False)
-    with pytest.raises(ConfigError, match="R.silent is of a sensor that is held out"):
+    with pytest.raises(ConfigError, match="R.silent belongs to a held-out sensor"):
         fit("kf", tuning, [Recording(log)], wanted=("R.silent",))
     found = fit("kf", tuning, [Recording(log)], wanted=("Q", "R"), aim=WITNESSES)
     # It reads with a variance of 4, beside what the estimate is off by, about 1.

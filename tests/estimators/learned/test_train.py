@@ -171,7 +171,7 @@ def test_what_cannot_be_learned_from_is_refused():
     given = made(curved(z), z, 3)
     with pytest.raises(EstimatorError, match="there are 7 windows to learn from; it takes 8 or more of two blocks"):
         train(RIDGE, given.of(np.arange(7)), names=("a", "b"))
-    with pytest.raises(EstimatorError, match="b is 2 in every window, and tells nothing apart; leave it out"):
+    with pytest.raises(EstimatorError, match="b is 2 in every window, and explains nothing; leave it out"):
         train(RIDGE, replace_features(given, 2.0), names=("a", "b"))
     many = made(np.zeros((401, 1)), np.random.default_rng(5).uniform(0.0, 1.0, (401, 1)), 3)
     with pytest.raises(EstimatorError, match="401 windows, and a Gaussian process takes 400 at most; make them longer"):

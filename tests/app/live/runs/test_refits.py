@@ -89,7 +89,7 @@ def test_what_does_not_win_is_not_proposed_and_is_said(begin):
     twin.measure(WINDOW + 1, 2.0)
     assert twin.look() == NOTHING and twin.refits.open is None
     (line,) = twin.refit_notices()
-    assert line.startswith("refit 1: nothing better: it does not predict the blocks held out better")
+    assert line.startswith("refit 1: nothing better: no better prediction of the held-out blocks")
     assert not version_files(twin.twin.path) and twin.engine.tuning is twin.engine.twin.tuning
     with pytest.raises(ConfigError, match="refit 1: it is nothing better; only what is proposed"):
         twin.refits.accept(1)
