@@ -89,6 +89,8 @@ class Fold(FoldOptions):
     """Write the track to this .csv or .parquet file, or a recording to this .rrd file."""
     html: Path | None = None
     """Write a self-contained HTML report: scores, charts, checks, episodes, tuning."""
+    plot: Path | None = None
+    """Draw the states with their measurements, and the NIS, into this .png, .pdf or .svg (needs `nisus[plot]`)."""
     smooth: Flag = False
     """Also smooth: estimate each state from all measurements, before and after. Adds columns to --out."""
     json: Flag = False

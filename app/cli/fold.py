@@ -18,6 +18,7 @@ from estimators.smoothing.smooth import check_smooth, smooth
 from estimators.smoothing.walk import Smoothed
 
 from ..live.watchdog import interruptible
+from ..present.drawing.plot import check_plot, plot_track
 from ..present.export.report import Reported, report
 from ..present.export.track_file import encoded
 from ..present.result import to_html, to_json, to_text
@@ -50,6 +51,8 @@ def fold_twin(arguments: Arguments) -> int:
     recorded = out is not None and out.suffix == ".rrd"
     if out is not None and recorded and os.path.lexists(out):
         raise ConfigError(f"--out {out}: {TAKEN}")
+    if arguments.plot is not None:
+        check_plot(arguments.plot)
     if arguments.smooth:
         check_smooth(find_estimator(twin.estimator, twin.model), twin.model, twin.tuning.options)
     prepare(twin)
@@ -93,6 +96,11 @@ def fold_twin(arguments: Arguments) -> int:
         )  # fmt: skip
         with writing(arguments.html, "--html"):
             arguments.html.write_text(to_html(f"{twin.name}, {twin.estimator}", report(run)), encoding="utf-8")
+    if arguments.plot is not None:
+        with writing(arguments.plot, "--plot"):
+            found, title = [item.episode for item in result.episodes], f"{twin.name}, {twin.estimator}"
+            figure = plot_track(twin.model, log.events, fold.track, episodes=found, title=title)
+            figure.savefig(arguments.plot, dpi=150)
     print(to_json(fold_json(result)) if arguments.json else "\n".join(to_text(fold_topics(result))))
     return 0
 

@@ -6,7 +6,7 @@ import html
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import viser
@@ -19,6 +19,7 @@ from ...live.commands import Command, Reset, SetEstimator, SetTuning
 from ...live.interface import Running
 from ...live.outputs import Status
 from ...present.drawing.colors import LIGHT, RGB, Palette, round_step
+from ...present.drawing.plot import SECONDS, TimeUnit, time_unit
 from ...present.series.chart_stream import drawn
 from ...present.series.charted_run import LiveRun
 from ...present.series.columns import columns_of
@@ -38,27 +39,6 @@ SIGNS = {"waiting": "○", "tracking": "●", "suspect": "◐", "degraded": "▲
 """Each health state has a sign of its own, for users who cannot distinguish the colours."""
 
 STYLE = "padding:0.2em 1.4em 0.6em 0.9em;font-size:0.85em;line-height:1.6;overflow-wrap:anywhere"
-
-
-class TimeUnit(NamedTuple):
-    """Unit of the time axis, with the digits after the point that a time has in it."""
-
-    name: str
-    seconds: float
-    digits: int
-
-    def text(self, seconds: float) -> str:
-        """Return a time in this unit, for example `3.50 min`."""
-        return f"{seconds / self.seconds:.{self.digits}f} {self.name}"
-
-
-SECONDS = TimeUnit("s", 1.0, 1)
-TIME_UNITS = (SECONDS, TimeUnit("min", 60.0, 2), TimeUnit("h", 3600.0, 3), TimeUnit("d", 86400.0, 4))
-
-
-def time_unit(span: float) -> TimeUnit:
-    """Return the largest unit of which `span` seconds hold at least three, or seconds."""
-    return [unit for unit in TIME_UNITS if span >= 3.0 * unit.seconds or unit is SECONDS][-1]
 
 
 class Panel:

@@ -191,14 +191,6 @@ def test_a_variance_of_zero_has_no_slider():
         assert list(view.panel.controls.handles) == ["estimator", "gate", "Q.temperature", "Q.rate"]
 
 
-@pytest.mark.parametrize(
-    ("span", "name"),
-    [(0.0, "s"), (179.0, "s"), (180.0, "min"), (3600.0, "min"), (10_800.0, "h"), (86400.0, "h"), (3 * 86400.0, "d")],
-)
-def test_the_time_unit_suits_the_span(span, name):
-    assert panel.time_unit(span).name == name
-
-
 def test_the_status_has_a_sign_a_cause_and_no_markup_of_others():
     assert set(SIGNS) == set(HEALTH_NAMES) and len(set(SIGNS.values())) == len(SIGNS)
     status = FakeEngine(WINDING, "kf").state

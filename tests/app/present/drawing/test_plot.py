@@ -1,0 +1,60 @@
+"""Charts as files: what they hold is what was folded, and a missing Matplotlib is one line."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from app.cli.main import main
+from app.present.drawing.plot import check_plot, plot_track, time_unit
+from estimators import MODELS, Log, fold
+from estimators.errors import ConfigError
+
+
+@pytest.fixture(scope="module")
+def run():
+    model = MODELS["motor_winding"]
+    log = Log.of(model)
+    rng = np.random.default_rng(1)
+    t = np.arange(1.0, 201.0)
+    log.add("winding", t, np.where(t == 100.0, 200.0, 40.0 + rng.normal(0, 2, t.size)))
+    return fold("kf", model, log, gate=0.9999)
+
+
+def test_a_plot_has_the_states_with_bands_and_measurements_and_the_nis(run):
+    figure = plot_track(run.model, run.events, run.track, title="motor")
+    rate, temperature, nis = figure.axes
+    lines = {line.get_label(): line for line in temperature.lines}
+    np.testing.assert_array_equal(lines["estimate"].get_ydata(), run.mean[:, 0])
+    assert lines["rejected"].get_ydata().tolist() == [200.0]
+    assert len(lines["measurement"].get_ydata()) == 199
+    band = temperature.collections[0].get_paths()[0].vertices
+    at_end = band[band[:, 0] == band[:, 0].max(), 1]
+    assert np.ptp(at_end) == pytest.approx(4.0 * run.std[-1, 0])
+    assert "temperature" in temperature.get_ylabel() and "°C" in temperature.get_ylabel()
+    assert "measurement" not in {line.get_label() for line in rate.lines}
+    mean = next(line for line in nis.lines if line.get_label() == "windowed mean").get_ydata()
+    np.testing.assert_array_equal(mean, run.track.nis_mean)
+
+
+@pytest.mark.parametrize(("ending", "magic"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")])
+def test_fold_draws_into_the_format_of_the_ending(ending, magic, tmp_path, capsys):
+    path = tmp_path / f"run.{ending}"
+    assert main(["fold", "motor_winding", "--duration", "20", "--plot", str(path)]) == 0
+    assert path.read_bytes().startswith(magic)
+
+
+def test_another_ending_and_a_missing_matplotlib_are_one_line(tmp_path, monkeypatch, capsys):
+    assert main(["fold", "motor_winding", "--plot", str(tmp_path / "run.bmp")]) == 2
+    assert ".png" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ConfigError, match=r"nisus\[plot\]"):
+        check_plot(tmp_path / "run.png")
+
+
+@pytest.mark.parametrize(
+    ("span", "name"),
+    [(0.0, "s"), (179.0, "s"), (180.0, "min"), (3600.0, "min"), (10_800.0, "h"), (86400.0, "h"), (3 * 86400.0, "d")],
+)
+def test_the_time_unit_suits_the_span(span, name):
+    assert time_unit(span).name == name
